@@ -1,0 +1,107 @@
+# Every door of the project.  `make` alone prints them.
+
+PYTHON ?= python3
+VENV   := .venv
+PY     := $(VENV)/bin/python
+SEED   ?= 1
+N      ?= 20
+REAL   ?= 0
+HEADLESS ?=
+WEB_HOST ?= 127.0.0.1
+WEB_PORT ?=
+
+# Wheels only: nothing is ever compiled here.  Our own tree is installed without a build sandbox,
+# so that a second run needs no network.
+PIP     := $(PY) -m pip --disable-pip-version-check --quiet install --only-binary :all:
+INSTALL := $(PIP) --no-build-isolation --editable
+RUNTIME := $(VENV)/.stamp-runtime
+DEV     := $(VENV)/.stamp-dev
+BROWSER := $(VENV)/.stamp-browser
+
+.PHONY: help demo test trials check format cov live browser bench-demo dist clean
+
+help:
+	@echo 'make demo [HEADLESS=1] [SEED=1]       three dogs, a red target and the page; HEADLESS: both experiments, then exit'
+	@echo '          [WEB_HOST=0.0.0.0] [WEB_PORT=8080]   whom the page is open to, and where'
+	@echo 'make test                             every test'
+	@echo 'make trials [N=20] [SEED=1] [REAL=3]  both experiments N times in memory, and REAL times as processes'
+	@echo 'make check                            format, lint, types, and the rules of the house'
+	@echo 'make format                           write the format that "make check" asks for'
+	@echo 'make cov                              the tests with coverage of lines and branches'
+	@echo 'make live                             only the tests with real sockets and processes'
+	@echo 'make browser                          only the tests of the page in Chromium'
+	@echo 'make bench-demo                       what the demonstration costs: memory, datagrams, seconds'
+	@echo 'make dist                             sdist and wheel, installed into a fresh environment and asked for help'
+	@echo 'make clean                            remove what the above left behind, the environment included'
+
+demo: $(RUNTIME)
+	@exec $(PY) -m sim.demo --seed $(SEED) $(if $(filter-out 0,$(HEADLESS)),--headless) \
+	    --web-host $(WEB_HOST) $(if $(WEB_PORT),--web-port $(WEB_PORT))
+
+test: $(DEV)
+	$(PY) -m twisted.trial tests
+
+trials: $(RUNTIME)
+	$(VENV)/bin/swarm trials --count $(N) --seed $(SEED) --real $(REAL)
+
+check: $(DEV)
+	$(PY) -m ruff format --check .
+	$(PY) -m ruff check .
+	$(PY) -m mypy
+	$(PY) -m twisted.trial --reporter=summary tests.test_house
+
+format: $(DEV)
+	$(PY) -m ruff check --fix --select I .
+	$(PY) -m ruff format .
+
+cov: $(DEV)
+	$(PY) -m coverage run -m twisted.trial tests
+	$(PY) -m coverage report
+
+live: $(DEV)
+	$(PY) -m twisted.trial tests.live
+
+browser: $(BROWSER)
+	$(PY) -m twisted.trial tests.live.test_page
+
+bench-demo: $(RUNTIME)
+	$(PY) -m benchmarks.demo --seed $(SEED)
+
+dist: $(DEV)
+	rm -rf build dist
+	$(PIP) 'build>=1.2,<2'
+	$(PY) -m build --quiet --outdir dist .
+	rm -rf build/fresh && $(PYTHON) -m venv build/fresh
+	build/fresh/bin/python -m pip --disable-pip-version-check --quiet install --only-binary :all: dist/*.whl
+	cd build && fresh/bin/twistd --help | grep swarm-node && fresh/bin/swarm --help >/dev/null
+	@ls -l dist
+
+clean:
+	rm -rf $(VENV) build dist run _trial_temp* *.egg-info .coverage .mypy_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -prune -exec rm -rf {} +
+	rm -f twisted/plugins/dropin.cache twistd.pid twistd.log*
+
+$(PY):
+	@command -v $(PYTHON) >/dev/null || { \
+	    echo "swarm-node: $(PYTHON) is not here; install it (apt install python3 python3-venv) or say make PYTHON=/path/to/python3" >&2; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
+	    echo "swarm-node: needs Python 3.11 or later, $(PYTHON) is `$(PYTHON) -V 2>&1`; say make PYTHON=python3.11" >&2; exit 1; }
+	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { \
+	    echo "swarm-node: $(PYTHON) cannot make virtual environments; install them: apt install python3-venv" >&2; exit 1; }
+	@echo "making $(VENV) with `$(PYTHON) -V`; needs the network this once"
+	@$(PYTHON) -m venv $(VENV)
+
+$(RUNTIME): setup.cfg pyproject.toml | $(PY)
+	@$(PIP) 'setuptools>=77'
+	@$(INSTALL) '.[all]'
+	@touch $@
+
+$(DEV): setup.cfg pyproject.toml | $(PY)
+	@$(PIP) 'setuptools>=77'
+	@$(INSTALL) '.[all,dev]'
+	@touch $@ $(RUNTIME)
+
+$(BROWSER): setup.cfg pyproject.toml | $(PY)
+	@$(PIP) 'setuptools>=77'
+	@$(INSTALL) '.[all,dev,browser]'
+	@touch $@ $(DEV) $(RUNTIME)

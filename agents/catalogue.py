@@ -1,0 +1,41 @@
+"""Catalogue: the predefined tasks that a person can choose from (thesis, Algorithm 4.4: ``tasks[choice]``)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from middleware.errors import UnknownTask
+from middleware.tasks import Task
+
+DEMO = "find-red-target"
+
+TASKS = {
+    DEMO: Task(
+        task_id="",
+        kind="find-target",
+        title="Find the red target",
+        requirements={"base2d": {}, "camera": {"width": 104}, "ranger": {"max": 0.5}},
+        parameters={"target_radius": 0.08},
+    ),
+    "turn-around": Task(
+        task_id="",
+        kind="turn-around",
+        title="Turn around once",
+        requirements={"base2d": {}, "odometry": {}, "power": {}},
+        waiting_period=1.0,
+    ),
+    "fetch-the-ball": Task(
+        task_id="",
+        kind="fetch",
+        title="Fetch the ball",
+        requirements={"base2d": {}, "camera": {}, "gripper": {}},
+    ),
+}
+
+
+def task_named(name: str, task_id: str, created: float) -> Task:
+    """The predefined task ``name`` as a new task; raises ``UnknownTask``, which names those that there are."""
+    template = TASKS.get(name)
+    if template is None:
+        raise UnknownTask(f"no predefined task is called {name!r}; there are {', '.join(sorted(TASKS))}")
+    return replace(template, task_id=task_id, created=created)

@@ -1,0 +1,208 @@
+"""Agent: the mind of one device; it joins the tasks that its body can do and turns what is sensed into what is done."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+
+from twisted.application.service import Service
+from twisted.internet.defer import Deferred
+from twisted.internet.interfaces import IDelayedCall, IReactorTime
+from twisted.logger import Logger
+
+from agents.behaviour import STAND, behaviour_for
+from agents.engagement import Engagement
+from drivers.driver import Driver, Permit
+from drivers.errors import DriverError, UsageError
+from drivers.reading import Observation
+from middleware.consensus.strategy import strategy_for
+from middleware.entangled.errors import EntangledError
+from middleware.entangled.record import Record
+from middleware.entangled.watch import Watch
+from middleware.errors import SwarmError
+from middleware.node import CAMERA, SwarmNode
+from middleware.presence import DONE, IDLE
+from middleware.tasks import Member, Result, Task, group_key, outcome_of, refusals, task_of
+
+TICK = 0.05
+REENGAGE = 0.5
+
+
+class Agent(Service):
+    """One device's agent: one turn a tick, in the order observe, decide, act, publish."""
+
+    _log = Logger()
+
+    def __init__(self, node: SwarmNode, driver: Driver, clock: IReactorTime, rng: random.Random) -> None:
+        self._node = node
+        self._driver = driver
+        self._clock = clock
+        self._rng = rng
+        self._open: dict[str, Task] = {}
+        self._ended: set[str] = set()
+        self._checking: set[str] = set()
+        self._engagement: Engagement | None = None
+        self._group: Watch | None = None
+        self._tick: IDelayedCall | None = None
+        self._unsubscribe: Callable[[], None] | None = None
+        self._token = 0
+
+    def startService(self) -> None:
+        """Connect the body, and follow the tasks once the node has joined."""
+        super().startService()
+        self._unsubscribe = self._driver.subscribe(self._seen)
+        self._driver.connect().addCallbacks(lambda _: self._driver.enable(), self._no_body)
+        self._node.joined.addCallback(self._follow)
+        self._tick = self._clock.callLater(TICK, self._turn)
+
+    def stopService(self) -> Deferred[None]:
+        """Stop the body first, then give back what is held."""
+        super().stopService()  # type: ignore[no-untyped-call]
+        self._driver.stop()
+        if self._tick is not None and self._tick.active():
+            self._tick.cancel()
+        if self._unsubscribe is not None:
+            self._unsubscribe()
+        self._disengage()
+        return self._driver.disconnect()
+
+    def _no_body(self, failure: object) -> None:
+        self._log.warn("no robot yet: {failure}", failure=failure)
+        self._node.presence.say(self._node.wall(), "has no robot at the moment")
+
+    # -- observe ----------------------------------------------------------------------------------------------------
+
+    def _seen(self, seen: Observation) -> None:
+        if seen.frame is not None:
+            self._node.streams.offer(CAMERA, seen.frame.seq, seen.frame.data)
+        if self._engagement is not None and not self._engagement.is_over:
+            self._engagement.look(seen)
+
+    # -- tasks ------------------------------------------------------------------------------------------------------
+
+    def _follow(self, _: object) -> object:
+        if self.running:
+            self._node.watch_tasks(self._tasks)
+        return _
+
+    def _tasks(self, records: list[Record]) -> None:
+        for task in sorted(filter(None, map(task_of, records)), key=lambda t: (t.created, t.task_id)):
+            new = task.task_id not in self._open and task.task_id not in self._ended | self._checking
+            if new and not refusals(self._driver.description.capabilities, task.requirements):
+                self._checking.add(task.task_id)
+                self._node.entangled.get(group_key(task.task_id)).addCallbacks(
+                    self._checked, self._unchecked, callbackArgs=(task,), errbackArgs=(task,)
+                )
+
+    def _checked(self, records: list[Record], task: Task) -> None:
+        """A task heard of: it may be an old one that is done."""
+        self._checking.discard(task.task_id)
+        if outcome_of(records) is not None:
+            self._ended.add(task.task_id)
+        else:
+            self._open[task.task_id] = task
+            self._engage_next()
+
+    def _unchecked(self, failure: object, task: Task) -> None:
+        """Nobody could tell; the next change of the tasks asks again."""
+        self._checking.discard(task.task_id)
+
+    def _engage_next(self) -> None:
+        busy = self._engagement is not None and not self._engagement.is_over
+        if busy or not self._open or not self.running:
+            return
+        self._disengage()
+        task = min(self._open.values(), key=lambda t: (t.created, t.task_id))
+        try:
+            behaviour = behaviour_for(task, self._rng)
+            strategy = strategy_for(task.strategy)
+        except SwarmError as error:
+            self._ended.add(task.task_id)
+            del self._open[task.task_id]
+            self._node.presence.say(self._node.wall(), str(error))
+            return self._engage_next()
+        me = Member(self._node.uuid, self._node.presence.device.name, IDLE)
+        engagement = Engagement(
+            task, me, behaviour, strategy, self._clock, self._token, self._tell, self._conclude, self._say
+        )
+        engagement.lessee = self._node.lessee(task, self._turn_now, self._token)
+        self._engagement = engagement
+        self._group = self._node.watch_group(task.task_id, engagement.heard)
+        self._node.report(task.task_id, engagement.me)
+        self._node.presence.change(task=task.task_id, status=engagement.me.status)
+        self._say(f"assigned: {task.title}")
+
+    def _disengage(self) -> None:
+        engagement, self._engagement = self._engagement, None
+        if self._group is not None:
+            self._group.stop()
+            self._group = None
+        if engagement is not None:
+            engagement.abandon()
+            if self.running:
+                self._node.withdraw(engagement.task.task_id)
+
+    # -- act --------------------------------------------------------------------------------------------------------
+
+    def _turn(self) -> None:
+        self._tick = self._clock.callLater(TICK, self._turn)
+        self._turn_now()
+
+    def _turn_now(self) -> None:
+        engagement = self._engagement
+        if engagement is None or not self.running:
+            return
+        if engagement.is_over:
+            return self._finished(engagement)
+        deed = engagement.step()
+        self._token = max(self._token, engagement.token)
+        if deed is None:
+            return
+        if self._driver.state != "ready":
+            return
+        try:
+            self._driver.act(deed.action, deed.permit)
+        except UsageError as error:
+            self._driver.stop()
+            self._log.debug("the body refused: {error}", error=error)
+        except DriverError as error:
+            self._log.info("the body does not answer: {error}", error=error)
+
+    def _finished(self, engagement: Engagement) -> None:
+        task_id = engagement.task.task_id
+        if task_id in self._ended:
+            return
+        self._driver.stop()
+        self._ended.add(task_id)
+        self._open.pop(task_id, None)
+        engagement.abandon()
+        by_me = engagement.result is not None and engagement.result.by == engagement.me.name
+        self._node.presence.change(task="", status=DONE if by_me else IDLE)
+        self._engage_next()
+
+    # -- publish ----------------------------------------------------------------------------------------------------
+
+    def _tell(self, member: Member) -> None:
+        engagement = self._engagement
+        if engagement is not None:
+            self._node.report(engagement.task.task_id, member)
+            self._node.presence.change(status=member.status)
+
+    def _conclude(self, result: Result) -> None:
+        engagement = self._engagement
+        if engagement is None:
+            return
+        concluded = self._node.conclude(engagement.task.task_id, result)
+        concluded.addErrback(self._not_concluded, engagement.task.task_id, result)
+
+    def _not_concluded(self, failure: object, task_id: str, result: Result) -> None:
+        """No majority could be told: try again for as long as the task is ours to conclude."""
+        failure.trap(EntangledError)  # type: ignore[attr-defined]
+        if self.running and self._engagement is not None and self._engagement.task.task_id == task_id:
+            self._clock.callLater(REENGAGE, self._conclude, result)
+
+    def _say(self, text: str) -> None:
+        self._node.presence.say(self._node.wall(), text)
+
+
+__all__ = ["STAND", "Agent", "Permit"]

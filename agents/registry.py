@@ -1,0 +1,31 @@
+"""Registry: the agent of a device, found by the name in its configuration (thesis, Table 5.1) and imported only then."""
+
+from __future__ import annotations
+
+import importlib
+import random
+from collections.abc import Callable
+from typing import Any
+
+from twisted.application.service import Service
+from twisted.internet.interfaces import IReactorTime
+
+from drivers.driver import Driver
+from middleware.errors import UnknownAgent
+from middleware.node import SwarmNode
+
+BUILT_IN = {"search": "agents.loop:Agent"}
+MakeAgent = Callable[[SwarmNode, Driver, IReactorTime, random.Random], Service]
+
+
+def agent_named(name: str) -> MakeAgent:
+    """What makes the agent called ``name``: a built-in one or ``module:Class``; raises ``UnknownAgent``, which names those."""
+    target = BUILT_IN.get(name, name if ":" in name else None)
+    if target is None:
+        raise UnknownAgent(f"no agent is called {name!r}; there are {', '.join(sorted(BUILT_IN))}, or write module:Class")
+    module, _, attribute = target.partition(":")
+    try:
+        make: Any = getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError) as error:
+        raise UnknownAgent(f"agent {name!r} cannot be loaded: {error}") from error
+    return make  # type: ignore[no-any-return]

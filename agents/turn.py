@@ -1,0 +1,49 @@
+"""TurnAround: one dog, the one with the most charge left, turns once on the spot."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Mapping
+
+from agents.behaviour import STAND
+from drivers.reading import Action, Observation
+
+SPEED = 1.2
+
+
+class TurnAround:
+    """A task that needs no target: what it costs is the charge already used, 0 to 1."""
+
+    def __init__(self, parameters: Mapping[str, float | str], rng: random.Random) -> None:
+        self._turns = float(parameters.get("turns", 1.0))
+        self._charge: float | None = None
+        self._yaw: float | None = None
+        self._turned = 0.0
+        self._acting = False
+
+    def look(self, seen: Observation, now: float) -> None:
+        """Take in the charge and the heading."""
+        self._charge = float(seen.values.get("power.level", math.nan))
+        yaw = float(seen.values.get("odom.yaw", 0.0))
+        if self._yaw is not None and self._acting:
+            self._turned += math.remainder(yaw - self._yaw, math.tau)
+        self._yaw = yaw
+
+    @property
+    def cost(self) -> float | None:
+        """The share of the charge that is used up."""
+        return None if self._charge is None or math.isnan(self._charge) else round(1.0 - self._charge, 4)
+
+    def search(self, now: float) -> Action:
+        """Nothing is to be searched."""
+        return STAND
+
+    def hold(self, now: float) -> Action:
+        """Stand still."""
+        return STAND
+
+    def execute(self, now: float) -> Action | None:
+        """Turn left until the turns are done."""
+        self._acting = True
+        return None if self._turned >= self._turns * math.tau else {**STAND, "base.wz": SPEED}

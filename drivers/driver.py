@@ -1,0 +1,68 @@
+"""The contract that every robot's driver keeps (after the "describe before you connect" rule)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+from twisted.internet.defer import Deferred
+
+from drivers.reading import Action, Description, Observation
+
+
+@dataclass(frozen=True)
+class Permit:
+    """The right to move a robot for a while: a fencing token and a deadline on the driver's clock, in seconds.
+
+    A driver keeps the highest token it has seen, refuses lower ones with ``StaleCommand``, and stops the robot by
+    itself when the deadline of the last command has passed.
+    """
+
+    token: int
+    deadline: float
+
+
+class Driver(Protocol):
+    """One robot, asked asynchronously; everything happens on the reactor's thread.
+
+    ``state`` is one of ``idle connecting ready stale stopped closed``.
+    """
+
+    @property
+    def description(self) -> Description:
+        """What the robot is; valid before ``connect``."""
+
+    @property
+    def state(self) -> str:
+        """Where the link stands."""
+
+    def connect(self) -> Deferred[Description]:
+        """Open the link; fires when the first observation has arrived.  Lost links are opened again with back-off."""
+
+    def disconnect(self) -> Deferred[None]:
+        """Stop the motion, then close.  May be called twice."""
+
+    def enable(self) -> Deferred[bool]:
+        """Motors on."""
+
+    def disable(self) -> Deferred[bool]:
+        """Motors off."""
+
+    def act(self, action: Action, permit: Permit) -> Action:
+        """Do ``action`` until ``permit.deadline``; returns what is really done, clipped to the limits.  Never blocks.
+
+        Raises ``NotEnabled``, ``Unsupported`` (unknown key, NaN), ``StaleCommand``.
+        """
+
+    def stop(self) -> Action:
+        """Zero motion now; safe in any state and never refused."""
+
+    def observe(self) -> Observation | None:
+        """The newest observation; never blocks."""
+
+    def subscribe(self, seen: Callable[[Observation], None]) -> Callable[[], None]:
+        """Call ``seen`` at each observation; call what is returned to end that."""
+
+    def diagnostics(self) -> dict[str, float]:
+        """Counters: frames, bad frames, bytes, reconnects, age of the newest observation in seconds."""

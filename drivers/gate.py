@@ -1,0 +1,51 @@
+"""Gate: who may move a robot now, and until when; the robot's own last word on fencing.
+
+Pure: the moment is an argument.  A driver asks it before a command leaves, and a robot (or its stand-in) asks it when
+a command arrives, so that a robot whose node froze stops by itself.
+"""
+
+from __future__ import annotations
+
+import math
+
+from drivers.driver import Permit
+from drivers.errors import StaleCommand
+
+
+class Gate:
+    """The highest token seen, and the deadline of the last command let through.
+
+    A gate serves one robot and one holder of the link; tokens of different tasks are compared with each other.
+    """
+
+    def __init__(self) -> None:
+        self._token: int | None = None
+        self._deadline: float | None = None
+
+    @property
+    def token(self) -> int | None:
+        """The highest token that was let through, None before the first."""
+        return self._token
+
+    @property
+    def deadline(self) -> float | None:
+        """When the motion must end; None while nothing is in force."""
+        return self._deadline
+
+    def admit(self, permit: Permit, now: float) -> None:
+        """Let a command through, or raise ``StaleCommand``: older token than one seen, or deadline not in the future."""
+        if not math.isfinite(permit.deadline) or permit.deadline <= now:
+            late = now - permit.deadline
+            raise StaleCommand(f"the deadline of token {permit.token} passed {late:.3f} s ago; take a new lease")
+        if self._token is not None and permit.token < self._token:
+            raise StaleCommand(f"token {permit.token} is older than token {self._token}; someone else holds the task now")
+        self._token = permit.token
+        self._deadline = permit.deadline
+
+    def is_over(self, now: float) -> bool:
+        """Whether the motion in force has reached its deadline and must be stopped now."""
+        return self._deadline is not None and now >= self._deadline
+
+    def close(self) -> None:
+        """Forget the motion in force, because it was stopped; the token is kept, so that fencing holds."""
+        self._deadline = None

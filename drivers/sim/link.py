@@ -1,0 +1,280 @@
+"""Link: the way between a client and the yard, over TCP or through memory; it carries bytes and knows no message.
+
+``TcpConnector`` is the edge to the world; ``MemoryConnector`` its twin for whole teams in one process on one turned clock.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+from twisted.application.internet import ClientService, backoffPolicy
+from twisted.internet import protocol
+from twisted.internet.defer import Deferred, succeed
+from twisted.internet.endpoints import HostnameEndpoint
+from twisted.internet.interfaces import IAddress, IPushProducer, IReactorTime
+from twisted.python.failure import Failure
+from zope.interface import implementer
+
+FIRST_RETRY_S = 0.1
+LAST_RETRY_S = 2.0
+RETRY_FACTOR = 1.6
+
+
+class Link(Protocol):
+    """One open connection, as its user sees it."""
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether what was sent before has not left yet; what can be dropped, should be."""
+
+    def send(self, data: bytes) -> None:
+        """Send bytes; does nothing on a closed link."""
+
+    def close(self) -> None:
+        """Close now, and throw away what has not left yet."""
+
+
+class Receiver(Protocol):
+    """Who is told what happens on a link."""
+
+    def received(self, data: bytes) -> None:
+        """Take bytes as they come, cut anyhow."""
+
+    def link_down(self) -> None:
+        """Learn that the link is gone, whoever closed it."""
+
+
+class Caller(Receiver, Protocol):
+    """A receiver that calls: it is given a new link each time that one opens."""
+
+    def link_up(self, link: Link) -> None:
+        """Take the link that has just opened."""
+
+
+class Line(Protocol):
+    """A standing wish to be connected."""
+
+    def hang_up(self) -> Deferred[None]:
+        """Close the link and stop trying; fires when it is closed."""
+
+
+class Connector(Protocol):
+    """What opens links."""
+
+    def call(self, host: str, port: int, caller: Caller) -> Line:
+        """Keep ``caller`` connected to the yard at this address, with back-off, until the line hangs up."""
+
+
+Accept = Callable[[Link], Receiver]
+"""What the yard does with a new link: it returns who shall hear what arrives."""
+
+
+@implementer(IPushProducer)
+class TcpLink(protocol.Protocol):
+    """A link over one TCP connection; both sides use it."""
+
+    def __init__(self, accept: Accept) -> None:
+        self._accept = accept
+        self._receiver: Receiver | None = None
+        self._is_busy = False
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether the transport asked to wait."""
+        return self._is_busy
+
+    def send(self, data: bytes) -> None:
+        """Send bytes; does nothing on a closed link."""
+        if self.connected and self.transport is not None:
+            self.transport.write(data)
+
+    def close(self) -> None:
+        """Close now, and throw away what has not left yet."""
+        transport: Any = self.transport
+        if self.connected and transport is not None:
+            transport.abortConnection()
+
+    def connectionMade(self) -> None:  # noqa: D102 (Twisted's)
+        transport: Any = self.transport
+        transport.setTcpNoDelay(True)
+        transport.setTcpKeepAlive(True)
+        transport.registerProducer(self, True)
+        self._receiver = self._accept(self)
+
+    def dataReceived(self, data: bytes) -> None:  # noqa: D102 (Twisted's)
+        if self._receiver is not None:
+            self._receiver.received(data)
+
+    def connectionLost(self, reason: Failure = protocol.connectionDone) -> None:  # noqa: D102 (Twisted's)
+        self.connected = 0
+        receiver, self._receiver = self._receiver, None
+        if receiver is not None:
+            receiver.link_down()
+
+    def pauseProducing(self) -> None:
+        """Learn from the transport that its buffer is full."""
+        self._is_busy = True
+
+    def resumeProducing(self) -> None:
+        """Learn from the transport that its buffer has emptied."""
+        self._is_busy = False
+
+    def stopProducing(self) -> None:
+        """Learn from the transport that it will never send again."""
+        self._is_busy = True
+
+
+class TcpLinkFactory(protocol.Factory):
+    """Makes a ``TcpLink`` for each connection."""
+
+    noisy = False
+
+    def __init__(self, accept: Accept) -> None:
+        self._accept = accept
+
+    def buildProtocol(self, addr: IAddress | None) -> TcpLink:  # noqa: D102 (Twisted's)
+        return TcpLink(self._accept)
+
+
+class TcpConnector:
+    """Opens links over TCP on ``reactor`` (the running one where none is given)."""
+
+    def __init__(self, reactor: Any = None) -> None:
+        self._reactor = reactor
+
+    def call(self, host: str, port: int, caller: Caller) -> Line:
+        """Keep ``caller`` connected to the yard at this address, with back-off, until the line hangs up."""
+        reactor = self._reactor
+        if reactor is None:
+            # Importing it installs it: that is the business of whoever runs a process, not of this module.
+            from twisted.internet import reactor as running
+
+            reactor = running
+
+        def accept(link: Link) -> Receiver:
+            caller.link_up(link)
+            return caller
+
+        endpoint = HostnameEndpoint(reactor, host, port, timeout=2.0)
+        policy = backoffPolicy(FIRST_RETRY_S, LAST_RETRY_S, RETRY_FACTOR, jitter=lambda: 0.0)
+        return _TcpLine(ClientService(endpoint, TcpLinkFactory(accept), retryPolicy=policy, clock=reactor))
+
+
+class _TcpLine:
+    def __init__(self, service: ClientService) -> None:
+        self._service = service
+        service.startService()
+
+    def hang_up(self) -> Deferred[None]:
+        stopped: Deferred[None] = self._service.stopService() or succeed(None)
+        return stopped
+
+
+class MemoryLink:
+    """One end of a pair in memory: what one end sends, the other receives ``delay`` seconds later, in order."""
+
+    def __init__(self, clock: IReactorTime, delay: float) -> None:
+        self.is_busy = False
+        self.other: MemoryLink | None = None
+        self.receiver: Receiver | None = None
+        self._clock = clock
+        self._delay = delay
+
+    def send(self, data: bytes) -> None:
+        """Send bytes; does nothing on a closed link."""
+        if self.other is not None:
+            self._clock.callLater(self._delay, self.other._deliver, data)
+
+    def close(self) -> None:
+        """Close both ends; the other learns it after the delay, and what is on the way is lost."""
+        other, self.other = self.other, None
+        if other is not None:
+            self._clock.callLater(self._delay, other._drop)
+            self._drop()
+
+    def _deliver(self, data: bytes) -> None:
+        if self.receiver is not None:
+            self.receiver.received(data)
+
+    def _drop(self) -> None:
+        self.other = None
+        receiver, self.receiver = self.receiver, None
+        if receiver is not None:
+            receiver.link_down()
+
+
+class MemoryConnector:
+    """Opens links to ``accept`` through ``clock``; host and port mean nothing.
+
+    ``is_open`` False turns new calls away, as a dead yard would, and ``cut`` breaks what is open.
+    """
+
+    def __init__(self, clock: IReactorTime, accept: Accept, delay: float = 0.0005) -> None:
+        self.is_open = True
+        self.links: list[MemoryLink] = []
+        self._clock = clock
+        self._accept = accept
+        self._delay = delay
+
+    def call(self, host: str, port: int, caller: Caller) -> Line:
+        """Keep ``caller`` connected, with back-off, until the line hangs up."""
+        return _MemoryLine(self, self._clock, caller)
+
+    def cut(self) -> None:
+        """Break every open link, as a lost network does."""
+        links, self.links = self.links, []
+        for link in links:
+            link.close()
+
+    def opened(self, caller: Receiver) -> MemoryLink | None:
+        """The caller's end of a new pair, or None while turned away."""
+        if not self.is_open:
+            return None
+        near, far = MemoryLink(self._clock, self._delay), MemoryLink(self._clock, self._delay)
+        near.other, far.other = far, near
+        near.receiver = caller
+        far.receiver = self._accept(far)
+        self.links = [link for link in self.links if link.other is not None] + [near]
+        return near
+
+
+class _MemoryLine:
+    """The memory twin of a ``ClientService``; it stands between link and caller to see the link go down."""
+
+    def __init__(self, connector: MemoryConnector, clock: IReactorTime, caller: Caller) -> None:
+        self._connector = connector
+        self._clock = clock
+        self._caller = caller
+        self._retry_s = FIRST_RETRY_S
+        self._link: MemoryLink | None = None
+        self._is_wanted = True
+        self._pending: Any = clock.callLater(0.0, self._try)
+
+    def hang_up(self) -> Deferred[None]:
+        self._is_wanted = False
+        if self._pending is not None:
+            self._pending.cancel()
+            self._pending = None
+        if self._link is not None:
+            self._link.close()
+        return succeed(None)
+
+    def received(self, data: bytes) -> None:
+        self._caller.received(data)
+
+    def link_down(self) -> None:
+        self._link = None
+        if self._is_wanted:
+            self._pending = self._clock.callLater(FIRST_RETRY_S, self._try)
+        self._caller.link_down()
+
+    def _try(self) -> None:
+        self._pending = None
+        self._link = self._connector.opened(self)
+        if self._link is None:
+            self._pending = self._clock.callLater(self._retry_s, self._try)
+            self._retry_s = min(self._retry_s * RETRY_FACTOR, LAST_RETRY_S)
+            return
+        self._retry_s = FIRST_RETRY_S
+        self._caller.link_up(self._link)

@@ -1,0 +1,170 @@
+"""YardOperator: the operator's side of the yard, from above: the truth for the map and the referee, and a hand in it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from twisted.internet.defer import Deferred, fail, succeed
+from twisted.internet.interfaces import IReactorTime
+from twisted.logger import Logger
+
+from drivers.errors import LinkLost, NoReply, UsageError
+from drivers.reading import Value
+from drivers.sim.codec import VERSION, Alive, Done, FrameReader, Order, Overlook, Truth, encoded
+from drivers.sim.link import Connector, Line, Link
+from drivers.sim.option import DEFAULT_PORT
+
+REPLY_S = 2.0
+ALIVE_S = 0.5
+
+Snapshot = Mapping[str, Any]
+"""``{t, walls: (w, h), dogs: ({name, x, y, heading, moving, stripes}, ...), target: {x, y, radius} or None, collisions}``."""
+
+
+class YardOperator:
+    """A client that sees the whole yard ``rate`` times a second, and may move things in it.
+
+    An order's Deferred fires with True when the yard has carried it out; it fails with ``UsageError`` where the yard says
+    why not, with ``LinkLost`` without a link, with ``NoReply`` after ``REPLY_S``.
+    """
+
+    log = Logger()
+
+    def __init__(
+        self,
+        connector: Connector,
+        clock: IReactorTime,
+        host: str = "127.0.0.1",
+        port: int = DEFAULT_PORT,
+        rate: float = 10.0,
+    ) -> None:
+        self._connector = connector
+        self._clock = clock
+        self._host = host
+        self._port = port
+        self._rate = rate
+        self._line: Line | None = None
+        self._link: Link | None = None
+        self._reader = FrameReader()
+        self._snapshot: Snapshot | None = None
+        self._connecting: Deferred[Snapshot] | None = None
+        self._alive: Any = None
+        self._seen: list[Callable[[Snapshot], None]] = []
+        self._orders: dict[int, tuple[Deferred[bool], Any]] = {}
+        self._number = 0
+
+    @property
+    def snapshot(self) -> Snapshot | None:
+        """The newest truth, None before the first and while the link is down."""
+        return self._snapshot
+
+    def connect(self) -> Deferred[Snapshot]:
+        """Open the link and keep it open; fires with the first snapshot, however long the yard needs to appear."""
+        if self._line is not None:
+            return fail(UsageError("this operator is connected already, or on its way"))
+        self._connecting = Deferred(lambda _: None)
+        connecting = self._connecting
+        self._line = self._connector.call(self._host, self._port, self)
+        return connecting
+
+    def disconnect(self) -> Deferred[None]:
+        """Close the link; may be called twice."""
+        line, self._line = self._line, None
+        connecting, self._connecting = self._connecting, None
+        if connecting is not None:
+            connecting.errback(LinkLost("the operator left before the first snapshot"))
+        return succeed(None) if line is None else line.hang_up()
+
+    def subscribe(self, seen: Callable[[Snapshot], None]) -> Callable[[], None]:
+        """Call ``seen`` at each snapshot; call what is returned to end that."""
+        self._seen.append(seen)
+
+        def end() -> None:
+            if seen in self._seen:
+                self._seen.remove(seen)
+
+        return end
+
+    def place_target(self, x: float, y: float) -> Deferred[bool]:
+        """Put the red target at this place, in metres from the lower left corner."""
+        return self._order("place_target", float(x), float(y))
+
+    def place_target_at_random(self) -> Deferred[bool]:
+        """Put the red target at a free place, at clearly different distances from the dogs."""
+        return self._order("place_target_at_random")
+
+    def clear_target(self) -> Deferred[bool]:
+        """Take the red target away."""
+        return self._order("clear_target")
+
+    def move_dog(self, name: str, x: float, y: float, heading: float) -> Deferred[bool]:
+        """Lift a dog and set it down here, heading in radians."""
+        return self._order("move_dog", name, float(x), float(y), float(heading))
+
+    def scatter(self, seed: int) -> Deferred[bool]:
+        """Set all dogs down at random free places; the same seed gives the same places."""
+        return self._order("scatter", seed)
+
+    def link_up(self, link: Link) -> None:
+        """Ask for the view from above; called by the line."""
+        self._link = link
+        self._reader = FrameReader()
+        link.send(encoded(Overlook(VERSION, self._rate)))
+        self._keep_alive()
+
+    def link_down(self) -> None:
+        """Forget what is old; called by the line."""
+        self._link = None
+        self._snapshot = None
+        if self._alive is not None:
+            self._alive.cancel()
+            self._alive = None
+        for number in list(self._orders):
+            self._settle(number, LinkLost("the link to the yard went away"))
+
+    def received(self, data: bytes) -> None:
+        """Take bytes from the yard; called by the line."""
+        for message in self._reader.read(data):
+            if isinstance(message, Truth):
+                self._on_truth(message.snapshot)
+            elif isinstance(message, Done):
+                self._settle(message.number, UsageError(message.problem) if message.problem else None)
+
+    def _on_truth(self, snapshot: Snapshot) -> None:
+        self._snapshot = snapshot
+        connecting, self._connecting = self._connecting, None
+        if connecting is not None:
+            connecting.callback(snapshot)
+        for seen in list(self._seen):
+            try:
+                seen(snapshot)
+            except Exception:
+                self.log.failure("a subscriber of the yard failed")
+
+    def _keep_alive(self) -> None:
+        if self._link is not None:
+            self._link.send(encoded(Alive()))
+            self._alive = self._clock.callLater(ALIVE_S, self._keep_alive)
+
+    def _order(self, verb: str, *arguments: Value) -> Deferred[bool]:
+        if self._link is None:
+            return fail(LinkLost(f"no link to the yard at {self._host}:{self._port}; is it running?"))
+        self._number += 1
+        number = self._number
+        done: Deferred[bool] = Deferred()
+        late = NoReply(f"the yard did not answer {verb} within {REPLY_S:g} s")
+        self._orders[number] = (done, self._clock.callLater(REPLY_S, self._settle, number, late))
+        self._link.send(encoded(Order(number, verb, arguments)))
+        return done
+
+    def _settle(self, number: int, error: Exception | None) -> None:
+        done, timer = self._orders.pop(number, (None, None))
+        if done is None or timer is None:
+            return
+        if timer.active():
+            timer.cancel()
+        if error is None:
+            done.callback(True)
+        else:
+            done.errback(error)

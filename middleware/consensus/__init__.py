@@ -1,0 +1,1 @@
+"""Who goes: ``strategy`` says who should act (selection), ``lease`` says who may (commitment)."""

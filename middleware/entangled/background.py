@@ -1,0 +1,103 @@
+"""Background: the work of a node that nobody waits for, on one clock, and gone without a trace when the node stops."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Coroutine
+from typing import Any
+
+from twisted.internet.defer import Deferred
+from twisted.internet.interfaces import IDelayedCall, IReactorTime
+from twisted.logger import Logger
+
+from middleware.entangled.errors import EntangledError
+
+
+class Background:
+    """Timers and coroutines of one node; after ``stop`` none of them runs."""
+
+    _log = Logger()
+
+    def __init__(self, clock: IReactorTime) -> None:
+        self._clock = clock
+        self._calls: dict[int, IDelayedCall] = {}
+        self._number = 0
+        self.is_stopped = False
+
+    def later(self, delay: float, work: Callable[..., object], *arguments: object) -> Callable[[], None]:
+        """Call ``work`` after ``delay`` seconds; call what is returned to prevent it."""
+        self._number += 1
+        number = self._number
+
+        def run() -> None:
+            self._calls.pop(number, None)
+            work(*arguments)
+
+        def cancel() -> None:
+            call = self._calls.pop(number, None)
+            if call is not None and call.active():
+                call.cancel()
+
+        if not self.is_stopped:
+            self._calls[number] = self._clock.callLater(delay, run)
+        return cancel
+
+    def every(self, period: float, work: Callable[[], object]) -> None:
+        """Call ``work`` again and again, ``period`` seconds apart."""
+
+        def again() -> None:
+            self.later(period, again)
+            work()
+
+        self.later(period, again)
+
+    def sleep(self, seconds: float) -> Deferred[None]:
+        """Fire after ``seconds``; never where the node stops before."""
+        woken: Deferred[None] = Deferred()
+        self.later(seconds, woken.callback, None)
+        return woken
+
+    def fork(self, work: Coroutine[Any, Any, Any]) -> None:
+        """Let ``work`` run by itself; the weather, a refusal and a stopped node end it quietly."""
+
+        def ended(failure: Any) -> None:
+            if failure.check(EntangledError) is None:
+                self._log.failure("in the background of a node", failure)
+
+        Deferred.fromCoroutine(work).addErrback(ended)
+
+    def stop(self) -> None:
+        """Cancel every timer."""
+        self.is_stopped = True
+        for call in self._calls.values():
+            if call.active():
+                call.cancel()
+        self._calls.clear()
+
+
+async def first(needed: int, work: list[Coroutine[Any, Any, Any]]) -> list[Any]:
+    """The results of the first ``needed`` of ``work`` that succeed, fewer when all have ended before; the others go on."""
+    results: list[Any] = []
+    left = len(work)
+    done: Deferred[None] = Deferred()
+
+    def settle() -> None:
+        if not done.called and (len(results) >= needed or left == 0):
+            done.callback(None)
+
+    def succeeded(result: Any) -> None:
+        nonlocal left
+        left -= 1
+        results.append(result)
+        settle()
+
+    def failed(failure: Any) -> None:
+        nonlocal left
+        left -= 1
+        settle()
+        failure.trap(EntangledError)
+
+    for coroutine in work:
+        Deferred.fromCoroutine(coroutine).addCallbacks(succeeded, failed)
+    settle()
+    await done
+    return list(results)

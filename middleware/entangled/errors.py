@@ -1,0 +1,70 @@
+"""Every exception of the peer-to-peer library; the class says who is to blame, and so what to do.
+
+::
+
+    EntangledError
+      RemoteError     the peer's fault: count it, drop it, live on
+        Malformed
+        Forged
+      WeatherError    nobody's fault: try again, with back-off
+        NoAnswer
+        Alone
+      LocalError      our caller's fault: let it fly
+        NotRunning
+        TooLarge
+        PortInUse
+        BadStore
+      Refused         a lawful no: an answer, and no accident
+"""
+
+
+class EntangledError(Exception):
+    """The root of what the library raises."""
+
+
+class RemoteError(EntangledError):
+    """A peer sent what it should not have sent."""
+
+
+class Malformed(RemoteError):
+    """Bytes that are not a message."""
+
+
+class Forged(RemoteError):
+    """Bytes or a record that do not come from where they claim."""
+
+
+class WeatherError(EntangledError):
+    """The network did not carry it this time."""
+
+
+class NoAnswer(WeatherError):
+    """The peer did not answer any of the tries."""
+
+
+class Alone(WeatherError):
+    """No other node is known or reachable."""
+
+
+class LocalError(EntangledError):
+    """The caller asked for something that cannot be."""
+
+
+class NotRunning(LocalError):
+    """The node was asked before it started or after it stopped."""
+
+
+class TooLarge(LocalError):
+    """A name, value or message is larger than what the network carries; split it, or shorten it."""
+
+
+class PortInUse(LocalError):
+    """Another program holds the port; choose another one, or 0 for any."""
+
+
+class BadStore(LocalError):
+    """The data store cannot be used as it is; the message says why and what to do."""
+
+
+class Refused(EntangledError):
+    """The peer understood and said no; ``str()`` is its reason."""

@@ -1,0 +1,59 @@
+"""Identity: the lasting key pair of a node, and the node id that follows from it.
+
+One 32-byte seed gives the Ed25519 pair that signs records and the X25519 pair that opens sessions.  The node id is the
+hash of the public key, so an id cannot be chosen or borrowed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, field
+
+from nacl import bindings
+from nacl.exceptions import CryptoError
+
+ID_BYTES = 20
+
+
+@dataclass(frozen=True)
+class Identity:
+    """A node's key pair, made from a secret ``seed`` of 32 bytes."""
+
+    seed: bytes = field(repr=False)
+    public: bytes = field(init=False)
+    node_id: bytes = field(init=False)
+    exchange_secret: bytes = field(init=False, repr=False)
+    _signing: bytes = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        public, signing = bindings.crypto_sign_seed_keypair(self.seed)
+        object.__setattr__(self, "public", public)
+        object.__setattr__(self, "_signing", signing)
+        object.__setattr__(self, "node_id", node_id(public))
+        object.__setattr__(self, "exchange_secret", bindings.crypto_sign_ed25519_sk_to_curve25519(signing))
+
+    def sign(self, message: bytes) -> bytes:
+        """The 64-byte Ed25519 signature of ``message``."""
+        return bindings.crypto_sign(message, self._signing)[: bindings.crypto_sign_BYTES]
+
+
+def node_id(public: bytes) -> bytes:
+    """The 160-bit id of the node that holds ``public``."""
+    return hashlib.blake2s(public, digest_size=ID_BYTES).digest()
+
+
+def exchange_key(public: bytes) -> bytes:
+    """The X25519 key that belongs to the Ed25519 key ``public``; raises ``ValueError`` where it is no key."""
+    try:
+        return bindings.crypto_sign_ed25519_pk_to_curve25519(public)
+    except CryptoError as error:
+        raise ValueError("not an Ed25519 public key") from error
+
+
+def verified(public: bytes, message: bytes, signature: bytes) -> bool:
+    """Whether ``signature`` over ``message`` was made by the holder of ``public``."""
+    try:
+        bindings.crypto_sign_open(signature + message, public)
+    except (CryptoError, ValueError):
+        return False
+    return True

@@ -1,0 +1,187 @@
+"""Routing table: the contacts of a node, many of them near and few of them far (Kademlia, sections 2.2 and 2.4).
+
+A k-bucket for each length of the prefix shared with the node's own id; the tree of the paper, flattened.  A contact
+that keeps answering is never displaced by a newcomer: nodes that have stayed long are the likeliest to stay, and
+nobody can flush the table by inventing ids.  Newcomers to a full bucket wait in its replacement cache.
+"""
+
+from __future__ import annotations
+
+import random
+from dataclasses import dataclass, field
+
+from middleware.entangled.identity import ID_BYTES
+from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.kademlia.distance import bucket_index, closest
+
+STALE_AFTER = 3
+"""Misses in a row that make a contact stale: from now on any newcomer takes its place."""
+DROPPED_AFTER = 5
+"""Misses in a row after which a contact goes even though nobody waits for its place."""
+PATIENCE = 1.0
+"""Seconds for which a contact that was heard, or that was just handed out to be pinged, is not handed out again."""
+
+
+@dataclass
+class _Entry:
+    """A contact in its bucket, and how it has behaved."""
+
+    contact: Contact
+    seen_at: float
+    questioned_at: float
+    misses: int = 0
+
+    @property
+    def is_stale(self) -> bool:
+        return self.misses >= STALE_AFTER
+
+
+@dataclass
+class _Bucket:
+    """One k-bucket; both dicts are ordered from the least to the most recently seen."""
+
+    entries: dict[bytes, _Entry] = field(default_factory=dict)
+    waiting: dict[bytes, Contact] = field(default_factory=dict)
+    searched_at: float = 0.0
+
+
+class RoutingTable:
+    """The contacts of the node ``own_id``, at most ``k`` in each bucket.
+
+    More ``k`` means more replicas, more contacts to keep alive and lookups that survive more losses at once.  Moments
+    (``now``) are in seconds on one clock of the caller.
+    """
+
+    def __init__(self, own_id: bytes, k: int = 8) -> None:
+        self._own_id = own_id
+        self._k = k
+        self._buckets: dict[int, _Bucket] = {}
+        self._size = 0
+
+    def __len__(self) -> int:
+        return self._size
+
+    def get(self, node_id: bytes) -> Contact | None:
+        """The contact with this id, if it is in the table (waiting in a cache does not count)."""
+        bucket = self._bucket(node_id)
+        entry = bucket.entries.get(node_id) if bucket else None
+        return entry.contact if entry else None
+
+    def contacts(self) -> list[Contact]:
+        """Every contact, nearest bucket first and in each the least recently seen first."""
+        return [entry.contact for index in sorted(self._buckets) for entry in self._buckets[index].entries.values()]
+
+    def closest(self, target: bytes, count: int | None = None) -> list[Contact]:
+        """The ``count`` (default k) contacts closest to ``target``, closest first.
+
+        Stale contacts are passed over as long as there are enough others; they still serve a node that lost sight of
+        everybody at once, so that a dropped radio does not empty the table.
+        """
+        wanted = self._k if count is None else count
+        stale: list[Contact] = []
+        live: list[Contact] = []
+        for bucket in self._buckets.values():
+            for entry in bucket.entries.values():
+                (stale if entry.is_stale else live).append(entry.contact)
+        chosen = closest(live, target, wanted)
+        if len(chosen) < wanted and stale:
+            chosen = closest([*chosen, *closest(stale, target, wanted - len(chosen))], target, wanted)
+        return chosen
+
+    def saw(self, contact: Contact, now: float) -> Contact | None:
+        """Take note that ``contact`` has proved its key and its address.
+
+        Returns the least recently seen contact of the bucket where the bucket is full: the caller pings it, and if it
+        is gone (``failed``) the newcomer moves up.  A contact that proved itself from a new address has moved there.
+        """
+        if contact.node_id == self._own_id:
+            return None
+        bucket = self._buckets.setdefault(bucket_index(self._own_id, contact.node_id), _Bucket(searched_at=now))
+        known = contact.node_id in bucket.entries
+        if not known and len(bucket.entries) >= self._k:
+            stale = next((node_id for node_id, entry in bucket.entries.items() if entry.is_stale), None)
+            if stale is None:
+                return self._queue(bucket, contact, now)
+            del bucket.entries[stale]
+            self._size -= 1
+        bucket.entries.pop(contact.node_id, None)
+        bucket.waiting.pop(contact.node_id, None)
+        bucket.entries[contact.node_id] = _Entry(contact, now, now)
+        self._size += 0 if known else 1
+        return None
+
+    def failed(self, contact: Contact, now: float) -> None:
+        """Count that ``contact`` did not answer at its address.
+
+        After ``STALE_AFTER`` misses in a row the most recently seen newcomer takes its place; without a newcomer it
+        stays, stale, until ``DROPPED_AFTER``.  A miss at an address that the contact has left since does not count.
+        """
+        bucket = self._bucket(contact.node_id)
+        if bucket is None:
+            return
+        if bucket.waiting.get(contact.node_id) == contact:
+            del bucket.waiting[contact.node_id]
+        entry = bucket.entries.get(contact.node_id)
+        if entry is None or entry.contact != contact:
+            return
+        entry.misses += 1
+        if entry.misses >= DROPPED_AFTER or (entry.is_stale and bucket.waiting):
+            self._free(bucket, contact.node_id, now)
+
+    def remove(self, contact: Contact, now: float = 0.0) -> None:
+        """Let go of ``contact``, which said goodbye; whoever waits for its place gets it."""
+        bucket = self._bucket(contact.node_id)
+        if bucket is not None:
+            bucket.waiting.pop(contact.node_id, None)
+            if contact.node_id in bucket.entries:
+                self._free(bucket, contact.node_id, now)
+
+    def searched(self, target: bytes, now: float) -> None:
+        """Take note of a lookup for ``target``, which keeps its bucket fresh."""
+        if target != self._own_id:
+            self._buckets.setdefault(bucket_index(self._own_id, target), _Bucket()).searched_at = now
+
+    def stale_buckets(self, now: float, older_than: float) -> list[int]:
+        """The indexes of buckets to refresh: no lookup went there for ``older_than`` seconds.
+
+        Counted from the nearest bucket with a contact to the farthest possible one, for nearer ones have nobody to find
+        (Kademlia, section 2.3).
+        """
+        filled = [index for index, bucket in self._buckets.items() if bucket.entries]
+        if not filled:
+            return []
+        return [index for index in range(min(filled), 8 * ID_BYTES) if self._is_old(index, now - older_than)]
+
+    def refresh_target(self, index: int, rng: random.Random) -> bytes:
+        """A random id in the range of bucket ``index``; a lookup for it refreshes the bucket."""
+        apart = (1 << index) | rng.getrandbits(index)
+        return (int.from_bytes(self._own_id) ^ apart).to_bytes(ID_BYTES)
+
+    def _bucket(self, node_id: bytes) -> _Bucket | None:
+        return None if node_id == self._own_id else self._buckets.get(bucket_index(self._own_id, node_id))
+
+    def _free(self, bucket: _Bucket, node_id: bytes, now: float) -> None:
+        """Take a contact out; the most recently seen newcomer, if any, takes its place."""
+        del bucket.entries[node_id]
+        self._size -= 1
+        if bucket.waiting:
+            newcomer_id, newcomer = bucket.waiting.popitem()
+            bucket.entries[newcomer_id] = _Entry(newcomer, now, now)
+            self._size += 1
+
+    def _queue(self, bucket: _Bucket, newcomer: Contact, now: float) -> Contact | None:
+        """Let ``newcomer`` wait, and say who should be asked whether it is still there."""
+        bucket.waiting.pop(newcomer.node_id, None)
+        bucket.waiting[newcomer.node_id] = newcomer
+        if len(bucket.waiting) > self._k:
+            del bucket.waiting[next(iter(bucket.waiting))]
+        oldest = next(iter(bucket.entries.values()))
+        # A flood of newcomers shall not become a flood of pings to one old contact.
+        if now - max(oldest.seen_at, oldest.questioned_at) < PATIENCE:
+            return None
+        oldest.questioned_at = now
+        return oldest.contact
+
+    def _is_old(self, index: int, before: float) -> bool:
+        bucket = self._buckets.get(index)
+        return bucket is None or bucket.searched_at <= before

@@ -1,0 +1,1 @@
+"""Datagram ports: the interface, the real one, and the one in memory."""

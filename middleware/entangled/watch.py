@@ -1,0 +1,96 @@
+"""Watch: what is known of one key, kept up to date by those who hold it.
+
+``View`` merges what several replicas say; it is pure.  A slot is present while any replica that still counts says so; of
+several records of one slot the one that beats the others holds.  No node testifies for its own lease: when a node
+dies, what it said of itself would otherwise outlive it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterable
+from typing import Protocol
+
+from middleware.entangled.identity import node_id
+from middleware.entangled.record import Record, Slot
+
+Changed = Callable[[list[Record]], None]
+
+
+def digest_of(records: Iterable[Record]) -> bytes:
+    """Eight bytes that tell whether two replicas hold the same of a key."""
+    h = hashlib.blake2s(digest_size=8)
+    for record in sorted(records, key=lambda r: (r.key, r.owner, r.name)):
+        h.update(record.owner + record.name.encode() + b"\0" + record.sequence.to_bytes(8, "big") + record.signature[:8])
+    return h.digest()
+
+
+class View:
+    """The opinions of all replicas of one key, merged."""
+
+    def __init__(self) -> None:
+        self._opinions: dict[bytes, dict[Slot, Record]] = {}
+
+    def replace(self, replica: bytes, records: Iterable[Record]) -> None:
+        """``replica`` (a node id) holds exactly ``records``, tombstones included."""
+        self._opinions[replica] = {r.slot: r for r in records}
+
+    def add(self, replica: bytes, record: Record) -> None:
+        """``replica`` now holds ``record``."""
+        held = self._opinions.setdefault(replica, {})
+        if record.beats(held.get(record.slot)):
+            held[record.slot] = record
+
+    def remove(self, replica: bytes, slot: Slot) -> None:
+        """``replica`` no longer holds the record of ``slot``: its lease or its time is over there."""
+        self._opinions.get(replica, {}).pop(slot, None)
+
+    def forget(self, replica: bytes) -> None:
+        """``replica`` is gone; what it said does not count any more."""
+        self._opinions.pop(replica, None)
+
+    def digest(self, replica: bytes) -> bytes:
+        """The digest of what ``replica`` is believed to hold."""
+        return digest_of(self._opinions.get(replica, {}).values())
+
+    def merged(self) -> list[Record]:
+        """What the key holds, without tombstones, in the order of (owner, name)."""
+        best: dict[Slot, Record] = {}
+        for replica, held in self._opinions.items():
+            for slot, record in held.items():
+                if record.lifetime == "leased" and node_id(record.owner) == replica:
+                    continue
+                if record.beats(best.get(slot)):
+                    best[slot] = record
+        live = [record for record in best.values() if not record.is_tombstone]
+        return sorted(live, key=lambda r: (r.owner, r.name))
+
+
+class Renewer(Protocol):
+    """Who keeps a watch alive; the node hands itself in."""
+
+    def unwatch(self, watch: Watch) -> None:
+        """End ``watch``."""
+
+
+class Watch:
+    """One subscription to one key; ``records`` is what is known now."""
+
+    def __init__(self, key: bytes, changed: Changed, renewer: Renewer) -> None:
+        self.key = key
+        self.view = View()
+        self.records: list[Record] = []
+        self._changed = changed
+        self._renewer = renewer
+
+    def settle(self) -> None:
+        """Merge the view again and tell the subscriber, if anything is different from what it knows."""
+        records = self.view.merged()
+        if records != self.records:
+            self.records = records
+            self._changed(list(records))
+
+    def stop(self) -> None:
+        """End the subscription; nothing is told any more."""
+        self._changed = lambda _records: None
+        self._renewer.unwatch(self)

@@ -1,0 +1,220 @@
+"""Noise: the handshake ``IK`` of the Noise Protocol Framework, with and without a pre-shared key.
+
+Implements ``Noise_IK_25519_ChaChaPoly_BLAKE2s`` and ``Noise_IKpsk1_25519_ChaChaPoly_BLAKE2s`` after the specification
+(noiseprotocol.org, revision 34; section numbers below are its).  With the pre-shared key mixed in at the end of the
+first message's tokens, who lacks the key cannot even read the first payload.  Knows neither datagrams nor sessions.
+"""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import hmac
+from typing import NamedTuple, Self
+
+from nacl import bindings
+from nacl.exceptions import CryptoError
+
+from middleware.entangled.errors import Forged
+
+KEY = 32
+TAG = 16
+FIRST_OVERHEAD = KEY + KEY + TAG + TAG
+SECOND_OVERHEAD = KEY + TAG
+_ZERO4 = bytes(4)
+
+
+class KeyPair(NamedTuple):
+    """An X25519 key pair."""
+
+    secret: bytes
+    public: bytes
+
+
+def key_pair(secret: bytes) -> KeyPair:
+    """The pair that belongs to 32 secret bytes."""
+    return KeyPair(secret, bindings.crypto_scalarmult_base(secret))
+
+
+class TransportKeys(NamedTuple):
+    """What a finished handshake leaves: a key for each direction (32 bytes), and the hash of all that was said."""
+
+    sending: bytes
+    receiving: bytes
+    handshake_hash: bytes
+
+
+def sealed(key: bytes, counter: int, plaintext: bytes, ad: bytes) -> bytes:
+    """``plaintext`` under ChaCha20-Poly1305 with Noise's nonce (section 12); 16 bytes longer."""
+    nonce = _ZERO4 + counter.to_bytes(8, "little")
+    return bindings.crypto_aead_chacha20poly1305_ietf_encrypt(plaintext, ad, nonce, key)
+
+
+def opened(key: bytes, counter: int, ciphertext: bytes, ad: bytes) -> bytes:
+    """What ``sealed`` hid; raises ``Forged`` where anything was changed."""
+    nonce = _ZERO4 + counter.to_bytes(8, "little")
+    try:
+        return bindings.crypto_aead_chacha20poly1305_ietf_decrypt(ciphertext, ad, nonce, key)
+    except (CryptoError, ValueError) as error:
+        raise Forged("a sealed part does not open") from error
+
+
+def _shared(secret: bytes, public: bytes) -> bytes:
+    try:
+        return bindings.crypto_scalarmult(secret, public)
+    except (CryptoError, RuntimeError) as error:  # a point of small order, whose product anybody could foretell
+        raise Forged("a key of small order") from error
+
+
+def _derived(chaining_key: bytes, material: bytes, count: int) -> list[bytes]:
+    """The key derivation of section 4.3: ``count`` outputs of 32 bytes."""
+    secret = hmac.digest(chaining_key, material, "blake2s")
+    outputs = [hmac.digest(secret, b"\x01", "blake2s")]
+    for number in range(2, count + 1):
+        outputs.append(hmac.digest(secret, outputs[-1] + bytes([number]), "blake2s"))
+    return outputs
+
+
+class _Transcript:
+    """The symmetric state of section 5.2: what both sides know so far."""
+
+    def __init__(self, name: bytes, prologue: bytes) -> None:
+        self.hash = name.ljust(32, b"\0") if len(name) <= 32 else hashlib.blake2s(name).digest()
+        self.chaining_key = self.hash
+        self.key = b""
+        self.counter = 0
+        self.mix_hash(prologue)
+
+    def mix_hash(self, data: bytes) -> None:
+        self.hash = hashlib.blake2s(self.hash + data).digest()
+
+    def mix_key(self, material: bytes) -> None:
+        self.chaining_key, self.key = _derived(self.chaining_key, material, 2)
+        self.counter = 0
+
+    def mix_key_and_hash(self, material: bytes) -> None:
+        self.chaining_key, hashed, self.key = _derived(self.chaining_key, material, 3)
+        self.mix_hash(hashed)
+        self.counter = 0
+
+    def seal(self, plaintext: bytes) -> bytes:
+        ciphertext = sealed(self.key, self.counter, plaintext, self.hash)
+        self.counter += 1
+        self.mix_hash(ciphertext)
+        return ciphertext
+
+    def open(self, ciphertext: bytes) -> bytes:
+        plaintext = opened(self.key, self.counter, ciphertext, self.hash)
+        self.counter += 1
+        self.mix_hash(ciphertext)
+        return plaintext
+
+    def split(self) -> tuple[bytes, bytes]:
+        first, second = _derived(self.chaining_key, b"", 2)
+        return first, second
+
+
+class _Side:
+    """What both sides of ``IK`` share.
+
+    ``psk`` is the pre-shared key of 32 bytes, or None for plain ``IK``.  The ephemeral secret is given, so that a run
+    can be replayed; it must never serve twice.
+    """
+
+    def __init__(self, static: KeyPair, ephemeral_secret: bytes, prologue: bytes, psk: bytes | None) -> None:
+        modifier = b"" if psk is None else b"psk1"
+        self._transcript = _Transcript(b"Noise_IK" + modifier + b"_25519_ChaChaPoly_BLAKE2s", prologue)
+        self._static = static
+        self._ephemeral_secret = ephemeral_secret
+        self._psk = psk
+
+    def copy(self) -> Self:
+        """This side as it stands, so that reading a forged message need not spoil it."""
+        twin = copy.copy(self)
+        twin._transcript = copy.copy(self._transcript)
+        return twin
+
+    def _mix_ephemeral(self, public: bytes) -> None:
+        self._transcript.mix_hash(public)
+        if self._psk is not None:  # section 9.2: ephemeral keys randomise what the pre-shared key encrypts
+            self._transcript.mix_key(public)
+
+    def _mix_psk(self) -> None:
+        if self._psk is not None:
+            self._transcript.mix_key_and_hash(self._psk)
+
+
+class Initiator(_Side):
+    """The side that knows the other's static key and speaks first."""
+
+    def __init__(
+        self,
+        static: KeyPair,
+        remote_static: bytes,
+        ephemeral_secret: bytes,
+        prologue: bytes = b"",
+        psk: bytes | None = None,
+    ) -> None:
+        super().__init__(static, ephemeral_secret, prologue, psk)
+        self._remote_static = remote_static
+        self._transcript.mix_hash(remote_static)
+
+    def write(self, payload: bytes) -> bytes:
+        """The first message (tokens e, es, s, ss and psk): 96 bytes longer than ``payload``."""
+        ephemeral = key_pair(self._ephemeral_secret)
+        transcript = self._transcript
+        self._mix_ephemeral(ephemeral.public)
+        transcript.mix_key(_shared(ephemeral.secret, self._remote_static))
+        static = transcript.seal(self._static.public)
+        transcript.mix_key(_shared(self._static.secret, self._remote_static))
+        self._mix_psk()
+        return ephemeral.public + static + transcript.seal(payload)
+
+    def read(self, message: bytes) -> tuple[bytes, TransportKeys]:
+        """The payload of the second message (tokens e, ee, se), and the keys; raises ``Forged``."""
+        if len(message) < SECOND_OVERHEAD:
+            raise Forged("a second message that is too short")
+        transcript = self._transcript
+        ephemeral = message[:KEY]
+        self._mix_ephemeral(ephemeral)
+        transcript.mix_key(_shared(self._ephemeral_secret, ephemeral))
+        transcript.mix_key(_shared(self._static.secret, ephemeral))
+        payload = transcript.open(message[KEY:])
+        sending, receiving = transcript.split()
+        return payload, TransportKeys(sending, receiving, transcript.hash)
+
+
+class Responder(_Side):
+    """The side that is spoken to."""
+
+    def __init__(
+        self, static: KeyPair, ephemeral_secret: bytes, prologue: bytes = b"", psk: bytes | None = None
+    ) -> None:
+        super().__init__(static, ephemeral_secret, prologue, psk)
+        self._transcript.mix_hash(static.public)
+        self._remote_static = b""
+        self._remote_ephemeral = b""
+
+    def read(self, message: bytes) -> tuple[bytes, bytes]:
+        """The payload of the first message and the static key that its sender proved to hold; raises ``Forged``."""
+        if len(message) < FIRST_OVERHEAD:
+            raise Forged("a first message that is too short")
+        transcript = self._transcript
+        self._remote_ephemeral = message[:KEY]
+        self._mix_ephemeral(self._remote_ephemeral)
+        transcript.mix_key(_shared(self._static.secret, self._remote_ephemeral))
+        self._remote_static = transcript.open(message[KEY : KEY + KEY + TAG])
+        transcript.mix_key(_shared(self._static.secret, self._remote_static))
+        self._mix_psk()
+        return transcript.open(message[KEY + KEY + TAG :]), self._remote_static
+
+    def write(self, payload: bytes) -> tuple[bytes, TransportKeys]:
+        """The second message, 48 bytes longer than ``payload``, and the keys."""
+        ephemeral = key_pair(self._ephemeral_secret)
+        transcript = self._transcript
+        self._mix_ephemeral(ephemeral.public)
+        transcript.mix_key(_shared(ephemeral.secret, self._remote_ephemeral))
+        transcript.mix_key(_shared(ephemeral.secret, self._remote_static))
+        message = ephemeral.public + transcript.seal(payload)
+        receiving, sending = transcript.split()
+        return message, TransportKeys(sending, receiving, transcript.hash)

@@ -1,0 +1,212 @@
+"""Settings: a node's TOML file, checked and frozen; every knob with its unit and what more and less of it do.
+
+Tables: ``[node]``, ``[agent]``, ``[driver]`` and ``[web]``, one dataclass each.  Whatever is wrong is one
+``BadSetting``, which says where, what, and what to write instead.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tomllib
+from collections.abc import Iterable, Mapping
+from dataclasses import MISSING, dataclass, field, fields, replace
+from difflib import get_close_matches
+from typing import Any
+
+from middleware import setting
+from middleware.entangled.network.network import Address
+from middleware.errors import BadSetting
+
+IN_MEMORY = ":memory:"
+ROLES = ("edge", "bootstrap", "web")
+COMMAND_LINE = "command line"
+
+
+@dataclass(frozen=True)
+class NodeSettings:
+    """``[node]``: the node itself and its way into the network."""
+
+    name: str = field(metadata=setting.pattern(r"[A-Za-z0-9_-]{1,40}", 'such as "dog1"'))
+    """What people call the device; 1 to 40 letters, digits, ``_`` or ``-``.  Required."""
+
+    kind: str = field(default="generic", metadata=setting.text(40))
+    """What sort of device it is, for people and for matching; at most 40 characters."""
+
+    description: str = field(default="", metadata=setting.text(200))
+    """A line about the device, shown on the page; at most 200 characters."""
+
+    host: str = field(default="127.0.0.1", metadata=setting.numeric_host())
+    """The numeric address to listen at.  The default hears this machine alone; ``0.0.0.0`` hears every network."""
+
+    port: int = field(default=0, metadata=setting.port())
+    """The UDP port; 0 takes any free one, which suits all nodes but those that others name in ``known_nodes``."""
+
+    known_nodes: tuple[Address, ...] = field(default=(), metadata=setting.addresses())
+    """Nodes to enter the network through, as ``"host:port"``.  Any one that answers is enough; more survive more
+    losses.  None: this node is the first of its network."""
+
+    store: str = field(default=IN_MEMORY, metadata=setting.text(4000, least=1))
+    """The data store's file, relative to the folder of the settings file; ``:memory:`` forgets all when the node ends,
+    and so gives the node a new identity each time."""
+
+    team_key: str = field(default="swarm", metadata=setting.text(1000, least=1), repr=False)
+    """What all nodes of a team know and nobody else does.  **The default is no secret: such a team is open to everyone
+    on its network.**  Any long text will do; it is hashed."""
+
+    roles: tuple[str, ...] = field(default=("edge",), metadata=setting.some_of(ROLES))
+    """What the node does: ``edge`` carries a device, ``bootstrap`` lets others in, ``web`` serves the page."""
+
+    capabilities: Mapping[str, Mapping[str, float | str]] = field(
+        default_factory=dict, metadata=setting.table_of_tables()
+    )
+    """What the device can do beyond what its driver says: a table of properties (numbers or text) for each
+    capability.  A capability that the driver names, too, is merged, and what stands here wins."""
+
+    presence_lease: float = field(default=1.0, metadata=setting.seconds(0.1, 60.0))
+    """Seconds for which the others believe in the device without a sign of it.  Less notices a loss sooner, and takes
+    a slow radio for a loss; more costs fewer datagrams (three are sent to each holder in that time)."""
+
+    @property
+    def team_secret(self) -> bytes:
+        """The 32 bytes that seal the team's datagrams: the BLAKE2s hash of ``team_key``."""
+        return hashlib.blake2s(self.team_key.encode()).digest()
+
+
+@dataclass(frozen=True)
+class AgentSettings:
+    """``[agent]``: the mind of the device."""
+
+    module: str = field(default="", metadata=setting.pattern(r"([A-Za-z_]\w*([.:][A-Za-z_]\w*)*)?", 'such as "search"'))
+    """The agent's module, by its name or its dotted path; none where empty."""
+
+    options: Mapping[str, object] = field(default_factory=dict, metadata=setting.table())
+    """Handed on to the agent as they stand."""
+
+
+@dataclass(frozen=True)
+class DriverSettings:
+    """``[driver]``: the body of the device."""
+
+    kind: str = field(default="", metadata=setting.pattern(r"([A-Za-z_]\w*([.:][A-Za-z_]\w*)*)?", 'such as "sim"'))
+    """The sort of robot, by its name or its dotted path; none where empty."""
+
+    options: Mapping[str, object] = field(default_factory=dict, metadata=setting.table())
+    """Handed on to the driver as they stand; it checks them."""
+
+
+@dataclass(frozen=True)
+class WebSettings:
+    """``[web]``: the page; read where the node has the role ``web``."""
+
+    host: str = field(default="127.0.0.1", metadata=setting.numeric_host())
+    """The numeric address to serve at.  The default serves this machine alone; ``0.0.0.0`` also phones and tablets."""
+
+    port: int = field(default=8080, metadata=setting.port())
+    """The TCP port of the page; 0 takes any free one."""
+
+    yard: Address | None = field(default=None, metadata=setting.address())
+    """Where the simulated yard takes its operator's commands, as ``"host:port"``; none where empty."""
+
+
+TABLES: dict[str, type[Any]] = {
+    "node": NodeSettings,
+    "agent": AgentSettings,
+    "driver": DriverSettings,
+    "web": WebSettings,
+}
+
+
+@dataclass(frozen=True)
+class Settings:
+    """All settings of one node; ``origin`` names the file they come from."""
+
+    node: NodeSettings
+    agent: AgentSettings = AgentSettings()
+    driver: DriverSettings = DriverSettings()
+    web: WebSettings = WebSettings()
+    origin: str = ""
+
+    @classmethod
+    def load(cls, path: str) -> Settings:
+        """The settings in the TOML file at ``path``; raises ``BadSetting`` with the line to mend."""
+        try:
+            with open(path, "rb") as file:
+                mapping = tomllib.load(file)
+        except OSError as error:
+            remedy = "name a settings file that can be read"
+            raise BadSetting(path, "", f"cannot be read: {error.strerror or error}", remedy) from error
+        except UnicodeDecodeError as error:
+            raise BadSetting(path, "", f"is not UTF-8 text at byte {error.start}", "save it as UTF-8") from error
+        except tomllib.TOMLDecodeError as error:
+            raise BadSetting(path, "", f"is not TOML: {error}", "mend that line") from error
+        return cls.from_mapping(mapping, path)
+
+    @classmethod
+    def from_mapping(cls, mapping: Mapping[str, object], origin: str) -> Settings:
+        """The settings in ``mapping`` (table name to table); raises ``BadSetting``.
+
+        ``origin`` names the file they come from: errors name it, and a relative store lies in its folder.
+        """
+        for name in mapping:
+            if name not in TABLES:
+                remedy = f"the nearest table is [{_nearest(name, TABLES)}]"
+                raise BadSetting(origin, f"[{name}]", "is not a table that a node has", remedy)
+        made: dict[str, Any] = {}
+        for name, kind in TABLES.items():
+            table = mapping.get(name, {})
+            if not isinstance(table, Mapping):
+                raise BadSetting(origin, f"[{name}]", f"must be a table, is {setting.shown(table)}", f"write [{name}]")
+            made[name] = _checked(table, name, kind, origin)
+        store = made["node"].store
+        if store != IN_MEMORY:
+            made["node"] = replace(made["node"], store=os.path.join(os.path.dirname(origin), store))
+        return cls(**made, origin=origin)
+
+    def with_flags(self, **flags: object) -> Settings:
+        """These settings with some of them replaced from the command line.
+
+        A flag of ``[node]`` is called as its key (``port``), those of other tables have the table before it
+        (``web_port``).  None leaves a setting as it is; text is read as the setting needs it, lists separated by
+        commas; a store is relative to where one stands.
+        """
+        known = {key if table == "node" else f"{table}_{key}": (table, key) for table, key in _keys()}
+        changed: dict[str, dict[str, Any]] = {}
+        for flag, value in flags.items():
+            shown = "--" + flag.replace("_", "-")
+            if flag not in known:
+                remedy = "the nearest is --" + _nearest(flag, known).replace("_", "-")
+                raise BadSetting(COMMAND_LINE, shown, "is not a setting", remedy)
+            if value is not None:
+                table, key = known[flag]
+                rule = next(f for f in fields(TABLES[table]) if f.name == key).metadata
+                value = rule["read"](value) if isinstance(value, str) else value
+                changed.setdefault(table, {})[key] = _ruled(rule, value, COMMAND_LINE, shown)
+        return replace(self, **{table: replace(getattr(self, table), **keys) for table, keys in changed.items()})
+
+
+def _checked(table: Mapping[str, object], name: str, kind: type[Any], origin: str) -> Any:
+    known = {f.name: f for f in fields(kind)}
+    for key in table:
+        if key not in known:
+            nearest = _nearest(key, known)
+            raise BadSetting(origin, f"[{name}] {key}", "is not a setting", f"the nearest is {nearest}")
+    for key, wanted in known.items():
+        if key not in table and wanted.default is MISSING and wanted.default_factory is MISSING:
+            raise BadSetting(origin, f"[{name}] {key}", "is missing", f'write {key} = "..." below [{name}]')
+    return kind(**{key: _ruled(known[key].metadata, value, origin, f"[{name}] {key}") for key, value in table.items()})
+
+
+def _ruled(rule: Mapping[str, Any], value: object, origin: str, key: str) -> Any:
+    try:
+        return rule["check"](value)
+    except setting.Wrong as wrong:
+        raise BadSetting(origin, key, wrong.problem, wrong.remedy) from None
+
+
+def _keys() -> list[tuple[str, str]]:
+    return [(table, f.name) for table, kind in TABLES.items() for f in fields(kind)]
+
+
+def _nearest(name: str, known: Iterable[str]) -> str:
+    return get_close_matches(name, known, n=1, cutoff=0.0)[0]

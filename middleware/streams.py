@@ -1,0 +1,142 @@
+"""Streams: newest-frame-wins channels for cameras, over the node's own sealed port.
+
+A viewer opens a channel at a publisher and keeps it open by asking again; the publisher sends each frame in a few datagrams that
+nobody acknowledges.  A frame that misses a part is dropped, and a late one too: there is never a backlog.  Nothing is
+sent while nobody looks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from twisted.internet.interfaces import IDelayedCall, IReactorTime
+
+from middleware.entangled.errors import EntangledError, Refused
+from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.wire.endpoint import Endpoint
+
+PART_BYTES = 1100
+MAX_PARTS = 64
+MAX_VIEWERS = 64
+OPEN_TTL = 3.0
+RENEW = 1.0
+
+OnFrame = Callable[[int, bytes], None]
+
+
+@dataclass
+class _Assembly:
+    """The parts of the newest frame of one channel."""
+
+    sequence: int = -1
+    parts: dict[int, bytes] = field(default_factory=dict)
+    done: int = -1
+
+
+class Streams:
+    """Both sides of all channels of one node."""
+
+    def __init__(self, endpoint: Endpoint, clock: IReactorTime) -> None:
+        self._endpoint = endpoint
+        self._clock = clock
+        self._viewers: dict[str, dict[bytes, tuple[Contact, float]]] = {}
+        self._looks: dict[tuple[bytes, str], _Look] = {}
+        endpoint.expose("stream.open", self._answer_open)
+        endpoint.expose("stream.part", self._answer_part)
+
+    # -- publisher --------------------------------------------------------------------------------------------------
+
+    def is_wanted(self, channel: str) -> bool:
+        """Whether anybody looks at ``channel`` now."""
+        now = self._clock.seconds()
+        viewers = self._viewers.get(channel, {})
+        for node_id in [n for n, (_, until) in viewers.items() if until < now]:
+            del viewers[node_id]
+        return bool(viewers)
+
+    def offer(self, channel: str, sequence: int, frame: bytes) -> None:
+        """Send ``frame`` to whoever looks at ``channel``; frames of over ``MAX_PARTS`` parts are not sent."""
+        if not self.is_wanted(channel):
+            return
+        parts = [frame[i : i + PART_BYTES] for i in range(0, len(frame), PART_BYTES)]
+        if len(parts) > MAX_PARTS:
+            return
+        for viewer, _ in self._viewers[channel].values():
+            for number, part in enumerate(parts):
+                self._endpoint.tell(viewer, "stream.part", channel, sequence, number, len(parts), part)
+
+    def _answer_open(self, peer: Contact, channel: str) -> bool:
+        if not isinstance(channel, str) or len(channel) > 32:
+            raise Refused("a channel is named by at most 32 characters")
+        viewers = self._viewers.setdefault(channel, {}) if len(self._viewers) < MAX_VIEWERS else {}
+        if len(viewers) >= MAX_VIEWERS:
+            raise Refused("too many viewers")
+        viewers[peer.node_id] = (peer, self._clock.seconds() + OPEN_TTL)
+        return True
+
+    # -- viewer -----------------------------------------------------------------------------------------------------
+
+    def look(self, publisher: Contact, channel: str, on_frame: OnFrame) -> Callable[[], None]:
+        """Call ``on_frame(sequence, frame)`` at each whole new frame until what is returned is called."""
+        place = (publisher.node_id, channel)
+        look = self._looks.get(place)
+        if look is None:
+            look = self._looks[place] = _Look(self, publisher, channel)
+            look.renew()
+        look.watchers.append(on_frame)
+
+        def stop() -> None:
+            if on_frame in look.watchers:
+                look.watchers.remove(on_frame)
+            if not look.watchers and self._looks.get(place) is look:
+                look.end()
+                del self._looks[place]
+
+        return stop
+
+    def stop(self) -> None:
+        """End everything that is looked at."""
+        for look in self._looks.values():
+            look.end()
+        self._looks.clear()
+
+    def _answer_part(self, peer: Contact, channel: str, sequence: int, number: int, count: int, part: bytes) -> None:
+        look = self._looks.get((peer.node_id, channel))
+        lawful = type(sequence) is int and type(number) is int and type(count) is int and isinstance(part, bytes)
+        if look is None or not lawful or not 0 <= number < count <= MAX_PARTS or len(part) > PART_BYTES:
+            return
+        assembly = look.assembly
+        if sequence < assembly.sequence and sequence > assembly.sequence - 1000:
+            return
+        if sequence != assembly.sequence:
+            assembly.sequence, assembly.parts = sequence, {}
+        assembly.parts[number] = part
+        if len(assembly.parts) == count and assembly.done != sequence:
+            assembly.done = sequence
+            frame = b"".join(assembly.parts[n] for n in range(count))
+            for on_frame in list(look.watchers):
+                on_frame(sequence, frame)
+
+
+class _Look:
+    """One channel looked at, kept open while there is a watcher."""
+
+    def __init__(self, streams: Streams, publisher: Contact, channel: str) -> None:
+        self.watchers: list[OnFrame] = []
+        self.assembly = _Assembly()
+        self._streams = streams
+        self._publisher = publisher
+        self._channel = channel
+        self._timer: IDelayedCall | None = None
+
+    def renew(self) -> None:
+        """Ask the publisher to go on."""
+        self._timer = self._streams._clock.callLater(RENEW, self.renew)
+        opened = self._streams._endpoint.ask(self._publisher, "stream.open", self._channel)
+        opened.addErrback(lambda failure: failure.trap(EntangledError))
+
+    def end(self) -> None:
+        """Stop renewing; the publisher notices by itself."""
+        if self._timer is not None and self._timer.active():
+            self._timer.cancel()

@@ -1,0 +1,200 @@
+"""The demonstration: three dogs, a laptop and a yard as five processes of this machine, told in words.
+
+``python -m sim.demo`` keeps the team running until Ctrl-C; with ``--headless`` it runs both experiments of the thesis,
+judges them by where the dogs really are, and exits with 0 or 1.  The nodes decide everything; this module only starts,
+watches, places the target, and once pulls a plug.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from twisted.internet.base import ReactorBase
+from twisted.internet.defer import Deferred
+from twisted.internet.task import deferLater, react
+
+from drivers.sim.link import TcpConnector
+from drivers.sim.operator import YardOperator
+from sim.configuration import BOOTSTRAP, DOGS, LOOPBACK, Plan
+from sim.experiment import Experiment, report, table
+from sim.port import PortBusy
+from sim.processes import Team
+from sim.stage import WEB_PORT, Trouble, arranged, fresh
+from sim.story import present, told
+from sim.visitor import PageError, Visitor
+
+START_S = 40.0
+SEARCH_S = 3.0
+"""How long the dogs have searched when the target is placed."""
+TICK_S = 0.05
+
+
+class Demonstration:
+    """Five processes, an eye on the page, and an eye over the yard."""
+
+    def __init__(self, reactor: Any, plan: Plan, seed: int, say: Callable[[str], None]) -> None:
+        self._reactor = reactor
+        self._plan = plan
+        self._seed = seed
+        self._say = say
+        self._born = reactor.seconds()
+        self._lost: set[str] = set()
+        self._team = Team(reactor, plan.run_dir)
+        self._operator = YardOperator(TcpConnector(reactor), reactor, LOOPBACK, plan.yard_port, rate=20.0)
+        host = LOOPBACK if plan.web_host == "0.0.0.0" else plan.web_host
+        self._visitor = Visitor(reactor, host, plan.web_port, self._on_state)
+        self.address = f"http://{host}:{plan.web_port}"
+
+    async def start(self) -> None:
+        """Start everything and wait until the page lists the three dogs."""
+        for name, text in self._plan.texts().items():
+            path = self._plan.file(name)
+            path.touch(mode=0o600)
+            path.write_text(text, encoding="utf-8")
+        yard = ["--host", LOOPBACK, "--port", str(self._plan.yard_port), "--seed", str(self._seed)]
+        self._team.add("yard", ["-m", "sim.server", *yard])
+        twistd = str(Path(sys.executable).parent / "twistd")
+        for name in (BOOTSTRAP, *DOGS):
+            self._team.add(name, [twistd, "-n", "--pidfile=", "swarm-node", "--config", str(self._plan.file(name))])
+        self._team.start()
+        self._operator.connect().addErrback(lambda _: None)
+        self._visitor.follow()
+        await self._until(self._is_complete, START_S, "the page does not list all three dogs")
+
+    def stop(self) -> Deferred[None]:
+        """End everything; fires when no process is left."""
+        self._visitor.leave()
+        self._operator.disconnect()
+        return self._team.stop()
+
+    async def experiment(self, number: int) -> Experiment:
+        """Run experiment 1 or 2 of the thesis to its end."""
+        await self._until(self._is_complete, START_S, "a dog is missing before the experiment")
+        await self._operator.clear_target()
+        await self._operator.scatter(self._seed + number)
+        title = f"Experiment {number}: " + ("the nearest dog approaches", "the dog on its way is lost")[number - 1]
+        self._say(title)
+        answer = await self._visitor.post("/api/demo")
+        run = Experiment(title, str(answer.get("id", "")), number == 2, self._reactor.seconds())
+        target_at = self._reactor.seconds() + SEARCH_S
+        while not run.is_over:
+            await self._pause(TICK_S)
+            now = self._reactor.seconds()
+            snapshot = self._operator.snapshot
+            if target_at <= now and snapshot is not None:
+                target_at = float("inf")
+                # A page that puts the target there itself has done so by now.
+                if snapshot["target"] is None:
+                    await self._operator.place_target_at_random()
+                    self._say("the red target is placed")
+            victim = run.look(now, self._visitor.state, snapshot)
+            if victim:
+                self._say(f"{victim} has come nearer; its node is killed (SIGKILL, process {self._team.pid(victim)})")
+                self._lost.add(victim)
+                self._team.kill(victim)
+            self._check_processes()
+        if run.takeover_s is not None:
+            self._say(f"{run.takeover_s:.2f} s from the kill to the next dog moving")
+        return run
+
+    def watch(self) -> None:
+        """Say when a process ends; the team starts it again."""
+        missing = set(self._team.missing())
+        for name in sorted(missing - self._lost):
+            self._say(f"the process of {name} ended; it starts again in 15 s (see {self._plan.run_dir / name}.log)")
+        self._lost = missing
+        self._reactor.callLater(1.0, self.watch)
+
+    def _is_complete(self) -> bool:
+        return set(DOGS) <= set(present(self._visitor.state)) and self._operator.snapshot is not None
+
+    def _on_state(self, before: dict[str, Any], after: dict[str, Any]) -> None:
+        for line in told(before, after):
+            self._say(f"{self._reactor.seconds() - self._born:7.2f} s  {line}")
+
+    async def _until(self, holds: Callable[[], bool], limit_s: float, problem: str) -> None:
+        end = self._reactor.seconds() + limit_s
+        while not holds():
+            self._check_processes()
+            if self._reactor.seconds() > end:
+                raise Trouble(f"{problem} after {limit_s:g} s; the logs are in {self._plan.run_dir}/")
+            await self._pause(TICK_S)
+
+    async def _pause(self, seconds: float) -> None:
+        await deferLater(self._reactor, seconds)
+
+    def _check_processes(self) -> None:
+        for name in self._team.missing():
+            if name not in self._lost:
+                tail = "\n  ".join(self._team.tail(name))
+                raise Trouble(f"the process of {name} ended; its last lines:\n  {tail}")
+
+
+def _arguments(arguments: Sequence[str]) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="python -m sim.demo", description="Three dogs, a red target and the page.")
+    parser.add_argument("--headless", action="store_true", help="run both experiments, judge them, exit with 0 or 1")
+    parser.add_argument("--seed", type=int, default=1, help="seed of the yard (default 1)")
+    parser.add_argument("--web-host", default=LOOPBACK, help="address of the page; 0.0.0.0 opens it to the network")
+    parser.add_argument(
+        "--web-port", type=int, default=None, help=f"port of the page (default {WEB_PORT}, or a free one)"
+    )
+    parser.add_argument("--run-dir", type=Path, default=Path("run"), help="logs, stores and configurations go there")
+    parser.add_argument("--report", type=Path, default=None, help="with --headless: write the verdict there as JSON")
+    return parser.parse_args(arguments)
+
+
+def _say(line: str) -> None:
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()
+
+
+async def _run(reactor: Any, wishes: argparse.Namespace) -> None:
+    try:
+        with fresh(wishes.run_dir.absolute()):
+            plan = arranged(wishes.run_dir.absolute(), wishes.web_host, wishes.web_port, _say)
+            demonstration = Demonstration(reactor, plan, wishes.seed, _say)
+            reactor.addSystemEventTrigger("before", "shutdown", demonstration.stop)
+            try:
+                await demonstration.start()
+                _invite(demonstration, plan)
+                if not wishes.headless:
+                    demonstration.watch()
+                    await Deferred()
+                runs = [await demonstration.experiment(number) for number in (1, 2)]
+            finally:
+                await demonstration.stop()
+        _say(table(runs))
+        if wishes.report is not None:
+            wishes.report.write_text(json.dumps(report(runs), indent=1) + "\n", encoding="utf-8")
+        if not all(run.held for run in runs):
+            raise SystemExit(1)
+    except (Trouble, PageError, PortBusy, OSError) as problem:
+        sys.stderr.write(f"swarm demo: {problem}\n")
+        raise SystemExit(2 if isinstance(problem, PortBusy) else 1) from None
+
+
+def _invite(demonstration: Demonstration, plan: Plan) -> None:
+    _say(f"The page: {demonstration.address}   (logs: {plan.run_dir}; end with Ctrl-C)")
+    if plan.web_host == LOOPBACK:
+        _say("For a phone or tablet in the same network: make demo WEB_HOST=0.0.0.0")
+    else:
+        _say(f"In the same network: http://{os.uname().nodename}.local:{plan.web_port}, or this machine's address")
+
+
+def main(arguments: Sequence[str] = tuple(sys.argv[1:])) -> None:
+    """Run the demonstration that the command line asks for."""
+    wishes = _arguments(arguments)
+    # Twisted's timers run on the wall clock; a step of that clock would freeze or fire all of them.
+    ReactorBase.seconds = staticmethod(time.monotonic)
+    react(lambda reactor: Deferred.fromCoroutine(_run(reactor, wishes)))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,169 @@
+"""Experiment: one run of the thesis' demonstration, judged from what the page says and where the robots really are.
+
+Experiment 1: three dogs search, the nearest approaches the target.  Experiment 2: the same, but the dog that
+approaches is lost on its way, and another one finishes (thesis, section 5).  No clock: ``now`` is an argument.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from sim.story import present
+
+MOVED_M = 0.10
+"""The dog is killed when it has come this much nearer to the target."""
+TOUCH_M = 0.15
+"""The gap between the dog's footprint and the target that still counts as having reached it."""
+SAME_M = 0.05
+"""Two distances that differ by less are the same to a robot's sensor."""
+FOOTPRINT_M = 0.12
+LIMIT_S = 150.0
+
+State = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Check:
+    """One thing that had to be so."""
+
+    what: str
+    held: bool
+
+
+class Experiment:
+    """One task from its assignment to its end.
+
+    :param kills: whether the dog that approaches shall be lost on its way
+    :param started: the moment of assignment, in seconds of the clock that ``look`` is given
+    """
+
+    def __init__(self, title: str, task: str, kills: bool, started: float) -> None:
+        self.title = title
+        self.killed = ""
+        self.by = ""
+        self.took_s: float | None = None
+        self.takeover_s: float | None = None
+        self.gap_m: float | None = None
+        self._task = task
+        self._kills = kills
+        self._started = started
+        self._killed_at = 0.0
+        self._executing = ""
+        self._decided: dict[str, dict[str, float]] = {}
+        self._end = ""
+
+    @property
+    def is_over(self) -> bool:
+        """Whether nothing more will happen: completed, failed, or out of time."""
+        return bool(self._end)
+
+    def look(self, now: float, state: State, snapshot: State | None) -> str:
+        """Take notice of the newest state and snapshot; returns the name of the dog to kill now, or an empty text."""
+        if self._end:
+            return ""
+        distances = to_target(snapshot)
+        task: State = next((row for row in state.get("tasks", []) if row.get("id") == self._task), {})
+        executing = [
+            name
+            for name, device in present(state).items()
+            if device.get("status") == "EXECUTING" and device.get("task") == self._task and name != self.killed
+        ]
+        for name in executing:
+            if name != self._executing:
+                self._executing = name
+                self._decided[name] = distances
+        if self._finishes(now, task, distances, snapshot):
+            return ""
+        if self.killed:
+            if self.takeover_s is None and any(_moves(snapshot, name) for name in executing):
+                self.takeover_s = now - self._killed_at
+        elif self._kills:
+            for name in executing:
+                if self._decided[name].get(name, 0.0) - distances.get(name, math.inf) >= MOVED_M:
+                    self.killed, self._killed_at = name, now
+                    return name
+        return ""
+
+    def _finishes(self, now: float, task: State, distances: Mapping[str, float], snapshot: State | None) -> bool:
+        status = str(task.get("status", "absent"))
+        if status in ("COMPLETED", "FAILED", "CANCELLED"):
+            self._end = status
+            self.took_s = now - self._started
+            result = task.get("result") or {}
+            self.by = str(result.get("by", ""))
+            target = (snapshot or {}).get("target")
+            if target and self.by in distances:
+                self.gap_m = distances[self.by] - float(target["radius"]) - FOOTPRINT_M
+        elif now - self._started > LIMIT_S:
+            self._end = f"out of time, task {status}"
+        return bool(self._end)
+
+    def checks(self) -> list[Check]:
+        """What had to be so, and whether it was."""
+        checks = [Check(f"task completed ({self._end or 'not over'})", self._end == "COMPLETED")]
+        gap = "unknown" if self.gap_m is None else f"{self.gap_m:.2f} m"
+        checks.append(Check(f"{self.by or 'nobody'} stands at the target (gap {gap})", _within(self.gap_m, TOUCH_M)))
+        if self._kills:
+            checks.append(Check(f"{self.killed or 'nobody'} was lost on its way", bool(self.killed)))
+            checks.append(Check(f"{self.by or 'nobody'} finished in its place", self.by not in ("", self.killed)))
+            first = self.killed
+        else:
+            first = self.by
+        if first:
+            at = self._decided.get(first, {})
+            nearest = min(at, key=lambda name: (at[name], name), default="nobody")
+            lead = at.get(first, math.inf) - at.get(nearest, 0.0)
+            checks.append(Check(f"{first} was the nearest when they decided (nearest: {nearest})", lead <= SAME_M))
+        return checks
+
+    @property
+    def held(self) -> bool:
+        """Whether everything was as it had to be."""
+        return all(check.held for check in self.checks())
+
+
+def table(runs: Sequence[Experiment]) -> str:
+    """The verdict over all experiments, one line for each thing that had to be so."""
+    lines = []
+    for run in runs:
+        took = "" if run.took_s is None else f", {run.took_s:.1f} s"
+        takeover = "" if run.takeover_s is None else f", takeover {run.takeover_s:.2f} s"
+        lines.append(f"{'PASS' if run.held else 'FAIL'}  {run.title}{took}{takeover}")
+        lines += [f"      {'yes' if check.held else 'NO '}  {check.what}" for check in run.checks()]
+    return "\n".join(lines)
+
+
+def report(runs: Sequence[Experiment]) -> list[dict[str, Any]]:
+    """The same for programs."""
+    return [
+        {
+            "title": run.title,
+            "held": run.held,
+            "by": run.by,
+            "killed": run.killed,
+            "took_s": run.took_s,
+            "takeover_s": run.takeover_s,
+            "gap_m": run.gap_m,
+            "checks": {check.what: check.held for check in run.checks()},
+        }
+        for run in runs
+    ]
+
+
+def to_target(snapshot: State | None) -> dict[str, float]:
+    """The distance of each dog to the target, centre to centre, in metres; empty where there is no target."""
+    target = (snapshot or {}).get("target")
+    if not snapshot or not target:
+        return {}
+    return {dog["name"]: math.hypot(dog["x"] - target["x"], dog["y"] - target["y"]) for dog in snapshot["dogs"]}
+
+
+def _moves(snapshot: State | None, name: str) -> bool:
+    return any(dog["name"] == name and bool(dog.get("moving")) for dog in (snapshot or {}).get("dogs", []))
+
+
+def _within(value: float | None, limit: float) -> bool:
+    return value is not None and value <= limit

@@ -1,0 +1,137 @@
+"""Team: the operating-system processes of a demonstration, watched by Twisted's ``ProcessMonitor``.
+
+What a process writes goes line by line to ``RUN_DIR/NAME.log`` and to whoever listens.  A process that ends is
+started again after ``restart_delay`` seconds, so that a killed node stays away long enough to be missed.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections import deque
+from collections.abc import Sequence
+from math import inf
+from pathlib import Path
+from typing import Any, Protocol, TextIO
+
+from twisted.internet.defer import Deferred
+from twisted.internet.error import ProcessExitedAlready
+from twisted.internet.interfaces import IReactorTime
+from twisted.logger import Logger
+from twisted.runner.procmon import ProcessMonitor
+
+TAIL_LINES = 12
+
+
+class Said(Protocol):
+    """Who is told each line that a process writes."""
+
+    def __call__(self, name: str, line: str) -> None:
+        """Process ``name`` wrote ``line``."""
+
+
+class Team:
+    """Processes by name, started and ended together.
+
+    :param reactor: starts the processes and says what time it is
+    :param run_dir: an existing folder; logs go there
+    :param said: told every line; None: only the logs have them
+    :param restart_delay: seconds between the end of a process and its next start
+    """
+
+    log = Logger()
+
+    def __init__(self, reactor: Any, run_dir: Path, said: Said | None = None, restart_delay: float = 15.0) -> None:
+        self._clock = IReactorTime(reactor)
+        self._run_dir = run_dir
+        self._said = said
+        self._logs: dict[str, TextIO] = {}
+        self._tails: dict[str, deque[str]] = {}
+        self._stopped: Deferred[None] | None = None
+        monitor = ProcessMonitor(reactor)
+        # Every end counts as "died too fast" for the monitor, and both its delays are ours: so it always waits.
+        monitor.threshold = inf  # type: ignore[assignment]
+        monitor.minRestartDelay = monitor.maxRestartDelay = restart_delay  # type: ignore[assignment]
+        monitor.killTime = 4
+        monitor.log = Logger(namespace="team", observer=self._observe)  # type: ignore[arg-type]
+        self._monitor = monitor
+
+    def add(self, name: str, arguments: Sequence[str]) -> None:
+        """Add a process; it starts at once where the team runs.  Raises ``KeyError`` where the name is taken."""
+        if name not in self._logs:
+            self._logs[name] = (self._run_dir / f"{name}.log").open("a", encoding="utf-8", buffering=1)
+            self._tails[name] = deque(maxlen=TAIL_LINES)
+        environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
+        self._monitor.addProcess(name, on_leash(arguments), env=environment)
+
+    def start(self) -> None:
+        """Start every process."""
+        self._monitor.startService()
+
+    def stop(self) -> Deferred[None]:
+        """End every process, by force after four seconds; fires when all have ended.  May be called twice."""
+        done: Deferred[None] = Deferred()
+        if self._stopped is None:
+            self._stopped = done
+            if self._monitor.running:
+                self._monitor.stopService()
+            self._await_end()
+        else:
+            self._stopped.addCallback(lambda _: done.callback(None))
+        return done
+
+    def _await_end(self) -> None:
+        if self._monitor.protocols:
+            self._clock.callLater(0.05, self._await_end)
+            return
+        for log in self._logs.values():
+            log.close()
+        assert self._stopped is not None
+        self._stopped.callback(None)
+
+    def pid(self, name: str) -> int | None:
+        """The process id; None while the process does not run."""
+        protocol = self._monitor.protocols.get(name)
+        return None if protocol is None or protocol.transport is None else protocol.transport.pid
+
+    def missing(self) -> list[str]:
+        """The names of the processes that do not run."""
+        return [name for name in self._logs if self.pid(name) is None]
+
+    def tail(self, name: str) -> list[str]:
+        """The last lines that the process wrote."""
+        return list(self._tails[name])
+
+    def kill(self, name: str) -> None:
+        """End a process as a power cut would (SIGKILL); it is started again after the delay.
+
+        Raises ``KeyError`` where no such process runs.
+        """
+        protocol = self._monitor.protocols.get(name)
+        if protocol is None or protocol.transport is None:
+            raise KeyError(f"{name} does not run")
+        try:
+            protocol.transport.signalProcess("KILL")
+        except ProcessExitedAlready:
+            raise KeyError(f"{name} does not run") from None
+
+    def _observe(self, event: dict[str, Any]) -> None:
+        name, line = event.get("tag"), event.get("line")
+        if not isinstance(name, str) or not isinstance(line, str):
+            failure = event.get("log_failure")
+            if failure is not None:
+                self.log.failure("A process cannot be watched", failure=failure)
+            return
+        if not line:
+            return  # the monitor ends every output with one line too many
+        self._tails[name].append(line)
+        log = self._logs[name]
+        if not log.closed:
+            log.write(line + "\n")
+        if self._said is not None:
+            self._said(name, line)
+
+
+def on_leash(arguments: Sequence[str]) -> list[str]:
+    """The command line that runs Python ``arguments`` so that they end with us (see ``sim.leash``)."""
+    return [sys.executable, "-m", "sim.leash", *arguments]

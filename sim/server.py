@@ -1,0 +1,66 @@
+"""Server: the yard as a process of its own, behind one TCP port: ``python -m sim.server``."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from random import Random
+from typing import Any, TextIO
+
+from twisted.internet.base import ReactorBase
+from twisted.internet.error import CannotListenError
+from twisted.logger import FilteringLogObserver, LogLevel, LogLevelFilterPredicate, globalLogBeginner, textFileLogObserver
+
+from drivers.sim.link import TcpLinkFactory
+from drivers.sim.option import DEFAULT_PORT
+from sim.scene import SceneError, loaded
+from sim.yard import Yard
+
+USAGE = 2
+
+
+def main(arguments: list[str] | None = None, output: TextIO = sys.stdout, errors: TextIO = sys.stderr) -> int:
+    """Run a yard until it is interrupted; returns the exit code: 0, or 2 with one line on what to change."""
+    parser = argparse.ArgumentParser(prog="python -m sim.server", description="The simulated yard of the dogs.")
+    parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default %(default)s)")
+    parser.add_argument("--port", type=int, default=DEFAULT_PORT, help="TCP port, 0 for any (default %(default)s)")
+    parser.add_argument("--seed", type=int, default=1, help="the same seed gives the same yard (default %(default)s)")
+    parser.add_argument("--scene", default="three-dogs", help="a scene's name or a .json file (default %(default)s)")
+    chosen = parser.parse_args(arguments)
+    if not 0 <= chosen.port <= 65535:
+        return _refused(errors, f"port {chosen.port} is no port; choose one from 1 to 65535, or 0 for any")
+    try:
+        scene = loaded(chosen.scene)
+    except SceneError as error:
+        return _refused(errors, str(error))
+    # Twisted's timers run on the wall clock by default: a step of that clock would freeze the yard, or race it.
+    ReactorBase.seconds = staticmethod(time.monotonic)  # type: ignore[method-assign]
+    from twisted.internet import reactor as running
+
+    reactor: Any = running
+    warnings = LogLevelFilterPredicate(defaultLogLevel=LogLevel.warn)
+    globalLogBeginner.beginLoggingTo(
+        [FilteringLogObserver(textFileLogObserver(errors), [warnings])], redirectStandardIO=False
+    )
+    yard = Yard(reactor, Random(chosen.seed), scene)
+    try:
+        port = reactor.listenTCP(chosen.port, TcpLinkFactory(yard.attach), interface=chosen.host)
+    except CannotListenError as error:
+        return _refused(errors, f"cannot listen on {chosen.host}:{chosen.port}: {error.socketError}; try another --port")
+    address = port.getHost()
+    yard.start()
+    reactor.addSystemEventTrigger("before", "shutdown", yard.stop)
+    dogs = ", ".join(yard.world.dogs)
+    print(f"yard {scene.name} ready on {address.host}:{address.port}: {dogs}", file=output, flush=True)
+    reactor.run()
+    return 0
+
+
+def _refused(errors: TextIO, problem: str) -> int:
+    print(f"sim.server: {problem}", file=errors)
+    return USAGE
+
+
+if __name__ == "__main__":
+    sys.exit(main())

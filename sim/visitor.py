@@ -1,0 +1,146 @@
+"""Visitor: a client of a web node's page, as a browser is one, for programs.
+
+Follows the live stream of states, and asks and orders through the page's JSON.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from typing import Any
+
+from twisted.internet.defer import Deferred
+from twisted.internet.interfaces import IDelayedCall, IReactorTime
+from twisted.internet.protocol import Protocol, connectionDone
+from twisted.python.failure import Failure
+from twisted.web.client import Agent, readBody
+from twisted.web.http_headers import Headers
+from twisted.web.iweb import IResponse
+
+RETRY_S = 0.5
+LIMIT_S = 5.0
+MAX_EVENT = 1 << 20
+
+
+class PageError(Exception):
+    """The page refused, or answered what is no answer; the message is the page's own."""
+
+
+class EventStream:
+    """Server-sent events out of bytes, however these are cut; an event above one MiB is dropped."""
+
+    def __init__(self) -> None:
+        self._buffer = b""
+        self._name = "message"
+        self._data: list[bytes] = []
+
+    def feed(self, data: bytes) -> list[tuple[str, bytes]]:
+        """Take the next bytes; returns the events that are complete now, each with its name and data."""
+        events = []
+        *lines, self._buffer = (self._buffer + data).split(b"\n")
+        if len(self._buffer) > MAX_EVENT:
+            self._buffer, self._data = b"", []
+        for line in lines:
+            line = line.removesuffix(b"\r")
+            field, _, value = line.partition(b":")
+            value = value.removeprefix(b" ")
+            if not line:
+                if self._data:
+                    events.append((self._name, b"\n".join(self._data)))
+                self._name, self._data = "message", []
+            elif field == b"event":
+                self._name = value.decode(errors="replace")
+            elif field == b"data":
+                self._data.append(value)
+        return events
+
+
+class Visitor:
+    """One visitor of the page at ``http://HOST:PORT``.
+
+    ``on_state(before, after)`` is called at each new state; ``state`` is the newest, empty before the first one.
+    """
+
+    def __init__(self, reactor: Any, host: str, port: int, on_state: Callable[[dict[str, Any], dict[str, Any]], None]):
+        self.state: dict[str, Any] = {}
+        self._clock = IReactorTime(reactor)
+        self._agent = Agent(reactor, connectTimeout=LIMIT_S)
+        self._address = f"http://{host}:{port}"
+        self._on_state = on_state
+        self._stream: _Stream | None = None
+        self._retry: IDelayedCall | None = None
+        self._following = False
+
+    def follow(self) -> None:
+        """Follow the live states until ``leave``; a lost stream is opened again."""
+        self._following = True
+        self._open()
+
+    def leave(self) -> None:
+        """Stop following."""
+        self._following = False
+        if self._retry is not None and self._retry.active():
+            self._retry.cancel()
+        if self._stream is not None and self._stream.transport is not None:
+            self._stream.transport.loseConnection()
+
+    async def post(self, path: str) -> dict[str, Any]:
+        """Give an order to the page; raises ``PageError`` where it is refused."""
+        return await self._ask(b"POST", path)
+
+    async def get(self, path: str) -> dict[str, Any]:
+        """Ask the page."""
+        return await self._ask(b"GET", path)
+
+    async def _ask(self, verb: bytes, path: str) -> dict[str, Any]:
+        asked = self._agent.request(verb, (self._address + path).encode(), Headers({"X-Swarm": ["1"]}))
+        response = await asked.addTimeout(LIMIT_S, self._clock)
+        body = await readBody(response).addTimeout(LIMIT_S, self._clock)
+        try:
+            answer = json.loads(body)
+        except ValueError:
+            answer = None
+        if response.code >= 400 or not isinstance(answer, dict):
+            raise PageError(f"{path}: {response.code} {body[:200].decode(errors='replace')}")
+        return answer
+
+    def _open(self) -> None:
+        asked = self._agent.request(b"GET", f"{self._address}/events".encode())
+        asked.addCallbacks(self._opened, self._lost)
+
+    def _opened(self, response: IResponse) -> None:
+        self._stream = _Stream(self._heard)
+        self._stream.over.addBoth(self._lost)
+        response.deliverBody(self._stream)
+        if not self._following:
+            self.leave()
+
+    def _lost(self, _: object) -> None:
+        self._stream = None
+        if self._following:
+            self._retry = self._clock.callLater(RETRY_S, self._open)
+
+    def _heard(self, name: str, data: bytes) -> None:
+        if name != "state":
+            return
+        try:
+            state = json.loads(data)
+        except ValueError:
+            return
+        if isinstance(state, dict):
+            before, self.state = self.state, state
+            self._on_state(before, state)
+
+
+class _Stream(Protocol):
+    def __init__(self, heard: Callable[[str, bytes], None]) -> None:
+        self.over: Deferred[None] = Deferred()
+        self._events = EventStream()
+        self._heard = heard
+
+    def dataReceived(self, data: bytes) -> None:
+        for name, event in self._events.feed(data):
+            self._heard(name, event)
+
+    def connectionLost(self, reason: Failure = connectionDone) -> None:
+        self.over.callback(None)

@@ -1,0 +1,53 @@
+"""Tests of ``drivers.gate``."""
+
+from __future__ import annotations
+
+import math
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from drivers.driver import Permit
+from drivers.errors import StaleCommand
+from drivers.gate import Gate
+
+
+class GateTests(SynchronousTestCase):
+    """The robot's last word on who may move it."""
+
+    def test_lets_the_same_and_higher_tokens_through(self) -> None:
+        """Tokens may repeat and rise."""
+        gate = Gate()
+        for token in (1, 1, 4):
+            gate.admit(Permit(token, 2.0), now=1.0)
+        self.assertEqual((gate.token, gate.deadline), (4, 2.0))
+
+    def test_refuses_a_lower_token_and_keeps_the_deadline(self) -> None:
+        """A lower token changes nothing, the deadline in force included."""
+        gate = Gate()
+        gate.admit(Permit(4, 2.0), now=1.0)
+        error = self.assertRaises(StaleCommand, gate.admit, Permit(3, 9.0), 1.5)
+        self.assertIn("token 3 is older than token 4", str(error))
+        self.assertEqual(gate.deadline, 2.0)
+
+    def test_refuses_deadlines_that_are_no_future(self) -> None:
+        """A deadline that is now, past, infinite or no number is refused, and its token is not learned."""
+        gate = Gate()
+        for deadline in (1.0, 0.5, math.inf, math.nan):
+            self.assertRaises(StaleCommand, gate.admit, Permit(7, deadline), 1.0)
+        self.assertIsNone(gate.token)
+
+    def test_says_when_to_stop(self) -> None:
+        """The motion is over at its deadline, not before, and not when nothing is in force."""
+        gate = Gate()
+        self.assertFalse(gate.is_over(5.0))
+        gate.admit(Permit(1, 2.0), now=1.0)
+        self.assertFalse(gate.is_over(1.999))
+        self.assertTrue(gate.is_over(2.0))
+
+    def test_keeps_fencing_after_it_was_closed(self) -> None:
+        """A stop ends the motion but does not let an old token in again."""
+        gate = Gate()
+        gate.admit(Permit(4, 2.0), now=1.0)
+        gate.close()
+        self.assertFalse(gate.is_over(3.0))
+        self.assertRaises(StaleCommand, gate.admit, Permit(3, 9.0), 3.0)

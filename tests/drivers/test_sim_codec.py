@@ -1,0 +1,156 @@
+"""Tests of ``drivers.sim.codec``."""
+
+from __future__ import annotations
+
+import msgpack
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from twisted.trial.unittest import SynchronousTestCase
+
+from drivers.errors import BadFrame
+from drivers.sim.codec import (
+    HEADER,
+    MARKER,
+    MAX_PAYLOAD,
+    Alive,
+    Done,
+    Drive,
+    FrameReader,
+    Halt,
+    Hello,
+    Message,
+    Motors,
+    Order,
+    Overlook,
+    Picture,
+    Refused,
+    Sensors,
+    Truth,
+    decoded,
+    encoded,
+)
+
+DOG = {"name": "dog1", "x": 1.0, "y": 2.0, "heading": 0.5, "moving": False, "stripes": 1}
+SNAPSHOT = {"t": 1.0, "walls": (3.0, 2.4), "dogs": (DOG,), "target": None, "collisions": 0}
+MESSAGES: list[Message] = [
+    Hello(1, "dog1", 15.0),
+    Overlook(1, 10.0),
+    Motors(True),
+    Drive(0.1, 0.0, -0.5, 7, 0.5, 12.25),
+    Halt(),
+    Alive(),
+    Order(3, "move_dog", ("dog1", 1.0, 2.0, 0.0)),
+    Sensors(1.5, {"range.near": 0.3, "base.moving": True}, {"imu.ax": (0.1, 0.2, 0.3, 0.4)}),
+    Picture(9, 1.5, 208, 160, b"\xff\xd8jpeg"),
+    Truth(SNAPSHOT),
+    Done(3, ""),
+    Refused("dog1 is taken", False),
+]
+settings.register_profile("yard", derandomize=True, database=None, deadline=None, max_examples=120)
+settings.load_profile("yard")
+
+
+def payload(*row: object) -> bytes:
+    """A payload that no honest client makes."""
+    return bytes(msgpack.packb(list(row)))
+
+
+class CodecTests(SynchronousTestCase):
+    """One payload to a message and back."""
+
+    def test_gives_back_every_message(self) -> None:
+        """What was encoded is decoded to an equal message, for each kind."""
+        self.assertEqual([decoded(encoded(message)[HEADER:]) for message in MESSAGES], MESSAGES)
+
+    def test_refuses_wrong_fields(self) -> None:
+        """Unknown tags, missing, surplus, ill-typed and unbounded fields are all bad frames."""
+        for bad in (
+            b"",
+            payload(),
+            payload("warp", 1),
+            payload(["hello"], 1),
+            payload("halt", 1),
+            payload("motors", 1),
+            payload("hello", 1, "dog1"),
+            payload("hello", True, "dog1", 15.0),
+            payload("hello", 1, "x" * 201, 15.0),
+            payload("drive", float("nan"), 0.0, 0.0, 1, 0.5, 0.0),
+            payload("drive", 0.1, 0.0, 0.0, -1, 0.5, 0.0),
+            payload("drive", 0.1, 0.0, 0.0, 1.0, 0.5, 0.0),
+            payload("drive", 0.1, 0.0, 0.0, 1, float("inf"), 0.0),
+            payload("sensors", 1.0, {1: 2.0}, {}),
+            payload("sensors", 1.0, {"a": None}, {}),
+            payload("sensors", 1.0, {"a": 1.0}, {"a": ["x"]}),
+            payload("sensors", 1.0, {str(i): 1.0 for i in range(65)}, {}),
+            payload("truth", {**SNAPSHOT, "dogs": ({**DOG, "x": "left"},)}),
+            payload("truth", {**SNAPSHOT, "target": {"x": 1.0}}),
+            payload("truth", {"t": 1.0}),
+            payload("order", 1, "scatter", [[1]]),
+        ):
+            self.assertRaises(BadFrame, decoded, bad)
+
+    def test_is_total(self) -> None:
+        """Any bytes at all are a message or a BadFrame."""
+
+        @given(st.binary(max_size=200))
+        @example(b"\x91" * 5000)
+        @example(b"\xdf\xff\xff\xff\xff")
+        @example(b"\xc1")
+        @example(b"\x92\xa4halt\xc7\x05\xff12345")
+        @example(payload("hello", 1, "dog1", 15.0) + b"more")
+        def check(data: bytes) -> None:
+            try:
+                decoded(data)
+            except BadFrame:
+                return
+
+        check()
+
+    def test_refuses_to_send_what_nobody_would_take(self) -> None:
+        """A message above the limit of a frame is the sender's fault."""
+        self.assertRaises(ValueError, encoded, Picture(1, 1.0, 1, 1, bytes(MAX_PAYLOAD)))
+
+
+class FrameReaderTests(SynchronousTestCase):
+    """A stream of bytes to messages."""
+
+    def setUp(self) -> None:
+        """All messages in one stream."""
+        self.stream = b"".join(encoded(message) for message in MESSAGES)
+        self.reader = FrameReader()
+
+    def test_reads_whole_and_byte_by_byte(self) -> None:
+        """However the bytes are cut, the same messages come out."""
+        self.assertEqual(list(self.reader.read(self.stream)), MESSAGES)
+        pieces = FrameReader()
+        read = [message for byte in self.stream for message in pieces.read(bytes([byte]))]
+        self.assertEqual(read, MESSAGES)
+        self.assertEqual((pieces.frames, pieces.bad_frames), (len(MESSAGES), 0))
+
+    def test_drops_noise_and_goes_on(self) -> None:
+        """After bytes that are no frame, the reader finds the next one; it counts what it dropped."""
+        for noise in (b"rubbish", MARKER + b"\xff\xff\xff\xff", b"\xa9", MARKER, MARKER + (3).to_bytes(4, "big") + b"abc"):
+            reader = FrameReader()
+            read = list(reader.read(noise + self.stream))
+            # Noise that looks like the start of a frame may swallow the first real ones, never all of them.
+            self.assertEqual(read, MESSAGES[-len(read) :])
+            self.assertGreater(len(read), len(MESSAGES) - 3)
+            self.assertGreater(reader.bad_frames, 0)
+
+    def test_keeps_little_of_endless_noise(self) -> None:
+        """Noise without end does not fill the memory."""
+        for _ in range(50):
+            self.assertEqual(list(self.reader.read(bytes(10_000))), [])
+        self.assertLessEqual(len(self.reader._rest), MAX_PAYLOAD + HEADER)
+        self.assertEqual(list(self.reader.read(self.stream)), MESSAGES)
+
+    def test_survives_any_stream(self) -> None:
+        """Any bytes, cut anywhere, raise nothing."""
+
+        @given(st.lists(st.binary(max_size=60) | st.sampled_from([MARKER, encoded(Halt()), encoded(Alive())[:5]])))
+        def check(chunks: list[bytes]) -> None:
+            reader = FrameReader()
+            for chunk in chunks:
+                list(reader.read(chunk))
+
+        check()

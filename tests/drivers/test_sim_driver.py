@@ -1,0 +1,307 @@
+"""Tests of ``drivers.sim.driver`` against the real yard, joined through memory."""
+
+from __future__ import annotations
+
+import json
+import math
+from random import Random
+
+from twisted.internet.task import Clock
+from twisted.trial.unittest import SynchronousTestCase
+
+from drivers.driver import Permit
+from drivers.errors import LinkLost, NoReply, NotEnabled, Unsupported, UsageError
+from drivers.sim.codec import Motors, Sensors, encoded
+from drivers.sim.driver import STALE_S, SimDriver
+from drivers.sim.link import Link, MemoryConnector, Receiver
+from drivers.sim.operator import YardOperator
+from sim.scene import loaded
+from sim.yard import Yard
+from tests.drivers.contract import DriverContract
+
+
+def pump(clock: Clock, seconds: float) -> None:
+    """Let time pass in small steps, so that answers to answers arrive."""
+    clock.pump([0.004] * round(seconds / 0.004))
+
+
+class SimDriverTests(DriverContract, SynchronousTestCase):
+    """A dog of the yard keeps the contract, and what is its own."""
+
+    def setUp(self) -> None:
+        """A yard on a clock that is turned by hand."""
+        self.clock = Clock()
+        self.yard = Yard(self.clock, Random(1), loaded("three-dogs"))
+        self.yard.start()
+        self.connector = self.yard.connector()
+        self.drivers: list[SimDriver] = []
+
+    def tearDown(self) -> None:
+        """Nothing is left on the clock once all have gone."""
+        for driver in self.drivers:
+            driver.disconnect()
+        self.yard.stop()
+        pump(self.clock, 0.02)
+        self.assertEqual(self.clock.getDelayedCalls(), [])
+
+    def make_driver(self, **options: object) -> SimDriver:
+        """A driver of dog1."""
+        driver = SimDriver({"robot": "dog1", "camera": False, **options}, self.connector, self.clock)
+        self.drivers.append(driver)
+        return driver
+
+    def pass_time(self, seconds: float) -> None:
+        """Turn the clock."""
+        pump(self.clock, seconds)
+
+    def now(self) -> float:
+        """The turned clock."""
+        return self.clock.seconds()
+
+    def true_speed(self) -> float:
+        """What the physics says."""
+        motion = self.yard.world.dogs["dog1"].motion
+        return math.hypot(motion.vx, motion.vy)
+
+    def cut_link(self) -> None:
+        """Break the memory link."""
+        self.connector.cut()
+
+    def test_shows_every_key_with_four_samples(self) -> None:
+        """An observation has the keys of an ERS-7, and the rangers and accelerometers four samples each."""
+        driver = self.make_driver()
+        driver.connect()
+        self.pass_time(0.2)
+        seen = driver.observe()
+        assert seen is not None
+        self.assertEqual(
+            set(seen.values),
+            {"base.vx", "base.vy", "base.wz", "base.moving", "odom.x", "odom.y", "odom.yaw", "range.near", "range.far"}
+            | {"range.chest", "imu.ax", "imu.ay", "imu.az", "power.level", "estop.engaged"},
+        )
+        self.assertEqual({len(row) for row in seen.samples.values()}, {4})
+        self.assertEqual(len(seen.samples), 6)
+        self.assertIsNone(seen.frame)
+        self.assertIs(seen.values["estop.engaged"], True)
+        self.assertAlmostEqual(float(seen.values["imu.az"]), 9.8, delta=0.5)
+
+    def test_gets_pictures_at_the_rate_it_asked_for(self) -> None:
+        """Two seconds at 15 pictures a second bring 30 whole JPEGs with growing numbers."""
+        driver = self.make_driver(camera=True, camera_fps=15)
+        seen: set[int] = set()
+        driver.subscribe(lambda one: seen.add(one.frame.seq if one.frame else 0))
+        driver.connect()
+        self.pass_time(2.0)
+        self.assertEqual(driver.diagnostics()["pictures"], 30)
+        self.assertEqual(seen - {0}, set(range(1, 31)))
+        newest = driver.observe()
+        assert newest is not None and newest.frame is not None
+        self.assertTrue(newest.frame.data.startswith(b"\xff\xd8") and newest.frame.data.endswith(b"\xff\xd9"))
+        self.assertEqual((newest.frame.width, newest.frame.height), (208, 160))
+
+    def test_is_told_that_there_is_no_such_robot(self) -> None:
+        """Connecting to a robot that the yard lacks fails at once, with the names of those that it has."""
+        driver = self.make_driver(robot="dog9")
+        connected = driver.connect()
+        self.pass_time(0.1)
+        self.assertIn("dog1, dog2, dog3", str(self.failureResultOf(connected, Unsupported).value))
+        self.assertEqual(driver.state, "closed")
+
+    def test_waits_for_a_robot_that_is_taken(self) -> None:
+        """A second driver of dog1 is turned away while the first holds it, and gets it when that one leaves."""
+        first, second = self.make_driver(), self.make_driver()
+        first.connect()
+        self.pass_time(0.1)
+        connected = second.connect()
+        self.pass_time(1.0)
+        self.assertNoResult(connected)
+        self.assertGreater(second.diagnostics()["refused"], 0)
+        first.disconnect()
+        self.pass_time(0.5)
+        self.successResultOf(connected)
+
+    def test_finds_a_yard_that_starts_later(self) -> None:
+        """Connect waits, with back-off, for a yard that is not there yet."""
+        self.connector.is_open = False
+        driver = self.make_driver()
+        connected = driver.connect()
+        self.pass_time(5.0)
+        self.assertNoResult(connected)
+        self.connector.is_open = True
+        self.pass_time(2.2)
+        self.successResultOf(connected)
+
+    def test_is_stale_when_the_yard_falls_silent(self) -> None:
+        """A yard that sends nothing though its link is open makes the driver stale, and act refuses."""
+        driver = self.ready()
+        self.yard._pending.cancel()
+        self.yard._pending = None
+        self.pass_time(STALE_S + 0.1)
+        self.assertEqual(driver.state, "stale")
+        self.assertRaises(NotEnabled, driver.act, {"base.vx": 0.1}, self.permit())
+
+    def test_gives_up_on_the_way(self) -> None:
+        """Disconnecting before the first observation fails the Deferred of connect."""
+        driver = self.make_driver()
+        connected = driver.connect()
+        driver.disconnect()
+        self.failureResultOf(connected, LinkLost)
+
+    def test_refuses_a_second_connect_and_an_early_enable(self) -> None:
+        """Asking out of order is answered with what to do."""
+        driver = self.make_driver()
+        self.failureResultOf(driver.enable(), LinkLost)
+        driver.connect()
+        self.failureResultOf(driver.connect(), UsageError)
+
+    def test_replays_from_a_seed(self) -> None:
+        """The same seed and the same commands give the same observations and pictures, bit by bit."""
+
+        def run() -> list[object]:
+            self.setUp()
+            driver = self.make_driver(camera=True, camera_fps=30)
+            seen: list[object] = []
+            driver.subscribe(lambda one: seen.append((one.t_robot, repr(one.values), one.frame)))
+            driver.connect()
+            self.pass_time(0.2)
+            driver.enable()
+            self.pass_time(0.1)
+            driver.act({"base.vx": 0.16, "base.wz": 0.5}, self.permit(seconds=0.4))
+            self.pass_time(0.6)
+            self.tearDown()
+            return seen
+
+        self.assertEqual(run(), run())
+
+
+class MuteRobot:
+    """The far end of a link that shows sensors once and answers nothing."""
+
+    def __init__(self, link: Link) -> None:
+        self.link = link
+        self.heard = b""
+        self.tell()
+
+    def tell(self) -> None:
+        """Say what is felt, motors off."""
+        self.link.send(encoded(Sensors(1.0, {"estop.engaged": True}, {})))
+
+    def received(self, data: bytes) -> None:
+        """Hear, and do nothing."""
+        self.heard += data
+
+    def link_down(self) -> None:
+        """Nothing to do."""
+
+
+class SimDriverAloneTests(SynchronousTestCase):
+    """The driver against a far end that misbehaves."""
+
+    def setUp(self) -> None:
+        """A driver, connected to what only talks when told to."""
+        self.clock = Clock()
+        self.robots: list[MuteRobot] = []
+        connector = MemoryConnector(self.clock, self.accept)
+        self.driver = SimDriver({"robot": "dog1"}, connector, self.clock)
+        self.connected = self.driver.connect()
+        pump(self.clock, 0.02)
+
+    def accept(self, link: Link) -> Receiver:
+        """Take the driver's call."""
+        self.robots.append(MuteRobot(link))
+        return self.robots[-1]
+
+    def test_says_that_the_robot_does_not_answer(self) -> None:
+        """Motors that are never switched fail the Deferred of enable with NoReply after a second."""
+        enabled = self.driver.enable()
+        pump(self.clock, 0.9)
+        self.assertNoResult(enabled)
+        pump(self.clock, 0.2)
+        self.failureResultOf(enabled, NoReply)
+        self.assertIn(encoded(Motors(True)), self.robots[0].heard)
+
+    def test_lives_on_after_bad_bytes(self) -> None:
+        """Rubbish and messages that only clients send are counted and dropped."""
+        self.robots[0].link.send(b"rubbish" + encoded(Motors(True)))
+        self.robots[0].tell()
+        pump(self.clock, 0.02)
+        self.assertEqual(self.driver.diagnostics()["bad_frames"], 2)
+        self.assertEqual(self.driver.state, "ready")
+
+    def test_ends_the_motion_on_its_own_side_too(self) -> None:
+        """At the deadline the driver itself sends a halt, once."""
+        self.robots[0].link.send(encoded(Sensors(1.0, {"estop.engaged": False}, {})))
+        pump(self.clock, 0.02)
+        self.driver.act({"base.vx": 0.1}, Permit(1, self.clock.seconds() + 0.1))
+        before = self.robots[0].heard
+        pump(self.clock, 0.2)
+        self.assertEqual(self.robots[0].heard[len(before) :].count(b"halt"), 1)
+
+
+class YardOperatorTests(SynchronousTestCase):
+    """The operator's side of the same wire."""
+
+    def setUp(self) -> None:
+        """A yard and an operator who has connected."""
+        self.clock = Clock()
+        self.yard = Yard(self.clock, Random(1), loaded("three-dogs"))
+        self.yard.start()
+        self.connector = self.yard.connector()
+        self.operator = YardOperator(self.connector, self.clock)
+        self.connected = self.operator.connect()
+        pump(self.clock, 0.2)
+
+    def test_sees_the_truth(self) -> None:
+        """The snapshot is what the world says, in plain data that JSON can carry."""
+        snapshot = self.successResultOf(self.connected)
+        self.assertEqual(list(snapshot["walls"]), [3.0, 2.4])
+        self.assertEqual([dog["name"] for dog in snapshot["dogs"]], ["dog1", "dog2", "dog3"])
+        self.assertIsNone(snapshot["target"])
+        json.dumps(self.operator.snapshot)
+
+    def test_moves_things(self) -> None:
+        """Target and dogs go where the operator puts them, and the next snapshots show it."""
+        seen: list[object] = []
+        end = self.operator.subscribe(lambda snapshot: seen.append(snapshot["target"]))
+        for order in (
+            self.operator.place_target(2.0, 1.0),
+            self.operator.move_dog("dog1", 1.0, 1.0, 0.5),
+        ):
+            pump(self.clock, 0.2)
+            self.assertIs(self.successResultOf(order), True)
+        snapshot = self.operator.snapshot
+        assert snapshot is not None
+        self.assertEqual(snapshot["target"], {"x": 2.0, "y": 1.0, "radius": 0.08})
+        self.assertEqual((snapshot["dogs"][0]["x"], snapshot["dogs"][0]["heading"]), (1.0, 0.5))
+        end()
+        for order in (self.operator.clear_target(), self.operator.scatter(3), self.operator.place_target_at_random()):
+            pump(self.clock, 0.1)
+            self.assertIs(self.successResultOf(order), True)
+        self.assertIn(snapshot["target"], seen)
+
+    def test_is_told_why_not(self) -> None:
+        """What cannot be done fails with the yard's own words."""
+        for order, words in (
+            (self.operator.place_target(9.0, 1.0), "does not fit"),
+            (self.operator.move_dog("dog7", 1.0, 1.0, 0.0), "no dog is named"),
+        ):
+            pump(self.clock, 0.1)
+            self.assertIn(words, str(self.failureResultOf(order, UsageError).value))
+
+    def test_fails_orders_without_a_link(self) -> None:
+        """Orders fail with LinkLost when the link breaks under them, and before it is there again."""
+        on_the_way = self.operator.clear_target()
+        self.connector.cut()
+        self.failureResultOf(on_the_way, LinkLost)
+        self.failureResultOf(self.operator.clear_target(), LinkLost)
+        self.assertIsNone(self.operator.snapshot)
+        pump(self.clock, 0.4)
+        self.assertIsNotNone(self.operator.snapshot)
+
+    def test_leaves_nothing_behind(self) -> None:
+        """After disconnect, also twice, no timer of the operator is left."""
+        self.operator.disconnect()
+        self.operator.disconnect()
+        self.yard.stop()
+        pump(self.clock, 0.02)
+        self.assertEqual(self.clock.getDelayedCalls(), [])

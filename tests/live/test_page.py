@@ -1,0 +1,247 @@
+"""The page in a real browser: what an operator sees and can do, on a phone and on a desk."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+import time
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from twisted.trial.unittest import SynchronousTestCase
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+FLAGS = [
+    *("--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"),
+    *("--disable-component-update", "--disable-sync", "--disable-dev-shm-usage"),
+]
+PHONE = {"viewport": {"width": 412, "height": 839}, "has_touch": True}
+DESK = {"viewport": {"width": 1280, "height": 800}}
+MISSING = [
+    *(() if CHROMIUM else ("the program chromium (apt-get install chromium)",)),
+    *(
+        f"the Python package {name} (pip install -e '.[browser]')"
+        for name in ("playwright", "axe_playwright_python", "cv2", "flask")
+        if find_spec(name) is None
+    ),
+]
+
+
+class Team:
+    """The page's server as a child process; ``order`` changes what it shows."""
+
+    def __init__(self, port: int = 0) -> None:
+        root = Path(__file__).parents[2]
+        command = [sys.executable, "-m", "tests.live.team", str(port)]
+        self._process = subprocess.Popen(command, cwd=root, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        self.port = int(self._line())
+        self.url = f"http://127.0.0.1:{self.port}/"
+
+    def _line(self) -> str:
+        assert self._process.stdout is not None
+        return self._process.stdout.readline()
+
+    def order(self, words: str) -> None:
+        """Give an order; ``freeze`` is not waited for."""
+        assert self._process.stdin is not None
+        self._process.stdin.write(words + "\n")
+        self._process.stdin.flush()
+        if not words.startswith("freeze"):
+            self._line()
+
+    def stop(self) -> None:
+        """End it at once."""
+        self._process.kill()
+        self._process.communicate()
+
+
+class PageTests(SynchronousTestCase):
+    if MISSING:
+        skip = f"THE PAGE IS NOT TESTED IN A BROWSER: missing {'; '.join(MISSING)}"
+
+    def setUp(self) -> None:
+        from playwright.sync_api import sync_playwright
+
+        self.team = Team()
+        self.addCleanup(lambda: self.team.stop())
+        play = sync_playwright().start()
+        self.addCleanup(play.stop)
+        self.browser = play.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        self.addCleanup(self.browser.close)
+
+    def opened(self, screen: dict[str, Any], scheme: Any = "light") -> Any:
+        context = self.browser.new_context(**screen, color_scheme=scheme, reduced_motion="reduce")
+        self.addCleanup(context.close)
+        page = context.new_page()
+        page.set_default_timeout(8000)
+        self.asked: list[str] = []
+        self.faults: list[str] = []
+        page.on("request", lambda request: self.asked.append(request.url))
+        page.on("pageerror", lambda error: self.faults.append(str(error)))
+        page.on("console", lambda words: self.faults.append(words.text) if words.type == "error" else None)
+        page.goto(self.team.url)
+        page.locator("#link[data-link=live]").wait_for()
+        page.locator(".device").nth(2).wait_for()
+        return page
+
+    def told(self, page: Any, words: str) -> None:
+        page.locator("#line", has_text=words).wait_for()
+
+    def names(self, page: Any) -> list[str]:
+        return list(page.locator(".device b").all_inner_texts())
+
+    def test_be_accessible(self) -> None:
+        """On phone and desk, light and dark, dialog open or not, axe finds nothing, nothing is cut off or small."""
+        from axe_playwright_python.sync_playwright import Axe
+
+        for screen in (PHONE, DESK):
+            for scheme in ("light", "dark"):
+                page = self.opened(screen, scheme)
+                page.locator("#tasks li").first.wait_for()
+                for dialog in (False, True):
+                    if dialog:
+                        page.locator(".device").first.focus()
+                        page.keyboard.press("Enter")
+                        page.locator("dialog[open]").wait_for()
+                    found = Axe().run(page).response["violations"]
+                    self.assertEqual([(each["id"], each["nodes"][0]["html"]) for each in found], [])
+                    wide = page.evaluate("document.documentElement.scrollWidth - innerWidth")
+                    self.assertLessEqual(wide, 0)
+                small = page.evaluate(
+                    "[...document.querySelectorAll('button, input, select')].filter(e => e.offsetParent)"
+                    ".filter(e => e.offsetHeight < 44 || e.offsetWidth < 44 || e.scrollWidth > e.clientWidth + 1)"
+                    ".map(e => e.outerHTML)"
+                )
+                self.assertEqual(small, [])
+                self.assertEqual(self.faults, [])
+        self.assertEqual([url for url in self.asked if not url.startswith(self.team.url)], [])
+
+    def test_show_cameras(self) -> None:
+        """On a desk all three cameras live; one that is scrolled away or whose device is gone is not asked for."""
+        page = self.opened(DESK)
+        page.locator("figure[data-camera=live]").nth(2).wait_for()
+        self.team.order("gone dog2")
+        page.locator("figure[data-camera=gone]", has_text="dog2").wait_for()
+        self.assertIn("gone", page.locator("figure", has_text="dog2").inner_text())
+        page.wait_for_timeout(300)
+        self.asked.clear()
+        page.wait_for_timeout(600)
+        self.assertFalse([url for url in self.asked if "/shot/0202" in url])
+        self.assertTrue([url for url in self.asked if "/shot/0101" in url])
+        page.context.close()
+        phone = self.opened(PHONE)
+        phone.wait_for_timeout(500)
+        self.assertFalse([url for url in self.asked if "/shot/" in url])
+        phone.locator("#cameras").scroll_into_view_if_needed()
+        phone.locator("figure[data-camera=live]").first.wait_for()
+
+    def test_show_who_left(self) -> None:
+        """A device that leaves stands in its place as gone, with its age, and comes back by itself."""
+        page = self.opened(DESK)
+        self.assertEqual(self.names(page), ["dog1", "dog2", "dog3"])
+        self.team.order("gone dog1")
+        page.locator(".device[data-state=GONE]", has_text="dog1").wait_for()
+        self.assertEqual(self.names(page), ["dog1", "dog2", "dog3"])
+        self.assertIn("gone", page.locator(".device").first.inner_text())
+        self.told(page, "dog1 is gone")
+        self.team.order("back dog1")
+        page.locator(".device[data-state=WAITING]", has_text="dog1").wait_for()
+
+    def test_open_a_device(self) -> None:
+        """A double click, a tap and Enter open a device; a single click does not; Escape closes."""
+        page = self.opened(DESK)
+        dialog = page.locator("dialog[open]")
+        page.locator(".device").nth(1).click()
+        page.wait_for_timeout(200)
+        self.assertEqual(dialog.count(), 0)
+        page.locator(".device").nth(1).dblclick()
+        dialog.wait_for()
+        for words in ("dog2", "base2d", "192.168.0.12:7000", "red target seen at 0.62 m"):
+            self.assertIn(words, dialog.inner_text())
+        page.keyboard.press("Escape")
+        dialog.wait_for(state="hidden")
+        page.locator(".device").nth(2).focus()
+        page.keyboard.press("Enter")
+        dialog.wait_for()
+        phone = self.opened(PHONE)
+        phone.locator(".device").first.tap()
+        phone.locator("dialog[open]").wait_for()
+
+    def test_speak_to_a_device(self) -> None:
+        """From the dialog a message is sent and a device told to leave; the answer stands there in words."""
+        page = self.opened(DESK)
+        page.locator(".device").first.dblclick()
+        page.locator("#d-text").fill("sit")
+        page.keyboard.press("Enter")
+        page.locator("#d-answer", has_text="Message sent").wait_for()
+        self.assertEqual(page.locator("#d-text").input_value(), "")
+        page.get_by_role("button", name="Disconnect").click()
+        page.locator("#d-answer", has_text="15 s").wait_for()
+
+    def test_give_tasks(self) -> None:
+        """Run Demo, assigning a chosen task and cancelling one are each a button and an answer in words."""
+        page = self.opened(PHONE)
+        page.get_by_role("button", name="Run Demo").tap()
+        self.told(page, "The demo runs")
+        page.locator("#task").select_option("patrol")
+        page.get_by_role("button", name="Assign").tap()
+        self.told(page, "Assigned")
+        page.get_by_role("button", name="Cancel").first.tap()
+        self.told(page, "sent")
+        self.assertIn("dog1: no gripper", page.locator("#tasks").inner_text())
+
+    def test_show_consensus(self) -> None:
+        """The group's consensus point and every bid stand there; a status is a word and a shape."""
+        page = self.opened(PHONE)
+        self.assertEqual(page.locator(".point").inner_text(), "dog2 – 3 of 3 agree")
+        self.assertEqual(page.locator(".cost").all_inner_texts(), ["1.04 m", "0.62 m", "1.37 m"])
+        shapes = [path.get_attribute("d") for path in page.locator("#devices .badge path").all()]
+        self.assertEqual(len(set(shapes)), 3)
+        self.team.order("status dog3 DONE")
+        page.locator(".device[data-state=DONE]", has_text="done").wait_for()
+
+    def test_move_the_target(self) -> None:
+        """A click, a drag and the arrow keys move the target; a button takes it away."""
+        page = self.opened(DESK)
+        box = page.locator(".floor").bounding_box()
+
+        def at(x: float, y: float) -> tuple[float, float]:
+            return box["x"] + box["width"] * x / 3.0, box["y"] + box["height"] * (1 - y / 2.4)
+
+        page.mouse.click(*at(2.03, 2.0))
+        page.locator("#place", has_text="Target at 2.0").wait_for()
+        ball = page.locator(".target .ball").bounding_box()
+        page.mouse.move(ball["x"] + ball["width"] / 2, ball["y"] + ball["height"] / 2)
+        page.mouse.down()
+        page.mouse.move(*at(1.5, 1.5), steps=4)
+        page.mouse.move(*at(1.03, 1.0), steps=4)
+        page.mouse.up()
+        self.told(page, "Target moved to 1.0")
+        page.locator("#place", has_text="Target at 1.0").wait_for()
+        page.locator(".target").focus()
+        for _ in range(4):
+            page.keyboard.press("ArrowRight")
+        page.locator("#place", has_text="Target at 1.2").wait_for()
+        page.get_by_role("button", name="Take away").click()
+        page.locator("#place", has_text="No target").wait_for()
+        page.get_by_role("button", name="Place target").click()
+        page.locator("#place", has_text="Target at 1.50, 1.20").wait_for()
+
+    def test_survive_loss(self) -> None:
+        """A frozen node is noticed within about two seconds, a killed one at once; the page goes on when it is back."""
+        page = self.opened(DESK)
+        started = time.monotonic()
+        self.team.order("freeze 4")
+        page.locator("#link[data-link=lost]").wait_for()
+        self.assertLess(time.monotonic() - started, 3.5)
+        page.locator("#link[data-link=live]").wait_for()
+        self.team.stop()
+        page.locator("#link[data-link=lost]").wait_for()
+        self.told(page, "Connection lost")
+        page.get_by_role("button", name="Run Demo").click()
+        self.told(page, "does not answer")
+        self.team = Team(self.team.port)
+        page.locator("#link[data-link=live]").wait_for()
+        page.locator("figure[data-camera=live]").nth(2).wait_for()

@@ -1,0 +1,79 @@
+"""Tests with real processes: nothing of a team outlives whoever started it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from twisted.trial.unittest import SynchronousTestCase
+
+ROOT = Path(__file__).resolve().parents[2]
+CHILD = "import os, sys, time; print(os.getpid(), *sys.argv[1:], flush=True); time.sleep(60)"
+PARENT = """
+import sys
+from pathlib import Path
+from twisted.internet import reactor
+from sim.processes import Team
+team = Team(reactor, Path(sys.argv[1]), lambda name, line: print(line, flush=True))
+for name in ("a", "b"):
+    team.add(name, [sys.argv[2], name])
+team.start()
+reactor.addSystemEventTrigger("before", "shutdown", team.stop)
+reactor.run()
+"""
+PATIENCE_S = 15.0
+
+
+def is_alive(pid: int) -> bool:
+    """Whether a process with this id runs."""
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    # Where nobody collects orphans the dead stay in the table.
+    try:
+        return ") Z " not in Path(f"/proc/{pid}/stat").read_text(encoding="ascii", errors="replace")
+    except OSError:
+        return False
+
+
+class OrphanTests(SynchronousTestCase):
+    """Children end with their parent, however that ends."""
+
+    def setUp(self) -> None:
+        folder = Path(self.mktemp()).resolve()
+        folder.mkdir()
+        child = folder / "child.py"
+        child.write_text(CHILD, encoding="utf-8")
+        self.parent = subprocess.Popen(
+            [sys.executable, "-c", PARENT, str(folder), str(child)], cwd=ROOT, stdout=subprocess.PIPE, text=True
+        )
+        assert self.parent.stdout is not None
+        self.addCleanup(self.parent.stdout.close)
+        self.addCleanup(self.parent.kill)
+        lines = [self.parent.stdout.readline().split() for _ in range(2)]
+        self.pids = [int(line[0]) for line in lines]
+        self.assertEqual(sorted(line[1] for line in lines), ["a", "b"])
+
+    def assert_ended(self) -> None:
+        """Wait until no child runs, and fail where one still does."""
+        end = time.monotonic() + PATIENCE_S
+        while any(map(is_alive, self.pids)) and time.monotonic() < end:
+            time.sleep(0.05)
+        self.assertEqual([pid for pid in self.pids if is_alive(pid)], [])
+
+    def test_killed_parent_leaves_no_orphan(self) -> None:
+        """When the parent is killed by SIGKILL, its children end by themselves."""
+        self.parent.kill()
+        self.parent.wait(PATIENCE_S)
+        self.assert_ended()
+
+    def test_interrupted_parent_ends_its_children_first(self) -> None:
+        """When the parent is interrupted (Ctrl-C), it ends its children before it ends itself."""
+        self.parent.send_signal(signal.SIGINT)
+        self.parent.wait(PATIENCE_S)
+        self.assert_ended()

@@ -1,0 +1,148 @@
+"""The web node on a real port: Flask and the native streams beside each other."""
+
+from __future__ import annotations
+
+import json
+import threading
+from typing import Any
+
+from twisted.internet import reactor as _reactor
+from twisted.internet.defer import Deferred, maybeDeferred
+from twisted.internet.protocol import Protocol
+from twisted.internet.task import deferLater
+from twisted.trial.unittest import TestCase
+from twisted.web.client import Agent, HTTPConnectionPool, readBody
+from twisted.web.http_headers import Headers
+
+from webnode.desk import MemoryDesk
+from webnode.errors import PortTaken
+from webnode.live import MemoryFrames
+from webnode.server import WORKERS, WebService, web_service
+from webnode.state import State, state_of
+
+reactor: Any = _reactor
+
+
+class Stream(Protocol):
+    """Collects what a stream says, and waits for words in it."""
+
+    def __init__(self) -> None:
+        self.data = b""
+        self._waiting: list[tuple[bytes, Deferred[bytes]]] = []
+
+    def dataReceived(self, data: bytes) -> None:
+        self.data += data
+        for entry in [entry for entry in self._waiting if entry[0] in self.data]:
+            self._waiting.remove(entry)
+            entry[1].callback(self.data)
+
+    def said(self, words: bytes) -> Deferred[bytes]:
+        found: Deferred[bytes] = Deferred()
+        self._waiting.append((words, found))
+        self.dataReceived(b"")
+        return found.addTimeout(5, reactor)
+
+
+class WebServiceTests(TestCase):
+    timeout = 20
+
+    def setUp(self) -> None:
+        self.devices: list[dict[str, Any]] = [{"uuid": "01", "name": "dog1", "joined": 1}]
+        self.gate = threading.Event()
+        self.gate.set()
+        self.desk = MemoryDesk()
+        self.frames = MemoryFrames()
+        self.web = self.service(0)
+        self.web.startService()
+        self.pool = HTTPConnectionPool(reactor, persistent=False)
+        self.agent = Agent(reactor, pool=self.pool, connectTimeout=5)
+
+    async def tearDown(self) -> None:  # type: ignore[override]
+        self.gate.set()
+        if self.web.running:
+            await maybeDeferred(self.web.stopService)
+        await self.pool.closeCachedConnections()
+        await deferLater(reactor, 0.05)
+
+    def service(self, port: int) -> WebService:
+        return web_service(reactor, "127.0.0.1", port, self.read, self.desk, self.frames, lambda: 1e9)
+
+    def read(self) -> State:
+        if threading.current_thread() is not threading.main_thread():
+            self.gate.wait(10)
+        return state_of(self.devices, [], {}, node="vaio")
+
+    def asked(self, path: str, method: bytes = b"GET") -> Deferred[Any]:
+        url = f"http://127.0.0.1:{self.web.port}{path}".encode()
+        return self.agent.request(method, url, Headers({"X-Swarm": ["1"]}))
+
+    async def body(self, path: str, method: bytes = b"GET") -> bytes:
+        return bytes(await readBody(await self.asked(path, method)))
+
+    async def opened(self, path: str) -> Stream:
+        stream = Stream()
+        (await self.asked(path)).deliverBody(stream)
+        return stream
+
+    async def test_serve_everything(self) -> None:
+        """Page, JSON, a file, a picture and a wish all go over the one port."""
+        self.assertIn(b"vaio", await self.body("/"))
+        self.assertEqual(json.loads(await self.body("/api/devices"))[0]["name"], "dog1")
+        self.assertIn(b"EventSource", await self.body("/static/stream.js"))
+        asked = self.asked("/shot/01?after=")
+        while "01" not in self.frames.watched:
+            await deferLater(reactor, 0.01)
+        self.frames.show("01", 1, b"\xff\xd8.")
+        self.assertEqual(await readBody(await asked), b"\xff\xd8.")
+        self.assertEqual(json.loads(await self.body("/api/demo", b"POST")), {"id": "demo-1"})
+
+    async def test_push_changes(self) -> None:
+        """A device that joins is on the open page by itself."""
+        stream = await self.opened("/events")
+        await stream.said(b"dog1")
+        self.devices.append({"uuid": "02", "name": "dog2", "joined": 2})
+        await stream.said(b"dog2")
+
+    async def test_stream_while_workers_are_stuck(self) -> None:
+        """With every worker held, states, files and pictures still go out; afterwards the held answers come too."""
+        self.gate.clear()
+        held = [self.asked("/api/state") for _ in range(WORKERS + 2)]
+        stream = await self.opened("/events")
+        await stream.said(b"dog1")
+        self.devices.append({"uuid": "02", "name": "dog2", "joined": 2})
+        await stream.said(b"dog2")
+        self.assertIn(b"EventSource", await self.body("/static/stream.js"))
+        self.gate.set()
+        for each in held:
+            self.assertIn(b"dog2", await readBody(await each))
+
+    async def test_feed_many_pages(self) -> None:
+        """Sixty open pages are all fed, and JSON is answered beside them."""
+        streams = [await self.opened("/events") for _ in range(60)]
+        self.devices.append({"uuid": "02", "name": "dog2", "joined": 2})
+        for stream in streams:
+            await stream.said(b"dog2")
+        self.assertIn(b"dog2", await self.body("/api/state"))
+
+    def test_tell_of_taken_port(self) -> None:
+        """A port that another program holds is told in one line that says where and what to do."""
+        second = self.service(self.web.port)
+        words = str(self.assertRaises(PortTaken, second.startService))
+        self.assertIn(f"127.0.0.1:{self.web.port}", words)
+        self.assertIn("choose another port", words)
+        self.assertNotIn("\n", words)
+
+    async def test_stop(self) -> None:
+        """Stopping ends the streams and the held questions, frees the port, and leaves nothing that ticks."""
+        stream = await self.opened("/events")
+        await stream.said(b"dog1")
+        held = self.asked("/shot/01?after=")
+        while "01" not in self.frames.watched:
+            await deferLater(reactor, 0.01)
+        port = self.web.port
+        await maybeDeferred(self.web.stopService)
+        self.assertEqual((await held).code, 204)
+        self.assertEqual(self.frames.watched, {})
+        again = self.service(port)
+        again.startService()
+        await maybeDeferred(again.stopService)

@@ -1,0 +1,264 @@
+"""Tests of the demonstration: configurations, the story, the judgement of an experiment, and the event stream."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from sim.configuration import DOGS, Plan
+from sim.demo import main
+from sim.experiment import LIMIT_S, Experiment, report, table, to_target
+from sim.stage import MARK, Trouble, fresh
+from sim.story import present, told
+from sim.visitor import MAX_EVENT, EventStream
+
+TASK = "t1"
+
+
+def snapshot(*xs: float, moving: str = "", target: bool = True) -> dict[str, Any]:
+    """The yard with dog1, dog2, ... at ``(x, 0)`` and the target at the origin."""
+    dogs = [
+        {"name": f"dog{number}", "x": x, "y": 0.0, "heading": 0.0, "moving": f"dog{number}" == moving}
+        for number, x in enumerate(xs, 1)
+    ]
+    return {"t": 0.0, "dogs": dogs, "target": {"x": 0.0, "y": 0.0, "radius": 0.08} if target else None}
+
+
+def state(task: str, by: str = "", **statuses: str) -> dict[str, Any]:
+    """What the page says: the task's status, who finished, and the status of each dog."""
+    return {
+        "devices": [
+            {"uuid": name, "name": name, "status": status, "task": TASK, "gone": None}
+            for name, status in statuses.items()
+        ],
+        "tasks": [{"id": TASK, "title": "Find", "status": task, "result": {"by": by, "took": 9.0} if by else None}],
+        "groups": [],
+    }
+
+
+class ExperimentTests(SynchronousTestCase):
+    """An experiment is judged by where the dogs are."""
+
+    def setUp(self) -> None:
+        self.first = Experiment("one", TASK, kills=False, started=0.0)
+        self.second = Experiment("two", TASK, kills=True, started=0.0)
+
+    def test_nearest_dog_at_the_target_passes(self) -> None:
+        """The nearest executes and stands at the target when the task is completed: all checks hold."""
+        self.first.look(5.0, state("EXECUTING", dog1="EXECUTING", dog2="WAITING"), snapshot(1.0, 1.5))
+        self.first.look(9.0, state("COMPLETED", "dog1", dog1="DONE"), snapshot(0.30, 1.5))
+        self.assertTrue(self.first.held, table([self.first]))
+        self.assertAlmostEqual(self.first.gap_m or 0.0, 0.10)
+
+    def test_wrong_dog_fails(self) -> None:
+        """A dog that was not the nearest when they decided fails the experiment, though it reached the target."""
+        self.first.look(5.0, state("EXECUTING", dog2="EXECUTING"), snapshot(1.0, 1.5))
+        self.first.look(9.0, state("COMPLETED", "dog2"), snapshot(1.0, 0.25))
+        self.assertFalse(self.first.held)
+        self.assertIn("nearest: dog1", table([self.first]))
+
+    def test_claim_without_reaching_the_target_fails(self) -> None:
+        """A task said to be completed by a dog that is far away fails."""
+        self.first.look(5.0, state("EXECUTING", dog1="EXECUTING"), snapshot(1.0, 1.5))
+        self.first.look(9.0, state("COMPLETED", "dog1"), snapshot(0.8, 1.5))
+        self.assertFalse(self.first.held)
+
+    def test_nobody_is_killed_in_the_first_experiment(self) -> None:
+        """Without ``kills`` no dog is named, however near it comes."""
+        self.first.look(5.0, state("EXECUTING", dog1="EXECUTING"), snapshot(1.0, 1.5))
+        self.assertEqual(self.first.look(6.0, state("EXECUTING", dog1="EXECUTING"), snapshot(0.4, 1.5)), "")
+
+    def test_dog_is_killed_once_and_on_its_way(self) -> None:
+        """The dog is named when it has come 0.1 m nearer, not before, and only once."""
+        running = state("EXECUTING", dog1="EXECUTING", dog2="WAITING")
+        named = [self.second.look(x, running, snapshot(1.05 - x, 1.5)) for x in (0.0, 0.05, 0.11, 0.2)]
+        self.assertEqual(named, ["", "", "dog1", ""])
+
+    def test_takeover_is_timed_until_another_dog_moves(self) -> None:
+        """The takeover lasts from the kill until another dog executes and moves; the lost one no longer counts."""
+        running = state("EXECUTING", dog1="EXECUTING", dog2="WAITING")
+        self.second.look(0.0, running, snapshot(1.0, 1.5))
+        self.assertEqual(self.second.look(1.0, running, snapshot(0.8, 1.5)), "dog1")
+        self.second.look(1.5, running, snapshot(0.8, 1.5, moving="dog1"))
+        taken = state("EXECUTING", dog1="EXECUTING", dog2="EXECUTING")
+        self.second.look(2.0, taken, snapshot(0.8, 1.5))
+        self.assertIsNone(self.second.takeover_s)
+        self.second.look(2.25, taken, snapshot(0.8, 1.5, moving="dog2"))
+        self.assertAlmostEqual(self.second.takeover_s or 0.0, 1.25)
+        self.second.look(9.0, state("COMPLETED", "dog2", dog2="DONE"), snapshot(0.8, 0.3))
+        self.assertTrue(self.second.held, table([self.second]))
+
+    def test_second_experiment_without_a_loss_fails(self) -> None:
+        """A task completed before any dog was lost proves nothing, and fails."""
+        self.second.look(0.0, state("EXECUTING", dog1="EXECUTING"), snapshot(0.3, 1.5))
+        self.second.look(1.0, state("COMPLETED", "dog1"), snapshot(0.25, 1.5))
+        self.assertFalse(self.second.held)
+
+    def test_lost_dog_that_finishes_fails(self) -> None:
+        """A result in the name of the dog that was killed is no takeover."""
+        running = state("EXECUTING", dog1="EXECUTING")
+        self.second.look(0.0, running, snapshot(1.0, 1.5))
+        self.second.look(1.0, running, snapshot(0.8, 1.5))
+        self.second.look(2.0, state("COMPLETED", "dog1"), snapshot(0.3, 1.5))
+        self.assertFalse(self.second.held)
+
+    def test_gone_dog_does_not_execute(self) -> None:
+        """A device that the page shows as gone is not taken for the one that executes."""
+        gone = state("EXECUTING", dog1="EXECUTING")
+        gone["devices"][0]["gone"] = 1.0
+        self.second.look(0.0, gone, snapshot(1.0))
+        self.assertEqual(self.second.look(1.0, gone, snapshot(0.5)), "")
+
+    def test_experiment_ends_when_time_is_up(self) -> None:
+        """A task that never ends is over after the limit, and fails with its status in words."""
+        self.first.look(LIMIT_S - 1, state("OPEN"), None)
+        self.assertFalse(self.first.is_over)
+        self.first.look(LIMIT_S + 1, state("OPEN"), None)
+        self.assertTrue(self.first.is_over)
+        self.assertIn("out of time, task OPEN", table([self.first]))
+
+    def test_failed_task_fails(self) -> None:
+        """A task that failed ends the experiment, which fails."""
+        self.first.look(1.0, state("FAILED"), snapshot(1.0))
+        self.assertTrue(self.first.is_over)
+        self.assertFalse(self.first.held)
+
+    def test_report_says_the_same_as_the_table(self) -> None:
+        """The report for programs has each check of the table with its truth."""
+        self.first.look(1.0, state("FAILED"), snapshot(1.0))
+        (row,) = report([self.first])
+        self.assertFalse(row["held"])
+        self.assertEqual(list(row["checks"].values()), [check.held for check in self.first.checks()])
+
+    def test_distances_need_a_target(self) -> None:
+        """Without a target, or without a snapshot, there are no distances."""
+        self.assertEqual(to_target(snapshot(1.0, target=False)), {})
+        self.assertEqual(to_target(None), {})
+        self.assertEqual(to_target(snapshot(-2.0)), {"dog1": 2.0})
+
+
+class StoryTests(SynchronousTestCase):
+    """What changed is told in words."""
+
+    def test_devices_join_change_leave_and_return(self) -> None:
+        """A device is told when it joins, changes its status, goes, and comes back; nothing is told twice."""
+        idle, busy = state("OPEN", dog1="IDLE"), state("OPEN", dog1="SEARCHING")
+        gone = state("OPEN", dog1="GONE")
+        gone["devices"][0]["gone"] = 3.0
+        self.assertIn("dog1 joined", told({}, idle))
+        self.assertEqual(told(idle, busy), ["dog1: IDLE -> SEARCHING"])
+        self.assertEqual(told(busy, busy), [])
+        self.assertEqual(told(busy, gone), ["dog1 is gone"])
+        self.assertEqual(told(gone, state("OPEN")), [])
+        self.assertEqual(told(gone, idle), ["dog1 is back"])
+
+    def test_task_is_told_with_its_result(self) -> None:
+        """A task's end names who did it, and how long it took."""
+        self.assertEqual(
+            told(state("EXECUTING"), state("COMPLETED", "dog2")),
+            ["task 'Find': EXECUTING -> COMPLETED by dog2 in 9.0 s"],
+        )
+
+    def test_consensus_is_told_with_the_bids(self) -> None:
+        """A group's consensus point is told with the bids that led to it, once."""
+        after = state("OPEN")
+        members = [{"name": "dog1", "cost": 0.5}, {"name": "dog2", "cost": None}]
+        after["groups"] = [{"task": TASK, "members": members, "assigned": "dog1", "agree": 2, "of": 2}]
+        self.assertEqual(told(state("OPEN"), after), ["2 of 2 agree on dog1 (dog1 0.50 m)"])
+        self.assertEqual(told(after, after), [])
+
+    def test_present_leaves_out_the_gone(self) -> None:
+        """Only devices that are there count as present."""
+        both = state("OPEN", dog1="IDLE", dog2="GONE")
+        self.assertEqual(list(present(both)), ["dog1"])
+
+
+class ConfigurationTests(SynchronousTestCase):
+    """The configurations are TOML that says what was planned."""
+
+    def setUp(self) -> None:
+        ports = {"vaio": 7000, "dog1": 7001, "dog2": 7002, "dog3": 7003}
+        folder = Path('/tmp/a "strange"\\folder\x7f')
+        self.plan = Plan(folder, "ab" * 32, "127.0.0.1", 8080, 7400, ports)
+        self.tables = {name: tomllib.loads(text) for name, text in self.plan.texts().items()}
+
+    def test_every_node_has_a_file_in_lawful_toml(self) -> None:
+        """One laptop and three dogs, each with its own port and store, whatever the folder is called."""
+        self.assertEqual(list(self.tables), ["vaio", *DOGS])
+        nodes = [table["node"] for table in self.tables.values()]
+        self.assertEqual([node["port"] for node in nodes], [7000, 7001, 7002, 7003])
+        self.assertEqual(nodes[1]["store"], str(self.plan.run_dir / "dog1.sqlite"))
+        self.assertEqual({node["team_key"] for node in nodes}, {"ab" * 32})
+
+    def test_dogs_know_the_laptop_and_drive_themselves(self) -> None:
+        """A dog knows the bootstrap node only, and its driver asks for the robot of its own name."""
+        dog = self.tables["dog2"]
+        self.assertEqual(dog["node"]["known_nodes"], ["127.0.0.1:7000"])
+        self.assertEqual(dog["agent"], {"module": "search"})
+        self.assertEqual((dog["driver"]["kind"], dog["driver"]["options"]["robot"]), ("sim", "dog2"))
+
+    def test_laptop_has_the_page_and_no_driver(self) -> None:
+        """The laptop serves the page over the yard, and has neither agent nor driver."""
+        self.assertEqual(self.tables["vaio"]["web"], {"host": "127.0.0.1", "port": 8080, "yard": "127.0.0.1:7400"})
+        self.assertEqual(set(self.tables["vaio"]), {"node", "web"})
+
+
+class EventStreamTests(SynchronousTestCase):
+    """Server-sent events come out of bytes."""
+
+    WIRE = b'event: state\r\ndata: {"a":\r\ndata: 1}\r\n\r\n: heartbeat\n\nevent: other\ndata:x\n\ndata: y\n\n'
+
+    def test_events_survive_any_cut(self) -> None:
+        """The same events come out whole and byte by byte; comments are none."""
+        wanted = [("state", b'{"a":\n1}'), ("other", b"x"), ("message", b"y")]
+        self.assertEqual(EventStream().feed(self.WIRE), wanted)
+        stream = EventStream()
+        pieces = [event for byte in self.WIRE for event in stream.feed(bytes([byte]))]
+        self.assertEqual(pieces, wanted)
+
+    def test_endless_line_is_dropped(self) -> None:
+        """A line without end does not fill the memory; the stream is understood again after it."""
+        stream = EventStream()
+        stream.feed(b"data: " + b"x" * (MAX_EVENT + 1))
+        self.assertEqual(stream.feed(b"\n\ndata: y\n\n"), [("message", b"y")])
+
+
+class StageTests(SynchronousTestCase):
+    """The run folder is emptied only where it is ours."""
+
+    def setUp(self) -> None:
+        self.folder = Path(self.mktemp())
+
+    def test_foreign_folder_is_refused(self) -> None:
+        """A folder with somebody's file in it is refused and left as it is."""
+        self.folder.mkdir()
+        (self.folder / "thesis.txt").write_text("mine")
+        with self.assertRaises(Trouble):
+            fresh(self.folder)
+        self.assertTrue((self.folder / "thesis.txt").exists())
+
+    def test_earlier_run_is_removed(self) -> None:
+        """Stores and logs of an earlier demonstration are gone, so no run sees the records of another."""
+        fresh(self.folder).close()
+        (self.folder / "dog1.sqlite").write_text("old")
+        (self.folder / "inner").mkdir()
+        fresh(self.folder).close()
+        self.assertEqual([entry.name for entry in self.folder.iterdir()], [MARK])
+
+    def test_second_demonstration_is_refused(self) -> None:
+        """While one demonstration holds the folder a second one is refused in one line."""
+        with fresh(self.folder):
+            error = self.assertRaises(Trouble, fresh, self.folder)
+            self.assertNotIn("\n", str(error))
+        fresh(self.folder).close()
+
+
+class CommandLineTests(SynchronousTestCase):
+    """The command line says what is wrong with it."""
+
+    def test_unknown_option_ends_with_two(self) -> None:
+        """An option that does not exist ends the program with exit code 2 before anything starts."""
+        self.assertEqual(self.assertRaises(SystemExit, main, ["--nonsense"]).code, 2)

@@ -1,0 +1,134 @@
+"""Tests of the team of processes, on a reactor in memory."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from twisted.internet.error import ProcessExitedAlready, ProcessTerminated
+from twisted.internet.interfaces import IReactorProcess
+from twisted.internet.protocol import ProcessProtocol
+from twisted.internet.task import Clock
+from twisted.python.failure import Failure
+from twisted.trial.unittest import SynchronousTestCase
+from zope.interface import implementer
+
+from sim.processes import Team, on_leash
+
+
+class MemoryProcess:
+    """A process that ends when it is told to, or, with ``stubborn``, only when it is killed."""
+
+    def __init__(self, clock: Clock, pid: int, arguments: list[str], protocol: ProcessProtocol, stubborn: bool) -> None:
+        self._clock = clock
+        self.pid = pid
+        self.arguments = arguments
+        self.signals: list[str] = []
+        self._protocol = protocol
+        self._stubborn = stubborn
+        self._ended = False
+
+    def signalProcess(self, signal: str) -> None:
+        if self._ended:
+            raise ProcessExitedAlready
+        self.signals.append(signal)
+        if signal == "KILL" or not self._stubborn:
+            self._ended = True
+            self._clock.callLater(0.0, self._protocol.processEnded, Failure(ProcessTerminated(1)))
+
+    def write_line(self, data: bytes) -> None:
+        """Write to standard output."""
+        self._protocol.outReceived(data)
+
+
+@implementer(IReactorProcess)
+class MemoryProcesses(Clock):
+    """A reactor whose processes are objects."""
+
+    def __init__(self, stubborn: bool = False) -> None:
+        super().__init__()
+        self.started: list[MemoryProcess] = []
+        self._stubborn = stubborn
+
+    def spawnProcess(  # type: ignore[override]
+        self, protocol: Any, executable: Any, args: Any = (), *_: Any, **__: Any
+    ) -> Any:
+        process = MemoryProcess(self, 100 + len(self.started), list(args), protocol, self._stubborn)
+        self.started.append(process)
+        protocol.makeConnection(process)
+        return process
+
+
+class TeamTests(SynchronousTestCase):
+    """Processes are started, heard, killed, started again and ended."""
+
+    def setUp(self) -> None:
+        self.folder = Path(self.mktemp())
+        self.folder.mkdir()
+        self.said: list[tuple[str, str]] = []
+
+    def team(self, stubborn: bool = False) -> tuple[Team, MemoryProcesses]:
+        reactor = MemoryProcesses(stubborn)
+        team = Team(reactor, self.folder, lambda name, line: self.said.append((name, line)))
+        team.add("dog1", ["-m", "x"])
+        team.add("dog2", ["-m", "y"])
+        team.start()
+        self.addCleanup(reactor.advance, 60.0)
+        self.addCleanup(team.stop)
+        return team, reactor
+
+    def test_processes_start_on_a_leash(self) -> None:
+        """Each process runs under this Python, on a leash, and has its id."""
+        team, reactor = self.team()
+        self.assertEqual(reactor.started[0].arguments, on_leash(["-m", "x"]))
+        self.assertEqual((team.pid("dog1"), team.pid("dog2"), team.missing()), (100, 101, []))
+
+    def test_lines_are_logged_under_the_name(self) -> None:
+        """What a process writes arrives line by line at the listener, in its log file and in its tail."""
+        team, reactor = self.team()
+        reactor.started[0].write_line(b"one\ntw")
+        reactor.started[0].write_line(b"o\n")
+        self.assertEqual(self.said, [("dog1", "one"), ("dog1", "two")])
+        self.assertEqual((self.folder / "dog1.log").read_text(), "one\ntwo\n")
+        self.assertEqual(team.tail("dog1"), ["one", "two"])
+
+    def test_killed_process_stays_away_for_the_delay(self) -> None:
+        """A process killed after a long life comes back after 15 seconds and not before; the others go on."""
+        team, reactor = self.team()
+        reactor.advance(100.0)
+        team.kill("dog1")
+        reactor.advance(0.0)
+        self.assertEqual((reactor.started[0].signals, team.missing()), (["KILL"], ["dog1"]))
+        reactor.advance(14.9)
+        self.assertIsNone(team.pid("dog1"))
+        reactor.advance(0.2)
+        self.assertEqual((team.pid("dog1"), team.pid("dog2")), (102, 101))
+
+    def test_process_that_is_away_cannot_be_killed(self) -> None:
+        """To kill what does not run, or is unknown, is the caller's mistake."""
+        team, _ = self.team()
+        team.kill("dog1")
+        self.assertRaises(KeyError, team.kill, "dog1")
+        self.assertRaises(KeyError, team.kill, "cat1")
+
+    def test_stop_ends_all_and_starts_none(self) -> None:
+        """After ``stop`` no process runs, none comes back, and no timer is left; a second call is answered too."""
+        team, reactor = self.team()
+        team.kill("dog2")
+        reactor.advance(0.0)
+        first, second = team.stop(), team.stop()
+        reactor.pump([0.1] * 3)
+        self.successResultOf(first)
+        self.successResultOf(second)
+        self.successResultOf(team.stop())
+        self.assertEqual((team.missing(), reactor.getDelayedCalls()), (["dog1", "dog2"], []))
+
+    def test_stop_waits_for_the_stubborn_and_kills_them(self) -> None:
+        """A process that ignores the request to end is killed after four seconds, and ``stop`` waits for that."""
+        team, reactor = self.team(stubborn=True)
+        done = team.stop()
+        reactor.pump([0.1] * 30)
+        self.assertNoResult(done)
+        reactor.pump([0.1] * 15)
+        self.successResultOf(done)
+        self.assertEqual(reactor.started[0].signals, ["TERM", "KILL"])

@@ -1,0 +1,288 @@
+"""The rules of the house as tests: who imports whom, what is pure, what is packaged, how tests are written."""
+
+from __future__ import annotations
+
+import ast
+import configparser
+import subprocess
+import sys
+from collections.abc import Iterator
+from importlib.metadata import packages_distributions
+from pathlib import Path
+
+from twisted.trial.unittest import SkipTest, SynchronousTestCase
+
+ROOT = Path(__file__).resolve().parent.parent
+ROOMS = ("agents", "drivers", "middleware", "sim", "webnode")
+
+# From the most special name to the room: what a module may import of the house.  The longest name that fits holds.
+MAY_IMPORT: dict[str, tuple[str, ...]] = {
+    "middleware": ("middleware",),
+    "middleware.entangled": ("middleware.entangled",),
+    "drivers": ("drivers",),
+    "sim": ("sim", "drivers"),
+    "webnode": (
+        "webnode",
+        "middleware.entangled.record",
+        "middleware.entangled.sqlite",
+        "middleware.tasks",
+        "middleware.presence",
+    ),
+    "agents": ("agents", "middleware", "drivers.driver", "drivers.reading", "drivers.errors"),
+    "swarmnode": ("swarmnode", *ROOMS),
+}
+
+# Plain objects: bytes and ``now`` in, decisions out.
+PURE = (
+    "agents.behaviour",
+    "agents.decision",
+    "drivers.errors",
+    "drivers.gate",
+    "drivers.reading",
+    "middleware.consensus.nearest",
+    "middleware.consensus.strategy",
+    "middleware.entangled.errors",
+    "middleware.entangled.identity",
+    "middleware.entangled.kademlia.contact",
+    "middleware.entangled.kademlia.lookup",
+    "middleware.entangled.kademlia.routing",
+    "middleware.entangled.network.network",
+    "middleware.entangled.record",
+    "middleware.entangled.wire.message",
+    "middleware.entangled.wire.noise",
+    "middleware.entangled.wire.session",
+    "middleware.errors",
+    "middleware.presence",
+    "middleware.settings",
+    "middleware.tasks",
+    "sim.configuration",
+    "sim.experiment",
+    "sim.story",
+)
+PURE_LAST_NAMES = ("codec",)
+NOT_IN_PURE = ("twisted", "time", "socket", "threading", "asyncio", "selectors", "subprocess", "secrets", "sqlite3")
+
+# The only modules of the lower floors that may touch the clock, the sockets, threads or the dice of the machine.
+EDGES = (
+    "drivers.sim.link",
+    "middleware.entangled.clock",
+    "middleware.entangled.network.udp",
+    "middleware.entangled.sqlite",
+)
+WORLD = ("time", "socket", "threading", "asyncio", "selectors", "subprocess", "secrets", "twisted.internet.reactor")
+GUARDED = ("middleware", "agents", "drivers")
+
+HEAVY = ("flask", "jinja2", "cv2", "numpy", "pymunk", "serial", "playwright")
+
+
+def _files() -> dict[str, Path]:
+    found = {}
+    for room in ROOMS:
+        for path in sorted((ROOT / room).rglob("*.py")):
+            parts = path.relative_to(ROOT).with_suffix("").parts
+            found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    if (ROOT / "swarmnode.py").exists():
+        found["swarmnode"] = ROOT / "swarmnode.py"
+    return found
+
+
+FILES = _files()
+TREES = {module: ast.parse(path.read_text(encoding="utf-8"), str(path)) for module, path in FILES.items()}
+
+
+def _within(name: str, *allowed: str) -> bool:
+    return any(name == one or name.startswith(one + ".") for one in allowed)
+
+
+def _imports(module: str) -> list[str]:
+    return sorted(set(_import_names(module)))
+
+
+def _import_names(module: str) -> Iterator[str]:
+    """Every module that ``module`` imports, wherever in the file; a name out of a package counts as that module."""
+    for node in ast.walk(TREES[module]):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            source = node.module or ""
+            for alias in node.names:
+                whole = f"{source}.{alias.name}"
+                yield whole if whole in FILES or whole in WORLD else source
+
+
+def _ours(module: str) -> list[str]:
+    return [name for name in _imports(module) if _within(name, "tests", "swarmnode", *ROOMS)]
+
+
+def _allowed(module: str) -> tuple[str, ...]:
+    room = max((name for name in MAY_IMPORT if _within(module, name)), key=len)
+    allowed = MAY_IMPORT[room]
+    parts = module.split(".")
+    if parts[0] == "drivers" and module != "drivers.registry":
+        # A kind of robot never knows another kind; only the registry knows them all.
+        kinds = sorted({name.split(".")[1] for name in FILES if name.count(".") == 2 and name.startswith("drivers.")})
+        own = parts[1] if len(parts) > 2 or module in (f"drivers.{kind}" for kind in kinds) else ""
+        contract = tuple(name for name in FILES if name.startswith("drivers.") and name.split(".")[1] not in kinds)
+        allowed = (*contract, f"drivers.{own}") if own else contract
+    return allowed
+
+
+class FloorPlanTests(SynchronousTestCase):
+    """Imports only go down."""
+
+    def test_imports_follow_the_floor_plan(self) -> None:
+        """No module imports a room that lies above it, beside it, or behind a contract."""
+        wrong = [
+            f"{module} imports {name}"
+            for module in FILES
+            for name in _ours(module)
+            if not _within(name, *_allowed(module))
+        ]
+        self.assertEqual(wrong, [])
+
+    def test_imports_are_absolute(self) -> None:
+        """No module uses a relative import, so the tree can be searched by name."""
+        wrong = [
+            f"{module} line {node.lineno}"
+            for module, tree in TREES.items()
+            for node in ast.walk(tree)
+            if isinstance(node, ast.ImportFrom) and node.level
+        ]
+        self.assertEqual(wrong, [])
+
+    def test_imports_make_no_circle(self) -> None:
+        """No module reaches itself by imports, those inside functions and for types included."""
+        arrows = {module: sorted({name for name in _ours(module) if name in FILES} - {module}) for module in FILES}
+        done: set[str] = set()
+        circles: list[str] = []
+
+        def walk(module: str, path: tuple[str, ...]) -> None:
+            if module in path:
+                circles.append(" -> ".join((*path[path.index(module) :], module)))
+            elif module not in done:
+                for name in arrows[module]:
+                    walk(name, (*path, module))
+                done.add(module)
+
+        for module in FILES:
+            walk(module, ())
+        self.assertEqual(circles, [])
+
+
+class PurityTests(SynchronousTestCase):
+    """Logic is a function of its arguments; the world comes in at listed edges."""
+
+    def test_pure_modules_touch_no_world(self) -> None:
+        """What is listed as pure imports no Twisted, clock, socket, thread or store."""
+        wrong = [
+            f"{module} imports {name}"
+            for module in FILES
+            if _within(module, *PURE) or module.split(".")[-1] in PURE_LAST_NAMES
+            for name in _imports(module)
+            if _within(name, *NOT_IN_PURE)
+        ]
+        self.assertEqual(wrong, [])
+
+    def test_world_enters_at_the_edges_only(self) -> None:
+        """Below the front door only the listed edges import the clock, sockets, threads or the reactor."""
+        wrong = [
+            f"{module} imports {name}; take it as an argument, or make it an edge"
+            for module in FILES
+            if _within(module, *GUARDED) and module not in EDGES
+            for name in _imports(module)
+            if _within(name, *WORLD)
+        ]
+        self.assertEqual(wrong, [])
+
+    def test_dice_are_handed_in(self) -> None:
+        """No module throws the dice of the process (``random.random()``): only ``random.Random`` may be named."""
+        wrong = []
+        for module in FILES:
+            for node in ast.walk(TREES[module]):
+                named = ""
+                if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "random":
+                    named = node.attr
+                elif isinstance(node, ast.ImportFrom) and node.module == "random":
+                    named = next((alias.name for alias in node.names if alias.name != "Random"), "")
+                if named not in ("", "Random") and (named != "SystemRandom" or _within(module, *GUARDED)):
+                    wrong.append(f"{module} line {getattr(node, 'lineno', 0)}: random.{named}")
+        self.assertEqual(wrong, [])
+
+    def test_package_files_hold_only_a_docstring(self) -> None:
+        """An ``__init__`` runs no code, so that importing one module never imports its neighbours."""
+        wrong = [
+            str(path.relative_to(ROOT))
+            for module, path in FILES.items()
+            if path.name == "__init__.py"
+            and not all(isinstance(n, ast.Expr) and isinstance(n.value, ast.Constant) for n in TREES[module].body)
+        ]
+        self.assertEqual(wrong, [])
+
+    def test_edge_node_loads_nothing_heavy(self) -> None:
+        """The front door, the node and the simulated driver load neither the page's nor the yard's libraries."""
+        if "swarmnode" not in FILES:
+            raise SkipTest("swarmnode.py is not there yet")
+        wanted = [
+            name
+            for name in ("middleware.node", "agents.loop", "drivers.registry", "drivers.sim.driver")
+            if name in FILES
+        ]
+        program = (
+            f"import sys, importlib; [importlib.import_module(n) for n in {['swarmnode', *wanted]!r}]; "
+            f"print(*[n for n in {HEAVY!r} if n in sys.modules])"
+        )
+        child = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=60)
+        self.assertEqual((child.returncode, child.stdout.strip()), (0, ""), child.stderr)
+
+
+class PackagingTests(SynchronousTestCase):
+    """What is in the tree is what gets installed."""
+
+    def setUp(self) -> None:
+        self.setup = configparser.ConfigParser()
+        self.setup.read(ROOT / "setup.cfg", encoding="utf-8")
+
+    def test_listed_packages_are_the_folders(self) -> None:
+        """A forgotten package works in an editable install and is missing in the wheel, so the list is compared."""
+        listed = set(self.setup["options"]["packages"].split())
+        found = {
+            ".".join(path.parent.relative_to(ROOT).parts) for room in ROOMS for path in (ROOT / room).rglob("*.py")
+        }
+        self.assertEqual(listed, found | {"twisted.plugins"})
+
+    def test_every_room_is_marked_as_typed(self) -> None:
+        """Each room ships ``py.typed``, or type checkers of users ignore our annotations."""
+        self.assertEqual([room for room in ROOMS if not (ROOT / room / "py.typed").exists()], [])
+
+    def test_twisted_is_not_hidden(self) -> None:
+        """No ``__init__.py`` in our ``twisted`` folders: one would hide Twisted itself, or the plugin."""
+        self.assertEqual(list((ROOT / "twisted").rglob("__init__.py")), [])
+
+    def test_nobody_else_owns_our_names(self) -> None:
+        """No other installed distribution has a top-level package of our names; files of both would mix silently."""
+        owners = packages_distributions()
+        foreign = {
+            room: others
+            for room in (*ROOMS, "swarmnode")
+            if (others := sorted({name for name in owners.get(room, []) if name.lower() != "swarm-node"}))
+        }
+        self.assertEqual(foreign, {}, "give swarm-node a virtual environment of its own")
+
+
+class TestCustomTests(SynchronousTestCase):
+    """Tests keep their own manners."""
+
+    def test_every_test_says_what_it_shows(self) -> None:
+        """Each test method has a docstring, each test folder an ``__init__.py`` and nothing is patched from outside."""
+        wrong = []
+        for path in sorted((ROOT / "tests").rglob("*.py")):
+            tree = ast.parse(path.read_text(encoding="utf-8"), str(path))
+            where = path.relative_to(ROOT)
+            if not (path.parent / "__init__.py").exists():
+                wrong.append(f"{path.parent.relative_to(ROOT)} has no __init__.py")
+            for node in ast.walk(tree):
+                if isinstance(node, ast.FunctionDef) and node.name.startswith("test_") and not ast.get_docstring(node):
+                    wrong.append(f"{where} line {node.lineno}: {node.name} has no docstring")
+                if isinstance(node, ast.ImportFrom) and node.module in ("unittest", "unittest.mock"):
+                    wrong.append(f"{where} line {node.lineno}: use a fake that ships, not a patch")
+        self.assertEqual(wrong, [])

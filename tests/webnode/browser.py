@@ -1,0 +1,56 @@
+"""A browser of bytes: HTTP requests through a real ``Site`` to a transport in memory, on a turned clock."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from twisted.internet.error import ConnectionDone
+from twisted.internet.task import Clock
+from twisted.internet.testing import StringTransport
+from twisted.python.failure import Failure
+from twisted.web.resource import IResource
+from twisted.web.server import Site
+
+from webnode.server import CappedRequest
+
+
+class Connection:
+    """One connection to a site."""
+
+    def __init__(self, site: Site) -> None:
+        self.transport = StringTransport()
+        self.protocol: Any = site.buildProtocol(self.transport.getPeer())
+        self.protocol.makeConnection(self.transport)
+
+    def ask(self, path: str, method: str = "GET", **headers: str) -> Connection:
+        """Send a request without a body; ``_`` in a header's name stands for ``-``."""
+        lines = "".join(f"{name.replace('_', '-')}: {value}\r\n" for name, value in {"Host": "vaio", **headers}.items())
+        return self.send(f"{method} {path} HTTP/1.1\r\n{lines}\r\n".encode())
+
+    def send(self, data: bytes) -> Connection:
+        """Send bytes."""
+        self.protocol.dataReceived(data)
+        return self
+
+    def taken(self) -> bytes:
+        """What has come since the last look."""
+        data: bytes = self.transport.value()
+        self.transport.clear()
+        return data
+
+    def pause(self) -> None:
+        """Read no more: the transport tells its producer to wait."""
+        self.protocol.pauseProducing()
+
+    def resume(self) -> None:
+        """Read again."""
+        self.protocol.resumeProducing()
+
+    def leave(self) -> None:
+        """Close."""
+        self.protocol.connectionLost(Failure(ConnectionDone()))
+
+
+def site_of(root: IResource, clock: Clock) -> Site:
+    """A site on ``clock`` with the web node's own kind of requests."""
+    return Site(root, requestFactory=CappedRequest, reactor=clock, timeout=None)

@@ -1,0 +1,48 @@
+"""What ``webnode.field`` promises."""
+
+from __future__ import annotations
+
+import json
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from twisted.trial.unittest import SynchronousTestCase
+
+from webnode.field import count, distance, number, properties, text, texts
+
+
+class FieldTests(SynchronousTestCase):
+    def test_take_lawful_values(self) -> None:
+        """Lawful values come through as they are."""
+        self.assertEqual(text("dog1"), "dog1")
+        self.assertEqual(number(0.5), 0.5)
+        self.assertEqual(count(3), 3)
+        self.assertEqual(distance(0), 0.0)
+        self.assertEqual(texts(["edge", "web"]), ["edge", "web"])
+        self.assertEqual(properties({"camera": {"fps": 30, "model": "x"}}), {"camera": {"fps": 30.0, "model": "x"}})
+
+    def test_refuse_what_json_cannot_carry(self) -> None:
+        """NaN, infinities, huge integers, truth values and negative lengths become the fallback."""
+        for value in (float("nan"), float("inf"), 10**400, True, "1", None):
+            self.assertEqual(number(value, -7.0), -7.0)
+        self.assertEqual(count(2**60, 5), 5)
+        self.assertIsNone(distance(-1.0))
+
+    def test_clean_text(self) -> None:
+        """Control characters become blanks, and text is cut at its limit."""
+        self.assertEqual(text("a\x00\x1b[31mb"), "a  [31mb")
+        self.assertEqual(text("x" * 500, limit=10), "x" * 10)
+        self.assertEqual(text("\x07", "nothing"), "nothing")
+
+    @settings(max_examples=150, deadline=None, database=None, derandomize=True)
+    @given(
+        st.recursive(
+            st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8) | st.binary(max_size=8),
+            lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=4), inner, max_size=4),
+            max_leaves=8,
+        )
+    )
+    def test_survive_anything(self, value: object) -> None:
+        """Whatever a record holds, the outcome is JSON that a browser can parse, in UTF-8."""
+        outcome = [text(value), number(value), count(value), distance(value), texts(value), properties(value)]
+        json.dumps(outcome, allow_nan=False, ensure_ascii=False).encode()

@@ -1,0 +1,244 @@
+"""What ``webnode.live`` promises."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from typing import Any
+
+from twisted.internet.task import Clock
+from twisted.trial.unittest import SynchronousTestCase
+from twisted.web.resource import Resource
+
+from tests.webnode.browser import Connection, site_of
+from webnode.errors import Refusal
+from webnode.live import MAX_VIEWERS, MAX_WAITING, Events, MemoryFrames, OnFrame, Shots
+
+JPEG = b"\xff\xd8 a picture"
+
+
+def events_in(data: bytes) -> list[tuple[str, Any]]:
+    blocks = [block for block in data.decode().split("\n") if block.startswith(("event: ", "data: "))]
+    return [
+        (name.removeprefix("event: "), json.loads(words.removeprefix("data: ")))
+        for name, words in zip(blocks[::2], blocks[1::2], strict=True)
+    ]
+
+
+class EventsTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.clock = Clock()
+        self.state: dict[str, Any] = {"n": 0}
+        self.yard: dict[str, Any] | None = None
+        self.reads = 0
+        self.events = Events(self.read, self.clock, lambda: 1e9 + self.clock.seconds(), lambda: self.yard)
+        root = Resource()
+        root.putChild(b"events", self.events)
+        self.site = site_of(root, self.clock)
+
+    def read(self) -> dict[str, Any]:
+        self.reads += 1
+        return dict(self.state)
+
+    def connected(self) -> Connection:
+        return Connection(self.site).ask("/events")
+
+    def test_start_with_everything(self) -> None:
+        """A new page gets the whole state, the yard and a beat at once, in a stream that nobody caches."""
+        data = self.connected().taken()
+        self.assertIn(b"text/event-stream", data)
+        self.assertIn(b"no-store", data)
+        beat = {"now": 1e9, "skipped": 0}
+        self.assertEqual(events_in(data), [("state", {"n": 0}), ("yard", None), ("beat", beat)])
+
+    def test_tell_changes_only(self) -> None:
+        """A change is told within a tenth of a second, once; without one there are only beats, each half second."""
+        page = self.connected()
+        page.taken()
+        self.state["n"] = 1
+        self.clock.advance(0.1)
+        self.assertEqual(events_in(page.taken()), [("state", {"n": 1})])
+        self.clock.pump([0.1] * 20)
+        told = events_in(page.taken())
+        self.assertEqual({name for name, _ in told}, {"beat"})
+        self.assertIn(len(told), (4, 5))
+
+    def test_limit_pace(self) -> None:
+        """However often the state changes, a page gets at most ten a second, and the newest last."""
+        page = self.connected()
+        page.taken()
+        for n in range(1, 101):
+            self.state["n"] = n
+            self.clock.advance(0.01)
+        told = [words["n"] for name, words in events_in(page.taken()) if name == "state"]
+        self.assertLessEqual(len(told), 10)
+        self.assertGreaterEqual(len(told), 9)
+        self.assertEqual(told, sorted(told))
+
+    def test_skip_slow_pages(self) -> None:
+        """A page that does not read is written nothing; when it reads again it gets the newest state and the count."""
+        slow, quick = self.connected(), self.connected()
+        slow.taken()
+        slow.pause()
+        for n in range(1, 6):
+            self.state["n"] = n
+            self.clock.advance(0.1)
+        self.assertEqual(slow.taken(), b"")
+        self.assertIn(("state", {"n": 5}), events_in(quick.taken()))
+        slow.resume()
+        self.clock.pump([0.1] * 6)
+        told = events_in(slow.taken())
+        self.assertEqual([words for name, words in told if name == "state"], [{"n": 5}])
+        self.assertGreaterEqual([words for name, words in told if name == "beat"][-1]["skipped"], 5)
+
+    def test_rest_when_nobody_looks(self) -> None:
+        """When the last page has gone, nothing is read and no timer is left."""
+        pages = [self.connected(), self.connected()]
+        for page in pages:
+            page.leave()
+        reads = self.reads
+        self.assertEqual((self.clock.getDelayedCalls(), self.events.viewers), ([], 0))
+        self.clock.advance(5)
+        self.assertEqual(self.reads, reads)
+
+    def test_live_through_failures(self) -> None:
+        """A state that cannot be read for a moment, or that JSON cannot carry, ends no stream and is logged once."""
+        page = self.connected()
+        page.taken()
+        self.state["n"] = float("nan")
+        self.clock.pump([0.1] * 6)
+        self.assertEqual({name for name, _ in events_in(page.taken())}, {"beat"})
+        self.assertEqual(len(self.flushLoggedErrors(ValueError)), 1)
+        self.state["n"] = 2
+        self.clock.advance(0.1)
+        self.assertIn(("state", {"n": 2}), events_in(page.taken()))
+
+    def test_cap_pages(self) -> None:
+        """One page too many is told so, and costs no stream."""
+        for _ in range(MAX_VIEWERS):
+            self.connected()
+        self.assertIn(b" 503 ", self.connected().taken())
+        self.assertEqual(self.events.viewers, MAX_VIEWERS)
+
+    def test_close(self) -> None:
+        """Closing ends every stream and leaves no timer."""
+        page = self.connected()
+        self.events.close()
+        self.assertTrue(page.taken().endswith(b"0\r\n\r\n"))
+        self.assertEqual(self.clock.getDelayedCalls(), [])
+
+
+class BlindFrames:
+    def watch(self, uuid: str, on_frame: OnFrame) -> Callable[[], None]:
+        raise Refusal("device", "it has no camera", "choose another", 404)
+
+
+class ShotsTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.clock = Clock()
+        self.frames = MemoryFrames()
+        self.shots = Shots(self.frames, self.clock)
+        self.site = self.site_with(self.shots)
+
+    def site_with(self, shots: Shots) -> Any:
+        root = Resource()
+        root.putChild(b"shot", shots)
+        return site_of(root, self.clock)
+
+    def asked(self, after: str = "", viewer: str = "") -> Connection:
+        return Connection(self.site).ask(f"/shot/ab?after={after}&viewer={viewer}")
+
+    def test_wait_for_the_next(self) -> None:
+        """A question is held until a picture comes, and is answered with it and its number."""
+        page = self.asked()
+        self.assertEqual(page.taken(), b"")
+        self.frames.show("ab", 7, JPEG)
+        data = page.taken()
+        self.assertIn(b"X-Seq: 7", data)
+        self.assertIn(b"image/jpeg", data)
+        self.assertTrue(data.endswith(JPEG))
+
+    def test_answer_with_the_newest(self) -> None:
+        """Who is behind gets the newest picture at once, never those between, and how old it is."""
+        self.asked()
+        for seq in (1, 2, 3):
+            self.frames.show("ab", seq, JPEG + b"%d" % seq)
+        self.clock.advance(0.25)
+        data = self.asked("1").taken()
+        self.assertIn(b"X-Seq: 3", data)
+        self.assertIn(b"X-Age: 0.250", data)
+        self.assertEqual(self.asked("3").taken(), b"")
+
+    def test_take_a_lower_number_for_new(self) -> None:
+        """A camera that started anew counts from one: its picture is news all the same."""
+        page = self.asked("900")
+        self.frames.show("ab", 1, JPEG)
+        self.assertIn(b"X-Seq: 1", page.taken())
+
+    def test_give_up_after_ten_seconds(self) -> None:
+        """Without a picture the answer after ten seconds is 204, so that the page knows that the node lives."""
+        page = self.asked()
+        self.clock.advance(9.9)
+        self.assertEqual(page.taken(), b"")
+        self.clock.advance(0.1)
+        self.assertIn(b" 204 ", page.taken())
+
+    def test_hold_one_question_a_viewer(self) -> None:
+        """A viewer that asks again has its older question answered with 204; others are left alone."""
+        first, other = self.asked(viewer="a"), self.asked(viewer="b")
+        second = self.asked(viewer="a")
+        self.assertIn(b" 204 ", first.taken())
+        self.frames.show("ab", 1, JPEG)
+        self.assertIn(b" 200 ", second.taken())
+        self.assertIn(b" 200 ", other.taken())
+
+    def test_watch_only_while_somebody_looks(self) -> None:
+        """The upstream starts with the first question and stops two seconds after the last, leaving no timer."""
+        self.assertEqual(list(self.frames.watched), [])
+        page = self.asked(viewer="a")
+        again = self.asked(viewer="a")
+        self.clock.advance(5)
+        self.assertEqual(list(self.frames.watched), ["ab"])
+        self.frames.show("ab", 1, JPEG)
+        self.clock.advance(1.9)
+        self.assertEqual(list(self.frames.watched), ["ab"])
+        self.clock.advance(0.2)
+        self.assertEqual((list(self.frames.watched), self.shots.watched), ([], []))
+        self.assertEqual(self.clock.getDelayedCalls(), [])
+        self.assertTrue(page.taken() and again.taken())
+
+    def test_forget_who_left(self) -> None:
+        """A viewer that closes its connection is waited for no longer."""
+        page = self.asked()
+        page.leave()
+        self.frames.show("ab", 1, JPEG)
+        self.clock.advance(2)
+        self.assertEqual((page.taken(), self.shots.watched), (b"", []))
+
+    def test_drop_what_is_no_picture(self) -> None:
+        """Bytes that are no JPEG, or far too many, go to nobody."""
+        page = self.asked()
+        self.frames.show("ab", 1, b"<script>")
+        self.frames.show("ab", 2, b"\xff\xd8" + bytes(2_000_000))
+        self.assertEqual(page.taken(), b"")
+
+    def test_tell_of_no_camera(self) -> None:
+        """A device without a camera is answered in words, and nothing is kept of it."""
+        shots = Shots(BlindFrames(), self.clock)
+        data = Connection(self.site_with(shots)).ask("/shot/cd?after=").taken()
+        self.assertIn(b" 404 ", data)
+        self.assertIn(b"it has no camera", data)
+        self.assertEqual(shots.watched, [])
+
+    def test_cap_waiting(self) -> None:
+        """More questions than a camera holds are refused."""
+        for _ in range(MAX_WAITING):
+            self.asked()
+        self.assertIn(b" 503 ", self.asked().taken())
+
+    def test_close(self) -> None:
+        """Closing answers whoever waits and stops the upstream now."""
+        page = self.asked()
+        self.shots.close()
+        self.assertIn(b" 204 ", page.taken())
+        self.assertEqual((list(self.frames.watched), self.clock.getDelayedCalls()), ([], []))

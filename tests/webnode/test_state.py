@@ -1,0 +1,122 @@
+"""What ``webnode.state`` promises."""
+
+from __future__ import annotations
+
+import json
+import random
+from typing import Any
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from webnode.state import Departed, group_view, state_of
+
+
+def device(number: int, **more: Any) -> dict[str, Any]:
+    return {"uuid": f"{number:032x}", "name": f"dog{number}", "joined": number, "status": "IDLE", "since": 1.0, **more}
+
+
+def member(number: int, cost: float | None, assigned: int | None) -> dict[str, Any]:
+    named = "" if assigned is None else f"{assigned:032x}"
+    return {"uuid": f"{number:032x}", "name": f"dog{number}", "status": "WAITING", "cost": cost, "assigned": named}
+
+
+class StateTests(SynchronousTestCase):
+    def test_order_by_joining(self) -> None:
+        """Devices stand in the order of joining on every web node, whatever order the records came in."""
+        records = [device(1, joined=3), device(2, joined=1), device(3, joined=2), device(4, joined=2)]
+        rng = random.Random(1)
+        for _ in range(6):
+            rng.shuffle(records)
+            names = [view["name"] for view in state_of(records, [], {})["devices"]]
+            self.assertEqual(names, ["dog2", "dog3", "dog4", "dog1"])
+
+    def test_name_objective(self) -> None:
+        """A device's objective is the title of its task, or the task's id where the task is not known."""
+        tasks = [{"id": "t1", "title": "Find it", "created": 5}]
+        views = state_of([device(1, task="t1"), device(2, task="t9"), device(3)], tasks, {})["devices"]
+        self.assertEqual([view["objective"] for view in views], ["Find it", "t9", ""])
+
+    def test_list_newest_task_first(self) -> None:
+        """Tasks stand newest first, and a result keeps who and how long."""
+        result = {"by": "dog2", "took": 41.5}
+        tasks = [{"id": "a", "created": 1, "result": result, "status": "COMPLETED"}, {"id": "b", "created": 2}]
+        views = state_of([], tasks, {})["tasks"]
+        self.assertEqual([view["id"] for view in views], ["b", "a"])
+        self.assertEqual(views[1]["result"], result)
+        self.assertEqual([view["status"] for view in views], ["UNKNOWN", "COMPLETED"])
+
+    def test_survive_unlawful_records(self) -> None:
+        """Records of the wrong shape neither break the view nor reach the page."""
+        bad: dict[str, Any] = {
+            "uuid": "ab",
+            "name": 7,
+            "capabilities": [1],
+            "network": {"sent": float("nan"), 3: 4},
+            "messages": [["x"], 3, [float("inf"), "m"]],
+            "roles": "edge",
+            "joined": "1",
+            "status": {},
+            "since": None,
+        }
+        state = state_of(
+            [bad, {}], [{"id": 5}, {"id": "t", "result": 3, "note": 1}], {"t": [{"cost": "near"}], "u": []}
+        )
+        json.dumps(state, allow_nan=False)
+        self.assertEqual([view["name"] for view in state["devices"]], ["unnamed"])
+        self.assertEqual(state["devices"][0]["messages"], [[0.0, "m"]])
+        self.assertEqual([group["task"] for group in state["groups"]], ["t"])
+
+
+class GroupTests(SynchronousTestCase):
+    def test_agree(self) -> None:
+        """Where all name the same agent, the consensus point is that agent and the costs share one scale."""
+        view = group_view("t", "T", [member(3, 2.0, 2), member(1, 1.0, 2), member(2, 0.5, 2)])
+        self.assertEqual((view["assigned"], view["agree"], view["of"]), ("dog2", 3, 3))
+        self.assertEqual([each["share"] for each in view["members"]], [0.5, 0.25, 1.0])
+        self.assertEqual((view["differ"], view["undecided"]), ([], []))
+
+    def test_differ(self) -> None:
+        """Who names another, and who names nobody, is told by name; who bids nothing has no share."""
+        view = group_view("t", "T", [member(1, 1.0, 1), member(2, 0.5, 2), member(3, 0.7, 2), member(4, None, None)])
+        self.assertEqual((view["assigned"], view["agree"], view["of"]), ("dog2", 2, 4))
+        self.assertEqual((view["differ"], view["undecided"]), (["dog1"], ["dog4"]))
+        self.assertIsNone(view["members"][3]["share"])
+
+    def test_decide_even_votes(self) -> None:
+        """Even votes give the lowest uuid, in any order of the members."""
+        members = [member(1, 1.0, 2), member(2, 1.0, 1)]
+        self.assertEqual(group_view("t", "T", members)["assigned"], "dog1")
+        self.assertEqual(group_view("t", "T", members[::-1])["assigned"], "dog1")
+
+    def test_be_undecided(self) -> None:
+        """A group without any named winner has no consensus point, and zero costs divide nothing."""
+        view = group_view("t", "T", [member(1, 0.0, None)])
+        self.assertEqual((view["assigned"], view["agree"]), ("", 0))
+        self.assertEqual(view["members"][0]["share"], 0.0)
+
+
+class DepartedTests(SynchronousTestCase):
+    def test_remember_for_a_minute(self) -> None:
+        """A device that left stands there as gone, in its place, for sixty seconds, and then no longer."""
+        departed = Departed()
+        both = [device(1), device(2, status="EXECUTING")]
+        departed.of(both, 100.0)
+        state = state_of(both[1:], [], {}, departed=departed.of(both[1:], 101.0))
+        self.assertEqual([(v["name"], v["status"], v["gone"]) for v in state["devices"]][0], ("dog1", "GONE", 101.0))
+        self.assertEqual([v["gone"] for v in departed.of(both[1:], 160.9)], [101.0])
+        self.assertEqual(departed.of(both[1:], 161.0), [])
+
+    def test_forget_when_back(self) -> None:
+        """A device that comes back is alive at once, and leaves anew with a new moment."""
+        departed = Departed()
+        departed.of([device(1)], 1.0)
+        self.assertEqual(len(departed.of([], 2.0)), 1)
+        self.assertEqual(departed.of([device(1)], 3.0), [])
+        self.assertEqual([v["gone"] for v in departed.of([], 4.0)], [4.0])
+
+    def test_show_present_only_once(self) -> None:
+        """A device among both the present and the departed is shown as present."""
+        departed = Departed()
+        departed.of([device(1)], 1.0)
+        gone = departed.of([], 2.0)
+        self.assertEqual([v["status"] for v in state_of([device(1)], [], {}, departed=gone)["devices"]], ["IDLE"])

@@ -1,0 +1,103 @@
+"""The desk: what an operator can ask the team for.
+
+The front door implements it over the node; ``MemoryDesk`` is the twin in memory, for a page without a team.  Every
+method is called on the reactor's thread and returns at once (or returns a Deferred that fires soon); what cannot be
+is a ``Refusal``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol
+
+from webnode.errors import Refusal
+
+
+class Desk(Protocol):
+    """An operator's wishes; the outcome is seen in the state, not in the answer."""
+
+    def run_demo(self) -> Any:
+        """Assign the demonstration's task; returns its id."""
+
+    def assign(self, name: str) -> Any:
+        """Assign a predefined task; returns its id, or ``{"id", "able": [names], "refused": {name: [reasons]}}``."""
+
+    def catalogue(self) -> Sequence[Mapping[str, Any]]:
+        """The predefined tasks: ``{"name", "title", "requirements"}`` each."""
+
+    def cancel(self, task_id: str) -> Any:
+        """End a task; its devices stop."""
+
+    def message(self, uuid: str, text: str) -> Any:
+        """Send ``text`` to one device, or to all where ``uuid`` is empty."""
+
+    def disconnect(self, uuid: str, seconds: float) -> Any:
+        """Let a device leave the network and come back after ``seconds``."""
+
+    def move_target(self, x: float, y: float) -> Any:
+        """Put the target at (x, y), metres in the yard's frame."""
+
+    def clear_target(self) -> Any:
+        """Take the target away."""
+
+    def yard(self) -> Mapping[str, Any] | None:
+        """The newest overhead snapshot, or None where there is no yard.
+
+        ``{"walls": [w, h], "dogs": [{"name", "x", "y", "heading", "stripes"}], "target": {"x", "y", "radius"} |
+        None}``; metres and radians, origin in the lower left corner.
+        """
+
+
+class MemoryDesk:
+    """A desk that writes down what it is asked, in ``asked``, and keeps the target of its own small yard."""
+
+    def __init__(self, catalogue: Sequence[Mapping[str, Any]] = (), yard: Mapping[str, Any] | None = None) -> None:
+        self.asked: list[tuple[Any, ...]] = []
+        self.tasks = list(catalogue)
+        self.ground: dict[str, Any] | None = dict(yard) if yard is not None else None
+
+    def run_demo(self) -> str:
+        """Return ``demo-N``."""
+        return self._noted("demo")
+
+    def assign(self, name: str) -> dict[str, Any]:
+        """Return ``assign-N``; nobody is able, nobody is refused."""
+        if name not in [task["name"] for task in self.tasks]:
+            raise Refusal("name", f"there is no task {name!r}", "choose one of /api/catalogue", 404)
+        return {"id": self._noted("assign", name), "able": [], "refused": {}}
+
+    def catalogue(self) -> list[Mapping[str, Any]]:
+        """Return what the desk was made with."""
+        return self.tasks
+
+    def cancel(self, task_id: str) -> None:
+        """Write it down."""
+        self._noted("cancel", task_id)
+
+    def message(self, uuid: str, text: str) -> None:
+        """Write it down."""
+        self._noted("message", uuid, text)
+
+    def disconnect(self, uuid: str, seconds: float) -> None:
+        """Write it down."""
+        self._noted("disconnect", uuid, seconds)
+
+    def move_target(self, x: float, y: float) -> None:
+        """Move it."""
+        self._noted("target", x, y)
+        if self.ground is not None:
+            self.ground = {**self.ground, "target": {"x": x, "y": y, "radius": 0.08}}
+
+    def clear_target(self) -> None:
+        """Take it away."""
+        self._noted("clear")
+        if self.ground is not None:
+            self.ground = {**self.ground, "target": None}
+
+    def yard(self) -> dict[str, Any] | None:
+        """Return the ground."""
+        return self.ground
+
+    def _noted(self, *wish: Any) -> str:
+        self.asked.append(wish)
+        return f"{wish[0]}-{len(self.asked)}"

@@ -1,0 +1,75 @@
+"""Ledger: what the data store says of the team, as the state that the page shows (thesis, Algorithm 4.3).
+
+``read`` is all it knows of the store: a key in, the records under it out.  Flask's threads hand in the SQLite file's reader,
+the live stream what the node watches; both make the same state.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict
+from typing import Any
+
+from middleware.entangled.record import Record
+from middleware.presence import DEVICES, Device, devices_of
+from middleware.tasks import TASKS, Task, group_key, member_of, outcome_of, refusals, task_of
+from webnode.state import Departed, State, state_of
+
+Read = Callable[[bytes], list[Record]]
+TASKS_SHOWN = 20
+
+
+def state_from(read: Read, departed: Departed, node: str, now: float) -> State:
+    """The whole state; ``now`` is the wall clock, ``departed`` remembers who left, ``node`` is the name of who serves."""
+    devices = [device for device, _ in devices_of(read(DEVICES))]
+    tasks = sorted(filter(None, map(task_of, read(TASKS))), key=lambda task: (-task.created, task.task_id))
+    rows, groups = [], {}
+    for task in tasks[:TASKS_SHOWN]:
+        records = read(group_key(task.task_id))
+        members = [m for r in records if (m := member_of(r)) is not None]
+        groups[task.task_id] = [asdict(member) for member in members]
+        rows.append(_task_row(task, records, devices))
+    views = [_device_row(device) for device in devices]
+    return state_of(views, rows, groups, departed=departed.of(views, now), node=node)
+
+
+def refused_by(task: Task, devices: list[Device]) -> dict[str, list[str]]:
+    """Why each of ``devices`` cannot do ``task``, by name; those that can are left out (Algorithm 4.4)."""
+    reasons = {device.name: refusals(device.capabilities, task.requirements) for device in devices}
+    return {name: why for name, why in reasons.items() if why}
+
+
+def _device_row(device: Device) -> dict[str, Any]:
+    return asdict(device)
+
+
+def _task_row(task: Task, records: list[Record], devices: list[Device]) -> dict[str, Any]:
+    outcome = outcome_of(records)
+    members = [m for r in records if (m := member_of(r)) is not None]
+    note = ""
+    if outcome is not None:
+        status = outcome.outcome
+        if outcome.bids:
+            note = "reports: " + ", ".join(f"{name} {cost:.2f}" for name, cost in outcome.bids)
+    elif any(m.status == "EXECUTING" for m in members):
+        status = "EXECUTING"
+    elif members:
+        status = "ASSIGNED"
+    else:
+        status = "OPEN"
+        refused = refused_by(task, devices)
+        if len(refused) == len(devices):
+            note = "no device can do it: " + "; ".join(f"{name} {', '.join(why)}" for name, why in refused.items())
+    return {
+        "id": task.task_id,
+        "kind": task.kind,
+        "title": task.title,
+        "requirements": task.requirements,
+        "waiting_period": task.waiting_period,
+        "strategy": task.strategy,
+        "created": task.created,
+        "council": [str(contact.address) for contact in task.council],
+        "status": status,
+        "note": note,
+        "result": None if outcome is None else {"by": outcome.by, "took": outcome.took},
+    }

@@ -1,0 +1,174 @@
+"""The state that the page shows: one pure function from records to a JSON-able view.
+
+The four views of the thesis (section 4.2.4): the devices, what each stores, the objective of each, and the consensus
+point that each group found.  Two web nodes that hold the same records make the same view, whatever order the records
+came in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from webnode.field import count, distance, number, properties, text, texts
+
+State = dict[str, Any]
+Fields = Mapping[str, Any]
+
+DEVICE_STATUSES = ("IDLE", "ASSIGNED", "SEARCHING", "WAITING", "EXECUTING", "DONE")
+TASK_STATUSES = ("OPEN", "ASSIGNED", "EXECUTING", "COMPLETED", "FAILED", "CANCELLED")
+UNKNOWN = "UNKNOWN"
+GONE = "GONE"
+REMEMBERED_S = 60.0
+MESSAGES = 5
+
+
+def state_of(
+    devices: Iterable[Fields],
+    tasks: Iterable[Fields],
+    groups: Mapping[str, Sequence[Fields]],
+    *,
+    departed: Iterable[State] = (),
+    node: str = "",
+) -> State:
+    """The whole view: devices in the order of joining, tasks newest first, groups in the order of the tasks.
+
+    ``departed`` are the devices that left a short while ago (``Departed.of``); ``node`` is the name of the node that
+    serves.
+    """
+    present = [view for view in map(device_view, devices) if view["uuid"]]
+    known = {view["uuid"] for view in present}
+    gone = [view for view in departed if view["uuid"] not in known]
+    shown = sorted([*present, *gone], key=lambda view: (view["joined"], view["uuid"]))
+    listed = [view for view in map(task_view, tasks) if view["id"]]
+    listed.sort(key=lambda view: (-view["created"], view["id"]))
+    titles = {view["id"]: view["title"] for view in listed}
+    for view in shown:
+        view["objective"] = titles.get(view["task"], view["task"])
+    order = {view["id"]: place for place, view in enumerate(listed)}
+    keys = sorted((key for key in groups if groups[key]), key=lambda key: (order.get(key, len(order)), key))
+    return {
+        "node": text(node),
+        "devices": shown,
+        "tasks": listed,
+        "groups": [group_view(key, titles.get(key, key), groups[key]) for key in keys],
+    }
+
+
+def device_view(fields: Fields) -> State:
+    """One device as the page shows it; fields that are missing or no lawful values become empty ones."""
+    network = fields.get("network")
+    return {
+        "uuid": text(fields.get("uuid"), limit=64),
+        "name": text(fields.get("name"), "unnamed", 64),
+        "kind": text(fields.get("kind"), limit=64),
+        "description": text(fields.get("description")),
+        "capabilities": properties(fields.get("capabilities")),
+        "address": text(fields.get("address"), limit=64),
+        "roles": texts(fields.get("roles")),
+        "joined": count(fields.get("joined")),
+        "since": number(fields.get("since")),
+        "task": text(fields.get("task"), limit=64),
+        "status": _status(fields.get("status"), DEVICE_STATUSES),
+        "messages": _messages(fields.get("messages")),
+        "network": {text(key): number(value) for key, value in network.items()} if isinstance(network, Mapping) else {},
+        "gone": None,
+    }
+
+
+def task_view(fields: Fields) -> State:
+    """One task as the page shows it."""
+    note, result = fields.get("note"), fields.get("result")
+    return {
+        "id": text(fields.get("id"), limit=64),
+        "kind": text(fields.get("kind"), limit=64),
+        "title": text(fields.get("title")) or text(fields.get("kind")) or "untitled",
+        "requirements": properties(fields.get("requirements")),
+        "waiting_period": number(fields.get("waiting_period")),
+        "strategy": text(fields.get("strategy")),
+        "created": number(fields.get("created")),
+        "council": texts(fields.get("council")),
+        "status": _status(fields.get("status"), TASK_STATUSES),
+        "note": "\n".join(texts(note.split("\n"))) if isinstance(note, str) else "",
+        "result": _result(result) if isinstance(result, Mapping) else None,
+    }
+
+
+def group_view(task: str, title: str, members: Sequence[Fields]) -> State:
+    """The consensus point of one group: whom each agent computed as the winner, and whether they agree.
+
+    The point is the agent named by most (the lowest uuid where two are named as often).  ``differ`` lists who named
+    another, ``undecided`` who named nobody yet.  ``share`` puts the costs (metres) on one scale: the farthest is 1.
+    """
+    views = [_member_view(member) for member in members]
+    views.sort(key=lambda view: (view["name"], view["uuid"]))
+    names = {view["uuid"]: view["name"] for view in views}
+    farthest = max((view["cost"] for view in views if view["cost"] is not None), default=0.0)
+    votes: dict[str, int] = {}
+    for view in views:
+        view["share"] = None if view["cost"] is None else round(view["cost"] / farthest, 4) if farthest else 0.0
+        if view["assigned"]:
+            votes[view["assigned"]] = votes.get(view["assigned"], 0) + 1
+    winner = min(votes, key=lambda uuid: (-votes[uuid], uuid), default="")
+    for view in views:
+        view["choice"] = names.get(view["assigned"], view["assigned"][:8])
+    return {
+        "task": text(task, limit=64),
+        "title": title,
+        "members": views,
+        "scale": farthest,
+        "assigned": names.get(winner, winner[:8]),
+        "assigned_uuid": winner,
+        "agree": votes.get(winner, 0),
+        "of": len(views),
+        "differ": [view["name"] for view in views if view["assigned"] and view["assigned"] != winner],
+        "undecided": [view["name"] for view in views if not view["assigned"]],
+    }
+
+
+class Departed:
+    """A small memory of the devices that left: a device that went away must not look alive, nor vanish at once."""
+
+    def __init__(self, remembered_s: float = REMEMBERED_S) -> None:
+        self._remembered_s = remembered_s
+        self._last: dict[str, State] = {}
+        self._gone: dict[str, State] = {}
+
+    def of(self, devices: Iterable[Fields], now: float) -> list[State]:
+        """Those not among ``devices`` that were there a short while ago, ``gone`` being when that was seen (unix s).
+
+        Safe to call from several threads: each call replaces what is remembered and changes nothing in place.
+        """
+        present = {view["uuid"]: view for view in map(device_view, devices) if view["uuid"]}
+        left = {uuid: {**view, "status": GONE, "gone": now} for uuid, view in self._last.items() if uuid not in present}
+        gone = {**left, **self._gone}
+        gone = {u: v for u, v in gone.items() if u not in present and now - v["gone"] < self._remembered_s}
+        self._last, self._gone = present, gone
+        return [dict(view) for view in gone.values()]
+
+
+def _member_view(fields: Fields) -> State:
+    return {
+        "uuid": text(fields.get("uuid"), limit=64),
+        "name": text(fields.get("name"), "unnamed", 64),
+        "status": _status(fields.get("status"), DEVICE_STATUSES),
+        "cost": distance(fields.get("cost")),
+        "assigned": text(fields.get("assigned"), limit=64),
+        "token": count(fields.get("token")),
+        "why": text(fields.get("why"), limit=600),
+    }
+
+
+def _result(fields: Fields) -> State:
+    return {"by": text(fields.get("by")), "took": number(fields.get("took"))}
+
+
+def _status(value: object, lawful: Sequence[str]) -> str:
+    return value if isinstance(value, str) and value in lawful else UNKNOWN
+
+
+def _messages(value: object) -> list[list[float | str]]:
+    if not isinstance(value, list | tuple):
+        return []
+    pairs = [entry for entry in value if isinstance(entry, list | tuple) and len(entry) == 2]
+    return [[number(moment), text(words)] for moment, words in pairs[-MESSAGES:]]

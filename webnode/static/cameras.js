@@ -1,0 +1,107 @@
+// Cameras: one loop each, one picture in flight each; the newest wins, and nothing is fetched that nobody sees.
+import { at, attribute, element, keyed, words } from "./element.js";
+
+const VIEWER = Math.random().toString(36).slice(2, 12);
+const cameras = new Map();
+
+class Camera {
+  constructor(uuid) {
+    this.uuid = uuid;
+    this.seq = "";
+    this.at = 0;
+    this.visible = false;
+    this.gone = false;
+    this.closed = false;
+    this.flight = null;
+    this.trouble = "";
+    this.canvas = element("canvas", { width: 208, height: 160, role: "img" });
+    this.name = element("b");
+    this.told = element("span", { class: "age" });
+    this.figure = element("figure", { "data-camera": "wait" }, this.canvas, element("figcaption", {}, this.name, this.told));
+    this.watch = new IntersectionObserver(([entry]) => { this.visible = entry.isIntersecting; this.turn(); });
+    this.watch.observe(this.figure);
+  }
+
+  get wanted() {
+    return this.visible && !this.gone && !this.closed && !document.hidden;
+  }
+
+  // Start the loop where it is wanted and does not run; end the question in flight where it is not.
+  turn() {
+    if (!this.wanted) this.flight?.abort();
+    else if (!this.flight) this.loop();
+  }
+
+  async loop() {
+    while (this.wanted) {
+      this.flight = new AbortController();
+      const deadline = setTimeout(() => this.flight?.abort(), 12000);
+      try {
+        const answer = await fetch(`/shot/${this.uuid}?after=${this.seq}&viewer=${VIEWER}`, { signal: this.flight.signal });
+        if (answer.status === 200) {
+          const picture = await createImageBitmap(await answer.blob());
+          this.seq = answer.headers.get("X-Seq");
+          this.at = performance.now() - 1000 * Number(answer.headers.get("X-Age"));
+          this.draw(picture);
+          this.trouble = "";
+        } else if (answer.status !== 204) {
+          this.trouble = (await answer.json().catch(() => ({}))).error?.problem ?? "no picture";
+          await pause();
+        }
+      } catch {
+        if (this.wanted) await pause();
+      }
+      clearTimeout(deadline);
+    }
+    this.flight = null;
+  }
+
+  draw(picture) {
+    if (this.canvas.width !== picture.width) Object.assign(this.canvas, { width: picture.width, height: picture.height });
+    this.canvas.getContext("2d").drawImage(picture, 0, 0);
+    picture.close();
+  }
+
+  tell() {
+    const age = (performance.now() - this.at) / 1000;
+    const state = this.gone ? "gone" : !this.at ? "wait" : age < 1 ? "live" : "late";
+    const seen = this.at ? `${age < 10 ? age.toFixed(1) : Math.round(age)} s old` : "no picture yet";
+    attribute(this.figure, "data-camera", state);
+    words(this.told, this.gone ? `gone, ${seen}` : this.trouble && state !== "live" ? this.trouble : state === "live" ? `live, ${seen}` : seen);
+  }
+
+  close() {
+    this.closed = true;
+    this.watch.disconnect();
+    this.flight?.abort();
+  }
+}
+
+const pause = () => new Promise((done) => setTimeout(done, 1000));
+
+export function showCameras(devices) {
+  const seeing = devices.filter((device) => device.capabilities.camera);
+  at("no-cameras").hidden = seeing.length > 0;
+  for (const [uuid, camera] of cameras) {
+    if (seeing.some((device) => device.uuid === uuid)) continue;
+    camera.close();
+    cameras.delete(uuid);
+  }
+  keyed(at("cameras"), seeing, (device) => device.uuid,
+    (device) => {
+      cameras.set(device.uuid, new Camera(device.uuid));
+      return cameras.get(device.uuid).figure;
+    },
+    (figure, device) => {
+      const camera = cameras.get(device.uuid);
+      words(camera.name, device.name);
+      attribute(camera.canvas, "aria-label", `What ${device.name} sees`);
+      camera.gone = device.gone !== null;
+      camera.turn();
+    });
+}
+
+export function startCameras() {
+  document.addEventListener("visibilitychange", () => cameras.forEach((camera) => camera.turn()));
+  setInterval(() => cameras.forEach((camera) => camera.tell()), 250);
+}

@@ -1,0 +1,107 @@
+// Devices: the list in the order of joining, and the dialog with what is known of one.
+import { at, attribute, badge, element, keyed, span, state, words } from "./element.js";
+import { say, wish } from "./desk.js";
+
+let devices = [];
+let open = "";
+let now = 0;
+
+const age = (device) => (device.gone === null ? `here ${span(now - device.since)}` : `gone ${span(now - device.gone)}`);
+
+export function showDevices(list) {
+  devices = list;
+  const here = list.filter((device) => device.gone === null).length;
+  words(at("count"), list.length ? String(here) : "");
+  at("no-devices").hidden = list.length > 0;
+  keyed(at("devices"), list, (device) => device.uuid, row, update);
+  if (open) fill();
+}
+
+export function tellTime(moment) {
+  now = moment;
+  for (const child of at("devices").children) {
+    const device = devices.find((each) => each.uuid === child.dataset.key);
+    if (device) words(child.querySelector(".age"), age(device));
+  }
+}
+
+function row(device) {
+  const button = element(
+    "button", { class: "device", "aria-haspopup": "dialog" },
+    element("b"), badge(), element("span", { class: "kind" }), element("span", { class: "age" }), element("span", { class: "objective" }));
+  let pointer = "mouse";
+  button.addEventListener("pointerdown", (event) => { pointer = event.pointerType; });
+  // A tap or Enter opens at once; with a mouse one click only marks, as the double click is what opens.
+  button.addEventListener("click", (event) => { if (event.detail === 0 || pointer !== "mouse") show(device.uuid); });
+  button.addEventListener("dblclick", () => show(device.uuid));
+  return element("li", {}, button);
+}
+
+function update(item, device) {
+  attribute(item.firstChild, "data-state", device.status);
+  words(item.querySelector("b"), device.name);
+  words(item.querySelector(".kind"), device.kind);
+  state(item.querySelector(".badge"), device.status);
+  words(item.querySelector(".objective"), device.objective || "no task");
+  words(item.querySelector(".age"), age(device));
+}
+
+function show(uuid) {
+  open = uuid;
+  words(at("d-answer"), "");
+  fill();
+  if (!at("device").open) at("device").showModal();
+}
+
+function facts(list, entries) {
+  const rows = entries.map(([name, value]) => [name, value === "" ? "–" : String(value)]);
+  const told = JSON.stringify(rows);
+  if (list.dataset.told === told) return;
+  list.dataset.told = told;
+  list.replaceChildren(...rows.map(([name, value]) =>
+    element("div", {}, element("dt", {}, name), element("dd", {}, value))));
+}
+
+function fill() {
+  const device = devices.find((each) => each.uuid === open);
+  if (!device) {
+    words(at("d-status"), "This device has left the network and is no longer remembered.");
+    return;
+  }
+  words(at("d-name"), device.name);
+  const task = device.objective ? `, task: ${device.objective}` : ", no task";
+  words(at("d-status"), `${device.kind || "device"}, ${device.status.toLowerCase()}${task}, ${age(device)}`);
+  words(at("d-about"), device.description);
+  const properties = (entries) => Object.entries(entries).map(([name, value]) => `${name} ${value}`).join(", ") || "yes";
+  facts(at("d-capabilities"), Object.entries(device.capabilities).map(([name, entries]) => [name, properties(entries)]));
+  facts(at("d-network"), [
+    ["address", device.address], ["roles", device.roles.join(", ")], ["joined", device.joined ? `as number ${device.joined}` : ""],
+    ...Object.entries(device.network), ["uuid", device.uuid]]);
+  const told = device.messages.map(([moment, text]) => [new Date(moment * 1000).toLocaleTimeString(), text]);
+  keyed(at("d-messages"), told.length ? told : [["", "No messages."]], (entry) => entry.join(), () => element("li"),
+    (item, entry) => words(item, entry.join(" ").trim()));
+  for (const button of at("device").querySelectorAll("form button")) button.disabled = device.gone !== null;
+}
+
+export function startDevices() {
+  const line = (text) => words(at("d-answer"), text);
+  at("d-close").addEventListener("click", () => at("device").close());
+  at("device").addEventListener("close", () => { open = ""; });
+  at("device").addEventListener("click", (event) => { if (event.target === at("device")) at("device").close(); });
+  at("d-message").addEventListener("submit", async (event) => {
+    event.preventDefault();
+    const body = { text: at("d-text").value };
+    if (await wish("Message", `/api/devices/${open}/message`, { body, line, done: () => "Message sent." })) at("d-text").value = "";
+  });
+  at("d-leave").addEventListener("submit", (event) => {
+    event.preventDefault();
+    const seconds = Number(at("d-seconds").value);
+    wish("Disconnecting", `/api/devices/${open}/disconnect`,
+      { body: { seconds }, line, done: () => `It leaves the network and comes back after ${seconds} s.` });
+  });
+  at("announce").addEventListener("submit", async (event) => {
+    event.preventDefault();
+    const body = { text: at("announce-text").value };
+    if (await wish("Message", "/api/message", { body, line: say, done: () => "Message sent to all devices." })) at("announce-text").value = "";
+  });
+}

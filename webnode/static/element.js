@@ -1,0 +1,77 @@
+// Elements: making them, and keeping a list of them in step with data without rebuilding what a person is using.
+const SVG = "http://www.w3.org/2000/svg";
+
+export const at = (id) => document.getElementById(id);
+
+export function element(tag, attributes = {}, ...children) {
+  const node = document.createElement(tag);
+  for (const [name, value] of Object.entries(attributes)) node.setAttribute(name, value);
+  node.append(...children);
+  return node;
+}
+
+export function drawn(tag, attributes = {}, ...children) {
+  const node = document.createElementNS(SVG, tag);
+  for (const [name, value] of Object.entries(attributes)) node.setAttribute(name, value);
+  node.append(...children);
+  return node;
+}
+
+// Text changes only when the words do: a screen reader hears no repetition.
+export function words(node, text) {
+  if (node.textContent !== text) node.textContent = text;
+}
+
+export function attribute(node, name, value) {
+  if (node.getAttribute(name) !== String(value)) node.setAttribute(name, value);
+}
+
+// One child for each item, in order; `make` once for a new key, `update` each time.
+export function keyed(parent, items, key, make, update) {
+  const old = new Map([...parent.children].map((child) => [child.dataset.key, child]));
+  items.forEach((item, place) => {
+    const name = String(key(item));
+    let child = old.get(name);
+    if (!child) {
+      child = make(item);
+      child.dataset.key = name;
+    }
+    old.delete(name);
+    if (parent.children[place] !== child) parent.insertBefore(child, parent.children[place] ?? null);
+    update(child, item);
+  });
+  for (const child of old.values()) child.remove();
+}
+
+// A shape for each state, so that no state is told by colour alone.
+const SHAPES = {
+  IDLE: "M8 2.5a5.5 5.5 0 1 0 .01 0zM8 5a3 3 0 1 1-.01 0z",
+  ASSIGNED: "M8 1.5 14.5 8 8 14.5 1.5 8zM8 5 5 8l3 3 3-3z",
+  OPEN: "M8 1.5 14.5 8 8 14.5 1.5 8zM8 5 5 8l3 3 3-3z",
+  SEARCHING: "M6.5 1.5a5 5 0 1 0 2.8 9.1l3.6 3.6 1.6-1.6-3.6-3.6A5 5 0 0 0 6.5 1.5zm0 2.3a2.7 2.7 0 1 1-.01 0z",
+  WAITING: "M3 2h3.6v12H3zM9.4 2H13v12H9.4z",
+  EXECUTING: "M3 1.5 14 8 3 14.5z",
+  DONE: "M6.3 13.6 1 8.3l2-2 3.3 3.2 6.7-6.7 2 2z",
+  COMPLETED: "M6.3 13.6 1 8.3l2-2 3.3 3.2 6.7-6.7 2 2z",
+  GONE: "M3.5 1.5 8 6l4.5-4.5 2 2L10 8l4.5 4.5-2 2L8 10l-4.5 4.5-2-2L6 8 1.5 3.5z",
+  FAILED: "M3.5 1.5 8 6l4.5-4.5 2 2L10 8l4.5 4.5-2 2L8 10l-4.5 4.5-2-2L6 8 1.5 3.5z",
+  CANCELLED: "M2 2h12v12H2zM4.5 4.5v7h7v-7z",
+  UNKNOWN: "M6.8 11h2.4v2.5H6.8zM8 2a4 4 0 0 1 1.2 7.8H6.8V7.6H8A1.8 1.8 0 1 0 6.2 5.8H4A4 4 0 0 1 8 2z",
+};
+
+export function badge() {
+  return element("span", { class: "badge" }, drawn("svg", { viewBox: "0 0 16 16", "aria-hidden": "true" }, drawn("path")), element("span"));
+}
+
+export function state(node, status) {
+  attribute(node, "data-state", status);
+  attribute(node.querySelector("path"), "d", SHAPES[status] ?? SHAPES.UNKNOWN);
+  words(node.lastChild, status.toLowerCase());
+}
+
+export function span(seconds) {
+  const s = Math.max(0, Math.round(seconds));
+  if (s < 60) return `${s} s`;
+  if (s < 3600) return `${Math.floor(s / 60)} min`;
+  return s < 86400 ? `${Math.floor(s / 3600)} h` : `${Math.floor(s / 86400)} d`;
+}

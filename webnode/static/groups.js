@@ -1,0 +1,36 @@
+// Groups: what each agent bids for a task, whom it computed as the winner, and whether they agree.
+import { at, attribute, element, keyed, words } from "./element.js";
+
+export function showGroups(groups) {
+  at("no-groups").hidden = groups.length > 0;
+  keyed(at("groups"), groups, (group) => group.task,
+    () => element("article", {}, element("h3"), element("p", { class: "point" }), element("ul", { class: "bids" })), update);
+}
+
+function point(group) {
+  if (!group.assigned) return "No consensus yet: nobody has named a winner.";
+  let told = `${group.assigned} – ${group.agree} of ${group.of} agree`;
+  if (group.differ.length) told += `; ${group.differ.join(", ")} ${group.differ.length > 1 ? "differ" : "differs"}`;
+  if (group.undecided.length) told += `; ${group.undecided.join(", ")} undecided`;
+  return told;
+}
+
+function update(article, group) {
+  const [title, told, bids] = article.children;
+  words(title, group.title);
+  words(told, point(group));
+  attribute(told, "data-agree", Boolean(group.assigned) && group.agree === group.of);
+  keyed(bids, group.members, (member) => member.uuid, bid, (item, member) => {
+    const [name, bar, cost, choice] = item.children;
+    attribute(item, "data-winner", member.uuid === group.assigned_uuid);
+    words(name, member.name);
+    bar.firstChild.style.width = `${100 * (member.share ?? 0)}%`;
+    words(cost, member.cost === null ? "no bid" : `${member.cost.toFixed(2)} m`);
+    words(choice, `${member.choice ? `names ${member.choice}` : "undecided"}${member.token ? `, token ${member.token}` : ""}${member.why ? ` – ${member.why}` : ""}`);
+  });
+}
+
+function bid() {
+  return element("li", {}, element("b"), element("span", { class: "bid", "aria-hidden": "true" }, element("i")),
+    element("span", { class: "cost" }), element("span", { class: "choice" }));
+}

@@ -1,0 +1,59 @@
+// Tasks: choosing a predefined one, seeing what became of each, and taking it back.
+import { at, badge, element, keyed, state, words } from "./element.js";
+import { ask, say, wish } from "./desk.js";
+
+const ENDED = ["COMPLETED", "FAILED", "CANCELLED"];
+const SHOWN = 8;
+
+export function showTasks(tasks) {
+  at("no-tasks").hidden = tasks.length > 0;
+  keyed(at("tasks"), tasks.slice(0, SHOWN), (task) => task.id, row, (item, task) => {
+    words(item.querySelector("b"), task.title);
+    state(item.querySelector(".badge"), task.status);
+    const result = task.result ? `Done by ${task.result.by} in ${task.result.took.toFixed(1)} s. ` : "";
+    words(item.querySelector(".note"), result + task.note);
+    const button = item.querySelector("button");
+    button.hidden = ENDED.includes(task.status);
+    button.setAttribute("aria-label", `Cancel ${task.title}`);
+  });
+}
+
+function row(task) {
+  const button = element("button", {}, "Cancel");
+  button.addEventListener("click", () => wish(`Cancelling ${task.title}`, `/api/tasks/${encodeURIComponent(task.id)}/cancel`));
+  return element("li", {}, element("b"), badge(), element("span", { class: "note" }), button);
+}
+
+function outcome({ able = [], refused = {} }) {
+  const no = Object.entries(refused).map(([name, reasons]) => `${name} cannot: ${[].concat(reasons).join(", ")}`);
+  const yes = able.length ? [`Assigned to ${able.join(", ")}`] : no.length ? ["Nobody can take it"] : ["Assigned"];
+  return `${[...yes, ...no].join(". ")}.`;
+}
+
+// The catalogue is read when the page connects, and again after each loss.
+export async function readCatalogue() {
+  const catalogue = await fetch("/api/catalogue").then((answer) => (answer.ok ? answer.json() : null)).catch(() => null);
+  if (!catalogue) return;
+  const chosen = at("task").value;
+  at("task").replaceChildren(...catalogue.map((task) => element("option", { value: task.name }, task.title || task.name)));
+  if (chosen) at("task").value = chosen;
+}
+
+export function startTasks() {
+  at("assign").addEventListener("submit", (event) => {
+    event.preventDefault();
+    if (!at("task").value) return say("There is no predefined task to assign.");
+    wish("Assigning", "/api/tasks", { body: { name: at("task").value }, done: outcome });
+  });
+  at("demo").addEventListener("click", async () => {
+    at("demo").disabled = true;
+    say("Starting the demo …");
+    try {
+      await ask("/api/demo");
+      say("The demo runs.");
+    } catch (error) {
+      say(error.message);
+    }
+    at("demo").disabled = false;
+  });
+}

@@ -1,0 +1,173 @@
+"""TeamDesk: an operator's wishes, carried out over the node (thesis, Algorithm 4.4 and the Run Demo button)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, Protocol
+
+from twisted.internet.defer import Deferred
+from twisted.logger import Logger
+
+from middleware.entangled.errors import EntangledError
+from middleware.entangled.record import Record
+from middleware.entangled.watch import Watch
+from middleware.node import CAMERA, SwarmNode
+from middleware.presence import DEVICES, devices_of
+from middleware.tasks import CANCELLED, TASKS, Result, Task, group_key, outcome_of, task_of
+from webnode.errors import Refusal
+from webnode.ledger import refused_by
+
+PLACING = 5.0
+"""Seconds between Run Demo and the target's appearance: it is placed while the robots search (thesis, section 5)."""
+
+
+class YardHand(Protocol):
+    """What the desk needs of a yard, where there is one."""
+
+    @property
+    def snapshot(self) -> Mapping[str, Any] | None:
+        """The newest view from above."""
+
+    def place_target(self, x: float, y: float) -> Deferred[bool]:
+        """Put the target at a place."""
+
+    def place_target_at_random(self) -> Deferred[bool]:
+        """Put the target anywhere."""
+
+    def clear_target(self) -> Deferred[bool]:
+        """Take the target away."""
+
+
+class TeamDesk:
+    """The desk of a running team; ``predefined`` and ``demo`` come from the catalogue of tasks."""
+
+    _log = Logger()
+
+    def __init__(
+        self, node: SwarmNode, predefined: Mapping[str, Task], demo: str, yard: YardHand | None = None
+    ) -> None:
+        self._node = node
+        self._predefined = predefined
+        self._demo = demo
+        self._yard = yard
+        self._groups: dict[str, Watch] = {}
+        self._devices = node.watch_devices(lambda records: None)
+        self._tasks = node.watch_tasks(self._follow)
+
+    # -- what is known ----------------------------------------------------------------------------------------------
+
+    def read(self, key: bytes) -> list[Record]:
+        """The records under ``key``, of the keys that the page shows, as they are watched now."""
+        if key == DEVICES:
+            return self._devices.records
+        if key == TASKS:
+            return self._tasks.records
+        return next((watch.records for watch in self._groups.values() if watch.key == key), [])
+
+    def watch(self, uuid: str, on_frame: Callable[[int, bytes], None]) -> Callable[[], None]:
+        """Look through the camera of the device ``uuid`` until what is returned is called."""
+        record = self._record_of(uuid)
+        contact = None if record is None else self._node.contact_of(record)
+        if contact is None:
+            return lambda: None
+        return self._node.streams.look(contact, CAMERA, on_frame)
+
+    def yard(self) -> Mapping[str, Any] | None:
+        """The newest view from above, or None."""
+        return None if self._yard is None else self._yard.snapshot
+
+    def catalogue(self) -> Sequence[Mapping[str, Any]]:
+        """The predefined tasks."""
+        return [
+            {"name": name, "title": task.title, "requirements": task.requirements}
+            for name, task in self._predefined.items()
+        ]
+
+    # -- what is wished ---------------------------------------------------------------------------------------------
+
+    def run_demo(self) -> str:
+        """Assign the demonstration's task; where there is a yard, the target is placed while the robots search."""
+        for task in self._open_tasks():
+            self.cancel(task.task_id)
+        if self._yard is not None:
+            self._quietly(self._yard.clear_target())
+            self._node.clock.callLater(PLACING, self._place)
+        return str(self.assign(self._demo)["id"])
+
+    def assign(self, name: str) -> dict[str, Any]:
+        """Publish a predefined task; the devices that can do it take it up by themselves."""
+        template = self._predefined.get(name)
+        if template is None:
+            known = ", ".join(sorted(self._predefined))
+            raise Refusal("name", f"there is no predefined task {name!r}", f"choose one of {known}", 404)
+        task_id = self._node.rng.randbytes(6).hex()
+        task = replace(template, task_id=task_id, created=self._node.wall())
+        devices = [device for device, _ in devices_of(self._devices.records)]
+        refused = refused_by(task, devices)
+        self._quietly(Deferred.fromCoroutine(self._node.submit(task)))
+        return {"id": task_id, "able": [d.name for d in devices if d.name not in refused], "refused": refused}
+
+    def cancel(self, task_id: str) -> None:
+        """Record that the task is cancelled; whoever is at it stops."""
+        self._quietly(self._node.conclude(task_id, Result(CANCELLED, self._node.presence.device.name)))
+
+    def message(self, uuid: str, text: str) -> None:
+        """Send a text to one device, or to all."""
+        for device, record in devices_of(self._devices.records):
+            if uuid in ("", device.uuid):
+                self._call(record, "device.message", text)
+
+    def disconnect(self, uuid: str, seconds: float) -> None:
+        """Ask a device to leave the network for a while, as if it had failed."""
+        record = self._record_of(uuid)
+        if record is not None:
+            self._call(record, "device.disconnect", seconds)
+
+    def move_target(self, x: float, y: float) -> Any:
+        """Put the target at (x, y)."""
+        return self._with_yard().place_target(x, y).addErrback(_refused)
+
+    def clear_target(self) -> Any:
+        """Take the target away."""
+        return self._with_yard().clear_target().addErrback(_refused)
+
+    # -- inside -----------------------------------------------------------------------------------------------------
+
+    def _follow(self, records: list[Record]) -> None:
+        for record in records:
+            task = task_of(record)
+            if task is not None and task.task_id not in self._groups:
+                self._groups[task.task_id] = self._node.watch_group(task.task_id, lambda records: None)
+
+    def _open_tasks(self) -> list[Task]:
+        tasks = filter(None, map(task_of, self._tasks.records))
+        return [task for task in tasks if outcome_of(self.read(group_key(task.task_id))) is None]
+
+    def _record_of(self, uuid: str) -> Record | None:
+        return next((record for device, record in devices_of(self._devices.records) if device.uuid == uuid), None)
+
+    def _call(self, record: Record, method: str, argument: object) -> None:
+        contact = self._node.contact_of(record)
+        if contact is not None:
+            self._quietly(self._node.entangled.endpoint.ask(contact, method, argument, changes=True))
+
+    def _with_yard(self) -> YardHand:
+        if self._yard is None:
+            raise Refusal("target", "this node has no yard", "start one, or name it in the settings", 409)
+        return self._yard
+
+    def _place(self) -> None:
+        if self._yard is not None and self._node.running:
+            self._quietly(self._yard.place_target_at_random())
+
+    def _quietly(self, work: Deferred[Any]) -> None:
+        def ended(failure: Any) -> None:
+            if failure.check(EntangledError) is None:
+                self._log.warn("a wish was not granted: {error}", error=failure.getErrorMessage())
+
+        work.addErrback(ended)
+
+
+def _refused(failure: Any) -> None:
+    raise Refusal("target", failure.getErrorMessage(), "choose another place, or look whether the yard runs", 409)
