@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import importlib
 import random
 import sys
 import time
@@ -215,6 +216,98 @@ def web_page(settings: Settings, seams: Seams, reactor: Any, node: SwarmNode) ->
     return WebService(reactor, settings.web.host, settings.web.port, app, events, Shots(desk, reactor), Files())
 
 
+# -- a team in memory -------------------------------------------------------------------------------------------------
+
+
+class VirtualTeam:
+    """A laptop, three dogs and their yard in one process, on one turned clock; a seed replays it exactly.
+
+    What runs is what runs on a robot: the real node, agent, driver, yard and detection; only clock, wire and disk are in memory.
+    """
+
+    BOOTSTRAP = "vaio"
+    DOGS = ("dog1", "dog2", "dog3")
+    JOINING = 0.3
+
+    def __init__(self, seed: int, camera_fps: float = 10.0, delay: float = 0.002, loss: float = 0.0) -> None:
+        from middleware.entangled.clock import HeapClock
+        from middleware.entangled.network.switchboard import Switchboard, Weather
+        from sim.scene import loaded
+        from sim.yard import Yard
+
+        self.clock = HeapClock()
+        weather = Weather(delay_s=delay, jitter_s=delay / 2, loss=loss)
+        self.board = Switchboard(self.clock, random.Random(f"{seed}/board"), weather)
+        self.yard = Yard(self.clock, random.Random(f"{seed}/yard"), loaded("three-dogs"))
+        self.yard.start()
+        self.services: dict[str, NodeService] = {}
+        self._seed = seed
+        self._fps = camera_fps
+        for place, name in enumerate((self.BOOTSTRAP, *self.DOGS)):
+            self._add(place, name)
+            self.clock.advance(self.JOINING)
+        self._open_desk()
+        self.clock.advance(self.JOINING)
+
+    def run_demo(self) -> str:
+        """Press the Run Demo button; returns the task's id."""
+        return self._desk.run_demo()
+
+    def state(self) -> dict[str, Any]:
+        """What the page shows now."""
+        return self._state()
+
+    def truth(self) -> dict[str, Any]:
+        """Where everything in the yard really is."""
+        return self.yard.world.snapshot()
+
+    def scatter(self, seed: int) -> None:
+        """Set the dogs down at random places."""
+        self.yard.world.scatter(seed)
+
+    def kill(self, name: str) -> None:
+        """End a node as SIGKILL does: without a word to anybody."""
+        self.services[name].vanish()
+
+    def stop(self) -> None:
+        """End everything."""
+        for service in self.services.values():
+            if service.running:
+                service.stopService()
+        self._operator.disconnect()
+        self.yard.stop()
+
+    def _add(self, place: int, name: str) -> None:
+        port = 7000 + place
+        mapping: dict[str, Any] = {"node": {"name": name, "port": port, "team_key": str(self._seed)}}
+        if place:
+            mapping["node"]["known_nodes"] = ["127.0.0.1:7000"]
+            mapping["agent"] = {"module": "search"}
+            mapping["driver"] = {"kind": "sim", "options": {"robot": name, "camera_fps": self._fps}}
+        seams = Seams(
+            self.clock,
+            partial(self.board.network, "127.0.0.1", port),
+            MemoryStore(),
+            random.Random(f"{self._seed}/{name}"),
+            self.clock.seconds,
+            self.yard.connector(),
+        )
+        self.services[name] = NodeService(Settings.from_mapping(mapping, f"seed {self._seed}"), seams)
+        self.services[name].startService()
+
+    def _open_desk(self) -> None:
+        from drivers.sim.operator import YardOperator
+        from webnode.ledger import state_from
+        from webnode.state import Departed
+        from webnode.team import TeamDesk
+
+        self._operator = YardOperator(self.yard.connector(), self.clock)
+        self._operator.connect()
+        self._desk = TeamDesk(self.services[self.BOOTSTRAP].assembly.node, TASKS, DEMO, self._operator)
+        departed = Departed()
+        self._state = lambda: state_from(self._desk.read, departed, self.BOOTSTRAP, self.clock.seconds())
+
+
 # -- twistd -----------------------------------------------------------------------------------------------------------
 
 
@@ -296,9 +389,10 @@ def main(arguments: list[str] | None = None) -> int:
     if not words or words[0] not in verbs:
         sys.stdout.write("usage: swarm VERB [options]\n\n" + "".join(f"  {v:8}{t[1]}\n" for v, t in verbs.items()))
         return 0 if words[:1] in ([], ["--help"], ["-h"]) else 2
-    import importlib
-
-    return int(importlib.import_module(verbs[words[0]][0]).main(words[1:]) or 0)
+    module = importlib.import_module(verbs[words[0]][0])
+    if words[0] == "trials":
+        return int(module.main(words[1:], VirtualTeam))
+    return int(module.main(words[1:]) or 0)
 
 
 if __name__ == "__main__":

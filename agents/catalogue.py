@@ -15,7 +15,8 @@ TASKS = {
         kind="find-target",
         title="Find the red target",
         requirements={"base2d": {}, "camera": {"width": 104}, "ranger": {"max": 0.5}},
-        parameters={"target_radius": 0.08},
+        parameters={"target_radius": 0.08, "target_height": 0.22},
+        waiting_period=15.0,
     ),
     "turn-around": Task(
         task_id="",

@@ -11,16 +11,11 @@ import random
 from collections.abc import Mapping
 
 from agents.behaviour import STAND
-from agents.vision import Sighting, find_target
+from agents.exploration import TURN_GAIN, TURN_SPEED, WALK, Exploration, Pose, clipped
+from agents.vision import Sighting, Size, find_target
 from drivers.reading import Action, Observation
 
 FACING = math.radians(3.0)
-TURN_SPEED = 1.1
-TURN_GAIN = 2.2
-WALK = 0.16
-LEG = 0.45
-"""Metres to walk to a new place after a full turn in which nothing was seen."""
-CLEARANCE = 0.40
 STOP_AT = 0.12
 """Metres left between the head and the target when the task is done: near, and not touching."""
 MEMORY = 1.5
@@ -30,21 +25,20 @@ SETTLE = 3
 
 
 class SearchAndApproach:
-    """One dog and one red target; ``parameters`` may give ``target_radius`` in metres."""
+    """One dog and one red target; ``parameters`` may give ``target_radius`` and ``target_height`` in metres."""
 
     def __init__(self, parameters: Mapping[str, float | str], rng: random.Random) -> None:
         self._radius = float(parameters.get("target_radius", 0.08))
-        self._rng = rng
+        self._size = Size(self._radius, float(parameters.get("target_height", 0.22)))
         self._side = rng.choice((-1.0, 1.0))
+        self._exploration = Exploration(rng)
         self._sighting: Sighting | None = None
         self._seen_at = -math.inf
         self._frame = -1
         self._ranges: dict[str, float] = {}
-        self._pose = (0.0, 0.0, 0.0)
+        self._pose: Pose = (0.0, 0.0, 0.0)
         self._facing_for = 0
         self._distances: list[float] = []
-        self._turned = 0.0
-        self._leg_from: tuple[float, float] | None = None
         self._done_for = 0
 
     # -- observing --------------------------------------------------------------------------------------------------
@@ -53,18 +47,19 @@ class SearchAndApproach:
         """Take in odometry and rangers, and search the picture if it is a new one."""
         values = seen.values
         before = self._pose
-        self._pose = tuple(float(values.get(f"odom.{axis}", 0.0)) for axis in ("x", "y", "yaw"))  # type: ignore[assignment]
+        x, y, yaw = (float(values.get(f"odom.{axis}", 0.0)) for axis in ("x", "y", "yaw"))
+        self._pose = (x, y, yaw)
         turned = math.remainder(self._pose[2] - before[2], math.tau)
-        self._turned += abs(turned)
         if self._sighting is not None:
             # Between pictures the bearing turns with the body.
             s = self._sighting
             self._sighting = Sighting(math.remainder(s.bearing - turned, math.tau), s.distance, s.is_whole)
         for name in ("near", "far"):
             self._ranges[name] = float(values.get(f"range.{name}", math.nan))
+        self._exploration.saw(self._pose, turned, self._ahead)
         if seen.frame is not None and seen.frame.seq != self._frame:
             self._frame = seen.frame.seq
-            self._saw(find_target(seen.frame.data, self._radius), now)
+            self._saw(find_target(seen.frame.data, self._size), now)
         if now - self._seen_at > MEMORY:
             self._forget()
 
@@ -104,23 +99,8 @@ class SearchAndApproach:
     # -- acting -----------------------------------------------------------------------------------------------------
 
     def search(self, now: float) -> Action:
-        """Turn a full circle; nothing seen, walk a leg and turn again; something seen, face it."""
-        if self._sighting is not None:
-            return self._face()
-        if self._leg_from is None:
-            if self._turned < math.tau * 1.05:
-                return {**STAND, "base.wz": self._side * TURN_SPEED}
-            self._leg_from = self._pose[:2]
-        walked = math.dist(self._leg_from, self._pose[:2])
-        if self._is_blocked():
-            # The way is not free: turn towards a free one before the leg is walked.
-            return {**STAND, "base.wz": self._side * TURN_SPEED}
-        if walked < LEG:
-            return {**STAND, "base.vx": WALK}
-        self._leg_from = None
-        self._turned = 0.0
-        self._side = self._rng.choice((-1.0, 1.0))
-        return STAND
+        """Look around and walk to new places; something seen, face it."""
+        return self._exploration.step(self._pose, self._ahead) if self._sighting is None else self._face()
 
     def hold(self, now: float) -> Action:
         """Stand and keep facing the target, ready to take over."""
@@ -131,7 +111,7 @@ class SearchAndApproach:
         sighting = self._sighting
         if sighting is None:
             return self.search(now)
-        turn = _clipped(TURN_GAIN * sighting.bearing, TURN_SPEED)
+        turn = clipped(TURN_GAIN * sighting.bearing, TURN_SPEED)
         gap = self._gap(sighting)
         if gap <= STOP_AT and abs(sighting.bearing) < 4 * FACING:
             self._done_for += 1
@@ -139,11 +119,11 @@ class SearchAndApproach:
         self._done_for = 0
         if abs(sighting.bearing) > math.radians(25):
             return {**STAND, "base.wz": turn}
-        nearest = min((r for r in self._ranges.values() if not math.isnan(r)), default=math.inf)
-        if nearest < 0.30 and nearest + self._radius < sighting.distance * (1 - DISAGREEMENT) - 0.05:
+        ahead = self._ahead
+        if ahead < 0.30 and ahead + self._radius < sighting.distance * (1 - DISAGREEMENT) - 0.05:
             # Something stands between: step aside, keep the eyes on the target.
             return {**STAND, "base.vy": self._side * 0.10, "base.wz": turn}
-        return {**STAND, "base.vx": _clipped(max(0.04, 0.9 * (gap - STOP_AT + 0.03)), WALK), "base.wz": turn}
+        return {**STAND, "base.vx": clipped(max(0.04, 0.9 * (gap - STOP_AT + 0.03)), WALK), "base.wz": turn}
 
     def _gap(self, sighting: Sighting) -> float:
         """Metres between the head and the surface of the target."""
@@ -158,11 +138,9 @@ class SearchAndApproach:
         bearing = self._sighting.bearing
         if abs(bearing) < FACING * 0.7:
             return STAND
-        return {**STAND, "base.wz": _clipped(TURN_GAIN * bearing, TURN_SPEED)}
+        return {**STAND, "base.wz": clipped(TURN_GAIN * bearing, TURN_SPEED)}
 
-    def _is_blocked(self) -> bool:
-        return any(r < CLEARANCE for r in self._ranges.values() if not math.isnan(r))
-
-
-def _clipped(value: float, limit: float) -> float:
-    return max(-limit, min(limit, value))
+    @property
+    def _ahead(self) -> float:
+        """Metres to whatever is straight ahead; NaN where nothing is within reach."""
+        return min((r for r in self._ranges.values() if not math.isnan(r)), default=math.nan)

@@ -1,7 +1,7 @@
 """Vision: find the red target in a camera picture.
 
-The only module of this room that needs OpenCV (extra ``[vision]``); it is imported when an agent that looks is made.
-Red is one corner of YCrCb, the colours that the ERS-7's camera delivers, so one range finds it without a wrap-around of hue.
+The only module of this room that needs OpenCV (extra ``[vision]``); it is imported when an agent that looks is made.  Red
+is one corner of YCrCb, the colours that the ERS-7's camera delivers, so one range finds it: no wrap-around of hue.
 """
 
 from __future__ import annotations
@@ -11,20 +11,32 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 cv2.setNumThreads(1)
 
-FIELD_OF_VIEW = math.radians(56.9)
-"""Horizontal, of the ERS-7's camera."""
+FIELD_OF_VIEW = math.radians(56.9), math.radians(45.2)
+"""Across and up, of the ERS-7's camera."""
 RED_LOW, RED_HIGH = (20, 165, 40), (240, 255, 135)
+GREY = 128.0
+BLUR = 2
 MIN_AREA = 14
+SAME_SHAPE = 0.2
+
+
+@dataclass(frozen=True)
+class Size:
+    """What the target measures, in metres: it stands upright and is round from above."""
+
+    radius: float
+    height: float
 
 
 @dataclass(frozen=True)
 class Sighting:
-    """The target in one picture: ``bearing`` in radians (left positive), ``distance`` in metres from the camera to its centre.
+    """The target in one picture: ``bearing`` in radians (left positive), ``distance`` in metres from the camera to its axis.
 
-    ``is_whole`` is false where the blob is cut off by the picture's edge or partly hidden, so that the size says less.
+    ``is_whole`` is false where the blob is cut off by the picture's edge or partly hidden, so that its size says less.
     """
 
     bearing: float
@@ -32,23 +44,38 @@ class Sighting:
     is_whole: bool
 
 
-def find_target(jpeg: bytes, target_radius: float) -> Sighting | None:
+def find_target(jpeg: bytes, size: Size) -> Sighting | None:
     """The largest red blob of a JPEG picture, or None; bytes that are no picture count as nothing seen."""
     picture = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
     if picture is None:
         return None
-    mask = cv2.inRange(cv2.cvtColor(picture, cv2.COLOR_BGR2YCrCb), RED_LOW, RED_HIGH)
-    count, _, stats, centres = cv2.connectedComponentsWithStats(mask, connectivity=8)
+    colours = cv2.cvtColor(picture, cv2.COLOR_BGR2YCrCb)
+    count, _, stats, centres = cv2.connectedComponentsWithStats(cv2.inRange(colours, RED_LOW, RED_HIGH), connectivity=8)
     if count < 2:
         return None
     best = 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
-    left, _top, width, height, area = (int(v) for v in stats[best])
+    left, top, width, height, area = (int(v) for v in stats[best])
     if area < MIN_AREA:
         return None
-    rows, columns = mask.shape
-    focal = (columns / 2) / math.tan(FIELD_OF_VIEW / 2)
-    bearing = math.atan2(columns / 2 - (float(centres[best][0]) + 0.5), focal)
-    is_whole = left > 0 and left + width < columns and area > 0.6 * width * height and 0.75 < width / height < 1.33
-    # The area of a whole disc averages out the pixel grid; of a part of it, the longer side is the better witness.
-    radius = math.sqrt(area / math.pi) if is_whole else max(width, height) / 2
-    return Sighting(bearing, focal * target_radius / radius / max(math.cos(bearing), 0.5), is_whole)
+    rows, columns = colours.shape[:2]
+    focal_x, focal_y = (n / 2 / math.tan(f / 2) for n, f in zip((columns, rows), FIELD_OF_VIEW, strict=True))
+    bearing = math.atan2(columns / 2 - (float(centres[best][0]) + 0.5), focal_x)
+    around = slice(max(0, top - BLUR), top + height + BLUR), slice(max(0, left - BLUR), left + width + BLUR)
+    across, up = _extent(colours[around][:, :, 1].astype(np.float32))
+    by_width = focal_x * 2 * size.radius / across
+    by_height = focal_y * size.height / up
+    is_whole = left > 0 and left + width < columns and abs(by_width / by_height - 1) < SAME_SHAPE
+    # What hides a part of it makes it look smaller, never larger: the nearer of the two is the better witness.
+    distance = by_width if is_whole else min(by_width, by_height)
+    return Sighting(bearing, distance / max(math.cos(bearing), 0.5), is_whole)
+
+
+def _extent(redness: npt.NDArray[np.float32]) -> tuple[float, float]:
+    """How many pixels the blob in ``redness`` (Cr) measures across and up, to a fraction of a pixel.
+
+    JPEG keeps colour at half the resolution, so edges are soft: a pixel counts by how red it is, from grey to the blob's own red.
+    """
+    share = np.clip((redness - GREY) / max(float(np.percentile(redness, 90)) - GREY, 1.0), 0.0, 1.0)
+    share[share < 0.1] = 0.0
+    across, up = share.sum(axis=1), share.sum(axis=0)
+    return max(float(np.percentile(across, 75)), 1.0), max(float(np.percentile(up, 75)), 1.0)

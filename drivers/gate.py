@@ -33,12 +33,14 @@ class Gate:
         return self._deadline
 
     def admit(self, permit: Permit, now: float) -> None:
-        """Let a command through, or raise ``StaleCommand``: older token than one seen, or deadline not in the future."""
+        """Let a command through, or raise ``StaleCommand``: token older than one seen, or deadline not ahead."""
         if not math.isfinite(permit.deadline) or permit.deadline <= now:
             late = now - permit.deadline
             raise StaleCommand(f"the deadline of token {permit.token} passed {late:.3f} s ago; take a new lease")
         if self._token is not None and permit.token < self._token:
-            raise StaleCommand(f"token {permit.token} is older than token {self._token}; someone else holds the task now")
+            raise StaleCommand(
+                f"token {permit.token} is older than token {self._token}; someone else holds the task now"
+            )
         self._token = permit.token
         self._deadline = permit.deadline
 

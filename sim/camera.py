@@ -34,7 +34,14 @@ _SHADOW: Colour = (84, 104, 92)
 _SEAMS = (1.0, 0.9, 0.72, 0.45, 0.1, -0.3, -0.62, -0.86, -1.0)
 """Where the strips of the round target meet, as shares of its half width, from left to right."""
 _REDS: tuple[Colour, ...] = (
-    (28, 18, 158), (32, 22, 176), (38, 28, 194), (48, 38, 212), (46, 36, 208), (40, 30, 200), (34, 24, 184), (29, 19, 164),
+    (28, 18, 158),
+    (32, 22, 176),
+    (38, 28, 194),
+    (48, 38, 212),
+    (46, 36, 208),
+    (40, 30, 200),
+    (34, 24, 184),
+    (29, 19, 164),
 )
 _RING = [(math.cos(turn * math.tau / 14), math.sin(turn * math.tau / 14)) for turn in range(14)]
 _SUB_BITS = 4

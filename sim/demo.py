@@ -93,22 +93,23 @@ class Demonstration:
                 # A page that puts the target there itself has done so by now.
                 if snapshot["target"] is None:
                     await self._operator.place_target_at_random()
-                    self._say("the red target is placed")
+                    self._tell("the red target is placed")
+            still = run.takeover_s is None
             victim = run.look(now, self._visitor.state, snapshot)
+            if still and run.takeover_s is not None:
+                self._tell(f"{run.takeover_s:.2f} s from the kill to the next dog moving")
             if victim:
-                self._say(f"{victim} has come nearer; its node is killed (SIGKILL, process {self._team.pid(victim)})")
+                self._tell(f"{victim} has come nearer; its node is killed (SIGKILL, process {self._team.pid(victim)})")
                 self._lost.add(victim)
                 self._team.kill(victim)
             self._check_processes()
-        if run.takeover_s is not None:
-            self._say(f"{run.takeover_s:.2f} s from the kill to the next dog moving")
         return run
 
     def watch(self) -> None:
         """Say when a process ends; the team starts it again."""
         missing = set(self._team.missing())
         for name in sorted(missing - self._lost):
-            self._say(f"the process of {name} ended; it starts again in 15 s (see {self._plan.run_dir / name}.log)")
+            self._tell(f"the process of {name} ended; it starts again in 15 s (see {self._plan.run_dir / name}.log)")
         self._lost = missing
         self._reactor.callLater(1.0, self.watch)
 
@@ -117,7 +118,10 @@ class Demonstration:
 
     def _on_state(self, before: dict[str, Any], after: dict[str, Any]) -> None:
         for line in told(before, after):
-            self._say(f"{self._reactor.seconds() - self._born:7.2f} s  {line}")
+            self._tell(line)
+
+    def _tell(self, line: str) -> None:
+        self._say(f"{self._reactor.seconds() - self._born:7.2f} s  {line}")
 
     async def _until(self, holds: Callable[[], bool], limit_s: float, problem: str) -> None:
         end = self._reactor.seconds() + limit_s

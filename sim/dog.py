@@ -85,7 +85,7 @@ class Dog:
         )
 
     def strive(self, dt: float) -> None:
-        """Change the velocity towards the command as much as the legs can in ``dt`` seconds; called before the physics."""
+        """Bring the velocity as near to the command as the legs can in ``dt`` seconds; called before the physics."""
         self._before = (self.body.velocity.x, self.body.velocity.y)
         vx, vy, wz = self.motion
         lack_x, lack_y = self.command.vx - vx, self.command.vy - vy

@@ -69,7 +69,7 @@ def _bands(
 
 
 def dog_mesh(stripes: int) -> Mesh:
-    """An ERS-7 in outline: body, head with ``stripes`` yellow stripes, ears, legs, tail, and the shade between the legs.
+    """An ERS-7 in outline: body, head with ``stripes`` yellow stripes, ears, legs, tail, the shade below.
 
     The trunk is as high as the target, so that a dog in front of it hides it whole.
     """
@@ -79,7 +79,7 @@ def dog_mesh(stripes: int) -> Mesh:
         for y in (-0.082, 0.034):
             build.box((x, x + 0.06), (y, y + 0.048), (0.0, 0.125), _GREY)
     build.box((-0.115, 0.105), (-0.080, 0.080), (0.105, 0.232), _WHITE)
-    build.box((-0.125, -0.105), (-0.010, 0.010), (0.19, 0.275), _DARK)
+    build.box((-0.130, -0.115), (-0.012, 0.012), (0.150, 0.240), _DARK)
     build.box(*HEAD, _WHITE, stripes)
     build.box((0.145, 0.172), (-0.030, 0.030), (0.190, 0.226), _DARK)
     for y in (-0.072, 0.058):

@@ -141,7 +141,12 @@ class _Sheet:
         stripes = int(dog["stripes"])
         for number in range(stripes):
             middle = 0.095 + 0.036 * (number - (stripes - 1) / 2)
-            band = [(middle - 0.010, -0.050), (middle + 0.010, -0.050), (middle + 0.010, 0.050), (middle - 0.010, 0.050)]
+            band = [
+                (middle - 0.010, -0.050),
+                (middle + 0.010, -0.050),
+                (middle + 0.010, 0.050),
+                (middle - 0.010, 0.050),
+            ]
             self._polygon(at(band), _YELLOW)
 
     def _outlined(self, points: Sequence[tuple[float, float]], colour: Colour) -> None:

@@ -62,7 +62,9 @@ def loaded(name: str) -> Scene:
             raise SceneError(f"scene {name}: is not UTF-8 text") from error
         return parsed(text, name)
     if name not in scene_names():
-        raise SceneError(f"unknown scene {name!r}; known are {', '.join(scene_names())}, or give the path of a .json file")
+        raise SceneError(
+            f"unknown scene {name!r}; known are {', '.join(scene_names())}, or give the path of a .json file"
+        )
     return parsed((resources.files("sim") / "scenes" / f"{name}.json").read_text(encoding="utf-8"), name)
 
 
@@ -110,7 +112,9 @@ def _check_apart(kennels: tuple[Kennel, ...], source: str) -> None:
             if one.name == other.name:
                 raise SceneError(f"scene {source}: two dogs are named {one.name}; give each its own name")
             if math.hypot(one.x - other.x, one.y - other.y) < 2 * FOOTPRINT:
-                raise SceneError(f"scene {source}: {other.name} and {one.name} overlap; put them {2 * FOOTPRINT} m apart")
+                raise SceneError(
+                    f"scene {source}: {other.name} and {one.name} overlap; put them {2 * FOOTPRINT} m apart"
+                )
 
 
 class _Table:

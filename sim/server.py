@@ -10,7 +10,13 @@ from typing import Any, TextIO
 
 from twisted.internet.base import ReactorBase
 from twisted.internet.error import CannotListenError
-from twisted.logger import FilteringLogObserver, LogLevel, LogLevelFilterPredicate, globalLogBeginner, textFileLogObserver
+from twisted.logger import (
+    FilteringLogObserver,
+    LogLevel,
+    LogLevelFilterPredicate,
+    globalLogBeginner,
+    textFileLogObserver,
+)
 
 from drivers.sim.link import TcpLinkFactory
 from drivers.sim.option import DEFAULT_PORT
@@ -35,7 +41,7 @@ def main(arguments: list[str] | None = None, output: TextIO = sys.stdout, errors
     except SceneError as error:
         return _refused(errors, str(error))
     # Twisted's timers run on the wall clock by default: a step of that clock would freeze the yard, or race it.
-    ReactorBase.seconds = staticmethod(time.monotonic)  # type: ignore[method-assign]
+    ReactorBase.seconds = staticmethod(time.monotonic)
     from twisted.internet import reactor as running
 
     reactor: Any = running
@@ -47,7 +53,9 @@ def main(arguments: list[str] | None = None, output: TextIO = sys.stdout, errors
     try:
         port = reactor.listenTCP(chosen.port, TcpLinkFactory(yard.attach), interface=chosen.host)
     except CannotListenError as error:
-        return _refused(errors, f"cannot listen on {chosen.host}:{chosen.port}: {error.socketError}; try another --port")
+        return _refused(
+            errors, f"cannot listen on {chosen.host}:{chosen.port}: {error.socketError}; try another --port"
+        )
     address = port.getHost()
     yard.start()
     reactor.addSystemEventTrigger("before", "shutdown", yard.stop)

@@ -12,8 +12,8 @@ from drivers.sim.link import Link
 class Session:
     """A driver that holds ``robot``, or an operator, or somebody who has not said yet; a ``Receiver`` of the link.
 
-    Each session has a gate of its own: a new driver of the same robot starts with fresh tokens, and the yard lets only one
-    driver hold a robot at a time.
+    Each session has a gate of its own: a new driver of the same robot starts with fresh tokens, and the yard lets only
+    one driver hold a robot at a time.
     """
 
     def __init__(

@@ -35,7 +35,7 @@ class Target:
 
 
 class World:
-    """The arena of ``scene``: dogs that push each other and bump into walls, and at most one target that stands fast."""
+    """The arena of ``scene``: dogs that push each other and bump into walls, and at most one fixed target."""
 
     def __init__(self, rng: Random, scene: Scene) -> None:
         self.scene = scene
@@ -85,7 +85,7 @@ class World:
         self.dogs[name].command = REST
 
     def distance_ahead(self, dog: Dog, forward: float, reach: float) -> float | None:
-        """Metres from the point ``forward`` metres before the dog's middle to what stands ahead, None beyond ``reach``."""
+        """Metres to what stands ahead of the point ``forward`` metres before the middle, None beyond ``reach``."""
         cos, sin = math.cos(dog.body.angle), math.sin(dog.body.angle)
         x, y = dog.x + forward * cos, dog.y + forward * sin
         hit = self._space.segment_query_first((x, y), (x + reach * cos, y + reach * sin), 0.0, dog.shape.filter)
@@ -145,7 +145,10 @@ class World:
         for other in self.dogs.values():
             if other is not dog and math.hypot(other.x - x, other.y - y) < 2 * FOOTPRINT:
                 raise NotPossible(f"{other.name} stands at ({x:.2f}, {y:.2f}); choose a free place")
-        if self.target is not None and math.hypot(self.target.x - x, self.target.y - y) < FOOTPRINT + self.target.radius:
+        if (
+            self.target is not None
+            and math.hypot(self.target.x - x, self.target.y - y) < FOOTPRINT + self.target.radius
+        ):
             raise NotPossible(f"the target stands at ({x:.2f}, {y:.2f}); choose a free place")
         self._put(dog, x, y, heading)
 
@@ -206,9 +209,7 @@ class World:
             # A wall has thickness so that nothing tunnels; it lies outside, so that its inner face is the boundary.
             length = math.hypot(x2 - x1, y2 - y1)
             out_x, out_y = half * (y2 - y1) / length, -half * (x2 - x1) / length
-            wall = pymunk.Segment(
-                self._space.static_body, (x1 + out_x, y1 + out_y), (x2 + out_x, y2 + out_y), half
-            )
+            wall = pymunk.Segment(self._space.static_body, (x1 + out_x, y1 + out_y), (x2 + out_x, y2 + out_y), half)
             wall.friction = 0.3
             wall.collision_type = WALL
             self._space.add(wall)

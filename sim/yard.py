@@ -208,7 +208,7 @@ class Yard:
                 self._halt(name, session)
             case Drive() if session.has_motors:
                 now = self._now()
-                # A command that was held up has used up its time on the way; nobody gains time by a stamp ahead of ours.
+                # A command that was held up has used up its time on the way; a stamp ahead of ours gains nothing.
                 deadline = min(message.sent, now) + min(message.ttl, MAX_TTL_S)
                 try:
                     session.gate.admit(Permit(message.token, deadline), now)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from typing import Any
 
 from twisted.internet.interfaces import IDelayedCall, IPushProducer, IReactorTime
 from twisted.logger import Logger
@@ -17,6 +17,7 @@ from twisted.web.resource import Resource
 from twisted.web.server import NOT_DONE_YET
 from zope.interface import implementer
 
+from webnode.camera import Camera, FrameSource
 from webnode.errors import Refusal
 from webnode.guard import HEADERS
 from webnode.state import State
@@ -24,39 +25,7 @@ from webnode.state import State
 BEAT_S = 0.5
 PACE_S = 0.1
 MAX_VIEWERS = 256
-POLL_S = 10.0
-LINGER_S = 2.0
 MAX_WAITING = 64
-MAX_FRAME = 1 << 20
-
-OnFrame = Callable[[int, bytes], None]
-
-
-class FrameSource(Protocol):
-    """Where camera pictures come from; the stream to a robot's node exists only while somebody looks."""
-
-    def watch(self, uuid: str, on_frame: OnFrame) -> Callable[[], None]:
-        """Call ``on_frame(seq, jpeg)`` for each new picture of a device until what is returned is called.
-
-        Raises ``Refusal`` where the device has no camera or is not there.
-        """
-
-
-class MemoryFrames:
-    """A frame source in memory: ``show`` hands over a picture; ``watched`` says whose pictures are wanted."""
-
-    def __init__(self) -> None:
-        self.watched: dict[str, OnFrame] = {}
-
-    def watch(self, uuid: str, on_frame: OnFrame) -> Callable[[], None]:
-        """Watch ``uuid``; every device has a camera here."""
-        self.watched[uuid] = on_frame
-        return lambda: self.watched.pop(uuid, None) and None
-
-    def show(self, uuid: str, seq: int, jpeg: bytes) -> None:
-        """Hand over one picture, if somebody watches."""
-        if uuid in self.watched:
-            self.watched[uuid](seq, jpeg)
 
 
 @implementer(IPushProducer)
@@ -187,9 +156,9 @@ class Events(Resource):
 class Shots(Resource):
     """``/shot/<device>?after=N&viewer=V``: the newest picture whose number is not N, as soon as there is one.
 
-    The answer carries ``X-Seq``, the number to give as ``after`` next.  204 after ten seconds without a new picture.  A
-    viewer that asks again while its last question is open gets the older one answered with 204: one picture in flight,
-    never a queue.
+    The answer carries ``X-Seq``, the number to give as ``after`` next.  204 after five seconds without a new
+    picture.  A viewer that asks again while its last question is open gets the older one answered with 204: one
+    picture in flight, never a queue.
     """
 
     def __init__(self, frames: FrameSource, clock: IReactorTime) -> None:
@@ -211,13 +180,11 @@ class Shots(Resource):
         """Answer at once if the newest picture is news, else when the next one comes."""
         camera = self._cameras.get(uuid)
         if camera is None:
-            camera = Camera(self._clock, lambda: self._end(uuid))
-            self._cameras[uuid] = camera
             try:
-                camera.stop_upstream = self._frames.watch(uuid, camera.on_frame)
+                camera = Camera(self._clock, lambda seen: self._frames.watch(uuid, seen), lambda: self._end(uuid))
             except Refusal as refusal:
-                del self._cameras[uuid]
                 return answer(request, refusal)
+            self._cameras[uuid] = camera
         if len(camera.waiting) >= MAX_WAITING:
             return answer(request, Refusal("shot", "too many look at this camera", "close one and try again", 503))
         camera.wait(request)
@@ -244,85 +211,6 @@ class _Shot(Resource):
         return self._shots.ask(self._uuid, request)
 
 
-class Camera:
-    """The newest picture of one device, and who waits for the next; ends itself two seconds after the last question."""
-
-    def __init__(self, clock: IReactorTime, on_end: Callable[[], None]) -> None:
-        self._clock = clock
-        self._on_end = on_end
-        self._newest: tuple[int, bytes, float] | None = None
-        self._linger: IDelayedCall | None = None
-        self.stop_upstream: Callable[[], None] = lambda: None
-        self.waiting: list[tuple[Request, bytes, IDelayedCall]] = []
-
-    def wait(self, request: Request) -> None:
-        """Answer ``request`` with the first picture that is news to it."""
-        viewer = _argument(request, b"viewer")
-        for entry in [entry for entry in self.waiting if viewer and entry[1] == viewer]:
-            self._release(entry)
-        if self._linger is not None:
-            self._linger.cancel()
-            self._linger = None
-        if self._newest is not None and _argument(request, b"after") != str(self._newest[0]).encode():
-            self._send(request)
-            self._rest()
-            return
-        entry = (request, viewer, self._clock.callLater(POLL_S, lambda: self._release(entry)))
-        self.waiting.append(entry)
-        request.notifyFinish().addErrback(lambda _: self._forget(entry))
-
-    def on_frame(self, seq: int, jpeg: bytes) -> None:
-        """Take the next picture; what is no JPEG or far too large is dropped."""
-        if not jpeg.startswith(b"\xff\xd8") or len(jpeg) > MAX_FRAME:
-            return
-        self._newest = (seq, jpeg, self._clock.seconds())
-        waiting, self.waiting = self.waiting, []
-        for request, _, deadline in waiting:
-            deadline.cancel()
-            self._send(request)
-        self._rest()
-
-    def close(self) -> None:
-        """Answer whoever waits with 204 and end the upstream now."""
-        for entry in list(self.waiting):
-            self._release(entry)
-        if self._linger is not None:
-            self._linger.cancel()
-        self._end()
-
-    def _send(self, request: Request) -> None:
-        assert self._newest is not None
-        seq, jpeg, at = self._newest
-        request.setHeader("Content-Type", "image/jpeg")
-        request.setHeader("Cache-Control", "no-store")
-        request.setHeader("X-Seq", str(seq))
-        request.setHeader("X-Age", f"{self._clock.seconds() - at:.3f}")
-        request.setHeader("Content-Length", str(len(jpeg)))
-        request.write(jpeg)
-        request.finish()
-
-    def _release(self, entry: tuple[Request, bytes, IDelayedCall]) -> None:
-        self._forget(entry)
-        entry[0].setResponseCode(204)
-        entry[0].finish()
-
-    def _forget(self, entry: tuple[Request, bytes, IDelayedCall]) -> None:
-        if entry in self.waiting:
-            self.waiting.remove(entry)
-        if entry[2].active():
-            entry[2].cancel()
-        self._rest()
-
-    def _rest(self) -> None:
-        if not self.waiting and self._linger is None:
-            self._linger = self._clock.callLater(LINGER_S, self._end)
-
-    def _end(self) -> None:
-        self._linger = None
-        self.stop_upstream()
-        self._on_end()
-
-
 def answer(request: Request, refusal: Refusal) -> bytes:
     """The body of a native resource's refusal, with its status and type set."""
     request.setResponseCode(refusal.status)
@@ -331,8 +219,3 @@ def answer(request: Request, refusal: Refusal) -> bytes:
     request.setHeader("Content-Type", "application/json")
     request.setHeader("Cache-Control", "no-store")
     return json.dumps(refusal.fields).encode()
-
-
-def _argument(request: Request, name: bytes) -> bytes:
-    values: list[bytes] = (request.args or {}).get(name, [b""])
-    return values[0][:40]

@@ -26,10 +26,11 @@ from twisted.web.server import Site
 from twisted.web.wsgi import WSGIResource
 
 from webnode.app import OnReactor, create_app
+from webnode.camera import FrameSource
 from webnode.desk import Desk
 from webnode.errors import PortTaken, Refusal
 from webnode.guard import HEADERS, MAX_BODY, is_local_host
-from webnode.live import Events, FrameSource, Shots, answer
+from webnode.live import Events, Shots, answer
 from webnode.state import State
 
 WORKERS = 4

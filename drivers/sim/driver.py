@@ -42,8 +42,8 @@ class SimDriver:
     """One dog of the yard, through links that ``connector`` opens; everything happens on the reactor's thread.
 
     After ``connect`` the motors are off and ``estop.engaged`` is true until ``enable``.  ``state`` says ``ready`` while
-    observations flow, ``stale`` while they do not (no frame for ``STALE_S``, or the link is being opened again) and ``stopped``
-    after ``disable``.  A link that comes back finds the motors as they were asked for, and the motion at rest.
+    observations flow, ``stale`` while they do not (no frame for ``STALE_S``, or the link is being opened again)
+    and ``stopped`` after ``disable``.  A link that comes back finds the motors as they were asked for, and the motion at rest.
     """
 
     log = Logger()
@@ -93,8 +93,8 @@ class SimDriver:
     def connect(self) -> Deferred[Description]:
         """Open the link; fires when the first observation has arrived.  Lost links are opened again with back-off.
 
-        Fails with ``Unsupported`` where the yard has no such robot.  While another driver holds the robot, it is asked for
-        again until it is free.
+        Fails with ``Unsupported`` where the yard has no such robot.  While another driver holds the robot, it is
+        asked for again until it is free.
         """
         if self._is_closed:
             return fail(UsageError("this driver was disconnected; make a new one"))
@@ -172,7 +172,7 @@ class SimDriver:
         return end
 
     def diagnostics(self) -> dict[str, float]:
-        """Counters: frames, bad frames, pictures, bytes, links, refusals; ``age`` of the newest observation in seconds."""
+        """Counters: frames, bad frames, pictures, bytes, links, reconnects, refused; ``age`` of what was last seen, in s."""
         counts: dict[str, float] = dict(self._counts)
         counts["reconnects"] = max(0, self._counts["links"] - 1)
         counts["age"] = math.inf if self._newest is None else self._clock.seconds() - self._newest.t_host
@@ -222,9 +222,7 @@ class SimDriver:
                 self._counts["bad_frames"] += 1
 
     def _on_sensors(self, message: Sensors) -> None:
-        observation = Observation(
-            self._clock.seconds(), float(message.t), message.values, message.samples, self._frame
-        )
+        observation = Observation(self._clock.seconds(), float(message.t), message.values, message.samples, self._frame)
         self._newest = observation
         self._is_heard = True
         self._has_problem = False

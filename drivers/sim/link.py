@@ -1,6 +1,7 @@
 """Link: the way between a client and the yard, over TCP or through memory; it carries bytes and knows no message.
 
-``TcpConnector`` is the edge to the world; ``MemoryConnector`` its twin for whole teams in one process on one turned clock.
+``TcpConnector`` is the edge to the world; ``MemoryConnector`` its twin for whole teams in one process on one turned
+clock.
 """
 
 from __future__ import annotations
@@ -187,7 +188,7 @@ class MemoryLink:
             self._clock.callLater(self._delay, self.other._deliver, data)
 
     def close(self) -> None:
-        """Close both ends; the other learns it after the delay, and what is on the way is lost."""
+        """Close both ends; the other learns it after the delay; what is on the way there still arrives, nothing comes back."""
         other, self.other = self.other, None
         if other is not None:
             self._clock.callLater(self._delay, other._drop)

@@ -1,4 +1,4 @@
-"""YardOperator: the operator's side of the yard, from above: the truth for the map and the referee, and a hand in it."""
+"""YardOperator: the yard from above: the truth for the map and the referee, and the operator's hand in it."""
 
 from __future__ import annotations
 
@@ -19,14 +19,15 @@ REPLY_S = 2.0
 ALIVE_S = 0.5
 
 Snapshot = Mapping[str, Any]
-"""``{t, walls: (w, h), dogs: ({name, x, y, heading, moving, stripes}, ...), target: {x, y, radius} or None, collisions}``."""
+"""``t``, ``walls`` (width, height), ``dogs`` (each name, x, y, heading, moving, stripes), ``target`` (x, y, radius) or None,
+``collisions``."""
 
 
 class YardOperator:
     """A client that sees the whole yard ``rate`` times a second, and may move things in it.
 
-    An order's Deferred fires with True when the yard has carried it out; it fails with ``UsageError`` where the yard says
-    why not, with ``LinkLost`` without a link, with ``NoReply`` after ``REPLY_S``.
+    An order's Deferred fires with True when the yard has carried it out; it fails with ``UsageError`` where the yard
+    says why not, with ``LinkLost`` without a link, with ``NoReply`` after ``REPLY_S``.
     """
 
     log = Logger()

@@ -120,9 +120,7 @@ class SqliteStore(MemoryStore):
                 self._turn.notify_all()
 
     def flush(self, timeout: float = 5.0) -> None:
-        """Wait until all that was put is in the file; raises ``BadStore`` where it is not within ``timeout``
-        seconds.
-        """
+        """Wait until all that was put is in the file; raises ``BadStore`` where that takes over ``timeout`` seconds."""
         with self._turn:
             self._hurry = bool(self._owed or self._owed_notes)
             self._turn.notify_all()
@@ -284,7 +282,7 @@ def _checked_version(path: str, connection: sqlite3.Connection) -> int:
         raise _bad(path, "is the database of another program", "name another file")
     if version > SCHEMA_VERSION:
         raise _bad(
-            path, f"has schema {version}, this program knows {SCHEMA_VERSION}", "update it, or name another file"
+            path, f"has schema {version}, we know {SCHEMA_VERSION}", "update it, or name another file"
         )
     (verdict,) = connection.execute("PRAGMA quick_check(1)").fetchone()
     if verdict != "ok":

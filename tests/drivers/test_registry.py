@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 
 from twisted.internet.task import Clock
 from twisted.trial.unittest import SynchronousTestCase
 
+import drivers
 from drivers.errors import UsageError
 from drivers.registry import describe, driver_for, kinds
 
@@ -56,8 +58,12 @@ class RegistryTests(SynchronousTestCase):
         script = (
             "import sys; import drivers.registry as r; assert 'drivers.sim.driver' not in sys.modules\n"
             "r.describe('sim', {}); r.driver_for('sim', {}, 'dog1', None)\n"
-            "import drivers.sim.operator; heavy = {'cv2', 'numpy', 'pymunk', 'twisted.internet.reactor'} & set(sys.modules)\n"
+            "import drivers.sim.operator; unwanted = {'cv2', 'numpy', 'pymunk', 'twisted.internet.reactor'}\n"
+            "heavy = unwanted & set(sys.modules)\n"
             "assert not heavy, heavy"
         )
-        done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=False)
+        root = Path(drivers.__file__).parents[1]
+        done = subprocess.run(
+            [sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=False, cwd=root
+        )
         self.assertEqual((done.returncode, done.stderr), (0, ""))

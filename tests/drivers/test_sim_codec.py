@@ -129,7 +129,13 @@ class FrameReaderTests(SynchronousTestCase):
 
     def test_drops_noise_and_goes_on(self) -> None:
         """After bytes that are no frame, the reader finds the next one; it counts what it dropped."""
-        for noise in (b"rubbish", MARKER + b"\xff\xff\xff\xff", b"\xa9", MARKER, MARKER + (3).to_bytes(4, "big") + b"abc"):
+        for noise in (
+            b"rubbish",
+            MARKER + b"\xff\xff\xff\xff",
+            b"\xa9",
+            MARKER,
+            MARKER + (3).to_bytes(4, "big") + b"abc",
+        ):
             reader = FrameReader()
             read = list(reader.read(noise + self.stream))
             # Noise that looks like the start of a frame may swallow the first real ones, never all of them.

@@ -16,8 +16,8 @@ from twisted.internet import reactor as _reactor
 from twisted.internet.stdio import StandardIO
 from twisted.protocols.basic import LineReceiver
 
+from webnode.camera import OnFrame
 from webnode.desk import MemoryDesk
-from webnode.live import OnFrame
 from webnode.server import WebService, web_service
 from webnode.state import Departed, State, state_of
 

@@ -14,9 +14,9 @@ from twisted.trial.unittest import TestCase
 from twisted.web.client import Agent, HTTPConnectionPool, readBody
 from twisted.web.http_headers import Headers
 
+from webnode.camera import MemoryFrames
 from webnode.desk import MemoryDesk
 from webnode.errors import PortTaken
-from webnode.live import MemoryFrames
 from webnode.server import WORKERS, WebService, web_service
 from webnode.state import State, state_of
 

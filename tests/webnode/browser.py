@@ -40,11 +40,13 @@ class Connection:
 
     def pause(self) -> None:
         """Read no more: the transport tells its producer to wait."""
-        self.protocol.pauseProducing()
+        producer: Any = self.transport.producer
+        producer.pauseProducing()
 
     def resume(self) -> None:
         """Read again."""
-        self.protocol.resumeProducing()
+        producer: Any = self.transport.producer
+        producer.resumeProducing()
 
     def leave(self) -> None:
         """Close."""

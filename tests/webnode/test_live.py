@@ -11,8 +11,9 @@ from twisted.trial.unittest import SynchronousTestCase
 from twisted.web.resource import Resource
 
 from tests.webnode.browser import Connection, site_of
+from webnode.camera import MemoryFrames, OnFrame
 from webnode.errors import Refusal
-from webnode.live import MAX_VIEWERS, MAX_WAITING, Events, MemoryFrames, OnFrame, Shots
+from webnode.live import MAX_VIEWERS, MAX_WAITING, Events, Shots
 
 JPEG = b"\xff\xd8 a picture"
 
@@ -175,13 +176,22 @@ class ShotsTests(SynchronousTestCase):
         self.frames.show("ab", 1, JPEG)
         self.assertIn(b"X-Seq: 1", page.taken())
 
-    def test_give_up_after_ten_seconds(self) -> None:
-        """Without a picture the answer after ten seconds is 204, so that the page knows that the node lives."""
+    def test_give_up_after_five_seconds(self) -> None:
+        """Without a picture the answer after five seconds is 204, so that the page knows that the node lives."""
         page = self.asked()
-        self.clock.advance(9.9)
+        self.clock.advance(4.9)
         self.assertEqual(page.taken(), b"")
         self.clock.advance(0.1)
         self.assertIn(b" 204 ", page.taken())
+
+    def test_open_a_silent_upstream_anew(self) -> None:
+        """A silent upstream is opened anew while one looks: its device may be back at another address."""
+        self.asked()
+        self.clock.advance(5)
+        page = self.asked()
+        self.frames.watched["ab"](1, JPEG)
+        self.assertIn(b" 200 ", page.taken())
+        self.assertEqual(self.frames.opened, 2)
 
     def test_hold_one_question_a_viewer(self) -> None:
         """A viewer that asks again has its older question answered with 204; others are left alone."""
@@ -197,7 +207,7 @@ class ShotsTests(SynchronousTestCase):
         self.assertEqual(list(self.frames.watched), [])
         page = self.asked(viewer="a")
         again = self.asked(viewer="a")
-        self.clock.advance(5)
+        self.clock.advance(4)
         self.assertEqual(list(self.frames.watched), ["ab"])
         self.frames.show("ab", 1, JPEG)
         self.clock.advance(1.9)
@@ -235,6 +245,14 @@ class ShotsTests(SynchronousTestCase):
         for _ in range(MAX_WAITING):
             self.asked()
         self.assertIn(b" 503 ", self.asked().taken())
+
+    def test_ignore_late_pictures(self) -> None:
+        """A picture that arrives after the upstream was stopped starts nothing again."""
+        self.asked()
+        late = self.frames.watched["ab"]
+        self.shots.close()
+        late(1, JPEG)
+        self.assertEqual((self.clock.getDelayedCalls(), self.shots.watched), ([], []))
 
     def test_close(self) -> None:
         """Closing answers whoever waits and stops the upstream now."""

@@ -1,14 +1,14 @@
 // The map: the yard from above, in centimetres with y upwards; the target follows a finger, a mouse or the arrow keys.
 import { at, attribute, drawn, keyed, words } from "./element.js";
-import { ask, say, wish } from "./desk.js";
+import { wish } from "./desk.js";
 
 const STEP = 0.05;
 const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
 let yard = null;
-let held = null;
-let sentAt = 0;
+let held = false;
 let settleAt = 0;
-let later;
+let sending = false;
+let next = null;
 
 const floor = drawn("rect", { class: "floor", rx: 2 });
 const grid = drawn("path", { class: "grid" });
@@ -18,8 +18,7 @@ const target = drawn("g", { class: "target", role: "button", tabindex: 0 },
 
 export function showYard(snapshot) {
   at("yard").hidden = !snapshot;
-  // A snapshot from before the last key must not pull the target back under the next one.
-  if (snapshot?.target && yard?.target && performance.now() < settleAt) snapshot = { ...snapshot, target: yard.target };
+  if (snapshot && yard && performance.now() < settleAt) snapshot = { ...snapshot, target: yard.target };
   yard = snapshot;
   if (!snapshot) return;
   const [w, h] = snapshot.walls.map((side) => side * 100);
@@ -34,7 +33,7 @@ export function showYard(snapshot) {
     attribute(shape, "transform", `translate(${(dog.x * 100).toFixed(1)} ${(h - dog.y * 100).toFixed(1)})`);
     attribute(shape.firstChild, "transform", `rotate(${((-dog.heading * 180) / Math.PI).toFixed(1)})`);
   });
-  if (!held) placeTarget(snapshot.target);
+  placeTarget(snapshot.target);
 }
 
 // A dog seen from above, looking along x, with as many yellow stripes on the head as its number.
@@ -70,47 +69,49 @@ function inside(x, y) {
   return { x: within(x, yard.walls[0]), y: within(y, yard.walls[1]) };
 }
 
-const move = (spot) => wish("Moving the target", "/api/target",
-  { body: spot, done: () => `Target moved to ${spot.x.toFixed(2)}, ${spot.y.toFixed(2)} m.` });
+// One wish in flight; the newest waits and those between are dropped, so the last one said is the last one done.
+async function send(doing) {
+  next = doing;
+  if (sending) return;
+  sending = true;
+  while (next) {
+    const now = next;
+    next = null;
+    if (!(await now())) settleAt = 0;
+  }
+  sending = false;
+}
+
+// Show what is wanted at once; snapshots from before must not pull it back while the wish is on its way.
+function want(spot) {
+  settleAt = performance.now() + 700;
+  yard = { ...yard, target: spot && { ...yard.target, ...spot } };
+  placeTarget(yard.target);
+  send(spot
+    ? () => wish("Moving the target", "/api/target", { body: spot, done: () => `Target moved to ${spot.x.toFixed(2)}, ${spot.y.toFixed(2)} m.` })
+    : () => wish("Taking the target away", "/api/target", { method: "DELETE", done: () => "The target is taken away." }));
+}
 
 export function startMap() {
   const map = at("map");
   map.append(floor, grid, dogs, target);
   map.addEventListener("click", (event) => {
-    if (yard && !target.contains(event.target)) move(spotOf(event));
+    if (yard && !target.contains(event.target)) want(spotOf(event));
   });
   target.addEventListener("pointerdown", (event) => {
     target.setPointerCapture(event.pointerId);
-    held = yard?.target ?? null;
+    held = true;
   });
   target.addEventListener("pointermove", (event) => {
-    if (!held) return;
-    held = spotOf(event);
-    placeTarget(held);
-    if (performance.now() - sentAt < 200) return;
-    sentAt = performance.now();
-    ask("/api/target", held).catch((error) => say(error.message));
+    if (held && yard?.target) want(spotOf(event));
   });
-  const drop = async () => {
-    if (!held) return;
-    await move({ x: held.x, y: held.y });
-    held = null;
-  };
-  target.addEventListener("pointerup", drop);
-  target.addEventListener("pointercancel", drop);
+  for (const name of ["pointerup", "pointercancel"]) target.addEventListener(name, () => { held = false; });
   target.addEventListener("keydown", (event) => {
     const arrow = ARROWS[event.key];
     if (!arrow || !yard?.target) return;
     event.preventDefault();
-    const from = yard.target;
-    const spot = inside(from.x + arrow[0] * STEP, from.y + arrow[1] * STEP);
-    yard = { ...yard, target: { ...from, ...spot } };
-    settleAt = performance.now() + 600;
-    placeTarget(yard.target);
-    clearTimeout(later);
-    later = setTimeout(() => move(spot), 120);
+    want(inside(yard.target.x + arrow[0] * STEP, yard.target.y + arrow[1] * STEP));
   });
-  at("put").addEventListener("click", () => { if (yard) move(inside(yard.walls[0] / 2, yard.walls[1] / 2)); });
-  at("clear").addEventListener("click", () => wish("Taking the target away", "/api/target",
-    { method: "DELETE", done: () => "The target is taken away." }));
+  at("put").addEventListener("click", () => { if (yard) want(inside(yard.walls[0] / 2, yard.walls[1] / 2)); });
+  at("clear").addEventListener("click", () => { if (yard) want(null); });
 }

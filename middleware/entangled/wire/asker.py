@@ -302,7 +302,10 @@ class Asker:
         self._counters["untold"] += len(peer.tells)
         peer.tells.clear()
         if peer.sessions:
-            return  # each question in the older session has its own timer
+            for inquiry in list(peer.inquiries.values()):
+                if inquiry.tries >= MAX_TRIES:  # it waited for this handshake only
+                    self._due(inquiry)
+            return  # the others have their own timers
         for inquiry in list(peer.inquiries.values()):
             had_its_chance = inquiry.asked_at <= opening.started_at and inquiry.address == opening.address
             if inquiry.is_patient or not had_its_chance:

@@ -47,7 +47,8 @@ class Endpoint:
     """The wire of one node.
 
     ``team_key`` (32 bytes) is the secret of the team: who lacks it can neither read nor be answered.  ``rng`` makes the
-    ephemeral keys, so outside of simulations it must be ``random.SystemRandom``.
+    ephemeral keys, so outside of simulations it must be ``random.SystemRandom``, and in them no node may be given dice
+    that fall as those of its former life did.
 
     ``on_contact`` is called when a peer has proved its key and its address: it answered us, or confirmed the session
     that it opened.  ``counters`` counts every datagram that was dropped, by its reason: oversized, unknown,

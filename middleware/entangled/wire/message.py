@@ -86,6 +86,8 @@ def decoded(data: bytes) -> Message:
         )
     except Exception as error:  # foreign code on foreign bytes; more kinds than its manual names have been seen
         raise Malformed(f"not msgpack: {type(error).__name__}") from None
+    if not (isinstance(fields, list) and fields and type(fields[0]) is int):  # True and 1.0 would match 1
+        raise Malformed("no message starts like this")
     match fields:
         case [0, id_, method, list(arguments)] if _is_id(id_) and _is_method(method) and _is_flat(arguments):
             return Question(id_, method, tuple(arguments))

@@ -1,0 +1,77 @@
+"""Exploration: look all around, then walk to a new place where the way is open, and look around again; pure.
+
+Knows ranges and the robot's own odometry, and not what is searched for.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+
+from agents.behaviour import STAND
+from drivers.reading import Action
+
+TURN_SPEED = 1.6
+TURN_GAIN = 2.2
+WALK = 0.16
+LEG = 0.6
+"""Metres to walk before looking around again."""
+CLEARANCE = 0.38
+"""Metres ahead at which a leg ends: something is in the way."""
+OPEN = 1.5
+"""A way with nothing within this range, the far ranger's, is as open as can be told."""
+AIMED = math.radians(8.0)
+
+Pose = tuple[float, float, float]
+
+
+class Exploration:
+    """One robot's way through an unknown place; ``pose`` is its odometry (x, y in metres, yaw in radians)."""
+
+    def __init__(self, rng: random.Random) -> None:
+        self._rng = rng
+        self._side = rng.choice((-1.0, 1.0))
+        self._turned = 0.0
+        self._openness: list[tuple[float, float]] = []
+        self._heading: float | None = None
+        self._leg_from: tuple[float, float] | None = None
+
+    def saw(self, pose: Pose, turned: float, ahead: float) -> None:
+        """Take in the pose, the turn since the last time, and the range ahead (NaN: nothing within reach)."""
+        if self._heading is None:
+            self._turned += abs(turned)
+            self._openness.append((OPEN if math.isnan(ahead) else ahead, pose[2]))
+
+    def step(self, pose: Pose, ahead: float) -> Action:
+        """What to do next."""
+        if self._heading is None:
+            if self._turned < math.tau:
+                return {**STAND, "base.wz": self._side * TURN_SPEED}
+            self._heading = self._most_open()
+        off = math.remainder(self._heading - pose[2], math.tau)
+        if self._leg_from is None:
+            if abs(off) > AIMED:
+                return {**STAND, "base.wz": clipped(TURN_GAIN * off, TURN_SPEED)}
+            self._leg_from = pose[:2]
+        is_blocked = not math.isnan(ahead) and ahead < CLEARANCE
+        if is_blocked or math.dist(self._leg_from, pose[:2]) >= LEG:
+            self._begin_turn()
+            return STAND
+        return {**STAND, "base.vx": WALK, "base.wz": clipped(TURN_GAIN * off, TURN_SPEED)}
+
+    def _most_open(self) -> float:
+        """A heading with room ahead and beside it; chance decides among the best."""
+        best = max(openness for openness, _ in self._openness)
+        return self._rng.choice([yaw for openness, yaw in self._openness if openness >= 0.95 * best])
+
+    def _begin_turn(self) -> None:
+        self._turned = 0.0
+        self._openness = []
+        self._heading = None
+        self._leg_from = None
+        self._side = self._rng.choice((-1.0, 1.0))
+
+
+def clipped(value: float, limit: float) -> float:
+    """``value``, or ``limit`` with its sign where it is larger."""
+    return max(-limit, min(limit, value))

@@ -1,0 +1,222 @@
+"""Trials: both experiments of the thesis, many times, each from a seed; a table, and pictures of each phase.
+
+``swarm trials --count 20 --seed 1`` runs in virtual time, where the real nodes, agents, drivers and yard run on a turned clock;
+``--real 3`` adds runs with real processes (``sim.demo``).  The team is handed in by the front door.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+from sim.experiment import Experiment, to_target
+
+LOOK_S = 0.032
+"""Virtual seconds between two looks at the team: one sensor frame."""
+LIMIT_S = 120.0
+SETTLED_S = 1.0
+
+
+class Team(Protocol):
+    """A team that can be made to live a while (``swarmnode.VirtualTeam``)."""
+
+    clock: Any
+    board: Any
+    yard: Any
+
+    def run_demo(self) -> str:
+        """Assign the demonstration's task."""
+
+    def state(self) -> dict[str, Any]:
+        """What the page shows."""
+
+    def truth(self) -> dict[str, Any]:
+        """Where everything really is."""
+
+    def scatter(self, seed: int) -> None:
+        """Set the dogs down at random places."""
+
+    def kill(self, name: str) -> None:
+        """End a node without a word."""
+
+    def stop(self) -> None:
+        """End everything."""
+
+
+MakeTeam = Callable[[int], Team]
+
+
+@dataclass
+class Outcome:
+    """What came of one trial; times in seconds since the task was assigned, ``takeover`` since the kill.
+
+    ``found`` says whether every dog reported before the task ended, ``agreed`` whether all agents named the same one, ``right``
+    whether the one that went was the nearest, ``held`` whether everything was as it had to be.
+    """
+
+    seed: int
+    experiment: int
+    held: bool = False
+    found: bool = False
+    agreed: bool = False
+    right: bool = False
+    by: str = ""
+    killed: str = ""
+    find: float | None = None
+    agree: float | None = None
+    reach: float | None = None
+    takeover: float | None = None
+    digest: str = ""
+    broken: list[str] = field(default_factory=list)
+
+
+def trial(make_team: MakeTeam, experiment: int, seed: int, pictures: Path | None = None) -> Outcome:
+    """Run one experiment from ``seed``; where ``pictures`` is given, draw each phase into that folder."""
+    team = make_team(seed)
+    team.scatter(seed)
+    draw = _painter(team, pictures, experiment, seed)
+    draw("1-without-target", "The dogs in the yard, no target yet")
+    began = team.clock.seconds()
+    run = Experiment(f"experiment {experiment}", team.run_demo(), experiment == 2, began)
+    outcome = Outcome(seed, experiment)
+    while not run.is_over and team.clock.seconds() - began < LIMIT_S:
+        team.clock.advance(LOOK_S)
+        state, truth = team.state(), team.truth()
+        _notice(outcome, state, truth, team.clock.seconds() - began, draw)
+        killed = run.look(team.clock.seconds(), state, truth)
+        if killed:
+            draw("5-lost", f"{killed} is lost on its way")
+            team.kill(killed)
+    draw("6-reached", f"{run.by or 'nobody'} stands at the target")
+    team.clock.advance(SETTLED_S)
+    outcome.digest = team.board.digest()
+    team.stop()
+    checks = run.checks()
+    outcome.by, outcome.killed, outcome.reach, outcome.takeover = run.by, run.killed, run.took_s, run.takeover_s
+    outcome.right = bool(checks) and checks[-1].held and "nearest" in checks[-1].what
+    outcome.broken = [check.what for check in checks if not check.held]
+    outcome.held = run.held
+    return outcome
+
+
+Draw = Callable[[str, str], None]
+
+
+def _notice(outcome: Outcome, state: dict[str, Any], truth: dict[str, Any], now: float, draw: Draw) -> None:
+    """The moments at which all have found the target, and at which all name the same agent."""
+    group = state["groups"][0] if state["groups"] else None
+    if truth["target"] is not None:
+        draw("2-with-target", "The target is placed while they search")
+    if group is None:
+        return
+    members = group["members"]
+    if members and outcome.find is None and all(m["cost"] is not None for m in members):
+        outcome.find, outcome.found = now, True
+        draw("3-found", "All dogs have found the target")
+    if members and outcome.agree is None and group["assigned"] and group["agree"] == group["of"]:
+        outcome.agree, outcome.agreed = now, True
+        draw("4-approach", f"All agree: {group['assigned']} goes")
+
+
+def _painter(team: Team, folder: Path | None, experiment: int, seed: int) -> Draw:
+    if folder is None:
+        return lambda phase, caption: None
+    from sim.picture import overhead
+
+    drawn: set[str] = set()
+
+    def draw(phase: str, caption: str) -> None:
+        if phase not in drawn:
+            drawn.add(phase)
+            path = folder / f"experiment{experiment}-seed{seed}-{phase}.png"
+            path.write_bytes(overhead(team.truth(), caption=caption))
+
+    return draw
+
+
+def percentile(values: Sequence[float], share: float) -> float:
+    """The smallest of ``values`` that at least ``share`` of them do not exceed."""
+    ordered = sorted(values)
+    return ordered[max(0, math.ceil(share * len(ordered)) - 1)]
+
+
+def table(outcomes: Iterable[Outcome]) -> str:
+    """One line an experiment: how many held, found, agreed and chose right, and the times as median (95th percentile)."""
+    rows = [f"{'':12}{'trials':>7}{'held':>7}{'found':>7}{'agreed':>8}{'right':>7}"]
+    rows[0] += "".join(f"{name:>16}" for name in ("find s", "agree s", "reach s", "take over s"))
+    every = list(outcomes)
+    for number in sorted({o.experiment for o in every}):
+        some = [o for o in every if o.experiment == number]
+        counts = [sum(getattr(o, name) for o in some) for name in ("held", "found", "agreed", "right")]
+        row = f"experiment {number}{len(some):>7}" + "".join(f"{n:>{w}}" for n, w in zip(counts, (7, 7, 8, 7), strict=True))
+        for name in ("find", "agree", "reach", "takeover"):
+            times = [t for o in some if (t := getattr(o, name)) is not None]
+            cell = f"{statistics.median(times):.2f} ({percentile(times, 0.95):.2f})" if times else "-"
+            row += f"{cell:>16}"
+        rows.append(row)
+    return "\n".join(rows)
+
+
+def _one(job: tuple[MakeTeam, int, int, Path | None]) -> Outcome:
+    make_team, experiment, seed, pictures = job
+    return trial(make_team, experiment, seed, pictures)
+
+
+def real(count: int, seed: int, run_dir: Path) -> list[bool]:
+    """Both experiments with real processes, ``count`` times; whether each run held."""
+    held = []
+    for number in range(count):
+        command = [sys.executable, "-m", "sim.demo", "--headless", "--seed", str(seed + number), "--run-dir"]
+        held.append(subprocess.run([*command, str(run_dir / f"real{number}")], check=False).returncode == 0)
+    return held
+
+
+def main(arguments: Sequence[str], make_team: MakeTeam) -> int:
+    """The command line; returns 0 where every trial held."""
+    parser = argparse.ArgumentParser(prog="swarm trials", description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--count", type=int, default=20, help="trials of each experiment in virtual time")
+    parser.add_argument("--seed", type=int, default=1, help="the first seed")
+    parser.add_argument("--real", type=int, default=0, help="runs of both experiments with real processes")
+    parser.add_argument("--out", type=Path, default=Path("run/trials"), help="folder for the report and the pictures")
+    parser.add_argument("--pictures", type=int, default=1, help="of how many seeds pictures are drawn")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="trials at the same time")
+    given = parser.parse_args(list(arguments))
+    given.out.mkdir(parents=True, exist_ok=True)
+    jobs = [
+        (make_team, experiment, given.seed + n, given.out if n < given.pictures else None)
+        for n in range(given.count)
+        for experiment in (1, 2)
+    ]
+    outcomes = []
+    began = time.monotonic()
+    with ProcessPoolExecutor(max_workers=given.jobs) as pool:
+        for outcome in pool.map(_one, jobs):
+            outcomes.append(outcome)
+            word = "ok  " if outcome.held else "FAIL"
+            broken = f"  ({'; '.join(outcome.broken)})" if outcome.broken else ""
+            line = f"{len(outcomes):4}/{len(jobs)} {word} experiment {outcome.experiment} seed {outcome.seed}"
+            sys.stdout.write(f"{line}: {outcome.by or 'nobody'} reached it{broken}\n")
+            sys.stdout.flush()
+    (given.out / "trials.json").write_text(json.dumps([asdict(o) for o in outcomes], indent=1), encoding="utf-8")
+    sys.stdout.write(f"\n{table(outcomes)}\n")
+    virtual = sum(o.reach or 0.0 for o in outcomes)
+    spent = time.monotonic() - began
+    sys.stdout.write(f"{virtual:.0f} s of team time in {spent:.0f} s; report and pictures in {given.out}\n")
+    held = real(given.real, given.seed, given.out)
+    if held:
+        sys.stdout.write(f"real processes: {sum(held)} of {len(held)} runs held, both experiments each\n")
+    return 0 if all(o.held for o in outcomes) and all(held) else 1
+
+
+__all__ = ["Outcome", "main", "table", "to_target", "trial"]

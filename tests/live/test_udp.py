@@ -1,0 +1,69 @@
+"""Tests of the real UDP network, over the loopback interface."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Generator
+from typing import Any
+
+from twisted.internet import reactor
+from twisted.internet.defer import Deferred, inlineCallbacks
+from twisted.trial.unittest import TestCase
+
+from middleware.entangled.errors import PortInUse
+from middleware.entangled.identity import Identity
+from middleware.entangled.network.network import MAX_DATAGRAM, Address
+from middleware.entangled.network.udp import UdpNetwork
+from middleware.entangled.wire.endpoint import Endpoint
+
+
+class UdpTests(TestCase):
+    """Behaviour of ``UdpNetwork``."""
+
+    def network(self) -> UdpNetwork:
+        """A network on a free port, closed after the test."""
+        network = UdpNetwork(reactor, "127.0.0.1", 0)
+
+        def close() -> Deferred[Any]:
+            network.close()
+            return network.closed
+
+        self.addCleanup(close)
+        return network
+
+    @inlineCallbacks
+    def test_endpoints_talk(self) -> Generator[Deferred[Any], Any, None]:
+        """Two endpoints greet, ask and answer over real sockets."""
+        ends = []
+        for seed in (1, 2):
+            end = Endpoint(Identity(bytes([seed]) * 32), b"k" * 32, self.network(), reactor, random.SystemRandom())
+            end.start()
+            self.addCleanup(end.stop)
+            ends.append(end)
+        ends[1].expose("twice", lambda peer, number: 2 * number, changes=True)
+        contact = yield ends[0].greet(ends[1].address)
+        self.assertEqual(contact.public, Identity(b"\x02" * 32).public)
+        answer = yield ends[0].ask(contact, "twice", 21, changes=True)
+        self.assertEqual(answer, 42)
+
+    def test_port_in_use(self) -> None:
+        """A port that is held is refused in one line that says which and what to do."""
+        first = self.network()
+        first.listen(lambda datagram, source: None)
+        self.assertNotEqual(first.address.port, 0)
+        second = UdpNetwork(reactor, "127.0.0.1", first.address.port)
+        error = self.assertRaises(PortInUse, second.listen, lambda datagram, source: None)
+        self.assertIn(f"127.0.0.1:{first.address.port}", str(error))
+        self.assertNotIn("\n", str(error))
+
+    def test_what_cannot_be_sent_is_counted(self) -> None:
+        """Odd addresses, too large datagrams and a closed port raise nothing."""
+        network = self.network()
+        network.send(b"x", Address("127.0.0.1", 9))
+        network.listen(lambda datagram, source: None)
+        for address in [Address("a name", 9), Address("::1", 9), Address("127.0.0.1", 99999), Address("127.0.0.1", -1)]:
+            network.send(b"x", address)
+        network.send(bytes(MAX_DATAGRAM + 1), Address("127.0.0.1", 9))
+        self.assertEqual((network.counters["unsent"], network.counters["oversized"]), (5, 1))
+        network.close()
+        network.close()

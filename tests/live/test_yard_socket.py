@@ -1,0 +1,131 @@
+"""The yard as a process of its own, over real loopback sockets."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+from twisted.internet import reactor
+from twisted.internet.defer import Deferred
+from twisted.internet.interfaces import IReactorTime
+from twisted.internet.task import deferLater
+from twisted.trial.unittest import SynchronousTestCase, TestCase
+
+import sim
+from drivers.driver import Permit
+from drivers.errors import UsageError
+from drivers.registry import driver_for
+from drivers.sim.link import TcpConnector
+from drivers.sim.operator import YardOperator
+
+ROOT = Path(sim.__file__).parents[1]
+
+
+def spawned(*arguments: str) -> subprocess.Popen[str]:
+    """A yard process; its first line says where it listens."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "sim.server", *arguments],
+        cwd=ROOT, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    )  # fmt: skip
+
+
+@asynccontextmanager
+async def running_yard() -> AsyncIterator[tuple[subprocess.Popen[str], int]]:
+    """A yard process on a free port."""
+    process = spawned("--port", "0")
+    assert process.stdout is not None
+    line = process.stdout.readline()
+    try:
+        yield process, int(line.split(" on ")[1].split(":")[1])
+    finally:
+        process.kill()
+        process.communicate()
+
+
+class YardSocketTests(TestCase):
+    """A driver and an operator, each over TCP."""
+
+    timeout = 20
+
+    def test_drives_a_dog(self) -> Deferred[None]:
+        """Over TCP a dog connects, sees, walks and stops; the operator watches and moves it; both leave cleanly."""
+        return Deferred.fromCoroutine(self._drive_a_dog())
+
+    async def _drive_a_dog(self) -> None:
+        clock = IReactorTime(reactor)
+        async with running_yard() as (_, port):
+            driver = driver_for("sim", {"port": port, "camera_fps": 30}, "dog1", clock)
+            operator = YardOperator(TcpConnector(), clock, port=port)
+            await driver.connect()
+            before = await operator.connect()
+            await driver.enable()
+            driver.act({"base.vx": 0.16}, Permit(1, clock.seconds() + 0.5))
+            await deferLater(clock, 1.0, lambda: None)
+            after = operator.snapshot
+            assert after is not None
+            moved = after["dogs"][0]["x"] - before["dogs"][0]["x"]
+            self.assertTrue(0.02 < moved < 0.1, moved)
+            self.assertFalse(after["dogs"][0]["moving"])
+            newest = driver.observe()
+            assert newest is not None and newest.frame is not None
+            self.assertGreater(newest.frame.seq, 15)
+            await operator.place_target(1.5, 1.2)
+            with self.assertRaises(UsageError):
+                await operator.place_target(-1.0, 0.0)
+            await driver.disconnect()
+            await operator.disconnect()
+
+    def test_opens_a_lost_link_again(self) -> Deferred[None]:
+        """A yard that is killed makes the driver stale at once; a new one at the same port finds it back by itself."""
+        return Deferred.fromCoroutine(self._open_again())
+
+    async def _open_again(self) -> None:
+        clock = IReactorTime(reactor)
+        async with running_yard() as (process, port):
+            driver = driver_for("sim", {"port": port, "camera": False}, "dog2", clock)
+            await driver.connect()
+            process.kill()
+            process.wait()
+            await deferLater(clock, 0.2, lambda: None)
+            self.assertEqual(driver.state, "stale")
+        again = spawned("--port", str(port))
+        try:
+            for _ in range(80):
+                await deferLater(clock, 0.1, lambda: None)
+                if driver.state == "ready":
+                    break
+            self.assertEqual(driver.state, "ready")
+        finally:
+            await driver.disconnect()
+            again.kill()
+            again.communicate()
+
+
+class YardCommandTests(SynchronousTestCase):
+    """What the command line says about mistakes."""
+
+    def refusal(self, *arguments: str) -> str:
+        """The one line of a yard that does not start."""
+        process = spawned(*arguments)
+        _, line = process.communicate(timeout=20)
+        self.assertEqual((process.returncode, line.count("\n")), (2, 1), line)
+        return line
+
+    def test_names_the_mistake(self) -> None:
+        """An unknown scene and a port that is none end with code 2 and one line that says what to write."""
+        self.assertIn("known are three-dogs", self.refusal("--scene", "nowhere"))
+        self.assertIn("1 to 65535", self.refusal("--port", "70000"))
+
+    def test_names_a_port_in_use(self) -> None:
+        """A second yard at the same port ends with code 2 and names the port."""
+        first = spawned("--port", "0")
+        try:
+            assert first.stdout is not None
+            port = first.stdout.readline().split(" on ")[1].split(":")[1].strip()
+            self.assertIn(f"cannot listen on 127.0.0.1:{port}", self.refusal("--port", port))
+        finally:
+            first.kill()
+            first.communicate()

@@ -1,0 +1,120 @@
+"""Tests of the simulated clock."""
+
+from __future__ import annotations
+
+import random
+import time
+
+from twisted.internet.base import ReactorBase
+from twisted.internet.error import AlreadyCalled, AlreadyCancelled
+from twisted.internet.interfaces import IDelayedCall, IReactorTime
+from twisted.trial.unittest import SynchronousTestCase
+from zope.interface.verify import verifyObject
+
+from middleware.entangled.clock import HeapClock, use_monotonic_time
+
+
+class HeapClockTests(SynchronousTestCase):
+    """Behaviour of ``HeapClock``."""
+
+    def setUp(self) -> None:
+        """Make a clock and a list of what was called."""
+        self.clock = HeapClock()
+        self.called: list[object] = []
+
+    def test_provides_interfaces(self) -> None:
+        """Clock and call provide what Twisted's interfaces ask for."""
+        verifyObject(IReactorTime, self.clock)
+        verifyObject(IDelayedCall, self.clock.callLater(1, self.called.append, 1))
+
+    def test_calls_in_order(self) -> None:
+        """Calls come by time, and at the same time in the order in which they were scheduled."""
+        for delay, name in [(2.0, "c"), (1.0, "a"), (2.0, "d"), (1.0, "b")]:
+            self.clock.callLater(delay, self.called.append, name)
+        self.clock.advance(1.5)
+        self.assertEqual(self.called, ["a", "b"])
+        self.clock.advance(0.5)
+        self.assertEqual(self.called, ["a", "b", "c", "d"])
+
+    def test_call_sees_its_own_moment(self) -> None:
+        """A call that runs during a long step sees the moment for which it was scheduled, and what it adds runs too."""
+
+        def again() -> None:
+            self.called.append(self.clock.seconds())
+            if len(self.called) < 3:
+                self.clock.callLater(0.25, again)
+
+        self.clock.callLater(0.25, again)
+        self.clock.run_until(10.0)
+        self.assertEqual(self.called, [0.25, 0.5, 0.75])
+        self.assertEqual(self.clock.seconds(), 10.0)
+
+    def test_cancel_reset_delay(self) -> None:
+        """A cancelled call never comes, a moved one comes once and at its new moment."""
+        gone = self.clock.callLater(1, self.called.append, "gone")
+        later = self.clock.callLater(1, self.called.append, "later")
+        sooner = self.clock.callLater(5, self.called.append, "sooner")
+        gone.cancel()
+        later.delay(2)
+        sooner.reset(2)
+        self.assertEqual(self.clock.getDelayedCalls(), [sooner, later])
+        self.clock.pump([2, 0.5])
+        self.assertEqual(self.called, ["sooner"])
+        self.clock.advance(10)
+        self.assertEqual(self.called, ["sooner", "later"])
+        self.assertFalse(later.active())
+        self.assertRaises(AlreadyCalled, later.cancel)
+        self.assertRaises(AlreadyCancelled, gone.reset, 1)
+        self.assertEqual(self.clock.getDelayedCalls(), [])
+
+    def test_refuses_the_past(self) -> None:
+        """A negative delay is an error of the caller."""
+        self.assertRaises(ValueError, self.clock.callLater, -1, self.called.append, 1)
+
+    def test_exception_passes(self) -> None:
+        """An exception of a call reaches whoever moves the time, and the clock stands at that call."""
+        self.clock.callLater(1, int, "x")
+        self.clock.callLater(2, self.called.append, "next")
+        self.assertRaises(ValueError, self.clock.advance, 5)
+        self.assertEqual(self.clock.seconds(), 1)
+        self.clock.advance(1)
+        self.assertEqual(self.called, ["next"])
+
+    def test_agrees_with_a_sorted_list(self) -> None:
+        """Under random scheduling, moving and cancelling the calls come as a sorted list says."""
+        rng = random.Random(7)
+        expected: dict[int, tuple[float, int]] = {}
+        calls = []
+        order = 0
+        for number in range(2000):
+            delay = rng.randrange(100) / 4
+            calls.append(self.clock.callLater(delay, self.called.append, number))
+            expected[number] = (delay, order := order + 1)
+            victim = rng.randrange(len(calls))
+            if calls[victim].active():
+                if rng.random() < 0.6:
+                    calls[victim].cancel()
+                    del expected[victim]
+                elif rng.random() < 0.5:
+                    delay = rng.randrange(100) / 4
+                    calls[victim].reset(delay)
+                    expected[victim] = (delay, order := order + 1)
+        self.clock.advance(30)
+        self.assertEqual(self.called, sorted(expected, key=lambda number: expected[number]))
+
+    def test_cancelled_calls_leave_the_heap(self) -> None:
+        """A hundred thousand cancelled time-outs do not pile up."""
+        for _ in range(100_000):
+            self.clock.callLater(60, self.called.append, 1).cancel()
+        self.assertLess(len(self.clock._heap), 200)
+
+
+class MonotonicTests(SynchronousTestCase):
+    """Behaviour of ``use_monotonic_time``."""
+
+    def test_reactors_run_on_monotonic_time(self) -> None:
+        """After the call every reactor measures with the monotonic clock; a second call changes nothing."""
+        self.patch(ReactorBase, "seconds", ReactorBase.__dict__["seconds"])
+        use_monotonic_time()
+        use_monotonic_time()
+        self.assertIs(ReactorBase.seconds, time.monotonic)

@@ -1,0 +1,488 @@
+"""Tests of the endpoint: two or three of them on simulated time and a switchboard."""
+
+from __future__ import annotations
+
+import random
+from typing import Any
+
+from twisted.internet.defer import Deferred
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.entangled.clock import HeapClock
+from middleware.entangled.errors import NoAnswer, NotRunning, Refused, TooLarge
+from middleware.entangled.identity import Identity
+from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.network.network import Address
+from middleware.entangled.network.switchboard import Switchboard, SwitchboardNetwork, Weather
+from middleware.entangled.wire.endpoint import Endpoint
+from middleware.entangled.wire.handshake import INIT, INIT_LEAST, RESP
+from middleware.entangled.wire.session import DATA, MAX_MESSAGE
+
+TEAM = b"k" * 32
+DELAY = 1 / 64  # sums of it are exact
+
+
+class Tap:
+    """A ``Network`` that keeps what it receives, and passes it on."""
+
+    def __init__(self, network: SwitchboardNetwork) -> None:
+        self.network = network
+        self.kept: list[tuple[bytes, Address]] = []
+        self.receiver: Any = None
+
+    @property
+    def address(self) -> Address:
+        """The address of the network underneath."""
+        return self.network.address
+
+    def listen(self, receiver: Any) -> None:
+        """Listen, with an ear between."""
+        self.receiver = receiver
+        self.network.listen(self._receive)
+
+    def _receive(self, datagram: bytes, source: Address) -> None:
+        self.kept.append((datagram, source))
+        self.receiver(datagram, source)
+
+    def send(self, datagram: bytes, to: Address) -> None:
+        """Send."""
+        self.network.send(datagram, to)
+
+    def close(self) -> None:
+        """Close."""
+        self.network.close()
+
+
+class EndpointCase(SynchronousTestCase):
+    """Two endpoints ``a`` and ``b``; ``b`` has a few methods."""
+
+    def setUp(self) -> None:
+        """Start both."""
+        self.clock = HeapClock()
+        self.rng = random.Random(11)
+        self.board = Switchboard(self.clock, self.rng, Weather(DELAY))
+        self.taps: dict[Address, Tap] = {}
+        self.runs: list[object] = []
+        self.a, self.to_a = self.endpoint(1)
+        self.b, self.to_b = self.endpoint(2)
+        self.equip(self.b)
+
+    def equip(self, endpoint: Endpoint) -> None:
+        """Give an endpoint the methods."""
+        endpoint.expose("echo", lambda peer, value: value)
+        endpoint.expose("add", self.add, changes=True)
+        endpoint.expose("refuse", self.refuse)
+        endpoint.expose("whole", self.whole)
+
+    def add(self, peer: Contact, value: int) -> int:
+        """Count a run."""
+        self.runs.append(value)
+        return value
+
+    def refuse(self, peer: Contact) -> None:
+        """Say no."""
+        raise Refused("not today")
+
+    def whole(self, peer: Contact, number: int, name: str | None = None) -> list[object]:
+        """Return the arguments."""
+        return [number, name]
+
+    def endpoint(
+        self, seed: int, team: bytes = TEAM, port: int = 0, identity: int | None = None
+    ) -> tuple[Endpoint, Contact]:
+        """A started endpoint and its contact."""
+        own = Identity(bytes([identity or seed]) * 32)
+        tap = Tap(self.board.network("127.0.0.1", port))
+        endpoint = Endpoint(own, team, tap, self.clock, random.Random(seed))
+        endpoint.start()
+        self.taps[tap.address] = tap
+        return endpoint, Contact(own.public, tap.address)
+
+    def got(self, deferred: Deferred[Any], seconds: float = 3.0) -> Any:
+        """The result of a Deferred after some time."""
+        self.clock.advance(seconds)
+        return self.successResultOf(deferred)
+
+    def failed(self, deferred: Deferred[Any], kind: type[Exception], seconds: float = 3.0) -> str:
+        """The text of the error that a Deferred fails with after some time."""
+        self.clock.advance(seconds)
+        return str(self.failureResultOf(deferred, kind).value)
+
+    def kept(self, contact: Contact, kind: int) -> list[tuple[bytes, Address]]:
+        """The datagrams of one kind that a node received."""
+        return [item for item in self.taps[contact.address].kept if item[0][0] == kind]
+
+
+class AskTests(EndpointCase):
+    """Questions and answers."""
+
+    def test_first_answer_takes_one_round_trip(self) -> None:
+        """A first question rides in the handshake: the answer is there after one round trip and two datagrams."""
+        asked = self.a.ask(self.to_b, "echo", [1, b"x", {"a": None}])
+        self.clock.advance(2 * DELAY)
+        self.assertEqual(self.successResultOf(asked), [1, b"x", {"a": None}])
+        self.clock.advance(1)
+        self.assertEqual(self.board.counters["sent"], 3)  # the third confirms the session
+
+    def test_change_waits_for_the_session(self) -> None:
+        """A changing question takes two round trips at first, then one, and no INIT carries it."""
+        self.assertEqual(self.got(self.a.ask(self.to_b, "add", 1, changes=True), 4 * DELAY), 1)
+        self.assertEqual(self.got(self.a.ask(self.to_b, "add", 2, changes=True), 2 * DELAY), 2)
+        self.assertEqual(self.board.counters["sent"], 6)
+
+    def test_undeclared_change_is_not_run_by_a_handshake(self) -> None:
+        """What the answerer exposed as a change never runs from an INIT, whatever the asker says, and is answered."""
+        asked = self.a.ask(self.to_b, "add", 5)
+        self.clock.advance(2 * DELAY)
+        self.assertEqual(self.runs, [])
+        self.assertEqual(self.got(asked), 5)
+        self.assertEqual(self.runs, [5])
+
+    def test_no_reply_is_larger_than_its_init(self) -> None:
+        """A RESP is never larger than the INIT; an answer that does not fit comes over the session."""
+        for seed, size in enumerate((1, 400, 500, 520, 1300), start=100):
+            a, _ = self.endpoint(seed)
+            self.b.expose("fill", lambda peer, count: bytes(count))
+            self.assertEqual(self.got(a.ask(self.to_b, "fill", size)), bytes(size))
+            response = self.kept(Contact(self.to_b.public, a.address), RESP)[0][0]
+            init = self.kept(self.to_b, INIT)[-1][0]
+            self.assertGreaterEqual(len(init), INIT_LEAST)
+            self.assertLessEqual(len(response), len(init))
+
+    def test_long_questions(self) -> None:
+        """A question too long for an INIT waits for the session, one too long for a datagram fails at once."""
+        self.assertEqual(len(self.got(self.a.ask(self.to_b, "echo", bytes(1330)))), 1330)
+        self.failureResultOf(self.a.ask(self.to_b, "echo", bytes(MAX_MESSAGE)), TooLarge)
+        self.failureResultOf(self.a.ask(self.to_b, "echo", object()), TypeError)
+        self.assertRaises(TooLarge, self.a.tell, self.to_b, "echo", bytes(MAX_MESSAGE))
+
+    def test_refusals(self) -> None:
+        """A lawful no, an unknown method, misfitting arguments and a too long answer each reach the asker in words."""
+        self.b.expose("fill", lambda peer, count: bytes(count))
+        ask = self.a.ask
+        self.assertEqual(self.failed(ask(self.to_b, "refuse"), Refused), "not today")
+        self.assertIn("no such method", self.failed(ask(self.to_b, "nothing"), Refused))
+        self.assertIn("takes 1 arguments", self.failed(ask(self.to_b, "echo"), Refused))
+        self.assertIn("takes 1 to 2 arguments", self.failed(ask(self.to_b, "whole"), Refused))
+        self.assertIn("argument 1 must be int, is str", self.failed(ask(self.to_b, "whole", "x"), Refused))
+        self.assertIn("argument 2 must be str or None", self.failed(ask(self.to_b, "whole", 1, b"x"), Refused))
+        self.assertIn("ask for less", self.failed(ask(self.to_b, "fill", 1400), Refused))
+        self.assertEqual(self.got(ask(self.to_b, "whole", 1, None)), [1, None])
+
+    def test_foreign_exceptions_stay_inside(self) -> None:
+        """An exception of a method, and a result that cannot be sent, are logged; the asker learns no detail."""
+        self.b.expose("crash", lambda peer: 1 // 0)
+        self.b.expose("odd", lambda peer: object())
+        for name in ("crash", "odd"):
+            self.assertEqual(self.failed(self.a.ask(self.to_b, name), Refused), "internal error")
+        self.assertEqual(len(self.flushLoggedErrors(ZeroDivisionError)), 1)
+
+    def test_slow_methods(self) -> None:
+        """Deferreds and coroutines answer when they are done, run once, and outlast the time-out of a single try."""
+        waiting: list[Deferred[int]] = []
+
+        async def slow(peer: Contact) -> int:
+            waiting.append(Deferred())
+            return await waiting[-1] + 1
+
+        self.b.expose("slow", slow)
+        self.b.expose("change", slow, changes=True)
+        self.got(self.a.ask(self.to_b, "echo", 1))
+        for name, patience in (("slow", None), ("change", None), ("slow", 20.0)):
+            del waiting[:]
+            asked = self.a.ask(self.to_b, name, timeout=patience)
+            self.clock.advance(1.3 if patience is None else 19.0)
+            self.assertNoResult(asked)
+            self.assertEqual(len(waiting), 1)
+            waiting[0].callback(41)
+            self.assertEqual(self.got(asked, 0.1), 42)
+
+    def test_no_answer(self) -> None:
+        """Nobody there: the question fails in 1.5 s after four tries; a peer that was known to be near fails sooner."""
+        asked = self.a.ask(Contact(self.to_b.public, Address("127.0.0.1", 9)), "echo", 1)
+        self.clock.advance(1.4)
+        self.assertNoResult(asked)
+        self.failed(asked, NoAnswer, 0.2)
+        self.assertEqual(self.board.counters["unheard"], 4)
+        self.got(self.a.ask(self.to_b, "echo", 1))
+        self.board.kill(self.to_b.address)
+        self.failed(self.a.ask(self.to_b, "echo", 1), NoAnswer, 1.0)
+        self.failed(self.a.ask(self.to_b, "echo", 1, timeout=0.1), NoAnswer, 0.11)
+        self.assertIn("no key", self.failed(self.a.ask(Contact(b"\xff" * 32, self.to_b.address), "echo", 1), NoAnswer))
+        self.assertEqual(self.clock.getDelayedCalls(), [])
+
+    def test_cancelled_question_is_forgotten(self) -> None:
+        """A cancelled question leaves no timer, and its late answer is only counted."""
+        self.got(self.a.ask(self.to_b, "echo", 1))
+        asked = self.a.ask(self.to_b, "echo", 2)
+        asked.cancel()
+        self.failed(asked, Exception)
+        self.assertEqual(self.a.counters["unasked"], 1)
+
+    def test_both_open_at_once(self) -> None:
+        """When both open a session in the same moment both get their answers, then and later."""
+        self.equip(self.a)
+        both = [self.a.ask(self.to_b, "add", 1, changes=True), self.b.ask(self.to_a, "add", 2, changes=True)]
+        self.clock.advance(1)
+        self.assertEqual([self.successResultOf(one) for one in both], [1, 2])
+        both = [self.a.ask(self.to_b, "echo", 3), self.b.ask(self.to_a, "echo", 4)]
+        self.clock.advance(1)
+        self.assertEqual([self.successResultOf(one) for one in both], [3, 4])
+
+    def test_many_questions_share_one_handshake(self) -> None:
+        """Questions asked at once of a stranger open a single session."""
+        asked = [self.a.ask(self.to_b, "echo", number) for number in range(20)]
+        self.clock.advance(1)
+        self.assertEqual([self.successResultOf(one) for one in asked], list(range(20)))
+        self.assertEqual(len(self.kept(self.to_b, INIT)), 1)
+
+    def test_contacts_are_reported_when_proved(self) -> None:
+        """The asker reports the answerer when it answers, the answerer the asker when its session is confirmed."""
+        seen: list[tuple[float, str, Contact]] = []
+        self.a.on_contact = lambda contact: seen.append((self.clock.seconds(), "a", contact))
+        self.b.on_contact = lambda contact: seen.append((self.clock.seconds(), "b", contact))
+        self.got(self.a.ask(self.to_b, "echo", 1))
+        self.assertIn((2 * DELAY, "a", self.to_b), seen)
+        self.assertEqual([item for item in seen if item[1] == "b"], [(3 * DELAY, "b", self.to_a)])
+
+
+class TellTests(EndpointCase):
+    """Messages without answer, greetings, starting and stopping."""
+
+    def test_tells_open_a_session_and_arrive_once(self) -> None:
+        """What is told before there is a session arrives after the handshake, in order and once each."""
+        self.board.weather = Weather(DELAY, duplicate=1.0)
+        for number in range(5):
+            self.a.tell(self.to_b, "add", number)
+        self.clock.advance(1)
+        self.a.tell(self.to_b, "add", 5)
+        self.a.tell(self.to_b, "nothing")
+        self.a.tell(self.to_b, "refuse")
+        self.clock.advance(1)
+        self.assertEqual(self.runs, [0, 1, 2, 3, 4, 5])
+        self.assertEqual((self.b.counters["unknown method"], self.b.counters["refused"]), (1, 1))
+
+    def test_tells_find_a_restarted_peer(self) -> None:
+        """Somebody who only tells notices within seconds that the peer was restarted."""
+        self.a.tell(self.to_b, "add", 0)
+        self.clock.advance(1)
+        self.b.stop()
+        self.b, self.to_b = self.endpoint(3, port=self.to_b.address.port, identity=2)
+        self.equip(self.b)
+        for _ in range(10):
+            self.a.tell(self.to_b, "add", 1)
+            self.clock.advance(1)
+        self.assertGreater(len(self.runs), 4)
+
+    def test_tells_that_cannot_arrive_are_counted(self) -> None:
+        """What is told to nobody is dropped and counted, and the queue is bounded."""
+        for number in range(100):
+            self.a.tell(Contact(self.to_b.public, Address("127.0.0.1", 9)), "add", number)
+        self.clock.advance(5)
+        self.assertEqual(self.a.counters["untold"], 100)
+        self.assertEqual(self.clock.getDelayedCalls(), [])
+
+    def test_greeting(self) -> None:
+        """A greeting learns the key at an address, under loss too, with an answer no larger than the question."""
+        self.board.weather = Weather(DELAY, loss=0.3)
+        self.assertEqual(self.got(self.a.greet(self.to_b.address)), self.to_b)
+        sizes = {len(datagram) for tap in self.taps.values() for datagram, _ in tap.kept}
+        self.assertEqual(len(sizes), 1)
+        self.failed(self.a.greet(Address("127.0.0.1", 9)), NoAnswer)
+
+    def test_stopped_endpoint_fails_everything(self) -> None:
+        """Stopping fails what is pending, leaves no timer, and later calls fail; it may be started again."""
+        pending = [self.a.ask(self.to_b, "echo", 1), self.a.greet(Address("127.0.0.1", 9))]
+        self.a.stop()
+        self.a.stop()
+        pending += [self.a.ask(self.to_b, "echo", 1), self.a.greet(self.to_b.address)]
+        for one in pending:
+            self.failureResultOf(one, NotRunning)
+        self.assertRaises(NotRunning, self.a.tell, self.to_b, "echo", 1)
+        self.assertEqual([call.getTime() for call in self.clock.getDelayedCalls()], [DELAY, DELAY])  # on the wire
+        self.a.start()
+        self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 2)), 2)
+
+
+class WeatherTests(EndpointCase):
+    """Loss, duplication, restart, moving."""
+
+    def test_changes_run_at_most_once(self) -> None:
+        """Under loss, duplication and reordering no change runs twice, and every answered one ran."""
+        self.board.weather = Weather(DELAY, DELAY / 2, loss=0.3, duplicate=0.3, reorder=0.2)
+        answered = []
+        for number in range(300):
+            asked = self.a.ask(self.to_b, "add", number, changes=True)
+            asked.addCallbacks(answered.append, lambda failure: failure.trap(NoAnswer))
+            self.clock.advance(0.5)
+        self.clock.advance(3)
+        self.assertEqual(len(self.runs), len(set(self.runs)))
+        self.assertLessEqual(set(answered), set(self.runs))
+        self.assertGreater(len(answered), 270)
+
+    def test_questions_get_through_heavy_loss(self) -> None:
+        """With 30 % of the datagrams lost each way at least nine of ten questions are answered."""
+        self.board.weather = Weather(DELAY, loss=0.3)
+        answers = []
+        for number in range(300):
+            self.a.ask(self.to_b, "echo", number).addCallbacks(answers.append, lambda failure: failure.trap(NoAnswer))
+            self.clock.advance(2)
+        self.assertGreater(len(answers), 270)
+
+    def test_restarted_peer_answers_again(self) -> None:
+        """A peer that lost its sessions answers the next question, changing or not, within half a second."""
+        self.got(self.a.ask(self.to_b, "echo", 1))
+        for seed, method in ((3, "echo"), (4, "add")):
+            self.board.kill(self.to_b.address)
+            self.b, self.to_b = self.endpoint(seed, port=self.to_b.address.port, identity=2)
+            self.equip(self.b)
+            self.assertEqual(self.got(self.a.ask(self.to_b, method, seed, changes=method == "add"), 0.5), seed)
+
+    def test_restart_at_another_address(self) -> None:
+        """A peer that comes back elsewhere is found at the address that the asker was given."""
+        self.got(self.a.ask(self.to_b, "echo", 1))
+        self.board.kill(self.to_b.address)
+        self.b, self.to_b = self.endpoint(5, identity=2)
+        self.equip(self.b)
+        self.assertEqual(self.got(self.a.ask(self.to_b, "add", 7, changes=True)), 7)
+
+    def test_address_follows_the_key(self) -> None:
+        """When a peer's datagrams come from a new address the answers go there, and a replay from elsewhere moves nothing."""
+        self.got(self.a.ask(self.to_b, "echo", 1))
+        old = self.taps[self.to_a.address]
+        moved = self.board.network("127.0.0.1", 40000)
+        moved.listen(old.receiver)
+        old.network = moved
+        seen: list[Contact] = []
+        self.equip(self.a)
+        self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 2)), 2)
+        recorded = self.kept(self.to_b, DATA)[-1][0]
+        self.taps[self.to_b.address].receiver(recorded, Address("127.0.0.1", 666))
+        self.b.on_contact = seen.append
+        self.assertEqual(self.got(self.b.ask(self.to_a, "echo", 3)), 3)
+        self.assertEqual(seen, [Contact(self.to_a.public, Address("127.0.0.1", 40000))])
+
+    def test_runs_are_replayed_from_the_seed(self) -> None:
+        """The same seeds give the same datagrams at the same moments."""
+        digests = set()
+        for _ in range(2):
+            self.setUp()
+            self.test_questions_get_through_heavy_loss()
+            digests.add(self.board.digest())
+        self.assertEqual(len(digests), 1)
+
+    def test_old_session_is_renewed(self) -> None:
+        """After an hour the next question opens a new session beside the old one and is answered all the same."""
+        self.got(self.a.ask(self.to_b, "echo", 1))
+        for hours in (1.05, 3.0):
+            self.clock.advance(hours * 3600)
+            before = len(self.kept(self.to_b, INIT))
+            self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 2)), 2)
+            self.assertEqual(len(self.kept(self.to_b, INIT)), before + 1)
+
+
+class AttackTests(EndpointCase):
+    """Datagrams that must change nothing."""
+
+    def send_raw(self, datagram: bytes, source: Address = Address("127.0.0.1", 666)) -> int:  # noqa: B008
+        """Hand a datagram to ``b``; how many datagrams ``b`` sent because of it."""
+        before = self.board.counters["sent"]
+        self.taps[self.to_b.address].receiver(datagram, source)
+        self.clock.advance(1)
+        return self.board.counters["sent"] - before
+
+    def test_wrong_team_is_not_answered(self) -> None:
+        """A node with another team key gets no byte back, neither to a question nor to a greeting."""
+        stranger, to_stranger = self.endpoint(9, team=b"x" * 32)
+        self.failed(stranger.ask(self.to_b, "echo", 1), NoAnswer)
+        self.failed(stranger.greet(self.to_b.address), NoAnswer)
+        self.assertEqual(self.taps[to_stranger.address].kept, [])
+        self.assertGreater(self.b.counters["forged"], 0)
+
+    def test_damaged_datagrams_are_silent(self) -> None:
+        """Every recorded datagram with a flipped byte or cut short is counted, and nothing is sent or run."""
+        self.got(self.a.ask(self.to_b, "add", 1, changes=True))
+        self.got(self.a.greet(self.to_b.address))
+        kept = list(self.taps[self.to_b.address].kept)
+        kept += self.taps[self.to_a.address].kept
+        sessions = len(self.b._sessions)
+        for datagram, _ in kept:
+            for _ in range(30):
+                damaged = bytearray(datagram)
+                damaged[self.rng.randrange(len(damaged))] ^= self.rng.randrange(1, 256)
+                self.assertEqual(self.send_raw(bytes(damaged)), 0)
+                self.assertEqual(self.send_raw(datagram[: self.rng.randrange(len(datagram))]), 0)
+        self.assertEqual((self.runs, len(self.b._sessions)), ([1], sessions))
+        self.assertEqual(self.send_raw(bytes(1500)), 0)
+        self.assertEqual(self.b.counters["oversized"], 1)
+
+    def test_replays_change_nothing(self) -> None:
+        """All recorded datagrams, sent again from elsewhere, run nothing and bring back no more bytes than they have."""
+        self.got(self.a.ask(self.to_b, "echo", 0))
+        self.got(self.a.ask(self.to_b, "add", 1, changes=True))
+        seen: list[Contact] = []
+        self.b.on_contact = seen.append
+        for datagram, _ in list(self.taps[self.to_b.address].kept):
+            sent = self.send_raw(datagram)
+            self.assertEqual(sent, 1 if datagram[0] == INIT else 0)
+        self.assertEqual((self.runs, seen), ([1], []))
+        self.assertEqual((self.b.counters["replayed"], self.b.counters["repeated"]), (2, 1))
+
+    def test_replay_to_a_restarted_node(self) -> None:
+        """A whole recording, played to the restarted node, makes no contact and runs no change."""
+        self.got(self.a.ask(self.to_b, "add", 1, changes=True))
+        recording = list(self.taps[self.to_b.address].kept)
+        self.b.stop()
+        self.b, self.to_b = self.endpoint(3, port=self.to_b.address.port, identity=2)
+        self.equip(self.b)
+        seen: list[Contact] = []
+        self.b.on_contact = seen.append
+        for datagram, source in recording:
+            self.send_raw(datagram, source)
+        self.assertEqual((self.runs, seen), ([1], []))
+
+    def test_response_counts_only_from_where_it_was_asked(self) -> None:
+        """A RESP that comes from another address, or twice, opens nothing."""
+        asked = self.a.ask(self.to_b, "echo", 1)
+        self.clock.advance(1.5 * DELAY)
+        tap = self.taps[self.to_a.address]
+        genuine = tap.receiver
+        tap.receiver = lambda datagram, source: None
+        self.clock.advance(DELAY)
+        response, source = self.kept(self.to_a, RESP)[0]
+        genuine(response, Address("127.0.0.1", 666))
+        damaged = bytearray(response)
+        damaged[40] ^= 1
+        genuine(bytes(damaged), source)
+        genuine(response[:20], source)
+        self.assertNoResult(asked)
+        genuine(response, source)
+        genuine(response, source)
+        self.assertEqual(self.successResultOf(asked), 1)
+        counted = [self.a.counters[name] for name in ("misdirected", "forged", "malformed", "stale")]
+        self.assertEqual(counted, [1, 1, 1, 1])
+
+    def test_flood_of_handshakes_stays_bounded(self) -> None:
+        """A thousand recorded handshakes that nobody confirms leave no more than the bounded number of half-open sessions."""
+        silent = self.board.network()
+        silent.listen(lambda datagram, source: None)
+        for number in range(700):
+            member = Endpoint(Identity(number.to_bytes(32, "big")), TEAM, silent, self.clock, random.Random(number))
+            member.is_running = True
+            member.ask(self.to_b, "echo", 1).addErrback(lambda failure: None)
+            self.clock.advance(0.001)
+        self.assertLessEqual(len(self.b._sessions), 512)
+        self.assertLessEqual(len(self.b._responses), 512)
+        self.clock.advance(60)
+        self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 1)), 1)
+        self.assertLessEqual(len(self.b._sessions), 2)
+
+    def test_random_bytes(self) -> None:
+        """Ten thousand random datagrams raise nothing and are answered by nothing."""
+        before = self.board.counters["sent"]
+        for number in range(10_000):
+            kind = bytes([0x11 + number % 6])
+            self.taps[self.to_b.address].receiver(kind + self.rng.randbytes(self.rng.randrange(700)), self.to_a.address)
+        self.taps[self.to_b.address].receiver(b"", self.to_a.address)
+        self.assertEqual(self.board.counters["sent"], before)
+        self.assertEqual(sum(self.b.counters.values()), 10_001)

@@ -1,0 +1,61 @@
+"""The lasting key pair of a node."""
+
+from __future__ import annotations
+
+from nacl import bindings
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.entangled.identity import ID_BYTES, Identity, exchange_key, node_id, verified
+
+DOG = Identity(b"\1" * 32)
+CAT = Identity(b"\2" * 32)
+
+
+class IdentityTest(SynchronousTestCase):
+    def test_published_vector(self) -> None:
+        """A seed makes the public key and the signature that RFC 8032 (section 7.1, test 2) gives for it."""
+        seed = bytes.fromhex("4ccd089b28ff96da9db6c346ec114e0f5b8a319f35aba624da8cf6ed4fb8a6fb")
+        public = "3d4017c3e843895a92b70aa74d1b7ebc9c982ccf2ec4968cc0cd55f12af4660c"
+        signature = (
+            "92a009a9f0d4cab8720e820b5f642540a2b27b5416503f8fb3762223ebdb69da"
+            "085ac1e43e15996e458f3613d0f11d8c387b2eaeb4302aeeb00d291612bb0c00"
+        )
+        identity = Identity(seed)
+        self.assertEqual(identity.public.hex(), public)
+        self.assertEqual(identity.sign(b"\x72").hex(), signature)
+
+    def test_id_follows_from_the_key(self) -> None:
+        """The id is the 160-bit hash of the public key, so nobody chooses or borrows one."""
+        self.assertEqual(DOG.node_id, node_id(DOG.public))
+        self.assertEqual(len(DOG.node_id), ID_BYTES)
+        self.assertNotEqual(DOG.node_id, CAT.node_id)
+
+    def test_same_seed_same_node(self) -> None:
+        """A node that kept its seed is the same node after a restart."""
+        self.assertEqual(Identity(b"\1" * 32), DOG)
+
+    def test_signatures(self) -> None:
+        """A signature stands for one message of one node; anything else is refused, whatever its length."""
+        signature = DOG.sign(b"sit")
+        self.assertTrue(verified(DOG.public, b"sit", signature))
+        self.assertFalse(verified(DOG.public, b"run", signature))
+        self.assertFalse(verified(CAT.public, b"sit", signature))
+        self.assertFalse(verified(DOG.public, b"sit", bytes(64)))
+        self.assertFalse(verified(DOG.public, b"sit", b""))
+        self.assertFalse(verified(b"short", b"sit", signature))
+
+    def test_both_ends_of_an_exchange_agree(self) -> None:
+        """The exchange keys of two nodes make one shared secret, each from its own secret and the other's public key."""
+        here = bindings.crypto_scalarmult(DOG.exchange_secret, exchange_key(CAT.public))
+        there = bindings.crypto_scalarmult(CAT.exchange_secret, exchange_key(DOG.public))
+        self.assertEqual(here, there)
+
+    def test_no_key(self) -> None:
+        """Bytes that are no public key have no exchange key, and say so by ``ValueError``."""
+        for public in (b"", bytes(32), b"\xff" * 32, b"\1" * 31):
+            self.assertRaises(ValueError, exchange_key, public)
+
+    def test_secrets_are_not_shown(self) -> None:
+        """The text of an identity, as it may reach a log, holds neither seed nor secrets."""
+        for secret in (DOG.seed, DOG.exchange_secret):
+            self.assertNotIn(repr(secret), repr(DOG))

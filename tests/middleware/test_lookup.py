@@ -1,0 +1,164 @@
+"""One iterative search."""
+
+from __future__ import annotations
+
+import random
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.kademlia.distance import closest
+from middleware.entangled.kademlia.lookup import Lookup
+from middleware.entangled.kademlia.routing import RoutingTable
+from middleware.entangled.network.network import Address
+
+TARGET = b"\x55" * 20
+
+
+def contact(number: int) -> Contact:
+    return Contact(number.to_bytes(32), Address("10.0.0.1", 7000 + number))
+
+
+CROWD = closest([contact(i) for i in range(40)], TARGET, 40)
+
+
+class LookupTest(SynchronousTestCase):
+    def test_nobody_to_ask(self) -> None:
+        """A search that knows nobody is over before it begins."""
+        lookup = Lookup(TARGET, 8, 3, [])
+        self.assertEqual(lookup.next(), [])
+        self.assertTrue(lookup.is_finished)
+        self.assertEqual(lookup.closest(), [])
+
+    def test_asks_the_closest_first(self) -> None:
+        """At most alpha are asked at the same time, the closest first, and nobody twice."""
+        lookup = Lookup(TARGET, 8, 3, reversed(CROWD[:8]))
+        self.assertEqual(lookup.next(), CROWD[:3])
+        self.assertEqual(lookup.next(), [])
+        lookup.answered(CROWD[1], [])
+        self.assertEqual(lookup.next(), [CROWD[3]])
+        self.assertFalse(lookup.is_finished)
+
+    def test_follows_what_it_hears(self) -> None:
+        """Closer contacts from an answer are asked before those known so far."""
+        lookup = Lookup(TARGET, 2, 1, CROWD[10:12])
+        lookup.next()
+        lookup.answered(CROWD[10], [CROWD[0], CROWD[5], CROWD[10]])
+        self.assertEqual(lookup.next(), [CROWD[0]])
+
+    def test_ends_when_the_k_closest_answered(self) -> None:
+        """The search is over as soon as the k closest have answered; those farther away are not asked."""
+        lookup = Lookup(TARGET, 2, 3, CROWD[:5])
+        self.assertEqual(lookup.next(), CROWD[:2])
+        lookup.answered(CROWD[0], CROWD)
+        self.assertFalse(lookup.is_finished)
+        lookup.answered(CROWD[1], CROWD)
+        self.assertTrue(lookup.is_finished)
+        self.assertEqual(lookup.next(), [])
+        self.assertEqual(lookup.closest(), CROWD[:2])
+
+    def test_failed_is_replaced(self) -> None:
+        """The next closest takes the place of one that failed, and what failed is not found."""
+        lookup = Lookup(TARGET, 2, 3, CROWD[:3])
+        lookup.next()
+        lookup.failed(CROWD[0])
+        self.assertEqual(lookup.next(), [CROWD[2]])
+        for known in CROWD[1:3]:
+            lookup.answered(known, [CROWD[0]])
+        self.assertEqual(lookup.next(), [])
+        self.assertTrue(lookup.is_finished)
+        self.assertEqual(lookup.closest(), CROWD[1:3])
+
+    def test_all_fail(self) -> None:
+        """A search in which everybody fails is over, and found nobody."""
+        lookup = Lookup(TARGET, 8, 3, CROWD[:2])
+        for known in lookup.next():
+            lookup.failed(known)
+        self.assertTrue(lookup.is_finished)
+        self.assertEqual(lookup.closest(), [])
+
+    def test_slow_frees_its_place(self) -> None:
+        """A slow contact lets others be asked, one beyond the k closest included, but the search waits for it."""
+        lookup = Lookup(TARGET, 2, 2, CROWD[:4])
+        self.assertEqual(lookup.next(), CROWD[:2])
+        lookup.slow(CROWD[0])
+        lookup.slow(CROWD[0])
+        self.assertEqual(lookup.next(), [CROWD[2]])
+        lookup.answered(CROWD[1], [])
+        lookup.answered(CROWD[2], [])
+        self.assertFalse(lookup.is_finished)
+        lookup.answered(CROWD[0], [])
+        self.assertTrue(lookup.is_finished)
+        self.assertEqual(lookup.closest(), CROWD[:2])
+
+    def test_slow_then_lost(self) -> None:
+        """Where the slow one is lost in the end, the one asked in its stead makes the search complete at once."""
+        lookup = Lookup(TARGET, 2, 2, CROWD[:4])
+        lookup.next()
+        lookup.slow(CROWD[0])
+        lookup.next()
+        lookup.answered(CROWD[1], [])
+        lookup.answered(CROWD[2], [])
+        lookup.failed(CROWD[0])
+        self.assertTrue(lookup.is_finished)
+        self.assertEqual(lookup.closest(), CROWD[1:3])
+
+    def test_late_answer_counts(self) -> None:
+        """An answer that comes after all was lost hope of is believed."""
+        lookup = Lookup(TARGET, 2, 2, CROWD[:1])
+        lookup.next()
+        lookup.failed(CROWD[0])
+        lookup.answered(CROWD[0], [CROWD[1]])
+        self.assertEqual(lookup.closest(), [CROWD[0]])
+        self.assertEqual(lookup.next(), [CROWD[1]])
+
+    def test_never_oneself(self) -> None:
+        """The searching node is neither asked nor found, though others name it."""
+        lookup = Lookup(TARGET, 8, 3, CROWD[:2], exclude=CROWD[0].node_id)
+        self.assertEqual(lookup.next(), [CROWD[1]])
+        lookup.answered(CROWD[1], CROWD[:1])
+        self.assertEqual(lookup.next(), [])
+        self.assertTrue(lookup.is_finished)
+
+    def test_strangers_do_not_count(self) -> None:
+        """Whoever was not asked cannot answer, fail or be slow."""
+        lookup = Lookup(TARGET, 8, 3, CROWD[:4])
+        for stranger in (CROWD[0], CROWD[9]):
+            lookup.answered(stranger, CROWD[4:])
+            lookup.failed(stranger)
+            lookup.slow(stranger)
+        self.assertEqual(lookup.next(), CROWD[:3])
+        self.assertEqual(lookup.closest(), [])
+
+    def test_an_answer_is_bounded(self) -> None:
+        """Of one answer at most the k closest are believed, however many it names."""
+        lookup = Lookup(TARGET, 2, 40, CROWD[39:])
+        lookup.next()
+        lookup.answered(CROWD[39], CROWD[:39])
+        asked = lookup.next()
+        for known in asked:
+            lookup.failed(known)
+        self.assertEqual(asked, CROWD[:2])
+        self.assertEqual(lookup.next(), [])
+
+    @settings(max_examples=30, deadline=None)
+    @given(st.integers(0, 2**32), st.integers(2, 60), st.binary(min_size=20, max_size=20))
+    def test_exact(self, seed: int, size: int, target: bytes) -> None:
+        """In a quiet network whose tables are whole the search finds exactly the k closest nodes, whatever the order."""
+        rng = random.Random(seed)
+        nodes = [contact(i) for i in range(size)]
+        tables = {node.node_id: RoutingTable(node.node_id, 4) for node in nodes}
+        for table in tables.values():
+            for node in rng.sample(nodes, size):
+                table.saw(node, 0.0)
+        me = nodes[0]
+        lookup = Lookup(target, 4, 3, tables[me.node_id].closest(target), exclude=me.node_id)
+        in_flight: list[Contact] = []
+        while not lookup.is_finished:
+            in_flight += lookup.next()
+            self.assertLessEqual(len(in_flight), 3)
+            asked = in_flight.pop(rng.randrange(len(in_flight)))
+            lookup.answered(asked, tables[asked.node_id].closest(target))
+        self.assertEqual(lookup.closest(), closest(nodes[1:], target, 4))

@@ -1,0 +1,93 @@
+"""Records: which holds, who signed, and what may come from the wire."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import msgpack
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.entangled.record import MAX_NAME, MAX_TTL, MAX_VALUE, Record, hashed_key, unpacked
+from tests.middleware.test_store import CAT, DOG, KEY, record
+
+ANYTHING = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text() | st.binary(),
+    lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner),
+)
+
+
+class RecordTest(SynchronousTestCase):
+    def test_slot(self) -> None:
+        """A slot is key, owner and name; two owners never share one."""
+        self.assertEqual(record().slot, (KEY, DOG.public, "state"))
+        self.assertNotEqual(record().slot, record(owner=CAT).slot)
+
+    def test_tombstone(self) -> None:
+        """A record without a value is a tombstone; one with an empty value is not."""
+        self.assertTrue(record(value=None).is_tombstone)
+        self.assertFalse(record(value=b"").is_tombstone)
+
+    def test_which_holds(self) -> None:
+        """The higher sequence holds; of two with one sequence all replicas choose the same, and none beats itself."""
+        one, other = record(value=b"1"), record(value=b"2")
+        self.assertTrue(record(sequence=2).beats(one))
+        self.assertFalse(one.beats(record(sequence=2)))
+        self.assertNotEqual(one.beats(other), other.beats(one))
+        self.assertFalse(one.beats(one))
+        self.assertTrue(one.beats(None))
+
+    def test_signature_covers_all(self) -> None:
+        """A record of which anything was changed after it was signed is not genuine."""
+        self.assertTrue(record().is_genuine())
+        changes: list[dict[str, object]] = [
+            {"key": hashed_key("tasks")},
+            {"name": "else"},
+            {"owner": CAT.public},
+            {"sequence": 2},
+            {"lifetime": "leased"},
+            {"ttl": 61.0},
+            {"value": b"there"},
+            {"value": None},
+            {"signature": bytes(64)},
+            {"signature": b""},
+        ]
+        for change in changes:
+            self.assertFalse(replace(record(), **change).is_genuine(), change)  # type: ignore[arg-type]
+
+    def test_there_and_back(self) -> None:
+        """What was packed into a message comes out of it the same."""
+        for one in (record(), record(value=None, lifetime="leased"), record("", value=bytes(MAX_VALUE))):
+            self.assertEqual(unpacked(msgpack.unpackb(msgpack.packb(one.packed()))), one)
+
+    def test_limits(self) -> None:
+        """Whatever is out of its limits, or of another type, is no record."""
+        bad: dict[int, list[object]] = {
+            0: [KEY[:-1], KEY + b"\0", "key", None],
+            1: ["n" * (MAX_NAME + 1), b"name", None],
+            2: [DOG.public[:-1], DOG.public + b"\0", "owner"],
+            3: [-1, 2**63, 1.0, True, None],
+            4: ["forever", "", None, []],
+            5: [0.0, -1.0, MAX_TTL + 1.0, float("nan"), float("inf"), 60, None],
+            6: [bytes(MAX_VALUE + 1), "value", 1],
+            7: [bytes(63), bytes(65), None, "s" * 64],
+        }
+        for place, values in bad.items():
+            for value in values:
+                fields = record().packed()
+                fields[place] = value
+                self.assertIsNone(unpacked(fields), (place, value))
+        for fields in (record().packed()[:-1], [*record().packed(), 1], tuple(record().packed()), None, {}):
+            self.assertIsNone(unpacked(fields))
+
+    @settings(deadline=None, derandomize=True)
+    @given(ANYTHING | st.lists(ANYTHING, min_size=8, max_size=8))
+    def test_total(self, fields: object) -> None:
+        """Anything a message can hold is a record or is not; nothing makes an accident."""
+        self.assertTrue(unpacked(fields) is None or isinstance(unpacked(fields), Record))
+
+    def test_keys_of_texts(self) -> None:
+        """The key of a text has 160 bits, is the same everywhere, and another text has another one."""
+        self.assertEqual(hashed_key("devices").hex(), "9bb41158fbb4af8c4afa5a3d2ad4ce4a76b2f8a5")
+        self.assertNotEqual(hashed_key("devices"), hashed_key("device"))

@@ -1,0 +1,220 @@
+"""The routing table."""
+
+from __future__ import annotations
+
+import random
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.kademlia.distance import bucket_index, closest
+from middleware.entangled.kademlia.routing import DROPPED_AFTER, PATIENCE, STALE_AFTER, RoutingTable
+from middleware.entangled.network.network import Address
+
+OWN = Contact(b"\xee" * 32, Address("10.0.0.1", 7000))
+
+
+def contact(number: int, port: int = 7000) -> Contact:
+    return Contact(number.to_bytes(32), Address("10.0.0.2", port))
+
+
+def of_bucket(index: int, count: int) -> list[Contact]:
+    """The first ``count`` contacts that belong into the bucket ``index`` of ``OWN``."""
+    found: list[Contact] = []
+    number = 0
+    while len(found) < count:
+        number += 1
+        if bucket_index(OWN.node_id, contact(number).node_id) == index:
+            found.append(contact(number))
+    return found
+
+
+class RoutingTableTest(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.table = RoutingTable(OWN.node_id, k=4)
+        self.old = of_bucket(159, 12)
+        self.new = self.old[4:]
+
+    def fill(self) -> None:
+        for moment, known in enumerate(self.old[:4]):
+            self.assertIsNone(self.table.saw(known, float(moment)))
+
+    def miss(self, missing: Contact, times: int) -> None:
+        for _ in range(times):
+            self.table.failed(missing, 100.0)
+
+    def test_keeps_whom_it_saw(self) -> None:
+        """A contact that proved itself is known from then on."""
+        self.table.saw(contact(1), 0.0)
+        self.assertEqual(self.table.get(contact(1).node_id), contact(1))
+        self.assertEqual(self.table.contacts(), [contact(1)])
+        self.assertEqual(len(self.table), 1)
+        self.assertIsNone(self.table.get(contact(2).node_id))
+
+    def test_never_oneself(self) -> None:
+        """A node is no contact of its own, whoever tells it so."""
+        self.assertIsNone(self.table.saw(OWN, 0.0))
+        self.table.failed(OWN, 0.0)
+        self.table.remove(OWN)
+        self.table.searched(OWN.node_id, 0.0)
+        self.assertEqual(len(self.table), 0)
+        self.assertIsNone(self.table.get(OWN.node_id))
+
+    def test_address_moves(self) -> None:
+        """A contact that proved its key from another address is found there, and counts once."""
+        self.table.saw(contact(1), 0.0)
+        self.table.saw(contact(1, port=7001), 1.0)
+        self.assertEqual(self.table.contacts(), [contact(1, port=7001)])
+        self.assertEqual(len(self.table), 1)
+
+    def test_miss_at_an_old_address(self) -> None:
+        """Silence at an address that a contact has left does not count against it."""
+        self.table.saw(contact(1, port=7001), 0.0)
+        self.miss(contact(1), DROPPED_AFTER)
+        self.assertEqual(len(self.table), 1)
+
+    def test_full_bucket_keeps_the_old(self) -> None:
+        """A newcomer to a full bucket displaces nobody; the least recently seen contact is to be pinged."""
+        self.fill()
+        self.assertEqual(self.table.saw(self.new[0], 10.0), self.old[0])
+        self.assertEqual(self.table.contacts(), self.old[:4])
+        self.assertIsNone(self.table.get(self.new[0].node_id))
+
+    def test_seen_again_is_asked_later(self) -> None:
+        """Who was seen again is the last to be doubted."""
+        self.fill()
+        self.table.saw(self.old[0], 5.0)
+        self.assertEqual(self.table.saw(self.new[0], 10.0), self.old[1])
+
+    def test_no_flood_of_pings(self) -> None:
+        """However many newcomers come at once, the old contact is handed out to be pinged once in a while only."""
+        self.fill()
+        asked = [self.table.saw(newcomer, 10.0) for newcomer in self.new]
+        self.assertEqual(asked, [self.old[0]] + [None] * 7)
+        self.assertEqual(self.table.saw(self.new[0], 10.0 + PATIENCE), self.old[0])
+
+    def test_replaced_from_the_cache(self) -> None:
+        """After three misses in a row the newcomer that was seen last takes the place."""
+        self.fill()
+        for newcomer in self.new[:2]:
+            self.table.saw(newcomer, 10.0)
+        self.miss(self.old[1], STALE_AFTER - 1)
+        self.assertIn(self.old[1], self.table.contacts())
+        self.miss(self.old[1], 1)
+        self.assertEqual(self.table.contacts(), [self.old[0], self.old[2], self.old[3], self.new[1]])
+        self.assertEqual(len(self.table), 4)
+
+    def test_cache_is_bounded(self) -> None:
+        """At most k newcomers wait, and the longest unseen leave the queue."""
+        self.fill()
+        for newcomer in self.new:
+            self.table.saw(newcomer, 10.0)
+        for known in self.old[:4]:
+            self.miss(known, STALE_AFTER)
+        self.assertEqual(sorted(self.table.contacts(), key=self.old.index), self.new[4:])
+
+    def test_silent_newcomer_leaves_the_cache(self) -> None:
+        """A waiting newcomer that does not answer waits no longer."""
+        self.fill()
+        self.table.saw(self.new[0], 10.0)
+        self.table.failed(self.new[0], 11.0)
+        self.miss(self.old[0], STALE_AFTER)
+        self.assertIn(self.old[0], self.table.contacts())
+
+    def test_stale_gives_way_at_once(self) -> None:
+        """A stale contact stays while nobody wants its place, and goes as soon as somebody does."""
+        self.fill()
+        self.miss(self.old[2], STALE_AFTER)
+        self.assertIn(self.old[2], self.table.contacts())
+        self.assertIsNone(self.table.saw(self.new[0], 10.0))
+        self.assertEqual(self.table.contacts(), [self.old[0], self.old[1], self.old[3], self.new[0]])
+        self.assertEqual(len(self.table), 4)
+
+    def test_dropped_after_five(self) -> None:
+        """A contact whose place nobody wants is dropped after five misses in a row."""
+        self.table.saw(contact(1), 0.0)
+        self.miss(contact(1), DROPPED_AFTER - 1)
+        self.assertEqual(len(self.table), 1)
+        self.miss(contact(1), 1)
+        self.assertEqual(self.table.contacts(), [])
+        self.assertEqual(len(self.table), 0)
+
+    def test_a_sign_forgives(self) -> None:
+        """Misses count in a row only: a sign of life clears them."""
+        self.table.saw(contact(1), 0.0)
+        self.miss(contact(1), DROPPED_AFTER - 1)
+        self.table.saw(contact(1), 200.0)
+        self.miss(contact(1), DROPPED_AFTER - 1)
+        self.assertEqual(len(self.table), 1)
+
+    def test_failure_of_a_stranger(self) -> None:
+        """Silence of somebody unknown changes nothing."""
+        self.table.saw(contact(1), 0.0)
+        self.miss(contact(2), DROPPED_AFTER)
+        self.miss(of_bucket(150, 1)[0], DROPPED_AFTER)
+        self.assertEqual(self.table.contacts(), [contact(1)])
+
+    def test_goodbye(self) -> None:
+        """Who says goodbye goes at once, and whoever waits for the place gets it."""
+        self.fill()
+        self.table.saw(self.new[0], 10.0)
+        self.table.saw(self.new[1], 10.0)
+        self.table.remove(self.new[1])
+        self.table.remove(self.old[0])
+        self.assertEqual(self.table.contacts(), [*self.old[1:4], self.new[0]])
+        self.assertEqual(len(self.table), 4)
+        self.table.remove(contact(999_999))
+
+    def test_closest_passes_over_the_stale(self) -> None:
+        """Stale contacts are named only where there are not enough others, and then in their place by distance."""
+        self.fill()
+        nearest = closest(self.old[:4], self.old[0].node_id, 4)
+        self.assertEqual(self.table.closest(self.old[0].node_id, 2), nearest[:2])
+        self.miss(self.old[0], STALE_AFTER)
+        self.assertEqual(self.table.closest(self.old[0].node_id, 3), nearest[1:])
+        self.assertEqual(self.table.closest(self.old[0].node_id), nearest)
+
+    def test_order_of_contacts(self) -> None:
+        """The nearest bucket comes first, whenever it was filled."""
+        near = of_bucket(150, 1)[0]
+        self.table.saw(self.old[0], 0.0)
+        self.table.saw(near, 1.0)
+        self.assertEqual(self.table.contacts(), [near, self.old[0]])
+
+    def test_nothing_to_refresh(self) -> None:
+        """An empty table has nobody to refresh it by."""
+        self.assertEqual(self.table.stale_buckets(1000.0, 60.0), [])
+
+    def test_buckets_to_refresh(self) -> None:
+        """Buckets without a lookup for long are named, from the nearest filled one outwards, the empty ones included."""
+        self.table.saw(of_bucket(156, 1)[0], 0.0)
+        self.table.saw(self.old[0], 50.0)
+        self.assertEqual(self.table.stale_buckets(60.0, 60.0), [156, 157, 158])
+        rng = random.Random(1)
+        for index in (156, 157):
+            self.table.searched(self.table.refresh_target(index, rng), 60.0)
+        self.assertEqual(self.table.stale_buckets(60.0, 60.0), [158])
+
+    @given(st.integers(0, 159), st.integers())
+    def test_refresh_target_lies_in_its_bucket(self, index: int, seed: int) -> None:
+        """The id to look up for a bucket belongs into it, and follows from the seed."""
+        table = RoutingTable(OWN.node_id)
+        target = table.refresh_target(index, random.Random(seed))
+        self.assertEqual(bucket_index(OWN.node_id, target), index)
+        self.assertEqual(target, table.refresh_target(index, random.Random(seed)))
+
+    @settings(max_examples=50, deadline=None)
+    @given(st.lists(st.tuples(st.sampled_from(["saw", "failed", "remove"]), st.integers(0, 40)), max_size=200))
+    def test_invariants(self, events: list[tuple[str, int]]) -> None:
+        """Whatever happens, no bucket holds more than k, nobody is there twice, and the length is what it holds."""
+        table = RoutingTable(OWN.node_id, k=3)
+        for moment, (event, number) in enumerate(events):
+            getattr(table, event)(contact(number), float(moment))
+            contacts = table.contacts()
+            self.assertEqual(len(table), len(contacts))
+            self.assertEqual(len({c.node_id for c in contacts}), len(contacts))
+            indexes = [bucket_index(OWN.node_id, c.node_id) for c in contacts]
+            self.assertTrue(all(indexes.count(index) <= 3 for index in indexes))
+            self.assertTrue(all(table.get(c.node_id) == c for c in contacts))

@@ -1,0 +1,72 @@
+"""Tests of sessions."""
+
+from __future__ import annotations
+
+import random
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.entangled.errors import Forged
+from middleware.entangled.identity import Identity
+from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.network.network import MAX_DATAGRAM, Address
+from middleware.entangled.wire.noise import TransportKeys
+from middleware.entangled.wire.session import MAX_MESSAGE, OVERHEAD, WINDOW, Session, index_of
+
+
+class SessionTests(SynchronousTestCase):
+    """Behaviour of ``Session``."""
+
+    def setUp(self) -> None:
+        """Make the two ends of one session."""
+        contact = Contact(Identity(bytes(32)).public, Address("127.0.0.1", 1))
+        one, two = b"1" * 32, b"2" * 32
+        self.a = Session(contact, 7, 8, TransportKeys(one, two, b""), 0.0, True)
+        self.b = Session(contact, 8, 7, TransportKeys(two, one, b""), 0.0, True)
+
+    def test_carries_messages_both_ways(self) -> None:
+        """What one end seals the other opens, with at most 36 bytes more, and the largest fits a datagram."""
+        datagram = self.a.seal(b"hello")
+        self.assertEqual(self.b.open(datagram), (b"hello", True))
+        self.assertEqual(self.a.open(self.b.seal(b"")), (b"", True))
+        self.assertEqual((index_of(datagram), len(datagram) - 5), (8, OVERHEAD))
+        self.assertLessEqual(OVERHEAD, 36)
+        self.assertEqual(len(self.a.seal(bytes(MAX_MESSAGE))), MAX_DATAGRAM)
+
+    def test_opens_each_once_in_any_order(self) -> None:
+        """Shuffled datagrams within the window open once each, and never again."""
+        datagrams = [self.a.seal(b"%d" % number) for number in range(WINDOW)]
+        shuffled = datagrams[:]
+        random.Random(1).shuffle(shuffled)
+        self.assertEqual({self.b.open(datagram)[0] for datagram in shuffled}, {b"%d" % n for n in range(WINDOW)})
+        for datagram in datagrams:
+            self.assertTrue(self.b.is_replay(datagram))
+            self.assertRaises(Forged, self.b.open, datagram)
+
+    def test_refuses_what_fell_out_of_the_window(self) -> None:
+        """A datagram older than the window is refused, the oldest inside it is not."""
+        datagrams = [self.a.seal(b"") for _ in range(WINDOW + 1)]
+        self.b.open(datagrams[-1])
+        self.assertTrue(self.b.is_replay(datagrams[0]))
+        self.assertEqual(self.b.open(datagrams[1]), (b"", False))
+
+    def test_window_survives_a_leap(self) -> None:
+        """After a leap over more than a window the old ones are refused and the next ones open."""
+        early = self.a.seal(b"early")
+        self.b.open(self.a.seal(b""))
+        self.a._sent = 2**40
+        late = self.a.seal(b"late")
+        self.assertEqual(self.b.open(late), (b"late", True))
+        self.assertRaises(Forged, self.b.open, early)
+        self.assertRaises(Forged, self.b.open, late)
+        self.assertEqual(self.b.open(self.a.seal(b"next"))[0], b"next")
+
+    def test_forged_datagram_changes_nothing(self) -> None:
+        """A datagram with any byte flipped does not open, and the genuine one still does."""
+        datagram = self.a.seal(b"hello")
+        for place in range(5, len(datagram)):
+            damaged = bytearray(datagram)
+            damaged[place] ^= 0x80
+            self.assertRaises(Forged, self.b.open, bytes(damaged))
+        self.assertRaises(Forged, self.b.open, datagram[: OVERHEAD - 1])
+        self.assertEqual(self.b.open(datagram), (b"hello", True))

@@ -1,0 +1,272 @@
+"""The data store with a file behind it."""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+import stat
+import subprocess
+import sys
+from contextlib import closing
+from pathlib import Path
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.entangled.errors import BadStore, NotRunning, Refused
+from middleware.entangled.record import Record, hashed_key
+from middleware.entangled.sqlite import APPLICATION_ID, SCHEMA_VERSION, SqliteStore, read_records
+from middleware.entangled.store import Store
+from tests.middleware.test_store import CAT, DOG, FOREVER, KEY, StoreContract, record
+
+
+class SqliteStoreTest(StoreContract, SynchronousTestCase):
+    def make(self, max_rows: int) -> SqliteStore:
+        store = SqliteStore.open(self.mktemp(), 0.0, max_rows)
+        self.addCleanup(store.close)
+        return store
+
+    def test_after_close(self) -> None:
+        """A closed store takes nothing more."""
+        self.store.close()
+        self.assertRaises(NotRunning, self.store.put, record(), FOREVER)
+        self.assertRaises(NotRunning, self.store.note, "seed", b"")
+
+
+class ReopenTest(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.path = self.mktemp()
+        self.store = self.reopened(0.0)
+
+    def reopened(self, now: float) -> SqliteStore:
+        store = SqliteStore.open(self.path, now)
+        self.addCleanup(store.close)
+        return store
+
+    def after_restart(self, now: float = 0.0) -> Store:
+        self.store.close()
+        return self.reopened(now)
+
+    def test_team_records_come_back(self) -> None:
+        """After a restart the team records and tombstones are back, to live a whole ttl from then."""
+        kept = [record("a"), record("b", sequence=3, value=None), record("c", value=b"")]
+        for one in kept:
+            self.store.put(one, 1.0)
+        store = self.after_restart(now=100.0)
+        self.assertEqual(store.get(KEY, tombstones=True), kept)
+        self.assertEqual(store.expire(159.0), [])
+        self.assertEqual(store.expire(160.0), kept)
+
+    def test_leased_records_do_not(self) -> None:
+        """After a restart no lease is held, for nobody watched whether its owner lived."""
+        self.store.put(record(lifetime="leased"), FOREVER)
+        self.assertEqual(len(self.after_restart()), 0)
+        self.assertEqual(read_records(self.path, KEY), [])
+
+    def test_what_left_stays_away(self) -> None:
+        """What ran out, or lost against a newer record, is not back after a restart."""
+        self.store.put(record("a"), 1.0)
+        self.store.put(record("b"), FOREVER)
+        self.store.put(record("b", sequence=2), FOREVER)
+        self.store.expire(1.0)
+        self.assertEqual(self.after_restart().records(), [record("b", sequence=2)])
+
+    def test_gone_and_back_between_commits(self) -> None:
+        """A slot that was emptied and filled again before anything was written is in the file as it is now."""
+        self.store.put(record("a"), 1.0)
+        self.store.expire(1.0)
+        self.store.put(record("a"), FOREVER)
+        self.assertEqual(self.after_restart().records(), [record("a")])
+
+    def test_notes_come_back(self) -> None:
+        """After a restart the node finds the facts that it noted."""
+        self.store.note("seed", DOG.seed)
+        self.assertEqual(self.after_restart().noted("seed"), DOG.seed)
+
+    def test_many_changes(self) -> None:
+        """More changes than fit in one commit all arrive."""
+        for number in range(1000):
+            self.store.put(record(str(number), value=None), FOREVER)
+        self.assertEqual(len(self.after_restart()), 1000)
+
+    def test_row_that_is_no_record(self) -> None:
+        """A rotten row is passed over; the others are back."""
+        self.store.put(record("a"), FOREVER)
+        self.store.put(record("b"), FOREVER)
+        self.store.close()
+        with closing(sqlite3.connect(self.path)) as connection, connection:
+            connection.execute("UPDATE records SET sequence = 'x' WHERE name = 'a'")
+        self.assertEqual(self.reopened(0.0).records(), [record("b")])
+        self.assertEqual(read_records(self.path, KEY), [record("b")])
+
+    def test_killed_in_the_middle(self) -> None:
+        """What was flushed is there after the process was killed with more on its way."""
+        self.store.close()
+        child = (
+            "import os, sys\n"
+            "from middleware.entangled.sqlite import SqliteStore\n"
+            "from tests.middleware.test_store import record\n"
+            "store = SqliteStore.open(sys.argv[1], 0.0)\n"
+            "for number in range(300): store.put(record(str(number), value=None), 9e9)\n"
+            "store.flush()\n"
+            "for number in range(300): store.put(record('late' + str(number), value=None), 9e9)\n"
+            "os.kill(os.getpid(), 9)\n"
+        )
+        root = Path(__file__).parents[2]
+        ended = subprocess.run([sys.executable, "-c", child, os.path.abspath(self.path)], cwd=root, check=False)
+        self.assertEqual(ended.returncode, -9)
+        store = self.reopened(0.0)
+        self.assertEqual({str(number) for number in range(300)} - {r.name for r in store.records()}, set())
+
+    def test_one_node_a_file(self) -> None:
+        """A second node is kept off a file that is in use, and let in when the first has gone."""
+        error = self.assertRaises(BadStore, SqliteStore.open, self.path, 0.0)
+        self.assertIn("another node uses it", str(error))
+        self.after_restart()
+
+    def test_only_for_its_owner(self) -> None:
+        """Nobody else may read the file or its log, for the seed of the identity lies in it."""
+        self.store.put(record(), FOREVER)
+        self.store.flush()
+        for path in (self.path, self.path + "-wal", self.path + "-shm"):
+            self.assertEqual(stat.S_IMODE(os.stat(path).st_mode), 0o600, path)
+        self.store.close()
+        os.chmod(self.path, 0o644)
+        self.reopened(0.0)
+        self.assertEqual(stat.S_IMODE(os.stat(self.path).st_mode), 0o600)
+
+
+class FullDiskTest(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.store = SqliteStore.open(self.mktemp(), 0.0)
+        self.addCleanup(self.store.close)
+        self.store.put(record("a"), FOREVER)
+        self.store.flush()
+        # No page more than there are: SQLite then says that the disk is full.
+        self.limit(1)
+        for number in range(40):
+            self.store.put(record(str(number), value=bytes(900)), FOREVER)
+        self.assertRaises(BadStore, self.store.flush, 0.2)
+
+    def limit(self, pages: int) -> None:
+        self.store._connection.execute(f"PRAGMA max_page_count = {pages}").fetchone()
+
+    def test_refuses_by_name(self) -> None:
+        """On a full disk a node refuses new records with the reason, and still answers, extends and lets go."""
+        error = self.assertRaises(Refused, self.store.put, record("b"), FOREVER)
+        self.assertIn("full", str(error))
+        self.assertFalse(self.store.put(record("a"), FOREVER))
+        self.assertIn(record("a"), self.store.get(KEY))
+        self.assertEqual(len(self.store.expire(FOREVER)), 41)
+        self.limit(10_000)
+
+    def test_recovers(self) -> None:
+        """When there is room again what was owed is written, and new records are taken."""
+        self.limit(10_000)
+        self.store.flush()
+        self.assertTrue(self.store.put(record("b"), FOREVER))
+        self.store.flush()
+        self.assertEqual(len(read_records(self.store._path, KEY)), 42)
+
+    def test_ends_all_the_same(self) -> None:
+        """A node whose disk stays full ends without waiting for it, and the log says what was lost."""
+        self.store.close()
+        logged = self.flushLoggedErrors()
+        self.assertEqual(logged, [])
+
+
+class BadFileTest(SynchronousTestCase):
+    def refusal(self, path: str) -> str:
+        """The one line by which the store at ``path`` is refused."""
+        line = str(self.assertRaises(BadStore, SqliteStore.open, path, 0.0))
+        self.assertNotIn("\n", line)
+        self.assertIn(path, line)
+        self.assertIn("; ", line)
+        return line
+
+    def test_directory(self) -> None:
+        """A directory is no store."""
+        path = self.mktemp()
+        os.mkdir(path)
+        self.assertIn("is a directory", self.refusal(path))
+
+    def test_no_such_folder(self) -> None:
+        """A file in a folder that does not exist, or in something that is none, cannot be made."""
+        path = self.mktemp()
+        self.assertIn("No such file", self.refusal(path + "/store"))
+        Path(path).touch()
+        self.assertIn("Not a directory", self.refusal(path + "/store"))
+
+    def test_not_a_database(self) -> None:
+        """Some other file is refused and left as it was."""
+        path = self.mktemp()
+        text = "a letter to a friend\n" * 100
+        Path(path).write_text(text)
+        os.chmod(path, 0o640)
+        self.assertIn("not a database", self.refusal(path))
+        self.assertEqual(Path(path).read_text(), text)
+        self.assertEqual(stat.S_IMODE(os.stat(path).st_mode), 0o640)
+
+    def test_of_another_program(self) -> None:
+        """A database of another program is refused, be it known by its id, its version or its tables."""
+        for statement in ("PRAGMA application_id = 7", "PRAGMA user_version = 1", "CREATE TABLE letters(text)"):
+            path = self.mktemp()
+            with closing(sqlite3.connect(path)) as connection:
+                connection.execute(statement)
+            self.assertIn("another program", self.refusal(path))
+
+    def test_newer_schema(self) -> None:
+        """A store of a newer version of this program is refused."""
+        path = self.mktemp()
+        SqliteStore.open(path, 0.0).close()
+        with closing(sqlite3.connect(path)) as connection:
+            connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION + 1}")
+        self.assertIn(f"schema {SCHEMA_VERSION + 1}", self.refusal(path))
+
+    def test_without_tables(self) -> None:
+        """A file that says it is ours and has not our tables is refused."""
+        path = self.mktemp()
+        with closing(sqlite3.connect(path)) as connection:
+            connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+            connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
+        self.assertIn("no such table", self.refusal(path))
+
+    def test_damaged(self) -> None:
+        """A file of which a part was overwritten is refused, and not served with holes."""
+        path = self.mktemp()
+        store = SqliteStore.open(path, 0.0)
+        for number in range(200):
+            store.put(record(str(number), value=bytes(500)), FOREVER)
+        store.close()
+        with open(path, "r+b") as file:
+            file.seek(4096 * 4)
+            file.write(b"\xff" * 4096 * 4)
+        self.refusal(path)
+
+    def test_refused_file_can_be_opened_later(self) -> None:
+        """A refusal leaves no lock behind."""
+        path = self.mktemp()
+        Path(path).write_text("a letter to a friend\n" * 100)
+        self.refusal(path)
+        os.remove(path)
+        SqliteStore.open(path, 0.0).close()
+
+
+class ReadRecordsTest(SynchronousTestCase):
+    def test_beside_a_running_node(self) -> None:
+        """A page reads the live records of a key in order, while the node holds the file."""
+        path = self.mktemp() + " what?#"
+        store = SqliteStore.open(path, 0.0)
+        self.addCleanup(store.close)
+        live = [record("a"), record("b", lifetime="leased"), record("a", owner=CAT)]
+        others: list[Record] = [record("c", value=None), record("a", key=hashed_key("tasks"))]
+        for one in live + others:
+            store.put(one, FOREVER)
+        store.flush()
+        self.assertEqual(read_records(path, KEY), sorted(live, key=lambda r: (r.owner, r.name)))
+
+    def test_no_such_file(self) -> None:
+        """Where there is no store the page learns so in one line, and none is made."""
+        path = self.mktemp()
+        error = self.assertRaises(BadStore, read_records, path, KEY)
+        self.assertIn(path, str(error))
+        self.assertFalse(os.path.exists(path))

@@ -1,0 +1,247 @@
+"""What every data store does, and the one in memory."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.entangled.errors import Refused
+from middleware.entangled.identity import Identity
+from middleware.entangled.record import Lifetime, Record, Slot, hashed_key
+from middleware.entangled.store import MemoryStore, Store
+
+if TYPE_CHECKING:
+    _Case = SynchronousTestCase
+else:
+    _Case = object
+
+DOG = Identity(b"\1" * 32)
+CAT = Identity(b"\2" * 32)
+KEY = hashed_key("devices")
+FOREVER = 1e9
+
+
+def record(
+    name: str = "state",
+    sequence: int = 1,
+    value: bytes | None = b"here",
+    owner: Identity = DOG,
+    key: bytes = KEY,
+    lifetime: Lifetime = "team",
+) -> Record:
+    """A record that its owner signed."""
+    return Record(key, name, owner.public, sequence, lifetime, 60.0, value).signed(owner)
+
+
+class StoreContract(_Case):
+    """What every store does; a test case mixes it in and makes the store."""
+
+    store: Store
+
+    def make(self, max_rows: int) -> Store:
+        """An empty store with room for ``max_rows`` slots; the test case closes it."""
+        raise NotImplementedError
+
+    def setUp(self) -> None:
+        self.store = self.make(100)
+
+    def test_empty(self) -> None:
+        """A new store holds nothing and has nothing to let go of."""
+        self.assertEqual(len(self.store), 0)
+        self.assertEqual(self.store.get(KEY), [])
+        self.assertIsNone(self.store.slot(Slot(KEY, DOG.public, "state")))
+        self.assertEqual(self.store.owned(DOG.public), [])
+        self.assertEqual(self.store.extend(DOG.public, FOREVER), 0)
+        self.assertEqual(self.store.expire(FOREVER), [])
+        self.assertEqual(self.store.drop_leased(DOG.public), [])
+        self.assertEqual(self.store.records(), [])
+        self.assertEqual(self.store.keys(), [])
+        self.assertIsNone(self.store.noted("seed"))
+
+    def test_put_and_get(self) -> None:
+        """What was put is found under its key and in its slot."""
+        self.assertTrue(self.store.put(record(), FOREVER))
+        self.assertEqual(self.store.get(KEY), [record()])
+        self.assertEqual(self.store.slot(record().slot), record())
+        self.assertEqual(self.store.keys(), [KEY])
+        self.assertEqual(self.store.get(hashed_key("tasks")), [])
+
+    def test_higher_sequence_holds(self) -> None:
+        """In one slot the higher sequence holds, in whichever order the two come."""
+        self.store.put(record(sequence=2), FOREVER)
+        self.assertFalse(self.store.put(record(sequence=1), FOREVER))
+        self.assertTrue(self.store.put(record(sequence=3), FOREVER))
+        self.assertEqual(self.store.get(KEY), [record(sequence=3)])
+        self.assertEqual(len(self.store), 1)
+
+    def test_order_of_a_key(self) -> None:
+        """The records of a key come in the order of owner and name, however they were put."""
+        records = [record("b", owner=CAT), record("a"), record("c", owner=CAT), record("b")]
+        for one in records:
+            self.store.put(one, FOREVER)
+        self.assertEqual(self.store.get(KEY), sorted(records, key=lambda r: (r.owner, r.name)))
+        self.assertEqual(self.store.records(), records)
+        self.assertEqual(self.store.owned(DOG.public), [record("a"), record("b")])
+
+    def test_answer_is_a_copy(self) -> None:
+        """Whoever changes a list that it got does not change the store."""
+        self.store.put(record(), FOREVER)
+        self.store.get(KEY, tombstones=True).clear()
+        self.store.get(KEY).clear()
+        self.assertEqual(self.store.get(KEY), [record()])
+
+    def test_tombstone(self) -> None:
+        """A deleted slot is empty to readers, and known to those who ask for tombstones."""
+        self.store.put(record(), FOREVER)
+        gone = record(sequence=2, value=None)
+        self.assertTrue(self.store.put(gone, FOREVER))
+        self.assertEqual(self.store.get(KEY), [])
+        self.assertEqual(self.store.get(KEY, tombstones=True), [gone])
+        self.assertEqual(self.store.slot(gone.slot), gone)
+        self.assertFalse(self.store.put(record(), FOREVER))
+
+    def test_expire(self) -> None:
+        """What has run out leaves, the earliest first; what has not stays."""
+        self.store.put(record("c"), 3.0)
+        self.store.put(record("b"), 2.0)
+        self.store.put(record("a"), 1.0)
+        self.assertEqual(self.store.expire(0.5), [])
+        self.assertEqual(self.store.expire(2.0), [record("a"), record("b")])
+        self.assertEqual(self.store.get(KEY), [record("c")])
+        self.assertEqual(self.store.owned(DOG.public), [record("c")])
+        self.assertEqual(self.store.expire(3.0), [record("c")])
+        self.assertEqual(len(self.store), 0)
+        self.assertEqual(self.store.keys(), [])
+
+    def test_same_again_lives_longer(self) -> None:
+        """The very same record only extends the life of the one that is held, and never shortens it."""
+        self.store.put(record(), 1.0)
+        self.assertFalse(self.store.put(record(), 5.0))
+        self.assertFalse(self.store.put(record(), 2.0))
+        self.assertEqual(self.store.expire(4.0), [])
+        self.assertEqual(self.store.expire(5.0), [record()])
+
+    def test_loser_extends_nothing(self) -> None:
+        """A record that loses against the held one does not extend its life."""
+        self.store.put(record(sequence=2), 1.0)
+        self.store.put(record(sequence=1), 5.0)
+        self.store.put(replace(record(sequence=2), value=b"else"), 5.0)
+        self.assertEqual(self.store.expire(1.0), [record(sequence=2)])
+
+    def test_newer_may_expire_earlier(self) -> None:
+        """The expiry of a slot is that of the record it holds now, be it earlier or later than before."""
+        self.store.put(record("a"), 10.0)
+        self.store.put(record("a", sequence=2), 1.0)
+        self.store.put(record("b"), 1.0)
+        self.store.put(record("b", sequence=2), 10.0)
+        self.assertEqual(self.store.expire(1.0), [record("a", sequence=2)])
+        self.assertEqual(self.store.expire(10.0), [record("b", sequence=2)])
+
+    def test_extend_leases(self) -> None:
+        """A sign of life extends all leased records of its owner and nothing else."""
+        self.store.put(record("a", lifetime="leased"), 1.0)
+        self.store.put(record("b", lifetime="leased"), 7.0)
+        self.store.put(record("c"), 1.0)
+        self.store.put(record("d", owner=CAT, lifetime="leased"), 1.0)
+        self.assertEqual(self.store.extend(DOG.public, 5.0), 2)
+        self.assertEqual([r.name for r in self.store.expire(4.0)], ["c", "d"] if DOG.public < CAT.public else ["d", "c"])
+        self.assertEqual([r.name for r in self.store.expire(5.0)], ["a"])
+        self.assertEqual([r.name for r in self.store.expire(7.0)], ["b"])
+
+    def test_goodbye(self) -> None:
+        """When an owner says goodbye its leased records leave; its team records stay."""
+        leased = [record(name, lifetime="leased") for name in "ba"]
+        for one in (*leased, record("c"), record("a", owner=CAT, lifetime="leased")):
+            self.store.put(one, FOREVER)
+        self.assertEqual(self.store.drop_leased(DOG.public), [leased[1], leased[0]])
+        self.assertEqual(len(self.store), 2)
+        self.assertEqual(self.store.get(KEY), sorted(self.store.records(), key=lambda r: r.owner))
+        self.assertEqual(self.store.drop_leased(DOG.public), [])
+
+    def test_back_after_goodbye(self) -> None:
+        """A slot that was let go of starts afresh, and its old expiry is forgotten."""
+        self.store.put(record(lifetime="leased"), 1.0)
+        self.store.drop_leased(DOG.public)
+        self.assertTrue(self.store.put(record(lifetime="leased"), 5.0))
+        self.assertEqual(self.store.expire(4.0), [])
+        self.assertEqual(len(self.store.expire(5.0)), 1)
+
+    def test_full(self) -> None:
+        """A full store refuses new slots, still takes new records for those it has, and has room again after losses."""
+        store = self.make(2)
+        store.put(record("a"), 1.0)
+        store.put(record("b"), FOREVER)
+        error = self.assertRaises(Refused, store.put, record("c"), FOREVER)
+        self.assertIn("store full", str(error))
+        self.assertTrue(store.put(record("b", sequence=2), FOREVER))
+        self.assertFalse(store.put(record("a"), 2.0))
+        store.expire(2.0)
+        self.assertTrue(store.put(record("c"), FOREVER))
+
+    def test_delete_always_fits(self) -> None:
+        """A full store takes tombstones even of slots it does not have, but not without end."""
+        store = self.make(1)
+        store.put(record("a"), FOREVER)
+        self.assertTrue(store.put(record("b", value=None), FOREVER))
+        self.assertRaises(Refused, store.put, record("c", value=None), FOREVER)
+        self.assertTrue(store.put(record("a", sequence=2, value=None), FOREVER))
+
+    def test_notes(self) -> None:
+        """A note is kept under its name, and the last one counts."""
+        self.store.note("seed", b"one")
+        self.store.note("seed", b"two")
+        self.store.note("seed", b"two")
+        self.store.note("contacts", b"")
+        self.assertEqual(self.store.noted("seed"), b"two")
+        self.assertEqual(self.store.noted("contacts"), b"")
+
+    def test_close_twice(self) -> None:
+        """A store may be closed again."""
+        self.store.close()
+        self.store.close()
+
+
+class MemoryStoreTest(StoreContract, SynchronousTestCase):
+    def make(self, max_rows: int) -> Store:
+        return MemoryStore(max_rows)
+
+    def test_expiries_do_not_pile_up(self) -> None:
+        """However often slots come and go, what the store remembers of their expiry stays in proportion to what it holds."""
+        store = MemoryStore()
+        for sequence in range(1, 1001):
+            store.put(record(sequence=sequence), FOREVER - sequence)
+            store.put(record("lease", sequence, lifetime="leased"), FOREVER)
+            store.drop_leased(DOG.public)
+        self.assertLess(len(store._heap), 80)
+        self.assertEqual(store.expire(FOREVER), [record(sequence=1000)])
+
+    @settings(max_examples=60, deadline=None, derandomize=True)
+    @given(st.lists(st.tuples(st.sampled_from("pped"), st.integers(0, 3), st.integers(1, 4), st.integers(0, 30))))
+    def test_like_the_obvious_one(self, events: list[tuple[str, int, int, int]]) -> None:
+        """Any series of puts, extensions, goodbyes and sweeps leaves what a plain dictionary of slots would hold."""
+        store, plain = MemoryStore(), dict[Slot, tuple[Record, float]]()
+        for verb, number, sequence, moment in events:
+            lifetime: Lifetime = "leased" if number % 2 else "team"
+            one = Record(KEY, str(number), DOG.public, sequence, lifetime, 60.0, b"", bytes(64))
+            leased = {slot: held for slot, held in plain.items() if held[0].lifetime == "leased"}
+            if verb == "p":
+                old = plain.get(one.slot)
+                self.assertEqual(store.put(one, moment), old is None or sequence > old[0].sequence)
+                if old is None or sequence > old[0].sequence:
+                    plain[one.slot] = (one, moment)
+                elif old[0] == one:
+                    plain[one.slot] = (one, max(old[1], moment))
+            elif verb == "e":
+                self.assertEqual(store.extend(DOG.public, moment), len(leased))
+                plain |= {slot: (held, max(until, moment)) for slot, (held, until) in leased.items()}
+            else:
+                gone = sorted((until, slot) for slot, (_, until) in plain.items() if until <= moment)
+                self.assertEqual([r.slot for r in store.expire(moment)], [slot for _, slot in gone])
+                for _, slot in gone:
+                    del plain[slot]
+            self.assertEqual(store.get(KEY), [plain[slot][0] for slot in sorted(plain)])
+            self.assertEqual(len(store), len(plain))

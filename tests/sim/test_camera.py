@@ -1,0 +1,125 @@
+"""Tests of ``sim.camera`` and ``sim.mesh``."""
+
+from __future__ import annotations
+
+import math
+from random import Random
+
+import cv2
+import numpy as np
+from twisted.trial.unittest import SynchronousTestCase
+
+from sim.camera import FOCAL_X, HEIGHT, WIDTH, Camera, Image
+from sim.scene import loaded
+from sim.sensor import NOSE
+from sim.world import World
+
+
+def red(image: Image) -> Image:
+    """Where the picture is target red: one range of Cr, as the ERS-7's own colour space has it."""
+    mask = cv2.inRange(cv2.cvtColor(image, cv2.COLOR_BGR2YCrCb), (20, 170, 60), (235, 255, 128))
+    return np.asarray(mask, dtype=np.uint8)
+
+
+def columns(mask: Image) -> tuple[int, int]:
+    """The first and the last column of a mask."""
+    lit = np.nonzero(mask.any(axis=0))[0]
+    return int(lit[0]), int(lit[-1])
+
+
+class CameraTests(SynchronousTestCase):
+    """What dog1 sees, standing at the left and looking to the right."""
+
+    def setUp(self) -> None:
+        """The others stand behind."""
+        self.world = World(Random(1), loaded("three-dogs"))
+        self.world.move_dog("dog1", 0.5, 1.2, 0.0)
+        self.world.move_dog("dog2", 0.3, 0.3, 0.0)
+        self.world.move_dog("dog3", 0.3, 2.1, 0.0)
+        self.camera = Camera(Random(2), self.world)
+        self.dog = self.world.dogs["dog1"]
+
+    def mask(self) -> Image:
+        """The red of a fresh picture."""
+        return red(self.camera.image(self.dog))
+
+    def test_sees_no_red_without_a_target(self) -> None:
+        """Walls, floor, dogs and noise have nothing of target red, from anywhere and in any direction."""
+        for seed in range(12):
+            self.world.scatter(seed)
+            for dog in self.world.dogs.values():
+                self.assertEqual(int(red(self.camera.image(dog)).sum()), 0)
+
+    def test_shows_the_target_where_and_as_large_as_it_is(self) -> None:
+        """Bearing and width of the red agree with the geometry to a pixel and a half, near and far."""
+        for x, y in ((1.0, 1.2), (1.5, 1.35), (2.0, 0.9), (2.8, 1.2), (2.8, 1.9)):
+            self.world.place_target(x, y)
+            left, right = columns(self.mask())
+            ahead, aside = x - 0.5 - NOSE, y - 1.2
+            bearing = math.atan2(aside, ahead)
+            half = math.asin(0.08 / math.hypot(ahead, aside))
+            self.assertLess(abs(left - (WIDTH / 2 - FOCAL_X * math.tan(bearing + half))), 1.6)
+            self.assertLess(abs(right + 1 - (WIDTH / 2 - FOCAL_X * math.tan(bearing - half))), 1.6)
+
+    def test_sees_the_target_across_the_yard(self) -> None:
+        """At the far end of the yard, and after JPEG, the target is still some nine pixels wide."""
+        self.world.move_dog("dog1", 0.14, 1.2, 0.0)
+        self.world.place_target(2.9, 1.2)
+        picture = cv2.imdecode(np.frombuffer(self.camera.jpeg(self.dog), np.uint8), cv2.IMREAD_COLOR)
+        left, right = columns(red(np.asarray(picture, dtype=np.uint8)))
+        self.assertGreaterEqual(right - left + 1, 9)
+
+    def test_fills_the_view_when_touching(self) -> None:
+        """Nose to nose with the target, most of the picture is red, and nothing breaks."""
+        self.world.place_target(0.5 + 0.12 + 0.081, 1.2)
+        self.assertGreater(int((self.mask() > 0).sum()), 0.7 * WIDTH * HEIGHT)
+
+    def test_hides_the_target_behind_a_dog(self) -> None:
+        """A dog between eye and target hides it, whichever way the dog looks; beside the line it does not."""
+        self.world.place_target(2.4, 1.2)
+        plain = int((self.mask() > 0).sum())
+        self.assertGreater(plain, 100)
+        for heading in (0.0, math.pi / 2, math.pi, -math.pi / 2, 0.7):
+            self.world.move_dog("dog2", 1.2, 1.2, heading)
+            self.assertEqual(int((self.mask() > 0).sum()), 0, heading)
+        self.world.move_dog("dog2", 1.2, 1.6, 0.0)
+        self.assertGreater(int((self.mask() > 0).sum()), 0.9 * plain)
+
+    def test_shows_the_target_before_a_dog(self) -> None:
+        """A dog behind the target takes nothing away from it."""
+        self.world.place_target(1.4, 1.2)
+        plain = int((self.mask() > 0).sum())
+        self.world.move_dog("dog2", 2.0, 1.2, 0.0)
+        self.assertLess(abs(int((self.mask() > 0).sum()) - plain), 0.05 * plain)
+
+    def test_shows_as_many_stripes_as_the_dog_has(self) -> None:
+        """One, two or three yellow stripes can be counted on the back of the head of a dog in front."""
+        self.camera = Camera(Random(2), self.world)
+        for name, stripes in (("dog2", 2), ("dog3", 3)):
+            self.world.move_dog(name, 1.1, 1.2, 0.0)
+            picture = self.camera.image(self.dog)
+            blue, green, ruby = (picture[:, :, i].astype(int) for i in range(3))
+            yellow = (ruby > 150) & (green > 120) & (blue < 110)
+            row = yellow[yellow.sum(axis=1).argmax()]
+            self.assertEqual(int((np.diff(row.astype(int)) == 1).sum()) + int(row[0]), stripes, name)
+            self.world.move_dog(name, 0.3, 0.3 if name == "dog2" else 2.1, 0.0)
+
+    def test_draws_anything_from_anywhere(self) -> None:
+        """Dogs nose to nose, in corners and against walls give pictures of the right size, not all one colour."""
+        for seed in range(20):
+            rng = Random(seed)
+            self.world.clear_target()
+            self.world.scatter(seed, clearance=0.25, from_walls=0.12)
+            for dog in self.world.dogs.values():
+                image = self.camera.image(dog)
+                self.assertEqual((image.shape, image.dtype), ((HEIGHT, WIDTH, 3), np.uint8))
+                self.assertGreater(float(image.std()), 1.0)
+            self.world.move_dog("dog1", 0.12, 0.12, rng.uniform(-3.0, 3.0))
+            self.camera.image(self.dog)
+
+    def test_repeats_for_a_seed(self) -> None:
+        """Cameras of one seed make the same JPEGs in turn; noise makes successive ones differ."""
+        other = Camera(Random(2), self.world)
+        first = [self.camera.jpeg(self.dog) for _ in range(8)]
+        self.assertEqual([other.jpeg(self.dog) for _ in range(8)], first)
+        self.assertGreater(len(set(first)), 1)

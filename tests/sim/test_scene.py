@@ -1,0 +1,80 @@
+"""Tests of ``sim.scene``."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from sim.scene import SceneError, loaded, parsed, scene_names
+
+
+class SceneTests(SynchronousTestCase):
+    """Scenes from JSON."""
+
+    def setUp(self) -> None:
+        """A lawful scene to spoil."""
+        self.fields = {
+            "name": "two",
+            "width": 2.0,
+            "height": 2.0,
+            "wall_height": 0.3,
+            "target": {"radius": 0.08, "height": 0.22},
+            "dogs": [
+                {"name": "a", "x": 0.5, "y": 0.5, "heading_deg": 90, "stripes": 1},
+                {"name": "b", "x": 1.5, "y": 1.5, "heading_deg": 0, "stripes": 2},
+            ],
+        }
+
+    def refusal(self) -> str:
+        """What is said about the spoilt scene."""
+        return str(self.assertRaises(SceneError, parsed, json.dumps(self.fields), "two.json"))
+
+    def test_loads_the_three_dogs_of_the_thesis(self) -> None:
+        """The installed scene has dogs with one, two and three stripes in a walled enclosure."""
+        self.assertIn("three-dogs", scene_names())
+        scene = loaded("three-dogs")
+        self.assertEqual([(one.name, one.stripes) for one in scene.kennels], [("dog1", 1), ("dog2", 2), ("dog3", 3)])
+        self.assertEqual((scene.width, scene.height), (3.0, 2.4))
+
+    def test_reads_a_file(self) -> None:
+        """A name that ends in .json is a path; degrees become radians."""
+        path = Path(self.mktemp() + ".json")
+        path.write_text(json.dumps(self.fields))
+        self.assertEqual(loaded(str(path)).kennels[0].heading, math.pi / 2)
+
+    def test_names_what_is_unknown(self) -> None:
+        """An unknown scene is answered with the known ones, a missing file with its path."""
+        self.assertIn("known are three-dogs", str(self.assertRaises(SceneError, loaded, "four-cats")))
+        self.assertIn("nowhere.json", str(self.assertRaises(SceneError, loaded, "nowhere.json")))
+
+    def test_refuses_what_is_no_scene(self) -> None:
+        """Text that is not JSON, or not an object, is refused with the source's name."""
+        for text in ("", "{", "[]", "7", "null", "[" * 100_000):
+            self.assertIn("two.json", str(self.assertRaises(SceneError, parsed, text, "two.json")))
+
+    def test_names_the_wrong_key(self) -> None:
+        """A missing or wrong field is refused with its key and lawful range."""
+        for key, value in (
+            ("width", 0),
+            ("height", "2"),
+            ("wall_height", None),
+            ("name", 7),
+            ("dogs", []),
+            ("target", 3),
+        ):
+            self.setUp()
+            self.fields[key] = value
+            self.assertIn(key, self.refusal())
+
+    def test_keeps_dogs_apart_and_inside(self) -> None:
+        """Dogs in a wall, in each other, or of one name are refused."""
+        for key, value, words in (("x", 1.95, "x must be"), ("name", "a", "two dogs"), ("stripes", 9, "stripes")):
+            self.setUp()
+            self.fields["dogs"][1][key] = value  # type: ignore[index]
+            self.assertIn(words, self.refusal())
+        self.setUp()
+        self.fields["dogs"][1].update(x=0.6, y=0.6)  # type: ignore[index]
+        self.assertIn("overlap", self.refusal())

@@ -1,0 +1,153 @@
+"""Tests of ``sim.world`` and ``sim.dog``."""
+
+from __future__ import annotations
+
+import math
+from random import Random
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from sim.scene import FOOTPRINT, loaded
+from sim.world import SUBSTEP, NotPossible, World
+
+
+def make_world(seed: int = 1) -> World:
+    """The three dogs, far apart."""
+    return World(Random(seed), loaded("three-dogs"))
+
+
+def run(world: World, seconds: float) -> None:
+    """Let time pass."""
+    for _ in range(round(seconds / SUBSTEP)):
+        world.step()
+
+
+class WorldTests(SynchronousTestCase):
+    """The physics of the yard."""
+
+    def setUp(self) -> None:
+        """A fresh world with dog1 in the middle, looking to the right."""
+        self.world = make_world()
+        self.dog = self.world.dogs["dog1"]
+        self.world.move_dog("dog1", 1.4, 1.0, 0.0)
+
+    def test_walks_as_far_as_an_aibo(self) -> None:
+        """Full speed ahead for two seconds is 0.16 m/s less the start, and no dog exceeds the walk figures."""
+        self.world.drive("dog1", 5.0, 0.0, 0.0)
+        run(self.world, 2.0)
+        self.assertAlmostEqual(self.dog.motion.vx, 0.160, 6)
+        self.assertTrue(1.4 + 0.29 < self.dog.x < 1.4 + 0.32, self.dog.x)
+        self.assertAlmostEqual(self.dog.y, 1.0, 6)
+
+    def test_moves_in_its_own_frame(self) -> None:
+        """Strafing left of a dog that looks up goes to smaller x, and positive turns are counter-clockwise."""
+        self.world.move_dog("dog1", 1.4, 1.0, math.pi / 2)
+        self.world.drive("dog1", 0.0, 0.1, 0.0)
+        run(self.world, 1.0)
+        self.assertLess(self.dog.x, 1.4 - 0.07)
+        self.world.drive("dog1", 0.0, 0.0, 1.0)
+        run(self.world, 0.5)
+        self.assertGreater(self.dog.heading, math.pi / 2 + 0.4)
+
+    def test_needs_time_to_start_and_to_stop(self) -> None:
+        """Speed neither jumps up nor down, and a dog at full speed stands within a tenth of a second."""
+        self.world.drive("dog1", 0.16, 0.0, 0.0)
+        run(self.world, 0.05)
+        self.assertTrue(0.01 < self.dog.motion.vx < 0.08)
+        run(self.world, 1.0)
+        self.world.halt("dog1")
+        self.world.step()
+        self.assertGreater(self.dog.motion.vx, 0.1)
+        run(self.world, 0.1)
+        self.assertFalse(self.dog.is_moving)
+
+    def test_stays_between_the_walls(self) -> None:
+        """Walking against walls and into corners for a minute never brings a dog more than 3 mm into them."""
+        for name, turn in (("dog1", 0.0), ("dog2", 0.3), ("dog3", -0.2)):
+            self.world.drive(name, 0.16, 0.05, turn)
+        for _ in range(round(60 / SUBSTEP)):
+            self.world.step()
+            for dog in self.world.dogs.values():
+                self.assertTrue(FOOTPRINT - 0.003 < dog.x < 3.0 - FOOTPRINT + 0.003, dog.x)
+                self.assertTrue(FOOTPRINT - 0.003 < dog.y < 2.4 - FOOTPRINT + 0.003, dog.y)
+        self.assertGreater(self.world.collisions, 0)
+
+    def test_pushes_another_dog_but_not_the_target(self) -> None:
+        """A dog walks another one along without overlapping; the target stands fast."""
+        self.world.move_dog("dog2", 1.8, 1.0, 0.0)
+        self.world.drive("dog1", 0.16, 0.0, 0.0)
+        run(self.world, 4.0)
+        other = self.world.dogs["dog2"]
+        self.assertGreater(math.hypot(other.x - self.dog.x, other.y - self.dog.y), 2 * FOOTPRINT - 0.005)
+        self.assertGreaterEqual(self.world.collisions, 1)
+        self.world.move_dog("dog2", 2.7, 0.3, 0.0)
+        self.world.move_dog("dog1", 1.4, 1.0, 0.0)
+        self.world.place_target(1.8, 1.0)
+        run(self.world, 4.0)
+        self.assertLess(self.dog.x, 1.8 - 0.08 - FOOTPRINT + 0.005)
+        assert self.world.target is not None
+        self.assertEqual((self.world.target.x, self.world.target.y), (1.8, 1.0))
+
+    def test_measures_ahead(self) -> None:
+        """The way ahead ends at a wall, a dog or the target, never at the dog itself, and is None beyond the reach."""
+        self.assertIsNone(self.world.distance_ahead(self.dog, 0.1, 1.0))
+        self.assertAlmostEqual(self.world.distance_ahead(self.dog, 0.1, 3.0) or 0.0, 1.5, 6)
+        self.world.place_target(2.0, 1.0)
+        self.assertAlmostEqual(self.world.distance_ahead(self.dog, 0.1, 1.0) or 0.0, 0.42, 6)
+        self.world.move_dog("dog2", 1.75, 1.0, 0.0)
+        self.assertAlmostEqual(self.world.distance_ahead(self.dog, 0.1, 1.0) or 0.0, 0.13, 6)
+        self.world.clear_target()
+        self.world.move_dog("dog2", 2.4, 0.5, 0.0)
+        self.assertIsNone(self.world.distance_ahead(self.dog, 0.1, 1.0))
+
+    def test_places_the_target_clear_of_everything(self) -> None:
+        """Over many seeds the random target keeps its distances, and one dog is clearly the nearest."""
+        for seed in range(60):
+            world = make_world(seed)
+            world.scatter(seed)
+            world.place_target_at_random()
+            target = world.target
+            assert target is not None
+            self.assertTrue(0.25 <= target.x <= 2.75 and 0.25 <= target.y <= 2.15)
+            far = sorted(math.hypot(dog.x - target.x, dog.y - target.y) for dog in world.dogs.values())
+            self.assertGreaterEqual(far[0], 0.45)
+            self.assertGreaterEqual(min(far[1] - far[0], far[2] - far[1]), 0.25 - 1e-9, seed)
+
+    def test_scatters_alike_for_one_seed(self) -> None:
+        """The same seed puts the dogs at the same free places, another seed at others."""
+        self.world.scatter(7)
+        first = self.world.snapshot()["dogs"]
+        self.world.scatter(8)
+        self.assertNotEqual(self.world.snapshot()["dogs"], first)
+        self.world.scatter(7)
+        self.assertEqual(self.world.snapshot()["dogs"], first)
+
+    def test_refuses_impossible_orders(self) -> None:
+        """Places in walls, dogs or the target, and unknown dogs are refused in words; nothing moves."""
+        self.world.place_target(2.0, 2.0)
+        before = self.world.snapshot()
+        for order in (
+            lambda: self.world.place_target(1.4, 1.1),
+            lambda: self.world.place_target(math.nan, 1.0),
+            lambda: self.world.place_target(3.0, 1.0),
+            lambda: self.world.move_dog("dog2", 1.5, 1.0, 0.0),
+            lambda: self.world.move_dog("dog2", 2.0, 1.9, 0.0),
+            lambda: self.world.move_dog("dog2", 0.0, 1.0, 0.0),
+            lambda: self.world.move_dog("dog2", 2.0, 1.0, math.inf),
+            lambda: self.world.move_dog("cat", 1.0, 1.0, 0.0),
+        ):
+            self.assertRaises(NotPossible, order)
+        self.assertEqual(self.world.snapshot(), before)
+
+    def test_replays_from_a_seed(self) -> None:
+        """Two worlds of one seed and one history agree to the last bit."""
+
+        def history() -> object:
+            world = make_world(5)
+            world.place_target_at_random()
+            for name in world.dogs:
+                world.drive(name, 0.16, 0.02, 0.4)
+            run(world, 20.0)
+            return world.snapshot()
+
+        self.assertEqual(history(), history())

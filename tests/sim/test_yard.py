@@ -1,0 +1,283 @@
+"""Tests of ``sim.yard`` and ``sim.session`` by the bytes that clients exchange with it."""
+
+from __future__ import annotations
+
+from random import Random
+
+from twisted.internet.task import Clock
+from twisted.trial.unittest import SynchronousTestCase
+
+from drivers.sim.codec import (
+    VERSION,
+    Alive,
+    Done,
+    Drive,
+    FrameReader,
+    Halt,
+    Hello,
+    Message,
+    Motors,
+    Order,
+    Overlook,
+    Picture,
+    Refused,
+    Sensors,
+    Truth,
+    encoded,
+)
+from sim.scene import loaded
+from sim.session import Beat, Session
+from sim.yard import SILENT_S, TICK_S, Yard
+
+
+class Client:
+    """A bare client: the yard's link and what came over it."""
+
+    def __init__(self, yard: Yard) -> None:
+        self.is_busy = False
+        self.is_open = True
+        self.heard: list[Message] = []
+        self._reader = FrameReader()
+        self.session: Session | None = None
+        self.session = yard.attach(self)
+
+    def send(self, data: bytes) -> None:
+        """Hear what the yard sends."""
+        self.heard += self._reader.read(data)
+
+    def close(self) -> None:
+        """Learn that the yard hangs up."""
+        if self.is_open:
+            self.is_open = False
+            if self.session is not None:
+                self.session.link_down()
+
+    def say(self, *messages: Message) -> None:
+        """Tell the yard."""
+        assert self.session is not None
+        self.session.received(b"".join(encoded(message) for message in messages))
+
+    def of(self, kind: type[Message]) -> list[Message]:
+        """What was heard of one kind."""
+        return [message for message in self.heard if isinstance(message, kind)]
+
+
+class YardTests(SynchronousTestCase):
+    """The yard as its clients meet it."""
+
+    def setUp(self) -> None:
+        """A yard on a turned clock, with dog1 driven."""
+        self.clock = Clock()
+        self.yard = Yard(self.clock, Random(1), loaded("three-dogs"))
+        self.yard.start()
+        self.client = Client(self.yard)
+        self.client.say(Hello(VERSION, "dog1", 0.0), Motors(True))
+
+    def ticks(self, count: int) -> None:
+        """Let whole ticks pass."""
+        for _ in range(count):
+            self.clock.advance(TICK_S)
+
+    def drive(self, token: int = 1, ttl: float = 0.5, sent: float | None = None, vx: float = 0.16) -> None:
+        """Send a command as dog1's driver."""
+        self.client.say(Drive(vx, 0.0, 0.0, token, ttl, self.clock.seconds() if sent is None else sent))
+
+    def is_moving(self) -> bool:
+        """Whether dog1 really moves."""
+        return self.yard.world.dogs["dog1"].is_moving
+
+    def test_sends_a_sensor_frame_each_32_ms(self) -> None:
+        """After ten seconds 312 frames have come, their stamps 32 ms apart without drift."""
+        for _ in range(1000):
+            self.clock.advance(0.01)
+            self.client.say(Alive())
+        stamps = [message.t for message in self.client.of(Sensors) if isinstance(message, Sensors)]
+        self.assertEqual(len(stamps), 312)
+        self.assertAlmostEqual(stamps[-1], 312 * TICK_S, 9)
+
+    def test_catches_up_on_physics_but_not_on_pictures(self) -> None:
+        """A yard that was held up for half a second makes up for the sensor frames, and draws once."""
+        self.client.say(Hello(VERSION, "dog1", 30.0))
+        self.ticks(2)
+        before = len(self.client.of(Picture))
+        self.clock.advance(0.512)
+        self.assertEqual(len(self.client.of(Sensors)), 18)
+        self.assertEqual(len(self.client.of(Picture)), before + 1)
+
+    def test_forgets_a_long_pause(self) -> None:
+        """After a minute of suspension the yard goes on from where it was."""
+        self.ticks(1)
+        self.clock.advance(60.0)
+        self.ticks(5)
+        self.assertLess(self.yard.world.t, 2.0)
+
+    def test_draws_only_for_those_who_asked(self) -> None:
+        """Without a wish there are no pictures; a wish of ten a second gives ten a second, of 99 thirty."""
+        self.ticks(31)
+        self.assertEqual(self.client.of(Picture), [])
+        for wish, count in ((10.0, 10), (99.0, 30)):
+            before = len(self.client.of(Picture))
+            self.client.say(Hello(VERSION, "dog1", wish))
+            self.ticks(31)
+            self.assertIn(len(self.client.of(Picture)) - before, (count - 1, count, count + 1))
+
+    def test_stops_at_the_end_of_the_time_to_live(self) -> None:
+        """A command runs out by itself, though the connection stands and the driver says nothing more."""
+        self.ticks(2)
+        self.drive(ttl=0.3)
+        self.ticks(8)
+        self.assertTrue(self.is_moving())
+        self.ticks(4)
+        self.assertFalse(self.is_moving())
+
+    def test_shortens_a_command_that_was_held_up(self) -> None:
+        """A late command runs shorter, a too late one not at all; a stamp ahead of the yard gains nothing."""
+        self.ticks(50)
+        now = self.clock.seconds()
+        self.drive(ttl=0.5, sent=now - 0.6)
+        self.ticks(1)
+        self.assertFalse(self.is_moving())
+        self.drive(ttl=0.5, sent=now - 0.4)
+        self.ticks(2)
+        self.assertTrue(self.is_moving())
+        self.ticks(4)
+        self.assertFalse(self.is_moving())
+        self.drive(ttl=0.2, sent=now + 1000.0)
+        self.ticks(9)
+        self.assertFalse(self.is_moving())
+
+    def test_refuses_older_tokens(self) -> None:
+        """A command with a lower token than one seen changes nothing."""
+        self.drive(token=5, ttl=1.0)
+        self.drive(token=4, ttl=1.0, vx=-0.1)
+        self.ticks(10)
+        self.assertGreater(self.yard.world.dogs["dog1"].motion.vx, 0.1)
+
+    def test_halts_at_once(self) -> None:
+        """A halt needs no token, and motors off mean no motion."""
+        for stop in (Halt(), Motors(False)):
+            self.drive(ttl=5.0)
+            self.ticks(5)
+            self.assertTrue(self.is_moving())
+            self.client.say(stop)
+            self.ticks(4)
+            self.assertFalse(self.is_moving())
+        self.drive(ttl=5.0)
+        self.ticks(5)
+        self.assertFalse(self.is_moving())
+
+    def test_stops_the_dog_of_a_lost_driver(self) -> None:
+        """When the connection closes, the dog stops and is free, with fresh tokens, for another driver."""
+        self.drive(token=9, ttl=5.0)
+        self.ticks(5)
+        self.client.close()
+        self.ticks(4)
+        self.assertFalse(self.is_moving())
+        self.client = Client(self.yard)
+        self.client.say(Hello(VERSION, "dog1", 0.0), Motors(True))
+        self.drive(token=1, ttl=5.0)
+        self.ticks(5)
+        self.assertTrue(self.is_moving())
+
+    def test_gives_up_a_silent_client(self) -> None:
+        """A frozen driver is hung up on after some seconds, and so is a stranger who never says hello."""
+        stranger = Client(self.yard)
+        lively = Client(self.yard)
+        for _ in range(round(SILENT_S / TICK_S) + 3):
+            lively.say(Alive())
+            self.ticks(1)
+        self.assertEqual((self.client.is_open, stranger.is_open, lively.is_open), (False, False, True))
+        self.assertEqual(self.yard.holders, [])
+
+    def test_keeps_one_driver_per_dog(self) -> None:
+        """A second driver is told that dog1 is taken and hung up on; the first goes on."""
+        second = Client(self.yard)
+        second.say(Hello(VERSION, "dog1", 0.0))
+        self.assertEqual(second.heard, [Refused("dog1 is taken by another driver", False)])
+        self.assertFalse(second.is_open)
+        self.ticks(1)
+        self.assertEqual(len(self.client.of(Sensors)), 1)
+        self.assertEqual(self.yard.holders, ["dog1"])
+
+    def test_refuses_what_waiting_will_not_mend(self) -> None:
+        """An unknown robot, another version and a second robot on one connection are refused for good."""
+        for hello in (Hello(VERSION, "cat", 0.0), Hello(VERSION + 1, "dog2", 0.0)):
+            client = Client(self.yard)
+            client.say(hello)
+            (refusal,) = client.heard
+            assert isinstance(refusal, Refused)
+            self.assertTrue(refusal.lasting)
+        self.client.say(Hello(VERSION, "dog2", 0.0))
+        self.assertEqual(self.client.heard[-1], Refused("this connection holds dog1 already", True))
+        self.assertEqual(self.yard.holders, [])
+
+    def test_drops_for_a_client_that_does_not_read(self) -> None:
+        """A busy link gets nothing until it is free again: the newest matters, not the oldest."""
+        self.client.is_busy = True
+        self.ticks(10)
+        self.assertEqual(self.client.heard, [])
+        self.client.is_busy = False
+        self.ticks(1)
+        (newest,) = self.client.of(Sensors)
+        assert isinstance(newest, Sensors)
+        self.assertAlmostEqual(newest.t, 11 * TICK_S)
+        self.assertEqual({len(row) for row in newest.samples.values()}, {4})
+
+    def test_lives_on_after_rubbish(self) -> None:
+        """Rubbish, orders of those who are no operator and commands of those who hold no dog change nothing."""
+        before = self.yard.world.snapshot()
+        stranger = Client(self.yard)
+        stranger.session.received(b"\x00\xff" * 500) if stranger.session else None
+        stranger.say(Order(1, "scatter", (1,)), Drive(0.1, 0.0, 0.0, 1, 1.0, 0.0), Halt())
+        self.assertEqual((stranger.heard, self.yard.world.snapshot()), ([], before))
+
+    def test_shows_the_operator_everything(self) -> None:
+        """An operator gets the truth at the rate asked for, and an answer to every order, lawful or not."""
+        operator = Client(self.yard)
+        operator.say(Overlook(VERSION, 5.0))
+        self.ticks(31)
+        self.assertIn(len(operator.of(Truth)), (5, 6))
+        operator.say(
+            Order(1, "place_target", (2.0, 2.0)),
+            Order(2, "place_target", (2.0,)),
+            Order(3, "place_target", (2, 2)),
+            Order(4, "explode", ()),
+            Order(5, "place_target", (float(9), 2.0)),
+        )
+        done = [message for message in operator.heard if isinstance(message, Done)]
+        self.assertEqual([(one.number, bool(one.problem)) for one in done], [(n, n > 1) for n in range(1, 6)])
+        self.assertIsNotNone(self.yard.world.target)
+
+    def test_turns_away_the_crowd(self) -> None:
+        """The sixty-fifth connection is refused; those that are open stay."""
+        crowd = [Client(self.yard) for _ in range(65)]
+        self.assertEqual(sum(not client.is_open for client in crowd), 2)
+        self.assertTrue(self.client.is_open)
+
+    def test_leaves_nothing_behind(self) -> None:
+        """A stopped yard has hung up on everybody and has no timer left."""
+        self.ticks(2)
+        self.yard.stop()
+        self.assertFalse(self.client.is_open)
+        self.assertEqual(self.clock.getDelayedCalls(), [])
+
+
+class BeatTests(SynchronousTestCase):
+    """The rhythm of pictures."""
+
+    def test_keeps_its_rate_on_average(self) -> None:
+        """Any rate up to the tick rate is kept over ten seconds of ticks."""
+        for rate in (1.0, 10.0, 15.0, 29.97, 30.0, 31.25):
+            beat = Beat(rate)
+            count = sum(beat.is_due(tick * TICK_S) for tick in range(1, 3126))
+            self.assertLess(abs(count - 100 * rate), 2, rate)
+
+    def test_never_beats_at_rate_zero(self) -> None:
+        """Nobody asked, nothing is due."""
+        self.assertFalse(any(Beat(0.0).is_due(float(t)) for t in range(100)))
+
+    def test_does_not_make_up_for_a_pause(self) -> None:
+        """After a pause one beat is due, not all the missed ones."""
+        beat = Beat(10.0)
+        self.assertTrue(beat.is_due(0.0))
+        self.assertEqual([beat.is_due(50.0), beat.is_due(50.032), beat.is_due(50.064)], [True, False, False])

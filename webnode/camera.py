@@ -1,0 +1,152 @@
+"""Cameras: the newest picture of a device, and who waits for the next one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol
+
+from twisted.internet.interfaces import IDelayedCall, IReactorTime
+from twisted.web.http import Request
+
+from webnode.errors import Refusal
+
+POLL_S = 5.0
+LINGER_S = 2.0
+MAX_FRAME = 1 << 20
+
+OnFrame = Callable[[int, bytes], None]
+Question = tuple[Request, bytes, IDelayedCall]
+
+
+class FrameSource(Protocol):
+    """Where camera pictures come from; the stream to a robot's node exists only while somebody looks."""
+
+    def watch(self, uuid: str, on_frame: OnFrame) -> Callable[[], None]:
+        """Call ``on_frame(seq, jpeg)`` for each new picture of a device until what is returned is called.
+
+        Raises ``Refusal`` where the device has no camera or is not there.
+        """
+
+
+class MemoryFrames:
+    """A frame source in memory: ``show`` hands over a picture; ``watched`` says whose pictures are wanted."""
+
+    def __init__(self) -> None:
+        self.watched: dict[str, OnFrame] = {}
+        self.opened = 0
+
+    def watch(self, uuid: str, on_frame: OnFrame) -> Callable[[], None]:
+        """Watch ``uuid``; every device has a camera here."""
+        self.watched[uuid] = on_frame
+        self.opened += 1
+        return lambda: self.watched.pop(uuid, None) and None
+
+    def show(self, uuid: str, seq: int, jpeg: bytes) -> None:
+        """Hand over one picture, if somebody watches."""
+        if uuid in self.watched:
+            self.watched[uuid](seq, jpeg)
+
+
+class Camera:
+    """The newest picture of one device, and who waits for the next; ends itself two seconds after the last question.
+
+    ``watch`` opens the upstream (and may raise ``Refusal``).  An upstream that is silent for ``POLL_S`` is opened anew:
+    its device may have come back at another address.
+    """
+
+    def __init__(self, clock: IReactorTime, watch: Callable[[OnFrame], Callable[[], None]], on_end: Callable[[], None]):
+        self._clock = clock
+        self._watch = watch
+        self._on_end = on_end
+        self._opened_at = clock.seconds()
+        self._newest: tuple[int, bytes, float] | None = None
+        self._linger: IDelayedCall | None = None
+        self._ended = False
+        self.waiting: list[Question] = []
+        self._stop_upstream = watch(self.on_frame)
+
+    def wait(self, request: Request) -> None:
+        """Answer ``request`` with the first picture that is news to it."""
+        viewer = _argument(request, b"viewer")
+        for entry in [entry for entry in self.waiting if viewer and entry[1] == viewer]:
+            self._release(entry)
+        if self._linger is not None:
+            self._linger.cancel()
+            self._linger = None
+        if self._newest is not None and _argument(request, b"after") != str(self._newest[0]).encode():
+            self._send(request)
+            self._rest()
+            return
+        entry = (request, viewer, self._clock.callLater(POLL_S, lambda: self._give_up(entry)))
+        self.waiting.append(entry)
+        request.notifyFinish().addErrback(lambda _: self._forget(entry))
+
+    def on_frame(self, seq: int, jpeg: bytes) -> None:
+        """Take the next picture; what is no JPEG, far too large or comes after the end is dropped."""
+        if self._ended or not jpeg.startswith(b"\xff\xd8") or len(jpeg) > MAX_FRAME:
+            return
+        self._newest = (seq, jpeg, self._clock.seconds())
+        waiting, self.waiting = self.waiting, []
+        for request, _, deadline in waiting:
+            deadline.cancel()
+            self._send(request)
+        self._rest()
+
+    def close(self) -> None:
+        """Answer whoever waits with 204 and end the upstream now."""
+        for entry in list(self.waiting):
+            self._release(entry)
+        if self._linger is not None:
+            self._linger.cancel()
+        self._end()
+
+    def _send(self, request: Request) -> None:
+        assert self._newest is not None
+        seq, jpeg, at = self._newest
+        request.setHeader("Content-Type", "image/jpeg")
+        request.setHeader("Cache-Control", "no-store")
+        request.setHeader("X-Seq", str(seq))
+        request.setHeader("X-Age", f"{self._clock.seconds() - at:.3f}")
+        request.setHeader("Content-Length", str(len(jpeg)))
+        request.write(jpeg)
+        request.finish()
+
+    def _give_up(self, entry: Question) -> None:
+        self._release(entry)
+        newest_at = -POLL_S if self._newest is None else self._newest[2]
+        if self._clock.seconds() - max(newest_at, self._opened_at) < POLL_S:
+            return
+        self._stop_upstream()
+        self._stop_upstream = lambda: None
+        try:
+            self._stop_upstream = self._watch(self.on_frame)
+            self._opened_at = self._clock.seconds()
+        except Refusal:
+            self.close()
+
+    def _release(self, entry: Question) -> None:
+        self._forget(entry)
+        entry[0].setResponseCode(204)
+        entry[0].finish()
+
+    def _forget(self, entry: Question) -> None:
+        if entry in self.waiting:
+            self.waiting.remove(entry)
+        if entry[2].active():
+            entry[2].cancel()
+        self._rest()
+
+    def _rest(self) -> None:
+        if not self.waiting and self._linger is None:
+            self._linger = self._clock.callLater(LINGER_S, self._end)
+
+    def _end(self) -> None:
+        self._linger = None
+        self._ended = True
+        self._stop_upstream()
+        self._on_end()
+
+
+def _argument(request: Request, name: bytes) -> bytes:
+    values: list[bytes] = (request.args or {}).get(name, [b""])
+    return values[0][:40]
