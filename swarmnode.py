@@ -40,6 +40,9 @@ from middleware.settings import Settings
 
 use_monotonic_time()
 
+FAULTS = (SwarmError, EntangledError, DriverError)
+"""What a person can mend, and is told in one line."""
+
 
 @dataclass(frozen=True)
 class Seams:
@@ -186,7 +189,7 @@ def real_seams(settings: Settings, reactor: Any) -> Seams:
 def web_page(settings: Settings, seams: Seams, reactor: Any, node: SwarmNode) -> IService:
     """The web role: the page over the node's data store, live streams beside it."""
     try:
-        import webnode.app as application
+        from webnode.app import create_app
         from webnode.ledger import state_from
         from webnode.live import Events, Shots
         from webnode.server import Files, WebService, caller
@@ -202,17 +205,13 @@ def web_page(settings: Settings, seams: Seams, reactor: Any, node: SwarmNode) ->
         yard = YardOperator(TcpConnector(), reactor, settings.web.yard.host, settings.web.yard.port)
         yard.connect().addErrback(lambda _: None)
     desk = TeamDesk(node, TASKS, DEMO, yard)
-    departed = Departed()
     name = settings.node.name
-
-    def live() -> Any:
-        return state_from(desk.read, departed, name, seams.wall())
-
-    def stored() -> Any:
-        return state_from(partial(read_records, Path(settings.node.store)), departed, name, seams.wall())
-
-    app = application.create_app(live if settings.node.store == ":memory:" else stored, desk, caller(reactor))
-    events = Events(live, reactor, seams.wall, desk.yard)
+    # A memory of the departed each: the file lags what is watched by a commit, and one would doubt the other.
+    live = partial(state_from, desk.read, Departed(), name)
+    on_file = partial(state_from, partial(read_records, Path(settings.node.store)), Departed(), name)
+    stored = live if settings.node.store == ":memory:" else on_file
+    app = create_app(lambda: stored(seams.wall()), desk, caller(reactor))
+    events = Events(lambda: live(seams.wall()), reactor, seams.wall, desk.yard)
     return WebService(reactor, settings.web.host, settings.web.port, app, events, Shots(desk, reactor), Files())
 
 
@@ -356,7 +355,7 @@ def makeService(options: Options) -> IService:
         seams = real_seams(settings, reactor)
         web = partial(web_page, settings, seams, reactor) if "web" in settings.node.roles else None
         return _Checked(settings, seams, web)
-    except (SwarmError, EntangledError, DriverError) as error:
+    except FAULTS as error:
         _refuse(f"{settings.origin}: {error}")
 
 
@@ -366,8 +365,12 @@ class _Checked(NodeService):
     def startService(self) -> None:
         try:
             super().startService()
-        except (SwarmError, EntangledError, DriverError) as error:
+        except FAULTS as error:
             _refuse(f"{self.settings.origin}: {error}")
+        except Exception as error:
+            if type(error).__name__ != "PortTaken":  # the page's own, not imported where there is no page
+                raise
+            _refuse(f"{self.settings.origin}: [web] port: {error}")
 
 
 def _refuse(problem: object) -> NoReturn:

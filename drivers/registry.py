@@ -37,7 +37,8 @@ def driver_for(
     """A driver of ``kind`` that is not connected yet.
 
     ``name`` is the device's and says which robot is meant where the options do not; ``connector`` opens the
-    links, real TCP on the running reactor where it is None.  Raises ``UsageError`` with one line for an unknown kind or a wrong option.
+    links, real TCP on the running reactor where it is None.  Raises ``UsageError`` with one line for an unknown
+    kind or a wrong option.
     """
     return cast(Factory, _found(kind, "made"))(options, name, clock, connector)
 

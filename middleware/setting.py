@@ -58,6 +58,17 @@ def pattern(expression: str, example: str) -> Rule:
     return _rule(check)
 
 
+def secret(most: int) -> Rule:
+    """A rule for text of 1 to ``most`` characters that no error shows."""
+
+    def check(value: object) -> str:
+        if not isinstance(value, str) or not 1 <= len(value) <= most:
+            raise Wrong(f"must be text of 1..{most} characters (it is not shown here)", "write text in quotes")
+        return value
+
+    return _rule(check)
+
+
 def port() -> Rule:
     """A rule for a port number."""
 

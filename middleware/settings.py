@@ -50,7 +50,7 @@ class NodeSettings:
     """The data store's file, relative to the folder of the settings file; ``:memory:`` forgets all when the node ends,
     and so gives the node a new identity each time."""
 
-    team_key: str = field(default="swarm", metadata=setting.text(1000, least=1), repr=False)
+    team_key: str = field(default="swarm", metadata=setting.secret(1000), repr=False)
     """What all nodes of a team know and nobody else does.  **The default is no secret: such a team is open to everyone
     on its network.**  Any long text will do; it is hashed."""
 

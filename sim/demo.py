@@ -162,7 +162,8 @@ def _say(line: str) -> None:
 async def _run(reactor: Any, wishes: argparse.Namespace) -> None:
     try:
         with fresh(wishes.run_dir.absolute()):
-            plan = arranged(wishes.run_dir.absolute(), wishes.web_host, wishes.web_port, _say)
+            folder = wishes.run_dir.absolute()
+            plan = arranged(folder, wishes.web_host, wishes.web_port, not wishes.headless, _say)
             demonstration = Demonstration(reactor, plan, wishes.seed, _say)
             reactor.addSystemEventTrigger("before", "shutdown", demonstration.stop)
             try:

@@ -21,8 +21,8 @@ def chosen(kind: Kind, host: str, wanted: int, what: str) -> int:
 
 
 def preferred(kind: Kind, host: str, wanted: int) -> int:
-    """``wanted`` where it is free, else any free port."""
-    return wanted if _is_free(kind, host, wanted) else free(kind, host, 1)[0]
+    """``wanted`` where it is free, else any free port; 0 wants any."""
+    return wanted if wanted and _is_free(kind, host, wanted) else free(kind, host, 1)[0]
 
 
 def free(kind: Kind, host: str, count: int) -> list[int]:

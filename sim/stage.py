@@ -45,15 +45,23 @@ def fresh(run_dir: Path) -> TextIO:
     return lock
 
 
-def arranged(run_dir: Path, web_host: str, web_port: int | None, say: Callable[[str], None]) -> Plan:
-    """A plan on ports that are free; a port that had to give way is said."""
-    web = port.chosen("tcp", web_host, web_port, "the page") if web_port else port.preferred("tcp", web_host, WEB_PORT)
-    yard = port.preferred("tcp", LOOPBACK, YARD_PORT)
-    node = port.preferred("udp", LOOPBACK, NODE_PORT)
-    for what, usual, got in (("the page", web_port or WEB_PORT, web), ("the yard", YARD_PORT, yard)):
-        if usual != got:
-            say(f"port {usual} is busy; {what} uses {got}")
-    if node != NODE_PORT:
-        say(f"port {NODE_PORT} is busy; the bootstrap node uses {node}")
-    nodes = {BOOTSTRAP: node, **dict(zip(DOGS, port.free("udp", LOOPBACK, len(DOGS)), strict=True))}
+def arranged(run_dir: Path, web_host: str, web_port: int | None, usual: bool, say: Callable[[str], None]) -> Plan:
+    """A plan on ports that are free; a usual port that had to give way is said.
+
+    ``usual``: try the usual ports first, for people who look at them; without it all ports are any free ones, so that
+    several demonstrations can start at the same moment.
+    """
+    if web_port:
+        web = port.chosen("tcp", web_host, web_port, "the page")
+    else:
+        web = port.preferred("tcp", web_host, WEB_PORT if usual else 0)
+    yard = port.preferred("tcp", LOOPBACK, YARD_PORT if usual else 0)
+    node, *others = port.free("udp", LOOPBACK, 1 + len(DOGS))
+    if usual:
+        node = port.preferred("udp", LOOPBACK, NODE_PORT)
+        wanted = (("the page", web_port or WEB_PORT, web), ("the yard", YARD_PORT, yard), ("vaio", NODE_PORT, node))
+        for what, wish, got in wanted:
+            if wish != got:
+                say(f"port {wish} is busy; {what} uses {got}")
+    nodes = {BOOTSTRAP: node, **dict(zip(DOGS, others, strict=True))}
     return Plan(run_dir, secrets.token_hex(32), web_host, web, yard, nodes)

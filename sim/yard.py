@@ -106,7 +106,7 @@ class Yard:
         return session
 
     def connector(self, delay: float = 0.0005) -> MemoryConnector:
-        """What drivers and operators in this process connect through: ``SimDriver(options, yard.connector(), clock)``."""
+        """What drivers in this process connect through: ``SimDriver(options, yard.connector(), clock)``."""
         return MemoryConnector(self._clock, self.attach, delay)
 
     def _now(self) -> float:

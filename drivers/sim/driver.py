@@ -43,7 +43,8 @@ class SimDriver:
 
     After ``connect`` the motors are off and ``estop.engaged`` is true until ``enable``.  ``state`` says ``ready`` while
     observations flow, ``stale`` while they do not (no frame for ``STALE_S``, or the link is being opened again)
-    and ``stopped`` after ``disable``.  A link that comes back finds the motors as they were asked for, and the motion at rest.
+    and ``stopped`` after ``disable``.  A link that comes back finds the motors as they were asked for, and
+    the motion at rest.
     """
 
     log = Logger()
@@ -172,7 +173,7 @@ class SimDriver:
         return end
 
     def diagnostics(self) -> dict[str, float]:
-        """Counters: frames, bad frames, pictures, bytes, links, reconnects, refused; ``age`` of what was last seen, in s."""
+        """Counters: frames, bad frames, pictures, bytes, links, reconnects, refused; ``age`` of the newest in s."""
         counts: dict[str, float] = dict(self._counts)
         counts["reconnects"] = max(0, self._counts["links"] - 1)
         counts["age"] = math.inf if self._newest is None else self._clock.seconds() - self._newest.t_host

@@ -188,7 +188,7 @@ class MemoryLink:
             self._clock.callLater(self._delay, self.other._deliver, data)
 
     def close(self) -> None:
-        """Close both ends; the other learns it after the delay; what is on the way there still arrives, nothing comes back."""
+        """Close both ends; the other learns it after the delay; what is on its way there still arrives."""
         other, self.other = self.other, None
         if other is not None:
             self._clock.callLater(self._delay, other._drop)

@@ -19,8 +19,8 @@ REPLY_S = 2.0
 ALIVE_S = 0.5
 
 Snapshot = Mapping[str, Any]
-"""``t``, ``walls`` (width, height), ``dogs`` (each name, x, y, heading, moving, stripes), ``target`` (x, y, radius) or None,
-``collisions``."""
+"""``t``, ``walls`` (width, height), ``dogs`` (each name, x, y, heading, moving, stripes), ``target`` (x, y,
+radius) or None, ``collisions``."""
 
 
 class YardOperator:

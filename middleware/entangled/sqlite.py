@@ -250,7 +250,8 @@ def _row(record: Record) -> tuple[object, ...]:
 
 
 def _bad(path: str, problem: str, remedy: str) -> BadStore:
-    return BadStore(f"store {path}: {problem}; {remedy}")
+    # SQLite may find several lines for what is wrong; people get one.
+    return BadStore(f"store {path}: {' '.join(problem.split())}; {remedy}")
 
 
 def _locked(path: str) -> int:
@@ -281,9 +282,7 @@ def _checked_version(path: str, connection: sqlite3.Connection) -> int:
     if application != APPLICATION_ID and (application or version or tables):
         raise _bad(path, "is the database of another program", "name another file")
     if version > SCHEMA_VERSION:
-        raise _bad(
-            path, f"has schema {version}, we know {SCHEMA_VERSION}", "update it, or name another file"
-        )
+        raise _bad(path, f"has schema {version}, we know {SCHEMA_VERSION}", "update it, or name another file")
     (verdict,) = connection.execute("PRAGMA quick_check(1)").fetchone()
     if verdict != "ok":
         raise _bad(path, f"is damaged ({verdict})", "move it away; the team holds copies of its records")

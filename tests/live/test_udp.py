@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import random
 from collections.abc import Generator
-from typing import Any
+from typing import Any, cast
 
 from twisted.internet import reactor
 from twisted.internet.defer import Deferred, inlineCallbacks
+from twisted.internet.interfaces import IReactorUDP
 from twisted.trial.unittest import TestCase
 
 from middleware.entangled.errors import PortInUse
@@ -22,7 +23,7 @@ class UdpTests(TestCase):
 
     def network(self) -> UdpNetwork:
         """A network on a free port, closed after the test."""
-        network = UdpNetwork(reactor, "127.0.0.1", 0)
+        network = UdpNetwork(cast(IReactorUDP, reactor), "127.0.0.1", 0)
 
         def close() -> Deferred[Any]:
             network.close()
@@ -51,7 +52,7 @@ class UdpTests(TestCase):
         first = self.network()
         first.listen(lambda datagram, source: None)
         self.assertNotEqual(first.address.port, 0)
-        second = UdpNetwork(reactor, "127.0.0.1", first.address.port)
+        second = UdpNetwork(cast(IReactorUDP, reactor), "127.0.0.1", first.address.port)
         error = self.assertRaises(PortInUse, second.listen, lambda datagram, source: None)
         self.assertIn(f"127.0.0.1:{first.address.port}", str(error))
         self.assertNotIn("\n", str(error))

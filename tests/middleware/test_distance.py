@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 
@@ -19,6 +19,7 @@ def contact(number: int, port: int = 7000) -> Contact:
 
 
 class DistanceTest(SynchronousTestCase):
+    @settings(deadline=None, derandomize=True, database=None)
     @given(IDS, IDS, IDS)
     def test_metric(self, a: bytes, b: bytes, c: bytes) -> None:
         """The distance is a metric: zero for one id only, the same both ways, and no way round is shorter."""
@@ -26,6 +27,7 @@ class DistanceTest(SynchronousTestCase):
         self.assertEqual(distance(a, b), distance(b, a))
         self.assertLessEqual(distance(a, c), distance(a, b) + distance(b, c))
 
+    @settings(deadline=None, derandomize=True, database=None)
     @given(IDS, IDS)
     def test_bucket_holds_its_range(self, own: bytes, other: bytes) -> None:
         """The bucket i of an id spans the distances from 2**i to below 2**(i+1)."""

@@ -310,7 +310,7 @@ class WeatherTests(EndpointCase):
     def test_changes_run_at_most_once(self) -> None:
         """Under loss, duplication and reordering no change runs twice, and every answered one ran."""
         self.board.weather = Weather(DELAY, DELAY / 2, loss=0.3, duplicate=0.3, reorder=0.2)
-        answered = []
+        answered: list[int] = []
         for number in range(300):
             asked = self.a.ask(self.to_b, "add", number, changes=True)
             asked.addCallbacks(answered.append, lambda failure: failure.trap(NoAnswer))
@@ -323,7 +323,7 @@ class WeatherTests(EndpointCase):
     def test_questions_get_through_heavy_loss(self) -> None:
         """With 30 % of the datagrams lost each way at least nine of ten questions are answered."""
         self.board.weather = Weather(DELAY, loss=0.3)
-        answers = []
+        answers: list[int] = []
         for number in range(300):
             self.a.ask(self.to_b, "echo", number).addCallbacks(answers.append, lambda failure: failure.trap(NoAnswer))
             self.clock.advance(2)
@@ -347,7 +347,7 @@ class WeatherTests(EndpointCase):
         self.assertEqual(self.got(self.a.ask(self.to_b, "add", 7, changes=True)), 7)
 
     def test_address_follows_the_key(self) -> None:
-        """When a peer's datagrams come from a new address the answers go there, and a replay from elsewhere moves nothing."""
+        """Answers go where a peer's newest datagram came from, and a replay from elsewhere moves nothing."""
         self.got(self.a.ask(self.to_b, "echo", 1))
         old = self.taps[self.to_a.address]
         moved = self.board.network("127.0.0.1", 40000)
@@ -417,7 +417,7 @@ class AttackTests(EndpointCase):
         self.assertEqual(self.b.counters["oversized"], 1)
 
     def test_replays_change_nothing(self) -> None:
-        """All recorded datagrams, sent again from elsewhere, run nothing and bring back no more bytes than they have."""
+        """Recorded datagrams, sent again from elsewhere, run nothing, and only an INIT gets its one RESP again."""
         self.got(self.a.ask(self.to_b, "echo", 0))
         self.got(self.a.ask(self.to_b, "add", 1, changes=True))
         seen: list[Contact] = []
@@ -463,7 +463,7 @@ class AttackTests(EndpointCase):
         self.assertEqual(counted, [1, 1, 1, 1])
 
     def test_flood_of_handshakes_stays_bounded(self) -> None:
-        """A thousand recorded handshakes that nobody confirms leave no more than the bounded number of half-open sessions."""
+        """Handshakes that nobody confirms leave no more than the bounded number of half-open sessions."""
         silent = self.board.network()
         silent.listen(lambda datagram, source: None)
         for number in range(700):

@@ -45,7 +45,7 @@ class IdentityTest(SynchronousTestCase):
         self.assertFalse(verified(b"short", b"sit", signature))
 
     def test_both_ends_of_an_exchange_agree(self) -> None:
-        """The exchange keys of two nodes make one shared secret, each from its own secret and the other's public key."""
+        """The exchange keys of two nodes make one shared secret, whichever of them makes it."""
         here = bindings.crypto_scalarmult(DOG.exchange_secret, exchange_key(CAT.public))
         there = bindings.crypto_scalarmult(CAT.exchange_secret, exchange_key(DOG.public))
         self.assertEqual(here, there)

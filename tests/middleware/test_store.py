@@ -148,7 +148,9 @@ class StoreContract(_Case):
         self.store.put(record("c"), 1.0)
         self.store.put(record("d", owner=CAT, lifetime="leased"), 1.0)
         self.assertEqual(self.store.extend(DOG.public, 5.0), 2)
-        self.assertEqual([r.name for r in self.store.expire(4.0)], ["c", "d"] if DOG.public < CAT.public else ["d", "c"])
+        self.assertEqual(
+            [r.name for r in self.store.expire(4.0)], ["c", "d"] if DOG.public < CAT.public else ["d", "c"]
+        )
         self.assertEqual([r.name for r in self.store.expire(5.0)], ["a"])
         self.assertEqual([r.name for r in self.store.expire(7.0)], ["b"])
 
