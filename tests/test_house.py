@@ -21,13 +21,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "middleware.entangled": ("middleware.entangled",),
     "drivers": ("drivers",),
     "sim": ("sim", "drivers"),
-    "webnode": (
-        "webnode",
-        "middleware.entangled.record",
-        "middleware.entangled.sqlite",
-        "middleware.tasks",
-        "middleware.presence",
-    ),
+    "webnode": ("webnode", "middleware"),
     "agents": ("agents", "middleware", "drivers.driver", "drivers.reading", "drivers.errors"),
     "swarmnode": ("swarmnode", *ROOMS),
 }

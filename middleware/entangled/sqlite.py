@@ -64,12 +64,13 @@ class SqliteStore(MemoryStore):
         self._thread = threading.Thread(target=self._write_on, name=f"writer of {path}", daemon=True)
 
     @classmethod
-    def open(cls, path: str, now: float, max_rows: int = MAX_ROWS) -> SqliteStore:
+    def open(cls, path: str | os.PathLike[str], now: float, max_rows: int = MAX_ROWS) -> SqliteStore:
         """The store in the file ``path``, made if there is none; raises ``BadStore`` with the reason and a remedy.
 
         Team records are back, to expire a whole ttl from ``now`` (the file cannot know how long it lay); leased ones
         are gone, for their owners' leases ended with the node that watched them.
         """
+        path = os.fspath(path)
         lock = _locked(path)
         connection = None
         try:
@@ -227,11 +228,12 @@ class SqliteStore(MemoryStore):
         return ""
 
 
-def read_records(path: str, key: bytes) -> list[Record]:
+def read_records(path: str | os.PathLike[str], key: bytes) -> list[Record]:
     """The records under ``key`` in the file ``path``, in the order of (owner, name); for any thread or process.
 
     Never blocks the writer; sees what was committed, up to ``COMMIT_AFTER`` late.  Raises ``BadStore``.
     """
+    path = os.fspath(path)
     connection = None
     try:
         connection = sqlite3.connect(f"file:{quote(path)}?mode=ro", uri=True, timeout=1.0)

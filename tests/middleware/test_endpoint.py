@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from dataclasses import replace
 from typing import Any
 
 from twisted.internet.defer import Deferred
@@ -10,12 +11,13 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.clock import HeapClock
 from middleware.entangled.errors import NoAnswer, NotRunning, Refused, TooLarge
-from middleware.entangled.identity import Identity
+from middleware.entangled.identity import Identity, exchange_key
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address
 from middleware.entangled.network.switchboard import Switchboard, SwitchboardNetwork, Weather
+from middleware.entangled.wire import asker, ledger
 from middleware.entangled.wire.endpoint import Endpoint
-from middleware.entangled.wire.handshake import INIT, INIT_LEAST, RESP
+from middleware.entangled.wire.handshake import INIT, INIT_LEAST, RESP, Invitation
 from middleware.entangled.wire.session import DATA, MAX_MESSAGE
 
 TEAM = b"k" * 32
@@ -476,6 +478,50 @@ class AttackTests(EndpointCase):
         self.clock.advance(60)
         self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 1)), 1)
         self.assertLessEqual(len(self.b._sessions), 2)
+
+    def test_malformed_messages_of_members(self) -> None:
+        """A member that seals rubbish, in a handshake or a session, is counted; the session goes on."""
+        self.got(self.a.ask(self.to_b, "echo", 1))
+        session = next(iter(self.a._sessions.values()))
+        for rubbish in (b"\xc1", b"\x93\x01", b"\x90", self.rng.randbytes(300)):
+            self.assertEqual(self.send_raw(session.seal(rubbish), self.to_a.address), 0)
+        invitation = Invitation(self.a._own, exchange_key(self.to_b.public), bytes(range(32)), 5, b"\xc1")
+        self.assertEqual(self.send_raw(invitation.datagram), 0)
+        self.assertEqual(self.b.counters, {"malformed": 5})
+        self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 2)), 2)
+
+    def test_key_of_another_is_not_believed(self) -> None:
+        """A member that names another one's public key in its INIT gets no answer and makes no session."""
+        thief = replace(self.a._own, public=Identity(b"v" * 32).public)
+        for own in (thief, replace(self.a._own, public=b"\xff" * 32)):
+            invitation = Invitation(own, exchange_key(self.to_b.public), self.rng.randbytes(32), 5, b"")
+            self.assertEqual(self.send_raw(invitation.datagram), 0)
+        self.assertEqual((self.b.counters, self.b._sessions), ({"forged": 2}, {}))
+
+    def test_peers_stay_bounded(self) -> None:
+        """Beyond the bounded number of peers the longest idle one goes with its sessions, and may come back."""
+        self.patch(asker, "MAX_PEERS", 5)
+        contacts = []
+        for seed in range(20, 30):
+            other, contact = self.endpoint(seed)
+            self.equip(other)
+            contacts.append(contact)
+            self.assertEqual(self.got(self.a.ask(contact, "echo", seed)), seed)
+        self.assertEqual((len(self.a._asker._peers), len(self.a._sessions)), (5, 5))
+        self.assertEqual(self.got(self.a.ask(contacts[0], "echo", 1)), 1)
+
+    def test_answers_under_way_stay_bounded(self) -> None:
+        """A peer that opens more long questions than it may is refused by name, and nothing runs for it."""
+        self.patch(ledger, "MAX_PER_PEER", 3)
+        self.got(self.a.ask(self.to_b, "echo", 1))
+        asked = [self.a.ask(self.to_b, "add", number, changes=True) for number in range(5)]
+        self.clock.advance(1)
+        self.assertEqual([self.successResultOf(one) for one in asked[:3]], [0, 1, 2])
+        for one in asked[3:]:
+            self.assertIn("ask again later", str(self.failureResultOf(one, Refused).value))
+        self.assertEqual(self.runs, [0, 1, 2])
+        self.clock.advance(40)
+        self.assertEqual(self.got(self.a.ask(self.to_b, "add", 9, changes=True)), 9)
 
     def test_random_bytes(self) -> None:
         """Ten thousand random datagrams raise nothing and are answered by nothing."""

@@ -47,7 +47,7 @@ def settings(**node: object) -> Settings:
 
 class SettingsTest(SynchronousTestCase):
     def file(self, text: str | bytes) -> str:
-        path = self.mktemp()
+        path: str = self.mktemp()
         Path(path).write_bytes(text.encode() if isinstance(text, str) else text)
         return path
 
@@ -55,7 +55,7 @@ class SettingsTest(SynchronousTestCase):
         """The line by which one value is refused; it says where, and what to do."""
         mapping = {"node": {"name": "dog1"}}
         mapping.setdefault(table, {})[key] = value  # type: ignore[assignment]
-        line = str(self.assertRaises(BadSetting, Settings.from_mapping, mapping, "dog1.toml"))
+        line: str = str(self.assertRaises(BadSetting, Settings.from_mapping, mapping, "dog1.toml"))
         self.assertEqual(line.splitlines(), [line])
         self.assertTrue(line.startswith(f"dog1.toml: [{table}] {key}: "), line)
         self.assertIn("; ", line)

@@ -10,8 +10,9 @@ import sys
 from contextlib import closing
 from pathlib import Path
 
-from twisted.logger import LogEvent, globalLogPublisher
+from twisted.logger import ILogObserver, LogEvent, globalLogPublisher
 from twisted.trial.unittest import SynchronousTestCase
+from zope.interface import implementer
 
 from middleware.entangled.errors import BadStore, NotRunning, Refused
 from middleware.entangled.record import Record, hashed_key
@@ -170,11 +171,16 @@ class FullDiskTest(SynchronousTestCase):
 
     def test_ends_all_the_same(self) -> None:
         """A node whose disk stays full ends without waiting for it, and the log says what was lost."""
-        events: list[LogEvent] = []
-        globalLogPublisher.addObserver(events.append)
-        self.addCleanup(globalLogPublisher.removeObserver, events.append)
+        lost: list[object] = []
+
+        @implementer(ILogObserver)
+        def seen(event: LogEvent) -> None:
+            lost.append(event.get("left"))
+
+        globalLogPublisher.addObserver(seen)
+        self.addCleanup(globalLogPublisher.removeObserver, seen)
         self.store.close()
-        self.assertIn(40, [event.get("left") for event in events])
+        self.assertIn(40, lost)
 
 
 class BadFileTest(SynchronousTestCase):
@@ -257,7 +263,7 @@ class BadFileTest(SynchronousTestCase):
 class ReadRecordsTest(SynchronousTestCase):
     def test_beside_a_running_node(self) -> None:
         """A page reads the live records of a key in order, while the node holds the file."""
-        path = self.mktemp() + " what?#"
+        path = Path(self.mktemp() + " what?#")
         store = SqliteStore.open(path, 0.0)
         self.addCleanup(store.close)
         live = [record("a"), record("b", lifetime="leased"), record("a", owner=CAT)]

@@ -148,9 +148,7 @@ class StoreContract(_Case):
         self.store.put(record("c"), 1.0)
         self.store.put(record("d", owner=CAT, lifetime="leased"), 1.0)
         self.assertEqual(self.store.extend(DOG.public, 5.0), 2)
-        self.assertEqual(
-            [r.name for r in self.store.expire(4.0)], ["c", "d"] if DOG.public < CAT.public else ["d", "c"]
-        )
+        self.assertEqual({r.name for r in self.store.expire(4.0)}, {"c", "d"})
         self.assertEqual([r.name for r in self.store.expire(5.0)], ["a"])
         self.assertEqual([r.name for r in self.store.expire(7.0)], ["b"])
 
@@ -212,7 +210,7 @@ class MemoryStoreTest(StoreContract, SynchronousTestCase):
         return MemoryStore(max_rows)
 
     def test_expiries_do_not_pile_up(self) -> None:
-        """However often slots come and go, what the store remembers of their expiry stays in proportion to what it holds."""
+        """However often slots come and go, the store remembers little more of their expiry than it holds."""
         store = MemoryStore()
         for sequence in range(1, 1001):
             store.put(record(sequence=sequence), FOREVER - sequence)
@@ -221,7 +219,7 @@ class MemoryStoreTest(StoreContract, SynchronousTestCase):
         self.assertLess(len(store._heap), 80)
         self.assertEqual(store.expire(FOREVER), [record(sequence=1000)])
 
-    @settings(max_examples=60, deadline=None, derandomize=True)
+    @settings(max_examples=60, deadline=None, derandomize=True, database=None)
     @given(st.lists(st.tuples(st.sampled_from("pped"), st.integers(0, 3), st.integers(1, 4), st.integers(0, 30))))
     def test_like_the_obvious_one(self, events: list[tuple[str, int, int, int]]) -> None:
         """Any series of puts, extensions, goodbyes and sweeps leaves what a plain dictionary of slots would hold."""
