@@ -16,10 +16,15 @@ from agents.vision import Sighting, Size, find_target
 from drivers.reading import Action, Observation
 
 FACING = math.radians(3.0)
+CAMERA_AHEAD = 0.10
+"""Metres from the robot's centre to its camera."""
+TURN_FIRST = math.radians(25)
+IN_THE_WAY = 0.30
+SIDESTEP, CREEP = 0.10, 0.04
 STOP_AT = 0.12
 """Metres left between the head and the target when the task is done: near, and not touching."""
-MEMORY = 1.5
-"""Seconds for which a target out of sight is still believed to be where it was."""
+MEMORY = 4.0
+"""Seconds for which a target out of sight is still believed to be where it was: another dog may only be passing by."""
 DISAGREEMENT = 0.25
 SETTLE = 3
 
@@ -32,12 +37,11 @@ class SearchAndApproach:
         self._size = Size(self._radius, float(parameters.get("target_height", 0.22)))
         self._side = rng.choice((-1.0, 1.0))
         self._exploration = Exploration(rng)
-        self._sighting: Sighting | None = None
+        self._target: tuple[float, float] | None = None
         self._seen_at = -math.inf
         self._frame = -1
         self._ranges: dict[str, float] = {}
         self._pose: Pose = (0.0, 0.0, 0.0)
-        self._facing_for = 0
         self._distances: list[float] = []
         self._done_for = 0
 
@@ -49,14 +53,9 @@ class SearchAndApproach:
         before = self._pose
         x, y, yaw = (float(values.get(f"odom.{axis}", 0.0)) for axis in ("x", "y", "yaw"))
         self._pose = (x, y, yaw)
-        turned = math.remainder(self._pose[2] - before[2], math.tau)
-        if self._sighting is not None:
-            # Between pictures the bearing turns with the body.
-            s = self._sighting
-            self._sighting = Sighting(math.remainder(s.bearing - turned, math.tau), s.distance, s.is_whole)
         for name in ("near", "far"):
             self._ranges[name] = float(values.get(f"range.{name}", math.nan))
-        self._exploration.saw(self._pose, turned, self._ahead)
+        self._exploration.saw(self._pose, math.remainder(yaw - before[2], math.tau), self._ahead)
         if seen.frame is not None and seen.frame.seq != self._frame:
             self._frame = seen.frame.seq
             self._saw(find_target(seen.frame.data, self._size), now)
@@ -65,17 +64,17 @@ class SearchAndApproach:
 
     def _saw(self, sighting: Sighting | None, now: float) -> None:
         if sighting is None:
-            self._facing_for = 0
             return
-        self._sighting, self._seen_at = sighting, now
+        self._seen_at = now
+        # Where it stands in the robot's own odometry: between pictures the body turns and walks, the target does not.
+        x, y, yaw = self._pose
+        reach, towards = sighting.distance + CAMERA_AHEAD, yaw + sighting.bearing
+        self._target = (x + reach * math.cos(towards), y + reach * math.sin(towards))
         if abs(sighting.bearing) < FACING:
-            self._facing_for += 1
             self._distances = [*self._distances, self._measured(sighting)][-9:]
-        else:
-            self._facing_for = 0
 
     def _measured(self, sighting: Sighting) -> float:
-        """The ranger's distance where it agrees with the picture, else the picture's."""
+        """Metres from the head: the ranger's where it agrees with the picture, else the picture's."""
         for name in ("near", "far"):
             ranged = self._ranges[name] + self._radius
             if abs(ranged - sighting.distance) < DISAGREEMENT * sighting.distance:
@@ -83,15 +82,27 @@ class SearchAndApproach:
         return sighting.distance
 
     def _forget(self) -> None:
-        self._sighting = None
-        self._facing_for = 0
+        self._target = None
         self._distances = []
         self._done_for = 0
 
     @property
+    def _bearing(self) -> float:
+        """Radians from straight ahead to the target, left positive."""
+        assert self._target is not None
+        x, y, yaw = self._pose
+        return math.remainder(math.atan2(self._target[1] - y, self._target[0] - x) - yaw, math.tau)
+
+    @property
+    def _distance(self) -> float:
+        """Metres from the camera to the target's axis."""
+        assert self._target is not None
+        return max(0.0, math.dist(self._pose[:2], self._target) - CAMERA_AHEAD)
+
+    @property
     def cost(self) -> float | None:
         """Metres to the target: the median of the newest measurements, once there are enough of them."""
-        if self._sighting is None or len(self._distances) < SETTLE:
+        if self._target is None or len(self._distances) < SETTLE:
             return None
         ordered = sorted(self._distances)
         return ordered[len(ordered) // 2]
@@ -100,45 +111,40 @@ class SearchAndApproach:
 
     def search(self, now: float) -> Action:
         """Look around and walk to new places; something seen, face it."""
-        return self._exploration.step(self._pose, self._ahead) if self._sighting is None else self._face()
+        return self._exploration.step(self._pose, self._ahead) if self._target is None else self._face()
 
     def hold(self, now: float) -> Action:
         """Stand and keep facing the target, ready to take over."""
-        return self.search(now) if self._sighting is None else self._face()
+        return self.search(now)
 
     def execute(self, now: float) -> Action | None:
         """Walk up to the target and stop before touching it; None once the dog stands there."""
-        sighting = self._sighting
-        if sighting is None:
+        if self._target is None:
             return self.search(now)
-        turn = clipped(TURN_GAIN * sighting.bearing, TURN_SPEED)
-        gap = self._gap(sighting)
-        if gap <= STOP_AT and abs(sighting.bearing) < 4 * FACING:
+        bearing, gap = self._bearing, self._gap
+        turn = clipped(TURN_GAIN * bearing, TURN_SPEED)
+        if gap <= STOP_AT and abs(bearing) < 4 * FACING:
             self._done_for += 1
             return None if self._done_for >= SETTLE else {**STAND, "base.wz": turn}
         self._done_for = 0
-        if abs(sighting.bearing) > math.radians(25):
+        if abs(bearing) > TURN_FIRST:
             return {**STAND, "base.wz": turn}
-        ahead = self._ahead
-        if ahead < 0.30 and ahead + self._radius < sighting.distance * (1 - DISAGREEMENT) - 0.05:
+        if self._ahead < IN_THE_WAY and self._ahead + self._radius < self._distance * (1 - DISAGREEMENT) - 0.05:
             # Something stands between: step aside, keep the eyes on the target.
-            return {**STAND, "base.vy": self._side * 0.10, "base.wz": turn}
-        return {**STAND, "base.vx": clipped(max(0.04, 0.9 * (gap - STOP_AT + 0.03)), WALK), "base.wz": turn}
+            return {**STAND, "base.vy": self._side * SIDESTEP, "base.wz": turn}
+        return {**STAND, "base.vx": clipped(max(CREEP, gap - STOP_AT), WALK), "base.wz": turn}
 
-    def _gap(self, sighting: Sighting) -> float:
+    @property
+    def _gap(self) -> float:
         """Metres between the head and the surface of the target."""
-        seen = max(0.0, sighting.distance - self._radius)
-        near = self._ranges["near"]
-        if not math.isnan(near) and abs(sighting.bearing) < 4 * FACING and abs(near - seen) < 0.12:
-            return near
-        return seen
+        believed = max(0.0, self._distance - self._radius)
+        near = self._ranges.get("near", math.nan)
+        is_it = abs(self._bearing) < 4 * FACING and abs(near - believed) < 0.12
+        return near if is_it else believed
 
     def _face(self) -> Action:
-        assert self._sighting is not None
-        bearing = self._sighting.bearing
-        if abs(bearing) < FACING * 0.7:
-            return STAND
-        return {**STAND, "base.wz": clipped(TURN_GAIN * bearing, TURN_SPEED)}
+        bearing = self._bearing
+        return STAND if abs(bearing) < FACING * 0.7 else {**STAND, "base.wz": clipped(TURN_GAIN * bearing, TURN_SPEED)}
 
     @property
     def _ahead(self) -> float:

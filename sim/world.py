@@ -106,26 +106,26 @@ class World:
         self._target_shape = shape
         self._space.add(shape)
 
-    def place_target_at_random(self, clearance: float = 0.45, from_walls: float = 0.25, apart: float = 0.25) -> None:
+    def place_target_at_random(self, clearance: float = 0.75, from_walls: float = 0.25, apart: float = 0.25) -> None:
         """Put the target at a free place, ``clearance`` from every dog, so that one dog is clearly the nearest.
 
-        The distances to the dogs differ pairwise by ``apart`` metres where that is possible, else by as much as was
-        found; raises ``NotPossible`` in a yard with no free place at all.
+        The distances to the dogs differ pairwise by ``apart`` metres.  Where no place has both, the one that comes nearest to
+        both is taken; raises ``NotPossible`` in a yard with no free place at all.
         """
-        best, best_gap = None, -1.0
+        best, best_fit = None, -math.inf
         for _ in range(TRIES):
             x = self._rng.uniform(from_walls, self.scene.width - from_walls)
             y = self._rng.uniform(from_walls, self.scene.height - from_walls)
             distances = sorted(math.hypot(dog.x - x, dog.y - y) for dog in self.dogs.values())
-            if distances[0] < clearance:
+            if distances and distances[0] < FOOTPRINT + 2 * self.scene.target_radius:
                 continue
             gap = min((b - a for a, b in zip(distances, distances[1:], strict=False)), default=apart)
-            if gap > best_gap:
-                best, best_gap = (x, y), gap
-            if gap >= apart:
-                break
+            room = distances[0] if distances else clearance
+            fit = min(gap / apart, 1.0) + min(room / clearance, 1.0)
+            if fit > best_fit:
+                best, best_fit = (x, y), fit
         if best is None:
-            raise NotPossible(f"no place is {clearance} m from every dog; move the dogs apart")
+            raise NotPossible("no place is free; move the dogs apart")
         self.place_target(*best)
 
     def clear_target(self) -> None:
