@@ -60,7 +60,9 @@ def main(arguments: list[str] | None = None, output: TextIO = sys.stdout, errors
     yard.start()
     reactor.addSystemEventTrigger("before", "shutdown", yard.stop)
     dogs = ", ".join(yard.world.dogs)
-    print(f"yard {scene.name} ready on {address.host}:{address.port}: {dogs}", file=output, flush=True)
+    line = f"yard {scene.name} ready on {address.host}:{address.port}: {dogs}"
+    # Said only once signals are heard: who reads it may at once ask the yard to end.
+    reactor.callWhenRunning(print, line, file=output, flush=True)
     reactor.run()
     return 0
 

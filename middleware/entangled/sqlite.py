@@ -111,6 +111,13 @@ class SqliteStore(MemoryStore):
         """Let go of all leased records of ``owner`` and return them in the order of their slots."""
         return self._let_go(super().drop_leased(owner))
 
+    def discard(self, slot: Slot) -> bool:
+        """Let go of what ``slot`` holds, and say whether it held anything."""
+        held = super().discard(slot)
+        if held:
+            self._owe({slot: None})
+        return held
+
     def note(self, name: str, value: bytes) -> None:
         """Keep a small fact of the node's own under ``name``; it is in the file after ``flush``."""
         self._check_open()

@@ -45,6 +45,9 @@ class Store(Protocol):
     def drop_leased(self, owner: bytes) -> list[Record]:
         """Let go of all leased records of ``owner`` (it said goodbye) and return them in the order of their slots."""
 
+    def discard(self, slot: Slot) -> bool:
+        """Let go of what ``slot`` holds, whatever its lifetime, and say whether it held anything."""
+
     def records(self) -> list[Record]:
         """Every record, tombstones included, in the order in which their slots came."""
 
@@ -159,6 +162,13 @@ class MemoryStore:
     def drop_leased(self, owner: bytes) -> list[Record]:
         """Let go of all leased records of ``owner`` and return them in the order of their slots."""
         return [self._remove(record.slot) for record in self.owned(owner) if record.lifetime == "leased"]
+
+    def discard(self, slot: Slot) -> bool:
+        """Let go of what ``slot`` holds, and say whether it held anything."""
+        held = slot in self._slots
+        if held:
+            self._remove(slot)
+        return held
 
     def records(self) -> list[Record]:
         """Every record, tombstones included, in the order in which their slots came."""

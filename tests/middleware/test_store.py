@@ -190,6 +190,18 @@ class StoreContract(_Case):
         self.assertRaises(Refused, store.put, record("c", value=None), FOREVER)
         self.assertTrue(store.put(record("a", sequence=2, value=None), FOREVER))
 
+    def test_discard(self) -> None:
+        """A slot that is discarded is empty, whatever its lifetime was, and its room is free; others stay."""
+        store = self.make(2)
+        store.put(record("a"), FOREVER)
+        store.put(record("b", lifetime="leased"), FOREVER)
+        self.assertTrue(store.discard(record("a").slot))
+        self.assertFalse(store.discard(record("a").slot))
+        self.assertEqual(store.get(KEY), [record("b", lifetime="leased")])
+        self.assertTrue(store.put(record("a"), 5.0))
+        self.assertTrue(store.discard(record("b").slot))
+        self.assertEqual(store.expire(FOREVER), [record("a")])
+
     def test_notes(self) -> None:
         """A note is kept under its name, and the last one counts."""
         self.store.note("seed", b"one")
@@ -220,7 +232,7 @@ class MemoryStoreTest(StoreContract, SynchronousTestCase):
         self.assertEqual(store.expire(FOREVER), [record(sequence=1000)])
 
     @settings(max_examples=60, deadline=None, derandomize=True, database=None)
-    @given(st.lists(st.tuples(st.sampled_from("pped"), st.integers(0, 3), st.integers(1, 4), st.integers(0, 30))))
+    @given(st.lists(st.tuples(st.sampled_from("ppedx"), st.integers(0, 3), st.integers(1, 4), st.integers(0, 30))))
     def test_like_the_obvious_one(self, events: list[tuple[str, int, int, int]]) -> None:
         """Any series of puts, extensions, goodbyes and sweeps leaves what a plain dictionary of slots would hold."""
         store, plain = MemoryStore(), dict[Slot, tuple[Record, float]]()
@@ -238,6 +250,8 @@ class MemoryStoreTest(StoreContract, SynchronousTestCase):
             elif verb == "e":
                 self.assertEqual(store.extend(DOG.public, moment), len(leased))
                 plain |= {slot: (held, max(until, moment)) for slot, (held, until) in leased.items()}
+            elif verb == "x":
+                self.assertEqual(store.discard(one.slot), plain.pop(one.slot, None) is not None)
             else:
                 gone = sorted((until, slot) for slot, (_, until) in plain.items() if until <= moment)
                 self.assertEqual([r.slot for r in store.expire(moment)], [slot for _, slot in gone])

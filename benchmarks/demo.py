@@ -1,0 +1,283 @@
+"""What the demonstration costs: memory and processor of every process, datagrams, the weight of the page.
+
+``make bench-demo`` starts the real demonstration, looks at its page as a browser would (three cameras and the stream of
+events), runs the task, and prints a table.  Linux only: the figures come from ``/proc``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import http.client
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import tomllib
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+START_S = 60.0
+TASK_S = 120.0
+TICKS = os.sysconf("SC_CLK_TCK")
+MIB = 1024.0
+TARGETS = {"pss": 300.0, "cores": 1.0, "page": 40_000, "plain": 40.0}
+"""MiB of all processes, cores of all processes, bytes of the page, MiB of a dog's node without vision."""
+
+
+class Page:
+    """The demonstration's page at ``url``, asked over HTTP."""
+
+    def __init__(self, url: str) -> None:
+        self._host = urlsplit(url).netloc
+
+    def ask(self, path: str, method: str = "GET", limit_s: float = 10.0) -> tuple[http.client.HTTPResponse, bytes]:
+        """One request on a connection of its own."""
+        connection = http.client.HTTPConnection(self._host, timeout=limit_s)
+        try:
+            connection.request(method, path, headers={"X-Swarm": "1"})
+            response = connection.getresponse()
+            return response, response.read()
+        finally:
+            connection.close()
+
+    def state(self) -> dict[str, Any]:
+        """What the page shows."""
+        state: dict[str, Any] = json.loads(self.ask("/api/state")[1])
+        return state
+
+    def weight(self) -> dict[str, int]:
+        """The bytes of the page and of everything that it loads from the node, uncompressed."""
+        sizes: dict[str, int] = {}
+        waiting = ["/"]
+        while waiting:
+            path = waiting.pop()
+            if path in sizes:
+                continue
+            body = self.ask(path)[1]
+            sizes[path] = len(body)
+            found = re.findall(rb'(?:href|src)="(/static/[^"]+)"', body) if path == "/" else []
+            if path.endswith(".js"):
+                found = [b"/static/" + name for name in re.findall(rb'from "\./([^"]+)"', body)]
+            waiting += [name.decode() for name in found]
+        return sizes
+
+
+class Viewer:
+    """One open page: the stream of events, and each camera's pictures as fast as they come."""
+
+    def __init__(self, page: Page, host: str) -> None:
+        self._page = page
+        self._host = host
+        self._ends = False
+        self._threads: list[threading.Thread] = []
+        self.pictures = 0
+        self.bytes = 0
+
+    def open(self) -> None:
+        """Begin to look."""
+        cameras = [device["uuid"] for device in self._page.state()["devices"] if "camera" in device["capabilities"]]
+        works: list[Callable[[], None]] = [self._events, *(self._camera_of(uuid) for uuid in cameras)]
+        self._threads = [threading.Thread(target=work, daemon=True) for work in works]
+        for thread in self._threads:
+            thread.start()
+
+    def close(self) -> None:
+        """Look away."""
+        self._ends = True
+        for thread in self._threads:
+            thread.join(6.0)
+
+    def _camera_of(self, uuid: str) -> Callable[[], None]:
+        def look() -> None:
+            connection = http.client.HTTPConnection(self._host, timeout=10)
+            after = "0"
+            while not self._ends:
+                connection.request("GET", f"/shot/{uuid}?after={after}&viewer=bench")
+                response = connection.getresponse()
+                picture = response.read()
+                after = response.headers.get("X-Seq", after)
+                if response.status == 200:
+                    self.pictures += 1
+                    self.bytes += len(picture)
+            connection.close()
+
+        return look
+
+    def _events(self) -> None:
+        connection = http.client.HTTPConnection(self._host, timeout=10)
+        connection.request("GET", "/events")
+        response = connection.getresponse()
+        while not self._ends:
+            line = response.readline()
+            self.bytes += len(line)
+        connection.close()
+
+
+def family(root: int) -> dict[int, str]:
+    """The processes that descend from ``root``, itself included, each with what it is."""
+    parents: dict[int, int] = {}
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                parents[int(entry.name)] = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
+            except (OSError, IndexError, ValueError):
+                continue
+    found = [root]
+    for pid in found:
+        found += [child for child in sorted(parents) if parents[child] == pid]
+    return {pid: _name_of(pid) for pid in found}
+
+
+def _name_of(pid: int) -> str:
+    try:
+        words = Path(f"/proc/{pid}/cmdline").read_text().split("\0")
+    except OSError:
+        return "ended"
+    configuration = next((Path(word).stem for word in words if word.endswith(".toml")), "")
+    return configuration or next((word for word in words if word in ("sim.server", "sim.demo")), words[0])
+
+
+def memory(pid: int) -> tuple[float, float]:
+    """PSS and RSS of a process, in MiB."""
+    text = Path(f"/proc/{pid}/smaps_rollup").read_text()
+    kib = {line.split(":")[0]: float(line.split()[1]) for line in text.splitlines()[1:] if line.endswith("kB")}
+    return kib["Pss"] / MIB, kib["Rss"] / MIB
+
+
+def spent(pid: int) -> float:
+    """The processor seconds that a process has used."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / TICKS
+
+
+def datagrams() -> int:
+    """The UDP datagrams that this machine has received, whoever sent them."""
+    rows = [line.split() for line in Path("/proc/net/snmp").read_text().splitlines() if line.startswith("Udp:")]
+    return int(rows[1][rows[0].index("InDatagrams")])
+
+
+@contextmanager
+def demonstration(run_dir: Path, seed: int) -> Iterator[tuple[subprocess.Popen[str], str, float]]:
+    """The demonstration with its page up: its process, the page's address, the seconds until then."""
+    began = time.monotonic()
+    command = [sys.executable, "-m", "sim.demo", "--seed", str(seed), "--run-dir", str(run_dir)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None
+        for line in process.stdout:
+            found = re.match(r"The page: (\S+)", line)
+            if found:
+                threading.Thread(target=process.stdout.read, daemon=True).start()
+                yield process, found[1], time.monotonic() - began
+                return
+        raise SystemExit("bench-demo: the demonstration ended before its page was up; run it alone to see why")
+    finally:
+        process.send_signal(signal.SIGTERM)
+        process.wait(15)
+
+
+@contextmanager
+def plain_node(run_dir: Path) -> Iterator[int]:
+    """A dog's node without agent and camera in the team of ``run_dir``: its process id."""
+    dog = tomllib.loads((run_dir / "dog1.toml").read_text())["node"]
+    known = json.dumps(dog["known_nodes"])
+    file = run_dir / "plain.toml"
+    file.touch(mode=0o600)
+    file.write_text(
+        f'[node]\nname = "plain"\nteam_key = "{dog["team_key"]}"\nknown_nodes = {known}\nstore = "plain.sqlite"\n'
+        '[driver]\nkind = "sim"\noptions = { robot = "dog1", camera = false }\n'
+    )
+    twistd = str(Path(sys.executable).parent / "twistd")
+    command = [twistd, "-n", "--pidfile=", "swarm-node", "--config", str(file)]
+    process = subprocess.Popen([sys.executable, *command], stdout=subprocess.DEVNULL, stderr=subprocess.STDOUT)
+    try:
+        yield process.pid
+    finally:
+        process.terminate()
+        process.wait(15)
+
+
+def task_run(page: Page, least_s: float) -> float:
+    """Press Run Demo; the seconds until the task is completed, and no fewer than ``least_s`` are waited for."""
+    task = json.loads(page.ask("/api/demo", "POST")[1])["id"]
+    began, took = time.monotonic(), 0.0
+    while not took or time.monotonic() - began < least_s:
+        if time.monotonic() - began > TASK_S:
+            raise SystemExit(f"bench-demo: the task was not completed within {TASK_S:g} s")
+        done = [row["id"] for row in page.state()["tasks"] if row["status"] == "COMPLETED"]
+        if not took and task in done:
+            took = time.monotonic() - began
+        time.sleep(0.5)
+    return took
+
+
+def _line(what: str, value: float, unit: str, target: str, note: str = "") -> str:
+    limit = TARGETS[target]
+    shown = f"{value:8.2f}" if value < 10 else f"{value:8.1f}" if value < 1000 else f"{value:8.0f}"
+    return f"{what:20}{shown} {unit:9} target {limit:g}: {'held' if value <= limit else 'MISSED'}{note}"
+
+
+def measured(seed: int, seconds: float, run_dir: Path) -> list[str]:
+    """The lines of the table."""
+    with demonstration(run_dir, seed) as (process, url, ready_s):
+        page = Page(url)
+        host = urlsplit(url).netloc
+        names = family(process.pid)
+        viewer = Viewer(page, host)
+        viewer.open()
+        time.sleep(2.0)
+        before, heard, began = {pid: spent(pid) for pid in names}, datagrams(), time.monotonic()
+        pictures, carried = viewer.pictures, viewer.bytes
+        took = task_run(page, seconds)
+        span = time.monotonic() - began
+        shares = {pid: (spent(pid) - before[pid]) / span for pid in names}
+        rate = (datagrams() - heard) / span
+        pictures, carried = viewer.pictures - pictures, viewer.bytes - carried
+        sizes = {pid: memory(pid) for pid in names}
+        viewer.close()
+        with plain_node(run_dir) as plain:
+            time.sleep(6.0)
+            plain_pss, plain_rss = memory(plain)
+            joined = "plain" in [device["name"] for device in page.state()["devices"]]
+        weight = page.weight()
+    lines = [f"{'process':12}{'PSS MiB':>9}{'RSS MiB':>9}{'cores':>8}"]
+    for pid, name in names.items():
+        pss, rss = sizes[pid]
+        lines.append(f"{name:12}{pss:9.1f}{rss:9.1f}{shares[pid]:8.3f}")
+    pss, cores, page_bytes = sum(size[0] for size in sizes.values()), sum(shares.values()), sum(weight.values())
+    joining = "" if joined else " (IT HAS NOT JOINED)"
+    lines += [
+        "",
+        _line("memory of all", pss, "MiB PSS", "pss"),
+        _line("processor of all", cores, "cores", "cores", f" (over {span:.0f} s, task and page running)"),
+        _line("page", page_bytes, "bytes", "page", f" ({len(weight)} files, uncompressed)"),
+        _line("node without vision", plain_rss, "MiB RSS", "plain", f" (PSS {plain_pss:.1f}){joining}"),
+        f"ready after         {ready_s:8.1f} s; the task took {took:.1f} s",
+        f"one open page       {pictures / span:8.1f} pictures a second, {carried / span / 1000:.0f} kB/s",
+        f"datagrams           {rate:8.0f} a second (all of this machine's UDP)",
+    ]
+    return lines
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.demo", description="What the demonstration costs.")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--seconds", type=float, default=20.0, help="at least so long the processor is watched")
+    given = parser.parse_args(arguments)
+    with tempfile.TemporaryDirectory() as folder:
+        lines = measured(given.seed, given.seconds, Path(folder) / "run")
+    sys.stdout.write("\n".join(lines) + "\n")
+    return 1 if any("MISSED" in line or "NOT JOINED" in line for line in lines) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,139 @@
+"""The real demonstration, five processes and the page, driven by taps in Chromium and looked at on a desk."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import threading
+import urllib.request
+from pathlib import Path
+from typing import Any
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from tests.live.test_page import CHROMIUM, DESK, FLAGS, MISSING, PHONE
+
+SMALL = """index => {
+  const seen = document.querySelectorAll("#cameras canvas")[index];
+  const small = new OffscreenCanvas(26, 20).getContext("2d");
+  small.drawImage(seen, 0, 0, 26, 20);
+  return Array.from(small.getImageData(0, 0, 26, 20).data);
+}"""
+"""A camera's picture, so small that its noise is averaged out."""
+MOVED = 4.0
+"""Mean difference of two such pictures, of 255, that noise alone does not reach and a turning dog does."""
+
+
+class DemonstrationPageTests(SynchronousTestCase):
+    if MISSING:
+        skip = f"THE DEMONSTRATION IS NOT TESTED IN A BROWSER: missing {'; '.join(MISSING)}"
+
+    def setUp(self) -> None:
+        from playwright.sync_api import sync_playwright
+
+        log, run_dir = Path(self.mktemp()), Path(self.mktemp()).absolute()
+        command = [sys.executable, "-m", "sim.demo", "--run-dir", str(run_dir)]
+        with log.open("w", encoding="utf-8") as errors:
+            root = Path(__file__).parents[2]
+            demo = subprocess.Popen(command, cwd=root, stdout=subprocess.PIPE, stderr=errors, text=True)
+        self.addCleanup(demo.wait, 20)
+        self.addCleanup(demo.terminate)
+        assert demo.stdout is not None
+        said = []
+        for line in demo.stdout:
+            said.append(line)
+            if line.startswith("The page: "):
+                break
+        else:
+            self.fail("".join(said) + log.read_text(encoding="utf-8"))
+        threading.Thread(target=demo.stdout.read, daemon=True).start()
+        self.url = said[-1].split()[2] + "/"
+        play = sync_playwright().start()
+        self.addCleanup(play.stop)
+        self.browser = play.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        self.addCleanup(self.browser.close)
+        self.faults: list[str] = []
+
+    def opened(self, screen: dict[str, Any]) -> Any:
+        page = self.browser.new_context(**screen).new_page()
+        page.set_default_timeout(15_000)
+        page.on("pageerror", lambda error: self.faults.append(str(error)))
+        page.goto(self.url)
+        page.locator("#link[data-link=live]").wait_for()
+        page.locator(".device").nth(3).wait_for()
+        return page
+
+    def assert_sound(self, page: Any, when: str) -> None:
+        """Axe finds nothing, and nothing is wider than the screen or cut off in its own box."""
+        from axe_playwright_python.sync_playwright import Axe
+
+        found = Axe().run(page).response["violations"]
+        self.assertEqual([(each["id"], each["nodes"][0]["html"]) for each in found], [], when)
+        self.assertLessEqual(page.evaluate("document.documentElement.scrollWidth - innerWidth"), 0, when)
+        cut = page.evaluate(
+            "[...document.querySelectorAll('button, select, dialog, .badge, .device, li, dd')]"
+            ".filter(e => e.offsetParent && e.scrollWidth > e.clientWidth + 1).map(e => e.outerHTML)"
+        )
+        self.assertEqual(cut, [], when)
+        self.assertEqual(self.faults, [], when)
+
+    def api(self, path: str) -> Any:
+        with urllib.request.urlopen(self.url + path, timeout=5) as answer:
+            return json.load(answer)
+
+    def test_be_driven_by_taps(self) -> None:
+        """On a phone: Run Demo, open a device, write to it, move the target, take a dog off the network; by taps alone."""
+        page = self.opened(PHONE)
+        self.assert_sound(page, "idle")
+        page.get_by_role("button", name="Run Demo").tap()
+        page.locator(".device[data-state=EXECUTING]").first.wait_for(timeout=45_000)
+        page.locator(".point[data-agree=true]").wait_for()
+        self.assert_sound(page, "executing")
+        page.locator("#tasks li", has_text="completed").wait_for(timeout=45_000)
+        self.assertIn("Done by dog", page.locator("#tasks li").first.inner_text())
+
+        page.locator(".device", has_text="dog2").tap()
+        page.locator("dialog[open]").wait_for()
+        self.assertIn("camera", page.locator("#d-capabilities").inner_text())
+        self.assert_sound(page, "device")
+        page.locator("#d-text").fill("good dog")
+        page.locator("#d-message button").tap()
+        page.locator("#d-messages", has_text="operator: good dog").wait_for()
+        page.locator("#d-seconds").fill("3")
+        page.get_by_role("button", name="Disconnect").tap()
+        page.locator("#d-answer", has_text="3 s").wait_for()
+        page.locator("#d-close").tap()
+        page.locator(".device[data-state=GONE]", has_text="dog2").wait_for()
+        self.assert_sound(page, "a dog is gone")
+        page.locator(".device[data-state=IDLE]", has_text="dog2").wait_for()
+
+        page.get_by_role("button", name="Take away").tap()
+        page.locator("#place", has_text="No target").wait_for()
+        floor = page.locator(".floor")
+        floor.scroll_into_view_if_needed()
+        page.get_by_role("button", name="Place target").tap()
+        page.locator("#place", has_text="Target at").wait_for()
+
+    def test_be_looked_at_from_a_desk(self) -> None:
+        """On a desk: devices in the order of joining, three cameras whose views move as the dogs search, the map."""
+        page = self.opened(DESK)
+        devices = self.api("api/devices")
+        self.assertEqual(page.locator(".device b").all_inner_texts(), [device["name"] for device in devices])
+        joined = [device["joined"] for device in devices]
+        self.assertEqual(joined, sorted(joined))
+        page.locator("figure[data-camera=live]").nth(2).wait_for()
+        self.assertEqual(page.locator("#map .dog").count() or page.locator("#map .body").count(), 3)
+        self.assert_sound(page, "desk")
+
+        page.get_by_role("button", name="Run Demo").click()
+        page.locator(".device[data-state=SEARCHING]").first.wait_for()
+        views = [page.evaluate(SMALL, index) for index in range(3)]
+        page.wait_for_timeout(2500)
+        for index, before in enumerate(views):
+            after = page.evaluate(SMALL, index)
+            differ = sum(abs(a - b) for a, b in zip(before, after, strict=True)) / len(before)
+            self.assertGreater(differ, MOVED, f"camera {index} shows a dog that does not turn")
+        page.locator("#tasks li button:visible").first.click()
+        page.locator("#tasks li", has_text="cancelled").first.wait_for()
+        self.assert_sound(page, "desk, cancelled")
