@@ -1,25 +1,27 @@
-"""The front door: builds the rooms from a node's settings and wires them; the only file that knows all.
+"""The front door: builds the rooms from a node's settings and wires them.
 
-``twistd -n swarm-node --config FILE`` runs a node (``Options``, ``makeService``); ``swarm`` is the command line (``main``);
-``assembled`` wires one node over whatever clock, network and store it is given, real ones or those in memory.
+``twistd -n swarm-node --config FILE`` runs a node (``Options``, ``makeService``); ``swarm`` is the command line
+(``main``); ``assembled`` wires one node over whatever clock, network and store it is given, real ones or those in
+memory (``rehearsal`` has a whole team of these).
 """
 
 from __future__ import annotations
 
 import importlib
 import random
+import socket
 import sys
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 
-from twisted.application.service import IService, Service
-from twisted.internet.defer import Deferred, maybeDeferred, succeed
-from twisted.internet.interfaces import IReactorTime
-from twisted.logger import Logger
+from twisted.application.service import IService, MultiService, Service
+from twisted.internet.defer import Deferred, gatherResults, maybeDeferred
+from twisted.internet.interfaces import IDelayedCall, IReactorTime
+from twisted.logger import Logger, LoggingFile
 from twisted.python import usage
 
 from agents.catalogue import DEMO, TASKS
@@ -28,28 +30,40 @@ from drivers.driver import Driver
 from drivers.errors import DriverError
 from drivers.registry import describe, driver_for
 from middleware.entangled.clock import use_monotonic_time
-from middleware.entangled.errors import EntangledError
+from middleware.entangled.errors import BadStore, EntangledError, PortInUse
 from middleware.entangled.identity import Identity
-from middleware.entangled.network.network import Network
+from middleware.entangled.network.network import Address, Network
 from middleware.entangled.sqlite import SqliteStore, read_records
 from middleware.entangled.store import MemoryStore, Store
-from middleware.errors import MissingExtra, SwarmError
+from middleware.errors import BadSetting, MissingExtra, SwarmError, UnknownAgent
 from middleware.node import SwarmNode
 from middleware.presence import Device
-from middleware.settings import Settings
+from middleware.settings import COMMAND_LINE, IN_MEMORY, Settings
+from webnode.errors import PortTaken, WebError
 
 use_monotonic_time()
 
-FAULTS = (SwarmError, EntangledError, DriverError)
+FAULTS = (SwarmError, EntangledError, DriverError, WebError)
 """What a person can mend, and is told in one line."""
+KEYS: Sequence[tuple[type[Exception], str]] = (
+    (PortInUse, "[node] port"),
+    (BadStore, "[node] store"),
+    (UnknownAgent, "[agent] module"),
+    (DriverError, "[driver]"),
+    (PortTaken, "[web] port"),
+    (MissingExtra, "[node] roles"),
+)
+"""Which setting to look at for which fault."""
+COMING_BACK = 2.0
+"""Seconds until a node that could not come back tries again."""
 
 
 @dataclass(frozen=True)
 class Seams:
     """Where a node touches the world; everything else is logic.
 
-    ``network`` makes the node's port each time that it enters the network; ``connector`` opens links to robots and yards
-    (None: TCP); ``wall`` is unix time, for people.
+    ``network`` makes the node's port each time that it enters the network; ``connector`` opens links to robots and
+    yards (None: TCP); ``wall`` is unix time, for people.
     """
 
     clock: IReactorTime
@@ -79,7 +93,10 @@ def identity_in(store: Store, rng: random.Random) -> Identity:
 
 
 def assembled(settings: Settings, seams: Seams) -> Assembly:
-    """Wire one node as ``settings`` say (thesis, Algorithm 4.1); raises ``SwarmError`` or ``DriverError`` where they cannot be met."""
+    """Wire one node as ``settings`` say (thesis, Algorithm 4.1).
+
+    Raises ``SwarmError`` or ``DriverError`` where they cannot be met.
+    """
     node_settings, driver = settings.node, None
     capabilities = dict(node_settings.capabilities)
     kind = node_settings.kind
@@ -117,44 +134,59 @@ def assembled(settings: Settings, seams: Seams) -> Assembly:
 
 
 class NodeService(Service):
-    """One node of a team, with what its roles add; it can fall off the network for a while and come back."""
+    """One node of a team, with what its roles add; it can fall off the network for a while and come back.
+
+    ``web`` makes the page of a node that runs; the page comes and goes with its node.
+    """
 
     _log = Logger()
 
     def __init__(self, settings: Settings, seams: Seams, web: Callable[[SwarmNode], IService] | None = None) -> None:
         self.settings = settings
+        self.assembly = assembled(settings, seams)
         self._seams = seams
         self._web = web
         self._page: IService | None = None
-        self.assembly = assembled(settings, seams)
+        self._coming: IDelayedCall | None = None
 
     def startService(self) -> None:
-        """Open the port and join; a port that cannot be had ends the program with one line."""
+        """Open the port and join; raises one of ``FAULTS`` where that cannot be."""
         super().startService()
         self._rise()
 
     def stopService(self) -> Deferred[None]:
         """Stop the robot, say goodbye, and close the store."""
-        super().stopService()  # type: ignore[no-untyped-call]
-        down = self._fall(self.assembly.node.stopService)
-        if self._page is not None:
-            down = down.addCallback(lambda _: maybeDeferred(self._page.stopService))  # type: ignore[union-attr]
+        super().stopService()
+        if self._coming is not None and self._coming.active():
+            self._coming.cancel()
+        ended = self._end_agent()
+        self.assembly.node.stopService()
+        down = gatherResults([ended, self._end_page()])
         return down.addBoth(lambda _: self._seams.store.close())
 
     def vanish(self) -> None:
-        """Stop at once and without a word, as when the power fails; the robot is left to its own dead-man timer."""
-        self._fall(self.assembly.node.vanish)
+        """Stop at once and without a word, as when the power fails; the robot's link breaks, too."""
+        # The node first: afterwards the agent can tell nobody, not even that it gives its lease back.
+        self.assembly.node.vanish()
+        self._end_agent()
+        self._end_page()
 
     def leave(self, seconds: float) -> None:
         """Fall off the network, robot and all, and come back after ``seconds``."""
-        self._log.info("{name} leaves the network for {s:g} s", name=self.settings.node.name, s=seconds)
-        self._fall(self.assembly.node.vanish)
-        self._seams.clock.callLater(seconds, self._return)
+        if self._coming is None and self.running:
+            self._log.info("{name} leaves the network for {s:g} s", name=self.settings.node.name, s=seconds)
+            self.vanish()
+            self._coming = self._seams.clock.callLater(seconds, self._return)
 
     def _return(self) -> None:
-        if self.running:
+        self._coming = None
+        try:
             self.assembly = assembled(self.settings, self._seams)
             self._rise()
+        except FAULTS as error:
+            self._log.warn("{name} cannot come back yet: {error}", name=self.settings.node.name, error=error)
+            self.vanish()
+            self._coming = self._seams.clock.callLater(COMING_BACK, self._return)
 
     def _rise(self) -> None:
         node, agent = self.assembly.node, self.assembly.agent
@@ -162,15 +194,17 @@ class NodeService(Service):
         node.startService()
         if agent is not None:
             agent.startService()
-        if self._web is not None and self._page is None:
+        if self._web is not None:
             self._page = self._web(node)
             self._page.startService()
 
-    def _fall(self, part: Callable[[], None]) -> Deferred[Any]:
+    def _end_agent(self) -> Deferred[object]:
         agent = self.assembly.agent
-        stopped = succeed(None) if agent is None or not agent.running else maybeDeferred(agent.stopService)
-        part()
-        return stopped
+        return maybeDeferred(lambda: agent.stopService() if agent is not None and agent.running else None)
+
+    def _end_page(self) -> Deferred[object]:
+        page, self._page = self._page, None
+        return maybeDeferred(lambda: page.stopService() if page is not None else None)
 
 
 # -- the real world ---------------------------------------------------------------------------------------------------
@@ -181,13 +215,55 @@ def real_seams(settings: Settings, reactor: Any) -> Seams:
     from middleware.entangled.network.udp import UdpNetwork
 
     path = settings.node.store
-    store: Store = MemoryStore() if path == ":memory:" else SqliteStore.open(Path(path), reactor.seconds())
+    store: Store = MemoryStore() if path == IN_MEMORY else SqliteStore.open(Path(path), reactor.seconds())
     network = partial(UdpNetwork, reactor, settings.node.host, settings.node.port)
     return Seams(reactor, network, store, random.SystemRandom(), time.time)
 
 
+LookUp = Callable[..., Sequence[tuple[Any, ...]]]
+
+
+def resolved(settings: Settings, look_up: LookUp = socket.getaddrinfo) -> Settings:
+    """``settings`` with an address in figures for every host name; raises ``BadSetting`` for a name that has none."""
+    family = socket.AF_INET6 if ":" in settings.node.host else socket.AF_INET
+
+    def figures(address: Address, key: str, family: int) -> Address:
+        try:
+            found = look_up(address.host, address.port, family=family, type=socket.SOCK_DGRAM)
+            return Address(str(found[0][4][0]), address.port)
+        except (OSError, UnicodeError, IndexError) as error:
+            why = getattr(error, "strerror", None) or str(error)
+            problem = f"no address is known for {address.host!r} ({why})"
+            raise BadSetting(settings.origin, key, problem, "mend the name, or write the address in figures") from error
+
+    known = tuple(figures(address, "[node] known_nodes", family) for address in settings.node.known_nodes)
+    yard = settings.web.yard
+    if yard is not None and "web" in settings.node.roles:
+        yard = figures(yard, "[web] yard", socket.AF_UNSPEC)
+    return replace(settings, node=replace(settings.node, known_nodes=known), web=replace(settings.web, yard=yard))
+
+
+class _Page(MultiService):
+    """The page, and its line to the yard where there is one."""
+
+    def __init__(self, web: Service, operator: Any) -> None:
+        super().__init__()
+        self._operator = operator
+        web.setServiceParent(self)
+
+    def startService(self) -> None:
+        super().startService()
+        if self._operator is not None:
+            self._operator.connect().addErrback(lambda _: None)
+
+    def stopService(self) -> Any:
+        if self._operator is not None:
+            self._operator.disconnect()
+        return super().stopService()
+
+
 def web_page(settings: Settings, seams: Seams, reactor: Any, node: SwarmNode) -> IService:
-    """The web role: the page over the node's data store, live streams beside it."""
+    """The web role: the page over the node's data store, live streams beside it; raises ``MissingExtra``."""
     try:
         from webnode.app import create_app
         from webnode.ledger import state_from
@@ -200,111 +276,18 @@ def web_page(settings: Settings, seams: Seams, reactor: Any, node: SwarmNode) ->
     from drivers.sim.link import TcpConnector
     from drivers.sim.operator import YardOperator
 
-    yard = None
-    if settings.web.yard:
-        yard = YardOperator(TcpConnector(), reactor, settings.web.yard.host, settings.web.yard.port)
-        yard.connect().addErrback(lambda _: None)
-    desk = TeamDesk(node, TASKS, DEMO, yard)
+    yard = settings.web.yard
+    operator = None if yard is None else YardOperator(TcpConnector(), reactor, yard.host, yard.port)
+    desk = TeamDesk(node, TASKS, DEMO, operator)
     name = settings.node.name
     # A memory of the departed each: the file lags what is watched by a commit, and one would doubt the other.
     live = partial(state_from, desk.read, Departed(), name)
     on_file = partial(state_from, partial(read_records, Path(settings.node.store)), Departed(), name)
-    stored = live if settings.node.store == ":memory:" else on_file
+    stored = live if settings.node.store == IN_MEMORY else on_file
     app = create_app(lambda: stored(seams.wall()), desk, caller(reactor))
     events = Events(lambda: live(seams.wall()), reactor, seams.wall, desk.yard)
-    return WebService(reactor, settings.web.host, settings.web.port, app, events, Shots(desk, reactor), Files())
-
-
-# -- a team in memory -------------------------------------------------------------------------------------------------
-
-
-class VirtualTeam:
-    """A laptop, three dogs and their yard in one process, on one turned clock; a seed replays it exactly.
-
-    What runs is what runs on a robot: the real node, agent, driver, yard and detection; only clock, wire and disk are in memory.
-    """
-
-    BOOTSTRAP = "vaio"
-    DOGS = ("dog1", "dog2", "dog3")
-    JOINING = 0.3
-
-    def __init__(self, seed: int, camera_fps: float = 10.0, delay: float = 0.002, loss: float = 0.0) -> None:
-        from middleware.entangled.clock import HeapClock
-        from middleware.entangled.network.switchboard import Switchboard, Weather
-        from sim.scene import loaded
-        from sim.yard import Yard
-
-        self.clock = HeapClock()
-        weather = Weather(delay_s=delay, jitter_s=delay / 2, loss=loss)
-        self.board = Switchboard(self.clock, random.Random(f"{seed}/board"), weather)
-        self.yard = Yard(self.clock, random.Random(f"{seed}/yard"), loaded("three-dogs"))
-        self.yard.start()
-        self.services: dict[str, NodeService] = {}
-        self._seed = seed
-        self._fps = camera_fps
-        for place, name in enumerate((self.BOOTSTRAP, *self.DOGS)):
-            self._add(place, name)
-            self.clock.advance(self.JOINING)
-        self._open_desk()
-        self.clock.advance(self.JOINING)
-
-    def run_demo(self) -> str:
-        """Press the Run Demo button; returns the task's id."""
-        return self._desk.run_demo()
-
-    def state(self) -> dict[str, Any]:
-        """What the page shows now."""
-        return self._state()
-
-    def truth(self) -> dict[str, Any]:
-        """Where everything in the yard really is."""
-        return self.yard.world.snapshot()
-
-    def scatter(self, seed: int) -> None:
-        """Set the dogs down at random places."""
-        self.yard.world.scatter(seed)
-
-    def kill(self, name: str) -> None:
-        """End a node as SIGKILL does: without a word to anybody."""
-        self.services[name].vanish()
-
-    def stop(self) -> None:
-        """End everything."""
-        for service in self.services.values():
-            if service.running:
-                service.stopService()
-        self._operator.disconnect()
-        self.yard.stop()
-
-    def _add(self, place: int, name: str) -> None:
-        port = 7000 + place
-        mapping: dict[str, Any] = {"node": {"name": name, "port": port, "team_key": str(self._seed)}}
-        if place:
-            mapping["node"]["known_nodes"] = ["127.0.0.1:7000"]
-            mapping["agent"] = {"module": "search"}
-            mapping["driver"] = {"kind": "sim", "options": {"robot": name, "camera_fps": self._fps}}
-        seams = Seams(
-            self.clock,
-            partial(self.board.network, "127.0.0.1", port),
-            MemoryStore(),
-            random.Random(f"{self._seed}/{name}"),
-            self.clock.seconds,
-            self.yard.connector(),
-        )
-        self.services[name] = NodeService(Settings.from_mapping(mapping, f"seed {self._seed}"), seams)
-        self.services[name].startService()
-
-    def _open_desk(self) -> None:
-        from drivers.sim.operator import YardOperator
-        from webnode.ledger import state_from
-        from webnode.state import Departed
-        from webnode.team import TeamDesk
-
-        self._operator = YardOperator(self.yard.connector(), self.clock)
-        self._operator.connect()
-        self._desk = TeamDesk(self.services[self.BOOTSTRAP].assembly.node, TASKS, DEMO, self._operator)
-        departed = Departed()
-        self._state = lambda: state_from(self._desk.read, departed, self.BOOTSTRAP, self.clock.seconds())
+    web = WebService(reactor, settings.web.host, settings.web.port, app, events, Shots(desk, reactor), Files())
+    return _Page(web, operator)
 
 
 # -- twistd -----------------------------------------------------------------------------------------------------------
@@ -314,7 +297,9 @@ class Options(usage.Options):
     """What ``twistd swarm-node`` takes; a flag wins over the file."""
 
     synopsis = "[--config FILE] [flags]"
-    longdesc = "Run one node of a swarm: a peer of the network, the agent of a device, and the page if it has the web role."
+    longdesc = (
+        "Run one node of a swarm: a peer of the network, the agent of a device, and the page if it has the web role."
+    )
     optParameters = [
         ["config", "c", None, "TOML file of the node"],
         ["name", "n", None, "name of the node"],
@@ -339,8 +324,10 @@ class Options(usage.Options):
         try:
             if self["config"]:
                 settings = Settings.load(self["config"])
+            elif self["name"] is None:
+                raise BadSetting(COMMAND_LINE, "--name", "is missing", "say --name NAME, or --config FILE")
             else:
-                settings = Settings.from_mapping({"node": {"name": self["name"] or ""}}, "command line")
+                settings = Settings.from_mapping({"node": {"name": "unnamed"}}, COMMAND_LINE)
             self.settings = settings.with_flags(**flags)
         except SwarmError as error:
             _refuse(error)
@@ -352,11 +339,12 @@ def makeService(options: Options) -> IService:
 
     settings = options.settings
     try:
+        settings = resolved(settings)
         seams = real_seams(settings, reactor)
         web = partial(web_page, settings, seams, reactor) if "web" in settings.node.roles else None
         return _Checked(settings, seams, web)
     except FAULTS as error:
-        _refuse(f"{settings.origin}: {error}")
+        _refuse(told(error, settings.origin))
 
 
 class _Checked(NodeService):
@@ -366,19 +354,29 @@ class _Checked(NodeService):
         try:
             super().startService()
         except FAULTS as error:
-            _refuse(f"{self.settings.origin}: {error}")
-        except Exception as error:
-            if type(error).__name__ != "PortTaken":  # the page's own, not imported where there is no page
-                raise
-            _refuse(f"{self.settings.origin}: [web] port: {error}")
+            _refuse(told(error, self.settings.origin))
+
+
+def told(error: Exception, origin: str) -> str:
+    """One line that says in which file, at which key, what is wrong and what to do."""
+    if isinstance(error, BadSetting):
+        return str(error)
+    key = next((key for kind, key in KEYS if isinstance(error, kind)), "")
+    return " ".join(": ".join(filter(None, (origin, key, str(error)))).split())
 
 
 def _refuse(problem: object) -> NoReturn:
-    sys.stderr.write(f"swarm-node: {problem}\n")
+    # Once twistd logs, what is written to sys.stderr ends up in the log and not before the person's eyes.
+    stream = sys.__stderr__ if isinstance(sys.stderr, LoggingFile) else sys.stderr
+    if stream is not None:
+        stream.write(f"swarm-node: {problem}\n")
     raise SystemExit(2)
 
 
 # -- swarm ------------------------------------------------------------------------------------------------------------
+
+
+OURS = ("agents", "drivers", "middleware", "rehearsal", "sim", "webnode")
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -387,14 +385,18 @@ def main(arguments: list[str] | None = None) -> int:
     verbs: dict[str, tuple[str, str]] = {
         "demo": ("sim.demo", "three robots, a yard and the page, on this machine"),
         "yard": ("sim.server", "the yard alone"),
-        "trials": ("sim.trials", "both experiments, many times"),
+        "trials": ("rehearsal", "both experiments, many times"),
     }
     if not words or words[0] not in verbs:
         sys.stdout.write("usage: swarm VERB [options]\n\n" + "".join(f"  {v:8}{t[1]}\n" for v, t in verbs.items()))
         return 0 if words[:1] in ([], ["--help"], ["-h"]) else 2
-    module = importlib.import_module(verbs[words[0]][0])
-    if words[0] == "trials":
-        return int(module.main(words[1:], VirtualTeam))
+    verb = words[0]
+    try:
+        module = importlib.import_module(verbs[verb][0])
+    except ModuleNotFoundError as error:
+        if (error.name or "").split(".")[0] in OURS:
+            raise
+        _refuse(MissingExtra(f"swarm {verb}", "all"))
     return int(module.main(words[1:]) or 0)
 
 

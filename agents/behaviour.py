@@ -1,22 +1,26 @@
 """Behaviour: how a body does one kind of task; pure, and loaded by name.
 
-A behaviour sees observations and names actions.  It knows neither peers nor leases: whether it may act is decided outside.
+A behaviour sees observations and names actions.  It knows neither peers nor leases: whether it may act is decided
+outside.
 """
 
 from __future__ import annotations
 
 import importlib
 import random
+from importlib.metadata import entry_points
 from typing import Protocol
 
 from drivers.reading import Action, Observation
-from middleware.errors import UnknownTask
+from middleware.errors import MissingExtra, UnknownTask
 from middleware.tasks import Task
 
 KINDS = {
     "find-target": "agents.search:SearchAndApproach",
     "turn-around": "agents.turn:TurnAround",
 }
+ENTRY_POINTS = "swarm_node.behaviours"
+VISION = ("cv2", "numpy")
 STAND = {"base.vx": 0.0, "base.vy": 0.0, "base.wz": 0.0}
 
 
@@ -41,13 +45,28 @@ class Behaviour(Protocol):
 
 
 def behaviour_for(task: Task, rng: random.Random) -> Behaviour:
-    """The behaviour for ``task.kind``: a known kind, or ``module:Class``; raises ``UnknownTask``, which names those there are."""
-    target = KINDS.get(task.kind, task.kind if ":" in task.kind else None)
+    """The behaviour for ``task.kind``: a built-in one, or an entry point of ``swarm_node.behaviours``.
+
+    A task comes from the wire, so its kind is looked up among what is installed here and never imported as it stands.
+    Raises ``UnknownTask``, which names those there are or says what is wrong with the task's parameters, and
+    ``MissingExtra`` where the behaviour's libraries are not installed.
+    """
+    target = KINDS.get(task.kind)
     if target is None:
-        raise UnknownTask(f"no behaviour for a task of kind {task.kind!r}; there are {', '.join(sorted(KINDS))}")
+        found = {point.name: point.value for point in entry_points(group=ENTRY_POINTS)}
+        target = found.get(task.kind)
+        if target is None:
+            known = ", ".join(sorted(KINDS | found))
+            raise UnknownTask(f"no behaviour for a task of kind {task.kind!r}; there are {known}")
     module, _, attribute = target.partition(":")
     try:
-        made: Behaviour = getattr(importlib.import_module(module), attribute)(task.parameters, rng)
+        make = getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError) as error:
+        if (getattr(error, "name", None) or "").split(".")[0] in VISION:
+            raise MissingExtra(f"the behaviour for {task.kind!r}", "vision") from error
         raise UnknownTask(f"the behaviour for {task.kind!r} cannot be loaded: {error}") from error
+    try:
+        made: Behaviour = make(task.parameters, rng)
+    except (TypeError, ValueError, AttributeError) as error:
+        raise UnknownTask(f"a task of kind {task.kind!r} cannot have these parameters: {error}") from error
     return made

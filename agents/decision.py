@@ -1,7 +1,7 @@
 """Decision: the rule between reports and deeds (Algorithm 4.5, revised); pure.
 
-The reports of all present members go in; who is assigned comes out, or why there is nobody yet.  It is taken again at every
-change: a member that left or came, a report, an assigned agent that goes.
+The reports of all present members go in; who is assigned comes out, or why there is nobody yet.  It is taken again at
+every change: a member that left or came, a report, an assigned agent that goes.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from middleware.tasks import Member
 
 @dataclass(frozen=True)
 class Decision:
-    """Who is ``assigned`` (a uuid, or None), a ``digest`` of the reports it rests on, and ``why`` in a person's words."""
+    """Who is ``assigned`` (a uuid, or None), a ``digest`` of the reports used, and ``why`` in a person's words."""
 
     assigned: str | None
     digest: str
@@ -32,9 +32,9 @@ def decide(
 ) -> Decision:
     """The consensus point of ``members``.
 
-    ``since_first`` is the seconds since the first report was seen, None when there is none.  Within the waiting period nobody
-    is assigned, unless everybody has reported or somebody acts already; whoever acts keeps the task until another is
-    better by the ``hysteresis``.
+    ``since_first`` is the seconds since the first report was seen, None when there is none.  Within the waiting period
+    nobody is assigned, unless everybody has reported or somebody acts already; whoever acts keeps the task until
+    another is better by the ``hysteresis``.
     """
     present = {m.uuid: m for m in members}
     reports = {m.uuid: Report(m.uuid, m.cost) for m in present.values() if m.cost is not None}

@@ -1,7 +1,8 @@
 """Engagement: one agent's part in one task, from assignment to end (Algorithm 4.5, revised).
 
-Selection and commitment are two things here: ``decide`` says who should act, the lease who may.  Nothing is executed without a
-lease that is valid now; when the decision or the lease goes elsewhere, the body stops first and the lease is given back after.
+Selection and commitment are two things here: ``decide`` says who should act, the lease who may.  Nothing is executed
+without a lease that is valid now; when the decision or the lease goes elsewhere, the body stops first and the lease is
+given back after.
 """
 
 from __future__ import annotations
@@ -22,7 +23,8 @@ from middleware.presence import ASSIGNED, DONE, EXECUTING, SEARCHING, WAITING
 from middleware.tasks import COMPLETED, Member, Result, Task, member_of, outcome_of
 
 FARTHER, NEARER, STEP = 1.15, 0.85, 0.05
-"""A report is renewed when the distance grew by 15 % and 5 cm, or shrank so much while not acting: the target was moved."""
+"""A report is renewed when the distance grew by 15 % and 5 cm (the target was moved), or shrank so much while the body
+does not act."""
 SEARCH_TTL = 0.5
 """Seconds for which a motion that needs no lease (to look around) is allowed at a time."""
 
@@ -38,8 +40,9 @@ class Deed:
 class Engagement:
     """One agent at one task.
 
-    ``tell`` publishes this agent's report; ``conclude`` records the outcome; ``say`` writes a line for people; ``token`` is the
-    highest token that the body has obeyed so far.
+    ``tell`` publishes this agent's report; ``conclude`` records the outcome; ``say`` writes a line for people; ``halt``
+    stops the body now; ``token`` is the highest token that the body has obeyed so far.  ``lessee`` is to be set before
+    the first step.
     """
 
     def __init__(
@@ -53,6 +56,7 @@ class Engagement:
         tell: Callable[[Member], None],
         conclude: Callable[[Result], None],
         say: Callable[[str], None],
+        halt: Callable[[], object],
     ) -> None:
         self.task = task
         self.me = replace(me, status=ASSIGNED)
@@ -65,6 +69,7 @@ class Engagement:
         self._tell = tell
         self._conclude = conclude
         self._say = say
+        self._halt = halt
         self._others: dict[str, Member] = {}
         self._first_report_at: float | None = None
         self._began = clock.seconds()
@@ -97,6 +102,12 @@ class Engagement:
             self._say("lost sight of it" if cost is None else f"reports {cost:.2f} m")
             self._publish(cost=cost)
 
+    def lose_body(self) -> None:
+        """Take the report back: the body does not answer, so another has to act.  The next look reports again."""
+        if self.me.cost is not None and not self.is_over:
+            self._say("has lost its robot")
+            self._publish(cost=None)
+
     def step(self) -> Deed | None:
         """Decide again and say what to do now; None where the task is over."""
         if self.is_over or self._concluding:
@@ -111,7 +122,7 @@ class Engagement:
         self.lessee.want()
         lease = self.lessee.lease
         if lease is None:
-            self._acting = False
+            self._rest()
             return self._stand_by(decision, now)
         if not self._acting:
             self._acting = True
@@ -160,15 +171,22 @@ class Engagement:
             self._tell(told)
 
     def _give_back(self) -> None:
-        if self._acting:
-            self._acting = False
+        if self._rest():
             self._say("gives the task back")
         if self.lessee is not None:
             self.lessee.release()
 
+    def _rest(self) -> bool:
+        """Stop the body where it acts; whether it did."""
+        was_acting, self._acting = self._acting, False
+        if was_acting:
+            self._halt()
+        return was_acting
+
     def _complete(self, token: int) -> None:
         """Record the outcome; the lease is kept until the outcome is known, so that nobody starts over in between."""
         self._concluding = True
+        self._halt()
         bids = sorted((m.name, m.cost) for m in [self.me, *self._others.values()] if m.cost is not None)
         took = round(self._clock.seconds() - self._began, 2)
         self._conclude(Result(COMPLETED, self.me.name, took, token, tuple(bids)))
@@ -177,5 +195,5 @@ class Engagement:
         self.result = outcome
         by_me = outcome.outcome == COMPLETED and outcome.by == self.me.name
         self._say("done" if by_me else f"{outcome.outcome.lower()} by {outcome.by}")
-        self._acting = False
+        self._rest()
         self._publish(status=DONE)

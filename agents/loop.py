@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable
+from typing import Any
 
 from twisted.application.service import Service
 from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IDelayedCall, IReactorTime
+from twisted.internet.task import deferLater
 from twisted.logger import Logger
 
-from agents.behaviour import STAND, behaviour_for
+from agents.behaviour import behaviour_for
 from agents.engagement import Engagement
-from drivers.driver import Driver, Permit
-from drivers.errors import DriverError, UsageError
+from drivers.driver import Driver
+from drivers.errors import DriverError, LinkError, UsageError
 from drivers.reading import Observation
 from middleware.consensus.strategy import strategy_for
 from middleware.entangled.errors import EntangledError
@@ -26,6 +28,8 @@ from middleware.tasks import Member, Result, Task, group_key, outcome_of, refusa
 
 TICK = 0.05
 REENGAGE = 0.5
+PATIENCE = 0.5
+"""Seconds for which a robot may fall silent before its agent takes its report back."""
 
 
 class Agent(Service):
@@ -46,18 +50,20 @@ class Agent(Service):
         self._tick: IDelayedCall | None = None
         self._unsubscribe: Callable[[], None] | None = None
         self._token = 0
+        self._is_awake = False
+        self._answered_at = clock.seconds()
 
     def startService(self) -> None:
         """Connect the body, and follow the tasks once the node has joined."""
         super().startService()
         self._unsubscribe = self._driver.subscribe(self._seen)
-        self._driver.connect().addCallbacks(lambda _: self._driver.enable(), self._no_body)
+        Deferred.fromCoroutine(self._wake()).addErrback(self._no_body)
         self._node.joined.addCallback(self._follow)
         self._tick = self._clock.callLater(TICK, self._turn)
 
     def stopService(self) -> Deferred[None]:
         """Stop the body first, then give back what is held."""
-        super().stopService()  # type: ignore[no-untyped-call]
+        super().stopService()
         self._driver.stop()
         if self._tick is not None and self._tick.active():
             self._tick.cancel()
@@ -66,9 +72,22 @@ class Agent(Service):
         self._disengage()
         return self._driver.disconnect()
 
-    def _no_body(self, failure: object) -> None:
-        self._log.warn("no robot yet: {failure}", failure=failure)
-        self._node.presence.say(self._node.wall(), "has no robot at the moment")
+    async def _wake(self) -> None:
+        """Have the body connected and its motors on; a link that goes away in between is tried again."""
+        await self._driver.connect()
+        while self.running and not self._is_awake:
+            try:
+                self._is_awake = await self._driver.enable()
+            except LinkError as error:
+                self._log.info("motors not on yet: {error}", error=error)
+                await deferLater(self._clock, REENGAGE)
+
+    def _no_body(self, failure: Any) -> None:
+        failure.trap(DriverError)
+        if self.running:
+            reason = failure.getErrorMessage()
+            self._log.warn("no robot: {reason}", reason=reason)
+            self._node.presence.say(self._node.wall(), f"has no robot: {reason}")
 
     # -- observe ----------------------------------------------------------------------------------------------------
 
@@ -90,9 +109,13 @@ class Agent(Service):
             new = task.task_id not in self._open and task.task_id not in self._ended | self._checking
             if new and not refusals(self._driver.description.capabilities, task.requirements):
                 self._checking.add(task.task_id)
-                self._node.entangled.get(group_key(task.task_id)).addCallbacks(
-                    self._checked, self._unchecked, callbackArgs=(task,), errbackArgs=(task,)
-                )
+                self._check(task)
+
+    def _check(self, task: Task) -> None:
+        if self.running:
+            known = self._node.entangled.get(group_key(task.task_id))
+            known.addCallback(self._checked, task)
+            known.addErrback(self._unchecked, task)
 
     def _checked(self, records: list[Record], task: Task) -> None:
         """A task heard of: it may be an old one that is done."""
@@ -103,9 +126,11 @@ class Agent(Service):
             self._open[task.task_id] = task
             self._engage_next()
 
-    def _unchecked(self, failure: object, task: Task) -> None:
-        """Nobody could tell; the next change of the tasks asks again."""
-        self._checking.discard(task.task_id)
+    def _unchecked(self, failure: Any, task: Task) -> None:
+        """Nobody could tell whether the task is still open: ask again in a while."""
+        failure.trap(EntangledError)
+        if self.running:
+            self._clock.callLater(REENGAGE, self._check, task)
 
     def _engage_next(self) -> None:
         busy = self._engagement is not None and not self._engagement.is_over
@@ -123,7 +148,16 @@ class Agent(Service):
             return self._engage_next()
         me = Member(self._node.uuid, self._node.presence.device.name, IDLE)
         engagement = Engagement(
-            task, me, behaviour, strategy, self._clock, self._token, self._tell, self._conclude, self._say
+            task,
+            me,
+            behaviour,
+            strategy,
+            self._clock,
+            self._token,
+            self._tell,
+            self._conclude,
+            self._say,
+            self._driver.stop,
         )
         engagement.lessee = self._node.lessee(task, self._turn_now, self._token)
         self._engagement = engagement
@@ -154,11 +188,12 @@ class Agent(Service):
             return
         if engagement.is_over:
             return self._finished(engagement)
+        has_body = self._has_body
+        if not has_body:
+            engagement.lose_body()
         deed = engagement.step()
         self._token = max(self._token, engagement.token)
-        if deed is None:
-            return
-        if self._driver.state != "ready":
+        if deed is None or not has_body or self._driver.state != "ready":
             return
         try:
             self._driver.act(deed.action, deed.permit)
@@ -167,6 +202,16 @@ class Agent(Service):
             self._log.debug("the body refused: {error}", error=error)
         except DriverError as error:
             self._log.info("the body does not answer: {error}", error=error)
+
+    @property
+    def _has_body(self) -> bool:
+        """Whether the robot answers with its motors on, or did so a moment ago."""
+        seen = self._driver.observe()
+        has_motors = seen is None or seen.values.get("estop.engaged") is not True
+        now = self._clock.seconds()
+        if self._is_awake and has_motors and self._driver.state == "ready":
+            self._answered_at = now
+        return self._is_awake and has_motors and now - self._answered_at <= PATIENCE
 
     def _finished(self, engagement: Engagement) -> None:
         task_id = engagement.task.task_id
@@ -186,7 +231,9 @@ class Agent(Service):
         engagement = self._engagement
         if engagement is not None:
             self._node.report(engagement.task.task_id, member)
-            self._node.presence.change(status=member.status)
+            if not engagement.is_over:
+                # What the device is after the task, its end says.
+                self._node.presence.change(status=member.status)
 
     def _conclude(self, result: Result) -> None:
         engagement = self._engagement
@@ -195,14 +242,11 @@ class Agent(Service):
         concluded = self._node.conclude(engagement.task.task_id, result)
         concluded.addErrback(self._not_concluded, engagement.task.task_id, result)
 
-    def _not_concluded(self, failure: object, task_id: str, result: Result) -> None:
+    def _not_concluded(self, failure: Any, task_id: str, result: Result) -> None:
         """No majority could be told: try again for as long as the task is ours to conclude."""
-        failure.trap(EntangledError)  # type: ignore[attr-defined]
+        failure.trap(EntangledError)
         if self.running and self._engagement is not None and self._engagement.task.task_id == task_id:
             self._clock.callLater(REENGAGE, self._conclude, result)
 
     def _say(self, text: str) -> None:
         self._node.presence.say(self._node.wall(), text)
-
-
-__all__ = ["STAND", "Agent", "Permit"]

@@ -1,4 +1,4 @@
-"""Registry: the agent of a device, found by the name in its configuration (thesis, Table 5.1) and imported only then."""
+"""Registry: the agent of a device, by the name in its configuration (thesis, Table 5.1), imported when asked for."""
 
 from __future__ import annotations
 
@@ -19,10 +19,14 @@ MakeAgent = Callable[[SwarmNode, Driver, IReactorTime, random.Random], Service]
 
 
 def agent_named(name: str) -> MakeAgent:
-    """What makes the agent called ``name``: a built-in one or ``module:Class``; raises ``UnknownAgent``, which names those."""
+    """What makes the agent called ``name``: a built-in one, or ``module:Class`` of this machine.
+
+    Raises ``UnknownAgent``, which names those there are.
+    """
     target = BUILT_IN.get(name, name if ":" in name else None)
     if target is None:
-        raise UnknownAgent(f"no agent is called {name!r}; there are {', '.join(sorted(BUILT_IN))}, or write module:Class")
+        known = ", ".join(sorted(BUILT_IN))
+        raise UnknownAgent(f"no agent is called {name!r}; there are {known}, or write module:Class")
     module, _, attribute = target.partition(":")
     try:
         make: Any = getattr(importlib.import_module(module), attribute)

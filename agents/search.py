@@ -1,7 +1,7 @@
 """SearchAndApproach: turn until the target is seen, face it, tell how far it is, and walk up to it (thesis, section 5).
 
-Distance comes from the infrared ranger once the dog faces the target, cross-checked with the size in the picture: a ranger that
-reads something else (a dog in between, a wall behind) is not believed.
+Distance comes from the infrared ranger once the dog faces the target, cross-checked with the size in the picture: a
+ranger that reads something else (a dog in between, a wall behind) is not believed.
 """
 
 from __future__ import annotations
@@ -25,16 +25,19 @@ STOP_AT = 0.12
 """Metres left between the head and the target when the task is done: near, and not touching."""
 MEMORY = 4.0
 """Seconds for which a target out of sight is still believed to be where it was: another dog may only be passing by."""
+FRESH = 0.5
+"""Seconds since the newest sighting that still count as seeing the target."""
 DISAGREEMENT = 0.25
 SETTLE = 3
+MAX_SIZE = 5.0
 
 
 class SearchAndApproach:
     """One dog and one red target; ``parameters`` may give ``target_radius`` and ``target_height`` in metres."""
 
     def __init__(self, parameters: Mapping[str, float | str], rng: random.Random) -> None:
-        self._radius = float(parameters.get("target_radius", 0.08))
-        self._size = Size(self._radius, float(parameters.get("target_height", 0.22)))
+        self._radius = _metres(parameters, "target_radius", 0.08)
+        self._size = Size(self._radius, _metres(parameters, "target_height", 0.22))
         self._side = rng.choice((-1.0, 1.0))
         self._exploration = Exploration(rng)
         self._target: tuple[float, float] | None = None
@@ -42,6 +45,7 @@ class SearchAndApproach:
         self._frame = -1
         self._ranges: dict[str, float] = {}
         self._pose: Pose = (0.0, 0.0, 0.0)
+        self._has_pose = False
         self._distances: list[float] = []
         self._done_for = 0
 
@@ -50,9 +54,10 @@ class SearchAndApproach:
     def look(self, seen: Observation, now: float) -> None:
         """Take in odometry and rangers, and search the picture if it is a new one."""
         values = seen.values
-        before = self._pose
         x, y, yaw = (float(values.get(f"odom.{axis}", 0.0)) for axis in ("x", "y", "yaw"))
-        self._pose = (x, y, yaw)
+        # Odometry counts from wherever the robot was switched on: the first pose is no turn.
+        before = self._pose if self._has_pose else (x, y, yaw)
+        self._pose, self._has_pose = (x, y, yaw), True
         for name in ("near", "far"):
             self._ranges[name] = float(values.get(f"range.{name}", math.nan))
         self._exploration.saw(self._pose, math.remainder(yaw - before[2], math.tau), self._ahead)
@@ -124,7 +129,8 @@ class SearchAndApproach:
         bearing, gap = self._bearing, self._gap
         turn = clipped(TURN_GAIN * bearing, TURN_SPEED)
         if gap <= STOP_AT and abs(bearing) < 4 * FACING:
-            self._done_for += 1
+            # Arriving at a memory is no arrival: the target must be before the eyes, or the dog waits until it forgets.
+            self._done_for = self._done_for + 1 if now - self._seen_at <= FRESH else 0
             return None if self._done_for >= SETTLE else {**STAND, "base.wz": turn}
         self._done_for = 0
         if abs(bearing) > TURN_FIRST:
@@ -150,3 +156,10 @@ class SearchAndApproach:
     def _ahead(self) -> float:
         """Metres to whatever is straight ahead; NaN where nothing is within reach."""
         return min((r for r in self._ranges.values() if not math.isnan(r)), default=math.nan)
+
+
+def _metres(parameters: Mapping[str, float | str], name: str, usual: float) -> float:
+    value = float(parameters.get(name, usual))
+    if not 0.0 < value <= MAX_SIZE:
+        raise ValueError(f"{name} must be more than 0 and at most {MAX_SIZE:g} m, is {value:g}")
+    return value

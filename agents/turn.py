@@ -10,6 +10,7 @@ from agents.behaviour import STAND
 from drivers.reading import Action, Observation
 
 SPEED = 1.2
+MAX_TURNS = 100.0
 
 
 class TurnAround:
@@ -17,6 +18,8 @@ class TurnAround:
 
     def __init__(self, parameters: Mapping[str, float | str], rng: random.Random) -> None:
         self._turns = float(parameters.get("turns", 1.0))
+        if not 0.0 <= self._turns <= MAX_TURNS:
+            raise ValueError(f"turns must be 0 to {MAX_TURNS:g}, is {self._turns:g}")
         self._charge: float | None = None
         self._yaw: float | None = None
         self._turned = 0.0

@@ -1,7 +1,7 @@
 """Vision: find the red target in a camera picture.
 
-The only module of this room that needs OpenCV (extra ``[vision]``); it is imported when an agent that looks is made.  Red
-is one corner of YCrCb, the colours that the ERS-7's camera delivers, so one range finds it: no wrap-around of hue.
+The only module of this room that needs OpenCV (extra ``[vision]``); it is imported when an agent that looks is made.
+Red is one corner of YCrCb, the colours that the ERS-7's camera delivers, so one range finds it: no wrap-around of hue.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Size:
 
 @dataclass(frozen=True)
 class Sighting:
-    """The target in one picture: ``bearing`` in radians (left positive), ``distance`` in metres from the camera to its axis.
+    """The target in one picture: ``bearing`` in radians (left positive), ``distance`` in metres from camera to axis.
 
     ``is_whole`` is false where the blob is cut off by the picture's edge or partly hidden, so that its size says less.
     """
@@ -46,7 +46,8 @@ class Sighting:
 
 def find_target(jpeg: bytes, size: Size) -> Sighting | None:
     """The largest red blob of a JPEG picture, or None; bytes that are no picture count as nothing seen."""
-    picture = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
+    # OpenCV raises where there is no byte at all, and gives None for all other bytes that are no picture.
+    picture = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR) if jpeg else None
     if picture is None:
         return None
     colours = cv2.cvtColor(picture, cv2.COLOR_BGR2YCrCb)
@@ -73,7 +74,8 @@ def find_target(jpeg: bytes, size: Size) -> Sighting | None:
 def _extent(redness: npt.NDArray[np.float32]) -> tuple[float, float]:
     """How many pixels the blob in ``redness`` (Cr) measures across and up, to a fraction of a pixel.
 
-    JPEG keeps colour at half the resolution, so edges are soft: a pixel counts by how red it is, from grey to the blob's own red.
+    JPEG keeps colour at half the resolution, so edges are soft: a pixel counts by how red it is, from grey to the red
+    of the blob itself.
     """
     share = np.clip((redness - GREY) / max(float(np.percentile(redness, 90)) - GREY, 1.0), 0.0, 1.0)
     share[share < 0.1] = 0.0

@@ -1,7 +1,7 @@
 """SwarmNode: one Twisted service that wires the rooms of the middleware; it decides nothing itself.
 
-What a device can do with its team goes through here: be present, see the devices and tasks, submit and follow a task, ask
-the council for a lease, send a camera's frames, and call a peer by name.
+What a device can do with its team goes through here: be present, see the devices and tasks, submit and follow a task,
+ask the council for a lease, send a camera's frames, and call a peer by name.
 """
 
 from __future__ import annotations
@@ -12,26 +12,30 @@ from dataclasses import replace
 from typing import Any
 
 from twisted.application.service import Service
-from twisted.internet.defer import Deferred, succeed
+from twisted.internet.defer import Deferred, maybeDeferred
 from twisted.internet.interfaces import IReactorTime
 from twisted.logger import Logger
 
 from middleware.consensus.lease import Acceptor, Lessee
-from middleware.entangled.errors import EntangledError, Refused
+from middleware.entangled.background import Background
+from middleware.entangled.errors import EntangledError, NotRunning, Refused, WeatherError
 from middleware.entangled.identity import Identity
-from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.kademlia.contact import Contact, unpacked
 from middleware.entangled.kademlia.distance import closest
 from middleware.entangled.network.network import Address, Network
 from middleware.entangled.node import EntangledNode
-from middleware.entangled.record import Record
+from middleware.entangled.record import MAX_NAME, Record
 from middleware.entangled.store import Store
 from middleware.entangled.watch import Changed, Watch
 from middleware.presence import DEVICES, Device, Presence, devices_of
 from middleware.streams import Streams
-from middleware.tasks import MEMBER, RESULT, TASKS, Member, Result, Task, group_key
+from middleware.tasks import MAX_LEASE_TTL, MEMBER, RESULT, TASKS, Member, Result, Task, group_key
 
 COUNCIL = 3
 CAMERA = "camera"
+LOOK_AGAIN = 0.3
+"""Seconds after which a newcomer looks whether others took the same place in the order of joining."""
+LOOKS = 10
 
 
 class SwarmNode(Service):
@@ -61,12 +65,13 @@ class SwarmNode(Service):
         self.store = store
         self.entangled = EntangledNode(identity, team_key, network, store, clock, rng, lease)
         self.uuid = identity.node_id.hex()
-        self.presence = Presence(device, self._announce, self._later)
+        self._chores = Background(clock)
+        self.presence = Presence(device, self._announce, self._chores.later)
         self.streams = Streams(self.entangled.endpoint, clock)
         self.joined: Deferred[None] = Deferred()
         self._known = list(known_nodes)
         self._network = network
-        self._acceptor = Acceptor()
+        self._acceptor = Acceptor(clock.seconds())
         self._on_message: Callable[[str], None] = lambda text: None
         self._on_disconnect: Callable[[float], None] = lambda seconds: None
         expose = self.entangled.endpoint.expose
@@ -81,43 +86,68 @@ class SwarmNode(Service):
         """Open the port, join the network through the known nodes, and appear among the devices."""
         super().startService()
         self.entangled.start()
-        joining = Deferred.fromCoroutine(self._join())
-        joining.addErrback(self._not_joined)
+        Deferred.fromCoroutine(self._join()).addErrback(self._not_joined)
 
     def stopService(self) -> None:
         """Say goodbye and close everything but the store, which belongs to whoever opened it."""
-        self.streams.stop()
-        self.entangled.stop()
-        super().stopService()  # type: ignore[no-untyped-call]
+        self._leave(self.entangled.stop)
 
     def vanish(self) -> None:
         """Leave without a word, as when the power fails."""
+        self._leave(self.entangled.vanish)
+
+    def _leave(self, leave: Callable[[], None]) -> None:
+        self._chores.stop()
         self.streams.stop()
-        self.entangled.vanish()
-        super().stopService()  # type: ignore[no-untyped-call]
+        leave()
+        super().stopService()
 
     async def _join(self) -> None:
         await self.entangled.join(self._known)
-        there = devices_of(await self.entangled.get(DEVICES))
-        own = [d.joined for d, _ in there if d.uuid == self.uuid]
-        joined = own[0] if own else max((d.joined for d, _ in there), default=0) + 1
+        others = await self._others()
+        kept = [d.joined for d in others if d.uuid == self.uuid]
         self.presence.device = self._addressed(self.presence.device)
-        self.presence.appear(joined)
-        self._log.info("{name} joined as number {joined}", name=self.presence.device.name, joined=joined)
+        self.presence.appear(kept[0] if kept else _next_place(others))
+        device = self.presence.device
+        self._log.info("{name} joined as number {joined}", name=device.name, joined=device.joined)
         self.joined.callback(None)
+        await self._step_behind()
+
+    async def _step_behind(self) -> None:
+        """Two that join at the same moment take the same place: the one with the higher uuid steps behind."""
+        for _ in range(LOOKS):
+            await self._chores.sleep(LOOK_AGAIN)
+            others = await self._others()
+            mine = self.presence.device.joined
+            ahead = [d for d in others if d.joined == mine and d.uuid < self.uuid]
+            if ahead:
+                self.presence.change(joined=_next_place(others))
+            elif not any(d.joined == mine and d.uuid != self.uuid for d in others):
+                return
+
+    async def _others(self) -> list[Device]:
+        """The devices that are here, as soon as anybody can tell."""
+        while True:
+            try:
+                return [device for device, _ in devices_of(await self.entangled.get(DEVICES))]
+            except NotRunning:
+                raise
+            except EntangledError as error:
+                self._log.info("nobody says who is here; asking again: {error}", error=error)
+                await self._chores.sleep(LOOK_AGAIN)
 
     def _addressed(self, device: Device) -> Device:
         return replace(device, uuid=self.uuid, address=str(self._network.address), since=self.wall())
 
     def _not_joined(self, failure: Any) -> None:
-        if failure.check(EntangledError) is None:
+        if failure.check(NotRunning) is None:
             self._log.failure("while joining", failure)
 
     # -- devices ----------------------------------------------------------------------------------------------------
 
-    def watch_devices(self, changed: Changed) -> Watch:
-        """Follow who is here; ``devices_of`` reads the records."""
-        return self.entangled.watch(DEVICES, changed)
+    def watch_devices(self, changed: Changed, keep: bool = False) -> Watch:
+        """Follow who is here; ``devices_of`` reads the records, and ``keep`` leaves them in the store as well."""
+        return self.entangled.watch(DEVICES, changed, keep)
 
     def contact_of(self, record: Record) -> Contact | None:
         """How to reach the device that wrote ``record``."""
@@ -125,7 +155,7 @@ class SwarmNode(Service):
         if pair is None:
             return None
         host, _, port = pair[0].address.rpartition(":")
-        return Contact(record.owner, Address(host, int(port))) if host and port.isdigit() else None
+        return unpacked([record.owner, host, int(port)]) if port.isascii() and port.isdigit() else None
 
     def on_message(self, receive: Callable[[str], None]) -> None:
         """Call ``receive`` with each text that an operator sends to this device."""
@@ -146,13 +176,13 @@ class SwarmNode(Service):
         await self.entangled.put(TASKS, task.task_id, task.packed(), "team")
         return task
 
-    def watch_tasks(self, changed: Changed) -> Watch:
-        """Follow the tasks of the team."""
-        return self.entangled.watch(TASKS, changed)
+    def watch_tasks(self, changed: Changed, keep: bool = False) -> Watch:
+        """Follow the tasks of the team; ``keep`` leaves them in the store as well."""
+        return self.entangled.watch(TASKS, changed, keep)
 
-    def watch_group(self, task_id: str, changed: Changed) -> Watch:
-        """Follow the reports and the outcome of one task."""
-        return self.entangled.watch(group_key(task_id), changed)
+    def watch_group(self, task_id: str, changed: Changed, keep: bool = False) -> Watch:
+        """Follow the reports and the outcome of one task; ``keep`` leaves them in the store as well."""
+        return self.entangled.watch(group_key(task_id), changed, keep)
 
     def report(self, task_id: str, member: Member) -> None:
         """Tell the other participants of a task; gone with this node, should it go."""
@@ -173,20 +203,19 @@ class SwarmNode(Service):
             contact = task.council[member]
             if contact.node_id == self.entangled.identity.node_id:
                 answer = self._answer_claim if method == "lease.claim" else self._answer_release
-                return succeed(answer(contact, *arguments))
+                return maybeDeferred(answer, contact, *arguments)
             return self.entangled.endpoint.ask(contact, method, *arguments, changes=True, timeout=task.lease_ttl / 3)
 
-        return Lessee(
-            task.task_id, self.uuid, task.lease_ttl, len(task.council), ask, self.clock, self.rng, changed, floor
-        )
+        ttl = float(task.lease_ttl)
+        return Lessee(task.task_id, self.uuid, ttl, len(task.council), ask, self.clock, self.rng, changed, floor)
 
     # -- what peers ask ---------------------------------------------------------------------------------------------
 
     def _answer_claim(self, peer: Contact, task_id: str, token: int, ttl: float) -> list[object]:
-        if not isinstance(task_id, str) or type(token) is not int or not 0 < token < 2**62:
+        if len(task_id) > MAX_NAME or not 0 < token < 2**62:
             raise Refused("lease.claim takes a task id, a positive token and a duration")
-        if not isinstance(ttl, float) or not 0.0 < ttl <= 60.0:
-            raise Refused("a lease lasts more than 0 and at most 60 seconds")
+        if not 0.0 < ttl <= MAX_LEASE_TTL:
+            raise Refused(f"a lease lasts more than 0 and at most {MAX_LEASE_TTL:g} seconds")
         grant = self._acceptor.claim(task_id, peer.node_id.hex(), token, ttl, self.clock.seconds())
         return [grant.granted, grant.token, grant.remaining]
 
@@ -194,31 +223,31 @@ class SwarmNode(Service):
         self._acceptor.release(task_id, peer.node_id.hex(), token, self.clock.seconds())
 
     def _answer_message(self, peer: Contact, text: str) -> str:
-        if not isinstance(text, str) or not 0 < len(text) <= 200:
+        if not 0 < len(text) <= 200:
             raise Refused("a message is a text of 1 to 200 characters")
         self._on_message(text)
         self.presence.say(self.wall(), f"operator: {text}")
         return "delivered"
 
     def _answer_disconnect(self, peer: Contact, seconds: float) -> str:
-        if not isinstance(seconds, float | int) or not 0 < seconds <= 3600:
+        if not 0 < seconds <= 3600:
             raise Refused("a device leaves for more than 0 and at most 3600 seconds")
         # After the answer is out.
-        self.clock.callLater(0.05, self._on_disconnect, float(seconds))
+        self._chores.later(0.05, self._on_disconnect, float(seconds))
         return "leaving"
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
     def _announce(self, value: bytes) -> None:
-        self._quietly(self.entangled.put(DEVICES, self.presence.device.name, value, "leased"))
-
-    def _later(self, delay: float, work: Callable[[], None]) -> object:
-        return self.clock.callLater(delay, lambda: work() if self.running else None)
+        self._quietly(maybeDeferred(self.entangled.put, DEVICES, self.presence.device.name, value, "leased"))
 
     def _quietly(self, work: Deferred[Any]) -> None:
         def ended(failure: Any) -> None:
-            if failure.check(EntangledError) is None:
+            if failure.check(WeatherError, NotRunning, Refused) is None:
                 self._log.failure("while telling the team", failure)
 
         work.addErrback(ended)
 
+
+def _next_place(devices: Sequence[Device]) -> int:
+    return max((d.joined for d in devices), default=0) + 1

@@ -1,19 +1,21 @@
 """Presence: who is here, what it can do, and how it is.
 
-Each device announces itself in an owner-leased record under one key, so it disappears with its node.  The order of joining is
-a number, one more than the highest seen when the device came, so it needs no common clock and is the same on every node.
+Each device announces itself in an owner-leased record under one key, so it disappears with its node.  The order of
+joining is a number, one more than the highest seen when the device came, so it needs no common clock and is the same
+on every node.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
 
 import msgpack
 
+from middleware.entangled.identity import node_id
 from middleware.entangled.record import MAX_VALUE, Record, hashed_key
+from middleware.value import are_capabilities, is_number, is_whole, mapping_of
 
 DEVICES = hashed_key("devices")
 IDLE, ASSIGNED, SEARCHING, WAITING, EXECUTING, DONE = "IDLE", "ASSIGNED", "SEARCHING", "WAITING", "EXECUTING", "DONE"
@@ -28,8 +30,8 @@ Capabilities = Mapping[str, Mapping[str, float | str]]
 class Device:
     """What a device says of itself (thesis, Algorithm 4.3).
 
-    ``uuid`` is its node id in hex; ``joined`` its place in the order of joining; ``since`` seconds of the wall clock, for
-    people; ``messages`` are its newest (time, text) lines.
+    ``uuid`` is its node id in hex; ``joined`` its place in the order of joining; ``since`` seconds of the wall clock,
+    for people; ``messages`` are its newest (time, text) lines.
     """
 
     uuid: str
@@ -52,29 +54,39 @@ class Device:
         return replace(self, messages=(*self.messages, line)[-MESSAGES_KEPT:])
 
     def packed(self) -> bytes:
-        """The value of the device's record; the oldest messages and the description give way where it would be too large."""
+        """The value of its record; the oldest messages and the description give way where it would be too large."""
         device = self
         while True:
             value = bytes(msgpack.packb(asdict(device)))
             if len(value) <= MAX_VALUE or not (device.messages or device.description):
                 return value
-            device = replace(device, messages=device.messages[1:]) if device.messages else replace(device, description="")
+            shorter = {"messages": device.messages[1:]} if device.messages else {"description": ""}
+            device = replace(device, **shorter)
 
 
 def device_of(record: Record) -> Device | None:
-    """The device that a record announces, or None where its value is not one."""
-    value = _mapping(record.value)
-    if value is None or not isinstance(value.get("uuid"), str) or not isinstance(value.get("name"), str):
+    """The device that a record announces, or None where its value is not one, or one of another node."""
+    value = mapping_of(record)
+    if value is None or value.get("uuid") != node_id(record.owner).hex():
         return None
-    known = {f.name: type(f.default) for f in fields(Device) if f.name in value}
+    content = {f.name: value[f.name] for f in fields(Device) if f.name in value}
     try:
-        value["messages"] = tuple((float(t), str(text)) for t, text in value.get("messages", ()))
-        value["roles"] = tuple(str(role) for role in value.get("roles", ()))
-        device = Device(**{name: value[name] for name in known})
-        lawful = device.status in STATUSES and type(device.joined) is int and isinstance(device.capabilities, dict)
-        return device if lawful and math.isfinite(float(device.since)) else None
-    except (TypeError, ValueError):
+        content["messages"] = tuple((float(t), text) for t, text in content.get("messages", ()))
+        content["roles"] = tuple(content.get("roles", Device.roles))
+        device = Device(**content)
+    except (TypeError, ValueError, OverflowError):
         return None
+    texts = (device.name, device.kind, device.description, device.address, device.task, device.status, *device.roles)
+    lawful = (
+        all(isinstance(text, str) for text in (*texts, *(text for _, text in device.messages)))
+        and device.status in STATUSES
+        and is_whole(device.joined)
+        and all(is_number(n) for n in (device.since, *(t for t, _ in device.messages)))
+        and are_capabilities(device.capabilities)
+        and isinstance(device.network, dict)
+        and all(isinstance(name, str) and is_number(n) for name, n in device.network.items())
+    )
+    return device if lawful else None
 
 
 def devices_of(records: list[Record]) -> list[tuple[Device, Record]]:
@@ -83,17 +95,8 @@ def devices_of(records: list[Record]) -> list[tuple[Device, Record]]:
     return sorted(known, key=lambda pair: (pair[0].joined, pair[0].uuid))
 
 
-def _mapping(value: bytes | None) -> dict[str, Any] | None:
-    if value is None:
-        return None
-    try:
-        content = msgpack.unpackb(value, strict_map_key=True)
-    except Exception:  # the decoder raises many kinds on crafted bytes
-        return None
-    return content if isinstance(content, dict) else None
-
-
 Announce = Callable[[bytes], None]
+Later = Callable[[float, Callable[[], None]], object]
 
 
 class Presence:
@@ -101,7 +104,7 @@ class Presence:
 
     PAUSE = 0.1
 
-    def __init__(self, device: Device, announce: Announce, later: Callable[[float, Callable[[], None]], object]) -> None:
+    def __init__(self, device: Device, announce: Announce, later: Later) -> None:
         self.device = device
         self._announce = announce
         self._later = later

@@ -1,8 +1,8 @@
 """Streams: newest-frame-wins channels for cameras, over the node's own sealed port.
 
-A viewer opens a channel at a publisher and keeps it open by asking again; the publisher sends each frame in a few datagrams that
-nobody acknowledges.  A frame that misses a part is dropped, and a late one too: there is never a backlog.  Nothing is
-sent while nobody looks.
+A viewer opens a channel at a publisher and keeps it open by asking again; the publisher sends each frame in a few
+datagrams that nobody acknowledges.  A frame that misses a part is dropped, and a late one too: there is never a
+backlog.  Nothing is sent while nobody looks.
 """
 
 from __future__ import annotations
@@ -21,17 +21,34 @@ MAX_PARTS = 64
 MAX_VIEWERS = 64
 OPEN_TTL = 3.0
 RENEW = 1.0
+PATIENCE = 1.0
+"""Seconds without a newer frame after which an older number is believed: the publisher began anew."""
+MAX_CHANNEL = 32
 
 OnFrame = Callable[[int, bytes], None]
 
 
 @dataclass
 class _Assembly:
-    """The parts of the newest frame of one channel."""
+    """The parts of the newest frame of one channel; ``at`` is when its first part came."""
 
     sequence: int = -1
+    count: int = 0
+    at: float = 0.0
     parts: dict[int, bytes] = field(default_factory=dict)
-    done: int = -1
+    is_done: bool = False
+
+    def add(self, sequence: int, number: int, count: int, part: bytes, now: float) -> bytes | None:
+        """Take in one part; the whole frame where it was the last one missing."""
+        if sequence < self.sequence and now - self.at <= PATIENCE:
+            return None
+        if sequence != self.sequence or count != self.count:
+            self.sequence, self.count, self.at, self.parts, self.is_done = sequence, count, now, {}, False
+        self.parts[number] = part
+        if self.is_done or len(self.parts) < count:
+            return None
+        self.is_done = True
+        return b"".join(self.parts[n] for n in range(count))
 
 
 class Streams:
@@ -53,6 +70,8 @@ class Streams:
         viewers = self._viewers.get(channel, {})
         for node_id in [n for n, (_, until) in viewers.items() if until < now]:
             del viewers[node_id]
+        if not viewers:
+            self._viewers.pop(channel, None)
         return bool(viewers)
 
     def offer(self, channel: str, sequence: int, frame: bytes) -> None:
@@ -67,12 +86,15 @@ class Streams:
                 self._endpoint.tell(viewer, "stream.part", channel, sequence, number, len(parts), part)
 
     def _answer_open(self, peer: Contact, channel: str) -> bool:
-        if not isinstance(channel, str) or len(channel) > 32:
-            raise Refused("a channel is named by at most 32 characters")
-        viewers = self._viewers.setdefault(channel, {}) if len(self._viewers) < MAX_VIEWERS else {}
-        if len(viewers) >= MAX_VIEWERS:
+        if len(channel) > MAX_CHANNEL:
+            raise Refused(f"a channel is named by at most {MAX_CHANNEL} characters")
+        for other in list(self._viewers):
+            self.is_wanted(other)  # forgets whoever looked no more
+        viewers = self._viewers.get(channel, {})
+        if peer.node_id not in viewers and sum(map(len, self._viewers.values())) >= MAX_VIEWERS:
             raise Refused("too many viewers")
         viewers[peer.node_id] = (peer, self._clock.seconds() + OPEN_TTL)
+        self._viewers[channel] = viewers
         return True
 
     # -- viewer -----------------------------------------------------------------------------------------------------
@@ -96,25 +118,18 @@ class Streams:
         return stop
 
     def stop(self) -> None:
-        """End everything that is looked at."""
+        """End everything that is looked at, and send nothing more."""
         for look in self._looks.values():
             look.end()
         self._looks.clear()
+        self._viewers.clear()
 
     def _answer_part(self, peer: Contact, channel: str, sequence: int, number: int, count: int, part: bytes) -> None:
         look = self._looks.get((peer.node_id, channel))
-        lawful = type(sequence) is int and type(number) is int and type(count) is int and isinstance(part, bytes)
-        if look is None or not lawful or not 0 <= number < count <= MAX_PARTS or len(part) > PART_BYTES:
+        if look is None or not 0 <= number < count <= MAX_PARTS or len(part) > PART_BYTES:
             return
-        assembly = look.assembly
-        if sequence < assembly.sequence and sequence > assembly.sequence - 1000:
-            return
-        if sequence != assembly.sequence:
-            assembly.sequence, assembly.parts = sequence, {}
-        assembly.parts[number] = part
-        if len(assembly.parts) == count and assembly.done != sequence:
-            assembly.done = sequence
-            frame = b"".join(assembly.parts[n] for n in range(count))
+        frame = look.assembly.add(sequence, number, count, part, self._clock.seconds())
+        if frame is not None:
             for on_frame in list(look.watchers):
                 on_frame(sequence, frame)
 

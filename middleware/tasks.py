@@ -1,26 +1,27 @@
 """Tasks: what is to be done, who can do it (Algorithm 4.4), and the record that says so.
 
-A task is a team record under one key, written once by whoever submits it; each participant writes a slot of its own under
-the task's group key, and the outcome is one more team record there.  So nothing is ever read, changed and written back.
+A task is a team record under one key, written once by whoever submits it; each participant writes a slot of its own
+under the task's group key, and the outcome is one more team record there.  So nothing is ever read, changed and
+written back.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
-from typing import Any
+from dataclasses import asdict, dataclass, field, fields, replace
 
 import msgpack
 
-from middleware.entangled.kademlia.contact import Contact, unpacked
 from middleware.entangled.identity import node_id
+from middleware.entangled.kademlia.contact import Contact, unpacked
 from middleware.entangled.record import Record, hashed_key
 from middleware.presence import Capabilities
+from middleware.value import are_capabilities, are_properties, is_number, is_whole, mapping_of
 
 TASKS = hashed_key("tasks")
 COMPLETED, FAILED, CANCELLED = "COMPLETED", "FAILED", "CANCELLED"
 OUTCOMES = (COMPLETED, FAILED, CANCELLED)
+MAX_LEASE_TTL = 60.0
 MEMBER = "member"
 RESULT = "result"
 
@@ -34,8 +35,8 @@ def group_key(task_id: str) -> bytes:
 class Task:
     """One thing to be done, by one device (``exclusive``), decided by ``strategy``.
 
-    ``requirements`` maps capability names to properties that a device must at least have; ``waiting_period`` is how long the
-    agents wait for each other's reports after the first one, in seconds; ``lease_ttl`` how long the right to
+    ``requirements`` maps capability names to properties that a device must at least have; ``waiting_period`` is how
+    long the agents wait for each other's reports after the first one, in seconds; ``lease_ttl`` how long the right to
     act outlives a silent holder; ``hysteresis`` by which share a late report must be better to take the task over;
     ``council`` are the nodes whose majority grants that right, pinned when the task is made.
     """
@@ -83,7 +84,7 @@ class Member:
 
 @dataclass(frozen=True)
 class Result:
-    """How a task ended: ``outcome`` is one of ``OUTCOMES``; ``bids`` are the reports that decided it, (name, metres) each."""
+    """How a task ended, one of ``OUTCOMES``; ``bids`` are the reports that decided it, (name, metres) each."""
 
     outcome: str
     by: str
@@ -117,28 +118,31 @@ def refusals(capabilities: Capabilities, requirements: Capabilities) -> list[str
 
 def task_of(record: Record) -> Task | None:
     """The task in a record, or None where its value is not one."""
-    content = _content(record)
+    content = mapping_of(record)
     if content is None:
         return None
-    council = tuple(unpacked(c) for c in content.get("council", ()) if isinstance(c, list))
-    if any(c is None for c in council):
-        return None
-    content["council"] = council
+    content = {f.name: content[f.name] for f in fields(Task) if f.name in content}
     try:
-        task = Task(**{f.name: content[f.name] for f in fields(Task) if f.name in content})
-        numbers = (task.waiting_period, task.lease_ttl, task.hysteresis, task.created)
-        lawful = all(isinstance(t, str) for t in (task.task_id, task.kind, task.title, task.strategy)) and all(
-            isinstance(n, float | int) and math.isfinite(n) and n >= 0 for n in numbers
-        )
-        lawful = lawful and all(isinstance(p, dict) for p in task.requirements.values())
-        return task if lawful and task.lease_ttl > 0 and task.task_id == record.name else None
-    except (TypeError, AttributeError):
+        council = [unpacked(fields_) for fields_ in content.get("council", ())]
+        content["council"] = tuple(contact for contact in council if contact is not None)
+        task = Task(**content)
+    except TypeError:
         return None
+    numbers = (task.waiting_period, task.lease_ttl, task.hysteresis, task.created)
+    lawful = (
+        len(task.council) == len(council)
+        and all(isinstance(text, str) for text in (task.task_id, task.kind, task.title, task.strategy))
+        and all(is_number(n) and n >= 0 for n in numbers)
+        and 0 < task.lease_ttl <= MAX_LEASE_TTL
+        and are_capabilities(task.requirements)
+        and are_properties(task.parameters)
+    )
+    return task if lawful and task.task_id == record.name else None
 
 
 def member_of(record: Record) -> Member | None:
     """The member report in a record, or None; a cost that is no finite distance counts as "nothing to report"."""
-    content = _content(record)
+    content = mapping_of(record)
     if record.name != MEMBER or content is None:
         return None
     try:
@@ -146,40 +150,36 @@ def member_of(record: Record) -> Member | None:
     except TypeError:
         return None
     texts = (member.uuid, member.name, member.status, member.assigned, member.digest, member.why)
-    if not all(isinstance(text, str) for text in texts) or type(member.token) is not int:
+    if not all(isinstance(text, str) for text in texts) or not is_whole(member.token):
         return None
     if node_id(record.owner).hex() != member.uuid:
         return None  # nobody reports for another
-    cost = member.cost
-    sound = isinstance(cost, float | int) and math.isfinite(cost) and cost >= 0
-    return member if cost is None or sound else None
+    sound = is_number(member.cost) and member.cost is not None and member.cost >= 0
+    return member if sound else replace(member, cost=None)
 
 
 def result_of(record: Record) -> Result | None:
     """The outcome in a record, or None."""
-    content = _content(record)
-    if record.name != RESULT or content is None or content.get("outcome") not in OUTCOMES:
+    content = mapping_of(record)
+    if record.name != RESULT or content is None:
         return None
+    content = {f.name: content[f.name] for f in fields(Result) if f.name in content}
     try:
-        bids = tuple((str(name), float(cost)) for name, cost in content.get("bids", ()))
-        return Result(
-            str(content["outcome"]), str(content["by"]), float(content["took"]), int(content["token"]), bids
-        )
-    except (TypeError, ValueError, KeyError):
+        content["bids"] = tuple((name, cost) for name, cost in content.get("bids", ()))
+        result = Result(**content)
+    except (TypeError, ValueError):
         return None
+    lawful = (
+        result.outcome in OUTCOMES
+        and isinstance(result.by, str)
+        and is_number(result.took)
+        and is_whole(result.token)
+        and all(isinstance(name, str) and is_number(cost) for name, cost in result.bids)
+    )
+    return result if lawful else None
 
 
 def outcome_of(records: list[Record]) -> Result | None:
     """How the task of a group ended, or None while it is open; of several results the highest token holds."""
     results = [result for record in records if (result := result_of(record)) is not None]
     return max(results, key=lambda result: (result.token, result.outcome, result.by), default=None)
-
-
-def _content(record: Record) -> dict[str, Any] | None:
-    if record.value is None:
-        return None
-    try:
-        content = msgpack.unpackb(record.value, strict_map_key=True)
-    except Exception:  # the decoder raises many kinds on crafted bytes
-        return None
-    return content if isinstance(content, dict) else None

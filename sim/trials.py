@@ -1,7 +1,7 @@
 """Trials: both experiments of the thesis, many times, each from a seed; a table, and pictures of each phase.
 
-``swarm trials --count 20 --seed 1`` runs in virtual time, where the real nodes, agents, drivers and yard run on a turned clock;
-``--real 3`` adds runs with real processes (``sim.demo``).  The team is handed in by the front door.
+``swarm trials --count 20 --seed 1`` runs in virtual time, where the real nodes, agents, drivers and yard run on a
+turned clock; ``--real 3`` adds runs with real processes (``sim.demo``).  The team is handed in by the front door.
 """
 
 from __future__ import annotations
@@ -16,11 +16,12 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
-from sim.experiment import Experiment, to_target
+from sim.experiment import Experiment
 
 LOOK_S = 0.032
 """Virtual seconds between two looks at the team: one sensor frame."""
@@ -29,7 +30,7 @@ SETTLED_S = 1.0
 
 
 class Team(Protocol):
-    """A team that can be made to live a while (``swarmnode.VirtualTeam``)."""
+    """A team that can be made to live a while (the front door's ``VirtualTeam``)."""
 
     clock: Any
     board: Any
@@ -61,8 +62,8 @@ MakeTeam = Callable[[int], Team]
 class Outcome:
     """What came of one trial; times in seconds since the task was assigned, ``takeover`` since the kill.
 
-    ``found`` says whether every dog reported before the task ended, ``agreed`` whether all agents named the same one, ``right``
-    whether the one that went was the nearest, ``held`` whether everything was as it had to be.
+    ``found`` says whether every dog reported before the task ended, ``agreed`` whether all agents named the same one,
+    ``right`` whether the one that went was the nearest, ``held`` whether everything was as it had to be.
     """
 
     seed: int
@@ -152,14 +153,15 @@ def percentile(values: Sequence[float], share: float) -> float:
 
 
 def table(outcomes: Iterable[Outcome]) -> str:
-    """One line an experiment: how many held, found, agreed and chose right, and the times as median (95th percentile)."""
+    """One line an experiment: how many held, found, agreed, chose right; times as median (95th percentile)."""
     rows = [f"{'':12}{'trials':>7}{'held':>7}{'found':>7}{'agreed':>8}{'right':>7}"]
     rows[0] += "".join(f"{name:>16}" for name in ("find s", "agree s", "reach s", "take over s"))
     every = list(outcomes)
     for number in sorted({o.experiment for o in every}):
         some = [o for o in every if o.experiment == number]
         counts = [sum(getattr(o, name) for o in some) for name in ("held", "found", "agreed", "right")]
-        row = f"experiment {number}{len(some):>7}" + "".join(f"{n:>{w}}" for n, w in zip(counts, (7, 7, 8, 7), strict=True))
+        cells = "".join(f"{n:>{width}}" for n, width in zip(counts, (7, 7, 8, 7), strict=True))
+        row = f"experiment {number}{len(some):>7}{cells}"
         for name in ("find", "agree", "reach", "takeover"):
             times = [t for o in some if (t := getattr(o, name)) is not None]
             cell = f"{statistics.median(times):.2f} ({percentile(times, 0.95):.2f})" if times else "-"
@@ -182,17 +184,28 @@ def real(count: int, seed: int, run_dir: Path) -> list[bool]:
     return held
 
 
+def whole(word: str) -> int:
+    """A number that is not negative, from the command line."""
+    number = int(word)
+    if number < 0:
+        raise ValueError(word)
+    return number
+
+
 def main(arguments: Sequence[str], make_team: MakeTeam) -> int:
     """The command line; returns 0 where every trial held."""
     parser = argparse.ArgumentParser(prog="swarm trials", description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--count", type=int, default=20, help="trials of each experiment in virtual time")
+    parser.add_argument("--count", type=whole, default=20, help="trials of each experiment in virtual time")
     parser.add_argument("--seed", type=int, default=1, help="the first seed")
-    parser.add_argument("--real", type=int, default=0, help="runs of both experiments with real processes")
+    parser.add_argument("--real", type=whole, default=0, help="runs of both experiments with real processes")
     parser.add_argument("--out", type=Path, default=Path("run/trials"), help="folder for the report and the pictures")
-    parser.add_argument("--pictures", type=int, default=1, help="of how many seeds pictures are drawn")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="trials at the same time")
+    parser.add_argument("--pictures", type=whole, default=1, help="of how many seeds pictures are drawn")
+    parser.add_argument("--jobs", type=whole, default=os.cpu_count() or 1, help="trials at the same time")
     given = parser.parse_args(list(arguments))
-    given.out.mkdir(parents=True, exist_ok=True)
+    try:
+        given.out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        parser.error(f"--out {given.out} cannot be made ({error.strerror}); name another folder")
     jobs = [
         (make_team, experiment, given.seed + n, given.out if n < given.pictures else None)
         for n in range(given.count)
@@ -200,8 +213,11 @@ def main(arguments: Sequence[str], make_team: MakeTeam) -> int:
     ]
     outcomes = []
     began = time.monotonic()
-    with ProcessPoolExecutor(max_workers=given.jobs) as pool:
-        for outcome in pool.map(_one, jobs):
+    with ExitStack() as stack:
+        spread: Callable[..., Iterable[Outcome]] = map
+        if given.jobs > 1:
+            spread = stack.enter_context(ProcessPoolExecutor(max_workers=given.jobs)).map
+        for outcome in spread(_one, jobs):
             outcomes.append(outcome)
             word = "ok  " if outcome.held else "FAIL"
             broken = f"  ({'; '.join(outcome.broken)})" if outcome.broken else ""
@@ -217,6 +233,3 @@ def main(arguments: Sequence[str], make_team: MakeTeam) -> int:
     if held:
         sys.stdout.write(f"real processes: {sum(held)} of {len(held)} runs held, both experiments each\n")
     return 0 if all(o.held for o in outcomes) and all(held) else 1
-
-
-__all__ = ["Outcome", "main", "table", "to_target", "trial"]

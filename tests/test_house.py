@@ -10,10 +10,11 @@ from collections.abc import Iterator
 from importlib.metadata import packages_distributions
 from pathlib import Path
 
-from twisted.trial.unittest import SkipTest, SynchronousTestCase
+from twisted.trial.unittest import SynchronousTestCase
 
 ROOT = Path(__file__).resolve().parent.parent
 ROOMS = ("agents", "drivers", "middleware", "sim", "webnode")
+FRONT = ("swarmnode", "rehearsal")
 
 # From the most special name to the room: what a module may import of the house.  The longest name that fits holds.
 MAY_IMPORT: dict[str, tuple[str, ...]] = {
@@ -24,6 +25,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "webnode": ("webnode", "middleware"),
     "agents": ("agents", "middleware", "drivers.driver", "drivers.reading", "drivers.errors"),
     "swarmnode": ("swarmnode", *ROOMS),
+    "rehearsal": (*FRONT, *ROOMS),
 }
 
 # Plain objects: bytes and ``now`` in, decisions out.
@@ -75,8 +77,8 @@ def _files() -> dict[str, Path]:
         for path in sorted((ROOT / room).rglob("*.py")):
             parts = path.relative_to(ROOT).with_suffix("").parts
             found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
-    if (ROOT / "swarmnode.py").exists():
-        found["swarmnode"] = ROOT / "swarmnode.py"
+    for module in FRONT:
+        found[module] = ROOT / f"{module}.py"
     return found
 
 
@@ -105,7 +107,7 @@ def _import_names(module: str) -> Iterator[str]:
 
 
 def _ours(module: str) -> list[str]:
-    return [name for name in _imports(module) if _within(name, "tests", "swarmnode", *ROOMS)]
+    return [name for name in _imports(module) if _within(name, "tests", *FRONT, *ROOMS)]
 
 
 def _allowed(module: str) -> tuple[str, ...]:
@@ -214,8 +216,6 @@ class PurityTests(SynchronousTestCase):
 
     def test_edge_node_loads_nothing_heavy(self) -> None:
         """The front door, the node and the simulated driver load neither the page's nor the yard's libraries."""
-        if "swarmnode" not in FILES:
-            raise SkipTest("swarmnode.py is not there yet")
         wanted = [
             name
             for name in ("middleware.node", "agents.loop", "drivers.registry", "drivers.sim.driver")
@@ -257,7 +257,7 @@ class PackagingTests(SynchronousTestCase):
         owners = packages_distributions()
         foreign = {
             room: others
-            for room in (*ROOMS, "swarmnode")
+            for room in (*ROOMS, *FRONT)
             if (others := sorted({name for name in owners.get(room, []) if name.lower() != "swarm-node"}))
         }
         self.assertEqual(foreign, {}, "give swarm-node a virtual environment of its own")

@@ -1,7 +1,7 @@
 """Ledger: what the data store says of the team, as the state that the page shows (thesis, Algorithm 4.3).
 
-``read`` is all it knows of the store: a key in, the records under it out.  Flask's threads hand in the SQLite file's reader,
-the live stream what the node watches; both make the same state.
+``read`` is all it knows of the store: a key in, the records under it out.  Flask's threads hand in the SQLite file's
+reader, the live stream what the node watches; both make the same state.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ TASKS_SHOWN = 20
 
 
 def state_from(read: Read, departed: Departed, node: str, now: float) -> State:
-    """The whole state; ``now`` is the wall clock, ``departed`` remembers who left, ``node`` is the name of who serves."""
+    """The whole state at ``now`` (unix s); ``departed`` remembers who left, ``node`` is the name of who serves."""
     devices = [device for device, _ in devices_of(read(DEVICES))]
     tasks = sorted(filter(None, map(task_of, read(TASKS))), key=lambda task: (-task.created, task.task_id))
     rows, groups = [], {}
@@ -58,7 +58,9 @@ def _task_row(task: Task, records: list[Record], devices: list[Device]) -> dict[
     else:
         status = "OPEN"
         refused = refused_by(task, devices)
-        if len(refused) == len(devices):
+        if not devices:
+            note = "no device is here"
+        elif len(refused) == len(devices):
             note = "no device can do it: " + "; ".join(f"{name} {', '.join(why)}" for name, why in refused.items())
     return {
         "id": task.task_id,

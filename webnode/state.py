@@ -45,13 +45,15 @@ def state_of(
     titles = {view["id"]: view["title"] for view in listed}
     for view in shown:
         view["objective"] = titles.get(view["task"], view["task"])
+    # A winner that has just died reports no more, and is still named by those that stand by.
+    names = {view["uuid"]: view["name"] for view in shown}
     order = {view["id"]: place for place, view in enumerate(listed)}
     keys = sorted((key for key in groups if groups[key]), key=lambda key: (order.get(key, len(order)), key))
     return {
         "node": text(node),
         "devices": shown,
         "tasks": listed,
-        "groups": [group_view(key, titles.get(key, key), groups[key]) for key in keys],
+        "groups": [group_view(key, titles.get(key, key), groups[key], names) for key in keys],
     }
 
 
@@ -94,15 +96,16 @@ def task_view(fields: Fields) -> State:
     }
 
 
-def group_view(task: str, title: str, members: Sequence[Fields]) -> State:
+def group_view(task: str, title: str, members: Sequence[Fields], known: Mapping[str, str] | None = None) -> State:
     """The consensus point of one group: whom each agent computed as the winner, and whether they agree.
 
     The point is the agent named by most (the lowest uuid where two are named as often).  ``differ`` lists who named
-    another, ``undecided`` who named nobody yet.  ``share`` puts the costs (metres) on one scale: the farthest is 1.
+    another, ``undecided`` who named nobody yet.  ``known`` names devices that report nothing here (uuid to name).
+    ``share`` puts the costs (metres) on one scale: the farthest is 1.
     """
     views = [_member_view(member) for member in members]
     views.sort(key=lambda view: (view["name"], view["uuid"]))
-    names = {view["uuid"]: view["name"] for view in views}
+    names = {**(known or {}), **{view["uuid"]: view["name"] for view in views}}
     farthest = max((view["cost"] for view in views if view["cost"] is not None), default=0.0)
     votes: dict[str, int] = {}
     for view in views:

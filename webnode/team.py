@@ -52,8 +52,8 @@ class TeamDesk:
         self._demo = demo
         self._yard = yard
         self._groups: dict[str, Watch] = {}
-        self._devices = node.watch_devices(lambda records: None)
-        self._tasks = node.watch_tasks(self._follow)
+        self._devices = node.watch_devices(lambda records: None, keep=True)
+        self._tasks = node.watch_tasks(self._follow, keep=True)
 
     # -- what is known ----------------------------------------------------------------------------------------------
 
@@ -138,7 +138,7 @@ class TeamDesk:
         for record in records:
             task = task_of(record)
             if task is not None and task.task_id not in self._groups:
-                self._groups[task.task_id] = self._node.watch_group(task.task_id, lambda records: None)
+                self._groups[task.task_id] = self._node.watch_group(task.task_id, lambda records: None, keep=True)
 
     def _open_tasks(self) -> list[Task]:
         tasks = filter(None, map(task_of, self._tasks.records))

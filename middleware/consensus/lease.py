@@ -1,32 +1,37 @@
 """Lease: who may act.  A majority of the task's council grants it, with a token that only grows.
 
-``Acceptor`` is the council member's side and ``Lessee`` the claimant's.  Durations travel, never moments; a lessee counts its
-deadline from when it *sent* the request, less a clock margin, so it ends before any acceptor would grant another
-(PaxosLease, arXiv 1209.4187).  The token fences: a device refuses commands whose token is older than one it has seen.
+``Acceptor`` is the council member's side and ``Lessee`` the claimant's.  Durations travel, never moments; a lessee
+counts its deadline from when it *sent* the request, less a clock margin, so it ends before any acceptor would grant
+another (PaxosLease, arXiv 1209.4187).  The token fences: a device refuses commands whose token is older than one it
+has seen.
 
-This is the plain form: tokens live in memory and a claim is one round.  The prepare phase, tokens that survive a
-restart and changes of the council have their place here.
+This is the plain form: tokens live in memory and a claim is one round.  A council member that was restarted has
+forgotten what it granted, so it grants nothing for one ttl.  The prepare phase, tokens that survive a restart and
+changes of the council have their place here.
 """
 
 from __future__ import annotations
 
+import math
 import random
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Any
 
-from twisted.internet.defer import Deferred, DeferredList
+from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IDelayedCall, IReactorTime
 
 CLOCK_MARGIN = 0.02
 """Share by which two clocks of correct nodes may drift apart (1 % each)."""
 TRIES_PER_TTL = 3
+RENEWAL_RETRY = 0.1
 RETRY = (0.02, 0.08)
+NOBODY = ""
 
 
 @dataclass(frozen=True)
 class Grant:
-    """An acceptor's answer: whether it grants, the highest token that it has seen, and seconds until its grant runs out."""
+    """An acceptor's answer: whether it grants, the highest token seen there, and seconds until the grant runs out."""
 
     granted: bool
     token: int
@@ -41,22 +46,25 @@ class _Granted:
 
 
 class Acceptor:
-    """One council member.  It grants at most one unexpired lease a task, and never an older token.
+    """One council member since ``born_at``.  It grants at most one unexpired lease a task, and never an older token.
 
-    It does not know whether the task exists: a lease on nothing hurts nobody and runs out.
+    It does not know whether the task exists: a lease on nothing hurts nobody and runs out.  A grant is only forgotten
+    when it has run out, so the member of a full council refuses rather than grants twice.
     """
 
     MAX_TASKS = 10_000
 
-    def __init__(self) -> None:
+    def __init__(self, born_at: float = -math.inf) -> None:
+        self._born_at = born_at
         self._granted: dict[str, _Granted] = {}
 
     def claim(self, task_id: str, holder: str, token: int, ttl: float, now: float) -> Grant:
         """Grant, or say what stands against it.  ``holder`` renews with the token that it holds."""
         held = self._granted.get(task_id)
         if held is None:
-            if len(self._granted) >= self.MAX_TASKS:
-                del self._granted[min(self._granted, key=lambda t: self._granted[t].until)]
+            wait = max(self._born_at + ttl - now, self._wait_for_room(now))
+            if wait > 0.0:
+                return Grant(False, 0, wait)
             self._granted[task_id] = _Granted(holder, token, now + ttl)
             return Grant(True, token, ttl)
         mine = held.holder == holder
@@ -66,10 +74,20 @@ class Acceptor:
         return Grant(True, token, ttl)
 
     def release(self, task_id: str, holder: str, token: int, now: float) -> None:
-        """End a lease early; the token stays, so nobody can use it again."""
+        """End a lease early; the token stays, so nobody can use it again, not even a claim that was under way."""
         held = self._granted.get(task_id)
         if held is not None and held.holder == holder and held.token == token:
-            held.until = now
+            held.holder, held.until = NOBODY, now
+
+    def _wait_for_room(self, now: float) -> float:
+        """Make room for one more task; the seconds until there will be some."""
+        if len(self._granted) < self.MAX_TASKS:
+            return 0.0
+        oldest = min(self._granted, key=lambda t: self._granted[t].until)
+        wait = self._granted[oldest].until - now
+        if wait <= 0.0:
+            del self._granted[oldest]
+        return wait
 
 
 @dataclass(frozen=True)
@@ -116,7 +134,7 @@ class Lessee:
         self._highest = floor
         self._deadline = 0.0
         self._wanted = False
-        self._asking = False
+        self._round: _Round | None = None
         self._timer: IDelayedCall | None = None
 
     @property
@@ -130,93 +148,84 @@ class Lessee:
         """Claim the lease and keep it, trying again until it is won."""
         if not self._wanted:
             self._wanted = True
-            self._round()
+            self._begin()
 
     def release(self) -> None:
         """Give the lease back (stop the device first), or stop claiming it."""
         self._wanted = False
         self._deadline = 0.0
+        # What a round under way still brings is given back, never used: the members may have let go by then.
+        self._round = None
         if self._timer is not None and self._timer.active():
             self._timer.cancel()
         if self.token:
-            for member in range(self._size):
-                self._ask(member, "lease.release", (self.task_id, self.token)).addErrback(lambda _: None)
+            self._give_up(self.token)
         self.token = 0
 
-    def _round(self) -> None:
+    def _begin(self) -> None:
         """One claim or renewal at all members at once."""
-        if not self._wanted or self._asking:
-            return
-        self._asking = True
-        sent = self._clock.seconds()
         held = self.lease
         token = held.token if held is not None else self._highest + 1
         self._highest = max(self._highest, token)
-        grants: list[Grant] = []
-        refusals: list[Grant] = []
-        needed = self._size // 2 + 1
-        settled = False
+        round_ = self._round = _Round(token, self._clock.seconds())
+        for member in range(self._size):
+            asked = self._ask(member, "lease.claim", (self.task_id, token, self._ttl))
+            asked.addBoth(self._answered, round_, member)
 
-        def settle() -> None:
-            nonlocal settled
-            if settled:
-                return
-            if len(grants) >= needed:
-                settled = True
-                self._asking = False
-                self._won(token, sent)
-            elif self._size - len(refusals) < needed:
-                settled = True
-                self._asking = False
-                self._not_won(token, refusals)
+    def _answered(self, answer: object, round_: _Round, member: int) -> None:
+        """Count the answer of one member, or its silence (a Failure)."""
+        grant = grant_of(answer) or Grant(False, 0, 0.0)
+        self._highest = max(self._highest, grant.token)
+        (round_.grants if grant.granted else round_.refusals).append(grant)
+        if self._round is round_:
+            needed = self._size // 2 + 1
+            if len(round_.grants) >= needed:
+                self._round = None
+                self._won(round_)
+            elif self._size - len(round_.refusals) < needed:
+                self._round = None
+                self._not_won(round_)
+        elif grant.granted and round_.token != self.token:
+            self._tell_release(member, round_.token)
 
-        def answered(answer: object) -> None:
-            grant = grant_of(answer)
-            if grant is None:
-                return lost(None)
-            self._highest = max(self._highest, grant.token)
-            (grants if grant.granted else refusals).append(grant)
-            if grant.granted and settled and token != self.token:
-                self._give_up(token)
-            settle()
-
-        def lost(_: object) -> None:
-            refusals.append(Grant(False, 0, 0.0))
-            settle()
-
-        asked = [self._ask(n, "lease.claim", (self.task_id, token, self._ttl)) for n in range(self._size)]
-        for question in asked:
-            question.addCallbacks(answered, lost)
-        DeferredList(asked)
-
-    def _won(self, token: int, sent: float) -> None:
-        if not self._wanted:
-            return self._give_up(token)
-        self.token = token
-        self._deadline = sent + self._ttl * (1.0 - CLOCK_MARGIN)
+    def _won(self, won: _Round) -> None:
+        self.token = won.token
+        self._deadline = won.sent + self._ttl * (1.0 - CLOCK_MARGIN)
         self._again(self._ttl / TRIES_PER_TTL)
         self._changed()
 
-    def _not_won(self, token: int, refusals: Sequence[Grant]) -> None:
+    def _not_won(self, lost: _Round) -> None:
         if self.lease is not None:
             # A renewal that failed this time: there is time for another before the deadline.
-            return self._again(0.1)
-        lost = self.token != 0
+            return self._again(RENEWAL_RETRY)
+        was_held = self.token != 0
         self.token = 0
         # What a minority granted must not keep a healthier claimant waiting.
-        self._give_up(token)
-        remaining = min((g.remaining for g in refusals if g.remaining > 0), default=0.0)
+        self._give_up(lost.token)
+        remaining = min((g.remaining for g in lost.refusals if g.remaining > 0), default=0.0)
         self._again(min(remaining, self._ttl / TRIES_PER_TTL) + self._rng.uniform(*RETRY))
-        if lost:
+        if was_held:
             self._changed()
 
     def _give_up(self, token: int) -> None:
         for member in range(self._size):
-            self._ask(member, "lease.release", (self.task_id, token)).addErrback(lambda _: None)
+            self._tell_release(member, token)
+
+    def _tell_release(self, member: int, token: int) -> None:
+        self._ask(member, "lease.release", (self.task_id, token)).addErrback(lambda _: None)
 
     def _again(self, delay: float) -> None:
-        if self._wanted:
-            self._timer = self._clock.callLater(delay, self._round)
+        self._timer = self._clock.callLater(delay, self._begin)
+
+
+@dataclass(eq=False)
+class _Round:
+    """One claim or renewal under way, and what has come of it; ``sent`` is when it was asked."""
+
+    token: int
+    sent: float
+    grants: list[Grant] = field(default_factory=list)
+    refusals: list[Grant] = field(default_factory=list)
 
 
 def grant_of(answer: object) -> Grant | None:

@@ -17,7 +17,7 @@ class Nearest:
         """The consensus point; None is assigned where nobody reports a finite, non-negative cost."""
         best: dict[str, Report] = {}
         for report in contacts:
-            if math.isfinite(report.cost) and report.cost >= 0:
+            if _is_lawful(report):
                 known = best.get(report.agent)
                 if known is None or report.cost < known.cost:
                     best[report.agent] = report
@@ -27,5 +27,9 @@ class Nearest:
         return Consensus(order[0], tuple(order[1:]), digest_of(list(best.values())))
 
     def improves(self, current: Report, offer: Report, hysteresis: float) -> bool:
-        """Whether ``offer`` is nearer by more than the share ``hysteresis``."""
-        return offer.cost < current.cost * (1.0 - hysteresis)
+        """Whether ``offer`` is nearer by more than the share ``hysteresis``; what is no distance never is."""
+        return _is_lawful(offer) and offer.cost < current.cost * (1.0 - hysteresis)
+
+
+def _is_lawful(report: Report) -> bool:
+    return math.isfinite(report.cost) and report.cost >= 0

@@ -1,7 +1,8 @@
 """Strategy: who should act.  Pure, replaceable, loaded by name; it may be wrong, and then only the choice suffers.
 
-A strategy sees the reports of the agents assigned to a task and names the one that should act (thesis, section 4.2.5 and
-Algorithm 4.5: ``consensus.find(contacts)``, ``consensus.assigned_agent``).  Who may act is not its business (``lease``).
+A strategy sees the reports of the agents assigned to a task and names the one that should act (thesis, section 4.2.5
+and Algorithm 4.5: ``consensus.find(contacts)``, ``consensus.assigned_agent``).  Who may act is not its business
+(``lease``).
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ class Report:
 
 @dataclass(frozen=True)
 class Consensus:
-    """The consensus point: the agent that should act, those that stand by in order, and a digest of the reports used."""
+    """The consensus point: who should act, those that stand by in order, and a digest of the reports used."""
 
     assigned_agent: str | None
     standby: tuple[str, ...] = ()
@@ -50,18 +51,17 @@ class ConsensusAlgorithm(Protocol):
 
 def digest_of(contacts: Sequence[Report]) -> str:
     """Eight hex digits that are equal for equal reports, whatever their order."""
-    text = "".join(f"{r.agent}={r.cost:.6f};" for r in sorted(contacts, key=lambda r: r.agent))
-    return hashlib.blake2s(text.encode(), digest_size=4).hexdigest()
+    texts = sorted(f"{r.agent}={r.cost + 0.0:.6f};" for r in contacts)  # -0.0 is 0.0
+    return hashlib.blake2s("".join(texts).encode(), digest_size=4).hexdigest()
 
 
-def strategy_for(name: str) -> ConsensusAlgorithm:
-    """The strategy called ``name``: a built-in one, an entry point of ``swarm_node.strategies``, or ``module:Class``.
+def strategy_for(name: str, dotted: bool = False) -> ConsensusAlgorithm:
+    """The strategy called ``name``: a built-in one, or an entry point of ``swarm_node.strategies``.
 
-    Raises ``UnknownStrategy``, which names those that there are.
+    With ``dotted`` also ``module:Class``, for names out of this machine's own settings: what a peer sends must never
+    say what is imported here.  Raises ``UnknownStrategy``, which names those that there are.
     """
-    target = BUILT_IN.get(name)
-    if target is None and ":" in name:
-        target = name
+    target = name if dotted and ":" in name else BUILT_IN.get(name)
     if target is None:
         found = {point.name: point.value for point in entry_points(group=ENTRY_POINTS)}
         target = found.get(name)
@@ -70,6 +70,6 @@ def strategy_for(name: str) -> ConsensusAlgorithm:
     module, _, attribute = target.partition(":")
     try:
         strategy: ConsensusAlgorithm = getattr(importlib.import_module(module), attribute)()
-    except (ImportError, AttributeError) as error:
+    except Exception as error:  # a module of somebody else may fail in any way
         raise UnknownStrategy(f"strategy {name!r} cannot be loaded: {error}") from error
     return strategy

@@ -75,7 +75,7 @@ class Background:
 
 
 async def first(needed: int, work: list[Coroutine[Any, Any, Any]]) -> list[Any]:
-    """The results of the first ``needed`` of ``work`` that succeed, fewer when all have ended before; the others go on."""
+    """The results of the first ``needed`` of ``work`` that succeed, fewer when all have ended; the others go on."""
     results: list[Any] = []
     left = len(work)
     done: Deferred[None] = Deferred()

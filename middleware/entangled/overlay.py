@@ -1,12 +1,13 @@
 """Overlay: the contacts of a node, and the way to those closest to an id (Kademlia, sections 2.2 to 2.4).
 
-A contact enters the table only when it has proved its key from its address; one that stays silent is asked, and goes after
-several misses.  Where records belong follows from here: to the k closest nodes of their key.
+A contact enters the table only when it has proved its key from its address; one that stays silent is asked, and goes
+after several misses.  Where records belong follows from here: to the k closest nodes of their key.
 """
 
 from __future__ import annotations
 
 import random
+from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -19,7 +20,7 @@ from middleware.entangled.errors import EntangledError, NoAnswer, NotRunning, Re
 from middleware.entangled.kademlia.contact import Contact, unpacked
 from middleware.entangled.kademlia.distance import closest
 from middleware.entangled.kademlia.lookup import Lookup
-from middleware.entangled.kademlia.routing import RoutingTable
+from middleware.entangled.kademlia.routing import STALE_AFTER, RoutingTable
 from middleware.entangled.network.network import Address
 from middleware.entangled.wire.endpoint import Endpoint
 
@@ -32,6 +33,10 @@ REFRESH = 10.0
 HEDGE = 0.15
 """Seconds after which a lookup asks one more node beside one that has not answered yet."""
 BACKOFF = (0.2, 5.0)
+MAX_FORMER = 32
+"""Addresses of known nodes and lost contacts that are tried when nobody is left."""
+MAX_FOUND = 512
+"""Keys whose closest nodes, as the last lookup found them, are remembered."""
 
 OnContact = Callable[[Contact], None]
 
@@ -53,8 +58,12 @@ class Overlay:
         self.on_newcomer: OnContact = lambda contact: None
         self.on_lost: OnContact = lambda contact: None
         self._heard_at: dict[bytes, float] = {}
+        self._found: OrderedDict[bytes, list[Contact]] = OrderedDict()
+        self._misses: dict[bytes, int] = {}
         endpoint.on_contact = self.heard
-        endpoint.expose("ping", self._answer_ping)
+        self._former: dict[Address, None] = {}
+        self._returning = False
+        endpoint.expose("ping", self._answer_ping, changes=True)
         endpoint.expose("find_node", self._answer_find_node)
 
     def start(self) -> None:
@@ -62,40 +71,71 @@ class Overlay:
         self._chores.every(PROBE, self._probe)
         self._chores.every(REFRESH, lambda: self._chores.fork(self.lookup(self._me().node_id)))
 
-    async def join(self, known: Sequence[Address]) -> None:
-        """Greet the known nodes, with back-off until one answers, then look up the own id."""
-        pause = BACKOFF[0]
-        while known and not await self._greeted(known):
+    async def join(self, known: Sequence[Address], remembered: Sequence[Address] = ()) -> None:
+        """Greet the known nodes, with back-off until one answers, then look up the own id.
+
+        ``remembered`` are greeted beside them, and waited for only where there are known nodes: without any, this may
+        be the first node of its network.  A known node that turns out to be this one is waited for no longer.
+        """
+        others, pause = list(known), BACKOFF[0]
+        self._former |= dict.fromkeys([*known, *remembered])
+        while others or remembered:
+            if await self._greeted(others, remembered):
+                await self.lookup(self._me().node_id)
+                return
             if self._chores.is_stopped:
                 raise NotRunning("the node stopped while it was joining")
-            addresses = ", ".join(map(str, known))
+            if not others:
+                return
+            addresses = ", ".join(map(str, others))
             self._log.info("no answer from {known}; trying again in {s:.1f} s", known=addresses, s=pause)
             await self._chores.sleep(pause * (0.75 + self._rng.random() / 2))
             pause = min(pause * 2, BACKOFF[1])
-        if known:
-            await self.lookup(self._me().node_id)
 
-    async def _greeted(self, known: Sequence[Address]) -> bool:
-        greetings = await DeferredList([self._endpoint.greet(address) for address in known], consumeErrors=True)
-        found = [contact for ok, contact in greetings if ok and contact.node_id != self._me().node_id]
-        pings = await DeferredList([self._endpoint.ask(contact, "ping") for contact in found], consumeErrors=True)
+    async def _greeted(self, known: list[Address], remembered: Sequence[Address]) -> bool:
+        """Whether any of them is there; takes those out of ``known`` at which this node itself answers."""
+        addresses = list(dict.fromkeys([*known, *remembered]))
+        greetings = await DeferredList([self._endpoint.greet(address) for address in addresses], consumeErrors=True)
+        found = []
+        for address, (ok, contact) in zip(addresses, greetings, strict=True):
+            if ok and contact.node_id == self._me().node_id:
+                known[:] = [other for other in known if other != address]
+            elif ok:
+                found.append(contact)
+        pings = await DeferredList(
+            [self._endpoint.ask(contact, "ping", changes=True) for contact in found], consumeErrors=True
+        )
         return any(ok for ok, _ in pings)
 
     # -- where things belong ----------------------------------------------------------------------------------------
 
     def responsible(self, key: bytes) -> list[Contact]:
         """The k closest nodes to ``key`` that are known here, this one included, the closest first."""
-        return closest([*self.table.closest(key), self._me()], key, K)
+        return _closest([*self._found.get(key, ()), *self.table.closest(key), self._me()], key)
+
+    def keepers(self, key: bytes) -> list[Contact]:
+        """The nodes, this one not included, that may hold records of ``key``: those responsible, and those last found.
+
+        A bucket has room for k contacts only, so in a large network not all that were found are in the table.
+        """
+        both = {c.node_id: c for c in [*self._found.get(key, ()), *self.responsible(key)]}
+        return [contact for node_id, contact in both.items() if node_id != self._me().node_id]
 
     def belongs(self, key: bytes, contact: Contact) -> bool:
         """Whether ``contact`` is among the k closest to ``key``, as far as is known here."""
         return any(c.node_id == contact.node_id for c in self.responsible(key))
 
     async def holders(self, key: bytes) -> list[Contact]:
-        """The k closest live nodes to ``key``; looked up unless the whole team is known."""
-        if len(self.table) > K:
-            await self.lookup(key)
-        return self.responsible(key)
+        """The k closest live nodes to ``key``; looked up where there may be more nodes than are known."""
+        if len(self.table) < K:
+            self._found.pop(key, None)
+            return self.responsible(key)
+        found = await self.lookup(key)
+        self._found[key] = found
+        self._found.move_to_end(key)
+        if len(self._found) > MAX_FOUND:
+            self._found.popitem(last=False)
+        return _closest([*found, self._me()], key) if len(found) >= K else self.responsible(key)
 
     async def lookup(self, target: bytes) -> list[Contact]:
         """The k live nodes closest to ``target``, this one not included (Kademlia, section 2.3)."""
@@ -136,20 +176,39 @@ class Overlay:
         try:
             answer = await self._endpoint.ask(contact, method, *arguments, changes=changes, timeout=timeout)
         except NoAnswer:
-            self.table.failed(contact, self._clock.seconds())
-            if self.table.get(contact.node_id) is None:
-                self.on_lost(contact)
+            self._missed(contact)
             raise
-        self._heard_at[contact.node_id] = self._clock.seconds()
         return answer
 
+    def _missed(self, contact: Contact) -> None:
+        was_known = self.table.get(contact.node_id) is not None
+        self.table.failed(contact, self._clock.seconds())
+        if self.table.get(contact.node_id) is not None:
+            return
+        self._misses[contact.node_id] = self._misses.get(contact.node_id, 0) + 1
+        # One that a full bucket keeps out of the table is not lost by a single miss either.
+        if was_known or self._misses[contact.node_id] >= STALE_AFTER:
+            self._forget(contact)
+
+    def _forget(self, contact: Contact) -> None:
+        self._former.pop(contact.address, None)
+        self._former[contact.address] = None
+        if len(self._former) > MAX_FORMER:
+            del self._former[next(iter(self._former))]
+        self._heard_at.pop(contact.node_id, None)
+        self._misses.pop(contact.node_id, None)
+        for found in self._found.values():
+            found[:] = [c for c in found if c.node_id != contact.node_id]
+        self.on_lost(contact)
+
     def heard(self, contact: Contact) -> None:
-        """``contact`` has proved its key and address."""
+        """``contact`` has proved its key and address, be it by an answer or by a question in its session."""
         if contact.node_id == self._me().node_id:
             return
         now = self._clock.seconds()
         known = self.table.get(contact.node_id)
         self._heard_at[contact.node_id] = now
+        self._misses.pop(contact.node_id, None)
         doubtful = self.table.saw(contact, now)
         if doubtful is not None:
             self._chores.fork(self._check(doubtful))
@@ -159,22 +218,42 @@ class Overlay:
 
     def left(self, contact: Contact) -> None:
         """``contact`` said goodbye."""
-        self.table.remove(contact)
-        self.on_lost(contact)
+        self.table.remove(contact, self._clock.seconds())
+        self._forget(contact)
+
+    async def _return(self) -> None:
+        """Look for those that were known once: a radio that was out costs a node all its contacts."""
+        self._returning = True
+        try:
+            if await self._greeted([], list(self._former)):
+                await self.lookup(self._me().node_id)
+        finally:
+            self._returning = False
 
     def _probe(self) -> None:
+        if not len(self.table) and self._former and not self._returning:
+            self._chores.fork(self._return())
         now = self._clock.seconds()
         for contact in self.table.contacts():
-            if now - self._heard_at.get(contact.node_id, 0.0) > SILENCE:
+            if now - self._heard_at.get(contact.node_id, -SILENCE) > SILENCE:
                 self._chores.fork(self._check(contact))
 
     async def _check(self, contact: Contact) -> None:
-        await self.ask(contact, "ping")
+        await self.ask(contact, "ping", changes=True)
 
     def _answer_ping(self, peer: Contact) -> str:
+        self.heard(peer)
         return "pong"
 
     def _answer_find_node(self, peer: Contact, target: bytes) -> list[object]:
         if not isinstance(target, bytes) or len(target) != len(peer.node_id):
             raise Refused("find_node takes a node id of 20 bytes")
         return [c.packed() for c in self.table.closest(target) if c.node_id != peer.node_id]
+
+
+def _closest(contacts: list[Contact], key: bytes) -> list[Contact]:
+    """The k closest of ``contacts``, each node once; of two addresses of one node the first one named holds."""
+    once: dict[bytes, Contact] = {}
+    for contact in contacts:
+        once.setdefault(contact.node_id, contact)
+    return closest(once.values(), key, K)

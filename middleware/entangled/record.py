@@ -34,9 +34,9 @@ class Slot(NamedTuple):
 class Record:
     """One signed entry.
 
-    ``owner`` is the public key (32 bytes); ``ttl`` is in seconds and counts from arrival: a ``leased`` record lives that long
-    after the last sign of its owner, a ``team`` record that long after it was stored.  ``value`` is at most ``MAX_VALUE`` bytes of
-    msgpack, or None for a tombstone.
+    ``owner`` is the public key (32 bytes); ``ttl`` is in seconds and counts from arrival: a ``leased`` record lives
+    that long after the last sign of its owner, a ``team`` record that long after it was stored.  ``value`` is at most
+    ``MAX_VALUE`` bytes of msgpack, or None for a tombstone.
     """
 
     key: bytes
@@ -73,7 +73,16 @@ class Record:
         return verified(self.owner, self._signed_bytes(), self.signature)
 
     def _signed_bytes(self) -> bytes:
-        fields = [b"swarm-record-1", self.key, self.name, self.owner, self.sequence, self.lifetime, self.ttl, self.value]
+        fields = [
+            b"swarm-record-1",
+            self.key,
+            self.name,
+            self.owner,
+            self.sequence,
+            self.lifetime,
+            self.ttl,
+            self.value,
+        ]
         return bytes(msgpack.packb(fields))
 
     def packed(self) -> list[object]:

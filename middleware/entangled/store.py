@@ -147,7 +147,7 @@ class MemoryStore:
 
     def expire(self, now: float) -> list[Record]:
         """Let go of what has run out by ``now`` and return it, the earliest first."""
-        gone = []
+        gone: list[tuple[float, Slot, Record]] = []
         while self._heap and self._heap[0][0] <= now:
             queued_at, slot = heapq.heappop(self._heap)
             held = self._slots.get(slot)
@@ -156,8 +156,10 @@ class MemoryStore:
             if held.expires_at > now:
                 self._queue(held)
             else:
-                gone.append(self._remove(slot))
-        return gone
+                gone.append((held.expires_at, slot, self._remove(slot)))
+        # One whose lease was extended comes off the heap at its old moment.
+        gone.sort(key=lambda ended: ended[:2])
+        return [record for _, _, record in gone]
 
     def drop_leased(self, owner: bytes) -> list[Record]:
         """Let go of all leased records of ``owner`` and return them in the order of their slots."""

@@ -1,8 +1,8 @@
 """Watch: what is known of one key, kept up to date by those who hold it.
 
-``View`` merges what several replicas say; it is pure.  A slot is present while any replica that still counts says so; of
-several records of one slot the one that beats the others holds.  No node testifies for its own lease: when a node
-dies, what it said of itself would otherwise outlive it.
+``View`` merges what several replicas say; it is pure.  A slot is present while any replica that still counts says so;
+of several records of one slot the one that beats the others holds.  No node testifies for its own lease, except to
+itself: when a node dies, what it said of itself would otherwise outlive it.
 """
 
 from __future__ import annotations
@@ -21,14 +21,16 @@ def digest_of(records: Iterable[Record]) -> bytes:
     """Eight bytes that tell whether two replicas hold the same of a key."""
     h = hashlib.blake2s(digest_size=8)
     for record in sorted(records, key=lambda r: (r.key, r.owner, r.name)):
-        h.update(record.owner + record.name.encode() + b"\0" + record.sequence.to_bytes(8, "big") + record.signature[:8])
+        place = record.owner + record.name.encode() + b"\0"
+        h.update(place + record.sequence.to_bytes(8, "big") + record.signature[:8])
     return h.digest()
 
 
 class View:
-    """The opinions of all replicas of one key, merged."""
+    """The opinions of all replicas of one key, merged for the node ``own_id``."""
 
-    def __init__(self) -> None:
+    def __init__(self, own_id: bytes = b"") -> None:
+        self._own_id = own_id
         self._opinions: dict[bytes, dict[Slot, Record]] = {}
 
     def replace(self, replica: bytes, records: Iterable[Record]) -> None:
@@ -49,6 +51,10 @@ class View:
         """``replica`` is gone; what it said does not count any more."""
         self._opinions.pop(replica, None)
 
+    def replicas(self) -> list[bytes]:
+        """The node ids whose opinions count, in the order in which they came."""
+        return list(self._opinions)
+
     def digest(self, replica: bytes) -> bytes:
         """The digest of what ``replica`` is believed to hold."""
         return digest_of(self._opinions.get(replica, {}).values())
@@ -58,7 +64,8 @@ class View:
         best: dict[Slot, Record] = {}
         for replica, held in self._opinions.items():
             for slot, record in held.items():
-                if record.lifetime == "leased" and node_id(record.owner) == replica:
+                is_own_lease = record.lifetime == "leased" and node_id(record.owner) == replica
+                if is_own_lease and replica != self._own_id:
                     continue
                 if record.beats(best.get(slot)):
                     best[slot] = record
@@ -74,12 +81,18 @@ class Renewer(Protocol):
 
 
 class Watch:
-    """One subscription to one key; ``records`` is what is known now."""
+    """One subscription to one key; ``records`` is what is known now.
 
-    def __init__(self, key: bytes, changed: Changed, renewer: Renewer) -> None:
+    ``asked`` are the node ids of the replicas that were asked to push; nobody else is believed.  ``keep`` says whether
+    what is known is to be kept in the node's own store as well.
+    """
+
+    def __init__(self, key: bytes, changed: Changed, renewer: Renewer, own_id: bytes = b"", keep: bool = False) -> None:
         self.key = key
-        self.view = View()
+        self.view = View(own_id)
         self.records: list[Record] = []
+        self.asked: set[bytes] = set()
+        self.keep = keep
         self._changed = changed
         self._renewer = renewer
 
@@ -89,6 +102,11 @@ class Watch:
         if records != self.records:
             self.records = records
             self._changed(list(records))
+
+    def forget(self, replica: bytes) -> None:
+        """What ``replica`` says does not count until it is asked again."""
+        self.asked.discard(replica)
+        self.view.forget(replica)
 
     def stop(self) -> None:
         """End the subscription; nothing is told any more."""

@@ -1,0 +1,42 @@
+"""Tests of ``agents.catalogue``."""
+
+from __future__ import annotations
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from agents.behaviour import KINDS
+from agents.catalogue import DEMO, TASKS, task_named
+from drivers.registry import describe
+from middleware.consensus.strategy import strategy_for
+from middleware.entangled.record import Record
+from middleware.errors import UnknownTask
+from middleware.tasks import TASKS as KEY
+from middleware.tasks import refusals, task_of
+
+
+class CatalogueTests(SynchronousTestCase):
+    def test_tasks_survive_the_wire(self) -> None:
+        """Each predefined task is a lawful record that reads back as it was, with a strategy that exists."""
+        for name in TASKS:
+            task = task_named(name, "t1", 5.0)
+            record = Record(KEY, "t1", bytes(32), 1, "team", 60.0, task.packed())
+            self.assertEqual(task_of(record), task)
+            strategy_for(task.strategy)
+
+    def test_yards_dog_can_do_what_it_is_made_for(self) -> None:
+        """A dog of the yard meets the demonstration's requirements, and lacks a gripper for the ball."""
+        capabilities = describe("sim", {}, "dog1").capabilities
+        self.assertEqual(refusals(capabilities, TASKS[DEMO].requirements), [])
+        self.assertEqual(refusals(capabilities, TASKS["turn-around"].requirements), [])
+        self.assertEqual(refusals(capabilities, TASKS["fetch-the-ball"].requirements), ["has no gripper"])
+
+    def test_doable_tasks_have_a_behaviour(self) -> None:
+        """What a dog of the yard can do there is a behaviour for."""
+        capabilities = describe("sim", {}, "dog1").capabilities
+        kinds = {task.kind for task in TASKS.values() if not refusals(capabilities, task.requirements)}
+        self.assertEqual(kinds - set(KINDS), set())
+
+    def test_unknown_name_lists_the_known(self) -> None:
+        """A task that is not predefined is refused with those that are."""
+        error = self.assertRaises(UnknownTask, task_named, "dance", "t1", 0.0)
+        self.assertIn("'dance'; there are fetch-the-ball, find-red-target, turn-around", str(error))

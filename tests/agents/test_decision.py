@@ -1,0 +1,103 @@
+"""Tests of ``agents.decision``: who is assigned, from the reports of all."""
+
+from __future__ import annotations
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from twisted.trial.unittest import SynchronousTestCase
+
+from agents.decision import Decision, decide
+from middleware.consensus.nearest import Nearest
+from middleware.presence import EXECUTING, SEARCHING, WAITING
+from middleware.tasks import Member
+
+
+def member(uuid: str, cost: float | None, status: str = WAITING) -> Member:
+    """One report."""
+    return Member(uuid, f"dog-{uuid}", status, cost)
+
+
+def decided(*members: Member, since: float | None = 100.0, hysteresis: float = 0.1) -> Decision:
+    """The decision with a waiting period of 8 s."""
+    return decide(members, Nearest(), hysteresis, 8.0, since)
+
+
+REPORTS = st.lists(
+    st.tuples(
+        st.integers(0, 9),
+        st.none() | st.floats(0.0, 9.0),
+        st.sampled_from((SEARCHING, WAITING, EXECUTING)),
+    ),
+    max_size=6,
+    unique_by=lambda entry: entry[0],
+)
+
+
+class DecisionTests(SynchronousTestCase):
+    def test_nearest_of_all_is_assigned(self) -> None:
+        """When everybody has reported, the nearest is assigned at once, before the waiting period is over."""
+        decision = decided(member("a", 2.0), member("b", 1.0), member("c", 3.0), since=0.0)
+        self.assertEqual(decision.assigned, "b")
+        self.assertEqual(decision.why, "dog-b with 1.00 of 3 reports")
+
+    def test_waiting_period_holds_for_those_who_are_missing(self) -> None:
+        """Within the waiting period nobody goes while a report is missing, and the reason names who is missing."""
+        members = member("a", 2.0), member("c", None, SEARCHING), member("b", None, SEARCHING)
+        early = decided(*members, since=7.9)
+        self.assertEqual((early.assigned, early.why), (None, "waiting for dog-b, dog-c"))
+        self.assertEqual(decided(*members, since=8.0).assigned, "a")
+
+    def test_nobody_goes_without_a_report(self) -> None:
+        """Without any report nobody is assigned, however long it takes."""
+        for members in ([], [member("a", None)]):
+            decision = decided(*members, since=None)
+            self.assertEqual((decision.assigned, decision.why), (None, "nobody has reported yet"))
+
+    def test_acting_member_keeps_the_task_within_the_hysteresis(self) -> None:
+        """Whoever acts goes on when another is nearer by less than the hysteresis, and gives way to a better one."""
+        acting = member("z", 1.0, EXECUTING)
+        for cost, assigned in ((0.95, "z"), (0.90, "z"), (0.89, "a")):
+            self.assertEqual(decided(acting, member("a", cost)).assigned, assigned, cost)
+
+    def test_acting_member_is_not_stopped_by_a_missing_report(self) -> None:
+        """A member that comes and has not reported yet does not take the task from whoever acts."""
+        decision = decided(member("z", 1.0, EXECUTING), member("a", None, SEARCHING), since=0.0)
+        self.assertEqual(decision.assigned, "z")
+
+    def test_acting_member_without_report_counts_for_nothing(self) -> None:
+        """Who says to act and reports nothing does not keep the task from the others."""
+        self.assertEqual(decided(member("z", None, EXECUTING), member("a", 5.0)).assigned, "a")
+
+    def test_two_acting_members_come_down_to_one(self) -> None:
+        """Where two say to act, all name the nearer of them, and of equals the lower uuid."""
+        self.assertEqual(decided(member("a", 1.02, EXECUTING), member("b", 1.0, EXECUTING)).assigned, "b")
+        self.assertEqual(decided(member("b", 1.0, EXECUTING), member("a", 1.0, EXECUTING)).assigned, "a")
+
+    def test_equal_reports_are_decided_by_uuid(self) -> None:
+        """Equal distances give one assigned agent, the one with the lower uuid."""
+        self.assertEqual(decided(member("b", 1.0), member("a", 1.0), member("c", 1.0)).assigned, "a")
+
+    @settings(max_examples=150, deadline=None, derandomize=True)
+    @given(REPORTS, st.floats(0.0, 20.0), st.randoms(use_true_random=False))
+    def test_order_of_members_does_not_matter(
+        self, entries: list[tuple[int, float | None, str]], since: float, rng: object
+    ) -> None:
+        """Members that hear the same reports in any order decide the same, in every word."""
+        members = [member(f"{number:x}", cost, status) for number, cost, status in entries]
+        shuffled = list(members)
+        rng.shuffle(shuffled)  # type: ignore[attr-defined]
+        self.assertEqual(decided(*members, since=since), decided(*shuffled, since=since))
+
+    @settings(max_examples=150, deadline=None, derandomize=True)
+    @given(REPORTS)
+    def test_assigned_agent_has_reported_and_is_good_enough(self, entries: list[tuple[int, float | None, str]]) -> None:
+        """After the waiting period one is assigned when anybody reported; nobody else beats it by the hysteresis."""
+        members = [member(f"{number:x}", cost, status) for number, cost, status in entries]
+        costs = {m.uuid: m.cost for m in members if m.cost is not None}
+        decision = decided(*members)
+        if not costs:
+            self.assertIsNone(decision.assigned)
+            return
+        assert decision.assigned is not None
+        chosen = costs[decision.assigned]
+        self.assertTrue(chosen == min(costs.values()) or min(costs.values()) >= chosen * 0.9)

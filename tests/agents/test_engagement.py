@@ -1,0 +1,294 @@
+"""Tests of ``agents.engagement``: one agent's part in one task, on a turned clock."""
+
+from __future__ import annotations
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from agents.behaviour import STAND
+from agents.engagement import SEARCH_TTL, Deed, Engagement
+from drivers.reading import Action, Observation
+from middleware.consensus.lease import Lease
+from middleware.consensus.nearest import Nearest
+from middleware.entangled.clock import HeapClock
+from middleware.entangled.identity import Identity
+from middleware.entangled.record import Record
+from middleware.presence import ASSIGNED, DONE, EXECUTING, SEARCHING, WAITING
+from middleware.tasks import CANCELLED, COMPLETED, MEMBER, RESULT, Member, Result, Task, group_key
+
+TASK = Task("t1", "find-target", "Find it", waiting_period=2.0)
+LOOK, GO, HOLD = {"base.wz": 1.0}, {"base.vx": 0.1}, {"base.wz": 0.0}
+ME = Identity(bytes([1]) * 32)
+
+
+class Dog:
+    """A behaviour whose body tells the cost that the test says, and needs ``steps`` steps to be done."""
+
+    def __init__(self) -> None:
+        self.cost: float | None = None
+        self.steps = 10**6
+        self.executed = 0
+
+    def look(self, seen: Observation, now: float) -> None:
+        """Take the cost from the observation."""
+        value = seen.values["cost"]
+        self.cost = None if isinstance(value, str) else float(value)
+
+    def search(self, now: float) -> Action:
+        """Look around."""
+        return LOOK
+
+    def hold(self, now: float) -> Action:
+        """Stand."""
+        return HOLD
+
+    def execute(self, now: float) -> Action | None:
+        """Go on, from where it was."""
+        self.executed += 1
+        return None if self.executed > self.steps else GO
+
+
+class Council:
+    """The lessee's side of a council that grants when the test says so, and writes down what happens."""
+
+    def __init__(self, clock: HeapClock, events: list[str]) -> None:
+        self.is_wanted = False
+        self.token = 0
+        self.deadline = 0.0
+        self._clock = clock
+        self._events = events
+
+    @property
+    def lease(self) -> Lease | None:
+        """The lease while it is valid."""
+        held = self.token and self._clock.seconds() < self.deadline
+        return Lease("t1", self.token, self.deadline) if held else None
+
+    def want(self) -> None:
+        """Note the wish."""
+        self.is_wanted = True
+
+    def release(self) -> None:
+        """Give it back."""
+        if self.token:
+            self._events.append("released")
+        self.is_wanted, self.token = False, 0
+
+    def grant(self, token: int, ttl: float = 1.5) -> None:
+        """Let the agent have it."""
+        self.token, self.deadline = token, self._clock.seconds() + ttl
+
+
+class EngagementTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.clock = HeapClock()
+        self.events: list[str] = []
+        self.told: list[Member] = []
+        self.results: list[Result] = []
+        self.said: list[str] = []
+        self.dog = Dog()
+        self.council = Council(self.clock, self.events)
+        self.others = {n: Identity(bytes([n]) * 32) for n in (2, 3)}
+        self.engagement = Engagement(
+            TASK,
+            Member(ME.node_id.hex(), "dog1", ""),
+            self.dog,
+            Nearest(),
+            self.clock,
+            4,
+            self.told.append,
+            self.results.append,
+            self.said.append,
+            lambda: self.events.append("halted"),
+        )
+        self.engagement.lessee = self.council  # type: ignore[assignment]
+
+    def report(self, number: int, cost: float | None, status: str = WAITING) -> Record:
+        """What another dog reports, as it comes from the network."""
+        owner = self.others[number]
+        member = Member(owner.node_id.hex(), f"dog{number}", status, cost)
+        return Record(group_key("t1"), MEMBER, owner.public, 1, "leased", 1.0, member.packed())
+
+    def outcome(self, outcome: str, by: str) -> Record:
+        """How the task ended."""
+        value = Result(outcome, by, 1.0, 5).packed()
+        return Record(group_key("t1"), RESULT, self.others[2].public, 1, "team", 60.0, value)
+
+    def see(self, cost: float | None) -> None:
+        """Let the body measure."""
+        self.engagement.look(Observation(0.0, 0.0, {"cost": "none" if cost is None else cost}))
+
+    def step(self) -> Deed:
+        """One step that has to give a deed."""
+        deed = self.engagement.step()
+        assert deed is not None
+        return deed
+
+    def acting(self, token: int = 5) -> None:
+        """Bring the agent to where it acts: nearest of two, lease granted."""
+        self.engagement.heard([self.report(2, 2.0)])
+        self.see(1.0)
+        self.step()
+        self.council.grant(token)
+        self.assertEqual(self.step().action, GO)
+
+    def test_states_follow_the_thesis(self) -> None:
+        """An agent is ASSIGNED, SEARCHING until it can report, then WAITING, EXECUTING with the lease, DONE."""
+        self.assertEqual(self.engagement.me.status, ASSIGNED)
+        self.engagement.heard([self.report(2, None)])
+        self.assertEqual(self.step().action, LOOK)
+        self.see(1.0)
+        self.assertEqual(self.step().action, HOLD)
+        self.engagement.heard([self.report(2, 2.0)])
+        self.step()
+        self.council.grant(5)
+        self.assertEqual(self.step().action, GO)
+        self.engagement.heard([self.outcome(COMPLETED, "dog1")])
+        statuses = list(dict.fromkeys(member.status for member in self.told))
+        self.assertEqual(statuses, [SEARCHING, WAITING, EXECUTING, DONE])
+
+    def test_nothing_is_executed_without_a_lease(self) -> None:
+        """The one that should act only stands by until the council grants, and again when the lease has run out."""
+        self.engagement.heard([self.report(2, 2.0)])
+        self.see(1.0)
+        for _ in range(5):
+            self.assertEqual(self.step().action, HOLD)
+            self.clock.advance(0.05)
+        self.assertTrue(self.council.is_wanted)
+        self.assertEqual(self.dog.executed, 0)
+        self.council.grant(5)
+        deed = self.step()
+        self.assertEqual((deed.action, deed.permit.token, deed.permit.deadline), (GO, 5, self.council.deadline))
+        self.clock.advance(1.6)
+        self.assertEqual(self.step().action, HOLD)
+        self.assertEqual(self.events, ["halted"])
+
+    def test_looking_around_is_permitted_for_a_moment_only(self) -> None:
+        """A motion that needs no lease carries the highest token that the body obeyed, and a short deadline."""
+        permit = self.step().permit
+        self.assertEqual((permit.token, permit.deadline), (4, self.clock.seconds() + SEARCH_TTL))
+
+    def test_lease_is_not_claimed_by_those_that_stand_by(self) -> None:
+        """An agent that is not the assigned one claims nothing."""
+        self.engagement.heard([self.report(2, 0.5)])
+        self.see(1.0)
+        self.step()
+        self.assertFalse(self.council.is_wanted)
+        self.assertEqual(self.engagement.me.assigned, self.others[2].node_id.hex())
+
+    def test_body_stops_before_the_lease_goes_back(self) -> None:
+        """When a better report takes the task away, the body is stopped first and the lease is given back after."""
+        self.acting()
+        self.engagement.heard([self.report(2, 0.5)])
+        self.assertEqual(self.step().action, HOLD)
+        self.assertEqual(self.events, ["halted", "released"])
+        self.assertIn("gives the task back", self.said)
+
+    def test_report_within_the_hysteresis_changes_nothing(self) -> None:
+        """A late report that is hardly better leaves the task where it is."""
+        self.acting()
+        self.engagement.heard([self.report(2, 0.95)])
+        self.assertEqual(self.step().action, GO)
+        self.assertEqual(self.events, [])
+
+    def test_member_that_left_is_decided_without(self) -> None:
+        """When the assigned agent disappears, the next one claims the lease at its next step."""
+        self.engagement.heard([self.report(2, 0.5, EXECUTING), self.report(3, 3.0)])
+        self.see(1.0)
+        self.step()
+        self.assertFalse(self.council.is_wanted)
+        self.engagement.heard([self.report(3, 3.0)])
+        self.step()
+        self.assertTrue(self.council.is_wanted)
+
+    def test_moved_target_is_reported_again(self) -> None:
+        """A distance that grew is reported anew by everybody; one that shrank only by those that do not walk."""
+        self.see(1.0)
+        self.see(1.1)
+        self.assertEqual([m.cost for m in self.told], [1.0])
+        self.see(1.5)
+        self.see(0.6)
+        self.assertEqual([m.cost for m in self.told], [1.0, 1.5, 0.6])
+        self.engagement.heard([self.report(2, 2.0)])
+        self.step()
+        self.council.grant(5)
+        self.step()
+        self.see(0.1)
+        self.assertEqual(self.engagement.me.cost, 0.6)
+        self.see(1.9)
+        self.assertEqual(self.engagement.me.cost, 1.9)
+
+    def test_lost_sight_is_reported(self) -> None:
+        """Who loses the target takes its report back, and searches."""
+        self.see(1.0)
+        self.see(None)
+        self.assertIsNone(self.engagement.me.cost)
+        self.assertEqual(self.step().action, LOOK)
+
+    def test_lost_body_is_reported(self) -> None:
+        """An agent whose robot does not answer leaves the task to the others and gives the lease back."""
+        self.acting()
+        self.engagement.lose_body()
+        self.clock.advance(2.1)
+        self.step()
+        self.assertEqual(self.engagement.me.assigned, self.others[2].node_id.hex())
+        self.assertEqual(self.events, ["halted", "released"])
+
+    def test_renewed_lease_goes_on_and_does_not_start_over(self) -> None:
+        """While the token stays the same the execution goes on: nothing is said twice, nothing begins again."""
+        self.acting()
+        for _ in range(40):
+            self.clock.advance(0.05)
+            self.council.grant(5)
+            self.assertEqual(self.step().action, GO)
+        self.assertEqual(self.dog.executed, 41)
+        self.assertEqual([line for line in self.said if line.startswith("goes")], ["goes: dog1 with 1.00 of 2 reports"])
+        self.assertEqual(self.events, [])
+
+    def test_highest_token_is_remembered(self) -> None:
+        """After a lease the body's own motions carry its token, so that the driver does not refuse them."""
+        self.acting(9)
+        self.clock.advance(2.0)
+        self.assertEqual(self.step().permit.token, 9)
+
+    def test_done_is_recorded_and_the_lease_kept_until_it_is_known(self) -> None:
+        """The finished agent stops, records the outcome once, and gives the lease back when the outcome is known."""
+        self.dog.steps = 1
+        self.acting()
+        deed = self.step()
+        self.assertEqual((deed.action, deed.permit.token), (STAND, 5))
+        self.assertIsNone(self.engagement.step())
+        self.assertEqual([(r.outcome, r.by, r.token) for r in self.results], [(COMPLETED, "dog1", 5)])
+        self.assertEqual(self.results[0].bids, (("dog1", 1.0), ("dog2", 2.0)))
+        self.assertEqual(self.events, ["halted"])
+        self.engagement.heard([self.outcome(COMPLETED, "dog1")])
+        self.engagement.abandon()
+        self.assertEqual(self.events[-1], "released")
+
+    def test_outcome_of_another_ends_it_at_once(self) -> None:
+        """A task that was cancelled or done by another is over: the body stops and no step follows."""
+        self.acting()
+        self.engagement.heard([self.outcome(CANCELLED, "vaio")])
+        self.assertTrue(self.engagement.is_over)
+        self.assertEqual(self.events, ["halted"])
+        self.assertIsNone(self.engagement.step())
+        self.assertEqual(self.said[-1], "cancelled by vaio")
+        self.see(0.5)
+
+    def test_own_report_from_the_network_is_not_a_second_member(self) -> None:
+        """The agent's own record that comes back does not count as another's."""
+        own = Member(ME.node_id.hex(), "dog1", WAITING, 9.0)
+        self.engagement.heard([Record(group_key("t1"), MEMBER, ME.public, 1, "leased", 1.0, own.packed())])
+        self.see(1.0)
+        self.step()
+        self.assertEqual(self.engagement.me.why, "dog1 with 1.00 of 1 reports")
+
+    def test_unchanged_reports_are_told_once(self) -> None:
+        """Deciding the same again tells nobody anything."""
+        self.engagement.heard([self.report(2, 0.5)])
+        self.see(1.0)
+        self.step()
+        before = len(self.told)
+        for _ in range(20):
+            self.clock.advance(0.05)
+            self.step()
+        self.assertEqual(len(self.told), before)

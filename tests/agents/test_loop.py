@@ -1,0 +1,185 @@
+"""Tests of ``agents.loop``: the agent between its node and its body, in a small team in memory."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from twisted.internet.defer import Deferred
+from twisted.internet.task import deferLater
+from twisted.trial.unittest import SynchronousTestCase
+
+from agents.loop import Agent
+from drivers.driver import Permit
+from drivers.errors import NotEnabled
+from drivers.reading import Action
+from middleware.consensus.lease import Lease
+from middleware.tasks import Task
+from rehearsal import VirtualTeam
+
+
+class LoopTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.team = VirtualTeam(11, dogs=("dog1", "dog2"))
+        self.addCleanup(self.team.stop)
+        self.agent = self.agent_of("dog1")
+
+    def agent_of(self, name: str) -> Agent:
+        """The agent of a dog."""
+        agent = self.team.services[name].assembly.agent
+        assert isinstance(agent, Agent)
+        return agent
+
+    def submit(self, **fields: Any) -> None:
+        """Publish a task of one's own making, past the desk and its catalogue."""
+        task = Task(**{"task_id": "t1", "kind": "turn-around", "title": "Odd", **fields})
+        node = self.team.services["vaio"].assembly.node
+        Deferred.fromCoroutine(node.submit(task))
+        self.team.clock.advance(1.0)
+
+    def device(self, name: str) -> dict[str, Any]:
+        """A device as the page shows it."""
+        return next(dict(row) for row in self.team.state()["devices"] if row["name"] == name)
+
+    def lines(self, name: str) -> list[str]:
+        """The messages of a device."""
+        return [text for _, text in self.device(name)["messages"]]
+
+    def test_no_command_before_the_motors_are_on(self) -> None:
+        """An agent whose task comes while its robot wakes up waits: not one command is refused by the robot."""
+        self.submit()
+        refused: list[str] = []
+        self.team.add("dog3")
+        driver: Any = self.team.services["dog3"].assembly.driver
+        act = driver.act
+
+        def watched(action: Action, permit: Permit) -> Action:
+            try:
+                done: Action = act(action, permit)
+                return done
+            except NotEnabled as error:
+                refused.append(str(error))
+                raise
+
+        enable = driver.enable
+        driver.act = watched
+        driver.enable = lambda: deferLater(self.team.clock, 1.5, enable)  # a robot that is slow to wake up
+        self.team.clock.advance(1.3)
+        self.assertIsNot(self.agent_of("dog3")._engagement, None)
+        self.assertFalse(self.agent_of("dog3")._is_awake)
+        self.team.clock.advance(2.0)
+        self.assertTrue(self.agent_of("dog3")._is_awake)
+        self.assertEqual(refused, [])
+
+    def test_motors_are_asked_for_until_they_are_on(self) -> None:
+        """A link that breaks while the motors are switched on is tried again until the robot is awake."""
+        self.team.add("dog3")
+        service = self.team.services["dog3"]
+        connector = service._seams.connector
+        driver: Any = service.assembly.driver
+        while driver.state == "connecting" or not connector.links:
+            self.team.clock.advance(0.0005)
+        connector.cut()
+        self.team.clock.advance(3.0)
+        self.team.desk.assign("turn-around")
+        self.team.clock.advance(1.0)
+        self.assertTrue(self.agent_of("dog3")._is_awake)
+        self.assertIsNot(self.agent_of("dog3")._engagement, None)
+
+    def test_every_motion_of_the_task_is_under_a_lease(self) -> None:
+        """While a dog turns for its task each command carries token and deadline of a lease that is valid then."""
+        bad: list[object] = []
+        count = 0
+        for name in ("dog1", "dog2"):
+            agent = self.agent_of(name)
+            driver: Any = agent._driver
+
+            def watched(action: Action, permit: Permit, agent: Agent = agent, act: Any = driver.act) -> Action:
+                nonlocal count
+                if any(action.values()):
+                    count += 1
+                    engagement = agent._engagement
+                    lease = None if engagement is None or engagement.lessee is None else engagement.lessee.lease
+                    if lease != Lease("t1", permit.token, permit.deadline):
+                        bad.append((action, permit, lease))
+                done: Action = act(action, permit)
+                return done
+
+            driver.act = watched
+        self.submit()
+        self.team.clock.advance(8.0)
+        self.assertGreater(count, 20)
+        self.assertEqual(bad, [])
+        self.assertEqual(self.team.state()["tasks"][0]["status"], "COMPLETED")
+
+    def test_task_of_unknown_kind_is_left_and_said(self) -> None:
+        """A task that no behaviour is known for leaves a line on the device, and the next task is done."""
+        self.submit(kind="os:system")
+        self.assertIn("no behaviour for a task of kind 'os:system'", self.lines("dog1")[-1])
+        self.submit(task_id="t2", created=1.0)
+        self.team.clock.advance(8.0)
+        self.assertEqual(self.team.state()["tasks"][0]["status"], "COMPLETED")
+
+    def test_strategy_is_never_imported_from_a_task(self) -> None:
+        """A task that brings a strategy as a module's path is left, with a line that says why."""
+        self.submit(strategy="os:system")
+        self.assertIn("no strategy is called 'os:system'", self.lines("dog1")[-1])
+        self.submit(task_id="t2", created=1.0, strategy="loudest")
+        self.assertIn("no strategy is called 'loudest'", self.lines("dog1")[-1])
+
+    def test_odd_parameters_do_not_stop_the_agent(self) -> None:
+        """Parameters from the wire that no behaviour can have cost the task and nothing else."""
+        self.submit(kind="find-target", parameters={"target_radius": 0.0})
+        self.assertIn("cannot have these parameters", self.lines("dog1")[-1])
+        self.submit(task_id="t2", created=1.0)
+        self.team.clock.advance(8.0)
+        self.assertEqual(self.team.state()["tasks"][0]["status"], "COMPLETED")
+
+    def test_old_task_that_is_done_is_not_begun_again(self) -> None:
+        """A dog that comes after the end of a task does not take it up."""
+        self.submit()
+        self.team.clock.advance(8.0)
+        self.team.add("dog3")
+        self.team.clock.advance(3.0)
+        self.assertEqual(self.device("dog3")["status"], "IDLE")
+        self.assertEqual(self.agent_of("dog3")._open, {})
+
+    def test_task_is_taken_up_when_nobody_could_tell_at_first(self) -> None:
+        """A task whose group nobody answers for is asked about again, without any other event."""
+        agent = self.agent_of("dog1")
+        node = agent._node
+        get, tries = node.entangled.get, []
+
+        def silent(key: bytes) -> Any:
+            tries.append(key)
+            return (
+                get(key)
+                if len(tries) > 2
+                else node.entangled.endpoint.greet(node.entangled.contact.address._replace(port=9), 0.1)
+            )
+
+        node.entangled.get = silent  # type: ignore[method-assign]
+        self.submit()
+        self.team.clock.advance(2.0)
+        self.assertGreaterEqual(len(tries), 3)
+        self.assertIsNot(agent._engagement, None)
+
+    def test_robot_that_the_yard_does_not_have_is_said(self) -> None:
+        """A device whose robot does not exist says so, and the others do the task without it."""
+        self.team.yard.world.dogs["ghost"] = self.team.yard.world.dogs.pop("dog3")
+        self.team.add("dog3")
+        self.team.clock.advance(2.0)
+        self.assertIn("has no robot: no robot is named 'dog3'", self.lines("dog3")[-1])
+        self.submit(waiting_period=2.0)
+        self.team.clock.advance(12.0)
+        self.assertEqual(self.team.state()["tasks"][0]["status"], "COMPLETED")
+        self.assertNotEqual(self.team.state()["tasks"][0]["result"]["by"], "dog3")
+
+    def test_stopped_agent_stands_still(self) -> None:
+        """An agent that is stopped while its robot moves leaves it at rest."""
+        self.submit()
+        self.team.clock.advance(1.0)
+        moving = [dog.name for dog in self.team.yard.world.dogs.values() if dog.is_moving]
+        self.assertEqual(len(moving), 1)
+        self.successResultOf(self.agent_of(moving[0]).stopService())
+        self.team.clock.advance(0.3)
+        self.assertFalse(self.team.yard.world.dogs[moving[0]].is_moving)

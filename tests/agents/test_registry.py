@@ -1,0 +1,28 @@
+"""Tests of ``agents.registry``."""
+
+from __future__ import annotations
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from agents.loop import Agent
+from agents.registry import agent_named
+from middleware.errors import UnknownAgent
+
+
+class RegistryTests(SynchronousTestCase):
+    def test_agents_are_found_by_name_or_path(self) -> None:
+        """A built-in agent is found by its name, one's own by module and class."""
+        self.assertIs(agent_named("search"), Agent)
+        self.assertIs(agent_named("agents.loop:Agent"), Agent)
+
+    def test_unknown_agent_is_refused_with_the_known(self) -> None:
+        """A name that is no agent is refused with those there are."""
+        error = self.assertRaises(UnknownAgent, agent_named, "serch")
+        self.assertEqual(str(error), "no agent is called 'serch'; there are search, or write module:Class")
+
+    def test_agent_that_cannot_be_loaded_says_why(self) -> None:
+        """A module or class that is not there is named."""
+        for name in ("no_such_module:Mind", "agents.loop:Mind"):
+            error = self.assertRaises(UnknownAgent, agent_named, name)
+            self.assertIn("cannot be loaded", str(error))
+            self.assertIn(name.partition(":")[name.startswith("agents") * 2], str(error))

@@ -1,0 +1,57 @@
+"""Tests of ``agents.turn``."""
+
+from __future__ import annotations
+
+import math
+import random
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from agents.behaviour import STAND
+from agents.turn import TurnAround
+from drivers.reading import Observation, Value
+
+
+def seen(**values: Value) -> Observation:
+    """An observation; ``odom_yaw`` stands for ``odom.yaw``."""
+    return Observation(0.0, 0.0, {key.replace("_", "."): value for key, value in values.items()})
+
+
+class TurnTests(SynchronousTestCase):
+    def test_cost_is_the_charge_used_up(self) -> None:
+        """The dog with the most charge left has the lowest cost; without a reading there is no report."""
+        turn = TurnAround({}, random.Random(1))
+        self.assertIsNone(turn.cost)
+        turn.look(seen(odom_yaw=0.0), 0.0)
+        self.assertIsNone(turn.cost)
+        turn.look(seen(power_level=0.75), 0.0)
+        self.assertEqual(turn.cost, 0.25)
+
+    def test_one_turn_and_no_more(self) -> None:
+        """The dog turns until it has turned once, across the seam of the angle, and not for what it turned before."""
+        turn = TurnAround({}, random.Random(1))
+        yaw = 2.0
+        for _ in range(20):
+            yaw += 0.3
+            turn.look(seen(odom_yaw=math.remainder(yaw, math.tau)), 0.0)
+        start = yaw
+        while (action := turn.execute(0.0)) is not None:
+            self.assertGreater(action["base.wz"], 0.0)
+            yaw += 0.05
+            turn.look(seen(odom_yaw=math.remainder(yaw, math.tau)), 0.0)
+        self.assertLess(abs(yaw - start - math.tau), 0.11)
+
+    def test_turns_can_be_chosen(self) -> None:
+        """The task says how many turns; half a turn is done after half a circle, and unlawful numbers are refused."""
+        turn = TurnAround({"turns": 0.5}, random.Random(1))
+        turn.execute(0.0)
+        for step in range(33):
+            turn.look(seen(odom_yaw=step * 0.1), 0.0)
+        self.assertIsNone(turn.execute(0.0))
+        for wrong in (-1.0, math.inf, math.nan, 1e9, "often"):
+            self.assertRaises(ValueError, TurnAround, {"turns": wrong}, random.Random(1))
+
+    def test_others_stand(self) -> None:
+        """Whoever does not act stands still."""
+        turn = TurnAround({}, random.Random(1))
+        self.assertEqual((turn.search(0.0), turn.hold(0.0)), (STAND, STAND))

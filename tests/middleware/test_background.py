@@ -1,0 +1,102 @@
+"""Tests of the work that nobody waits for."""
+
+from __future__ import annotations
+
+from twisted.internet.defer import Deferred, fail, succeed
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.entangled.background import Background, first
+from middleware.entangled.clock import HeapClock
+from middleware.entangled.errors import NoAnswer, Refused
+
+
+async def wait(deferred: Deferred[int]) -> int:
+    """The result of ``deferred``."""
+    return await deferred
+
+
+class BackgroundTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.clock = HeapClock()
+        self.chores = Background(self.clock)
+        self.runs: list[object] = []
+
+    def test_later_and_cancel(self) -> None:
+        """What is put off runs once with its arguments, unless it is prevented; to prevent it late is harmless."""
+        prevent = self.chores.later(1.0, self.runs.append, "a")
+        self.chores.later(1.0, self.runs.append, "b")()
+        self.clock.advance(2.0)
+        prevent()
+        self.assertEqual(self.runs, ["a"])
+
+    def test_every_survives_an_accident(self) -> None:
+        """A chore that fails once is done again the next time."""
+
+        def work() -> None:
+            self.runs.append(1)
+            if len(self.runs) == 1:
+                raise ZeroDivisionError
+
+        self.chores.every(1.0, work)
+        self.assertRaises(ZeroDivisionError, self.clock.advance, 1.0)
+        self.clock.advance(2.0)
+        self.assertEqual(len(self.runs), 3)
+
+    def test_stop_leaves_nothing(self) -> None:
+        """After the stop no timer is left, nothing new begins, and who sleeps is not woken."""
+        self.chores.every(1.0, lambda: self.runs.append(1))
+        sleep = self.chores.sleep(1.0)
+        self.chores.stop()
+        self.chores.later(1.0, self.runs.append, 1)
+        self.assertEqual(self.clock.getDelayedCalls(), [])
+        self.clock.advance(3.0)
+        self.assertNoResult(sleep)
+        self.assertEqual(self.runs, [])
+
+    def test_sleep(self) -> None:
+        """Who sleeps is woken in time."""
+        sleep = self.chores.sleep(1.0)
+        self.clock.advance(0.9)
+        self.assertNoResult(sleep)
+        self.clock.advance(0.2)
+        self.successResultOf(sleep)
+
+    def test_fork_hears_only_accidents(self) -> None:
+        """The weather and a refusal end work quietly, anything else is logged."""
+        for error in (NoAnswer("x"), Refused("x"), ZeroDivisionError()):
+            self.chores.fork(wait(fail(error)))
+        self.assertEqual(len(self.flushLoggedErrors()), 1)
+
+
+class FirstTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.asked: list[Deferred[int]] = [Deferred() for _ in range(3)]
+
+    def begin(self, needed: int) -> Deferred[list[int]]:
+        """Wait for ``needed`` of three."""
+        return Deferred.fromCoroutine(first(needed, [wait(d) for d in self.asked]))
+
+    def test_enough(self) -> None:
+        """As many as are needed settle it, in the order in which they came; what comes later changes nothing."""
+        result = self.begin(2)
+        self.asked[2].callback(2)
+        self.assertNoResult(result)
+        self.asked[0].callback(0)
+        results = self.successResultOf(result)
+        self.asked[1].callback(1)
+        self.assertEqual(results, [2, 0])
+
+    def test_too_few(self) -> None:
+        """Where too many fail, those that succeeded are the result."""
+        result = self.begin(3)
+        self.asked[0].errback(NoAnswer("x"))
+        self.asked[1].callback(1)
+        self.assertNoResult(result)
+        self.asked[2].errback(Refused("x"))
+        self.assertEqual(self.successResultOf(result), [1])
+
+    def test_nothing_to_wait_for(self) -> None:
+        """Nothing needed, or nothing to do, is settled at once."""
+        self.assertEqual(self.successResultOf(self.begin(0)), [])
+        self.assertEqual(self.successResultOf(Deferred.fromCoroutine(first(2, []))), [])
+        self.assertEqual(self.successResultOf(Deferred.fromCoroutine(first(1, [wait(succeed(7))]))), [7])

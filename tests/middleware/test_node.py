@@ -1,0 +1,556 @@
+"""Tests of the library's node: a fleet of them on simulated time and a switchboard."""
+
+from __future__ import annotations
+
+import random
+from typing import Any
+
+import msgpack
+
+from middleware.entangled.errors import Alone, NoAnswer, NotRunning, Refused, TooLarge
+from middleware.entangled.network.switchboard import Weather
+from middleware.entangled.node import CONTACTS, EntangledNode
+from middleware.entangled.record import MAX_NAME, MAX_VALUE, Record, hashed_key
+from middleware.entangled.replica import SWEEP
+from tests.fleet import Fleet, FleetCase
+
+KEY = hashed_key("devices")
+ROUGH = Weather(delay_s=0.01, jitter_s=0.01, loss=0.3, duplicate=0.05, reorder=0.1)
+
+
+class NodeCase(FleetCase):
+    """A few words for what most tests do."""
+
+    def values(self, fleet: Fleet, place: int, key: bytes = KEY, within: float = 3.0) -> list[bytes | None]:
+        """What a node finds under ``key``."""
+        return [record.value for record in self.done(fleet, fleet.nodes[place].get(key), within)]
+
+    def watched(self, node: EntangledNode, **options: Any) -> list[list[bytes | None]]:
+        """All that a watch tells, from now on."""
+        told: list[list[bytes | None]] = []
+        node.watch(KEY, lambda records: told.append([r.value for r in records]), **options)
+        return told
+
+
+class VerbTests(NodeCase):
+    def test_put_and_get(self) -> None:
+        """What one node puts, every node finds; a majority has it."""
+        fleet = self.fleet(4)
+        self.assertGreaterEqual(self.done(fleet, fleet.nodes[1].put(KEY, "state", b"one")), 3)
+        for place in range(4):
+            self.assertEqual(self.values(fleet, place), [b"one"])
+
+    def test_owners_do_not_disturb_each_other(self) -> None:
+        """Several owners write under one key, each in its slot, and the newest value of each is found."""
+        fleet = self.fleet(3)
+        for value in (b"old", b"new"):
+            for node in fleet.nodes[:2]:
+                node.put(KEY, "state", value)
+        fleet.run(1.0)
+        self.assertEqual(self.values(fleet, 2), [b"new", b"new"])
+
+    def test_remove(self) -> None:
+        """A removed record is gone for all and stays gone, and its slot can be filled again."""
+        fleet = self.fleet(3)
+        self.done(fleet, fleet.nodes[0].put(KEY, "state", b"one"))
+        self.done(fleet, fleet.nodes[0].remove(KEY, "state"))
+        self.assertEqual(self.values(fleet, 2), [])
+        fleet.run(60.0)
+        self.assertEqual(self.values(fleet, 1), [])
+        self.done(fleet, fleet.nodes[0].put(KEY, "state", b"two"))
+        self.assertEqual(self.values(fleet, 2), [b"two"])
+
+    def test_a_node_alone(self) -> None:
+        """A node alone keeps, finds and watches its own records, leases included."""
+        fleet = self.fleet(1)
+        told = self.watched(fleet.nodes[0])
+        self.assertEqual(self.done(fleet, fleet.nodes[0].put(KEY, "state", b"one", "leased")), 1)
+        self.assertEqual(self.values(fleet, 0), [b"one"])
+        self.assertEqual(told, [[b"one"]])
+
+    def test_wrong_calls_fly(self) -> None:
+        """What cannot be stored raises at once, and nothing can be asked of a node that does not run."""
+        fleet = self.fleet(1)
+        node = fleet.nodes[0]
+        self.assertRaises(TooLarge, node.put, KEY, "state", bytes(MAX_VALUE + 1))
+        self.assertRaises(TooLarge, node.put, KEY, "ä" * MAX_NAME, b"")
+        for call in (lambda: node.put(b"x", "s", b""), lambda: node.get(b"x"), lambda: node.watch(b"x", print)):
+            self.assertRaises(ValueError, call)
+        node.stop()
+        for call in (lambda: node.put(KEY, "s", b""), lambda: node.get(KEY), lambda: node.watch(KEY, print)):
+            self.assertRaises(NotRunning, call)
+
+    def test_the_largest_record(self) -> None:
+        """The largest value under the longest name travels, several of them page by page, with many small ones."""
+        fleet = self.fleet(2)
+        for place in range(12):
+            name = f"{place:02}" + "ä" * (MAX_NAME // 2 - 1)
+            fleet.nodes[0].put(KEY, name, bytes([place]) * (MAX_VALUE if place < 4 else 1))
+        fleet.run(1.0)
+        self.assertEqual(len(self.values(fleet, 1)), 12)
+
+    def test_no_majority(self) -> None:
+        """A record that no majority takes is not said to be stored; a read that nobody answers fails."""
+        fleet = self.fleet(4)
+        for place in (1, 2, 3):
+            fleet.board.kill(fleet.address(place))
+        stored, read = fleet.nodes[0].put(KEY, "state", b"one"), fleet.nodes[0].get(KEY)
+        fleet.run(4.0)
+        self.failureResultOf(stored, NoAnswer)
+        self.failureResultOf(read, Alone)
+
+    def test_find_node(self) -> None:
+        """A lookup finds the closest others."""
+        fleet = self.fleet(4)
+        target = fleet.nodes[2].identity.node_id
+        self.assertEqual(self.done(fleet, fleet.nodes[0].find_node(target))[0], fleet.nodes[2].contact)
+
+    def test_earlier_life_is_stepped_over(self) -> None:
+        """A node that lost its store writes over what its former life has left, even by the same number."""
+        for writes in (1, 3):
+            fleet = self.fleet(3, seed=writes)
+            for number in range(writes):
+                self.done(fleet, fleet.nodes[2].put(KEY, "state", b"old %d" % number))
+            fleet.nodes[2].vanish()
+            fleet.stores.pop(2)
+            node = fleet.restart(2)
+            fleet.run(1.0)
+            first, second = node.put(KEY, "state", b"newer"), node.put(KEY, "state", b"newest")
+            fleet.run(3.0)
+            self.successResultOf(first)
+            self.successResultOf(second)
+            self.assertEqual(self.values(fleet, 0), [b"newest"])
+
+
+class LeaseTests(NodeCase):
+    def test_vanish_with_the_owner(self) -> None:
+        """What a node owns on lease stays while it lives, and is gone within one lease and a sweep of its death."""
+        fleet = self.fleet(4)
+        fleet.nodes[3].put(KEY, "state", b"here", "leased")
+        fleet.run(30.0)
+        told = self.watched(fleet.nodes[1])
+        fleet.run(2.5)
+        self.assertEqual(told, [[b"here"]])
+        fleet.nodes[3].vanish()
+        fleet.run(0.6)
+        self.assertEqual(told, [[b"here"]])
+        fleet.run(1.0 - 0.6 + 2 * SWEEP)
+        self.assertEqual(told, [[b"here"], []])
+        self.assertEqual(self.values(fleet, 0), [])
+
+    def test_two_die_at_once(self) -> None:
+        """A dead replica does not keep the lease of one that died with it."""
+        fleet = self.fleet(4)
+        for node in fleet.nodes[2:]:
+            node.put(KEY, "state", b"here", "leased")
+        told = self.watched(fleet.nodes[0])
+        fleet.run(5.0)
+        for node in fleet.nodes[2:]:
+            node.vanish()
+        fleet.run(1.0 + 2 * SWEEP)
+        self.assertEqual(told[-1], [])
+
+    def test_goodbye(self) -> None:
+        """What a node leased leaves with it at once when it says goodbye, and comes back with it."""
+        fleet = self.fleet(3)
+        fleet.nodes[2].put(KEY, "state", b"here", "leased")
+        told = self.watched(fleet.nodes[0])
+        fleet.run(3.0)
+        fleet.nodes[2].stop()
+        fleet.run(0.05)
+        self.assertEqual(told, [[b"here"], []])
+        fleet.restart(2).put(KEY, "state", b"back", "leased")
+        fleet.run(1.0)
+        self.assertEqual(told[-1], [b"back"])
+
+    def test_lost_replica_is_mended(self) -> None:
+        """A replica that lost a lease gets it again within a few beats."""
+        fleet = self.fleet(3)
+        fleet.nodes[2].put(KEY, "state", b"here", "leased")
+        fleet.run(1.0)
+        fleet.stores[0].drop_leased(fleet.nodes[2].identity.public)
+        fleet.run(1.5)
+        self.assertEqual([r.value for r in fleet.stores[0].get(KEY)], [b"here"])
+
+    def test_replica_lets_go_of_what_it_holds_in_vain(self) -> None:
+        """An old lease that a replica still has, and that its owner does not know any more, goes in a few beats."""
+        fleet = self.fleet(3)
+        old = Record(KEY, "old", fleet.nodes[2].identity.public, 1, "leased", 1.0, b"old").signed(fleet.identity(2))
+        fleet.nodes[2].put(KEY, "state", b"here", "leased")
+        fleet.nodes[0].replica.keep(old)
+        fleet.run(3.0)
+        self.assertEqual([r.value for r in fleet.stores[0].get(KEY)], [b"here"])
+
+    def test_short_silence_ends_no_lease(self) -> None:
+        """A cut of half a lease costs nobody its place; a long one does, and after it all is back."""
+        fleet = self.fleet(3)
+        fleet.nodes[2].put(KEY, "state", b"here", "leased")
+        told = self.watched(fleet.nodes[0])
+        fleet.run(2.0)
+        for seconds, expected in ((0.5, [[b"here"]]), (3.0, [[b"here"], []])):
+            fleet.board.partition([fleet.address(2)])
+            fleet.run(seconds)
+            fleet.board.heal()
+            self.assertEqual(told, expected)
+            fleet.run(5.0)
+        self.assertEqual(told, [[b"here"], [], [b"here"]])
+
+
+class TeamRecordTests(NodeCase):
+    def test_outlive_the_writer(self) -> None:
+        """A team record is found when its writer is dead, also by a newcomer that the writer never saw."""
+        fleet = self.fleet(4)
+        self.done(fleet, fleet.nodes[3].put(KEY, "task", b"do it"))
+        fleet.nodes[3].vanish()
+        fleet.run(20.0)
+        fleet.add()
+        fleet.run(2.0)
+        self.assertEqual([r.value for r in fleet.stores[4].get(KEY)], [b"do it"])
+        self.assertEqual(self.values(fleet, 4), [b"do it"])
+
+    def test_pass_from_hand_to_hand(self) -> None:
+        """A record and a tombstone outlive every node that held them at first, one leaving after the other."""
+        fleet = self.fleet(3)
+        self.done(fleet, fleet.nodes[0].put(KEY, "task", b"do it"))
+        self.done(fleet, fleet.nodes[0].put(KEY, "gone", b"no"))
+        self.done(fleet, fleet.nodes[0].remove(KEY, "gone"))
+        for place in range(3):
+            fleet.nodes.append(fleet.made(3 + place))
+            fleet.enter(fleet.nodes[-1], [fleet.address(place)])
+            fleet.run(2.0)
+            fleet.nodes[place].vanish()
+            fleet.run(12.0)
+        self.assertEqual(self.values(fleet, 5), [b"do it"])
+        self.assertEqual(len(fleet.stores[5].get(KEY, tombstones=True)), 2)
+
+    def test_restart_brings_them_back(self) -> None:
+        """After all nodes were off at once, what their stores kept is there again, and no lease is."""
+        fleet = self.fleet(3)
+        self.done(fleet, fleet.nodes[1].put(KEY, "task", b"do it"))
+        fleet.nodes[1].put(KEY, "state", b"here", "leased")
+        fleet.run(1.0)
+        for node in fleet.nodes:
+            node.vanish()
+        fleet.run(5.0)
+        before = fleet.nodes[2].contact
+        for place in range(3):
+            fleet.restart(place)
+        fleet.run(3.0)
+        self.assertEqual(self.values(fleet, 2), [b"do it"])
+        self.assertEqual(fleet.nodes[2].contact, before)
+
+
+class WatchTests(NodeCase):
+    def test_changes_are_pushed(self) -> None:
+        """A watcher hears each change at once, without asking again."""
+        fleet = self.fleet(3)
+        told = self.watched(fleet.nodes[2])
+        fleet.run(0.5)
+        for value in (b"one", b"two"):
+            fleet.nodes[0].put(KEY, "state", value)
+            fleet.run(0.05)
+        fleet.nodes[0].remove(KEY, "state")
+        fleet.run(0.05)
+        self.assertEqual(told, [[b"one"], [b"two"], []])
+
+    def test_stop(self) -> None:
+        """After its end a watch tells nothing."""
+        fleet = self.fleet(2)
+        told: list[object] = []
+        watch = fleet.nodes[1].watch(KEY, told.append)
+        fleet.run(0.5)
+        watch.stop()
+        watch.stop()
+        fleet.nodes[0].put(KEY, "state", b"one")
+        fleet.run(1.0)
+        self.assertEqual(told, [])
+
+    def test_end_of_the_node_is_no_news(self) -> None:
+        """A node that stops does not tell its own subscribers that everybody has left."""
+        fleet = self.fleet(3)
+        told = self.watched(fleet.nodes[2])
+        fleet.nodes[0].put(KEY, "state", b"one", "leased")
+        fleet.run(1.99)
+        fleet.nodes[2].stop()
+        fleet.run(5.0)
+        self.assertEqual(told, [[b"one"]])
+
+    def test_failing_subscriber(self) -> None:
+        """A subscriber that fails is logged, and the others are told."""
+        fleet = self.fleet(2)
+        fleet.nodes[1].watch(KEY, lambda records: [][0])
+        told = self.watched(fleet.nodes[1])
+        fleet.nodes[0].put(KEY, "state", b"one")
+        fleet.run(1.0)
+        self.assertEqual(told, [[b"one"]])
+        self.assertEqual(len(self.flushLoggedErrors(IndexError)), 1)
+
+    def test_push_by_a_stranger(self) -> None:
+        """Only replicas that were asked are believed, and nothing malformed that they push changes anything."""
+        fleet = self.fleet(3)
+        told = self.watched(fleet.nodes[2])
+        fleet.run(0.5)
+        pusher, target = fleet.nodes[0].endpoint, fleet.nodes[2].contact
+        genuine = Record(KEY, "x", fleet.nodes[0].identity.public, 9, "team", 1.0, b"x").signed(fleet.identity(0))
+        forged = Record(KEY, "x", fleet.nodes[1].identity.public, 9, "team", 1.0, b"x", bytes(64))
+        bad: list[list[list[Any]]] = [
+            [[forged.packed()], []],
+            [[5, None, []], [5, [], [1, 2], [[], "x"], [b"", "x", 1]]],
+        ]
+        for records, gone in bad:
+            self.done(fleet, pusher.ask(target, "push", KEY, records, gone, changes=True), 0.5)
+        self.assertEqual(told, [])
+        fleet.nodes[2]._subscriber._watches[0].asked.clear()
+        self.done(fleet, pusher.ask(target, "push", KEY, [genuine.packed()], [], changes=True), 0.01)
+        self.assertEqual(told, [])
+
+    def test_rough_weather(self) -> None:
+        """With three of ten datagrams lost, each value arrives everywhere and the living stay in sight."""
+        for seed in range(3):
+            fleet = self.fleet(4, seed, ROUGH)
+            fleet.run(8.0)
+            tellings = [self.watched(node) for node in fleet.nodes]
+            for node in fleet.nodes:
+                stored = node.put(KEY, "state", node.identity.node_id[:2], "leased")
+                stored.addErrback(lambda failure: failure.trap(NoAnswer))
+            fleet.run(15.0)
+            everybody = sorted(node.identity.node_id[:2] for node in fleet.nodes)
+            for told in tellings:
+                self.assertEqual(sorted(told[-1], key=repr), sorted(everybody, key=repr), seed)
+            fleet.nodes[1].vanish()
+            fleet.run(8.0)
+            self.assertEqual({len(told[-1]) for place, told in enumerate(tellings) if place != 1}, {3}, seed)
+
+
+class KeepTests(NodeCase):
+    def setUp(self) -> None:
+        super().setUp()
+        self.world = self.fleet(14, seed=4)
+        key_id = int.from_bytes(KEY)
+        self.order = sorted(self.world.nodes, key=lambda n: int.from_bytes(n.identity.node_id) ^ key_id)
+        self.page, self.dog = self.order[-1], self.order[-2]
+
+    def test_copies_follow_what_is_seen(self) -> None:
+        """A node that does not hold a key has its records in its store while it watches with ``keep``."""
+        store = self.page.store
+        self.dog.put(KEY, "state", b"here", "leased")
+        self.world.run(1.0)
+        self.assertEqual(store.get(KEY), [])
+        watch = self.page.watch(KEY, lambda records: None, keep=True)
+        self.world.run(10.0)
+        self.assertEqual([r.value for r in store.get(KEY)], [b"here"])
+        self.dog.put(KEY, "state", b"there", "leased")
+        self.world.run(0.5)
+        self.assertEqual([r.value for r in store.get(KEY)], [b"there"])
+        self.dog.vanish()
+        self.world.run(1.0 + 3 * SWEEP)
+        self.assertEqual(store.get(KEY), [])
+        self.order[0].put(KEY, "task", b"do it")
+        self.world.run(1.0)
+        self.assertEqual([r.value for r in store.get(KEY)], [b"do it"])
+        watch.stop()
+        self.assertEqual(store.get(KEY), [])
+
+    def test_copies_are_nobodys_opinion(self) -> None:
+        """Nobody is answered from a copy, and none survives its node."""
+        self.dog.put(KEY, "state", b"here", "leased")
+        self.page.watch(KEY, lambda records: None, keep=True)
+        self.world.run(3.0)
+        self.assertEqual(len(self.page.store.get(KEY)), 1)
+        asked = self.order[0].endpoint.ask(self.page.contact, "find_value", KEY, None)
+        self.assertEqual(self.done(self.world, asked, 1.0), [[], None])
+        self.page.vanish()
+        self.assertEqual(self.page.store.get(KEY), [])
+
+    def test_copy_that_comes_to_be_held(self) -> None:
+        """A copy whose record is then stored here for good is held as any other: its lease can run out."""
+        self.dog.put(KEY, "state", b"here", "leased")
+        self.page.watch(KEY, lambda records: None, keep=True)
+        self.world.run(3.0)
+        record = self.page.store.get(KEY)[0]
+        self.assertEqual(self.page.replica.keep(record), 0)
+        self.assertEqual(self.page.replica.held(KEY), [record])
+        self.dog.vanish()
+        self.world.run(2.0)
+        self.assertEqual(self.page.store.get(KEY), [])
+
+
+class LargeFleetTests(NodeCase):
+    def test_more_nodes_than_replicas(self) -> None:
+        """Among 20 nodes each value is found by all, leases outlive minutes and end with their owners."""
+        fleet = self.fleet(20, seed=3, weather=Weather(delay_s=0.002))
+        for place in (0, 7, 13, 19):
+            fleet.nodes[place].put(KEY, "state", bytes([place]), "leased")
+            fleet.nodes[place].put(hashed_key(f"task {place}"), "task", b"do it")
+        told = self.watched(fleet.nodes[5])
+        fleet.run(25.0)
+        self.assertEqual(sorted(told[-1], key=repr), sorted((bytes([p]) for p in (0, 7, 13, 19)), key=repr))
+        settled = len(told)
+        fleet.run(25.0)
+        self.assertEqual(len(told), settled, "the team flickers")
+        fleet.nodes[13].vanish()
+        fleet.run(1.0 + 3 * SWEEP)
+        self.assertEqual(len(told[-1]), 3)
+        for place in range(20):
+            if place != 13:
+                self.assertEqual(self.values(fleet, place, hashed_key("task 13")), [b"do it"])
+
+    def test_no_chatter_about_leases(self) -> None:
+        """Once everything is where it belongs, no replica complains of missing leases any more."""
+        fleet = self.fleet(14, seed=5)
+        complaints: list[str] = []
+        for node in fleet.nodes:
+            node.put(KEY, "state", b"here", "leased")
+            node.put(hashed_key(node.contact.address.__str__()), "own", b"here", "leased")
+        fleet.run(15.0)
+        for node in fleet.nodes:
+            node.endpoint.expose("missing", lambda peer, marks: complaints.append(str(peer.address)))
+        fleet.run(10.0)
+        self.assertEqual(complaints, [])
+
+    def test_records_survive_a_slow_die_off(self) -> None:
+        """With their writer dead and half of the others dying one by one, the team's records are still found."""
+        fleet = self.fleet(20, seed=6)
+        for number in range(5):
+            fleet.nodes[19].put(hashed_key(f"task {number}"), "task", b"do it")
+        fleet.run(2.0)
+        for place in range(19, 9, -1):
+            fleet.nodes[place].vanish()
+            fleet.run(12.0)
+        for number in range(5):
+            self.assertEqual(self.values(fleet, number, hashed_key(f"task {number}")), [b"do it"])
+
+
+class JoinTests(NodeCase):
+    def test_bootstrap_comes_later(self) -> None:
+        """A node tries again until the one it knows is there."""
+        fleet = self.fleet(1)
+        fleet.nodes[0].vanish()
+        node = fleet.made(1)
+        fleet.nodes.append(node)
+        joined = fleet.enter(node, [fleet.address(0)])
+        fleet.run(20.0)
+        self.assertNoResult(joined)
+        fleet.restart(0)
+        fleet.run(8.0)
+        self.successResultOf(joined)
+        self.assertEqual(len(fleet.nodes[0].overlay.table), 1)
+
+    def test_known_to_oneself_only(self) -> None:
+        """A bootstrap node that is told to join through itself is the first node of its network."""
+        fleet = self.fleet(1)
+        node = fleet.made(1)
+        fleet.nodes.append(node)
+        self.done(fleet, fleet.enter(node, [fleet.address(1)]))
+
+    def test_stopped_while_joining(self) -> None:
+        """A node that is stopped while nobody answers leaves nothing behind."""
+        for seconds in (0.1, 3.0):
+            fleet = self.fleet(1)
+            node = fleet.made(1)
+            fleet.nodes.append(node)
+            joined = fleet.enter(node, [fleet.address(9)])
+            joined.addErrback(lambda failure: failure.trap(NotRunning))
+            fleet.run(seconds)
+            node.stop()
+
+    def test_rejoin_through_remembered_contacts(self) -> None:
+        """A restarted node finds the team by those it remembers, though the node that it is told to join by is dead."""
+        fleet = self.fleet(4)
+        fleet.run(31.0)
+        fleet.nodes[3].vanish()
+        fleet.nodes[0].vanish()
+        fleet.run(1.0)
+        node = fleet.restart(3)
+        fleet.run(3.0)
+        self.assertEqual(
+            {c.address for c in node.overlay.table.contacts()} >= {fleet.address(1), fleet.address(2)}, True
+        )
+
+    def test_first_node_does_not_wait_for_the_dead(self) -> None:
+        """A bootstrap that remembers only dead contacts goes on without them; with living ones it joins them."""
+        fleet = self.fleet(2)
+        fleet.nodes[0].stop()
+        fleet.nodes[1].vanish()
+        fleet.nodes[0] = fleet.made(0)
+        self.done(fleet, fleet.enter(fleet.nodes[0], []), 4.0)
+
+    def test_rotten_memory(self) -> None:
+        """Whatever the store remembers as contacts, the node starts."""
+        for rotten in (b"", b"\xc1", msgpack.packb(5), msgpack.packb([5, [b"x", "y", 1]]), b"\x91" * 2000):
+            fleet = self.fleet(1)
+            fleet.nodes[0].stop()
+            fleet.stores[0].note(CONTACTS, rotten)
+            node = fleet.made(0)
+            fleet.nodes[0] = node
+            self.done(fleet, fleet.enter(node, []))
+
+
+class WireTests(NodeCase):
+    METHODS = ("store", "find_value", "watch", "alive", "let_go", "goodbye!", "push", "missing", "find_node", "ping")
+
+    def test_malformed_questions_change_nothing(self) -> None:
+        """A member of the team that sends nonsense to every method gets a no, and nothing is logged or changed."""
+        fleet = self.fleet(3)
+        self.done(fleet, fleet.nodes[0].put(KEY, "state", b"one"))
+        rng = random.Random(5)
+        good = fleet.stores[0].get(KEY)[0].packed()
+        pieces: list[Any] = [
+            None,
+            5,
+            -1.5,
+            "x",
+            b"x",
+            KEY,
+            [],
+            [5],
+            [[]],
+            {},
+            [good[:7]],
+            [good, 5],
+            [None, "x"],
+            [1, 2],
+        ]
+        before = [store.records() for store in fleet.stores.values()]
+        for method in self.METHODS:
+            for _ in range(25):
+                arguments = [rng.choice(pieces) for _ in range(rng.randrange(4))]
+                asked = fleet.nodes[2].endpoint.ask(fleet.nodes[0].contact, method, *arguments, changes=True)
+                asked.addErrback(lambda failure: failure.trap(Refused))
+                fleet.run(0.02)
+        fleet.run(2.0)
+        self.assertEqual(self.flushLoggedErrors(), [])
+        self.assertEqual([store.records() for store in fleet.stores.values()], before)
+
+    def test_records_of_others(self) -> None:
+        """Nobody stores a record in the name of another without its signature, nor a lease of another at all."""
+        fleet = self.fleet(3)
+        owner = fleet.nodes[1].identity
+        forged = Record(KEY, "x", owner.public, 9, "team", 60.0, b"x", bytes(64))
+        leased = Record(KEY, "x", owner.public, 9, "leased", 60.0, b"x").signed(owner)
+        genuine = Record(KEY, "y", owner.public, 9, "team", 60.0, b"y").signed(owner)
+        packed = [r.packed() for r in (forged, leased, genuine)]
+        asked = fleet.nodes[2].endpoint.ask(fleet.nodes[0].contact, "store", packed, changes=True)
+        self.assertEqual(self.done(fleet, asked), [-1, -1, 0])
+        self.assertEqual(fleet.stores[0].get(KEY), [genuine])
+
+    def test_half_a_message_is_none(self) -> None:
+        """Where one of several records is malformed, none of them is stored."""
+        fleet = self.fleet(2)
+        owner = fleet.nodes[1].identity
+        genuine = Record(KEY, "y", owner.public, 9, "team", 60.0, b"y").signed(owner)
+        asked = fleet.nodes[1].endpoint.ask(fleet.nodes[0].contact, "store", [genuine.packed(), 5], changes=True)
+        fleet.run(1.0)
+        self.failureResultOf(asked, Refused)
+        self.assertEqual(fleet.stores[0].get(KEY), [])
+
+    def test_lying_replica(self) -> None:
+        """A replica that answers nonsense to everything costs its own opinion and no more."""
+        fleet = self.fleet(4)
+        answers: list[Any] = [None, 5, [], [[]], [[], []], [[5], None], [2**63 - 1], [True], [[None] * 3, [b"", ""]]]
+        for answer in answers:
+            for method in ("store", "find_value", "watch", "find_node", "ping"):
+                fleet.nodes[3].endpoint.expose(method, lambda peer, *_, answer=answer: answer)
+            self.done(fleet, fleet.nodes[0].put(KEY, "state", repr(answer).encode()))
+            self.assertEqual(self.values(fleet, 1), [repr(answer).encode()])
+        self.assertEqual(self.flushLoggedErrors(), [])

@@ -1,0 +1,58 @@
+"""Tests of who a node knows, and of where records belong."""
+
+from __future__ import annotations
+
+from twisted.internet.defer import Deferred
+
+from middleware.entangled.kademlia.distance import closest
+from middleware.entangled.overlay import K
+from middleware.entangled.record import hashed_key
+from tests.fleet import FleetCase
+
+
+class OverlayTests(FleetCase):
+    def test_everybody_knows_everybody_in_a_small_team(self) -> None:
+        """In a team of five each knows the four others."""
+        fleet = self.fleet(5)
+        self.assertEqual([len(node.overlay.table) for node in fleet.nodes], [4] * 5)
+
+    def test_holders_are_the_closest_of_all(self) -> None:
+        """In a large network every node finds the same k holders of a key, the truly closest, in order."""
+        for n in (9, 20):
+            fleet = self.fleet(n, seed=n)
+            for key in map(hashed_key, "abc"):
+                truth = closest([node.contact for node in fleet.nodes], key, K)
+                for node in fleet.nodes:
+                    found = self.done(fleet, Deferred.fromCoroutine(node.overlay.holders(key)), 0.5)
+                    self.assertEqual(found, truth)
+                    others = {c.node_id for c in truth} - {node.identity.node_id}
+                    self.assertLessEqual(others, {c.node_id for c in node.overlay.keepers(key)})
+
+    def test_the_silent_go(self) -> None:
+        """One that died without a word is out of every table after a while, one that left in order at once."""
+        fleet = self.fleet(4)
+        fleet.nodes[3].vanish()
+        fleet.nodes[2].stop()
+        fleet.run(0.1)
+        self.assertIsNone(fleet.nodes[0].overlay.table.get(fleet.nodes[2].identity.node_id))
+        fleet.run(20.0)
+        self.assertEqual([len(node.overlay.table) for node in fleet.nodes[:2]], [1, 1])
+
+    def test_return_after_a_cut(self) -> None:
+        """A node whose radio was out, for however long, is known to all again soon after, and knows them."""
+        for seconds in (2.0, 6.0, 60.0):
+            fleet = self.fleet(4)
+            fleet.board.partition([fleet.address(3)])
+            fleet.run(seconds)
+            fleet.board.heal()
+            fleet.run(6.0)
+            self.assertEqual([len(node.overlay.table) for node in fleet.nodes], [3] * 4, seconds)
+
+    def test_two_halves_find_each_other(self) -> None:
+        """A team that was cut in two for some seconds is one again soon after."""
+        fleet = self.fleet(4)
+        fleet.board.partition([fleet.address(0), fleet.address(1)])
+        fleet.run(3.0)
+        fleet.board.heal()
+        fleet.run(12.0)
+        self.assertEqual([len(node.overlay.table) for node in fleet.nodes], [3] * 4)

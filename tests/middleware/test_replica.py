@@ -1,0 +1,195 @@
+"""Tests of what a node does for the records of others: one replica, asked by hand."""
+
+from __future__ import annotations
+
+import random
+from typing import Any
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.entangled.background import Background
+from middleware.entangled.clock import HeapClock
+from middleware.entangled.errors import Refused
+from middleware.entangled.identity import Identity
+from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.network.network import Address
+from middleware.entangled.network.switchboard import Switchboard
+from middleware.entangled.record import Lifetime, Record, hashed_key, unpacked
+from middleware.entangled.replica import SWEEP, WATCH_TTL, Replica
+from middleware.entangled.store import MemoryStore
+from middleware.entangled.watch import digest_of
+from middleware.entangled.wire.endpoint import Endpoint
+
+DOG, CAT, ME = (Identity(bytes([n]) * 32) for n in (1, 2, 3))
+KEY = hashed_key("devices")
+TEAM = b"t" * 32
+
+
+def record(
+    name: str = "state",
+    sequence: int = 1,
+    value: bytes | None = b"v",
+    owner: Identity = DOG,
+    lifetime: Lifetime = "team",
+) -> Record:
+    """A record that its owner signed."""
+    return Record(KEY, name, owner.public, sequence, lifetime, 1.0, value).signed(owner)
+
+
+class ReplicaTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.clock = HeapClock()
+        self.board = Switchboard(self.clock, random.Random(1))
+        self.store = MemoryStore(50)
+        self.chores = Background(self.clock)
+        self.endpoint = self.opened(ME, 1)
+        self.replica = Replica(self.store, self.endpoint, self.clock, self.chores)
+        self.replica.start()
+        self.told: list[tuple[object, ...]] = []
+        self.replica.on_record = lambda r: self.told.append(("record", r.name))
+        self.replica.on_gone = lambda r: self.told.append(("gone", r.name))
+        self.replica.on_silent = lambda owner: self.told.append(("silent", owner))
+        self.dog = Contact(DOG.public, Address("10.0.0.1", 2))
+        self.cat = Contact(CAT.public, Address("10.0.0.1", 3))
+        self.heard: list[tuple[object, ...]] = []
+        self.watcher = self.opened(CAT, 3)
+        self.watcher.expose("push", lambda peer, *arguments: self.heard.append(arguments), changes=True)
+        self.owner = self.opened(DOG, 2)
+        self.owner.expose("missing", lambda peer, marks: self.heard.append(("missing", marks)))
+
+    def opened(self, identity: Identity, port: int) -> Endpoint:
+        """An endpoint on the switchboard."""
+        network = self.board.network("10.0.0.1", port)
+        endpoint = Endpoint(identity, TEAM, network, self.clock, random.Random(port))
+        endpoint.start()
+        return endpoint
+
+    def tearDown(self) -> None:
+        self.chores.stop()
+        for endpoint in (self.endpoint, self.watcher, self.owner):
+            endpoint.stop()
+
+    def stored(self, *records: Record, peer: Contact | None = None) -> list[int]:
+        """What the replica answers to a STORE."""
+        return self.replica.answer_store(peer or self.dog, [r.packed() for r in records])
+
+    def test_the_stronger_record_is_kept(self) -> None:
+        """A newer record is taken, the same one again too, and against an older one the number that holds is told."""
+        self.assertEqual(self.stored(record(sequence=5)), [0])
+        self.assertEqual(self.stored(record(sequence=5)), [0])
+        self.assertEqual(self.stored(record(sequence=4)), [5])
+        self.assertEqual(self.stored(record(sequence=6)), [0])
+        weaker, stronger = sorted([record("x", value=b"a"), record("x", value=b"b")], key=lambda r: r.signature)
+        self.assertEqual(self.stored(stronger), [0])
+        self.assertEqual(self.stored(weaker), [1])
+
+    def test_who_may_store(self) -> None:
+        """A lease comes from its owner only, a team record from anybody, but signed, its owner included."""
+        forged = Record(KEY, "f", DOG.public, 1, "team", 1.0, b"v", bytes(64))
+        self.assertEqual(self.stored(record(lifetime="leased"), record("t"), forged, peer=self.cat), [-1, 0, -1])
+        self.assertEqual(self.stored(record(lifetime="leased"), forged), [0, -1])
+
+    def test_full(self) -> None:
+        """A full store says so to the writer."""
+        for number in range(50):
+            self.stored(record(str(number)))
+        self.assertRaises(Refused, self.stored, record("one more"))
+
+    def test_lease_runs_out(self) -> None:
+        """A lease ends one ttl after the last sign of its owner; a team record makes nobody silent."""
+        self.stored(record(lifetime="leased"), record("t"))
+        self.clock.advance(0.8)
+        self.replica.answer_alive(self.dog, 1.0, digest_of([record(lifetime="leased")]))
+        self.clock.advance(0.3)
+        self.assertEqual(self.told, [("record", "state"), ("record", "t"), ("gone", "t")])
+        self.clock.advance(0.7 + SWEEP)
+        self.assertEqual(self.told[3:], [("gone", "state"), ("silent", DOG.public)])
+
+    def test_strange_leases(self) -> None:
+        """However long a lease an owner claims, it is bounded; a wrong number changes nothing."""
+        self.stored(record(lifetime="leased"))
+        for lease in (float("nan"), -5.0, 5, float("inf")):
+            self.replica.answer_alive(self.dog, lease, b"")
+        self.clock.advance(3590.0)
+        self.assertEqual(len(self.store.get(KEY)), 1)
+        self.clock.advance(20.0)
+        self.assertEqual(self.store.get(KEY), [])
+
+    def test_goodbye(self) -> None:
+        """A goodbye ends the leases and the watches of the peer, not its team records."""
+        self.stored(record(lifetime="leased"), record("t"))
+        self.replica.answer_goodbye(self.dog)
+        self.assertEqual([r.name for r in self.store.get(KEY)], ["t"])
+        self.assertEqual(self.told[2:], [("gone", "state"), ("silent", DOG.public)])
+
+    def test_missing_is_told_the_second_time(self) -> None:
+        """What is held differs from what the owner says: a hiccup is passed over, the second time it is told."""
+        held = record(lifetime="leased")
+        self.stored(held)
+        self.replica.answer_alive(self.dog, 1.0, b"other")
+        self.clock.advance(0.1)
+        self.assertEqual(self.heard, [])
+        self.replica.answer_alive(self.dog, 1.0, b"other")
+        self.clock.advance(0.1)
+        self.assertEqual(self.heard, [("missing", [digest_of([held])])])
+
+    def test_let_go(self) -> None:
+        """The owner can take a lease away from here, nobody else can, and never a team record."""
+        held, team = record(lifetime="leased"), record("t")
+        self.stored(held, team)
+        marks: list[object] = [digest_of([held]), digest_of([team]), 5, None]
+        self.replica.answer_let_go(self.cat, marks)
+        self.assertEqual(len(self.store.get(KEY)), 2)
+        self.replica.answer_let_go(self.dog, marks)
+        self.assertEqual(self.store.get(KEY), [team])
+        self.assertEqual(self.told[2:], [("gone", "state")])
+
+    def test_pages(self) -> None:
+        """A key with many records is read page by page, each record once, tombstones included."""
+        records = [record(f"{n:02}", value=None if n % 3 else b"v" * 200) for n in range(30)]
+        for one in records:
+            self.stored(one)
+        seen: list[object] = []
+        page: list[Any] = self.replica.answer_find_value(self.dog, KEY)
+        pages = 1
+        while page[1] is not None:
+            seen += page[0]
+            page = self.replica.answer_find_value(self.dog, KEY, page[1])
+            pages += 1
+        seen += page[0]
+        self.assertEqual([unpacked(fields) for fields in seen], records)
+        self.assertGreater(pages, 4)
+
+    def test_bad_cursors_and_keys(self) -> None:
+        """A cursor that is none, or a key of another length, is refused in one line."""
+        self.stored(record())
+        for after in ([], [1, 2], ["x", "y"], [b"x"], [b"x", "y", 1]):
+            self.assertRaises(Refused, self.replica.answer_find_value, self.dog, KEY, after)
+        self.assertRaises(Refused, self.replica.answer_find_value, self.dog, b"short")
+        self.assertRaises(Refused, self.replica.answer_watch, self.dog, b"short", b"")
+        self.assertEqual(self.replica.answer_find_value(self.dog, KEY, [b"\xff" * 32, ""]), [[], None])
+
+    def test_watch(self) -> None:
+        """A watcher gets the first page unless it is up to date, then each change, until it asks no more."""
+        self.stored(record())
+        page = self.replica.answer_watch(self.cat, KEY, b"")
+        self.assertEqual(page, [[record().packed()], None])
+        self.assertIsNone(self.replica.answer_watch(self.cat, KEY, digest_of([record()])))
+        self.stored(record(sequence=2))
+        self.clock.advance(0.5)
+        self.assertEqual(self.heard, [(KEY, [record(sequence=2).packed()], [])])
+        self.clock.advance(0.6)
+        self.assertEqual(self.heard[1:], [(KEY, [], [[DOG.public, "state"]])])
+        self.clock.advance(2 * WATCH_TTL)
+        self.stored(record(sequence=3))
+        self.clock.advance(0.5)
+        self.assertEqual(len(self.heard), 2)
+        self.assertEqual(self.replica._watchers, {})
+
+    def test_too_many_watchers(self) -> None:
+        """Watchers are bounded, and one that is in already may stay."""
+        peers = [Contact(bytes([n % 256, n >> 8] * 16), Address("10.0.0.9", 1 + n)) for n in range(1001)]
+        for peer in peers[:1000]:
+            self.replica.answer_watch(peer, KEY, b"")
+        self.assertRaises(Refused, self.replica.answer_watch, peers[1000], KEY, b"")
+        self.replica.answer_watch(peers[0], KEY, b"")

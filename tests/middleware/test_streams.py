@@ -1,0 +1,146 @@
+"""Tests of camera channels: publisher and viewers on a switchboard."""
+
+from __future__ import annotations
+
+import random
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.entangled.clock import HeapClock
+from middleware.entangled.errors import Refused
+from middleware.entangled.identity import Identity
+from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.network.network import Address
+from middleware.entangled.network.switchboard import Switchboard, Weather
+from middleware.entangled.wire.endpoint import Endpoint
+from middleware.streams import MAX_PARTS, MAX_VIEWERS, OPEN_TTL, PART_BYTES, Streams
+
+TEAM = b"t" * 32
+CAMERA = "camera"
+
+
+class StreamsTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.clock = HeapClock()
+        self.board = Switchboard(self.clock, random.Random(1), Weather(delay_s=0.001))
+        self.ends = [self.opened(n) for n in (1, 2)]
+        self.publisher, self.viewer = (streams for _, streams in self.ends)
+        self.to_publisher, self.to_viewer = (Contact(Identity(bytes([n]) * 32).public, self.at(n)) for n in (1, 2))
+        self.frames: list[tuple[int, bytes]] = []
+
+    def at(self, n: int) -> Address:
+        """Where the n-th end listens."""
+        return Address("10.0.0.1", 7000 + n)
+
+    def opened(self, n: int) -> tuple[Endpoint, Streams]:
+        """One end."""
+        endpoint = Endpoint(
+            Identity(bytes([n]) * 32), TEAM, self.board.network(*self.at(n)), self.clock, random.Random(n)
+        )
+        endpoint.start()
+        return endpoint, Streams(endpoint, self.clock)
+
+    def tearDown(self) -> None:
+        for endpoint, streams in self.ends:
+            streams.stop()
+            endpoint.stop()
+
+    def see(self, sequence: int, frame: bytes) -> None:
+        """Take note of a frame."""
+        self.frames.append((sequence, frame))
+
+    def part(self, sequence: int, number: int, count: int, part: bytes) -> None:
+        """One part arrives."""
+        self.viewer._answer_part(self.to_publisher, CAMERA, sequence, number, count, part)
+
+    def test_frames_arrive_whole(self) -> None:
+        """A frame of many parts arrives as it was, at every watcher, until each of them stops."""
+        others: list[int] = []
+        stop = self.viewer.look(self.to_publisher, CAMERA, self.see)
+        stop_other = self.viewer.look(self.to_publisher, CAMERA, lambda sequence, frame: others.append(sequence))
+        self.clock.advance(0.1)
+        frame = random.Random(1).randbytes(5 * PART_BYTES + 7)
+        self.publisher.offer(CAMERA, 1, frame)
+        self.clock.advance(0.1)
+        stop()
+        stop()
+        self.publisher.offer(CAMERA, 2, b"x")
+        self.clock.advance(0.1)
+        stop_other()
+        self.assertEqual((self.frames, others), ([(1, frame)], [1, 2]))
+
+    def test_nothing_is_sent_unseen(self) -> None:
+        """While nobody looks nothing is sent, and soon after the last look ended neither."""
+        self.assertFalse(self.publisher.is_wanted(CAMERA))
+        stop = self.viewer.look(self.to_publisher, CAMERA, self.see)
+        self.clock.advance(10.0)
+        self.assertTrue(self.publisher.is_wanted(CAMERA))
+        stop()
+        self.clock.advance(OPEN_TTL + 0.1)
+        sent = self.board.counters["sent"]
+        self.publisher.offer(CAMERA, 1, b"x")
+        self.assertEqual(self.board.counters["sent"], sent)
+
+    def test_lost_part_drops_the_frame(self) -> None:
+        """A frame that misses a part is dropped, and so is an older one that comes late; none is shown twice."""
+        self.viewer.look(self.to_publisher, CAMERA, self.see)
+        self.part(1, 0, 2, b"a")
+        self.part(2, 1, 2, b"d")
+        self.part(1, 1, 2, b"b")
+        self.part(2, 0, 2, b"c")
+        self.part(2, 0, 2, b"c")
+        self.assertEqual(self.frames, [(2, b"cd")])
+
+    def test_publisher_begins_anew(self) -> None:
+        """A camera that counts from the start again is seen again after a moment."""
+        self.viewer.look(self.to_publisher, CAMERA, self.see)
+        self.part(500, 0, 1, b"old")
+        self.part(1, 0, 1, b"too soon")
+        self.clock.advance(1.1)
+        self.part(2, 0, 1, b"new")
+        self.part(3, 0, 1, b"newer")
+        self.assertEqual([frame for _, frame in self.frames], [b"old", b"new", b"newer"])
+
+    def test_crafted_parts(self) -> None:
+        """Parts that do not fit together, are too many or too large, change nothing and raise nothing."""
+        self.viewer.look(self.to_publisher, CAMERA, self.see)
+        self.part(1, 5, 6, b"x")
+        self.part(1, 0, 2, b"x")
+        for number, count in ((0, 0), (-1, 1), (1, 1), (0, MAX_PARTS + 1)):
+            self.part(2, number, count, b"x")
+        self.part(2, 0, 1, bytes(PART_BYTES + 1))
+        self.viewer._answer_part(self.to_viewer, CAMERA, 1, 0, 1, b"a stranger's")
+        self.viewer._answer_part(self.to_publisher, "other", 1, 0, 1, b"x")
+        self.assertEqual(self.frames, [])
+
+    def test_too_large_a_frame(self) -> None:
+        """A frame of more parts than there may be is not sent; an empty one neither."""
+        self.viewer.look(self.to_publisher, CAMERA, self.see)
+        self.clock.advance(0.1)
+        for frame in (bytes(MAX_PARTS * PART_BYTES + 1), b""):
+            self.publisher.offer(CAMERA, 1, frame)
+        self.clock.advance(0.1)
+        self.assertEqual(self.frames, [])
+
+    def test_viewers_are_bounded(self) -> None:
+        """There is an end to viewers and names, whoever looks may go on looking, and places come free again."""
+        peers = [Contact(bytes([n]) * 32, self.at(9)) for n in range(MAX_VIEWERS + 1)]
+        for number, peer in enumerate(peers[:-1]):
+            self.assertTrue(self.publisher._answer_open(peer, f"channel {number}"))
+        self.assertRaises(Refused, self.publisher._answer_open, peers[-1], CAMERA)
+        self.assertTrue(self.publisher._answer_open(peers[0], "channel 0"))
+        self.assertRaises(Refused, self.publisher._answer_open, peers[0], "x" * 33)
+        self.clock.advance(OPEN_TTL + 0.1)
+        self.assertTrue(self.publisher._answer_open(peers[-1], CAMERA))
+        self.assertTrue(self.publisher.is_wanted(CAMERA))
+
+    def test_stop(self) -> None:
+        """After the stop nothing is left on the clock, and a frame that still comes is not sent."""
+        self.viewer.look(self.to_publisher, CAMERA, self.see)
+        self.clock.advance(0.1)
+        for endpoint, streams in self.ends:
+            streams.stop()
+            endpoint.stop()
+        self.publisher.offer(CAMERA, 1, b"x")
+        self.clock.advance(0.1)
+        self.assertEqual(self.clock.getDelayedCalls(), [])

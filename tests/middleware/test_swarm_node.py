@@ -1,0 +1,267 @@
+"""Tests of the whole node: a team of them on simulated time and a switchboard."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from twisted.internet.defer import Deferred
+
+from middleware.consensus.lease import Lessee
+from middleware.entangled.errors import NoAnswer, Refused
+from middleware.entangled.network.switchboard import Weather
+from middleware.entangled.record import Record
+from middleware.node import SwarmNode
+from middleware.presence import DEVICES, Device, devices_of
+from middleware.tasks import COMPLETED, TASKS, Member, Result, Task, group_key, member_of, outcome_of, task_of
+from tests.fleet import FleetCase, SwarmFleet
+
+TASK = Task("t1", "search", "Find it")
+ROUGH = Weather(delay_s=0.01, jitter_s=0.01, loss=0.3)
+
+
+class SwarmNodeTests(FleetCase):
+    def names(self, fleet: SwarmFleet, place: int = 0) -> list[tuple[str, int]]:
+        """Names and places of the devices as one node sees them."""
+        records = self.done(fleet, fleet.nodes[place].entangled.get(DEVICES), 2.0)
+        return [(device.name, device.joined) for device, _ in devices_of(records)]
+
+    def submitted(self, fleet: SwarmFleet, task: Task = TASK) -> Task:
+        """A task as it was published."""
+        return self.done(fleet, Deferred.fromCoroutine(fleet.nodes[0].submit(task)), 1.0)
+
+    def asked(self, fleet: SwarmFleet, method: str, *arguments: object) -> Deferred[Any]:
+        """A call of dog1 to dog0."""
+        to = fleet.nodes[0].entangled.contact
+        return fleet.nodes[1].entangled.endpoint.ask(to, method, *arguments, changes=True)
+
+    def test_order_of_joining(self) -> None:
+        """Who comes later has a higher number, and every node sees the same."""
+        fleet = self.swarm(4)
+        expected = [(f"dog{n}", n + 1) for n in range(4)]
+        for place in range(4):
+            self.assertEqual(self.names(fleet, place), expected)
+
+    def test_joining_at_the_same_moment(self) -> None:
+        """Those that come at one moment get different numbers all the same, also in rough weather."""
+        for seed, weather in ((1, Weather(0.005)), (2, Weather(0.005, 0.005)), (3, ROUGH), (4, ROUGH)):
+            fleet = self.swarm(5, seed, weather, pause=0.0)
+            fleet.run(20.0)
+            places = [node.presence.device.joined for node in fleet.nodes]
+            self.assertEqual(len(set(places)), 5, places)
+
+    def test_joins_in_rough_weather(self) -> None:
+        """A device appears although its first questions were lost."""
+        for seed in range(4):
+            fleet = self.swarm(3, seed, Weather(delay_s=0.01, loss=0.5))
+            fleet.run(40.0)
+            self.assertEqual([node.presence.device.joined > 0 for node in fleet.nodes], [True] * 3, seed)
+
+    def test_replay(self) -> None:
+        """The same seed gives the same datagrams at the same moments, and another seed others."""
+        digests = []
+        for seed in (1, 1, 2):
+            fleet = self.swarm(4, seed, ROUGH)
+            fleet.nodes[1].watch_devices(lambda records: None, keep=True)
+            self.submitted(fleet)
+            fleet.nodes[2].vanish()
+            fleet.run(10.0)
+            digests.append(fleet.board.digest())
+        self.assertEqual(digests[0], digests[1])
+        self.assertNotEqual(digests[0], digests[2])
+
+    def test_place_is_kept(self) -> None:
+        """A device that changes what it says of itself keeps its number; its messages reach everybody."""
+        fleet = self.swarm(2)
+        fleet.nodes[1].presence.say(5.0, "hello")
+        fleet.run(1.0)
+        records = self.done(fleet, fleet.nodes[0].entangled.get(DEVICES), 1.0)
+        device = devices_of(records)[1][0]
+        self.assertEqual((device.joined, device.messages, device.address), (2, ((5.0, "hello"),), "10.0.0.1:7001"))
+
+    def test_vanish_and_leave(self) -> None:
+        """A device is gone with its node, at once when it leaves in order, within its lease when it does not."""
+        fleet = self.swarm(4)
+        told: list[list[Record]] = []
+        fleet.nodes[0].watch_devices(told.append)
+        fleet.run(1.0)
+        fleet.nodes[3].stopService()
+        fleet.run(0.05)
+        self.assertEqual(len(told[-1]), 3)
+        fleet.nodes[2].vanish()
+        fleet.run(1.25)
+        self.assertEqual(len(told[-1]), 2)
+
+    def test_task_and_its_end(self) -> None:
+        """A task is seen by all with its council; reports go with their node, the outcome stays."""
+        fleet = self.swarm(4)
+        task = self.submitted(fleet)
+        self.assertEqual(len(task.council), 3)
+        seen: list[Task | None] = []
+        fleet.nodes[3].watch_tasks(lambda records: seen.extend(map(task_of, records)))
+        group: list[list[Record]] = []
+        fleet.nodes[3].watch_group("t1", group.append, keep=True)
+        for node in fleet.nodes[1:3]:
+            node.report("t1", Member(node.uuid, node.presence.device.name, "WAITING", 1.0))
+        fleet.run(1.0)
+        self.assertEqual(seen, [task])
+        self.assertEqual(
+            [member.name for r in group[-1] if (member := member_of(r))],
+            ["dog1", "dog2"]
+            if fleet.nodes[1].entangled.identity.public < fleet.nodes[2].entangled.identity.public
+            else ["dog2", "dog1"],
+        )
+        fleet.nodes[1].withdraw("t1")
+        self.done(fleet, fleet.nodes[2].conclude("t1", Result(COMPLETED, "dog2", 3.0, 1)), 1.0)
+        fleet.nodes[2].vanish()
+        fleet.run(2.0)
+        self.assertEqual(outcome_of(group[-1]), Result(COMPLETED, "dog2", 3.0, 1))
+        self.assertEqual(len(group[-1]), 1)
+        self.assertEqual(fleet.nodes[3].store.get(group_key("t1")), group[-1])
+        self.assertEqual(len(fleet.nodes[3].store.get(TASKS)), 1)
+
+    def lessees(self, fleet: SwarmFleet, task: Task) -> list[Lessee]:
+        """The claimants of all nodes."""
+        return [node.lessee(task, lambda: None, 0) for node in fleet.nodes]
+
+    def test_one_holder_and_takeover(self) -> None:
+        """Of three that want a task one gets it; when it vanishes, another one does, with a higher token."""
+        fleet = self.swarm(4)
+        fleet.run(TASK.lease_ttl)
+        lessees = self.lessees(fleet, self.submitted(fleet))
+        for lessee in lessees[1:]:
+            lessee.want()
+        fleet.run(2.0)
+        (first,) = [n for n, lessee in enumerate(lessees) if lessee.lease]
+        token = lessees[first].token
+        lessees[first].release()
+        fleet.nodes[first].vanish()
+        for _ in range(60):
+            fleet.run(0.05)
+            self.assertLessEqual(len([lessee for lessee in lessees if lessee.lease]), 1)
+        (second,) = [lessee for lessee in lessees if lessee.lease]
+        self.assertGreater(second.token, token)
+        for lessee in lessees:
+            lessee.release()
+        fleet.run(2.0)
+
+    def test_council_member_comes_back(self) -> None:
+        """Two of three members that were restarted do not grant what they have granted before they forgot it."""
+        fleet = self.swarm(4)
+        fleet.run(TASK.lease_ttl)
+        task = self.submitted(fleet)
+        lessees = self.lessees(fleet, task)
+        outsider = next(n for n, node in enumerate(fleet.nodes) if node.entangled.contact not in task.council)
+        lessees[outsider].want()
+        fleet.run(0.5)
+        lease = lessees[outsider].lease
+        assert lease is not None
+        fleet.board.partition([fleet.address(outsider)])
+        for place in [n for n in range(4) if n != outsider][:2]:
+            fleet.nodes[place].vanish()
+            fleet.nodes[place] = fleet.made(place)
+            fleet.nodes[place].startService()
+        rival = fleet.nodes[next(n for n in range(4) if n != outsider)].lessee(task, lambda: None, 0)
+        rival.want()
+        while lessees[outsider].lease:
+            fleet.run(0.02)
+            self.assertFalse(rival.lease and lessees[outsider].lease)
+        fleet.run(4.0)
+        self.assertIsNotNone(rival.lease)
+        rival.release()
+        lessees[outsider].release()
+        fleet.run(2.0)
+
+    def test_strange_tasks(self) -> None:
+        """A claim on a task whose ttl or token no council grants is refused, not an accident."""
+        fleet = self.swarm(2)
+        task = self.submitted(fleet)
+        for strange in (replace(task, lease_ttl=999.0), replace(task, lease_ttl=1), replace(task, council=())):
+            for node in fleet.nodes:
+                lessee = node.lessee(strange, lambda: None, 0)
+                lessee.want()
+                fleet.run(0.3)
+                lessee.release()
+                fleet.run(1.0)
+        self.assertEqual(self.flushLoggedErrors(), [])
+
+    def test_claims_from_the_wire(self) -> None:
+        """Claims with a wrong token, name or duration are refused."""
+        fleet = self.swarm(2)
+        for bad in (
+            ("t", 0, 1.0),
+            ("t", 2**62, 1.0),
+            ("t", 1, 0.0),
+            ("t", 1, 61.0),
+            ("t", 1, float("nan")),
+            ("t" * 65, 1, 1.0),
+            (5, 1, 1.0),
+            ("t", True, 1.0),
+            ("t", 1, "1"),
+        ):
+            asked = self.asked(fleet, "lease.claim", *bad)
+            fleet.run(0.1)
+            self.failureResultOf(asked, Refused)
+
+    def test_operator(self) -> None:
+        """A text from an operator is delivered and shown; a wish to leave is carried out after its answer."""
+        fleet = self.swarm(2)
+        texts: list[str] = []
+        gone: list[float] = []
+        fleet.nodes[0].on_message(texts.append)
+        fleet.nodes[0].on_disconnect(gone.append)
+        self.assertEqual(self.done(fleet, self.asked(fleet, "device.message", "come"), 0.5), "delivered")
+        self.assertEqual(texts, ["come"])
+        self.assertEqual(fleet.nodes[0].presence.device.messages[-1][1], "operator: come")
+        self.assertEqual(self.done(fleet, self.asked(fleet, "device.disconnect", 5), 0.5), "leaving")
+        self.assertEqual(gone, [5.0])
+        for method, bad in (
+            ("device.message", ""),
+            ("device.message", "x" * 201),
+            ("device.disconnect", 0),
+            ("device.disconnect", float("nan")),
+            ("device.disconnect", 3601.0),
+        ):
+            asked = self.asked(fleet, method, bad)
+            fleet.run(0.1)
+            self.failureResultOf(asked, Refused)
+
+    def test_stopped_before_the_wish(self) -> None:
+        """A node that is stopped right after an operator's wish to leave leaves nothing on the clock."""
+        fleet = self.swarm(2)
+        gone: list[float] = []
+        fleet.nodes[0].on_disconnect(gone.append)
+        self.asked(fleet, "device.disconnect", 5)
+        fleet.nodes[0].presence.say(1.0, "late")
+        fleet.run(0.02)
+        fleet.nodes[0].stopService()
+        fleet.run(1.0)
+        self.assertEqual(gone, [])
+
+    def test_contact_of(self) -> None:
+        """A device is reached where it says; a crafted address is no contact and no accident."""
+        fleet = self.swarm(1)
+        node: SwarmNode = fleet.nodes[0]
+        rows = {
+            "10.0.0.1:7001": True,
+            "": False,
+            "x": False,
+            ":7001": False,
+            "h:0": False,
+            "h:70000": False,
+            "h:²": False,
+        }
+        for address, is_contact in rows.items():
+            value = Device(node.uuid, "dog", address=address).packed()
+            record = Record(DEVICES, "dog", node.entangled.identity.public, 1, "leased", 1.0, value, bytes(64))
+            self.assertEqual(node.contact_of(record) is not None, is_contact, address)
+        self.assertIsNone(node.contact_of(replace(record, value=b"?")))
+
+    def test_too_much_to_say(self) -> None:
+        """A device that cannot be squeezed into a record is logged, and the node lives on."""
+        fleet = self.swarm(1)
+        fleet.nodes[0].presence.change(capabilities={"arm": {"kind": "x" * 2000}})
+        fleet.run(1.0)
+        self.assertEqual(len(self.flushLoggedErrors()), 1)
+        asked = fleet.nodes[0].conclude("t", Result(COMPLETED, "dog0"))
+        asked.addErrback(lambda failure: failure.trap(NoAnswer))

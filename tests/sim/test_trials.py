@@ -1,0 +1,158 @@
+"""Tests of ``sim.trials``: the table, and the command line with a team that is played."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.entangled.clock import HeapClock
+from sim.trials import Outcome, main, percentile, table, trial
+
+
+class PlayedTeam:
+    """Two dogs that do what the seed says: an even seed completes, an odd one never does."""
+
+    def __init__(self, seed: int) -> None:
+        self.clock = HeapClock()
+        self.board = self
+        self.yard = None
+        self.lost: set[str] = set()
+        self._seed = seed
+        self._began: float | None = None
+
+    def digest(self) -> str:
+        """As the board's."""
+        return f"digest {self._seed}"
+
+    def run_demo(self) -> str:
+        """Begin."""
+        self._began = self.clock.seconds()
+        return "t1"
+
+    def scatter(self, seed: int) -> None:
+        """Nothing moves by itself."""
+
+    def kill(self, name: str) -> None:
+        """Lose a dog."""
+        self.lost.add(name)
+
+    def stop(self) -> None:
+        """Nothing to end."""
+
+    def _age(self) -> float:
+        return 0.0 if self._began is None else self.clock.seconds() - self._began
+
+    def _by(self) -> str:
+        return "dog2" if "dog1" in self.lost else "dog1"
+
+    def truth(self) -> dict[str, Any]:
+        """The dogs walk to the target, the nearer one first."""
+        near = max(0.22, 1.0 - 0.1 * self._age())
+        at = {"dog1": 0.9 if "dog1" in self.lost else near, "dog2": near if "dog1" in self.lost else 2.0}
+        dogs = [{"name": n, "x": x, "y": 0.0, "heading": 0.0, "moving": True, "stripes": 1} for n, x in at.items()]
+        return {"t": self._age(), "walls": [3.0, 2.4], "dogs": dogs, "target": {"x": 0.0, "y": 0.0, "radius": 0.08}}
+
+    def state(self) -> dict[str, Any]:
+        """What the page would show."""
+        is_done = self._age() > 9.0 and self._seed % 2 == 0
+        by = self._by()
+        names = [name for name in ("dog1", "dog2") if name not in self.lost]
+        status = {name: "EXECUTING" if name == by and not is_done else "WAITING" for name in names}
+        devices = [{"uuid": n, "name": n, "status": s, "task": "t1", "gone": None} for n, s in status.items()]
+        members = [{"name": n, "cost": 1.0} for n in names]
+        group = {"task": "t1", "members": members, "assigned": by, "agree": len(names), "of": len(names)}
+        task = {"id": "t1", "status": "COMPLETED" if is_done else "EXECUTING", "result": None}
+        if is_done:
+            task["result"] = {"by": by, "took": 9.0}  # type: ignore[assignment]
+        return {"devices": devices, "tasks": [task], "groups": [group]}
+
+
+class TrialTests(SynchronousTestCase):
+    def test_trial_notes_what_came_of_it(self) -> None:
+        """A trial says who reached it, whether all found and agreed, and keeps the trace's hash."""
+        outcome = trial(PlayedTeam, 1, 2)
+        self.assertEqual(outcome.broken, [])
+        self.assertTrue(outcome.held and outcome.found and outcome.agreed and outcome.right)
+        self.assertEqual((outcome.by, outcome.killed, outcome.digest), ("dog1", "", "digest 2"))
+
+    def test_second_experiment_loses_the_dog_on_its_way(self) -> None:
+        """In experiment 2 the dog that approaches is killed once, and the time until another moves is noted."""
+        outcome = trial(PlayedTeam, 2, 2)
+        self.assertEqual((outcome.killed, outcome.by, outcome.broken), ("dog1", "dog2", []))
+        assert outcome.takeover is not None
+        self.assertLess(outcome.takeover, 0.1)
+
+    def test_trial_that_never_ends_is_broken(self) -> None:
+        """A task that is never done ends after the limit, and says what was not so."""
+        outcome = trial(PlayedTeam, 1, 1)
+        self.assertFalse(outcome.held)
+        self.assertTrue(any("task completed" in what for what in outcome.broken))
+
+    def test_pictures_of_each_phase_are_drawn(self) -> None:
+        """With a folder each phase is drawn once, as a PNG."""
+        folder = Path(self.mktemp())
+        folder.mkdir()
+        trial(PlayedTeam, 2, 2, folder)
+        names = sorted(path.name.removeprefix("experiment2-seed2-") for path in folder.iterdir())
+        wanted = ("1-without-target", "2-with-target", "3-found", "4-approach", "5-lost", "6-reached")
+        self.assertEqual(names, [f"{phase}.png" for phase in wanted])
+        self.assertTrue(all(path.read_bytes()[:4] == b"\x89PNG" for path in folder.iterdir()))
+
+
+class TableTests(SynchronousTestCase):
+    def test_percentile_is_a_value_that_was(self) -> None:
+        """The percentile is the smallest value that the share does not exceed; it invents none."""
+        values = [5.0, 1.0, 4.0, 2.0, 3.0]
+        self.assertEqual([percentile(values, share) for share in (0.0, 0.2, 0.21, 0.5, 0.95, 1.0)], [1, 1, 2, 3, 5, 5])
+
+    def test_table_counts_and_measures(self) -> None:
+        """One line for each experiment, with counts, medians and 95th percentiles; a dash for nothing measured."""
+        good: dict[str, Any] = {"held": True, "found": True, "agreed": True, "right": True}
+        outcomes = [Outcome(n, 1, **good, find=1.0 + n, agree=2.0, reach=10.0) for n in range(3)]
+        outcomes.append(Outcome(1, 2, takeover=1.25))
+        lines = [line.split() for line in table(outcomes).splitlines()]
+        self.assertEqual(lines[1][:7], ["experiment", "1", "3", "3", "3", "3", "3"])
+        self.assertEqual(lines[1][7:], ["2.00", "(3.00)", "2.00", "(2.00)", "10.00", "(10.00)", "-"])
+        self.assertEqual(lines[2], ["experiment", "2", "1", "0", "0", "0", "0", "-", "-", "-", "1.25", "(1.25)"])
+
+
+class MainTests(SynchronousTestCase):
+    def run_main(self, *words: str) -> tuple[int, str, Path]:
+        """The command with a folder of its own; code, output and folder."""
+        folder = Path(self.mktemp())
+        output = io.StringIO()
+        with contextlib.redirect_stdout(output):
+            code = main([*words, "--jobs", "1", "--out", str(folder)], PlayedTeam)
+        return code, output.getvalue(), folder
+
+    def test_all_held_is_success(self) -> None:
+        """When every trial held the code is 0; progress, table and report are there, and the report has each trial."""
+        code, output, folder = self.run_main("--count", "1", "--seed", "2")
+        self.assertEqual(code, 0, output)
+        self.assertIn("   1/2 ok   experiment 1 seed 2: dog1 reached it", output)
+        self.assertIn("experiment 2      1      1", output)
+        rows = json.loads((folder / "trials.json").read_text(encoding="utf-8"))
+        self.assertEqual([(row["experiment"], row["held"]) for row in rows], [(1, True), (2, True)])
+        self.assertTrue(list(folder.glob("*.png")))
+
+    def test_one_that_did_not_hold_is_failure(self) -> None:
+        """When one trial did not hold the code is 1, and its line says what was not so."""
+        code, output, _ = self.run_main("--count", "1", "--seed", "1", "--pictures", "0")
+        self.assertEqual(code, 1)
+        self.assertIn("1/2 FAIL experiment 1 seed 1: nobody reached it  (task completed (", output)
+
+    def test_wrong_arguments_are_refused(self) -> None:
+        """A negative number, a word for a number and a folder that cannot be made are one line and code 2."""
+        blocked = Path(self.mktemp())
+        blocked.write_text("a file", encoding="utf-8")
+        for words in (["--count", "-1"], ["--count", "many"], ["--out", str(blocked / "below")]):
+            errors = io.StringIO()
+            with contextlib.redirect_stderr(errors), self.assertRaises(SystemExit) as caught:
+                main(words, PlayedTeam)
+            self.assertEqual(caught.exception.code, 2)
+            self.assertNotIn("Traceback", errors.getvalue())
