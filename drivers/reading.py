@@ -34,7 +34,8 @@ class Observation:
     """The newest that is known of a robot.
 
     ``values`` maps flat keys to SI values (NaN: nothing in range); ``samples`` maps a key to the samples since the
-    frame before, oldest first (the ERS-7 delivers 4 each 32 ms).  ``t_host`` is the moment of arrival on the driver's clock.
+    frame before, oldest first (the ERS-7 delivers 4 each 32 ms).  ``t_host`` is the moment of arrival on the
+    driver's clock.
     """
 
     t_host: float
@@ -48,8 +49,8 @@ class Observation:
 class Description:
     """What a robot is and can do, known without connecting to it.
 
-    ``capabilities`` maps a capability name (``base2d``, ``ranger``, ``camera``, ``imu``, ``odometry``, ``power``) to its
-    properties (numbers or text; ``ranger`` has ``max`` in metres, ``camera`` has ``width``, ``height``, ``fps``);
+    ``capabilities`` maps a capability name (``base2d``, ``ranger``, ``camera``, ``imu``, ``odometry``, ``power``) to
+    its properties (numbers or text; ``ranger`` has ``max`` in metres, ``camera`` has ``width``, ``height``, ``fps``);
     ``limits`` maps each action key to its lowest and highest value.
     """
 

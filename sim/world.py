@@ -109,8 +109,8 @@ class World:
     def place_target_at_random(self, clearance: float = 0.75, from_walls: float = 0.25, apart: float = 0.25) -> None:
         """Put the target at a free place, ``clearance`` from every dog, so that one dog is clearly the nearest.
 
-        The distances to the dogs differ pairwise by ``apart`` metres.  Where no place has both, the one that comes nearest to
-        both is taken; raises ``NotPossible`` in a yard with no free place at all.
+        The distances to the dogs differ pairwise by ``apart`` metres.  Where no place has both, the one that comes
+        nearest to both is taken; raises ``NotPossible`` in a yard with no free place at all.
         """
         best, best_fit = None, -math.inf
         for _ in range(TRIES):
