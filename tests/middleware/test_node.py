@@ -8,8 +8,10 @@ from typing import Any
 import msgpack
 
 from middleware.entangled.errors import Alone, NoAnswer, NotRunning, Refused, TooLarge
+from middleware.entangled.kademlia.distance import closest
 from middleware.entangled.network.switchboard import Weather
 from middleware.entangled.node import CONTACTS, EntangledNode
+from middleware.entangled.overlay import K
 from middleware.entangled.record import MAX_NAME, MAX_VALUE, Record, hashed_key
 from middleware.entangled.replica import SWEEP
 from tests.fleet import Fleet, FleetCase
@@ -407,6 +409,33 @@ class LargeFleetTests(NodeCase):
             node.endpoint.expose("missing", lambda peer, marks: complaints.append(str(peer.address)))
         fleet.run(10.0)
         self.assertEqual(complaints, [])
+
+    def test_the_next_in_line_inherits(self) -> None:
+        """When a holder leaves, the node that takes its place among the closest has the record at once."""
+        fleet = self.fleet(14, seed=7)
+        self.done(fleet, fleet.nodes[13].put(KEY, "task", b"do it"))
+        fleet.nodes[13].vanish()
+        fleet.run(25.0)
+        order = closest([node.contact for node in fleet.nodes[:13]], KEY, 13)
+        leaver, heir = (fleet.nodes[order[n].address.port - 7000] for n in (1, K))
+        self.assertEqual(heir.store.get(KEY), [])
+        leaver.stop()
+        fleet.run(0.5)
+        self.assertEqual([r.value for r in heir.store.get(KEY)], [b"do it"])
+
+    def test_former_replicas_do_not_count(self) -> None:
+        """When newcomers take over a key, what its former holders said is forgotten by those who watch it."""
+        fleet = self.fleet(10, seed=8)
+        self.done(fleet, fleet.nodes[0].put(KEY, "task", b"do it"))
+        told = self.watched(fleet.nodes[0])
+        fleet.run(3.0)
+        for _ in range(10):
+            fleet.add()
+        fleet.run(5.0)
+        holders = {c.node_id for c in closest([node.contact for node in fleet.nodes], KEY, K)}
+        replicas = set(fleet.nodes[0]._subscriber._watches[0].view.replicas())
+        self.assertLessEqual(replicas - {fleet.nodes[0].identity.node_id}, holders)
+        self.assertEqual(told, [[b"do it"]])
 
     def test_records_survive_a_slow_die_off(self) -> None:
         """With their writer dead and half of the others dying one by one, the team's records are still found."""

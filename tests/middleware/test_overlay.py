@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from twisted.internet.defer import Deferred
 
+from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.distance import closest
+from middleware.entangled.network.network import Address
 from middleware.entangled.overlay import K
 from middleware.entangled.record import hashed_key
 from tests.fleet import FleetCase
@@ -27,6 +29,18 @@ class OverlayTests(FleetCase):
                     self.assertEqual(found, truth)
                     others = {c.node_id for c in truth} - {node.identity.node_id}
                     self.assertLessEqual(others, {c.node_id for c in node.overlay.keepers(key)})
+
+    def test_the_found_are_kept_in_mind(self) -> None:
+        """A contact that is in the table but not there drives none of those that were found out of mind."""
+        fleet = self.fleet(14, seed=2)
+        node, key = fleet.nodes[0], hashed_key("a")
+        found = self.done(fleet, Deferred.fromCoroutine(node.overlay.holders(key)), 0.5)
+        strangers = [Contact(bytes([n]) * 32, Address("10.0.0.9", n)) for n in range(1, 200)]
+        for stranger in closest(strangers, key, 20):
+            node.overlay.table.saw(stranger, fleet.clock.seconds())
+        others = {c.node_id for c in found} - {node.identity.node_id}
+        self.assertFalse(others <= {c.node_id for c in node.overlay.responsible(key)})
+        self.assertLessEqual(others, {c.node_id for c in node.overlay.keepers(key)})
 
     def test_the_silent_go(self) -> None:
         """One that died without a word is out of every table after a while, one that left in order at once."""
