@@ -24,7 +24,6 @@ from twisted.internet.interfaces import IDelayedCall, IReactorTime
 from twisted.logger import Logger, LoggingFile
 from twisted.python import usage
 
-from agents.catalogue import DEMO, TASKS
 from agents.registry import agent_named
 from drivers.driver import Driver
 from drivers.errors import DriverError
@@ -264,6 +263,8 @@ class _Page(MultiService):
 
 def web_page(settings: Settings, seams: Seams, reactor: Any, node: SwarmNode) -> IService:
     """The web role: the page over the node's data store, live streams beside it; raises ``MissingExtra``."""
+    from agents.catalogue import DEMO, TASKS
+
     try:
         from webnode.app import create_app
         from webnode.ledger import state_from
@@ -271,7 +272,7 @@ def web_page(settings: Settings, seams: Seams, reactor: Any, node: SwarmNode) ->
         from webnode.server import Files, WebService, caller
         from webnode.state import Departed
         from webnode.team import TeamDesk
-    except ImportError as error:
+    except ModuleNotFoundError as error:
         raise MissingExtra("the web role", "web") from error
     from drivers.sim.link import TcpConnector
     from drivers.sim.operator import YardOperator
@@ -398,7 +399,3 @@ def main(arguments: list[str] | None = None) -> int:
             raise
         _refuse(MissingExtra(f"swarm {verb}", "all"))
     return int(module.main(words[1:]) or 0)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import importlib
 import random
-from importlib.metadata import entry_points
 from typing import Protocol
 
 from drivers.reading import Action, Observation
@@ -53,6 +52,8 @@ def behaviour_for(task: Task, rng: random.Random) -> Behaviour:
     """
     target = KINDS.get(task.kind)
     if target is None:
+        from importlib.metadata import entry_points  # heavy, and most nodes never come here
+
         found = {point.name: point.value for point in entry_points(group=ENTRY_POINTS)}
         target = found.get(task.kind)
         if target is None:

@@ -36,6 +36,8 @@ CAMERA = "camera"
 LOOK_AGAIN = 0.3
 """Seconds after which a newcomer looks whether others took the same place in the order of joining."""
 LOOKS = 10
+COUNTING = 2.0
+"""Seconds between two looks at the node's own network figures."""
 
 
 class SwarmNode(Service):
@@ -110,8 +112,17 @@ class SwarmNode(Service):
         self.presence.appear(kept[0] if kept else _next_place(others))
         device = self.presence.device
         self._log.info("{name} joined as number {joined}", name=device.name, joined=device.joined)
+        self._count()
+        self._chores.every(COUNTING, self._count)
         self.joined.callback(None)
         await self._step_behind()
+
+    def _count(self) -> None:
+        """Say how this node stands in the network (the page's network data)."""
+        entangled = self.entangled
+        dropped = sum(entangled.endpoint.counters.values())
+        contacts, records = len(entangled.overlay.table), len(self.store)
+        self.presence.change(network={"contacts": contacts, "records": records, "dropped": dropped})
 
     async def _step_behind(self) -> None:
         """Two that join at the same moment take the same place: the one with the higher uuid steps behind."""

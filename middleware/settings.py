@@ -11,7 +11,6 @@ import os
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, dataclass, field, fields, replace
-from difflib import get_close_matches
 from typing import Any
 
 from middleware import setting
@@ -209,4 +208,6 @@ def _keys() -> list[tuple[str, str]]:
 
 
 def _nearest(name: str, known: Iterable[str]) -> str:
+    from difflib import get_close_matches  # only a mistake needs it
+
     return get_close_matches(name, known, n=1, cutoff=0.0)[0]

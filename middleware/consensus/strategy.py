@@ -11,7 +11,6 @@ import hashlib
 import importlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.metadata import entry_points
 from typing import Protocol
 
 from middleware.errors import UnknownStrategy
@@ -63,6 +62,8 @@ def strategy_for(name: str, dotted: bool = False) -> ConsensusAlgorithm:
     """
     target = name if dotted and ":" in name else BUILT_IN.get(name)
     if target is None:
+        from importlib.metadata import entry_points  # heavy, and most nodes never come here
+
         found = {point.name: point.value for point in entry_points(group=ENTRY_POINTS)}
         target = found.get(name)
         if target is None:

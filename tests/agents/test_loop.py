@@ -111,6 +111,26 @@ class LoopTests(SynchronousTestCase):
         self.assertEqual(bad, [])
         self.assertEqual(self.team.state()["tasks"][0]["status"], "COMPLETED")
 
+    def test_only_who_did_it_is_done(self) -> None:
+        """At the end the device that did the task becomes DONE and the other IDLE, and never DONE for a moment."""
+        self.submit()
+        ends: dict[str, list[str]] = {"dog1": [], "dog2": []}
+        for name, statuses in ends.items():
+            presence = self.team.services[name].assembly.node.presence
+            change = presence.change
+
+            def watched(statuses: list[str] = statuses, change: Any = change, **changes: Any) -> None:
+                if "status" in changes:
+                    statuses.append(changes["status"])
+                change(**changes)
+
+            presence.change = watched  # type: ignore[method-assign]
+        self.team.clock.advance(8.0)
+        by = self.team.state()["tasks"][0]["result"]["by"]
+        self.assertEqual(ends.pop(by)[-1], "DONE")
+        (other,) = ends.values()
+        self.assertEqual((other[-1], other.count("DONE")), ("IDLE", 0))
+
     def test_task_of_unknown_kind_is_left_and_said(self) -> None:
         """A task that no behaviour is known for leaves a line on the device, and the next task is done."""
         self.submit(kind="os:system")
