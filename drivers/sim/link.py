@@ -162,11 +162,11 @@ class TcpConnector:
 
 
 class _TcpLine(protocol.ReconnectingClientFactory):
-    """Twisted's older way to stay connected: ``ClientService`` would cost a dog's node 0.6 MiB, and does no more here."""
+    """Twisted's older way to stay connected: ``ClientService`` would cost a node 0.6 MiB, and does no more here."""
 
     noisy = False
-    initialDelay = FIRST_RETRY_S
-    maxDelay = LAST_RETRY_S
+    initialDelay = FIRST_RETRY_S  # noqa: N815 (Twisted's)
+    maxDelay = LAST_RETRY_S  # noqa: N815 (Twisted's)
     factor = RETRY_FACTOR
     jitter = 0.0
 
@@ -180,7 +180,7 @@ class _TcpLine(protocol.ReconnectingClientFactory):
         self.resetDelay()
         return TcpLink(self._accept)
 
-    def clientConnectionLost(self, connector: Any, unused_reason: Failure) -> None:
+    def clientConnectionLost(self, connector: Any, unused_reason: Failure) -> None:  # noqa: N802 (Twisted's)
         super().clientConnectionLost(connector, unused_reason)
         gone, self._gone = self._gone, None
         if gone is not None:
