@@ -15,8 +15,8 @@ from middleware.entangled.clock import HeapClock
 from middleware.entangled.network.switchboard import Switchboard, Weather
 from middleware.entangled.store import MemoryStore
 from middleware.settings import Settings
+from sim.demo.trials import main as run_trials
 from sim.scene import loaded
-from sim.trials import main as run_trials
 from sim.yard import Yard
 from swarmnode import NodeService, Seams
 from webnode.ledger import state_from

@@ -384,7 +384,7 @@ def main(arguments: list[str] | None = None) -> int:
     """The ``swarm`` command: ``swarm demo``, ``swarm yard``, ``swarm trials``."""
     words = sys.argv[1:] if arguments is None else arguments
     verbs: dict[str, tuple[str, str]] = {
-        "demo": ("sim.demo", "three robots, a yard and the page, on this machine"),
+        "demo": ("sim.demo.demonstration", "three robots, a yard and the page, on this machine"),
         "yard": ("sim.server", "the yard alone"),
         "trials": ("rehearsal", "both experiments, many times"),
     }

@@ -1,1 +1,1 @@
-"""The yard in place of robots, the demonstration that starts a team in it, and the trials of both experiments."""
+"""The yard in place of robots: world, cameras, sensors, and the server that robots' drivers talk to."""

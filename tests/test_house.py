@@ -51,9 +51,9 @@ PURE = (
     "middleware.presence",
     "middleware.settings",
     "middleware.tasks",
-    "sim.configuration",
-    "sim.experiment",
-    "sim.story",
+    "sim.demo.configuration",
+    "sim.demo.experiment",
+    "sim.demo.story",
 )
 PURE_LAST_NAMES = ("codec",)
 NOT_IN_PURE = ("twisted", "time", "socket", "threading", "asyncio", "selectors", "subprocess", "secrets", "sqlite3")

@@ -17,7 +17,7 @@ PARENT = """
 import sys
 from pathlib import Path
 from twisted.internet import reactor
-from sim.processes import Team
+from sim.demo.processes import Team
 team = Team(reactor, Path(sys.argv[1]), lambda name, line: print(line, flush=True))
 for name in ("a", "b"):
     team.add(name, [sys.argv[2], name])

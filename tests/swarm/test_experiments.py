@@ -10,8 +10,8 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from drivers.sim.link import MemoryLink
 from rehearsal import VirtualTeam
-from sim.experiment import FOOTPRINT_M, TOUCH_M
-from sim.trials import trial
+from sim.demo.experiment import FOOTPRINT_M, TOUCH_M
+from sim.demo.trials import trial
 
 LOOK_S = 0.05
 

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sim.story import present
+from sim.demo.story import present
 
 MOVED_M = 0.10
 """The dog is killed when it has come this much nearer to the target."""

@@ -1,8 +1,8 @@
 """Leash: runs a program that ends when whoever started it ends, a killed parent included.
 
-``python -m sim.leash FILE|-m MODULE [ARGUMENTS]`` runs the program in this very process, so its process id is the one
-that was started.  The parent holds the other end of standard input and never writes; end of file there means that the
-parent is gone.  A kernel closes that pipe however the parent died, which no signal handler could promise.
+``python -m sim.demo.leash FILE|-m MODULE [ARGUMENTS]`` runs the program in this very process, so its process id is the
+one that was started.  The parent holds the other end of standard input and never writes; end of file there means that
+the parent is gone.  A kernel closes that pipe however the parent died, which no signal handler could promise.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def _watch(descriptor: int) -> None:
 def main() -> None:
     """Run the program that the command line names, on a leash."""
     if len(sys.argv) < 2 or sys.argv[1:] == ["-m"]:
-        raise SystemExit("usage: python -m sim.leash FILE|-m MODULE [ARGUMENTS]")
+        raise SystemExit("usage: python -m sim.demo.leash FILE|-m MODULE [ARGUMENTS]")
     leash = os.dup(0)
     os.set_inheritable(leash, False)
     threading.Thread(target=_watch, args=(leash,), name="leash", daemon=True).start()

@@ -22,13 +22,13 @@ from twisted.internet.task import deferLater, react
 
 from drivers.sim.link import TcpConnector
 from drivers.sim.operator import YardOperator
-from sim.configuration import BOOTSTRAP, DOGS, LOOPBACK, Plan
-from sim.experiment import Experiment, report, table
-from sim.port import PortBusy
-from sim.processes import Team
-from sim.stage import WEB_PORT, Trouble, arranged, fresh
-from sim.story import present, told
-from sim.visitor import PageError, Visitor
+from sim.demo.configuration import BOOTSTRAP, DOGS, LOOPBACK, Plan
+from sim.demo.experiment import Experiment, report, table
+from sim.demo.port import PortBusy
+from sim.demo.processes import Team
+from sim.demo.stage import WEB_PORT, Trouble, arranged, fresh
+from sim.demo.story import present, told
+from sim.demo.visitor import PageError, Visitor
 
 START_S = 40.0
 SEARCH_S = 3.0
@@ -199,7 +199,3 @@ def main(arguments: Sequence[str] = tuple(sys.argv[1:])) -> None:
     # Twisted's timers run on the wall clock; a step of that clock would freeze or fire all of them.
     ReactorBase.seconds = staticmethod(time.monotonic)
     react(lambda reactor: Deferred.fromCoroutine(_run(reactor, wishes)))
-
-
-if __name__ == "__main__":
-    main()

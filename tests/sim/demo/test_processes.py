@@ -13,7 +13,7 @@ from twisted.python.failure import Failure
 from twisted.trial.unittest import SynchronousTestCase
 from zope.interface import implementer
 
-from sim.processes import Team, on_leash
+from sim.demo.processes import Team, on_leash
 
 
 class MemoryProcess:

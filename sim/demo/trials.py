@@ -21,7 +21,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
-from sim.experiment import Experiment
+from sim.demo.experiment import Experiment
 
 LOOK_S = 0.032
 """Virtual seconds between two looks at the team: one sensor frame."""

@@ -133,5 +133,5 @@ class Team:
 
 
 def on_leash(arguments: Sequence[str]) -> list[str]:
-    """The command line that runs Python ``arguments`` so that they end with us (see ``sim.leash``)."""
-    return [sys.executable, "-m", "sim.leash", *arguments]
+    """The command line that runs Python ``arguments`` so that they end with us (see ``sim.demo.leash``)."""
+    return [sys.executable, "-m", "sim.demo.leash", *arguments]

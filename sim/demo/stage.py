@@ -9,8 +9,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TextIO
 
-from sim import port
-from sim.configuration import BOOTSTRAP, DOGS, LOOPBACK, Plan
+from sim.demo import port
+from sim.demo.configuration import BOOTSTRAP, DOGS, LOOPBACK, Plan
 
 WEB_PORT, NODE_PORT, YARD_PORT = 8080, 7000, 7400
 MARK = ".swarm-demo"

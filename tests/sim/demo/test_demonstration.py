@@ -8,12 +8,12 @@ from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from sim.configuration import DOGS, Plan
-from sim.demo import main
-from sim.experiment import LIMIT_S, Experiment, report, table, to_target
-from sim.stage import MARK, Trouble, fresh
-from sim.story import present, told
-from sim.visitor import MAX_EVENT, EventStream
+from sim.demo.configuration import DOGS, Plan
+from sim.demo.demonstration import main
+from sim.demo.experiment import LIMIT_S, Experiment, report, table, to_target
+from sim.demo.stage import MARK, Trouble, fresh
+from sim.demo.story import present, told
+from sim.demo.visitor import MAX_EVENT, EventStream
 
 TASK = "t1"
 

@@ -1,4 +1,4 @@
-"""Tests of ``sim.trials``: the table, and the command line with a team that is played."""
+"""Tests of ``sim.demo.trials``: the table, and the command line with a team that is played."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.clock import HeapClock
-from sim.trials import Outcome, main, percentile, table, trial
+from sim.demo.trials import Outcome, main, percentile, table, trial
 
 
 class PlayedTeam:
