@@ -55,4 +55,4 @@ def decide(
     elif acting:
         best = min((reports[uuid] for uuid in acting), key=lambda r: (r.cost, r.agent)).agent
     name, cost = present[best].name, reports[best].cost
-    return Decision(best, consensus.digest, f"{name} with {cost:.2f} of {len(reports)} reports")
+    return Decision(best, consensus.digest, f"{name}, {cost:.2f}, best of {len(reports)}")

@@ -91,14 +91,19 @@ def seconds(least: float, most: float) -> Rule:
     return _rule(check, _number)
 
 
-def numeric_host() -> Rule:
-    """A rule for an address of this machine, in figures."""
+def numeric_host(is_told: bool = False) -> Rule:
+    """A rule for an address of this machine, in figures; one that ``is_told`` to others must be reachable."""
+    example = "192.168.1.10" if is_told else "0.0.0.0"
+    remedy = f'write one such as "{example}" (`ip -brief address` lists yours)'
 
     def check(value: object) -> str:
         with suppress(ValueError):
             if isinstance(value, str):
-                return str(ip_address(value))
-        raise Wrong(f"must be a numeric address, is {shown(value)}", 'write one such as "127.0.0.1" or "0.0.0.0"')
+                address = ip_address(value)
+                if is_told and address.is_unspecified:
+                    raise Wrong(f"must be an address that other nodes can reach, is {shown(value)}", remedy)
+                return str(address)
+        raise Wrong(f"must be a numeric address, is {shown(value)}", remedy)
 
     return _rule(check)
 

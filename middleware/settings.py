@@ -35,8 +35,8 @@ class NodeSettings:
     description: str = field(default="", metadata=setting.text(200))
     """A line about the device, shown on the page; at most 200 characters."""
 
-    host: str = field(default="127.0.0.1", metadata=setting.numeric_host())
-    """The numeric address to listen at.  The default hears this machine alone; ``0.0.0.0`` hears every network."""
+    host: str = field(default="127.0.0.1", metadata=setting.numeric_host(is_told=True))
+    """The numeric address to listen at; the others are told it too.  The default hears this machine alone."""
 
     port: int = field(default=0, metadata=setting.port())
     """The UDP port; 0 takes any free one, which suits all nodes but those that others name in ``known_nodes``."""

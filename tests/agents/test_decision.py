@@ -38,7 +38,7 @@ class DecisionTests(SynchronousTestCase):
         """When everybody has reported, the nearest is assigned at once, before the waiting period is over."""
         decision = decided(member("a", 2.0), member("b", 1.0), member("c", 3.0), since=0.0)
         self.assertEqual(decision.assigned, "b")
-        self.assertEqual(decision.why, "dog-b with 1.00 of 3 reports")
+        self.assertEqual(decision.why, "dog-b, 1.00, best of 3")
 
     def test_waiting_period_holds_for_those_who_are_missing(self) -> None:
         """Within the waiting period nobody goes while a report is missing, and the reason names who is missing."""

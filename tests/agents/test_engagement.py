@@ -241,7 +241,7 @@ class EngagementTests(SynchronousTestCase):
             self.council.grant(5)
             self.assertEqual(self.step().action, GO)
         self.assertEqual(self.dog.executed, 41)
-        self.assertEqual([line for line in self.said if line.startswith("goes")], ["goes: dog1 with 1.00 of 2 reports"])
+        self.assertEqual([line for line in self.said if line.startswith("goes")], ["goes: dog1, 1.00, best of 2"])
         self.assertEqual(self.events, [])
 
     def test_highest_token_is_remembered(self) -> None:
@@ -280,7 +280,7 @@ class EngagementTests(SynchronousTestCase):
         self.engagement.heard([Record(group_key("t1"), MEMBER, ME.public, 1, "leased", 1.0, own.packed())])
         self.see(1.0)
         self.step()
-        self.assertEqual(self.engagement.me.why, "dog1 with 1.00 of 1 reports")
+        self.assertEqual(self.engagement.me.why, "dog1, 1.00, best of 1")
 
     def test_unchanged_reports_are_told_once(self) -> None:
         """Deciding the same again tells nobody anything."""

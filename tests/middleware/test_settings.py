@@ -18,7 +18,7 @@ WHOLE = """
 name = "dog1"
 kind = "ers7"
 description = "a white dog"
-host = "0.0.0.0"
+host = "127.0.0.2"
 port = 7001
 known_nodes = ["10.0.0.7:7000", "vaio.local:7000", "[fe80::1]:7000", "10.0.0.7:7000"]
 store = "dog1.db"
@@ -67,7 +67,7 @@ class SettingsTest(SynchronousTestCase):
         read = Settings.load(path)
         node = read.node
         self.assertEqual((node.name, node.kind, node.description), ("dog1", "ers7", "a white dog"))
-        self.assertEqual((node.host, node.port, node.presence_lease), ("0.0.0.0", 7001, 2.0))
+        self.assertEqual((node.host, node.port, node.presence_lease), ("127.0.0.2", 7001, 2.0))
         self.assertEqual(
             node.known_nodes, (Address("10.0.0.7", 7000), Address("vaio.local", 7000), Address("fe80::1", 7000))
         )
@@ -121,7 +121,7 @@ class SettingsTest(SynchronousTestCase):
             ("node", "name"): ["", "x" * 41, "dog 1", "dög", 1, "dog\n"],
             ("node", "kind"): [1, "x" * 41, "two\nlines"],
             ("node", "description"): [["text"], "x" * 201],
-            ("node", "host"): ["localhost", "", 7, "10.0.0.256"],
+            ("node", "host"): ["localhost", "", 7, "10.0.0.256", "0.0.0.0", "::"],
             ("node", "port"): [-1, 65536, 1.0, True, "7000"],
             ("node", "known_nodes"): [
                 "10.0.0.7:7000",
