@@ -1,0 +1,191 @@
+"""Command: ``swarm dht``, ``swarm tuple``, ``swarm keyword`` and ``swarm rpc``, asked of the node of this machine.
+
+It needs nothing but the standard library, so that help and answers come at once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import socket
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, TextIO
+
+from middleware.entangled.control import word
+from middleware.entangled.control.place import NoControl, found
+
+FAILED, WRONG = 1, 2
+FORMS = """fields:     7  1.5  true  null  "7"  words       JSON where it is JSON, else text
+templates:  _  any;  ?int ?float ?str ?bytes ?bool  a kind;  >5  <=5  !=red  in:a,b  prefix:job-  a predicate"""
+KEYS = "A key is any text, or id: and its 40 hexadecimal digits."
+
+Ask = Callable[[Path, dict[str, Any]], Iterator[dict[str, Any]]]
+
+
+def parser(group: str) -> argparse.ArgumentParser:
+    """The command line of one group of verbs."""
+    common = argparse.ArgumentParser(add_help=False)
+    common.add_argument("--node", metavar="NAME", help="which node of this machine, where several run")
+    common.add_argument("--json", action="store_true", help="answer in JSON, one line each")
+    if group == "rpc":
+        rpc = argparse.ArgumentParser(prog="swarm rpc", parents=[common], description="Call a method of a node.")
+        rpc.add_argument("node_asked", metavar="NODE", help="HOST:PORT, or the beginning of a known node's id")
+        rpc.add_argument("method", help="for instance ping")
+        rpc.add_argument("arguments", nargs="*", help="JSON where it is JSON, else text")
+        rpc.set_defaults(verb="rpc")
+        return rpc
+    build = {"dht": _dht, "tuple": _tuple, "keyword": _keyword}[group]
+    whole = argparse.ArgumentParser(
+        prog=f"swarm {group}",
+        epilog=FORMS if group == "tuple" else KEYS if group == "dht" else None,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    verbs = whole.add_subparsers(dest="verb", required=True, metavar="VERB")
+
+    def verb(name: str, purpose: str) -> argparse.ArgumentParser:
+        added = verbs.add_parser(name, help=purpose, description=purpose, parents=[common])
+        added.set_defaults(verb=f"{group} {name}")
+        return added
+
+    build(verb)
+    return whole
+
+
+def _dht(verb: Callable[[str, str], argparse.ArgumentParser]) -> None:
+    get = verb("get", "Print what the network holds under a key.")
+    get.add_argument("key")
+    get.add_argument("--concern", choices=("fast", "majority"), default="majority", help="one answer, or a sure one")
+    put = verb("put", "Store a value under a key, in this node's own slot.")
+    put.add_argument("key")
+    put.add_argument("value", help="text; - reads standard input, @FILE a file")
+    put.add_argument("--name", default="", help="which of this node's slots under the key")
+    put.add_argument("--lifetime", choices=("team", "leased"), default="team", help="outlive this node, or leave with it")
+    put.add_argument("--concern", choices=("one", "majority", "all"), default="majority", help="who must have it")
+    put.add_argument("--expect", type=int, metavar="SEQUENCE", help="only where the slot is at this sequence; 0: empty")
+    remove = verb("remove", "Remove this node's value under a key.")
+    remove.add_argument("key")
+    remove.add_argument("--name", default="")
+    verb("find", "Print the nodes that are closest to a key.").add_argument("key")
+    verb("watch", "Print what a key holds whenever it changes, until Ctrl-C.").add_argument("key")
+
+
+def _keyword(verb: Callable[[str, str], argparse.ArgumentParser]) -> None:
+    publish = verb("publish", "Publish data under every word of a name.")
+    publish.add_argument("name")
+    publish.add_argument("value", help="text; - reads standard input, @FILE a file")
+    verb("search", "Print what was published under all of the words.").add_argument("words", nargs="+")
+    verb("watch", "Print what was published under a word whenever it changes, until Ctrl-C.").add_argument("words")
+    verb("remove", "Take back what this node published under a name.").add_argument("name")
+
+
+def _tuple(verb: Callable[[str, str], argparse.ArgumentParser]) -> None:
+    put = verb("put", "Put a tuple into the space.")
+    put.add_argument("fields", nargs="+", metavar="FIELD")
+    put.add_argument("--ttl", type=float, metavar="SECONDS", help="take it out after that time")
+    get = verb("get", "Take a tuple that matches out of the space; nobody else gets it.")
+    read = verb("read", "Print a tuple that matches, and leave it.")
+    for each in (get, read):
+        each.add_argument("template", nargs="+", metavar="FIELD")
+        each.add_argument("--wait", type=float, metavar="SECONDS", help="for one to come")
+    read.add_argument("--all", action="store_true", help="print all that match")
+
+
+def request_of(wishes: argparse.Namespace) -> dict[str, Any]:
+    """The request that a command line means; raises ``word.BadWord``, or ``OSError`` for a file that cannot be read."""
+    given = {name: value for name, value in vars(wishes).items() if name not in ("verb", "node", "json")}
+    if "node_asked" in given:
+        given["node"] = given.pop("node_asked")
+    if isinstance(given.get("words"), list):
+        given["words"] = " ".join(given["words"])
+    for name, read in (("fields", word.scalar), ("arguments", _json_or_text), ("template", word.pattern)):
+        if name in given:
+            given[name] = [read(each) for each in given[name]]
+    if "value" in given:
+        given["value"] = _value(given["value"])
+    return {"verb": wishes.verb, "with": {name: value for name, value in given.items() if value is not None}}
+
+
+def asked(path: Path, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """The lines that the node behind the socket at ``path`` answers; raises ``NoControl`` where it does not."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
+        try:
+            connection.connect(str(path))
+            connection.sendall(json.dumps(request).encode() + b"\n")
+            with connection.makefile("rb") as lines:
+                for line in lines:
+                    yield json.loads(line)
+        except (OSError, ValueError) as error:
+            raise NoControl(f"the node behind {path} does not answer ({error}); is it running?") from error
+
+
+def main(group: str, words: Sequence[str], out: TextIO | None = None, ask: Ask = asked) -> int:
+    """Run one command; returns 0, 1 where nothing was found or the node refused, 2 where the command is wrong."""
+    out = out or sys.stdout
+    wishes = parser(group).parse_args(words)
+    try:
+        request = request_of(wishes)
+        path = found(wishes.node)
+        for line in ask(path, request):
+            if "error" in line:
+                if wishes.json:
+                    out.write(json.dumps(line) + "\n")
+                return _complain(group, line["text"], WRONG if line["error"] == "BadRequest" else FAILED)
+            answer = line["answer"] if "answer" in line else line.get("event")
+            out.write("".join(f"{text}\n" for text in _texts(wishes.verb, answer, wishes.json)))
+            out.flush()
+            if "answer" in line:
+                return FAILED if _is_nothing(wishes.verb, answer) else 0
+    except KeyboardInterrupt:
+        return 0
+    except (NoControl, word.BadWord, OSError) as problem:
+        return _complain(group, problem, WRONG)
+    return _complain(group, "the node closed the connection without an answer", FAILED)
+
+
+def _texts(verb: str, answer: Any, is_json: bool) -> list[str]:
+    if is_json:
+        return [json.dumps(answer, ensure_ascii=False)]
+    if answer is None:
+        return []
+    if verb == "dht find":
+        return [f"{each['id']}  {each['host']}:{each['port']}" for each in answer]
+    if verb in ("dht get", "dht watch", "keyword search", "keyword watch"):
+        lines = [f"{each['owner'][:10]}  {each['name'] or '-'}  {_plain(each['value'])}" for each in answer]
+        return [*lines, *([""] if verb.endswith("watch") else [])]
+    if verb == "tuple read" and answer and isinstance(answer[0], list):
+        return [word.shown(each) for each in answer]
+    if verb in ("tuple get", "tuple read"):
+        return [word.shown(answer)]
+    if isinstance(answer, dict) and "replicas" in answer:
+        return [f"{answer['replicas']} replicas have it"]
+    return [json.dumps(answer, ensure_ascii=False)]
+
+
+def _is_nothing(verb: str, answer: Any) -> bool:
+    return verb in ("dht get", "tuple get", "tuple read", "keyword search") and not answer
+
+
+def _plain(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+def _json_or_text(text: str) -> Any:
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError):
+        return text
+
+
+def _value(text: str) -> Any:
+    if text == "-":
+        return word.plain(sys.stdin.buffer.read())
+    if text.startswith("@"):
+        return word.plain(Path(text[1:]).read_bytes())
+    return text
+
+
+def _complain(group: str, problem: object, code: int) -> int:
+    sys.stderr.write(f"swarm {group}: {problem}\n")
+    return code

@@ -1,0 +1,56 @@
+"""Place: where the control sockets of this machine's nodes lie, one file a node, for its owner's eyes only."""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+
+from middleware.entangled.errors import LocalError
+
+FOLDER = "swarm-node"
+ENDING = ".control"
+MAX_PATH = 107
+"""Bytes of the path of a UNIX socket (``sockaddr_un``, Linux)."""
+
+
+class NoControl(LocalError):
+    """There is no such control socket, or none can be made."""
+
+
+def folder() -> Path:
+    """The folder of the sockets: in ``XDG_RUNTIME_DIR`` where there is one, else in ``/tmp`` under the user's number."""
+    runtime = os.environ.get("XDG_RUNTIME_DIR")
+    return Path(runtime) / FOLDER if runtime else Path(f"/tmp/{FOLDER}-{os.getuid()}")
+
+
+def made(name: str) -> Path:
+    """The path for the socket of node ``name``, its folder made; raises ``NoControl`` where that is not safe."""
+    where = folder()
+    try:
+        where.mkdir(mode=0o700, parents=True, exist_ok=True)
+        state = where.lstat()
+    except OSError as error:
+        raise NoControl(f"cannot make {where} for the control socket: {error.strerror}") from error
+    # In /tmp anybody may have made it first.
+    if not stat.S_ISDIR(state.st_mode) or state.st_uid != os.getuid() or state.st_mode & 0o077:
+        raise NoControl(f"{where} is not yours alone; remove it, or set XDG_RUNTIME_DIR to a folder of your own")
+    path = where / f"{name}{ENDING}"
+    if len(os.fsencode(path)) > MAX_PATH:
+        raise NoControl(f"{path} is longer than the {MAX_PATH} bytes of a socket's path; set a shorter XDG_RUNTIME_DIR")
+    return path
+
+
+def found(name: str | None) -> Path:
+    """The socket of node ``name``, or of the only node of this machine; raises ``NoControl`` and names those there are."""
+    names = sorted(path.name.removesuffix(ENDING) for path in folder().glob(f"*{ENDING}"))
+    if name is None and len(names) == 1:
+        name = names[0]
+    if name in names:
+        return folder() / f"{name}{ENDING}"
+    if not names:
+        raise NoControl("no node runs on this machine; start one: twistd -n swarm-node --name NAME")
+    there = ", ".join(names)
+    if name is None:
+        raise NoControl(f"several nodes run on this machine; say which: --node NAME, one of {there}")
+    raise NoControl(f"no node {name!r} runs on this machine; there are {there}")
