@@ -25,11 +25,9 @@ from twisted.internet.defer import Deferred, succeed
 from middleware.entangled.errors import Full
 from middleware.entangled.record import Record, Slot
 
-MAX_ROWS = 10_000
-"""Slots that a node holds.  More serves a larger network; less spares memory: about 1 KiB a row beside its value.
-
-With ``MAX_BYTES`` a full store adds some 18 MiB to a node of 40, which leaves a device of 64 MB alive.
-"""
+MAX_ROWS = 12_000
+"""Slots that a node holds.  More serves a larger network; less spares memory: 1.2 KiB a row beside what ``weight``
+counts.  Full with ``MAX_BYTES`` a store adds some 22 MiB to a node of 40, which a device of 64 MB just bears."""
 MAX_BYTES = 8 * 2**20
 """Bytes that a node holds, as ``weight`` counts them.  More holds more large values; less spares memory and card."""
 HOLD = 86_400.0

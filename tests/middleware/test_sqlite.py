@@ -16,7 +16,7 @@ from zope.interface import implementer
 
 from middleware.entangled.errors import BadStore, NotRunning, Refused
 from middleware.entangled.record import Record, hashed_key
-from middleware.entangled.schema import APPLICATION_ID, SCHEMA_VERSION
+from middleware.entangled.schema import SCHEMA_VERSION
 from middleware.entangled.sqlite import SqliteStore, read_records
 from tests.middleware.test_store import CAT, DOG, FOREVER, KEY, StoreContract, record
 
