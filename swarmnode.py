@@ -86,6 +86,8 @@ def identity_in(store: Store, rng: random.Random) -> Identity:
     """The lasting identity that the store keeps, made at the first start."""
     seed = store.noted("identity")
     if seed is None or len(seed) != 32:
+        if store.origin != "new":
+            NodeService._log.warn("the data store has lost the node's identity: this node is a new one now")
         seed = rng.randbytes(32)
         store.note("identity", seed)
     return Identity(seed)
@@ -214,9 +216,14 @@ def real_seams(settings: Settings, reactor: Any) -> Seams:
     from middleware.entangled.network.udp import UdpNetwork
 
     path = settings.node.store
-    store: Store = MemoryStore() if path == IN_MEMORY else SqliteStore.open(Path(path), reactor.seconds())
+    rng = random.SystemRandom()
+    store: Store = (
+        MemoryStore(epoch=rng.randbytes(8))
+        if path == IN_MEMORY
+        else SqliteStore.open(Path(path), reactor.seconds(), deliver=reactor.callFromThread)
+    )
     network = partial(UdpNetwork, reactor, settings.node.host, settings.node.port)
-    return Seams(reactor, network, store, random.SystemRandom(), time.time)
+    return Seams(reactor, network, store, rng, time.time)
 
 
 LookUp = Callable[..., Sequence[tuple[Any, ...]]]

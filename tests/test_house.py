@@ -63,7 +63,7 @@ EDGES = (
     "drivers.sim.link",
     "middleware.entangled.clock",
     "middleware.entangled.network.udp",
-    "middleware.entangled.sqlite",
+    "middleware.entangled.writer",
 )
 WORLD = ("time", "socket", "threading", "asyncio", "selectors", "subprocess", "secrets", "twisted.internet.reactor")
 GUARDED = ("middleware", "agents", "drivers")

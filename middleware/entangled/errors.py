@@ -15,6 +15,8 @@
         PortInUse
         BadStore
       Refused         a lawful no: an answer, and no accident
+        Full
+        Unwritable
 """
 
 
@@ -68,3 +70,11 @@ class BadStore(LocalError):
 
 class Refused(EntangledError):
     """The peer understood and said no; ``str()`` is its reason."""
+
+
+class Full(Refused):
+    """The store has no room and nothing that it may let go of; remove some, or allow it more rows or bytes."""
+
+
+class Unwritable(Refused):
+    """The store's file cannot be written now (full disk, read-only, broken); reads go on, writes do when it can."""

@@ -2,45 +2,119 @@
 
 ``MemoryStore`` forgets when the node ends; ``sqlite.SqliteStore`` is the same with a file behind it.  Moments are in
 seconds on one clock of the caller, who says when something expires and what the time is.
+
+Where there is no room for a record, room is made in this order, and no further than is needed:
+
+1. what has run out;
+2. tombstones that are older than ``hold``, the oldest first: whoever was away for longer than that re-joins empty;
+3. cached copies, the oldest first: others hold them for good.
+
+What is held for good is never let go of for the sake of something else: if that is not enough, the writer is told
+``Full``, with figures, and nothing has changed but 1.
 """
 
 from __future__ import annotations
 
 import heapq
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Literal, NamedTuple, Protocol
 
-from middleware.entangled.errors import Refused
+from twisted.internet.defer import Deferred, succeed
+
+from middleware.entangled.errors import Full
 from middleware.entangled.record import Record, Slot
 
-MAX_ROWS = 20_000
-"""Slots that a node holds.  More serves a larger network; less spares memory (about 1 KiB a row) and card."""
+MAX_ROWS = 12_000
+"""Slots that a node holds.  More serves a larger network; less spares memory: 1.2 KiB a row beside what ``weight``
+counts.  Full with ``MAX_BYTES`` a store adds some 22 MiB to a node of 40, which a device of 64 MB just bears."""
+MAX_BYTES = 8 * 2**20
+"""Bytes that a node holds, as ``weight`` counts them.  More holds more large values; less spares memory and card."""
+HOLD = 86_400.0
+"""Seconds for which a tombstone stays even where room is short: the longest absence after which a deleted record does
+not come back with whoever was away.  More is safer; less gives room back earlier."""
+FIXED_BYTES = 17
+"""Sequence (8), ttl (8) and lifetime (1) of a record."""
+
+Origin = Literal["new", "kept", "replaced"]
+"""Where a store comes from: made now, back from its file, or made now because its file was rotten."""
+
+
+class Usage(NamedTuple):
+    """What a store holds and may hold."""
+
+    rows: int
+    max_rows: int
+    bytes: int
+    max_bytes: int
+
+    def __str__(self) -> str:
+        return f"{self.rows} of {self.max_rows} rows, {self.bytes} of {self.max_bytes} bytes"
 
 
 class Store(Protocol):
-    """What every data store does; one thread uses it."""
+    """What every data store does; one thread uses it.
 
-    def put(self, record: Record, expires_at: float) -> bool:
+    A *cached* copy is one that nobody was promised: it is in memory only, may be let go of at any time without a word,
+    and is not seen unless asked for.
+    """
+
+    @property
+    def epoch(self) -> bytes:
+        """Eight bytes drawn when the store was made: others tell by them that a node lost what it had."""
+
+    @property
+    def origin(self) -> Origin:
+        """Where the store comes from; what is not ``new`` to its node may be stale or empty until it is compared."""
+
+    @property
+    def rotten(self) -> int:
+        """Rows that failed their checksum when the store was opened; they are absent, and its replicas repair them."""
+
+    @property
+    def usage(self) -> Usage:
+        """Rows and bytes held, cached copies and tombstones included, and how many may be."""
+
+    @property
+    def trouble(self) -> str:
+        """Why nothing can be written at present; empty if it can."""
+
+    def put(self, record: Record, expires_at: float, cached: bool = False, now: float | None = None) -> bool:
         """Hold ``record`` if it beats what its slot holds, and say whether it did.
 
-        The very record that is already held only stays longer.  Raises ``Refused`` where there is no room for a new
-        slot, or where it cannot be written.
+        The very record that is already held only stays longer, and for good if it was a cached copy so far.  A slot
+        that is held for good stays so whatever is cached in it.  ``now``: what has run out by then makes room first.
+
+        Raises ``Full`` where there is no room, ``Unwritable`` where it cannot be written.  It is safe, and may be
+        acknowledged, once ``written`` has fired.
         """
 
-    def get(self, key: bytes, tombstones: bool = False) -> list[Record]:
-        """The records under ``key`` in the order of (owner, name); ``tombstones``: with the empty slots."""
+    def written(self) -> Deferred[None]:
+        """Fire when all that was put until now survives the end of the process; fail with ``Unwritable`` if not."""
+
+    def get(self, key: bytes, tombstones: bool = False, cached: bool = False) -> list[Record]:
+        """The records under ``key`` in the order of (owner, name).
+
+        ``tombstones``: with the empty slots; ``cached``: with the cached copies.
+        """
 
     def slot(self, slot: Slot) -> Record | None:
-        """What ``slot`` holds, be it a tombstone."""
+        """What ``slot`` holds, be it a tombstone or a cached copy."""
+
+    def is_cached(self, slot: Slot) -> bool:
+        """Whether what ``slot`` holds is a cached copy."""
 
     def owned(self, owner: bytes) -> list[Record]:
-        """The records of ``owner``, tombstones included, in the order of their slots."""
+        """The records of ``owner``, tombstones included and cached copies not, in the order of their slots."""
 
     def extend(self, owner: bytes, expires_at: float) -> int:
         """Let all leased records of ``owner`` live until ``expires_at`` at least; returns how many there are."""
 
     def expire(self, now: float) -> list[Record]:
-        """Let go of what has run out by ``now`` and return it, the earliest first."""
+        """Let go of what has run out by ``now``; return it, the earliest first, and before it what had to make room.
+
+        Cached copies go without being told of.
+        """
 
     def drop_leased(self, owner: bytes) -> list[Record]:
         """Let go of all leased records of ``owner`` (it said goodbye) and return them in the order of their slots."""
@@ -49,10 +123,10 @@ class Store(Protocol):
         """Let go of what ``slot`` holds, whatever its lifetime, and say whether it held anything."""
 
     def records(self) -> list[Record]:
-        """Every record, tombstones included, in the order in which their slots came."""
+        """Every record held for good, tombstones included, in the order in which their slots came."""
 
     def keys(self) -> list[bytes]:
-        """Every key that has a slot, in the order in which they came."""
+        """Every key that has a slot, cached or not, in the order in which they came."""
 
     def note(self, name: str, value: bytes) -> None:
         """Keep a small fact of the node's own (its seed, its contacts) under ``name``."""
@@ -64,105 +138,146 @@ class Store(Protocol):
         """Write what is to be written and let go; may be called twice."""
 
     def __len__(self) -> int:
-        """How many slots are held, the empty ones included."""
+        """How many slots are held, the empty and the cached ones included."""
 
 
-@dataclass
+@dataclass(slots=True)
 class _Held:
     """A record with its expiry; ``queued_at`` is the moment under which the heap knows it."""
 
     record: Record
     expires_at: float
     queued_at: float
+    is_cached: bool
+
+
+def weight(record: Record) -> int:
+    """What ``record`` counts against a quota: the bytes of all its fields."""
+    name = len(record.name.encode())
+    return len(record.key) + len(record.owner) + name + len(record.value or b"") + len(record.signature) + FIXED_BYTES
 
 
 class MemoryStore:
     """A ``Store`` that lives as long as the program.
 
-    ``max_rows`` slots at most.  A tombstone is let in above that, for a delete must never fail for want of room, up to
-    as many slots again, for nobody shall fill the memory with them.
+    ``max_rows`` slots and ``max_bytes`` at most.  A tombstone is let in above that, for a delete must never fail for
+    want of room, up to as many slots again, for nobody shall fill the memory with them.
     """
 
-    def __init__(self, max_rows: int = MAX_ROWS) -> None:
+    origin: Origin = "new"
+    rotten = 0
+
+    def __init__(
+        self, max_rows: int = MAX_ROWS, max_bytes: int = MAX_BYTES, hold: float = HOLD, epoch: bytes = bytes(8)
+    ) -> None:
+        self.epoch = epoch
         self._max_rows = max_rows
+        self._max_bytes = max_bytes
+        self._hold = hold
+        self._now = float("-inf")
+        self._bytes = 0
         self._slots: dict[Slot, _Held] = {}
         self._by_key: dict[bytes, dict[Slot, _Held]] = {}
         self._by_owner: dict[bytes, dict[Slot, _Held]] = {}
-        self._sorted: dict[bytes, list[Record]] = {}
+        # In the order in which they may be let go of.
+        self._tombstones: dict[Slot, _Held] = {}
+        self._cached: dict[Slot, _Held] = {}
+        self._made_room: list[Record] = []
+        self._sorted: dict[bytes, list[_Held]] = {}
         self._heap: list[tuple[float, Slot]] = []
         self._notes: dict[str, bytes] = {}
 
     def __len__(self) -> int:
-        """How many slots are held, the empty ones included."""
+        """How many slots are held, the empty and the cached ones included."""
         return len(self._slots)
 
-    def put(self, record: Record, expires_at: float) -> bool:
+    @property
+    def trouble(self) -> str:
+        """Nothing: memory can always be written."""
+        return ""
+
+    @property
+    def usage(self) -> Usage:
+        """Rows and bytes held, and how many may be."""
+        return Usage(len(self._slots), self._max_rows, self._bytes, self._max_bytes)
+
+    def put(self, record: Record, expires_at: float, cached: bool = False, now: float | None = None) -> bool:
         """Hold ``record`` if it beats what its slot holds; see ``Store.put``."""
+        if now is not None:
+            self._now = max(self._now, now)
+            if not self._fits(record, 1, weight(record)):
+                self._made_room += self._run_out(now)
         slot = record.slot
         held = self._slots.get(slot)
-        if held is None:
-            self._check_room(record)
-            self._insert(record, expires_at)
-        elif record.beats(held.record):
-            held.record, held.expires_at = record, expires_at
-            if expires_at < held.queued_at:
-                self._queue(held)
-        else:
+        if held is not None and not record.beats(held.record):
             if record == held.record:
-                held.expires_at = max(held.expires_at, expires_at)
+                self._stay(held, expires_at, cached)
             return False
-        self._sorted.pop(slot.key, None)
+        if held is not None and cached and not held.is_cached:
+            cached, expires_at = False, max(expires_at, held.expires_at)
+        self._make_room(record, held)
+        if held is None:
+            self._insert(record, expires_at, cached)
+        else:
+            self._replace(held, record, expires_at, cached)
+        if not cached:
+            self._changed(slot, record)
         return True
 
-    def get(self, key: bytes, tombstones: bool = False) -> list[Record]:
+    def written(self) -> Deferred[None]:
+        """Fire at once: what is in memory gets no safer."""
+        return succeed(None)
+
+    def get(self, key: bytes, tombstones: bool = False, cached: bool = False) -> list[Record]:
         """The records under ``key``; see ``Store.get``."""
-        records = self._sorted.get(key)
-        if records is None:
+        holding = self._sorted.get(key)
+        if holding is None:
             slots = self._by_key.get(key)
             if slots is None:
                 return []
             # Large keys are read page by page, so the order is worth keeping between two changes.
-            records = self._sorted[key] = [slots[slot].record for slot in sorted(slots)]
-        return list(records) if tombstones else [record for record in records if not record.is_tombstone]
+            holding = self._sorted[key] = [slots[slot] for slot in sorted(slots)]
+        return [
+            held.record
+            for held in holding
+            if (tombstones or held.record.value is not None) and (cached or not held.is_cached)
+        ]
 
     def slot(self, slot: Slot) -> Record | None:
-        """What ``slot`` holds, be it a tombstone."""
+        """What ``slot`` holds, be it a tombstone or a cached copy."""
         held = self._slots.get(slot)
         return held.record if held else None
+
+    def is_cached(self, slot: Slot) -> bool:
+        """Whether what ``slot`` holds is a cached copy."""
+        return slot in self._cached
 
     def owned(self, owner: bytes) -> list[Record]:
         """The records of ``owner``, tombstones included, in the order of their slots."""
         slots = self._by_owner.get(owner, {})
-        return [slots[slot].record for slot in sorted(slots)]
+        return [slots[slot].record for slot in sorted(slots) if not slots[slot].is_cached]
 
     def extend(self, owner: bytes, expires_at: float) -> int:
         """Let all leased records of ``owner`` live until ``expires_at`` at least; returns how many there are."""
         leased = 0
         for held in self._by_owner.get(owner, {}).values():
-            if held.record.lifetime == "leased":
+            if held.record.lifetime == "leased" and not held.is_cached:
                 # The heap is not told: it will find out at the old moment and look again at the new one.
                 held.expires_at = max(held.expires_at, expires_at)
                 leased += 1
         return leased
 
     def expire(self, now: float) -> list[Record]:
-        """Let go of what has run out by ``now`` and return it, the earliest first."""
-        gone: list[tuple[float, Slot, Record]] = []
-        while self._heap and self._heap[0][0] <= now:
-            queued_at, slot = heapq.heappop(self._heap)
-            held = self._slots.get(slot)
-            if held is None or held.queued_at != queued_at:
-                continue
-            if held.expires_at > now:
-                self._queue(held)
-            else:
-                gone.append((held.expires_at, slot, self._remove(slot)))
-        # One whose lease was extended comes off the heap at its old moment.
-        gone.sort(key=lambda ended: ended[:2])
-        return [record for _, _, record in gone]
+        """Let go of what has run out by ``now``; see ``Store.expire``."""
+        self._now = max(self._now, now)
+        made_room, self._made_room = self._made_room, []
+        return made_room + self._run_out(now)
 
     def drop_leased(self, owner: bytes) -> list[Record]:
         """Let go of all leased records of ``owner`` and return them in the order of their slots."""
+        for slot in [slot for slot in self._by_owner.get(owner, {}) if slot in self._cached]:
+            if self._slots[slot].record.lifetime == "leased":
+                self._remove(slot)
         return [self._remove(record.slot) for record in self.owned(owner) if record.lifetime == "leased"]
 
     def discard(self, slot: Slot) -> bool:
@@ -173,8 +288,8 @@ class MemoryStore:
         return held
 
     def records(self) -> list[Record]:
-        """Every record, tombstones included, in the order in which their slots came."""
-        return [held.record for held in self._slots.values()]
+        """Every record held for good, tombstones included, in the order in which their slots came."""
+        return [held.record for held in self._slots.values() if not held.is_cached]
 
     def keys(self) -> list[bytes]:
         """Every key that has a slot, in the order in which they came."""
@@ -191,18 +306,104 @@ class MemoryStore:
     def close(self) -> None:
         """Do nothing: what is in memory needs no goodbye."""
 
-    def _check_room(self, record: Record) -> None:
-        room = 2 * self._max_rows if record.is_tombstone else self._max_rows
-        if len(self._slots) >= room:
-            raise Refused(f"store full: it holds {len(self._slots)} of {room} slots; remove some, or allow more rows")
+    # -- room --------------------------------------------------------------------------------------------------------
 
-    def _insert(self, record: Record, expires_at: float) -> None:
+    def _fits(self, record: Record, rows: int, size: int) -> bool:
+        """Whether ``rows`` and ``size`` more are within the quota for the like of ``record``."""
+        if record.is_tombstone:
+            return len(self._slots) + rows <= 2 * self._max_rows
+        return len(self._slots) + rows <= self._max_rows and self._bytes + size <= self._max_bytes
+
+    def _make_room(self, record: Record, held: _Held | None) -> None:
+        """Let go of what may go until ``record`` fits in the place of ``held``; raises ``Full``."""
+        rows = 1 if held is None else 0
+        size = weight(record) - (0 if held is None else weight(held.record))
+        if not rows and size <= 0:
+            return
+        leaving: list[Slot] = []
+        candidates = self._dispensable(record.slot)
+        while not self._fits(record, rows, size):
+            slot = next(candidates, None)
+            if slot is None:
+                raise Full(f"store full: it holds {self.usage}, no room for {size} bytes; remove some, or allow more")
+            leaving.append(slot)
+            rows, size = rows - 1, size - weight(self._slots[slot].record)
+        for slot in leaving:
+            is_cached = slot in self._cached
+            gone = self._remove(slot)
+            if not is_cached:
+                self._made_room.append(gone)
+
+    def _dispensable(self, spared: Slot) -> Iterator[Slot]:
+        """What may be let go of, in that order, but for ``spared``."""
+        for slot, held in self._tombstones.items():
+            if held.expires_at - held.record.ttl + self._hold > self._now:
+                break
+            if slot != spared:
+                yield slot
+        yield from (slot for slot in self._cached if slot != spared)
+
+    # -- inside ------------------------------------------------------------------------------------------------------
+
+    def _changed(self, slot: Slot, record: Record | None) -> None:
+        """Learn that ``slot`` holds ``record`` for good from now on, or nothing."""
+
+    def _insert(self, record: Record, expires_at: float, cached: bool) -> None:
         slot = record.slot
-        held = _Held(record, expires_at, expires_at)
+        held = _Held(record, expires_at, expires_at, cached)
         self._slots[slot] = held
         self._by_key.setdefault(slot.key, {})[slot] = held
         self._by_owner.setdefault(slot.owner, {})[slot] = held
+        self._sorted.pop(slot.key, None)
+        self._bytes += weight(record)
+        self._sort_in(slot, held)
         self._queue(held)
+
+    def _replace(self, held: _Held, record: Record, expires_at: float, cached: bool) -> None:
+        self._bytes += weight(record) - weight(held.record)
+        held.record, held.expires_at, held.is_cached = record, expires_at, cached
+        self._sort_in(record.slot, held)
+        if expires_at < held.queued_at:
+            self._queue(held)
+
+    def _stay(self, held: _Held, expires_at: float, cached: bool) -> None:
+        """Let ``held`` live until ``expires_at`` at least, and for good unless that is for a cached copy."""
+        if cached and not held.is_cached:
+            return
+        held.expires_at = max(held.expires_at, expires_at)
+        becomes_held = held.is_cached and not cached
+        held.is_cached = cached
+        slot = held.record.slot
+        self._sort_in(slot, held)
+        if becomes_held:
+            self._changed(slot, held.record)
+
+    def _sort_in(self, slot: Slot, held: _Held) -> None:
+        """Put ``held`` at the end of whichever row it is to wait in until room is needed."""
+        self._cached.pop(slot, None)
+        self._tombstones.pop(slot, None)
+        if held.is_cached:
+            self._cached[slot] = held
+        elif held.record.is_tombstone:
+            self._tombstones[slot] = held
+
+    def _run_out(self, now: float) -> list[Record]:
+        gone: list[tuple[float, Slot, Record]] = []
+        while self._heap and self._heap[0][0] <= now:
+            queued_at, slot = heapq.heappop(self._heap)
+            held = self._slots.get(slot)
+            if held is None or held.queued_at != queued_at:
+                continue
+            if held.expires_at > now:
+                self._queue(held)
+            else:
+                is_cached = held.is_cached
+                record = self._remove(slot)
+                if not is_cached:
+                    gone.append((held.expires_at, slot, record))
+        # One whose lease was extended comes off the heap at its old moment.
+        gone.sort(key=lambda ended: ended[:2])
+        return [record for _, _, record in gone]
 
     def _queue(self, held: _Held) -> None:
         held.queued_at = held.expires_at
@@ -220,4 +421,9 @@ class MemoryStore:
             if not index[name]:
                 del index[name]
         self._sorted.pop(slot.key, None)
+        self._bytes -= weight(held.record)
+        self._tombstones.pop(slot, None)
+        self._cached.pop(slot, None)
+        if not held.is_cached:
+            self._changed(slot, None)
         return held.record

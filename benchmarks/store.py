@@ -1,0 +1,350 @@
+"""What the data store promises, tried: rows that survive ``kill -9``, a quick restart, commits that stall nobody.
+
+``--kills N`` kills a writer N times and looks whether a row that it had acknowledged is lost or the file is damaged;
+``--restart ROWS`` takes the time from the start of a node's process until it serves; ``--rate`` writes and reads as
+fast as it goes.  Exit code 1 where a promise is broken.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import os
+import random
+import signal
+import sqlite3
+import subprocess
+import sys
+import tempfile
+import time
+from contextlib import closing
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from middleware.entangled.record import MAX_VALUE, Record, hashed_key
+from middleware.entangled.sqlite import SqliteStore
+
+ROOT = Path(__file__).resolve().parents[1]
+KEY = hashed_key("kills")
+OWNER = bytes(range(32))
+SLOTS = 3000
+TTL = 1e6
+RESTART_S = 2.0
+STALL_S = 0.05
+"""What the reactor may be late by, at the 99th percentile, while the store writes as fast as it can."""
+MIB = 2**20
+
+
+def written_as(number: int) -> Record:
+    """The record that is written in the place ``number`` of the series; all of it follows from the number."""
+    dice = random.Random(number)
+    size = min(MAX_VALUE, 200_000) if number % 97 == 0 else dice.randrange(300)
+    value = None if number % 7 == 0 else dice.randbytes(size)
+    signature = hashlib.blake2b(str(number).encode()).digest()
+    return Record(KEY, str(number % SLOTS), OWNER, number, "team", TTL, value, signature)
+
+
+def _say(*words: object) -> None:
+    sys.stdout.write(" ".join(map(str, words)) + "\n")
+    sys.stdout.flush()
+
+
+# -- kills ------------------------------------------------------------------------------------------------------------
+
+
+def write_until_killed(path: str, first: int) -> None:
+    """Write the series from ``first`` on, in groups; print the number of the last that is safe after each."""
+    _say("opening")
+    store = SqliteStore.open(path, 0.0)
+    number = first
+    while True:
+        for _ in range(random.Random(number).choice((1, 1, 3, 20, 50))):
+            store.put(written_as(number), TTL)
+            number += 1
+        store.flush(60.0)
+        _say(number - 1)
+
+
+@dataclass
+class Kills:
+    """What was seen over a number of kills."""
+
+    kills: int = 0
+    acknowledged: int = 0
+    early: int = 0
+    lost: list[str] = field(default_factory=list)
+    damaged: list[str] = field(default_factory=list)
+
+    def is_clean(self) -> bool:
+        """Whether nothing was lost and nothing damaged."""
+        return not self.lost and not self.damaged
+
+
+def killed(path: str, count: int, seed: int) -> Kills:
+    """Kill a process that writes to the store ``path``, ``count`` times, and look at what it left each time."""
+    rng = random.Random(seed)
+    seen = Kills()
+    safe = 0
+    for kill in range(1, count + 1):
+        first = _highest(path) + 1
+        command = [sys.executable, "-m", "benchmarks.store", "--child", path, str(first)]
+        child = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
+        assert child.stdout is not None
+        with closing(child.stdout):
+            child.stdout.readline()
+            # Now and then it dies while it opens the file.
+            time.sleep(rng.choice((rng.uniform(0.0, 0.03), rng.uniform(0.0, 0.3))))
+            child.send_signal(signal.SIGKILL)
+            lines = [line for line in child.stdout.read().splitlines(keepends=True) if line.endswith("\n")]
+            child.wait()
+        if child.returncode != -signal.SIGKILL:
+            seen.damaged.append(f"kill {kill}: the writer ended by itself with {child.returncode}")
+            return seen
+        seen.kills = kill
+        seen.early += not lines
+        last = int(lines[-1]) if lines else safe
+        seen.acknowledged += last - first + 1 if lines else 0
+        safe = max(safe, last)
+        _look(path, safe, kill, seen)
+    return seen
+
+
+def _highest(path: str) -> int:
+    if not os.path.exists(path):
+        return 0
+    with closing(SqliteStore.open(path, 0.0)) as store:
+        return max((record.sequence for record in store.records()), default=0)
+
+
+def _look(path: str, safe: int, kill: int, seen: Kills) -> None:
+    with closing(sqlite3.connect(path)) as connection:
+        (verdict,) = connection.execute("PRAGMA integrity_check").fetchone()
+        if verdict != "ok":
+            seen.damaged.append(f"kill {kill}: {verdict}")
+    with closing(SqliteStore.open(path, 0.0)) as store:
+        if (kill > 1 and store.origin != "kept") or store.rotten:
+            seen.damaged.append(f"kill {kill}: the store is {store.origin}, {store.rotten} rows are rotten")
+        held = {record.name: record for record in store.records()}
+        for number in range(max(1, safe - SLOTS + 1), safe + 1):
+            record = held.get(str(number % SLOTS))
+            if record is None or record.sequence < number or record != written_as(record.sequence):
+                seen.lost.append(f"kill {kill}: row {number}")
+
+
+# -- restart ----------------------------------------------------------------------------------------------------------
+
+
+def serve(path: str) -> None:
+    """Start a whole node on the store ``path``; print when it serves, how many rows it holds, and its memory."""
+    from twisted.internet import reactor
+
+    import swarmnode
+    from middleware.settings import Settings
+
+    settings = Settings.from_mapping({"node": {"name": "bench", "host": "127.0.0.1", "port": 0}}, "benchmark")
+    settings = settings.with_flags(store=path, team_key="of the benchmark, and of nobody else")
+    seams = swarmnode.real_seams(settings, reactor)
+    service = swarmnode.NodeService(settings, seams)
+
+    def serving() -> None:
+        service.startService()
+        _say(len(seams.store), *_memory())
+
+    reactor.callWhenRunning(serving)  # type: ignore[attr-defined]
+    reactor.run()  # type: ignore[attr-defined]
+
+
+def _memory() -> tuple[int, int]:
+    """Resident memory of this process, now and at its highest, in bytes."""
+    lines = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines())
+    return int(lines["VmRSS"].split()[0]) * 1024, int(lines["VmHWM"].split()[0]) * 1024
+
+
+def restarted(folder: str, rows: int, times: int = 5) -> bool:
+    """Print how long a node with ``rows`` rows takes to serve; False if too long."""
+    _say(f"{'rows':>8} {'file MiB':>9} {'serving after s':>16} {'worst s':>8} {'RSS MiB':>8} {'peak MiB':>9}")
+    held = True
+    for count in (0, rows):
+        path = os.path.join(folder, f"{count}.sqlite")
+        with closing(SqliteStore.open(path, 0.0, max_rows=max(1, count))) as store:
+            dice = random.Random(count)
+            for number in range(count):
+                value, signature = dice.randbytes(200), dice.randbytes(64)
+                name, owner = str(number), dice.choice((OWNER, OWNER[::-1]))
+                store.put(Record(dice.randbytes(20), name, owner, 1, "team", TTL, value, signature), TTL)
+        took, said = [], [0, 0, 0]
+        for _ in range(times):
+            started = time.monotonic()
+            child = subprocess.Popen(
+                [sys.executable, "-m", "benchmarks.store", "--serve", path], cwd=ROOT, stdout=subprocess.PIPE, text=True
+            )
+            assert child.stdout is not None
+            with closing(child.stdout):
+                said = [int(word) for word in child.stdout.readline().split()]
+                took.append(time.monotonic() - started)
+                child.terminate()
+                child.wait()
+        assert said and said[0] >= count
+        size = os.path.getsize(path) / MIB
+        median = sorted(took)[times // 2]
+        _say(f"{count:8} {size:9.1f} {median:16.2f} {max(took):8.2f} {said[1] / MIB:8.1f} {said[2] / MIB:9.1f}")
+        held = held and max(took) <= RESTART_S
+    _say(f"target: at most {RESTART_S:g} s, the worst of {times}: {'held' if held else 'MISSED'}")
+    return held
+
+
+# -- rate -------------------------------------------------------------------------------------------------------------
+
+
+def _percentile(figures: list[float], share: float) -> float:
+    return sorted(figures)[min(len(figures) - 1, int(share * len(figures)))]
+
+
+class Rate:
+    """Puts that wait for their commit, ``in_flight`` at a time, while the reactor's lateness is watched."""
+
+    TICK = 0.002
+
+    def __init__(self, store: SqliteStore, size: int, count: int, in_flight: int, base: int) -> None:
+        self._store = store
+        self._size = size
+        self._count = count
+        self._in_flight = in_flight
+        self._base = base
+        self.latencies: list[float] = []
+        self.late: list[float] = []
+        self._left = 0
+
+    async def run(self) -> float:
+        """The seconds that it took."""
+        from twisted.internet import reactor
+        from twisted.internet.defer import Deferred, gatherResults
+
+        running = True
+
+        def tick(due: float) -> None:
+            now = time.monotonic()
+            self.late.append(now - due)
+            if running:
+                reactor.callLater(self.TICK, tick, now + self.TICK)  # type: ignore[attr-defined]
+
+        tick(time.monotonic())
+        self._left = self._count
+        started = time.monotonic()
+        await gatherResults([Deferred.fromCoroutine(self._put_on()) for _ in range(self._in_flight)])
+        running = False
+        return time.monotonic() - started
+
+    async def _put_on(self) -> None:
+        while self._left:
+            self._left -= 1
+            number = self._base + self._left
+            dice = random.Random(number)
+            record = Record(
+                dice.randbytes(20), str(number), OWNER, 1, "team", TTL, dice.randbytes(self._size), bytes(64)
+            )
+            started = time.monotonic()
+            self._store.put(record, TTL)
+            await self._store.written()
+            self.latencies.append(time.monotonic() - started)
+
+
+async def _rates(folder: str, outcome: list[bool]) -> None:
+    from twisted.internet import reactor
+
+    deliver = reactor.callFromThread  # type: ignore[attr-defined]
+    _say(f"disk: {_sync_s(folder) * 1000:.2f} ms for a write and fsync of 4 KiB (median of 100)")
+    _say(
+        f"{'value':>9} {'in flight':>10} {'puts/s':>8} {'safe after p50':>15} {'p99 ms':>8} {'max ms':>8}"
+        f" {'late p99 ms':>12} {'max ms':>8} {'gets/s':>9} {'RSS MiB':>8}"
+    )
+    base = 0
+    for size, count, in_flight in ((200, 1500, 1), (200, 6000, 64), (10_000, 400, 16), (MIB, 24, 4)):
+        if size > MAX_VALUE and size > 10_000:
+            _say(f"{size:9} (a record carries at most {MAX_VALUE} bytes)")
+        path = os.path.join(folder, f"rate-{size}-{in_flight}.sqlite")
+        with closing(SqliteStore.open(path, 0.0, max_bytes=64 * MIB, deliver=deliver)) as store:
+            rate = Rate(store, size, count, in_flight, base)
+            seconds = await rate.run()
+            base += count
+            keys = store.keys()
+            started = time.perf_counter()
+            for key in keys * max(1, 20_000 // len(keys)):
+                store.get(key)
+            gets = len(keys) * max(1, 20_000 // len(keys)) / (time.perf_counter() - started)
+        late = _percentile(rate.late, 0.99)
+        outcome.append(late <= STALL_S)
+        _say(
+            f"{size:9} {in_flight:10} {count / seconds:8.0f} {_percentile(rate.latencies, 0.5) * 1000:15.2f}"
+            f" {_percentile(rate.latencies, 0.99) * 1000:8.2f} {max(rate.latencies) * 1000:8.2f}"
+            f" {late * 1000:12.2f} {max(rate.late) * 1000:8.2f} {gets:9.0f} {_memory()[0] / MIB:8.1f}"
+        )
+
+
+def _sync_s(folder: str) -> float:
+    took = []
+    with open(os.path.join(folder, "sync"), "wb", buffering=0) as file:
+        for _ in range(100):
+            started = time.perf_counter()
+            file.write(bytes(4096))
+            os.fsync(file.fileno())
+            took.append(time.perf_counter() - started)
+    return _percentile(took, 0.5)
+
+
+def rated(folder: str) -> bool:
+    """Print what the store does in a second; False if the reactor was kept waiting."""
+    from twisted.internet import task
+
+    outcome: list[bool] = []
+    try:
+        from twisted.internet.defer import Deferred
+
+        task.react(lambda reactor: Deferred.fromCoroutine(_rates(folder, outcome)))
+    except SystemExit as ended:
+        outcome.append(not ended.code)
+    held = all(outcome)
+    _say(f"target: the reactor at most {STALL_S * 1000:g} ms late at p99: {'held' if held else 'MISSED'}")
+    return held
+
+
+def main() -> int:
+    """The command."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.store", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--kills", type=int, default=0, metavar="N", help="kill a writer N times")
+    parser.add_argument("--restart", type=int, default=0, metavar="ROWS", help="start a node with that many rows")
+    parser.add_argument("--rate", action="store_true", help="puts and gets in a second, and how long they take")
+    parser.add_argument("--seed", type=int, default=1, help="of the moments of the kills")
+    parser.add_argument("--folder", default=None, help="where the stores are made, to choose the disk")
+    parser.add_argument("--child", nargs=2, metavar=("PATH", "FIRST"), help=argparse.SUPPRESS)
+    parser.add_argument("--serve", metavar="PATH", help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.child:
+        write_until_killed(options.child[0], int(options.child[1]))
+    if options.serve:
+        serve(options.serve)
+        return 0
+    if not (options.kills or options.restart or options.rate):
+        parser.error("say at least one of --kills, --restart, --rate")
+    held = True
+    with tempfile.TemporaryDirectory(dir=options.folder) as folder:
+        if options.kills:
+            started = time.monotonic()
+            seen = killed(os.path.join(folder, "kills.sqlite"), options.kills, options.seed)
+            _say(f"{'kills':>6} {'while opening':>14} {'acknowledged':>13} {'lost':>5} {'damaged':>8} {'seconds':>8}")
+            _say(
+                f"{seen.kills:6} {seen.early:14} {seen.acknowledged:13} {len(seen.lost):5} {len(seen.damaged):8}"
+                f" {time.monotonic() - started:8.0f}"
+            )
+            for line in seen.lost[:10] + seen.damaged[:10]:
+                _say(line)
+            held = seen.is_clean() and held
+        if options.restart:
+            held = restarted(folder, options.restart) and held
+        if options.rate:
+            held = rated(folder) and held
+    return 0 if held else 1
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,216 @@
+"""Schema: how records and notes stand in a SQLite file, how they are checked, and how older files become new ones.
+
+Each row carries a CRC-32 of what it says, for flash that rots inside a page leaves SQLite's own structure whole.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import msgpack
+
+from middleware.entangled.errors import BadStore
+from middleware.entangled.record import Record, unpacked
+
+APPLICATION_ID = 0x53574E31
+"""Says in the file's header that the file is ours ("SWN1")."""
+SCHEMA_VERSION = 2
+MARK = bytes.fromhex("a9531c4e5fd0428fb1e7706d2c8834f6")
+"""Stands among the notes, so that a file whose header is gone is still known as ours."""
+RECORDS_1 = (
+    "CREATE TABLE records(key BLOB, owner BLOB, name TEXT, sequence INTEGER, lifetime TEXT, ttl REAL, value BLOB,"
+    " signature BLOB, PRIMARY KEY(key, owner, name)) WITHOUT ROWID"
+)
+"""Until version 1; large values make such a table slow, for they lie in the tree by which it is searched."""
+RECORDS = (
+    "CREATE TABLE records(id INTEGER PRIMARY KEY, key BLOB, owner BLOB, name TEXT, sequence INTEGER, lifetime TEXT,"
+    " ttl REAL, signature BLOB, crc INTEGER, value BLOB, UNIQUE(key, owner, name))"
+)
+NOTES = "CREATE TABLE notes(name TEXT PRIMARY KEY, value BLOB, crc INTEGER)"
+ROTTEN = (
+    "CREATE TABLE rotten(id INTEGER PRIMARY KEY, key BLOB, owner BLOB, name TEXT, sequence INTEGER, lifetime TEXT,"
+    " ttl REAL, signature BLOB, crc INTEGER, value BLOB)"
+)
+MAX_ROTTEN = 16
+"""Rotten rows that are kept to be looked at; more helps whoever wonders about a card, less spares it."""
+
+FIELDS = "key, owner, name, sequence, lifetime, ttl, signature, crc, value"
+SELECT = f"SELECT {FIELDS} FROM records"
+PUT = (
+    f"INSERT INTO records({FIELDS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?) ON CONFLICT(key, owner, name) DO UPDATE SET"
+    " sequence = excluded.sequence, lifetime = excluded.lifetime, ttl = excluded.ttl, signature = excluded.signature,"
+    " crc = excluded.crc, value = excluded.value"
+)
+DELETE = "DELETE FROM records WHERE key = ? AND owner = ? AND name = ?"
+NOTE = "REPLACE INTO notes VALUES (?, ?, ?)"
+
+Statement = tuple[str, Sequence[Any]]
+
+
+class Rotten(Exception):
+    """The file is ours and damaged; ``str()`` says how that showed."""
+
+
+@dataclass
+class Contents:
+    """What a file holds; ``repairs`` are the statements that set aside what is rotten or belongs to an earlier life."""
+
+    records: list[Record] = field(default_factory=list)
+    notes: dict[str, bytes] = field(default_factory=dict)
+    rotten: int = 0
+    repairs: list[Statement] = field(default_factory=list)
+
+
+def row_of(record: Record) -> tuple[object, ...]:
+    """``record`` in the order of ``FIELDS``."""
+    key, owner, name = record.slot
+    return (
+        key,
+        owner,
+        name,
+        record.sequence,
+        record.lifetime,
+        record.ttl,
+        record.signature,
+        _crc(record.packed()),
+        record.value,
+    )
+
+
+def record_of(row: Sequence[Any]) -> Record | None:
+    """The record in a row of ``FIELDS`` whose texts are bytes; None if the row is rotten."""
+    record = _unchecked(row)
+    return record if record is not None and _crc(record.packed()) == row[7] else None
+
+
+def note_of(name: str, value: bytes) -> tuple[str, bytes, int]:
+    """A row of ``notes``."""
+    return name, value, _crc([name, value])
+
+
+def open_rows(connection: sqlite3.Connection) -> None:
+    """Let ``connection`` answer texts as bytes: those of a rotten row may be no texts."""
+    connection.text_factory = bytes
+
+
+def checked_version(path: str, connection: sqlite3.Connection) -> int:
+    """The schema version of the file, 0 where it is empty.
+
+    Raises ``BadStore`` where it is not ours or newer than we are, ``Rotten`` where it is not whole.
+    """
+    (application,) = connection.execute("PRAGMA application_id").fetchone()
+    (version,) = connection.execute("PRAGMA user_version").fetchone()
+    tables = [_text(sql) for (sql,) in connection.execute("SELECT sql FROM sqlite_schema WHERE type = 'table'")]
+    if application != APPLICATION_ID:
+        if RECORDS in tables or RECORDS_1 in tables:
+            raise Rotten("its header is not ours")
+        if application or version or tables:
+            raise BadStore(f"store {path}: is the database of another program; name another file")
+        return 0
+    if version > SCHEMA_VERSION:
+        raise BadStore(f"store {path}: has schema {version}, we know {SCHEMA_VERSION}; update us, or name another file")
+    if (RECORDS if version == SCHEMA_VERSION else RECORDS_1) not in tables:
+        raise Rotten(f"it has not the tables of schema {version}")
+    (verdict,) = connection.execute("PRAGMA integrity_check(1)").fetchone()
+    if _text(verdict) != "ok":
+        raise Rotten(str(_text(verdict)))
+    return int(version)
+
+
+def make(connection: sqlite3.Connection, version: int) -> None:
+    """Bring the file from ``version`` (0: empty) to ours, in one transaction: all of it, or nothing."""
+    if version == SCHEMA_VERSION:
+        return
+    connection.execute("BEGIN IMMEDIATE")
+    try:
+        if version == 1:
+            connection.execute("ALTER TABLE records RENAME TO old_records")
+            connection.execute("ALTER TABLE notes RENAME TO old_notes")
+        for statement in (RECORDS, NOTES, ROTTEN):
+            connection.execute(statement)
+        if version == 1:
+            _migrate_from_1(connection)
+        connection.execute(NOTE, note_of("mark", MARK))
+        connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+        connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
+        connection.execute("COMMIT")
+    except BaseException:
+        connection.rollback()
+        raise
+
+
+def contents(connection: sqlite3.Connection) -> Contents:
+    """What the file holds, in the order in which it came."""
+    found = Contents()
+    # Leases ended with the node that watched them.
+    found.repairs.append(("DELETE FROM records WHERE lifetime = 'leased'", ()))
+    # Owners and keys stand in many rows; one copy of each is enough.
+    known: dict[bytes, bytes] = {}
+    for row_id, key, owner, *rest in connection.execute(f"SELECT id, {FIELDS} FROM records ORDER BY id"):
+        record = record_of([known.setdefault(key, key), known.setdefault(owner, owner), *rest])
+        if record is None:
+            found.rotten += 1
+            found.repairs += _set_aside(row_id)
+        elif record.lifetime == "team":
+            found.records.append(record)
+    found.notes, bad = notes_in(connection)
+    found.rotten += bad
+    return found
+
+
+def notes_in(connection: sqlite3.Connection) -> tuple[dict[str, bytes], int]:
+    """The notes of the file that are whole, and how many are not."""
+    notes: dict[str, bytes] = {}
+    rotten = 0
+    for raw, value, crc in connection.execute("SELECT name, value, crc FROM notes ORDER BY name"):
+        name = _text(raw)
+        if isinstance(name, str) and isinstance(value, bytes) and _crc([name, value]) == crc:
+            notes[name] = value
+        else:
+            rotten += 1
+    return notes, rotten
+
+
+def _migrate_from_1(connection: sqlite3.Connection) -> None:
+    """Give every row of schema 1 its checksum."""
+    fields = "key, owner, name, sequence, lifetime, ttl, signature, NULL, value"
+    for row in connection.execute(f"SELECT {fields} FROM old_records ORDER BY key, owner, name"):
+        record = _unchecked(row)
+        if record is None:
+            connection.execute(f"INSERT INTO rotten({FIELDS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)", row)
+        else:
+            connection.execute(PUT, row_of(record))
+    notes = connection.execute("SELECT name, value FROM old_notes").fetchall()
+    connection.executemany(NOTE, [note_of(name.decode(), value) for name, value in notes])
+    connection.execute("DROP TABLE old_records")
+    connection.execute("DROP TABLE old_notes")
+
+
+def _unchecked(row: Sequence[Any]) -> Record | None:
+    key, owner, name, sequence, lifetime, ttl, signature, _, value = row
+    return unpacked([key, _text(name), owner, sequence, _text(lifetime), ttl, value, signature])
+
+
+def _set_aside(row_id: int) -> list[Statement]:
+    return [
+        (f"INSERT INTO rotten({FIELDS}) SELECT {FIELDS} FROM records WHERE id = ?", (row_id,)),
+        ("DELETE FROM records WHERE id = ?", (row_id,)),
+        ("DELETE FROM rotten WHERE id <= (SELECT max(id) FROM rotten) - ?", (MAX_ROTTEN,)),
+    ]
+
+
+def _text(raw: object) -> object:
+    if not isinstance(raw, bytes):
+        return raw
+    try:
+        return raw.decode()
+    except UnicodeDecodeError:
+        return None
+
+
+def _crc(fields: list[object]) -> int:
+    return zlib.crc32(msgpack.packb(fields))
