@@ -12,11 +12,12 @@ from dataclasses import asdict, dataclass, field, fields, replace
 
 import msgpack
 
+from middleware.entangled.errors import TooLarge
 from middleware.entangled.identity import node_id
 from middleware.entangled.kademlia.contact import Contact, unpacked
 from middleware.entangled.record import Record, hashed_key
 from middleware.presence import Capabilities
-from middleware.value import are_capabilities, are_properties, is_number, is_whole, mapping_of
+from middleware.value import MAX_VALUE, are_capabilities, are_properties, is_number, is_whole, mapping_of
 
 TASKS = hashed_key("tasks")
 COMPLETED, FAILED, CANCELLED = "COMPLETED", "FAILED", "CANCELLED"
@@ -57,7 +58,7 @@ class Task:
         """The value of the task's record."""
         content = {f.name: getattr(self, f.name) for f in fields(self)}
         content["council"] = [contact.packed() for contact in self.council]
-        return bytes(msgpack.packb(content))
+        return _packed(content)
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,7 @@ class Member:
 
     def packed(self) -> bytes:
         """The value of the member's record."""
-        return bytes(msgpack.packb(asdict(self)))
+        return _packed(asdict(self))
 
 
 @dataclass(frozen=True)
@@ -94,7 +95,15 @@ class Result:
 
     def packed(self) -> bytes:
         """The value of the result's record."""
-        return bytes(msgpack.packb(asdict(self)))
+        return _packed(asdict(self))
+
+
+def _packed(content: Mapping[str, object]) -> bytes:
+    """The value of a record that every device will hold; raises ``TooLarge``."""
+    value = bytes(msgpack.packb(content))
+    if len(value) > MAX_VALUE:
+        raise TooLarge(f"{len(value)} bytes; what the whole team holds has at most {MAX_VALUE}: shorten the texts")
+    return value
 
 
 def refusals(capabilities: Capabilities, requirements: Capabilities) -> list[str]:

@@ -11,13 +11,15 @@ import msgpack
 
 from middleware.entangled.record import Record
 
+MAX_VALUE = 1000
+"""Bytes in a value that every device of the team holds: its record fits into one datagram."""
 LARGEST = 2**53
 """No number of ours is larger: up to here every reader of the page's JSON keeps them exact."""
 
 
 def mapping_of(record: Record) -> dict[str, Any] | None:
-    """The mapping in a record's value, or None where there is none; never raises."""
-    if record.value is None:
+    """The mapping in a record's value, or None where there is none or it is too large; never raises."""
+    if record.value is None or len(record.value) > MAX_VALUE:
         return None
     try:
         content = msgpack.unpackb(record.value, strict_map_key=True)
