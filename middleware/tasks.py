@@ -12,12 +12,11 @@ from dataclasses import asdict, dataclass, field, fields, replace
 
 import msgpack
 
-from middleware.entangled.errors import TooLarge
 from middleware.entangled.identity import node_id
 from middleware.entangled.kademlia.contact import Contact, unpacked
 from middleware.entangled.record import Record, hashed_key
 from middleware.presence import Capabilities
-from middleware.value import MAX_VALUE, are_capabilities, are_properties, is_number, is_whole, mapping_of
+from middleware.value import are_capabilities, are_properties, bounded, is_number, is_whole, mapping_of
 
 TASKS = hashed_key("tasks")
 COMPLETED, FAILED, CANCELLED = "COMPLETED", "FAILED", "CANCELLED"
@@ -58,7 +57,7 @@ class Task:
         """The value of the task's record."""
         content = {f.name: getattr(self, f.name) for f in fields(self)}
         content["council"] = [contact.packed() for contact in self.council]
-        return _packed(content)
+        return bounded(bytes(msgpack.packb(content)))
 
 
 @dataclass(frozen=True)
@@ -80,7 +79,7 @@ class Member:
 
     def packed(self) -> bytes:
         """The value of the member's record."""
-        return _packed(asdict(self))
+        return bounded(bytes(msgpack.packb(asdict(self))))
 
 
 @dataclass(frozen=True)
@@ -95,15 +94,7 @@ class Result:
 
     def packed(self) -> bytes:
         """The value of the result's record."""
-        return _packed(asdict(self))
-
-
-def _packed(content: Mapping[str, object]) -> bytes:
-    """The value of a record that every device will hold; raises ``TooLarge``."""
-    value = bytes(msgpack.packb(content))
-    if len(value) > MAX_VALUE:
-        raise TooLarge(f"{len(value)} bytes; what the whole team holds has at most {MAX_VALUE}: shorten the texts")
-    return value
+        return bounded(bytes(msgpack.packb(asdict(self))))
 
 
 def refusals(capabilities: Capabilities, requirements: Capabilities) -> list[str]:

@@ -9,6 +9,7 @@ from typing import Any
 
 import msgpack
 
+from middleware.entangled.errors import TooLarge
 from middleware.entangled.record import Record
 
 MAX_VALUE = 1000
@@ -26,6 +27,13 @@ def mapping_of(record: Record) -> dict[str, Any] | None:
     except Exception:  # the decoder raises many kinds on crafted bytes
         return None
     return content if isinstance(content, dict) else None
+
+
+def bounded(value: bytes) -> bytes:
+    """The same value, where every device of the team can hold it; else raises ``TooLarge``."""
+    if len(value) > MAX_VALUE:
+        raise TooLarge(f"{len(value)} bytes; what the whole team holds has at most {MAX_VALUE}: shorten the texts")
+    return value
 
 
 def is_number(value: object) -> bool:
