@@ -83,8 +83,8 @@ class Courier:
 
     ``send`` seals bytes for a peer, ``deliver`` is called with a session and each message that has arrived whole,
     ``first_wait`` says how long to wait for a peer's first receipt, ``is_awaited`` whether anybody waits for the answer
-    of a peer to a question, and ``on_progress`` is called with the id of a question of ours and a peer whenever that got
-    a part of it, or we one of the answer.
+    of a peer to a question.  ``on_progress`` is called with the id of a question of ours and a peer whenever the peer
+    got a part of it, or we one of the answer.
     """
 
     def __init__(

@@ -256,8 +256,8 @@ class Endpoint:
 
     def _established(self, session: Session, is_owed: bool) -> None:
         peer = self._peers.established(session)
-        self._asker.established(peer, session, is_owed)
         self._courier.restart(peer.public)
+        self._asker.established(peer, session, is_owed)
 
     def _resolve(self, message: Answer | Failure, contact: Contact) -> None:
         if self._asker.is_asked(message.id, contact.public):

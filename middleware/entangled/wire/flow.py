@@ -180,7 +180,7 @@ class Flow:
             return  # a late one
         now = self._clock.seconds()
         self._silences = 0
-        count, newest, round_trip = 0, -1, None
+        count, newest, sent_once, round_trip = 0, -1, -1, None
         for number in parcel.taken(receipt, now):
             order = parcel.orders.pop(number, -1)
             if order < 0:
@@ -188,8 +188,9 @@ class Flow:
                 continue
             _, _, sent_at = self._under_way.pop(order)
             count += 1
-            if order > newest:
-                newest, round_trip = order, None if parcel.repeated >> number & 1 else now - sent_at
+            newest = max(newest, order)
+            if order > sent_once and not parcel.repeated >> number & 1:
+                sent_once, round_trip = order, now - sent_at
         if round_trip is not None:
             self._round_trip.measured(round_trip)
         if count:

@@ -35,6 +35,7 @@ LEAST_WINDOW = 4.0
 MOST_WINDOW = 512.0
 BASE_S = 10.0
 SAMPLE = 32
+ROUND_SAMPLES = 8
 # Far below what ChaCha20-Poly1305 allows under one key (2**62 datagrams of this size).
 SESSION_DATAGRAMS = 2**32
 
@@ -67,7 +68,9 @@ class RoundTrip:
 
     @property
     def usual(self) -> float:
-        """Within how many seconds nearly every answer comes."""
+        """Within how many seconds nearly every answer comes; the first wait where nothing was measured yet."""
+        if not self.is_measured:
+            return self.wait
         return max(self._smoothed * 9 / 8, self._smoothed + 4 * self._deviation)
 
     def ambiguous(self) -> None:
@@ -81,11 +84,11 @@ class Window:
     Radio loses datagrams without being full, and halving the window at each of them would leave a window of five at 5 %
     loss.  So a loss counts as congestion only with a queue behind it, as in TCP Veno (Fu and Liew, 2003), or when more
     than one in six of at least ``SAMPLE`` parts is lost.  A queue is seen as in HyStart (Ha and Rhee, 2008; RFC 9406):
-    even the quickest round trip of a round takes longer than the quickest of the last ``BASE_S`` seconds by an eighth
-    of that, by at least 4 and at most 16 ms.
+    even the quickest of ``ROUND_SAMPLES`` round trips takes longer than the quickest of the last ``BASE_S`` seconds by
+    an eighth of that, by 4 ms, and by twice what round trips usually differ from one to the next: jitter is no queue.
     """
 
-    __slots__ = ("size", "_threshold", "_base", "_base_at", "_quickest", "_round_end", "_taken", "_lost")
+    __slots__ = ("size", "_threshold", "_base", "_base_at", "_quickest", "_samples", "_last", "_jitter", "_round_end", "_taken", "_lost")
 
     def __init__(self) -> None:
         self.size = FIRST_WINDOW
@@ -93,6 +96,9 @@ class Window:
         self._base = math.inf
         self._base_at = -math.inf
         self._quickest = math.inf
+        self._samples = 0
+        self._last = -1.0
+        self._jitter = 0.0
         self._round_end = 0
         self._taken = self._lost = 0
 
@@ -100,6 +106,10 @@ class Window:
         """Learn from a receipt for ``count`` parts, the newest being sent as number ``order`` of ``last_order``."""
         if round_trip is not None:
             self._quickest = min(self._quickest, round_trip)
+            self._samples += 1
+            if self._last >= 0.0:
+                self._jitter += (abs(round_trip - self._last) - self._jitter) / 16
+            self._last = round_trip
             if round_trip <= self._base or now - self._base_at > BASE_S:
                 self._base, self._base_at = round_trip, now
         self._taken += count
@@ -108,10 +118,11 @@ class Window:
         else:
             self.size += count * max(1 / self.size, 1 / 32)
         self.size = min(self.size, MOST_WINDOW)
-        if order >= self._round_end:
+        if order >= self._round_end and self._samples >= ROUND_SAMPLES:
             self._judge()
             self._round_end = last_order + 1
             self._quickest = math.inf
+            self._samples = 0
 
     def lost(self, count: int) -> None:
         """Take note of parts that were lost."""
@@ -127,8 +138,7 @@ class Window:
         self.size = min(self.size, FIRST_WINDOW)
 
     def _judge(self) -> None:
-        margin = min(0.016, max(0.004, self._base / 8))
-        is_queueing = self._quickest < math.inf and self._quickest > self._base + margin
+        is_queueing = self._quickest > self._base + max(0.004, self._base / 8, 2 * self._jitter)
         is_known = self._lost + self._taken >= SAMPLE
         if (is_queueing and self._lost > 0) or (is_known and 6 * self._lost > self._lost + self._taken):
             self.size = self._threshold = max(LEAST_WINDOW, self.size / 2)
