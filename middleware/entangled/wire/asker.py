@@ -14,9 +14,10 @@ from twisted.internet import defer
 from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IDelayedCall, IReactorTime
 
-from middleware.entangled.errors import NoAnswer, TooLarge
+from middleware.entangled.errors import Crowded, NoAnswer, TooLarge
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address
+from middleware.entangled.wire.congestion import BACK_OFF, LONGEST
 from middleware.entangled.wire.courier import Courier
 from middleware.entangled.wire.message import (
     MAX_MESSAGE,
@@ -30,14 +31,14 @@ from middleware.entangled.wire.message import (
     encoded,
 )
 from middleware.entangled.wire.method import ErrorCodes
-from middleware.entangled.wire.peer import BACK_OFF, LONGEST, MAX_TRIES, Opening, Peer, Peers, cancel
+from middleware.entangled.wire.peer import MAX_TRIES, Opening, Peer, Peers, cancel
 from middleware.entangled.wire.session import MAX_PLAIN, Session
 
 PATIENCE = 1.5
 MAX_TELLS = 32
 SILENCE_S = 5.0
 _CROWDED = "too many handshakes are under way"
-_FULL = "too much is on its way to it already"
+_FULL = "too much is on its way already; ask again later"
 
 
 @dataclass(slots=True, eq=False)
@@ -106,6 +107,9 @@ class Asker:
             peer = self._peers.peer(contact)
         except ValueError:
             return defer.fail(NoAnswer(f"{contact.address}: the key of this contact is no key"))
+        is_bulky = len(message) > MAX_PLAIN
+        if is_bulky and not self._courier.reserve(contact.public, len(message)):
+            return defer.fail(Crowded(f"{method} asked of {contact.address}: {_FULL}"))
         self._next_number += 1
         now = self._clock.seconds()
         patience = PATIENCE if timeout is None else timeout
@@ -120,7 +124,7 @@ class Asker:
             asked_at=now,
             deadline=now + patience,
             is_patient=patience > PATIENCE,
-            is_bulky=len(message) > MAX_PLAIN,
+            is_bulky=is_bulky,
             grace=PATIENCE if timeout is None else 0.0,
             deferred=deferred,
         )
@@ -215,9 +219,7 @@ class Asker:
             inquiry.sent_at = now
         message = aged(inquiry.message, inquiry.deadline - now)
         if inquiry.is_bulky:
-            if not self._courier.post(inquiry.peer.public, Key(False, inquiry.number), message):
-                self._fail(inquiry, _FULL)
-                return
+            self._courier.post(inquiry.peer.public, Key(False, inquiry.number), message)
         else:
             self._send(session, message)
         wait = inquiry.peer.round_trip.wait * BACK_OFF ** min(inquiry.tries - 1, MAX_TRIES)
@@ -288,7 +290,8 @@ class Asker:
 
     def _fail(self, inquiry: Inquiry, why: str) -> None:
         self._forget(inquiry)
-        inquiry.deferred.errback(NoAnswer(f"{inquiry.method} asked of {inquiry.address}: {why}"))
+        kind = Crowded if why is _CROWDED else NoAnswer
+        inquiry.deferred.errback(kind(f"{inquiry.method} asked of {inquiry.address}: {why}"))
 
     def _cancel(self, inquiry: Inquiry) -> None:
         """Forget a question because its asker does not wait any more, and say so to the peer."""
@@ -303,6 +306,7 @@ class Asker:
         inquiry.peer.inquiries.pop(inquiry.number, None)
         if inquiry.is_bulky:
             self._courier.drop(inquiry.peer.public, Key(False, inquiry.number))
+            self._courier.release(inquiry.peer.public, len(inquiry.message))
         if inquiry.progress_at >= 0:
             self._courier.forget(inquiry.peer.public, Key(True, inquiry.number))
 

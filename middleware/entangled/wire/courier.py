@@ -105,7 +105,7 @@ class Courier:
         self._on_progress = on_progress
         self._counters = counters
         self._flows: OrderedDict[bytes, Flow] = OrderedDict()
-        self._bytes_out = 0
+        self._bytes_out: Counter[bytes] = Counter()
         self._assemblies: dict[tuple[bytes, Key], Assembly] = {}
         self._bytes_in: Counter[bytes] = Counter()
         self._ended: OrderedDict[tuple[bytes, Key], None] = OrderedDict()
@@ -120,20 +120,32 @@ class Courier:
         self._assemblies.clear()
         self._bytes_in.clear()
         self._ended.clear()
-        self._bytes_out = 0
+        self._bytes_out.clear()
+
+    def reserve(self, public: bytes, size: int) -> bool:
+        """Whether a message of ``size`` bytes may wait here for a peer; it counts until it is ``released``."""
+        if self._bytes_out[public] + size > MAX_OUT_OF_PEER or self._bytes_out.total() + size > MAX_OUT:
+            self._counters["crowded"] += 1
+            return False
+        self._bytes_out[public] += size
+        return True
+
+    def release(self, public: bytes, size: int) -> None:
+        """Take note that a message for which there was room is not held any more."""
+        self._bytes_out[public] -= size
+        if self._bytes_out[public] <= 0:
+            del self._bytes_out[public]
 
     def post(self, public: bytes, key: Key, message: bytes) -> bool:
-        """Carry a message to a peer; False where too much waits already.  One that is under way goes on."""
+        """Carry a message to a peer.  A question has its room already; False where an answer finds none."""
         flow = self._flows.get(public)
         if flow is None:
             flow = self._new_flow(public)
         self._flows.move_to_end(public)
         if key in flow.parcels:
-            return True
-        if flow.bytes + len(message) > MAX_OUT_OF_PEER or self._bytes_out + len(message) > MAX_OUT:
-            self._counters["crowded"] += 1
+            return True  # it is under way
+        if key.is_answer and not self.reserve(public, len(message)):
             return False
-        self._bytes_out += len(message)
         flow.post(key, message)
         return True
 
@@ -192,12 +204,12 @@ class Courier:
             if is_over:
                 self._counters["unasked" if key.is_answer else "repeated"] += 1
                 if part.is_wanted:
-                    self._send(public, packed_receipt(key, True, 0, 0))
+                    self._send(public, packed_receipt(key, True, 0, part.number, 0))
                 return
             if self._bytes_in[public] + part.total > MAX_IN_OF_PEER or self._bytes_in.total() + part.total > MAX_IN:
                 self._counters["crowded"] += 1
                 if part.is_wanted:
-                    self._send(public, packed_receipt(key, False, 0, 0))
+                    self._send(public, packed_receipt(key, False, 0, part.number, 0))
                 return
             assembly = self._assemblies[where] = Assembly.of(part.total, now)
             self._bytes_in[public] += part.total
@@ -213,12 +225,12 @@ class Courier:
                 self._ended[where] = None
                 if len(self._ended) > MAX_ENDED:
                     self._ended.popitem(last=False)
-            self._send(public, packed_receipt(key, True, 0, assembly.here))
+            self._send(public, packed_receipt(key, True, 0, part.number, assembly.here))
             self._deliver(session, key, assembly.message())
             return
         if is_urgent or part.is_wanted:
             room = max(LEAST_ROOM, ROOM_PARTS // len(self._assemblies))
-            self._send(public, packed_receipt(key, False, room, assembly.here))
+            self._send(public, packed_receipt(key, False, room, part.number, assembly.here))
         if key.is_answer:
             self._on_progress(key.id, public)
 
@@ -227,12 +239,14 @@ class Courier:
             idle = [other for other, flow in self._flows.items() if not flow.parcels]
             for other in idle[:1]:
                 del self._flows[other]
-        flow = Flow(self._clock, lambda plain: self._send(public, plain), self._carried, self._first_wait(public))
+
+        def carried(parcel: Parcel) -> None:
+            if parcel.key.is_answer:
+                self.release(public, len(parcel.data))
+
+        flow = Flow(self._clock, lambda plain: self._send(public, plain), carried, self._first_wait(public))
         self._flows[public] = flow
         return flow
-
-    def _carried(self, parcel: Parcel) -> None:
-        self._bytes_out -= len(parcel.data)
 
     def _forget(self, where: tuple[bytes, Key]) -> None:
         assembly = self._assemblies.pop(where, None)

@@ -22,7 +22,7 @@ from middleware.entangled.network.network import MAX_DATAGRAM, Address, Network
 from middleware.entangled.wire.answerer import Answerer
 from middleware.entangled.wire.asker import PATIENCE, Asker
 from middleware.entangled.wire.courier import Courier
-from middleware.entangled.wire.greeting import COOKIE, HERE, WHO, Cookies, Greeter, answered_mac, opened_cookie
+from middleware.entangled.wire.greeting import COOKIE, HERE, WHO, Cookies, Greeter
 from middleware.entangled.wire.message import (
     PART,
     RECEIPT,
@@ -88,9 +88,9 @@ class Endpoint:
         )
         self._answerer = Answerer(clock, self._send, self._courier, self._codes, self.counters)
         self._asker = Asker(clock, rng, self._peers, self._courier, self._send, self._codes, self.counters)
-        self._greeter = Greeter(identity.public, derived_key(team_key, b"greet"), network, clock, rng, self.counters)
-        self._cookie_key = derived_key(team_key, b"cookie")
-        self._cookies = Cookies(self._cookie_key, rng)
+        greet_key, cookie_key = derived_key(team_key, b"greet"), derived_key(team_key, b"cookie")
+        self._greeter = Greeter(identity.public, greet_key, cookie_key, self._peers, network, clock, rng, self.counters)
+        self._cookies = Cookies(cookie_key, rng)
         self._sessions = self._peers.sessions
         self._half_open = HalfOpen(self._sessions)
         self._receivers: dict[int, Callable[[bytes, Address], None]] = {
@@ -99,7 +99,7 @@ class Endpoint:
             RESP: self._on_resp,
             WHO: self._greeter.on_who,
             HERE: self._greeter.on_here,
-            COOKIE: self._on_cookie,
+            COOKIE: self._greeter.on_cookie,
         }
 
     @property
@@ -120,11 +120,11 @@ class Endpoint:
         self.is_running = False
         self._network.close()
         self._answerer.clear()
-        self._courier.stop()
         self._half_open.clear()
         error = NotRunning("the endpoint was stopped")
         self._greeter.stop(error)
         self._asker.stop(error)
+        self._courier.stop()
         self._peers.stop()
 
     def expose(self, name: str, answer: Callable[..., object], changes: bool = False) -> None:
@@ -160,8 +160,8 @@ class Endpoint:
         something: such a question waits for the session, others ride in the handshake.
 
         Fails with ``NoAnswer``, ``Refused`` (the peer's text), an exception named by ``expose_error``, ``TooLarge``,
-        ``NotRunning``, or with the ``TypeError`` of arguments that msgpack cannot hold.  When it is cancelled, the peer
-        is told and cancels its work.
+        ``Crowded``, ``NotRunning``, or with the ``TypeError`` of arguments that msgpack cannot hold.  When it is
+        cancelled, the peer is told and cancels its work.
         """
         if not self.is_running:
             return defer.fail(NotRunning("the endpoint is not running; start it first"))
@@ -272,7 +272,7 @@ class Endpoint:
         if not self._cookies.is_lawful(datagram, source, now):
             self.counters["forged"] += 1
             return
-        known = self._half_open.response(datagram)
+        known = self._half_open.response(datagram, now)
         if known is not None:  # the RESP was lost, or somebody plays a recording: neither costs a key exchange
             self.counters["repeated"] += 1
             self._network.send(known, source)
@@ -334,20 +334,6 @@ class Endpoint:
             self._asker.resolve(message, contact.public)
         if self.is_running:
             self._established(session, is_owed=True)
-
-    def _on_cookie(self, datagram: bytes, source: Address) -> None:
-        opening = self._peers.opening_of(answered_mac(datagram))
-        if opening is None:
-            self.counters["stale"] += 1
-        elif source != opening.address:
-            self.counters["misdirected"] += 1
-        else:
-            try:
-                cookie = opened_cookie(self._cookie_key, datagram)
-            except Forged:
-                self.counters["forged"] += 1
-                return
-            self._peers.paid(opening, cookie)
 
     def _send(self, session: Session, message: bytes) -> None:
         if self.is_running:

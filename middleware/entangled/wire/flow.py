@@ -8,6 +8,7 @@ from itertools import islice
 
 from twisted.internet.interfaces import IDelayedCall, IReactorTime
 
+from middleware.entangled.wire.congestion import BACK_OFF, LONGEST, RoundTrip, Window
 from middleware.entangled.wire.message import (
     MAX_PARTS,
     OF_ANSWER,
@@ -18,7 +19,7 @@ from middleware.entangled.wire.message import (
     Receipt,
     part_count,
 )
-from middleware.entangled.wire.peer import BACK_OFF, LONGEST, RoundTrip, Window, cancel
+from middleware.entangled.wire.peer import cancel
 
 IDLE_S = 10.0
 TURNS = 4  # parcels to one peer that take turns; the others wait, or each would hold memory at the receiver
@@ -131,7 +132,6 @@ class Flow:
         self, clock: IReactorTime, send: Callable[[bytes], None], ended: Callable[[Parcel], None], first_wait: float
     ) -> None:
         self.parcels: OrderedDict[Key, Parcel] = OrderedDict()
-        self.bytes = 0
         self._clock = clock
         self._send = send
         self._ended = ended
@@ -156,7 +156,6 @@ class Flow:
         if now - self._sent_at > REST_S:
             self._window.rested()
         self.parcels[key] = Parcel(key, message, now)
-        self.bytes += len(message)
         self._pump(now)
 
     def drop(self, key: Key) -> None:
@@ -180,7 +179,7 @@ class Flow:
             return  # a late one
         now = self._clock.seconds()
         self._silences = 0
-        count, newest, sent_once, round_trip = 0, -1, -1, None
+        count, newest, round_trip = 0, -1, None
         for number in parcel.taken(receipt, now):
             order = parcel.orders.pop(number, -1)
             if order < 0:
@@ -189,8 +188,8 @@ class Flow:
             _, _, sent_at = self._under_way.pop(order)
             count += 1
             newest = max(newest, order)
-            if order > sent_once and not parcel.repeated >> number & 1:
-                sent_once, round_trip = order, now - sent_at
+            if number == receipt.cause and not parcel.repeated >> number & 1:
+                round_trip = now - sent_at
         if round_trip is not None:
             self._round_trip.measured(round_trip)
         if count:
@@ -267,7 +266,8 @@ class Flow:
         return self._sent_at + self._patience()
 
     def _patience(self) -> float:
-        return min(LONGEST, self._round_trip.wait * BACK_OFF ** min(self._silences, 8))
+        wait = self._round_trip.wait
+        return min(LONGEST, max(wait, min(LONGEST_PROBE, wait * BACK_OFF ** min(self._silences, 8))))
 
     def _arm(self, now: float) -> None:
         if not self.parcels:
@@ -312,7 +312,6 @@ class Flow:
 
     def _end(self, parcel: Parcel) -> None:
         del self.parcels[parcel.key]
-        self.bytes -= len(parcel.data)
         for order in parcel.orders.values():
             del self._under_way[order]
         if parcel in self._turns:

@@ -23,7 +23,8 @@ from twisted.internet.interfaces import IDelayedCall, IReactorTime
 from middleware.entangled.errors import Forged, NoAnswer
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address, Network
-from middleware.entangled.wire.peer import BACK_OFF, FIRST_GUESS, LONGEST
+from middleware.entangled.wire.congestion import BACK_OFF, FIRST_GUESS, LONGEST
+from middleware.entangled.wire.peer import Peers
 from middleware.entangled.wire.session import MAC, has_cookie, mac_of
 
 WHO = 0x14
@@ -78,11 +79,6 @@ def opened_cookie(key: bytes, datagram: bytes) -> bytes:
         return bindings.crypto_aead_xchacha20poly1305_ietf_decrypt(ciphertext, head, nonce, key)
     except (CryptoError, ValueError) as error:
         raise Forged("a cookie that does not open") from error
-
-
-def answered_mac(datagram: bytes) -> bytes:
-    """The hash of the INIT to which a COOKIE datagram is the answer."""
-    return datagram[1 : 1 + MAC]
 
 
 class Cookies:
@@ -142,12 +138,14 @@ class _Bucket:
 
 
 class Greeter:
-    """Greets addresses for an endpoint, again and again until one answers or the time is up, and greets back."""
+    """Greets addresses for an endpoint until one answers or the time is up, greets back, and pays with cookies."""
 
     def __init__(
         self,
         public: bytes,
         key: bytes,
+        cookie_key: bytes,
+        peers: Peers,
         network: Network,
         clock: IReactorTime,
         rng: random.Random,
@@ -155,6 +153,8 @@ class Greeter:
     ) -> None:
         self._public = public
         self._key = key
+        self._cookie_key = cookie_key
+        self._peers = peers
         self._network = network
         self._clock = clock
         self._rng = rng
@@ -201,6 +201,21 @@ class Greeter:
         else:
             self._forget(token)
             greeting.deferred.callback(Contact(public, source))
+
+    def on_cookie(self, datagram: bytes, source: Address) -> None:
+        """Pay with the cookie that the answer to an INIT of ours brings."""
+        opening = self._peers.opening_of(datagram[1 : 1 + MAC])
+        if opening is None:
+            self._counters["stale"] += 1
+        elif source != opening.address:
+            self._counters["misdirected"] += 1
+        else:
+            try:
+                cookie = opened_cookie(self._cookie_key, datagram)
+            except Forged:
+                self._counters["forged"] += 1
+                return
+            self._peers.paid(opening, cookie)
 
     def _send(self, token: bytes, wait: float) -> None:
         greeting = self._pending[token]

@@ -4,11 +4,12 @@
 bytes.  Moments never travel.  A part and a receipt each fill one datagram::
 
     PART     0x01  flags 1  id 8  total bytes 4  number 2  the bytes of this part
-    RECEIPT  0x02  flags 1  id 8  next 2  room 2  bitmap
+    RECEIPT  0x02  flags 1  id 8  next 2  room 2  cause 2  bitmap
 
 All parts but the last have ``PART_BYTES``, so a part has one place where it fits, and parts never overlap.  ``next`` is
 the first part that is missing, bit n of the bitmap (least significant first) says that part ``next + 1 + n`` is here,
-and ``room`` is how many parts from ``next`` on the receiver takes.
+and ``room`` is how many parts from ``next`` on the receiver takes.  ``cause`` is the part that called for the receipt:
+it alone tells the round trip, since earlier receipts for the others may have been lost.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ OF_ANSWER = 0x01  # flag of both: the parcel is the answer to the question with 
 WANTED = 0x02  # flag of PART: the sender wants a receipt now
 DONE = 0x02  # flag of RECEIPT: send no more; everything is here, or nobody waits for it
 _PART_HEAD = 16
-_RECEIPT_HEAD = 14
+_RECEIPT_HEAD = 16
 PART_BYTES = MAX_PLAIN - _PART_HEAD
 MAX_PARTS = -(-MAX_MESSAGE // PART_BYTES)
 MAX_BITMAP = -(-MAX_PARTS // 8)
@@ -229,6 +230,7 @@ class Receipt(NamedTuple):
     is_done: bool
     next: int
     room: int
+    cause: int
     here: int
 
 
@@ -253,16 +255,17 @@ def receipt_of(plain: bytes) -> Receipt:
     if not _RECEIPT_HEAD <= len(plain) <= _RECEIPT_HEAD + MAX_BITMAP or plain[1] & ~(OF_ANSWER | DONE):
         raise Malformed("a receipt of a wrong length, or with unknown flags")
     first = int.from_bytes(plain[10:12], "little")
+    room, cause = int.from_bytes(plain[12:14], "little"), int.from_bytes(plain[14:16], "little")
     here = int.from_bytes(plain[_RECEIPT_HEAD:], "little") << (first + 1) | (1 << first) - 1
-    return Receipt(_key(plain), bool(plain[1] & DONE), first, int.from_bytes(plain[12:14], "little"), here)
+    return Receipt(_key(plain), bool(plain[1] & DONE), first, room, cause, here)
 
 
-def packed_receipt(key: Key, is_done: bool, room: int, here: int) -> bytes:
-    """The RECEIPT for a parcel of which the parts in ``here`` have come."""
+def packed_receipt(key: Key, is_done: bool, room: int, cause: int, here: int) -> bytes:
+    """The RECEIPT for a parcel of which the parts in ``here`` have come, the part ``cause`` just now."""
     first = ((here + 1) & ~here).bit_length() - 1  # the lowest bit that is not set
     bitmap = here >> (first + 1)
     head = bytes([RECEIPT, key.is_answer * OF_ANSWER | is_done * DONE]) + key.id.to_bytes(8, "little")
-    head += first.to_bytes(2, "little") + room.to_bytes(2, "little")
+    head += first.to_bytes(2, "little") + room.to_bytes(2, "little") + cause.to_bytes(2, "little")
     return head + bitmap.to_bytes(-(-bitmap.bit_length() // 8), "little")
 
 

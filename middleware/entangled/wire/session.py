@@ -260,16 +260,17 @@ class HalfOpen:
         self._unconfirmed: OrderedDict[int, Session] = OrderedDict()
         self._responses: OrderedDict[bytes, tuple[float, bytes]] = OrderedDict()
 
-    def response(self, init: bytes) -> bytes | None:
+    def response(self, init: bytes, now: float) -> bytes | None:
         """The RESP that this INIT got already."""
-        known = self._responses.get(ephemeral_of(init))
-        return known[1] if known is not None else None
+        made_at, response = self._responses.get(ephemeral_of(init), (-RESPONSES_S, None))
+        return response if made_at > now - RESPONSES_S else None
 
     def add(self, session: Session, init: bytes, response: bytes, now: float) -> None:
         """Keep a new session, and let go of those that are too many or too old."""
         unconfirmed, responses = self._unconfirmed, self._responses
         self._sessions[session.local_index] = unconfirmed[session.local_index] = session
         responses[ephemeral_of(init)] = (now, response)
+        responses.move_to_end(ephemeral_of(init))
         while unconfirmed:
             index, oldest = next(iter(unconfirmed.items()))
             if len(unconfirmed) <= MAX_UNCONFIRMED and oldest.opened_at > now - UNCONFIRMED_S:
