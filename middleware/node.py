@@ -30,6 +30,7 @@ from middleware.entangled.watch import Changed, Watch
 from middleware.presence import DEVICES, Device, Presence, devices_of
 from middleware.streams import Streams
 from middleware.tasks import MAX_LEASE_TTL, MEMBER, RESULT, TASKS, Member, Result, Task, group_key
+from middleware.value import bounded
 
 COUNCIL = 3
 CAMERA = "camera"
@@ -250,7 +251,10 @@ class SwarmNode(Service):
     # -- inside -----------------------------------------------------------------------------------------------------
 
     def _announce(self, value: bytes) -> None:
-        self._quietly(maybeDeferred(self.entangled.put, DEVICES, self.presence.device.name, value, "leased"))
+        def put() -> Deferred[int]:
+            return self.entangled.put(DEVICES, self.presence.device.name, bounded(value), "leased")
+
+        self._quietly(maybeDeferred(put))
 
     def _quietly(self, work: Deferred[Any]) -> None:
         def ended(failure: Any) -> None:

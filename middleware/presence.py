@@ -14,8 +14,8 @@ from typing import Any
 import msgpack
 
 from middleware.entangled.identity import node_id
-from middleware.entangled.record import MAX_VALUE, Record, hashed_key
-from middleware.value import are_capabilities, is_number, is_whole, mapping_of
+from middleware.entangled.record import Record, hashed_key
+from middleware.value import MAX_VALUE, are_capabilities, is_number, is_whole, mapping_of
 
 DEVICES = hashed_key("devices")
 IDLE, ASSIGNED, SEARCHING, WAITING, EXECUTING, DONE = "IDLE", "ASSIGNED", "SEARCHING", "WAITING", "EXECUTING", "DONE"

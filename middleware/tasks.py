@@ -16,7 +16,7 @@ from middleware.entangled.identity import node_id
 from middleware.entangled.kademlia.contact import Contact, unpacked
 from middleware.entangled.record import Record, hashed_key
 from middleware.presence import Capabilities
-from middleware.value import are_capabilities, are_properties, is_number, is_whole, mapping_of
+from middleware.value import are_capabilities, are_properties, bounded, is_number, is_whole, mapping_of
 
 TASKS = hashed_key("tasks")
 COMPLETED, FAILED, CANCELLED = "COMPLETED", "FAILED", "CANCELLED"
@@ -57,7 +57,7 @@ class Task:
         """The value of the task's record."""
         content = {f.name: getattr(self, f.name) for f in fields(self)}
         content["council"] = [contact.packed() for contact in self.council]
-        return bytes(msgpack.packb(content))
+        return bounded(bytes(msgpack.packb(content)))
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class Member:
 
     def packed(self) -> bytes:
         """The value of the member's record."""
-        return bytes(msgpack.packb(asdict(self)))
+        return bounded(bytes(msgpack.packb(asdict(self))))
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ class Result:
 
     def packed(self) -> bytes:
         """The value of the result's record."""
-        return bytes(msgpack.packb(asdict(self)))
+        return bounded(bytes(msgpack.packb(asdict(self))))
 
 
 def refusals(capabilities: Capabilities, requirements: Capabilities) -> list[str]:

@@ -9,21 +9,31 @@ from typing import Any
 
 import msgpack
 
+from middleware.entangled.errors import TooLarge
 from middleware.entangled.record import Record
 
+MAX_VALUE = 1000
+"""Bytes in a value that every device of the team holds: its record fits into one datagram."""
 LARGEST = 2**53
 """No number of ours is larger: up to here every reader of the page's JSON keeps them exact."""
 
 
 def mapping_of(record: Record) -> dict[str, Any] | None:
-    """The mapping in a record's value, or None where there is none; never raises."""
-    if record.value is None:
+    """The mapping in a record's value, or None where there is none or it is too large; never raises."""
+    if record.value is None or len(record.value) > MAX_VALUE:
         return None
     try:
         content = msgpack.unpackb(record.value, strict_map_key=True)
     except Exception:  # the decoder raises many kinds on crafted bytes
         return None
     return content if isinstance(content, dict) else None
+
+
+def bounded(value: bytes) -> bytes:
+    """The same value, where every device of the team can hold it; else raises ``TooLarge``."""
+    if len(value) > MAX_VALUE:
+        raise TooLarge(f"{len(value)} bytes; what the whole team holds has at most {MAX_VALUE}: shorten the texts")
+    return value
 
 
 def is_number(value: object) -> bool:

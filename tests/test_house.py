@@ -44,6 +44,7 @@ PURE = (
     "middleware.entangled.kademlia.routing",
     "middleware.entangled.network.network",
     "middleware.entangled.record",
+    "middleware.entangled.wire.congestion",
     "middleware.entangled.wire.message",
     "middleware.entangled.wire.noise",
     "middleware.entangled.wire.session",

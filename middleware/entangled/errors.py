@@ -9,6 +9,7 @@
       WeatherError    nobody's fault: try again, with back-off
         NoAnswer
         Alone
+        Crowded
       LocalError      our caller's fault: let it fly
         NotRunning
         TooLarge
@@ -48,6 +49,10 @@ class Alone(WeatherError):
     """No other node is known or reachable."""
 
 
+class Crowded(WeatherError):
+    """This node has as much on its way as it may; nothing was sent, and nothing is said about the peer."""
+
+
 class LocalError(EntangledError):
     """The caller asked for something that cannot be."""
 
@@ -69,7 +74,14 @@ class BadStore(LocalError):
 
 
 class Refused(EntangledError):
-    """The peer understood and said no; ``str()`` is its reason."""
+    """The peer understood and said no; ``str()`` is its reason, ``code`` names the kind of it for programs."""
+
+    code = "refused"
+
+    def __init__(self, text: str = "", code: str | None = None) -> None:
+        super().__init__(text)
+        if code is not None:
+            self.code = code
 
 
 class Full(Refused):

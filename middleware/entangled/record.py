@@ -17,7 +17,7 @@ from middleware.entangled.identity import Identity, verified
 
 Lifetime = Literal["leased", "team"]
 KEY_BYTES = 20
-MAX_VALUE = 1000
+MAX_VALUE = 2**20
 MAX_NAME = 64
 MAX_TTL = 30 * 86400.0
 

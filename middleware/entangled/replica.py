@@ -25,7 +25,8 @@ WATCH_TTL = 8.0
 MAX_WATCHERS = 1000
 MAX_WATCHED = 10_000
 """Keys that are watched here at the same time."""
-PAGE_BYTES = 1000
+PAGE_BYTES = 12_000
+"""A page of small records goes out in one burst: ten datagrams are the first window of a parcel."""
 RECORD_BYTES = 160
 """What a record weighs in a message beside its name and value."""
 SWEEP = 0.1

@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.identity import Identity
-from middleware.entangled.record import MAX_VALUE, Record
+from middleware.entangled.record import Record
 from middleware.presence import DEVICES, IDLE, MESSAGES_KEPT, SEARCHING, Device, Presence, device_of, devices_of
+from middleware.value import MAX_VALUE
 
 DOG = Identity(b"\1" * 32)
 CAT = Identity(b"\2" * 32)

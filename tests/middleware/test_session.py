@@ -11,7 +11,7 @@ from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import MAX_DATAGRAM, Address
 from middleware.entangled.wire.noise import TransportKeys
-from middleware.entangled.wire.session import MAX_MESSAGE, OVERHEAD, WINDOW, Session, index_of
+from middleware.entangled.wire.session import MAX_PLAIN, OVERHEAD, WINDOW, Session, index_of
 
 
 class SessionTests(SynchronousTestCase):
@@ -31,7 +31,7 @@ class SessionTests(SynchronousTestCase):
         self.assertEqual(self.a.open(self.b.seal(b"")), (b"", True))
         self.assertEqual((index_of(datagram), len(datagram) - 5), (8, OVERHEAD))
         self.assertLessEqual(OVERHEAD, 36)
-        self.assertEqual(len(self.a.seal(bytes(MAX_MESSAGE))), MAX_DATAGRAM)
+        self.assertEqual(len(self.a.seal(bytes(MAX_PLAIN))), MAX_DATAGRAM)
 
     def test_opens_each_once_in_any_order(self) -> None:
         """Shuffled datagrams within the window open once each, and never again."""

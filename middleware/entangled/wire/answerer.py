@@ -1,12 +1,13 @@
-"""Answerer: runs the exposed methods for peers, each change at most once, and makes the answers.
+"""Answerer: runs the exposed methods for peers, each change at most once, in time or not at all, and makes the answers.
 
-It knows no keys and no sockets: it is handed questions, and a callable that sends a message on a session.
+It knows no keys and no sockets: it is handed questions, and callables that send a message on a session.
 """
 
 from __future__ import annotations
 
 import inspect
-from collections import Counter
+import math
+from collections import Counter, OrderedDict
 from collections.abc import Callable
 
 from twisted.internet.defer import Deferred
@@ -14,24 +15,31 @@ from twisted.internet.interfaces import IReactorTime
 from twisted.logger import Logger
 from twisted.python.failure import Failure as Trouble
 
-from middleware.entangled.errors import Refused
 from middleware.entangled.kademlia.contact import Contact
-from middleware.entangled.wire.ledger import Entry, Ledger
+from middleware.entangled.wire.courier import Courier
 from middleware.entangled.wire.message import (
-    BAD_ARGUMENTS,
+    BUSY,
+    GONE,
     INTERNAL,
+    MAX_MESSAGE,
+    NO_LIMIT_MS,
     REFUSED,
     UNKNOWN_METHOD,
     Answer,
+    Cancel,
     Failure,
+    Key,
     Question,
     Told,
     encoded,
 )
-from middleware.entangled.wire.method import BadArguments, Method
-from middleware.entangled.wire.session import MAX_MESSAGE, Session
+from middleware.entangled.wire.method import Entry, ErrorCodes, Ledger, Method
+from middleware.entangled.wire.session import MAX_PLAIN, Session
 
+MAX_CANCELLED = 1024
 _BUSY = "this node holds as many open questions as it may; ask again later"
+_FULL = "too much is on its way to you already; ask again later"
+_GONE = "the call ran, and its answer was too large to keep; ask what it changed"
 
 
 class Answerer:
@@ -39,32 +47,55 @@ class Answerer:
 
     _log = Logger()
 
-    def __init__(self, clock: IReactorTime, send: Callable[[Session, bytes], None], counters: Counter[str]) -> None:
+    def __init__(
+        self,
+        clock: IReactorTime,
+        send: Callable[[Session, bytes], None],
+        courier: Courier,
+        codes: ErrorCodes,
+        counters: Counter[str],
+    ) -> None:
         self.methods: dict[str, Method] = {}
         self._clock = clock
         self._send = send
+        self._courier = courier
+        self._codes = codes
         self._counters = counters
         self._ledger = Ledger()
+        self._cancelled: OrderedDict[tuple[bytes, int], None] = OrderedDict()
 
     def clear(self) -> None:
         """Forget what was asked; answers that are still being made go nowhere."""
         self._ledger.clear()
+        self._cancelled.clear()
 
-    def answer(self, question: Question, session: Session) -> None:
-        """Answer a question of an established session, now or when the method is done."""
+    def answer(self, question: Question, session: Session, is_bulky: bool = False) -> None:
+        """Answer a question of an established session, now or when the method is done.
+
+        ``is_bulky`` says that it came as a parcel.  Its answer then goes as one too, however short: a parcel is
+        repeated by us, and the asker need not send the whole question again because a short answer got lost.
+        """
         public = session.contact.public
-        entry = self._ledger.entry(public, question.id)
-        if entry is not None:
-            self._counters["repeated"] += 1
-            if entry.answer is None:
-                entry.session = session
-                self._send(session, b"")  # a sign of life: the asker keeps waiting
-            else:
-                self._send(session, entry.answer)
+        if (public, question.id) in self._cancelled:
+            self._counters["cancelled"] += 1
             return
-        answer = self._run(question, session.contact, session)
+        entry = self._ledger.entry(public, question.id)
+        is_known = entry is not None or self._courier.is_carrying(public, Key(True, question.id))
+        if is_known:
+            self._counters["repeated"] += 1
+            if entry is not None and entry.answer is not None:
+                self._reply(session, question.id, entry.answer, is_bulky)
+            else:
+                if entry is not None:
+                    entry.session = session
+                self._send(session, b"")  # a sign of life: the asker keeps waiting
+            return
+        if not question.left_ms:
+            self._counters["late"] += 1
+            return
+        answer = self._run(question, session.contact, session, is_bulky)
         if answer is not None:
-            self._send(session, answer)
+            self._reply(session, question.id, answer, is_bulky)
 
     def ride(self, question: Question, peer: Contact, room: int) -> bytes:
         """The answer to a question that came with a handshake, or nothing where it must wait for the session.
@@ -72,9 +103,10 @@ class Answerer:
         It must wait where it changes something (a handshake may be a replay), takes its time, or needs more ``room``.
         """
         method = self.methods.get(question.method)
-        if (method is not None and method.changes) or self._ledger.entry(peer.public, question.id) is not None:
+        known = self._ledger.entry(peer.public, question.id)
+        if (method is not None and method.changes) or known is not None or not question.left_ms:
             return b""
-        answer = self._run(question, peer, None)
+        answer = self._run(question, peer, None, False)
         return answer if answer is not None and len(answer) <= room else b""
 
     def take(self, told: Told, peer: Contact) -> None:
@@ -83,24 +115,37 @@ class Answerer:
         if method is None:
             self._counters["unknown method"] += 1
             return
-        result = self._called(method, peer, told.arguments)
+        result = self._called(method, peer, told.arguments, math.inf)
         if isinstance(result, Deferred):
             result.addErrback(lambda trouble: self._told_no(method, trouble))
         elif isinstance(result, Trouble):
             self._told_no(method, result)
 
-    def _run(self, question: Question, peer: Contact, session: Session | None) -> bytes | None:
+    def cancel(self, message: Cancel, public: bytes) -> None:
+        """Stop the work on a question for which nobody waits any more, and do not begin it if it comes later."""
+        self._courier.drop(public, Key(True, message.id))
+        self._courier.forget(public, Key(False, message.id))
+        entry = self._ledger.entry(public, message.id)
+        if entry is None:
+            self._cancelled[public, message.id] = None
+            if len(self._cancelled) > MAX_CANCELLED:
+                self._cancelled.popitem(last=False)
+        elif entry.work is not None:
+            self._counters["cancelled"] += 1
+            self._stop(entry)
+
+    def _run(self, question: Question, peer: Contact, session: Session | None, is_bulky: bool) -> bytes | None:
         """Run a new question; the answer, or None where it comes later."""
         method = self.methods.get(question.method)
         if method is None:
             return encoded(Failure(question.id, UNKNOWN_METHOD, f"{question.method}: no such method here"))
-        public, entry = peer.public, None
+        public, entry, now = peer.public, None, self._clock.seconds()
         if method.changes:
-            entry = self._ledger.begin(public, question.id, session, self._clock.seconds())
+            entry = self._ledger.begin(public, question.id, session, now, is_bulky)
             if entry is None:
-                self._counters["busy"] += 1
-                return encoded(Failure(question.id, REFUSED, _BUSY))
-        result = self._called(method, peer, question.arguments)
+                return self._busy(question.id)
+        deadline = math.inf if question.left_ms == NO_LIMIT_MS else now + question.left_ms / 1000
+        result = self._called(method, peer, question.arguments, deadline)
         if isinstance(result, Deferred):
             early: list[object] = []
             is_late = False
@@ -115,15 +160,18 @@ class Answerer:
             if not early:
                 is_late = True
                 if entry is None:
-                    entry = self._ledger.begin(public, question.id, session, self._clock.seconds())
+                    entry = self._ledger.begin(public, question.id, session, now, is_bulky)
                 if entry is None:
-                    self._counters["busy"] += 1
-                    return encoded(Failure(question.id, REFUSED, _BUSY))
+                    result.cancel()
+                    return self._busy(question.id)
+                entry.work = result
+                if deadline < math.inf:
+                    entry.timer = self._clock.callLater(deadline - now, self._too_late, entry)
                 return None
             result = early[0]
         answer = self._worded(method, question.id, result)
         if entry is not None:
-            self._ledger.end(public, question.id, answer, self._clock.seconds())
+            self._ledger.end(public, question.id, _kept(question.id, answer), self._clock.seconds())
         return answer
 
     def _finish(self, result: object, method: Method, number: int, public: bytes, entry: Entry | None) -> None:
@@ -131,14 +179,36 @@ class Answerer:
         if entry is None or self._ledger.entry(public, number) is not entry:
             return  # it was turned away, or the node stopped meanwhile
         session = entry.session
-        self._ledger.end(public, number, answer if method.changes else None, self._clock.seconds())
+        kept = _kept(number, answer) if method.changes else None
+        self._ledger.end(public, number, kept, self._clock.seconds())
         if session is not None:
-            self._send(session, answer)
+            self._reply(session, number, answer, entry.is_bulky)
 
-    def _called(self, method: Method, peer: Contact, arguments: tuple[object, ...]) -> object:
+    def _reply(self, session: Session, number: int, answer: bytes, is_bulky: bool) -> None:
+        """Send an answer, as a parcel where it must be one."""
+        if len(answer) <= MAX_PLAIN and not is_bulky:
+            self._send(session, answer)
+        elif not self._courier.post(session.contact.public, Key(True, number), answer):
+            self._send(session, encoded(Failure(number, BUSY, _FULL)))
+
+    def _too_late(self, entry: Entry) -> None:
+        self._counters["late"] += 1
+        self._stop(entry)
+
+    def _stop(self, entry: Entry) -> None:
+        """Cancel the work on a question; its outcome goes nowhere."""
+        work, entry.session = entry.work, None
+        if work is not None:
+            work.cancel()
+
+    def _busy(self, number: int) -> bytes:
+        self._counters["busy"] += 1
+        return encoded(Failure(number, BUSY, _BUSY))
+
+    def _called(self, method: Method, peer: Contact, arguments: tuple[object, ...], deadline: float) -> object:
         """What the method returned, a Deferred for a coroutine, or the trouble it raised."""
         try:
-            result = method.run(peer, arguments)
+            result = method.run(peer, arguments, deadline)
         except Exception:  # the method is the owner's code, not ours
             return Trouble()
         return Deferred.fromCoroutine(result) if inspect.iscoroutine(result) else result
@@ -146,9 +216,9 @@ class Answerer:
     def _worded(self, method: Method, number: int, result: object) -> bytes:
         """The bytes that tell the asker the result of a method, good or bad."""
         if isinstance(result, Trouble):
-            if isinstance(result.value, Refused):
-                code = BAD_ARGUMENTS if isinstance(result.value, BadArguments) else REFUSED
-                return encoded(Failure(number, code, str(result.value)))
+            known = self._codes.failure(number, result)
+            if known is not None:
+                return encoded(known)
             self._log.failure("{method} failed for a peer", failure=result, method=method.name)
             return encoded(Failure(number, INTERNAL, "internal error"))
         try:
@@ -162,7 +232,12 @@ class Answerer:
         return answer
 
     def _told_no(self, method: Method, trouble: Trouble) -> None:
-        if isinstance(trouble.value, Refused):
+        if self._codes.failure(0, trouble) is not None:
             self._counters["refused"] += 1
         else:
             self._log.failure("{method} failed for a peer", failure=trouble, method=method.name)
+
+
+def _kept(number: int, answer: bytes) -> bytes:
+    """What is kept of an answer for those who ask again."""
+    return answer if len(answer) <= MAX_PLAIN else encoded(Failure(number, GONE, _GONE))

@@ -7,7 +7,7 @@ stands in ``asker``, how they are answered in ``answerer``; ``docs/protocol.md``
 from __future__ import annotations
 
 import random
-from collections import Counter, OrderedDict
+from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
@@ -20,27 +20,36 @@ from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import MAX_DATAGRAM, Address, Network
 from middleware.entangled.wire.answerer import Answerer
-from middleware.entangled.wire.asker import Asker
-from middleware.entangled.wire.greeting import HERE, WHO, Greeter
-from middleware.entangled.wire.handshake import (
+from middleware.entangled.wire.asker import PATIENCE, Asker
+from middleware.entangled.wire.courier import Courier
+from middleware.entangled.wire.greeting import COOKIE, HERE, WHO, Cookies, Greeter
+from middleware.entangled.wire.message import (
+    PART,
+    RECEIPT,
+    Answer,
+    Cancel,
+    Failure,
+    Key,
+    Question,
+    Told,
+    decoded,
+)
+from middleware.entangled.wire.method import ErrorCodes, Method
+from middleware.entangled.wire.peer import Peers
+from middleware.entangled.wire.session import (
+    DATA,
     INIT,
+    OVERHEAD,
     RESP,
+    RESP_LEAST,
     Acceptance,
     Credentials,
+    HalfOpen,
+    Session,
     derived_key,
-    ephemeral_of,
+    index_of,
     is_init_of_team,
 )
-from middleware.entangled.wire.message import Answer, Failure, Question, Told, decoded
-from middleware.entangled.wire.method import Method
-from middleware.entangled.wire.noise import SECOND_OVERHEAD
-from middleware.entangled.wire.session import DATA, INDEX_BYTES, OVERHEAD, Session, index_of
-
-PATIENCE = 1.5
-MAX_UNCONFIRMED = 512
-UNCONFIRMED_S = 10.0
-MAX_RESPONSES = 512
-RESPONSES_S = 30.0
 
 
 class Endpoint:
@@ -52,8 +61,8 @@ class Endpoint:
 
     ``on_contact`` is called when a peer has proved its key and its address: it answered us, or confirmed the session
     that it opened.  ``counters`` counts every datagram that was dropped, by its reason: oversized, unknown,
-    malformed, forged, replayed, stale (no such session), repeated, misdirected, unasked; and what was refused for
-    want of room.
+    malformed, forged, replayed, stale (no such session), repeated, misdirected, unasked, late, cancelled, abandoned
+    (a parcel that stopped half-way); and what was put off or refused for want of room (crowded, busy).
     """
 
     def __init__(
@@ -66,18 +75,31 @@ class Endpoint:
         self._clock = clock
         self._rng = rng
         self._own = Credentials.of(identity, team_key)
-        self._answerer = Answerer(clock, self._send, self.counters)
-        self._asker = Asker(self._own, clock, rng, network, self._sessions_end, self._new_index, self.counters)
-        self._greeter = Greeter(identity.public, derived_key(team_key, b"greet"), network, clock, rng, self.counters)
-        self._sessions: dict[int, Session] = {}
-        self._unconfirmed: OrderedDict[int, Session] = OrderedDict()
-        self._responses: OrderedDict[bytes, tuple[float, bytes]] = OrderedDict()
+        self._codes = ErrorCodes()
+        self._peers = Peers(self._own, clock, rng, network, self.counters)
+        self._courier = Courier(
+            clock,
+            self._send_to,
+            self._on_parcel,
+            self._peers.wait_for,
+            lambda number, public: self._asker.is_asked(number, public),
+            lambda number, public: self._asker.progressed(number, public),
+            self.counters,
+        )
+        self._answerer = Answerer(clock, self._send, self._courier, self._codes, self.counters)
+        self._asker = Asker(clock, rng, self._peers, self._courier, self._send, self._codes, self.counters)
+        greet_key, cookie_key = derived_key(team_key, b"greet"), derived_key(team_key, b"cookie")
+        self._greeter = Greeter(identity.public, greet_key, cookie_key, self._peers, network, clock, rng, self.counters)
+        self._cookies = Cookies(cookie_key, rng)
+        self._sessions = self._peers.sessions
+        self._half_open = HalfOpen(self._sessions)
         self._receivers: dict[int, Callable[[bytes, Address], None]] = {
             DATA: self._on_data,
             INIT: self._on_init,
             RESP: self._on_resp,
             WHO: self._greeter.on_who,
             HERE: self._greeter.on_here,
+            COOKIE: self._greeter.on_cookie,
         }
 
     @property
@@ -98,42 +120,57 @@ class Endpoint:
         self.is_running = False
         self._network.close()
         self._answerer.clear()
-        self._sessions.clear()
-        self._unconfirmed.clear()
-        self._responses.clear()
+        self._half_open.clear()
         error = NotRunning("the endpoint was stopped")
         self._greeter.stop(error)
         self._asker.stop(error)
+        self._courier.stop()
+        self._peers.stop()
 
     def expose(self, name: str, answer: Callable[..., object], changes: bool = False) -> None:
         """Let peers call ``answer(peer, *arguments)`` under ``name``.
 
-        It returns something that msgpack can hold, a Deferred or a coroutine of it, or raises ``Refused``, whose text
-        the asker gets.  Arguments that do not fit the function's parameters and plain annotations are refused before
-        it runs; other exceptions are logged, and the asker gets ``Refused("internal error")``.  With ``changes`` it
-        runs only in an established session, and at most once for each question.
+        It returns something that msgpack can hold (``MAX_MESSAGE`` at most), a Deferred or a coroutine of it, or raises
+        ``Refused`` or an exception that both sides named by ``expose_error``: the asker gets it with its text.
+        Arguments that do not fit the function's parameters and plain annotations are refused before it runs; other
+        exceptions are logged, and the asker gets ``Refused("internal error")``.  With ``changes`` it runs only in an
+        established session, and at most once for each question.
+
+        When the asker gives up or its time is over, a Deferred or coroutine is cancelled.  A function with a
+        keyword-only parameter ``deadline`` gets that moment, in seconds of this node's clock (infinite where none).
         """
         self._answerer.methods[name] = Method(name, answer, changes)
+
+    def expose_error(self, kind: type[Exception], code: str) -> None:
+        """Let exceptions of ``kind`` cross the wire, both ways, under ``code``, made again from their text alone.
+
+        What has no name here arrives as ``Refused`` with its ``code``.  Raises ``ValueError`` for a code that is taken
+        or cannot be one.
+        """
+        self._codes.add(kind, code)
 
     def ask(
         self, contact: Contact, method: str, *arguments: object, timeout: float | None = None, changes: bool = False
     ) -> Deferred[Any]:
-        """Ask a peer, and try again until it answers, at most four times and for ``timeout`` (default 1.5) seconds.
+        """Ask a peer, and try again until it answers, at most four times and for ``timeout`` seconds.
 
-        With a longer ``timeout`` the tries are spread over it, for methods that take their time.  Say ``changes``
-        where the method changes something: such a question waits for the session, others ride in the handshake.
-        Fails with ``NoAnswer``, ``Refused`` (the peer's text), ``TooLarge``, ``NotRunning``, or with the
-        ``TypeError`` of arguments that msgpack cannot hold.
+        Question and answer may have ``MAX_MESSAGE`` bytes; what does not fit into a datagram goes as a parcel.  Without
+        ``timeout`` the answer has 1.5 s, counted anew at each sign that a parcel makes progress.  With a longer one
+        the tries are spread over it, for methods that take their time.  Say ``changes`` where the method changes
+        something: such a question waits for the session, others ride in the handshake.
+
+        Fails with ``NoAnswer``, ``Refused`` (the peer's text), an exception named by ``expose_error``, ``TooLarge``,
+        ``Crowded``, ``NotRunning``, or with the ``TypeError`` of arguments that msgpack cannot hold.  When it is
+        cancelled, the peer is told and cancels its work.
         """
         if not self.is_running:
             return defer.fail(NotRunning("the endpoint is not running; start it first"))
-        patience = PATIENCE if timeout is None else timeout
-        return self._asker.ask(contact, method, arguments, patience, patience > PATIENCE, changes)
+        return self._asker.ask(contact, method, arguments, timeout, changes)
 
     def tell(self, contact: Contact, method: str, *arguments: object) -> None:
         """Call a peer's method once, without answer and without a second try; raises ``TooLarge`` and ``NotRunning``.
 
-        Opens a session first where there is none.
+        It must fit into one datagram.  Opens a session first where there is none.
         """
         if not self.is_running:
             raise NotRunning("the endpoint is not running; start it first")
@@ -174,13 +211,18 @@ class Endpoint:
         session.heard_at = self._clock.seconds()
         if is_newest and source != session.contact.address:
             session.contact = Contact(session.contact.public, source)
-            self._asker.moved(session)
+            self._peers.moved(session)
         if not session.is_confirmed:
-            session.is_confirmed = True
-            self._unconfirmed.pop(session.local_index, None)
-            self._asker.established(session)
+            self._half_open.confirm(session)
+            self._established(session, is_owed=False)
             self.on_contact(session.contact)
-        if data and self.is_running:
+        if not data or not self.is_running:
+            return
+        if data[0] == PART:
+            self._courier.on_part(session, data)
+        elif data[0] == RECEIPT:
+            self._courier.on_receipt(session, data)
+        else:
             self._read(data, session)
 
     def _read(self, data: bytes, session: Session) -> None:
@@ -193,8 +235,29 @@ class Endpoint:
             self._answerer.answer(message, session)
         elif isinstance(message, Told):
             self._answerer.take(message, session.contact)
+        elif isinstance(message, Cancel):
+            self._answerer.cancel(message, session.contact.public)
         else:
             self._resolve(message, session.contact)
+
+    def _on_parcel(self, session: Session, key: Key, data: bytes) -> None:
+        """Take a message that arrived in parts; it must be what its parcel said."""
+        try:
+            message = decoded(data)
+        except Malformed:
+            self.counters["malformed"] += 1
+            return
+        if isinstance(message, Question) and key == (False, message.id):
+            self._answerer.answer(message, session, is_bulky=True)
+        elif isinstance(message, Answer | Failure) and key == (True, message.id):
+            self._resolve(message, session.contact)
+        else:
+            self.counters["malformed"] += 1
+
+    def _established(self, session: Session, is_owed: bool) -> None:
+        peer = self._peers.established(session)
+        self._courier.restart(peer.public)
+        self._asker.established(peer, session, is_owed)
 
     def _resolve(self, message: Answer | Failure, contact: Contact) -> None:
         if self._asker.is_asked(message.id, contact.public):
@@ -206,10 +269,17 @@ class Endpoint:
             self.counters["forged"] += 1
             return
         now = self._clock.seconds()
-        known = self._responses.get(ephemeral_of(datagram))
+        if not self._cookies.is_lawful(datagram, source, now):
+            self.counters["forged"] += 1
+            return
+        known = self._half_open.response(datagram, now)
         if known is not None:  # the RESP was lost, or somebody plays a recording: neither costs a key exchange
             self.counters["repeated"] += 1
-            self._network.send(known[1], source)
+            self._network.send(known, source)
+            return
+        if not self._cookies.admits(datagram, source, now):
+            self.counters["crowded"] += 1
+            self._network.send(self._cookies.reply(datagram, source, now), source)
             return
         try:
             acceptance = Acceptance(self._own, datagram, self._rng.randbytes(32))
@@ -226,19 +296,17 @@ class Endpoint:
             answer = self._answerer.ride(rider, contact, acceptance.answer_room)
         if not self.is_running:
             return  # the method stopped us
-        index = self._new_index()
+        index = self._peers.new_index()
         response, keys = acceptance.accept(index, answer)
         session = Session(contact, index, acceptance.remote_index, keys, now, is_confirmed=False)
-        self._sessions[index] = self._unconfirmed[index] = session
-        self._responses[ephemeral_of(datagram)] = (now, response)
-        self._trim(now)
+        self._half_open.add(session, datagram, response, now)
         self._network.send(response, source)
 
     def _on_resp(self, datagram: bytes, source: Address) -> None:
-        if len(datagram) < 1 + INDEX_BYTES + SECOND_OVERHEAD:
+        if len(datagram) < RESP_LEAST:
             self.counters["malformed"] += 1
             return
-        opening = self._asker.opening(index_of(datagram))
+        opening = self._peers.opening(index_of(datagram))
         if opening is None:
             self.counters["stale"] += 1
             return
@@ -254,7 +322,7 @@ class Endpoint:
         index = opening.invitation.local_index
         session = Session(contact, index, remote_index, keys, self._clock.seconds(), is_confirmed=True)
         self._sessions[index] = session
-        self._asker.accepted(opening)
+        self._peers.accepted(opening)
         self.on_contact(contact)
         message: object = None
         if data:
@@ -265,33 +333,14 @@ class Endpoint:
         if isinstance(message, Answer | Failure):
             self._asker.resolve(message, contact.public)
         if self.is_running:
-            self._asker.established(session, is_owed=True)
-
-    def _trim(self, now: float) -> None:
-        """Drop half-open sessions and kept responses that are too many or too old."""
-        unconfirmed, responses = self._unconfirmed, self._responses
-        while unconfirmed:
-            index, session = next(iter(unconfirmed.items()))
-            if len(unconfirmed) <= MAX_UNCONFIRMED and session.opened_at > now - UNCONFIRMED_S:
-                break
-            del unconfirmed[index]
-            self._sessions.pop(index, None)
-        while responses:
-            ephemeral, (made_at, _) = next(iter(responses.items()))
-            if len(responses) <= MAX_RESPONSES and made_at > now - RESPONSES_S:
-                break
-            del responses[ephemeral]
-
-    def _sessions_end(self, sessions: list[Session]) -> None:
-        for session in sessions:
-            self._sessions.pop(session.local_index, None)
-
-    def _new_index(self) -> int:
-        while True:
-            index = self._rng.getrandbits(8 * INDEX_BYTES)
-            if index not in self._sessions and self._asker.opening(index) is None:
-                return index
+            self._established(session, is_owed=True)
 
     def _send(self, session: Session, message: bytes) -> None:
         if self.is_running:
             self._network.send(session.seal(message), session.contact.address)
+
+    def _send_to(self, public: bytes, message: bytes) -> None:
+        """Send on the newest session with a peer; where there is none the message is lost, as datagrams may be."""
+        peer = self._peers.known(public)
+        if peer is not None and peer.session is not None:
+            self._send(peer.session, message)

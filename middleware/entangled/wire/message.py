@@ -1,30 +1,64 @@
-"""Message: what travels inside a sealed datagram, as strict msgpack.
+"""Message: what travels inside sealed datagrams: messages as strict msgpack, parts of large ones, receipts for these.
 
-``decoded`` is total: it gives a message or raises ``Malformed``, whatever the bytes.  Moments never travel.
+``decoded``, ``part_of`` and ``receipt_of`` are total: they give what they promise or raise ``Malformed``, whatever the
+bytes.  Moments never travel.  A part and a receipt each fill one datagram::
+
+    PART     0x01  flags 1  id 8  total bytes 4  number 2  the bytes of this part
+    RECEIPT  0x02  flags 1  id 8  next 2  room 2  cause 2  bitmap
+
+All parts but the last have ``PART_BYTES``, so a part has one place where it fits, and parts never overlap.  ``next`` is
+the first part that is missing, bit n of the bitmap (least significant first) says that part ``next + 1 + n`` is here,
+and ``room`` is how many parts from ``next`` on the receiver takes.  ``cause`` is the part that called for the receipt:
+it alone tells the round trip, since earlier receipts for the others may have been lost.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple, NoReturn
 
 import msgpack
 
 from middleware.entangled.errors import Malformed
 from middleware.entangled.network.network import MAX_DATAGRAM
+from middleware.entangled.wire.session import MAX_PLAIN
 
+# A record of 1 MiB, and room for its other fields and for those of the question around it.
+MAX_MESSAGE = 2**20 + 4096
 MAX_METHOD = 64
+MAX_CODE = 64
 MAX_TEXT = 300
 MAX_DEPTH = 16
-_QUESTION, _ANSWER, _FAILURE, _TOLD = range(4)
+# A byte on the wire can become a list of 56 bytes in memory: so large messages are bounded by what is in them, too.
+MAX_ITEMS = 2**17
+NO_LIMIT_MS = 2**32 - 1
+REFUSED, UNKNOWN_METHOD, BAD_ARGUMENTS = "refused", "unknown-method", "bad-arguments"
+INTERNAL, CANCELLED, GONE, BUSY = "internal", "cancelled", "gone", "busy"
+_QUESTION, _ANSWER, _FAILURE, _TOLD, _CANCEL = range(5)
+_UINT32 = b"\xce"
+
+PART, RECEIPT = 0x01, 0x02
+OF_ANSWER = 0x01  # flag of both: the parcel is the answer to the question with this id, else the question itself
+WANTED = 0x02  # flag of PART: the sender wants a receipt now
+DONE = 0x02  # flag of RECEIPT: send no more; everything is here, or nobody waits for it
+_PART_HEAD = 16
+_RECEIPT_HEAD = 16
+PART_BYTES = MAX_PLAIN - _PART_HEAD
+MAX_PARTS = -(-MAX_MESSAGE // PART_BYTES)
+MAX_BITMAP = -(-MAX_PARTS // 8)
 
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """Asks for ``method``; ``id`` (64 bits) is the asker's and tells a repeated question from a new one."""
+    """Asks for ``method``; ``id`` (64 bits) is the asker's and tells a repeated question from a new one.
+
+    ``left_ms`` is how long the asker will still wait, in milliseconds.
+    """
 
     id: int
     method: str
     arguments: tuple[object, ...]
+    left_ms: int = NO_LIMIT_MS
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,10 +71,10 @@ class Answer:
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """Why there is no value; ``code`` is one of ``REFUSED``, ``UNKNOWN_METHOD``, ``BAD_ARGUMENTS``, ``INTERNAL``."""
+    """Why there is no value; ``code`` names the kind of error, ``text`` says it in words."""
 
     id: int
-    code: int
+    code: str
     text: str
 
 
@@ -52,36 +86,56 @@ class Told:
     arguments: tuple[object, ...]
 
 
-REFUSED, UNKNOWN_METHOD, BAD_ARGUMENTS, INTERNAL = range(1, 5)
+@dataclass(frozen=True, slots=True)
+class Cancel:
+    """Says that nobody waits any more for the answer to the question ``id``."""
 
-Message = Question | Answer | Failure | Told
+    id: int
+
+
+Message = Question | Answer | Failure | Told | Cancel
 
 
 def encoded(message: Message) -> bytes:
     """The bytes of ``message``; raises ``TypeError``, ``ValueError`` or ``OverflowError`` for what cannot be packed."""
     match message:
-        case Question(id=number, method=method, arguments=arguments):
-            fields = [_QUESTION, number, method, arguments]
+        case Question(id=number, method=method, arguments=arguments, left_ms=left_ms):
+            # The time that is left stands last and always has four bytes, so that ``aged`` can write another one.
+            head = bytes(msgpack.packb([_QUESTION, number, method, arguments]))
+            return b"\x95" + head[1:] + _UINT32 + left_ms.to_bytes(4, "big")
         case Answer(id=number, value=value):
             fields = [_ANSWER, number, value]
         case Failure(id=number, code=code, text=text):
-            fields = [_FAILURE, number, code, text[:MAX_TEXT]]
+            fields = [_FAILURE, number, code, text[:MAX_TEXT].encode(errors="replace").decode()]
         case Told(method=method, arguments=arguments):
             fields = [_TOLD, method, arguments]
+        case Cancel(id=number):
+            fields = [_CANCEL, number]
     return bytes(msgpack.packb(fields))
+
+
+def aged(question: bytes, seconds: float) -> bytes:
+    """An encoded question with other ``seconds`` left."""
+    left_ms = min(NO_LIMIT_MS, max(0, round(seconds * 1000)))
+    return question[:-4] + left_ms.to_bytes(4, "big")
 
 
 def decoded(data: bytes) -> Message:
     """The message that the bytes hold; raises ``Malformed`` and nothing else."""
+    is_large = len(data) > MAX_DATAGRAM
+    longest = MAX_MESSAGE if is_large else MAX_DATAGRAM
+    budget = _Budget() if is_large else None
     try:
         fields = msgpack.unpackb(
             data,
             strict_map_key=True,
             ext_hook=_no_extension,
-            max_str_len=MAX_DATAGRAM,
-            max_bin_len=MAX_DATAGRAM,
-            max_array_len=MAX_DATAGRAM,
-            max_map_len=MAX_DATAGRAM,
+            list_hook=budget and budget.spend,
+            object_hook=budget and budget.spend,
+            max_str_len=longest,
+            max_bin_len=longest,
+            max_array_len=min(longest, MAX_ITEMS),
+            max_map_len=min(longest, MAX_ITEMS),
             max_ext_len=0,
         )
     except Exception as error:  # foreign code on foreign bytes; more kinds than its manual names have been seen
@@ -89,27 +143,45 @@ def decoded(data: bytes) -> Message:
     if not (isinstance(fields, list) and fields and type(fields[0]) is int):  # True and 1.0 would match 1
         raise Malformed("no message starts like this")
     match fields:
-        case [0, id_, method, list(arguments)] if _is_id(id_) and _is_method(method) and _is_flat(arguments):
-            return Question(id_, method, tuple(arguments))
+        case [0, id_, method, list(arguments), left] if _is_id(id_) and _is_method(method) and _is_flat(arguments):
+            if type(left) is int and 0 <= left <= NO_LIMIT_MS:
+                return Question(id_, method, tuple(arguments), left)
         case [1, id_, value] if _is_id(id_) and _is_flat(value):
             return Answer(id_, value)
-        case [2, id_, code, str(text)] if _is_id(id_) and _is_code(code) and len(text) <= MAX_TEXT:
+        case [2, id_, code, str(text)] if _is_id(id_) and is_code(code) and len(text) <= MAX_TEXT:
             return Failure(id_, code, text)
         case [3, method, list(arguments)] if _is_method(method) and _is_flat(arguments):
             return Told(method, tuple(arguments))
+        case [4, id_] if _is_id(id_):
+            return Cancel(id_)
     raise Malformed("no message has this shape")
 
 
-def _no_extension(code: int, data: bytes) -> object:
+def is_code(value: object) -> bool:
+    """Whether ``value`` may name a kind of error."""
+    return isinstance(value, str) and 0 < len(value) <= MAX_CODE and value.isascii() and value.isprintable()
+
+
+class _Budget:
+    """Counts what the lists and maps of one message hold, while they are made."""
+
+    def __init__(self) -> None:
+        self._left = MAX_ITEMS
+
+    def spend(self, items: object) -> object:
+        assert isinstance(items, list | dict)
+        self._left -= 1 + len(items)
+        if self._left < 0:
+            raise Malformed("a message with too many things in it")
+        return items
+
+
+def _no_extension(code: int, data: bytes) -> NoReturn:
     raise Malformed("extension types are not part of the protocol")
 
 
 def _is_id(value: object) -> bool:
     return type(value) is int and 0 <= value < 2**64
-
-
-def _is_code(value: object) -> bool:
-    return type(value) is int and 0 <= value < 256
 
 
 def _is_method(value: object) -> bool:
@@ -132,3 +204,70 @@ def _is_flat(value: object) -> bool:
             return True
         level = below
     return False
+
+
+class Key(NamedTuple):
+    """Which parcel of a peer: the question ``id``, or the answer to it."""
+
+    is_answer: bool
+    id: int
+
+
+class Part(NamedTuple):
+    """What a PART says."""
+
+    key: Key
+    is_wanted: bool
+    total: int
+    number: int
+    data: bytes
+
+
+class Receipt(NamedTuple):
+    """What a RECEIPT says; ``here`` has bit n set where part n is with the receiver."""
+
+    key: Key
+    is_done: bool
+    next: int
+    room: int
+    cause: int
+    here: int
+
+
+def part_count(total: int) -> int:
+    """How many parts a message of ``total`` bytes has."""
+    return -(-total // PART_BYTES)
+
+
+def part_of(plain: bytes) -> Part:
+    """The PART in what a datagram carried; raises ``Malformed``."""
+    flags, total = plain[1] if len(plain) > _PART_HEAD else 0xFF, int.from_bytes(plain[10:14], "little")
+    number, data = int.from_bytes(plain[14:16], "little"), plain[_PART_HEAD:]
+    if flags & ~(OF_ANSWER | WANTED) or not 0 < total <= MAX_MESSAGE or number >= part_count(total):
+        raise Malformed("a part of no parcel that can be")
+    if len(data) != min(PART_BYTES, total - number * PART_BYTES):
+        raise Malformed("a part that does not fit its place")
+    return Part(_key(plain), bool(flags & WANTED), total, number, data)
+
+
+def receipt_of(plain: bytes) -> Receipt:
+    """The RECEIPT in what a datagram carried; raises ``Malformed``."""
+    if not _RECEIPT_HEAD <= len(plain) <= _RECEIPT_HEAD + MAX_BITMAP or plain[1] & ~(OF_ANSWER | DONE):
+        raise Malformed("a receipt of a wrong length, or with unknown flags")
+    first = int.from_bytes(plain[10:12], "little")
+    room, cause = int.from_bytes(plain[12:14], "little"), int.from_bytes(plain[14:16], "little")
+    here = int.from_bytes(plain[_RECEIPT_HEAD:], "little") << (first + 1) | (1 << first) - 1
+    return Receipt(_key(plain), bool(plain[1] & DONE), first, room, cause, here)
+
+
+def packed_receipt(key: Key, is_done: bool, room: int, cause: int, here: int) -> bytes:
+    """The RECEIPT for a parcel of which the parts in ``here`` have come, the part ``cause`` just now."""
+    first = ((here + 1) & ~here).bit_length() - 1  # the lowest bit that is not set
+    bitmap = here >> (first + 1)
+    head = bytes([RECEIPT, key.is_answer * OF_ANSWER | is_done * DONE]) + key.id.to_bytes(8, "little")
+    head += first.to_bytes(2, "little") + room.to_bytes(2, "little") + cause.to_bytes(2, "little")
+    return head + bitmap.to_bytes(-(-bitmap.bit_length() // 8), "little")
+
+
+def _key(plain: bytes) -> Key:
+    return Key(bool(plain[1] & OF_ANSWER), int.from_bytes(plain[2:10], "little"))

@@ -1,0 +1,269 @@
+"""Courier: carries parcels: hands those that go out to flows, puts together those that come in, and keeps the bounds.
+
+What waits here is bounded by peer and by node: a message that finds no room to go out is refused at once, and one that
+finds no room to come in waits at its sender.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from twisted.internet.interfaces import IDelayedCall, IReactorTime
+
+from middleware.entangled.errors import Malformed
+from middleware.entangled.wire.flow import IDLE_S, Flow, Parcel
+from middleware.entangled.wire.message import (
+    MAX_MESSAGE,
+    Key,
+    Part,
+    packed_receipt,
+    part_count,
+    part_of,
+    receipt_of,
+)
+from middleware.entangled.wire.peer import cancel
+from middleware.entangled.wire.session import Session
+
+# Going out: eight of the largest to one peer, so that a burst of writes is not refused; 16 MiB in all.
+MAX_OUT_OF_PEER = 8 * MAX_MESSAGE
+MAX_OUT = 16 * MAX_MESSAGE
+# Coming in: four of the largest of one peer, 8 MiB in all: a fifth of an edge node's memory.
+MAX_IN_OF_PEER = 4 * MAX_MESSAGE
+MAX_IN = 8 * MAX_MESSAGE
+# The parts that all senders together may have under way to us: what the usual receive buffer of 208 KiB holds.
+ROOM_PARTS = 128
+LEAST_ROOM = 4
+LONGEST_S = 60.0
+# Of this many questions a receiver knows that it has had them; their repeated parts get a receipt and are dropped.
+MAX_ENDED = 1024
+MAX_FLOWS = 64
+TELL_S = 0.1
+
+
+@dataclass(slots=True)
+class Assembly:
+    """A parcel that arrives.  ``here`` has bit n set where part n has come."""
+
+    total: int
+    begun_at: float
+    heard_at: float
+    parts: list[bytes]
+    here: int = 0
+
+    @classmethod
+    def of(cls, total: int, now: float) -> Assembly:
+        """An empty one."""
+        return cls(total, now, now, [b""] * part_count(total))
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether every part is here."""
+        return self.here == (1 << len(self.parts)) - 1
+
+    def add(self, part: Part, now: float) -> bool:
+        """Put a part into its place; whether to tell its sender at once, since it leaves a gap or is here twice."""
+        self.heard_at = now
+        bit = 1 << part.number
+        if self.here & bit:
+            return True
+        leaves_gap = bit > 1 and not self.here & (bit >> 1)
+        self.here |= bit
+        self.parts[part.number] = part.data
+        return leaves_gap
+
+    def message(self) -> bytes:
+        """What the parts make together."""
+        return b"".join(self.parts)
+
+
+class Courier:
+    """Carries parcels for an endpoint.
+
+    ``send`` seals bytes for a peer, ``deliver`` is called with a session and each message that has arrived whole,
+    ``first_wait`` says how long to wait for a peer's first receipt, ``is_awaited`` whether anybody waits for the answer
+    of a peer to a question.  ``on_progress`` is called with the id of a question of ours and a peer whenever the peer
+    got a part of it, or we one of the answer.
+    """
+
+    def __init__(
+        self,
+        clock: IReactorTime,
+        send: Callable[[bytes, bytes], None],
+        deliver: Callable[[Session, Key, bytes], None],
+        first_wait: Callable[[bytes], float],
+        is_awaited: Callable[[int, bytes], bool],
+        on_progress: Callable[[int, bytes], None],
+        counters: Counter[str],
+    ) -> None:
+        self._clock = clock
+        self._send = send
+        self._deliver = deliver
+        self._first_wait = first_wait
+        self._is_awaited = is_awaited
+        self._on_progress = on_progress
+        self._counters = counters
+        self._flows: OrderedDict[bytes, Flow] = OrderedDict()
+        self._bytes_out: Counter[bytes] = Counter()
+        self._assemblies: dict[tuple[bytes, Key], Assembly] = {}
+        self._bytes_in: Counter[bytes] = Counter()
+        self._ended: OrderedDict[tuple[bytes, Key], None] = OrderedDict()
+        self._sweeper: IDelayedCall | None = None
+
+    def stop(self) -> None:
+        """Forget everything and cancel every timer."""
+        for flow in self._flows.values():
+            flow.stop()
+        cancel(self._sweeper)
+        self._flows.clear()
+        self._assemblies.clear()
+        self._bytes_in.clear()
+        self._ended.clear()
+        self._bytes_out.clear()
+
+    def reserve(self, public: bytes, size: int) -> bool:
+        """Whether a message of ``size`` bytes may wait here for a peer; it counts until it is ``released``."""
+        if self._bytes_out[public] + size > MAX_OUT_OF_PEER or self._bytes_out.total() + size > MAX_OUT:
+            self._counters["crowded"] += 1
+            return False
+        self._bytes_out[public] += size
+        return True
+
+    def release(self, public: bytes, size: int) -> None:
+        """Take note that a message for which there was room is not held any more."""
+        self._bytes_out[public] -= size
+        if self._bytes_out[public] <= 0:
+            del self._bytes_out[public]
+
+    def post(self, public: bytes, key: Key, message: bytes) -> bool:
+        """Carry a message to a peer.  A question has its room already; False where an answer finds none."""
+        flow = self._flows.get(public)
+        if flow is None:
+            flow = self._new_flow(public)
+        self._flows.move_to_end(public)
+        if key in flow.parcels:
+            return True  # it is under way
+        if key.is_answer and not self.reserve(public, len(message)):
+            return False
+        flow.post(key, message)
+        return True
+
+    def is_carrying(self, public: bytes, key: Key) -> bool:
+        """Whether a message is under way to a peer and not yet acknowledged whole."""
+        flow = self._flows.get(public)
+        return flow is not None and key in flow.parcels
+
+    def drop(self, public: bytes, key: Key) -> None:
+        """Stop carrying a message to a peer."""
+        flow = self._flows.get(public)
+        if flow is not None:
+            flow.drop(key)
+
+    def forget(self, public: bytes, key: Key) -> None:
+        """Forget what has come of a message from a peer."""
+        self._forget((public, key))
+
+    def restart(self, public: bytes) -> None:
+        """Begin what goes to a peer anew: there is a new session, so perhaps the peer was restarted."""
+        flow = self._flows.get(public)
+        if flow is not None and flow.parcels:
+            flow.restart()
+
+    def on_receipt(self, session: Session, plain: bytes) -> None:
+        """Take a RECEIPT."""
+        try:
+            receipt = receipt_of(plain)
+        except Malformed:
+            self._counters["malformed"] += 1
+            return
+        public = session.contact.public
+        flow = self._flows.get(public)
+        if flow is not None and receipt.key in flow.parcels:
+            now = self._clock.seconds()
+            if now - flow.told_at >= TELL_S:
+                # Those that wait for their turn make progress, too.
+                flow.told_at = now
+                for key in flow.parcels:
+                    if not key.is_answer:
+                        self._on_progress(key.id, public)
+            flow.take(receipt)
+
+    def on_part(self, session: Session, plain: bytes) -> None:
+        """Take a PART."""
+        try:
+            part = part_of(plain)
+        except Malformed:
+            self._counters["malformed"] += 1
+            return
+        now, public, key = self._clock.seconds(), session.contact.public, part.key
+        where = (public, key)
+        assembly = self._assemblies.get(where)
+        if assembly is None:
+            is_over = not self._is_awaited(key.id, public) if key.is_answer else where in self._ended
+            if is_over:
+                self._counters["unasked" if key.is_answer else "repeated"] += 1
+                if part.is_wanted:
+                    self._send(public, packed_receipt(key, True, 0, part.number, 0))
+                return
+            if self._bytes_in[public] + part.total > MAX_IN_OF_PEER or self._bytes_in.total() + part.total > MAX_IN:
+                self._counters["crowded"] += 1
+                if part.is_wanted:
+                    self._send(public, packed_receipt(key, False, 0, part.number, 0))
+                return
+            assembly = self._assemblies[where] = Assembly.of(part.total, now)
+            self._bytes_in[public] += part.total
+            if self._sweeper is None or not self._sweeper.active():
+                self._sweeper = self._clock.callLater(1.0, self._sweep)
+        elif assembly.total != part.total:
+            self._counters["malformed"] += 1
+            return
+        is_urgent = assembly.add(part, now)
+        if assembly.is_whole:
+            self._forget(where)
+            if not key.is_answer:
+                self._ended[where] = None
+                if len(self._ended) > MAX_ENDED:
+                    self._ended.popitem(last=False)
+            self._send(public, packed_receipt(key, True, 0, part.number, assembly.here))
+            self._deliver(session, key, assembly.message())
+            return
+        if is_urgent or part.is_wanted:
+            room = max(LEAST_ROOM, ROOM_PARTS // len(self._assemblies))
+            self._send(public, packed_receipt(key, False, room, part.number, assembly.here))
+        if key.is_answer:
+            self._on_progress(key.id, public)
+
+    def _new_flow(self, public: bytes) -> Flow:
+        if len(self._flows) >= MAX_FLOWS:
+            idle = [other for other, flow in self._flows.items() if not flow.parcels]
+            for other in idle[:1]:
+                del self._flows[other]
+
+        def carried(parcel: Parcel) -> None:
+            if parcel.key.is_answer:
+                self.release(public, len(parcel.data))
+
+        flow = Flow(self._clock, lambda plain: self._send(public, plain), carried, self._first_wait(public))
+        self._flows[public] = flow
+        return flow
+
+    def _forget(self, where: tuple[bytes, Key]) -> None:
+        assembly = self._assemblies.pop(where, None)
+        if assembly is not None:
+            public = where[0]
+            self._bytes_in[public] -= assembly.total
+            if not self._bytes_in[public]:
+                del self._bytes_in[public]
+            if not self._assemblies:
+                cancel(self._sweeper)
+
+    def _sweep(self) -> None:
+        """Forget what has not grown for ``IDLE_S``, or takes longer than ``LONGEST_S``."""
+        now = self._clock.seconds()
+        for where, assembly in list(self._assemblies.items()):
+            if now - assembly.heard_at >= IDLE_S or now - assembly.begun_at >= LONGEST_S:
+                self._counters["abandoned"] += 1
+                self._forget(where)
+        if self._assemblies:
+            self._sweeper = self._clock.callLater(1.0, self._sweep)
