@@ -24,6 +24,7 @@ from middleware.entangled.overlay import Overlay
 from middleware.entangled.owner import Owner
 from middleware.entangled.record import KEY_BYTES, MAX_NAME, MAX_VALUE, Lifetime, Record
 from middleware.entangled.replica import Replica
+from middleware.entangled.space.seat import Seat
 from middleware.entangled.store import Store
 from middleware.entangled.subscriber import Subscriber
 from middleware.entangled.watch import Changed, Watch
@@ -63,6 +64,7 @@ class EntangledNode:
         self._owner = Owner(identity, lease, store, self.replica, self.overlay, self.endpoint, clock, chores)
         self._handover = Handover(own_id, store, self.replica, self.overlay, self._owner, chores)
         self._subscriber = Subscriber(own_id, self.replica, self.overlay, self.endpoint, clock, chores)
+        self.seat = Seat(self.endpoint, store, clock, rng)
         self.overlay.on_newcomer = self._welcome
         self.overlay.on_lost = self._lost
         self.replica.on_record = self._subscriber.held_here
@@ -143,6 +145,11 @@ class EntangledNode:
         """
         self._check(key)
         return self._subscriber.watch(key, changed, keep)
+
+    def refresh(self, watch: Watch) -> None:
+        """Ask those that hold a watched key at once whether they hold anything new; else they are asked every 2 s."""
+        if self._running:
+            self._subscriber.refresh(watch)
 
     def find_node(self, node_id: bytes) -> Deferred[list[Contact]]:
         """The k live nodes closest to ``node_id``, by an iterative lookup (Kademlia, section 2.3)."""

@@ -85,6 +85,10 @@ class Subscriber:
             if watch.keep:
                 self._copy(watch.key)
 
+    def refresh(self, watch: Watch) -> None:
+        """Ask every holder of the key now whether it holds anything else than what is believed."""
+        self._chores.fork(self._renew(watch))
+
     # -- what the node hears ----------------------------------------------------------------------------------------
 
     def welcome(self, contact: Contact) -> None:

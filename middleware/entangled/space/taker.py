@@ -1,0 +1,301 @@
+"""Taker: claims and takes tuples for a space, and completes what others began and left undone."""
+
+from __future__ import annotations
+
+import random
+import zlib
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from typing import Any, Protocol
+
+from twisted.internet import defer
+from twisted.internet.defer import Deferred
+from twisted.internet.interfaces import IReactorTime
+
+from middleware.entangled.background import Background, first
+from middleware.entangled.errors import Alone, EntangledError, NoAnswer
+from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.kademlia.distance import closest
+from middleware.entangled.node import EntangledNode
+from middleware.entangled.space.claim import Claim, ClaimLost
+from middleware.entangled.space.council import Council
+from middleware.entangled.space.decree import Ballot, Outcome, Result
+from middleware.entangled.space.keeper import Keeper
+from middleware.entangled.space.posting import INCARNATION_BYTES, Member, Place, Posted, standing
+from middleware.entangled.space.seat import MAX_PLACES
+from middleware.entangled.space.template import Template, Tuple
+
+MARGIN = 0.02
+"""Share by which two clocks of correct nodes may drift apart (1 % each)."""
+ENROLLED = 5.0
+"""Seconds for which the council of a key is not asked again whether it is there."""
+REPAIR = 2.0
+LEASED_RETRY = 0.5
+CONTEST_RETRY = (0.02, 0.08)
+SILENT_RETRY = (0.2, 0.6)
+MAX_REMEMBERED = 10_000
+
+
+class Waits(Protocol):
+    """Whoever waits for a take."""
+
+    is_over: bool
+
+
+class Taker:
+    """The takes of one node in one space; ``held`` are the tuples it holds, ``gone`` those it knows to be taken.
+
+    ``on_free`` is called when this node gives up a tuple that it held, ``put_back`` with a tuple that was confirmed to
+    a call for which nobody waits any more.
+    """
+
+    def __init__(
+        self,
+        node: EntangledNode,
+        clock: IReactorTime,
+        rng: random.Random,
+        chores: Background,
+        keeper: Keeper,
+        council: int,
+    ) -> None:
+        self.on_free: Callable[[Place], None] = lambda place: None
+        self.put_back: Callable[[Tuple], None] = lambda fields: None
+        self.held: set[Place] = set()
+        self.gone: dict[Place, bytes] = {}
+        self._node = node
+        self._clock = clock
+        self._rng = rng
+        self._chores = chores
+        self._keeper = keeper
+        self._size = council
+        self._council = Council(self._ask, rng, chores)
+        self._seed = zlib.crc32(node.identity.node_id)
+        self._counters: dict[Place, int] = {}
+        self._not_before: dict[Place, float] = {}
+        self._members: dict[bytes, tuple[float, list[Member]]] = {}
+        chores.every(REPAIR, self._repair)
+
+    # -- councils ---------------------------------------------------------------------------------------------------
+
+    async def enrolled(self, key: bytes) -> list[Member]:
+        """The council for a tuple that is put now: the live nodes closest to ``key``, this one among them."""
+        until, members = self._members.get(key, (0.0, []))
+        if until > self._clock.seconds():
+            return members
+        near = closest([*await self._node.find_node(key), self._node.contact], key, 2 * self._size)
+        left, members = near, []
+        while left and len(members) < self._size:
+            asked, left = left[: self._size - len(members)], left[self._size - len(members) :]
+            members += [m for m in await first(len(asked), [self._enrol(c) for c in asked]) if m is not None]
+        if not members:
+            raise Alone("no node agrees to be in the council of a tuple")
+        self._members[key] = (self._clock.seconds() + ENROLLED, members)
+        return members
+
+    async def _enrol(self, contact: Contact) -> Member | None:
+        incarnation = await self._ask(contact, "decree.enrol", ())
+        lawful = isinstance(incarnation, bytes) and len(incarnation) == INCARNATION_BYTES
+        return Member(contact, incarnation) if lawful else None
+
+    def _ask(self, contact: Contact, method: str, arguments: tuple[object, ...]) -> Deferred[Any]:
+        node = self._node
+        if contact.node_id == node.identity.node_id:
+            answer = getattr(node.seat, method.replace("decree.", "answer_"))
+            return defer.maybeDeferred(answer, node.contact, *arguments)
+        # A member may have moved since the tuple was put; its key is still the same.
+        contact = node.overlay.table.get(contact.node_id) or contact
+        return node.endpoint.ask(contact, method, *arguments, changes=method != "decree.enrol")
+
+    # -- choosing ---------------------------------------------------------------------------------------------------
+
+    def candidates(
+        self, posted: Sequence[Posted], template: Template, is_patient: bool = True
+    ) -> tuple[list[Posted], float | None]:
+        """The tuples to try now, in this node's own order, and the seconds until another may be tried.
+
+        Every node has another order, so that takers seldom fight for the same tuple.
+        """
+        now = self._clock.seconds()
+        open_ = [p for p in posted if p.place not in self.gone and p.place not in self.held]
+        fitting = [p for p in open_ if template.matches(p.fields)]
+        ready = [p for p in fitting if not is_patient or self._not_before.get(p.place, 0.0) <= now]
+        ready.sort(key=lambda p: (zlib.crc32(p.place.mark, self._seed), p.place))
+        moments = [self._not_before[p.place] for p in fitting if p.place in self._not_before]
+        return ready, min((max(0.001, moment - now) for moment in moments), default=None)
+
+    def batch(self, posted: Sequence[Posted], most: int) -> list[Posted]:
+        """The first of ``posted`` and as many with the same council as fit into one question."""
+        alike = [one for one in posted if one.council == posted[0].council]
+        return alike[: min(most, MAX_PLACES)]
+
+    # -- taking -----------------------------------------------------------------------------------------------------
+
+    async def claim(self, posted: Sequence[Posted], lease: float) -> tuple[list[Claim], bool]:
+        """Claim tuples of one council; what was won, and whether too little of the council was to be heard."""
+        places = [one.place for one in posted]
+        self.held.update(places)
+        ballot = Ballot(1 + max(self._counters.get(place, 0) for place in places), self._bidder())
+        sent = self._clock.seconds()
+        outcomes = await self._council.claim(posted, ballot, lease)
+        claims = []
+        for one, outcome in zip(posted, outcomes, strict=True):
+            self._counters[one.place] = max(ballot.counter, outcome.counter)
+            if outcome.result is Result.WON and outcome.value is None:
+                deadline = sent + lease * (1.0 - MARGIN)
+                claim = Claim(one, ballot, lease, deadline, self._confirm, self._release, self._renew)
+                claims.append(claim)
+                self._expire(claim)
+            elif outcome.result is Result.WON:
+                # A taker died while it was confirming: what it began is completed in its name.
+                self._chores.fork(self._complete(one, outcome.value))
+            else:
+                self._missed(one.place, outcome)
+        _trim(self._counters)
+        _trim(self._not_before)
+        return claims, any(outcome.result is Result.SILENT for outcome in outcomes)
+
+    async def decide(self, claims: Sequence[Claim], wait: Waits | None = None) -> list[bool]:
+        """Confirm claims of one ballot and say of each whether the tuple is ours.
+
+        Goes on until the council has decided, for nobody else may take meanwhile what it may have given to us; what
+        is ours when nobody waits any more is put back.
+        """
+        if not claims:
+            return []
+        for claim in claims:
+            claim.is_over = True
+        ballot = claims[0].ballot
+        outcomes = await self._council.confirm([claim.posted for claim in claims], ballot, ballot.taker)
+        pairs = zip(claims, outcomes, strict=True)
+        works = [Deferred.fromCoroutine(self._settled(claim, outcome, wait)) for claim, outcome in pairs]
+        return [await work for work in works]
+
+    async def _settled(self, claim: Claim, outcome: Outcome, wait: Waits | None) -> bool:
+        taker, place = claim.ballot.taker, claim.posted.place
+        winner = taker if outcome.result is Result.WON else outcome.value
+        if winner is None:
+            counter = max(claim.ballot.counter, outcome.counter)
+            winner = await self._council.resolve(claim.posted, taker, taker, counter) or taker
+        self._over(place, winner)
+        if winner != taker:
+            self._keeper.doubt(place, winner)
+            return False
+        with suppress(EntangledError):  # the node goes on to spread the note, and the council knows without it
+            await self._keeper.note(place, winner)
+        if wait is not None and wait.is_over:
+            self.put_back(claim.fields)
+        return True
+
+    async def _complete(self, posted: Posted, value: bytes | None) -> None:
+        place = posted.place
+        self.held.add(place)
+        try:
+            winner = await self._council.resolve(posted, self._bidder(), value, self._counters.get(place, 0))
+        finally:
+            self.held.discard(place)
+        if winner is not None:
+            self._over(place, winner)
+            self._keeper.doubt(place, winner)
+            self._node.seat.settle(place)
+        else:
+            self.on_free(place)
+
+    def _missed(self, place: Place, outcome: Outcome) -> None:
+        now = self._clock.seconds()
+        self.held.discard(place)
+        if outcome.result is Result.DECIDED and outcome.value is not None:
+            self._over(place, outcome.value)
+            self._keeper.doubt(place, outcome.value)
+        elif outcome.result is Result.LEASED:
+            self._not_before[place] = now + min(outcome.remaining, LEASED_RETRY) + self._rng.uniform(*CONTEST_RETRY)
+        elif outcome.result is Result.OUTBID:
+            self._not_before[place] = now + self._rng.uniform(*CONTEST_RETRY)
+        else:
+            self._not_before[place] = now + self._rng.uniform(*SILENT_RETRY)
+
+    def _over(self, place: Place, winner: bytes) -> None:
+        self.held.discard(place)
+        self._counters.pop(place, None)
+        self._not_before.pop(place, None)
+        self.gone[place] = winner
+        _trim(self.gone)
+
+    def _bidder(self) -> bytes:
+        """A name under which nobody has ever bid, not even this node in an earlier life."""
+        return self._node.identity.node_id + self._rng.randbytes(8)
+
+    def _repair(self) -> None:
+        """See to what this node accepted as a council member and never heard the end of."""
+        late = [posted for posted in self._node.seat.unsettled() if posted.place.key in self._keeper.keys]
+        for key in dict.fromkeys(posted.place.key for posted in late):
+            _, taken = standing(self._node.store.get(key))
+            for posted in late:
+                if posted.place in taken:
+                    self._node.seat.settle(posted.place)
+                elif posted.place.key == key and posted.place not in self.held:
+                    self._chores.fork(self._complete(posted, None))
+
+    # -- claims that somebody holds ---------------------------------------------------------------------------------
+
+    def _expire(self, claim: Claim) -> None:
+        """Give up ``claim`` when its time is over, unless it was renewed."""
+        left = claim.deadline - self._clock.seconds()
+        if claim.is_over:
+            return
+        if left > 0:
+            self._chores.later(left, self._expire, claim)
+        else:
+            self._free(claim.posted.place)
+
+    def _free(self, place: Place) -> None:
+        self.held.discard(place)
+        self.on_free(place)
+
+    def _confirm(self, claim: Claim) -> Deferred[Tuple]:
+        class Cancelled:
+            is_over = False
+
+        def cancel(_: object) -> None:
+            Cancelled.is_over = True
+
+        result: Deferred[Tuple] = Deferred(cancel)
+
+        async def work() -> None:
+            [won] = await self.decide([claim], Cancelled)
+            if Cancelled.is_over:
+                return
+            if won:
+                result.callback(claim.fields)
+            else:
+                result.errback(ClaimLost("the tuple was taken by another after the lease on it had ended"))
+
+        if claim.is_over:
+            return defer.fail(ClaimLost("the claim was confirmed or released before"))
+        self._chores.fork(work())
+        return result
+
+    def _release(self, claim: Claim) -> None:
+        if not claim.is_over:
+            claim.is_over = True
+            self._council.release([claim.posted], claim.ballot)
+            self._free(claim.posted.place)
+
+    def _renew(self, claim: Claim) -> Deferred[None]:
+        async def work() -> None:
+            if claim.is_over:
+                raise ClaimLost("the claim was confirmed or released before")
+            sent = self._clock.seconds()
+            [outcome] = await self._council.renew([claim.posted], claim.ballot, claim.lease)
+            if outcome.result is Result.SILENT:
+                raise NoAnswer("too little of the council answers to renew the lease")
+            if outcome.result is not Result.WON or outcome.value is not None:
+                raise ClaimLost("the tuple was claimed by another after the lease on it had ended")
+            claim.deadline = sent + claim.lease * (1.0 - MARGIN)
+
+        return Deferred.fromCoroutine(work())
+
+
+def _trim(remembered: dict[Place, Any]) -> None:
+    """Forget the oldest above the limit; whatever is forgotten the council knows."""
+    while len(remembered) > MAX_REMEMBERED:
+        del remembered[next(iter(remembered))]

@@ -1,0 +1,256 @@
+"""Template: what a tuple may hold, and which tuples a template matches; pure.
+
+A tuple is a sequence of at most ``MAX_FIELDS`` values.  A template has as many fields, each a value, ``ANY``, a type
+(``int``, ``float``, ``str``, ``bytes``, ``bool``) or a predicate made by ``where``.  Kinds are strict: ``1``, ``1.0``
+and ``True`` are three values, and only predicates that compare take ``int`` and ``float`` for one kind.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, TypeGuard
+
+import msgpack
+
+from middleware.entangled.errors import LocalError, Malformed, TooLarge
+
+Value = None | bool | int | float | str | bytes
+Tuple = tuple[Value, ...]
+
+MAX_FIELDS = 32
+MAX_TUPLE = 600
+"""Bytes of a tuple or template as msgpack; a record must hold it beside its council."""
+MAX_CHOICES = 32
+OPERATORS = ("<", "<=", ">", ">=", "!=", "in", "prefix")
+_TYPES: Final[dict[str, type]] = {"bool": bool, "bytes": bytes, "float": float, "int": int, "str": str}
+_VALUE, _ANY, _TYPE, _PREDICATE = range(4)
+
+
+class BadTuple(LocalError):
+    """A tuple or template holds what it cannot hold; the message says which field and what is lawful."""
+
+
+@dataclass(frozen=True)
+class Wildcard:
+    """The field that everything fits; ``ANY`` is all that is needed of it."""
+
+
+ANY: Final = Wildcard()
+
+
+@dataclass(frozen=True)
+class Predicate:
+    """A test of one field; ``where`` makes and checks it."""
+
+    operator: str
+    operand: Value | Tuple
+
+    def holds(self, value: Value) -> bool:
+        """Whether ``value`` passes; what cannot be compared with the operand does not, except under ``!=``."""
+        operand = self.operand
+        if isinstance(operand, tuple):
+            return any(_same(value, choice) for choice in operand)
+        if self.operator == "!=":
+            return not (value == operand if _are_numbers(value, operand) else _same(value, operand))
+        if self.operator == "prefix":
+            if isinstance(value, str) and isinstance(operand, str):
+                return value.startswith(operand)
+            return isinstance(value, bytes) and isinstance(operand, bytes) and value.startswith(operand)
+        order = _order(value, operand)
+        if order is None:
+            return False
+        return {"<": order < 0, "<=": order <= 0, ">": order > 0, ">=": order >= 0}[self.operator]
+
+
+Field = Value | Wildcard | type | Predicate
+
+
+@dataclass(frozen=True)
+class Template:
+    """The fields that a tuple must have; ``template_of`` makes and checks it."""
+
+    fields: tuple[Field, ...]
+
+    @property
+    def arity(self) -> int:
+        """How many fields a matching tuple has."""
+        return len(self.fields)
+
+    def matches(self, values: Sequence[Value]) -> bool:
+        """Whether the tuple ``values`` has what this template asks for."""
+        return len(values) == len(self.fields) and all(map(_fits, self.fields, values))
+
+    def packed(self) -> list[object]:
+        """The template as it stands in a message; ``template_unpacked`` reads it."""
+        return [_packed_field(field) for field in self.fields]
+
+
+def where(operator: str, operand: Value | Sequence[Value]) -> Predicate:
+    """A predicate over one field: ``where("<", 5)``, ``where("in", ("a", "b"))``, ``where("prefix", "job-")``.
+
+    The operators are ``<  <=  >  >=  !=  in  prefix``.  Raises ``BadTuple`` for others, and for operands that they
+    cannot take.
+    """
+    if isinstance(operand, Sequence) and not isinstance(operand, str | bytes):
+        operand = tuple(operand)
+    problem = _predicate_problem(operator, operand)
+    if problem:
+        raise BadTuple(problem)
+    return Predicate(operator, operand)
+
+
+def template_of(fields: Sequence[Field] | Template) -> Template:
+    """The template with these fields; raises ``BadTuple`` or ``TooLarge`` with the field that is wrong."""
+    if isinstance(fields, Template):
+        return fields
+    _check_count(fields)
+    for place, field in enumerate(fields):
+        lawful = (
+            isinstance(field, Wildcard | Predicate)
+            or (isinstance(field, type) and field in _TYPES.values())
+            or is_value(field)
+        )
+        if not lawful:
+            raise BadTuple(f"field {place}: {field!r} is no value, ANY, type or predicate")
+    template = Template(tuple(fields))
+    _check_size(template.packed())
+    return template
+
+
+def tuple_of(fields: Sequence[Value]) -> Tuple:
+    """The tuple with these fields; raises ``BadTuple`` or ``TooLarge`` with the field that is wrong."""
+    _check_count(fields)
+    for place, field in enumerate(fields):
+        if not is_value(field):
+            raise BadTuple(f"field {place}: {field!r} is no None, bool, int of 64 bits, float, str or bytes")
+    values = tuple(fields)
+    _check_size(list(values))
+    return values
+
+
+def is_value(value: object) -> TypeGuard[Value]:
+    """Whether ``value`` may stand in a tuple; NaN may not, for it would equal nothing."""
+    if value is None or isinstance(value, bool):
+        return True
+    if type(value) is int:
+        return -(2**63) <= value < 2**64
+    if type(value) is float:
+        return not math.isnan(value)
+    if type(value) is str:
+        return _is_text(value)
+    return type(value) is bytes
+
+
+def tuple_unpacked(fields: object) -> Tuple:
+    """The tuple in a decoded message or record; raises ``Malformed`` and nothing else."""
+    if not isinstance(fields, list) or not 0 < len(fields) <= MAX_FIELDS or not all(map(is_value, fields)):
+        raise Malformed("not a tuple")
+    return tuple(fields)
+
+
+def template_unpacked(fields: object) -> Template:
+    """The template in a decoded message; raises ``Malformed`` and nothing else."""
+    if not isinstance(fields, list) or not 0 < len(fields) <= MAX_FIELDS:
+        raise Malformed("not a template")
+    return Template(tuple(_unpacked_field(field) for field in fields))
+
+
+def _unpacked_field(packed: object) -> Field:
+    match packed:
+        case [int(kind), *_] if isinstance(kind, bool):
+            pass  # True would match 1
+        case [0, value] if is_value(value):
+            return value
+        case [1]:
+            return ANY
+        case [2, str(name)] if name in _TYPES:
+            return _TYPES[name]
+        case [3, str(operator), operand]:
+            if isinstance(operand, list):
+                operand = tuple(operand)  # what it holds is looked at next
+            if _is_operand(operand) and not _predicate_problem(operator, operand):
+                return Predicate(operator, operand)
+    raise Malformed("not a field of a template")
+
+
+def _packed_field(field: Field) -> list[object]:
+    if isinstance(field, Wildcard):
+        return [_ANY]
+    if isinstance(field, type):
+        return [_TYPE, field.__name__]
+    if isinstance(field, Predicate):
+        operand = list(field.operand) if isinstance(field.operand, tuple) else field.operand
+        return [_PREDICATE, field.operator, operand]
+    return [_VALUE, field]
+
+
+def _fits(field: Field, value: Value) -> bool:
+    if isinstance(field, Wildcard):
+        return True
+    if isinstance(field, type):
+        return type(value) is field
+    if isinstance(field, Predicate):
+        return field.holds(value)
+    return _same(value, field)
+
+
+def _same(a: Value, b: Value) -> bool:
+    return type(a) is type(b) and a == b
+
+
+def _are_numbers(a: object, b: object) -> bool:
+    return type(a) in (int, float) and type(b) in (int, float)
+
+
+def _order(a: Value, b: Value) -> int | None:
+    """Less, equal or greater as -1, 0 or 1; None where the two have no order."""
+    if isinstance(a, int | float) and isinstance(b, int | float) and _are_numbers(a, b):
+        return (a > b) - (a < b)
+    if isinstance(a, str) and isinstance(b, str):
+        return (a > b) - (a < b)
+    if isinstance(a, bytes) and isinstance(b, bytes):
+        return (a > b) - (a < b)
+    return None
+
+
+def _predicate_problem(operator: object, operand: object) -> str:
+    """What is wrong with a predicate, or an empty text."""
+    if operator not in OPERATORS:
+        return f"operator {operator!r}: only {' '.join(OPERATORS)} are known"
+    if operator == "in":
+        lawful = isinstance(operand, tuple) and len(operand) <= MAX_CHOICES and all(map(is_value, operand))
+        return "" if lawful else f"in: takes a sequence of at most {MAX_CHOICES} values"
+    if not is_value(operand):
+        return f"{operator}: {operand!r} is no value"
+    if operator == "prefix":
+        return "" if isinstance(operand, str | bytes) else "prefix: takes a str or bytes"
+    if operator != "!=" and (operand is None or isinstance(operand, bool)):
+        return f"{operator}: {operand!r} has no order"
+    return ""
+
+
+def _check_count(fields: Sequence[object]) -> None:
+    if isinstance(fields, str | bytes) or not isinstance(fields, Sequence):
+        raise BadTuple(f"{fields!r}: give the fields as a tuple or list")
+    if not 0 < len(fields) <= MAX_FIELDS:
+        raise BadTuple(f"{len(fields)} fields; a tuple has 1 to {MAX_FIELDS}")
+
+
+def _check_size(fields: list[object]) -> None:
+    size = len(msgpack.packb(fields))
+    if size > MAX_TUPLE:
+        raise TooLarge(f"tuple of {size} bytes; at most {MAX_TUPLE} fit, so put the bulk under a key of its own")
+
+
+def _is_operand(operand: object) -> TypeGuard[Value | Tuple]:
+    return is_value(operand) or (isinstance(operand, tuple) and all(map(is_value, operand)))
+
+
+def _is_text(text: str) -> bool:
+    try:
+        text.encode()
+    except UnicodeEncodeError:  # a lone surrogate
+        return False
+    return True

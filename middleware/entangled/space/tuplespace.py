@@ -1,0 +1,283 @@
+"""TupleSpace: put, get, read and claim tuples by template; each is confirmed to at most one taker.
+
+A tuple is a record of its publisher, with the council that decides who takes it; ``decree`` has the agreement,
+``taker`` the conversation that leads to it.  What a call waits for is described in ``docs/tuplespace.md``.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable, Coroutine, Sequence
+from typing import Any, TypeVar
+
+from twisted.internet.defer import Deferred
+from twisted.internet.interfaces import IReactorTime
+from twisted.logger import Logger
+
+from middleware.entangled.background import Background
+from middleware.entangled.errors import EntangledError, NoAnswer, NotRunning, WeatherError
+from middleware.entangled.node import EntangledNode
+from middleware.entangled.space.claim import Claim
+from middleware.entangled.space.keeper import Keeper
+from middleware.entangled.space.posting import Place, space_key, standing
+from middleware.entangled.space.shelf import Shelf
+from middleware.entangled.space.taker import Taker
+from middleware.entangled.space.template import Field, Template, Tuple, Value, template_of, tuple_of
+
+COUNCIL = 3
+GET_LEASE = 2.0
+PASSES = 4
+PASS_PAUSE = (0.01, 0.05)
+
+T = TypeVar("T")
+
+
+class NoTuple(WeatherError):
+    """No matching tuple came within the time-out."""
+
+
+class Wait:
+    """One blocking call; ``is_over`` when it was answered, cancelled or timed out."""
+
+    def __init__(self) -> None:
+        self.is_over = False
+        self.deferred: Deferred[Any] = Deferred(lambda _: self.end())
+        self.on_end: list[Callable[[], object]] = []
+
+    def end(self) -> None:
+        """Let whoever works for this call know that nobody waits any more."""
+        if not self.is_over:
+            self.is_over = True
+            for tell in self.on_end:
+                tell()
+
+
+class TupleSpace:
+    """The tuples of one space, seen from one node.
+
+    ``council`` nodes decide about each tuple that is put here: more survive the loss of more of them (3 of 1, 5 of 2)
+    and cost more questions.  Spaces of different names never see each other's tuples.
+    """
+
+    _log = Logger()
+
+    def __init__(
+        self,
+        node: EntangledNode,
+        clock: IReactorTime,
+        rng: random.Random,
+        name: str = "default",
+        council: int = COUNCIL,
+    ) -> None:
+        self.name = name
+        self._node = node
+        self._clock = clock
+        self._rng = rng
+        self._chores = Background(clock)
+        self._keeper = Keeper(node, rng, self._chores)
+        self._taker = Taker(node, clock, rng, self._chores, self._keeper, council)
+        self._taker.on_free = self._freed
+        self._taker.put_back = lambda fields: self._chores.fork(self._put(fields, None))
+        self._shelves: dict[bytes, Shelf] = {}
+        self._waits: dict[Wait, None] = {}
+
+    def stop(self) -> None:
+        """End every call with ``NotRunning`` and every timer; tuples that are held come back when their lease ends."""
+        if self._chores.is_stopped:
+            return
+        self._chores.stop()
+        for shelf in self._shelves.values():
+            shelf.close()
+        for wait in list(self._waits):
+            if not wait.is_over:
+                wait.end()
+                wait.deferred.errback(NotRunning(f"the tuple space {self.name} was stopped"))
+
+    # -- put --------------------------------------------------------------------------------------------------------
+
+    def put(self, fields: Sequence[Value], ttl: float | None = None) -> Deferred[None]:
+        """Put a tuple; fires when a majority of those who keep it has it, and it can then outlive this node.
+
+        With ``ttl`` it is taken out after that many seconds, if this node lives.  Raises ``BadTuple`` and ``TooLarge``
+        at once.  Where it fails with ``NoAnswer`` the tuple may appear all the same: it can't be unsaid.
+        """
+        return self._work(self._put(tuple_of(fields), ttl))
+
+    async def _put(self, fields: Tuple, ttl: float | None) -> None:
+        key = space_key(self.name, len(fields))
+        await self._keeper.post(key, fields, await self._taker.enrolled(key), ttl)
+
+    # -- take -------------------------------------------------------------------------------------------------------
+
+    def get(self, template: Sequence[Field] | Template, timeout: float | None = None) -> Deferred[Tuple]:
+        """Take a matching tuple, waiting for one; ``NoTuple`` after ``timeout`` seconds, and it may be cancelled.
+
+        Should the council just then decide for this call, the tuple is put back.
+        """
+        return self._blocking(self._get, template_of(template), timeout)
+
+    def get_if_exists(self, template: Sequence[Field] | Template) -> Deferred[Tuple | None]:
+        """Take a matching tuple, or fire with None where there is none that nobody holds.
+
+        Fails with ``NoAnswer`` where there is one, but too little of its council can be reached.
+        """
+        many = self.get_many(template, 1)
+        return many.addCallback(lambda found: found[0] if found else None)
+
+    def get_many(self, template: Sequence[Field] | Template, most: int) -> Deferred[list[Tuple]]:
+        """Take up to ``most`` matching tuples that exist, many in one question; fails as ``get_if_exists`` does."""
+        return self._work(self._get_many(template_of(template), most))
+
+    def claim(
+        self, template: Sequence[Field] | Template, lease: float = 10.0, timeout: float | None = None
+    ) -> Deferred[Claim]:
+        """Hold a matching tuple for ``lease`` seconds, waiting for one as ``get`` does; confirm it when it is used."""
+
+        async def work(wanted: Template, wait: Wait) -> Claim | None:
+            claim = await self._claim(wanted, wait, lease)
+            if claim is not None and wait.is_over:
+                claim.release()
+            return claim
+
+        return self._blocking(work, template_of(template), timeout)
+
+    async def _get(self, template: Template, wait: Wait) -> Tuple | None:
+        while True:
+            claim = await self._claim(template, wait, GET_LEASE)
+            if claim is None:
+                return None
+            if wait.is_over:
+                claim.release()
+                return None
+            [won] = await self._taker.decide([claim], wait)
+            if won or wait.is_over:
+                return claim.fields
+
+    async def _claim(self, template: Template, wait: Wait, lease: float) -> Claim | None:
+        """A claim on a matching tuple, or None when nobody waits for it any more."""
+        shelf = self._shelf(space_key(self.name, template.arity))
+        shelf.enter()
+        wait.on_end.append(shelf.wake)
+        try:
+            while not wait.is_over:
+                ready, pause = self._taker.candidates(shelf.posted, template)
+                if ready:
+                    claims, _ = await self._taker.claim(ready[:1], lease)
+                    if claims:
+                        return claims[0]
+                else:
+                    await shelf.sleep(pause)
+        finally:
+            shelf.leave()
+        return None
+
+    async def _get_many(self, template: Template, most: int) -> list[Tuple]:
+        key = space_key(self.name, template.arity)
+        self._keeper.look_after(key)
+        taken: list[Tuple] = []
+        is_silent = False
+        for _ in range(PASSES):
+            posted, _ = standing(await self._node.get(key))
+            ready, _ = self._taker.candidates(posted, template, is_patient=False)
+            left = [one for one in ready if one.place not in self._taker.held]
+            if not left:
+                return taken
+            while left and len(taken) < most:
+                batch = self._taker.batch(left, most - len(taken))
+                left = [one for one in left if one not in batch]
+                claims, silent = await self._taker.claim(batch, GET_LEASE)
+                is_silent = is_silent or silent
+                won = await self._taker.decide(claims)
+                taken += [claim.fields for claim, is_ours in zip(claims, won, strict=True) if is_ours]
+            if taken:
+                return taken
+            # All of them were held by others: perhaps by nobody for long, as when three claim at once.
+            await self._chores.sleep(self._rng.uniform(*PASS_PAUSE))
+        if is_silent:
+            raise NoAnswer("a tuple matches, but not enough of its council can be reached to take it")
+        return taken
+
+    # -- read -------------------------------------------------------------------------------------------------------
+
+    def read(self, template: Sequence[Field] | Template, timeout: float | None = None) -> Deferred[Tuple]:
+        """A matching tuple, which stays, waiting for one; ``NoTuple`` after ``timeout`` seconds; may be cancelled."""
+        return self._blocking(self._read, template_of(template), timeout)
+
+    def read_if_exists(self, template: Sequence[Field] | Template) -> Deferred[Tuple | None]:
+        """A matching tuple, which stays, or None."""
+        found = self.read_all(template)
+        return found.addCallback(lambda tuples: tuples[0] if tuples else None)
+
+    def read_all(self, template: Sequence[Field] | Template) -> Deferred[list[Tuple]]:
+        """All matching tuples that nobody took; those that are held under a lease are among them."""
+        return self._work(self._read_all(template_of(template)))
+
+    async def _read(self, template: Template, wait: Wait) -> Tuple | None:
+        shelf = self._shelf(space_key(self.name, template.arity))
+        shelf.enter()
+        wait.on_end.append(shelf.wake)
+        try:
+            while not wait.is_over:
+                for one in shelf.posted:
+                    if one.place not in self._taker.gone and template.matches(one.fields):
+                        return one.fields
+                await shelf.sleep(None)
+        finally:
+            shelf.leave()
+        return None
+
+    async def _read_all(self, template: Template) -> list[Tuple]:
+        posted, _ = standing(await self._node.get(space_key(self.name, template.arity)))
+        gone = self._taker.gone
+        return [one.fields for one in posted if one.place not in gone and template.matches(one.fields)]
+
+    # -- inside -----------------------------------------------------------------------------------------------------
+
+    def _shelf(self, key: bytes) -> Shelf:
+        self._keeper.look_after(key)
+        return self._shelves.setdefault(key, Shelf(self._node, key, self._chores))
+
+    def _freed(self, place: Place) -> None:
+        if place.key in self._shelves:
+            self._shelves[place.key].wake()
+
+    def _work(self, work: Coroutine[Any, Any, T]) -> Deferred[T]:
+        async def checked() -> T:
+            if self._chores.is_stopped:
+                work.close()
+                raise NotRunning(f"the tuple space {self.name} was stopped")
+            return await work
+
+        return Deferred.fromCoroutine(checked())
+
+    def _blocking(
+        self,
+        work: Callable[[Template, Wait], Coroutine[Any, Any, Any]],
+        template: Template,
+        timeout: float | None,
+    ) -> Deferred[Any]:
+        wait = Wait()
+        self._waits[wait] = None
+        wait.on_end.append(lambda: self._waits.pop(wait, None))
+
+        def answered(value: object) -> None:
+            if not wait.is_over:
+                wait.end()
+                wait.deferred.callback(value)
+
+        def failed(failure: Any) -> None:
+            if not wait.is_over:
+                wait.end()
+                wait.deferred.errback(failure)
+            elif failure.check(EntangledError) is None:
+                self._log.failure("in a call that nobody waits for", failure)
+
+        def expired() -> None:
+            if not wait.is_over:
+                wait.end()
+                wait.deferred.errback(NoTuple(f"no matching tuple came within {timeout} s"))
+
+        if timeout is not None:
+            wait.on_end.append(self._chores.later(timeout, expired))
+        self._work(work(template, wait)).addCallbacks(answered, failed)
+        return wait.deferred
