@@ -9,6 +9,9 @@ REAL   ?= 0
 HEADLESS ?=
 WEB_HOST ?= 127.0.0.1
 WEB_PORT ?=
+NODES  ?= 8,32
+SECONDS ?= 5
+PEERS  ?=
 
 # Wheels only: nothing is ever compiled here.  Our own tree is installed without a build sandbox,
 # so that a second run needs no network.
@@ -17,8 +20,9 @@ INSTALL := $(PIP) --no-build-isolation --editable
 RUNTIME := $(VENV)/.stamp-runtime
 DEV     := $(VENV)/.stamp-dev
 BROWSER := $(VENV)/.stamp-browser
+BENCH   := $(VENV)/.stamp-bench
 
-.PHONY: help demo test trials check format cov live browser bench-demo dist clean
+.PHONY: help demo test trials check format cov live browser bench-demo bench-dht dist clean
 
 help:
 	@echo 'make demo [HEADLESS=1] [SEED=1]       three dogs, a red target and the page; HEADLESS: both experiments, then exit'
@@ -31,6 +35,7 @@ help:
 	@echo 'make live                             only the tests with real sockets and processes'
 	@echo 'make browser                          only the tests of the page in Chromium'
 	@echo 'make bench-demo                       what the demonstration costs: memory, datagrams, seconds'
+	@echo 'make bench-dht [NODES=8,32] [SECONDS=5] [PEERS=..]   the peer-to-peer library beside others of its kind'
 	@echo 'make dist                             sdist and wheel, installed into a fresh environment and asked for help'
 	@echo 'make clean                            remove what the above left behind, the environment included'
 
@@ -66,6 +71,14 @@ browser: $(BROWSER)
 
 bench-demo: $(RUNTIME)
 	$(PY) -m benchmarks.demo --seed $(SEED)
+
+# In a network of its own, where that is allowed, the counted datagrams are those of the nodes alone.
+bench-dht: $(BENCH)
+	@mkdir -p build
+	@set -- $(PY) -m benchmarks.dht --nodes $(NODES) --seconds $(SECONDS) $(if $(PEERS),--peers $(PEERS)) \
+	    --out build/bench-dht.json --plot build/bench-dht.svg; \
+	if unshare -rn ip link set lo up 2>/dev/null; \
+	then exec unshare -rn sh -c 'ip link set lo up; exec "$$@"' sh "$$@"; else exec "$$@"; fi
 
 dist: $(DEV)
 	rm -rf build dist
@@ -105,3 +118,8 @@ $(BROWSER): setup.cfg pyproject.toml | $(PY)
 	@$(PIP) 'setuptools>=77'
 	@$(INSTALL) '.[all,dev,browser]'
 	@touch $@ $(DEV) $(RUNTIME)
+
+$(BENCH): setup.cfg pyproject.toml | $(PY)
+	@$(PIP) 'setuptools>=77'
+	@$(INSTALL) '.[all,bench]'
+	@touch $@ $(RUNTIME)

@@ -1,0 +1,1 @@
+"""The peer-to-peer library beside others of its kind, measured in one run: ``python -m benchmarks.dht``."""

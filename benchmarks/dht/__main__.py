@@ -1,0 +1,103 @@
+"""The door: ``python -m benchmarks.dht [--nodes 8,32] [--seconds 5] [--peers ...] [--out FILE] [--plot FILE]``."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import platform
+import signal
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+from benchmarks.dht.contestant import ENTRIES, Entry, chosen
+from benchmarks.dht.course import Course, Plan, Result
+from benchmarks.dht.loss import LEAST, lost
+from benchmarks.dht.plot import drawn
+from benchmarks.dht.report import table
+from benchmarks.dht.space import space
+from benchmarks.dht.team import Lost, Team
+from benchmarks.dht.verbs import long_values, watches
+
+PARTS = ("steady", "killed", "silent")
+KEYS = 200
+ENDED = 130
+
+
+async def run(course: Course, part: str) -> None:
+    """One part of the comparison, with a team of its own."""
+    if part != "steady":
+        await lost(course, is_silent=part == "silent")
+    elif await course.steady():
+        for verb in (watches, long_values, space):
+            await verb(course)
+
+
+async def measured(entry: Entry, size: int, plan: Plan, parts: Sequence[str], result: Result) -> None:
+    """Everything of one library at one size; ``result`` has what was reached, however it ends."""
+    task = asyncio.current_task()
+    assert task is not None
+    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, task.cancel)
+    for part in parts:
+        if part != "steady" and size < LEAST:
+            continue
+        figures = result if part == "steady" else result.setdefault(part, {})
+        with tempfile.TemporaryDirectory() as folder:
+            try:
+                async with Team(entry, size, folder) as team:
+                    await run(Course(team, plan, figures), part)
+            except Lost as error:
+                figures.setdefault("trouble", {})["team"] = str(error)
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Measure, print, write."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.dht", description="This library beside its peers.")
+    parser.add_argument("--nodes", default="8,32", help="sizes of the network, each node a process (default 8,32)")
+    parser.add_argument("--seconds", type=float, default=5.0, help="how long each load lasts (default 5)")
+    parser.add_argument("--peers", default=",".join(ENTRIES), help="which of %(default)s; opendht names both of its")
+    parser.add_argument("--parts", default=",".join(PARTS), help=f"which of %(default)s; losses from {LEAST} nodes on")
+    parser.add_argument("--seed", type=int, default=1, help="who does what (default 1)")
+    parser.add_argument("--profile", default="", help="prefix of files for profiles of the loaded node")
+    parser.add_argument("--out", help="write all figures there, as JSON")
+    parser.add_argument("--plot", help="draw the main figures there, as SVG")
+    given = parser.parse_args(arguments)
+    try:
+        entries = chosen(given.peers)
+        sizes = [int(size) for size in given.nodes.split(",")]
+    except ValueError as error:
+        parser.error(str(error))
+    parts = given.parts.split(",")
+    if min(sizes) < 2 or given.seconds <= 0 or not set(parts) <= set(PARTS):
+        parser.error("it takes 2 nodes, more than 0 seconds, and parts of " + ", ".join(PARTS))
+    keys = min(KEYS, max(10, int(KEYS * given.seconds)))
+    plan = Plan(keys, given.seconds, seed=given.seed, profile=given.profile)
+    for entry in entries:
+        if not entry.is_installed:
+            sys.stderr.write(f"{entry.name}: skipped, the package {entry.package} is missing: pip install '.[bench]'\n")
+    results: dict[str, dict[str, Result]] = {}
+    ended = 0
+    try:
+        for size in sizes:
+            for entry in [entry for entry in entries if entry.is_installed]:
+                sys.stderr.write(f"{entry.name}, {size} nodes\n")
+                result = results.setdefault(str(size), {}).setdefault(entry.name, {})
+                asyncio.run(measured(entry, size, plan, parts, result))
+    except (KeyboardInterrupt, asyncio.CancelledError):
+        sys.stderr.write("ended early; what was measured until now:\n")
+        ended = ENDED
+    sys.stdout.write(table(results))
+    if given.out:
+        about = {"python": platform.python_version(), "machine": platform.machine(), **vars(plan)}
+        behind = {e.name: {"behind": e.behind, "promise": e.promise, "largest": e.largest} for e in entries}
+        text = json.dumps({"about": about, "behind": behind, "results": results}, indent=1)
+        Path(given.out).write_text(text + "\n", encoding="utf-8")
+    if given.plot:
+        Path(given.plot).write_text(drawn(results), encoding="utf-8")
+    return ended
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

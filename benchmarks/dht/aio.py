@@ -1,0 +1,61 @@
+"""AsyncioPeer: what the contestants share whose loop is asyncio's, or whose own threads call back into it."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Coroutine
+from typing import Any
+
+from benchmarks.dht.contestant import Done, Got, Prevent
+
+
+class AsyncioPeer:
+    """The loop of a contestant; a library with threads of its own comes in through ``soon``."""
+
+    def __init__(self, folder: str) -> None:
+        self._tasks: set[asyncio.Task[Any]] = set()
+
+    def run(self, begin: Callable[[], None]) -> None:
+        """Run the loop."""
+
+        async def forever() -> None:
+            self._loop = asyncio.get_running_loop()
+            begin()
+            await asyncio.Event().wait()
+
+        asyncio.run(forever())
+
+    def soon(self, call: Callable[..., object], *arguments: object) -> None:
+        """Call from any thread into the loop."""
+        self._loop.call_soon_threadsafe(call, *arguments)
+
+    def later(self, seconds: float, call: Callable[..., object], *arguments: object) -> Prevent:
+        """Call after ``seconds``."""
+        return self._loop.call_later(seconds, call, *arguments).cancel
+
+    def fork(self, work: Coroutine[Any, Any, Any], done: Callable[[Any], object]) -> None:
+        """Run ``work`` and call ``done`` with its result, None where it failed."""
+        task = self._loop.create_task(work)
+        self._tasks.add(task)
+
+        def ended(task: asyncio.Task[Any]) -> None:
+            self._tasks.discard(task)
+            done(None if task.cancelled() or task.exception() else task.result())
+
+        task.add_done_callback(ended)
+
+    def holds(self, keys: list[str]) -> list[bool | None]:
+        """Say that it is not known, unless the library tells."""
+        return [None] * len(keys)
+
+    def watch(self, key: str, heard: Got, done: Callable[[], None]) -> None:
+        """Raise, unless the library has it."""
+        raise NotImplementedError("this library has no watch")
+
+    def space(self, verb: str, fields: list[object], limit_s: float, done: Done) -> None:
+        """Raise: none of these libraries has it."""
+        raise NotImplementedError("this library has no tuple space")
+
+    def lose(self, share: float) -> None:
+        """Raise: their sockets are out of reach."""
+        raise NotImplementedError("the datagrams of this library are out of reach")

@@ -1,0 +1,168 @@
+"""Child: one node in one process; it does what it is told in JSON lines, and measures its own operations.
+
+``python -m benchmarks.dht.child NAME FOLDER``.  The same code gives orders, takes times and keeps the load up for every
+library, so that a difference between two of them is theirs.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import random
+import sys
+import threading
+import time
+from collections.abc import Callable
+from typing import Any, TextIO
+
+from benchmarks.dht.contestant import ENTRIES, Contestant
+from benchmarks.dht.load import Load
+
+Order = dict[str, Any]
+AGAIN_S = 0.01
+TRY_S = 2.0
+
+
+class Child:
+    """Carries out orders on ``node`` and answers each on ``out`` by its id."""
+
+    def __init__(self, node: Contestant, out: TextIO) -> None:
+        self._node = node
+        self._out = out
+        self._lock = threading.Lock()
+        self._heard: dict[str, list[float]] = {}
+        self._profile: Any = None
+
+    def begin(self) -> None:
+        """Read orders from now on."""
+        threading.Thread(target=self._read, daemon=True).start()
+        self._answer({"id": 0})
+
+    def _read(self) -> None:
+        for line in sys.stdin:
+            self._node.soon(self._obey, json.loads(line))
+        # Whoever gave the orders is gone, perhaps without a word.
+        os._exit(0)
+
+    def _obey(self, order: Order) -> None:
+        try:
+            getattr(self, "_do_" + order["do"])(order)
+        except NotImplementedError as error:
+            self._answer(order, cannot=str(error))
+
+    def _answer(self, order: Order, **fields: object) -> None:
+        with self._lock:
+            self._out.write(json.dumps({"id": order["id"], **fields}) + "\n")
+            self._out.flush()
+
+    # -- orders -----------------------------------------------------------------------------------------------------
+
+    def _do_start(self, order: Order) -> None:
+        """Join; with ``wanted``, a key that is there already, take the time until it has been read."""
+        began = time.monotonic()
+        wanted = order.get("wanted")
+
+        def ms() -> float:
+            return (time.monotonic() - began) * 1000
+
+        def joined() -> None:
+            if wanted is None:
+                self._answer(order, join_ms=ms())
+            else:
+                self._timed("get", wanted[0], bytes.fromhex(wanted[1]), TRY_S, read)
+
+        def read(is_good: bool, _: float) -> None:
+            if is_good or time.monotonic() - began > order["limit_s"]:
+                self._answer(order, join_ms=ms() if is_good else None)
+            else:
+                self._node.later(AGAIN_S, joined)
+
+        self._node.start(order["port"], order["known"], joined)
+
+    def _do_once(self, order: Order) -> None:
+        """One operation; ``moment`` is its beginning, on the clock that all processes of a machine share."""
+        moment = time.monotonic()
+
+        def done(is_good: bool, ms: float) -> None:
+            self._answer(order, good=is_good, ms=ms, moment=moment)
+
+        key, value = order["key"], order["value"]
+        # A long value is named by its length: reader and writer make the same one out of the key.
+        data = random.Random(key).randbytes(value) if isinstance(value, int) else bytes.fromhex(value)
+        self._timed(order["kind"], key, data, order["limit_s"], done)
+
+    def _do_load(self, order: Order) -> None:
+        """Keep operations in flight: each item ``once``, or all of them again and again for ``seconds``."""
+        Load(self._timed, self._node.later, order, lambda **fields: self._answer(order, **fields)).fill()
+
+    def _do_space(self, order: Order) -> None:
+        """One operation on the tuple space; ``moments`` are its beginning and its end."""
+        began = time.monotonic()
+
+        def done(is_good: bool) -> None:
+            ended = time.monotonic()
+            self._answer(order, good=is_good, ms=(ended - began) * 1000, moments=[began, ended])
+
+        self._node.space(order["verb"], order["fields"], order["limit_s"], done)
+
+    def _do_watch(self, order: Order) -> None:
+        """Note the moment at which each value of a key comes."""
+        value = bytes.fromhex(order["value"])
+        moments = self._heard.setdefault(order["key"], [])
+
+        def heard(came: bytes | None) -> None:
+            if came == value:
+                moments.append(time.monotonic())
+
+        self._node.watch(order["key"], heard, lambda: self._answer(order))
+
+    def _do_heard(self, order: Order) -> None:
+        self._answer(order, moments=self._heard.get(order["key"], []))
+
+    def _do_holds(self, order: Order) -> None:
+        self._answer(order, holds=self._node.holds(order["keys"]))
+
+    def _do_lose(self, order: Order) -> None:
+        self._node.lose(order["share"])
+        self._answer(order)
+
+    def _do_profile(self, order: Order) -> None:
+        """Begin a profile of the loop's thread, or end it and write it to ``file``."""
+        import cProfile
+
+        if order["file"]:
+            self._profile.disable()
+            self._profile.dump_stats(order["file"])
+        else:
+            self._profile = cProfile.Profile()
+            self._profile.enable()
+        self._answer(order)
+
+    def _timed(self, kind: str, key: str, value: bytes, limit_s: float, done: Callable[[bool, float], None]) -> None:
+        is_open = True
+        began = time.monotonic()
+
+        def finish(result: object) -> None:
+            nonlocal is_open
+            if is_open:
+                is_open = False
+                in_time()
+                done(result == value if kind == "get" else bool(result), (time.monotonic() - began) * 1000)
+
+        in_time = self._node.later(limit_s, finish, None)
+        (self._node.get if kind == "get" else self._node.put)(key, value, finish)
+
+
+def main(name: str, folder: str) -> None:
+    """Be a node until the orders end."""
+    logging.disable(logging.CRITICAL)
+    # The orders own the real stdout; what a library prints goes the way of errors.
+    out = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)
+    node = ENTRIES[name].made(folder)
+    node.run(Child(node, out).begin)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

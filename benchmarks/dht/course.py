@@ -1,0 +1,223 @@
+"""Course: what every library is put through while all its nodes are well, in phases that are bounded in time.
+
+Each phase writes its figures into the result as it goes; what ends a phase early stands there under "trouble", and the
+next one begins.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import random
+import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from typing import Any
+
+from benchmarks.dht.meter import Cost, Meter, memory_mib, percentile
+from benchmarks.dht.team import Lost, Node, Team
+
+JOINERS = 4
+JOIN_LIMIT_S = 15.0
+LIMIT_S = 15.0
+SINGLE_S = 20.0
+PHASE_S = 60.0
+VALUE_BYTES = 100
+LEAST_FAR = 0.1
+"""The share of keys that a node must not hold to be loaded with these alone."""
+
+Result = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How much is done: ``seconds`` of each load, ``keys`` single operations; ``seed`` draws who does what.
+
+    A short load makes the pauses before it short as well.
+    """
+
+    keys: int = 200
+    seconds: float = 5.0
+    in_flight: int = 32
+    load_keys: int = 2000
+    seed: int = 1
+    profile: str = ""
+
+    def pause(self, seconds: float) -> float:
+        """``seconds`` of rest, fewer in a short run."""
+        return min(seconds, self.seconds)
+
+    def share(self, count: int) -> int:
+        """``count`` of something, fewer in a run with few keys."""
+        return max(2, min(count, count * self.keys // 200))
+
+
+class Course:
+    """One run of one team; ``result`` is filled phase by phase."""
+
+    def __init__(self, team: Team, plan: Plan, result: Result) -> None:
+        self.team = team
+        self.nodes = team.nodes
+        self.plan = plan
+        self.result = result
+        self.rng = random.Random(f"{plan.seed}/{len(team.nodes)}")
+        self.idle = Cost()
+
+    @asynccontextmanager
+    async def phase(self, name: str, limit_s: float = PHASE_S) -> AsyncIterator[None]:
+        """Bound a phase in time, and note what ended it early."""
+        try:
+            async with asyncio.timeout(limit_s):
+                yield
+        except Lost as error:
+            self.result.setdefault("trouble", {})[name] = str(error)
+        except TimeoutError:
+            self.result.setdefault("trouble", {})[name] = f"not through within {limit_s:g} s"
+
+    # -- what phases are made of ------------------------------------------------------------------------------------
+
+    async def begin(self, nodes: list[Node]) -> None:
+        """Start these nodes one after the other, each known to the first one, and let each store something."""
+        first = self.nodes[0]
+        for node in nodes:
+            await node.order("start", port=node.port, known=0 if node is first else first.port)
+        await asyncio.sleep(self.plan.pause(4.0))
+        for number, node in enumerate(nodes):
+            await self.stored(node, f"warm {number} {node.port}")
+
+    async def stored(self, writer: Node, key: str) -> str:
+        """Store a new value, with patience; raises ``Lost``."""
+        value = self.value()
+        for _ in range(6):
+            if (await self.once(writer, "put", key, value))["good"]:
+                return value
+            await asyncio.sleep(1.0)
+        raise Lost(f"the node on port {writer.port} could not put anything")
+
+    async def once(self, node: Node, kind: str, key: str, value: str | int, limit_s: float = LIMIT_S) -> Result:
+        """One operation."""
+        return await node.order("once", limit_s + 5.0, kind=kind, key=key, value=value, limit_s=limit_s)
+
+    async def singles(self, kind: str, works: list[tuple[Node, str, str]]) -> Result:
+        """One operation after the other, each at its node."""
+        took, failed = [], 0
+        ends_at = time.monotonic() + SINGLE_S
+        meter = Meter(self.team.pids)
+        for node, key, value in works:
+            if time.monotonic() > ends_at:
+                break
+            outcome = await self.once(node, kind, key, value)
+            failed += not outcome["good"]
+            if outcome["good"]:
+                took.append(outcome["ms"])
+        tried = len(took) + failed
+        return {**times(took), "tried": tried, "failed": failed, **meter.read().per(tried, self.idle)}
+
+    async def loaded(
+        self, node: Node, kind: str, items: list[tuple[str, str]], in_flight: int, seconds: float, once: bool
+    ) -> Result:
+        """Many operations of one node at a time."""
+        order = {"kind": kind, "items": items, "in_flight": in_flight, "seconds": seconds, "once": once}
+        return await node.order("load", seconds + LIMIT_S, **order, limit_s=LIMIT_S)
+
+    def value(self) -> str:
+        """A new value."""
+        return self.rng.randbytes(VALUE_BYTES).hex()
+
+    # -- phases -----------------------------------------------------------------------------------------------------
+
+    async def steady(self) -> bool:
+        """Join, rest, single operations, operations in flight, memory; False where not even joining went well."""
+        joiners = min(JOINERS, len(self.nodes) // 2)
+        async with self.phase("join", 2 * PHASE_S):
+            await self.begin(self.nodes[: len(self.nodes) - joiners])
+            self.result["join_ms"] = await self._joined(joiners)
+        if "trouble" in self.result:
+            return False
+        async with self.phase("idle"):
+            await self._rest()
+        items = [(f"single {n}", self.value()) for n in range(self.plan.keys)]
+        held: list[list[bool | None]] = []
+        async with self.phase("singles", 4 * PHASE_S):
+            held = await self._single(items)
+        if held:
+            async with self.phase("load", 2 * PHASE_S):
+                await self._load(items, held)
+        memory = [memory_mib(pid) for pid in self.team.pids]
+        self.result["rss_mib"] = percentile([rss for rss, _ in memory], 50)
+        self.result["uss_mib"] = percentile([uss for _, uss in memory], 50)
+        return True
+
+    async def _joined(self, joiners: int) -> list[float | None]:
+        """Time for each of the last nodes until it has read a key that was there before it."""
+        old = self.nodes[: len(self.nodes) - joiners]
+        took: list[float | None] = []
+        for number, node in enumerate(self.nodes[len(old) :]):
+            key = f"early {number}"
+            wanted = [key, await self.stored(self.rng.choice(old), key)]
+            order = {"port": node.port, "known": self.nodes[0].port, "wanted": wanted, "limit_s": JOIN_LIMIT_S}
+            took.append((await node.order("start", **order))["join_ms"])
+        return took
+
+    async def _rest(self) -> None:
+        await asyncio.sleep(self.plan.pause(4.0))
+        meter = Meter(self.team.pids)
+        await asyncio.sleep(self.plan.pause(3.0))
+        self.idle = meter.read()
+        share = 1 / self.idle.seconds / len(self.nodes)
+        self.result["idle"] = {
+            "datagrams_per_s": self.idle.datagrams * share,
+            "core_percent": 100 * self.idle.cpu_s * share,
+        }
+
+    async def _single(self, items: list[tuple[str, str]]) -> list[list[bool | None]]:
+        """Put and get one at a time; returns who holds what."""
+        nodes, count = self.nodes, range(len(self.nodes))
+        writers = [self.rng.choice(count) for _ in items]
+        works = [(nodes[w], *item) for w, item in zip(writers, items, strict=True)]
+        self.result["put"] = await self.singles("put", works)
+        await asyncio.sleep(self.plan.pause(0.5))
+        held = [(await node.order("holds", keys=[key for key, _ in items]))["holds"] for node in nodes]
+        readers = [self.rng.choice([n for n in count if n != writer]) for writer in writers]
+        reads = [(nodes[r], *item) for r, item in zip(readers, items, strict=True)]
+        self.result["get"] = await self.singles("get", reads)
+        remote = [read for n, read in enumerate(reads) if held[readers[n]][n] is not True]
+        self.result["local_share"] = 1 - len(remote) / len(reads)
+        if len(remote) == len(reads):
+            self.result["remote_get"] = self.result["get"]
+        elif remote:
+            self.result["remote_get"] = await self.singles("get", remote)
+        return held
+
+    async def _load(self, items: list[tuple[str, str]], held: list[list[bool | None]]) -> None:
+        """As many operations as one node gets through, so many at a time."""
+        loaded = self.nodes[len(self.nodes) // 2]
+        mine = held[len(self.nodes) // 2]
+        # In a small network a node holds everything, or all but a few: then its reads are local ones.
+        far = [item for n, item in enumerate(items) if mine[n] is not True]
+        if len(far) < len(items) * LEAST_FAR:
+            far = items
+        self.result["load_local_share"] = sum(mine[n] is True for n, item in enumerate(items) if item in far) / len(far)
+        new = [(f"load {n}", self.value()) for n in range(self.plan.load_keys)]
+        for name, kind, wanted in (("gets", "get", far), ("puts", "put", new)):
+            await asyncio.sleep(self.plan.pause(0.5))
+            if self.plan.profile:
+                await loaded.order("profile", file="")
+            meter = Meter(self.team.pids)
+            outcome = await self.loaded(loaded, kind, wanted, self.plan.in_flight, self.plan.seconds, once=False)
+            cost = meter.read()
+            if self.plan.profile:
+                await loaded.order("profile", file=f"{self.plan.profile}-{self.team.entry.name}.{kind}")
+            self.result[name] = {
+                "per_s": outcome["good"] / outcome["seconds"],
+                **times(outcome["ms"]),
+                "tried": outcome["tried"],
+                "failed": outcome["tried"] - outcome["good"],
+                "unfinished": outcome["unfinished"],
+                **cost.per(outcome["good"], self.idle),
+            }
+
+
+def times(took: list[float]) -> Result:
+    """What is said of a list of milliseconds."""
+    return {"p50": percentile(took, 50), "p95": percentile(took, 95), "max": max(took, default=None)}

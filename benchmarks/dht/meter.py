@@ -1,0 +1,92 @@
+"""Meter: what the kernel counts: processor time, memory, datagrams.  Linux only: the figures come from ``/proc``."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+MIB = 1024.0
+
+
+def percentile(values: list[float], percent: float) -> float | None:
+    """The value below which ``percent`` of ``values`` lie (nearest rank); None of nothing."""
+    ordered = sorted(values)
+    return ordered[min(len(ordered) - 1, round(percent / 100 * (len(ordered) - 1)))] if ordered else None
+
+
+def cpu_s(pids: Iterable[int]) -> float:
+    """The seconds that the threads of these processes have run; one that has ended counts nothing."""
+    total = 0
+    for pid in pids:
+        for file in Path(f"/proc/{pid}/task").glob("*/schedstat"):
+            try:
+                total += int(file.read_text().split()[0])
+            except OSError:
+                continue
+    return total / 1e9
+
+
+def memory_mib(pid: int) -> tuple[float, float]:
+    """Resident memory of a process, and the part of it that is its own (RSS, USS)."""
+    text = Path(f"/proc/{pid}/smaps_rollup").read_text()
+    kib = {line.split(":")[0]: float(line.split()[1]) for line in text.splitlines()[1:] if line.endswith("kB")}
+    return kib["Rss"] / MIB, (kib["Private_Clean"] + kib["Private_Dirty"]) / MIB
+
+
+def datagrams() -> tuple[int, int]:
+    """The UDP datagrams that this machine has sent, and those that it dropped at full buffers, whosever they are.
+
+    In a network namespace of its own (``benchmarks/README.md``) the figures are of the nodes alone.
+    """
+    rows = [line.split() for line in Path("/proc/net/snmp").read_text().splitlines() if line.startswith("Udp:")]
+    return int(rows[1][rows[0].index("OutDatagrams")]), int(rows[1][rows[0].index("RcvbufErrors")])
+
+
+def busy_s() -> float:
+    """The seconds that all processors together were busy with anything."""
+    fields = [int(field) for field in Path("/proc/stat").read_text().splitlines()[0].split()[1:9]]
+    return (sum(fields) - fields[3] - fields[4]) / os.sysconf("SC_CLK_TCK")
+
+
+@dataclass
+class Cost:
+    """What a phase has used; ``foreign`` is the share of the machine that others took, the noise of the figures."""
+
+    seconds: float = 1.0
+    cpu_s: float = 0.0
+    datagrams: float = 0.0
+    dropped: float = 0.0
+    foreign: float = 0.0
+
+    def per(self, operations: int, idle: Cost) -> dict[str, float]:
+        """The cost of one operation, without what an idle network spends in that time."""
+        noise = {"dropped": self.dropped, "foreign": self.foreign}
+        if not operations:
+            return noise
+        share = self.seconds / idle.seconds
+        return {
+            "cpu_ms": max(0.0, self.cpu_s - idle.cpu_s * share) * 1000 / operations,
+            "datagrams": max(0.0, self.datagrams - idle.datagrams * share) / operations,
+            **noise,
+        }
+
+
+class Meter:
+    """Counts from its making to ``read``."""
+
+    def __init__(self, pids: list[int]) -> None:
+        self._pids = pids
+        self._start = self._now()
+
+    def read(self) -> Cost:
+        """The cost since the beginning."""
+        seconds, cpu, own, sent, dropped, busy = (b - a for a, b in zip(self._start, self._now(), strict=True))
+        foreign = (busy - cpu - own) / seconds / (os.cpu_count() or 1)
+        return Cost(seconds, cpu, sent, dropped, max(0.0, foreign))
+
+    def _now(self) -> tuple[float, ...]:
+        sent, dropped = datagrams()
+        return time.monotonic(), cpu_s(self._pids), time.process_time(), float(sent), float(dropped), busy_s()

@@ -1,0 +1,69 @@
+"""OpenDhtPeer: a node of OpenDHT through its own Python binding, with its request limits or without."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import opendht
+
+from benchmarks.dht.aio import AsyncioPeer
+from benchmarks.dht.contestant import HOST, Done, Got
+
+LISTENS_AFTER_S = 0.5
+"""The binding does not tell when a listen stands with its replicas."""
+
+
+class OpenDhtPeer(AsyncioPeer):
+    """A contestant; "free" lifts the limits on requests a second, which all nodes of one address share."""
+
+    def __init__(self, folder: str, limits: str = "") -> None:
+        super().__init__(folder)
+        self._config = opendht.DhtConfig()
+        if limits == "free":
+            self._config.setRateLimit(-1, -1)
+        self._kept: list[Any] = []
+
+    def start(self, port: int, known: int, done: Callable[[], None]) -> None:
+        """Run the node's threads; the library does not tell when it has joined."""
+        self._node = opendht.DhtRunner()
+        self._node.run(port=port, ipv4=HOST, ipv6="", config=self._config)
+        if known:
+            self._node.bootstrap(HOST, str(known))
+        done()
+
+    def put(self, key: str, value: bytes, done: Done) -> None:
+        """Store."""
+        self._node.put(opendht.InfoHash.get(key), opendht.Value(value), lambda ok, nodes: self.soon(done, ok))
+
+    def get(self, key: str, value: bytes, done: Got) -> None:
+        """Read the first value that comes, and end the search with it."""
+        is_open = True
+
+        def finish(result: bytes | None) -> None:
+            nonlocal is_open
+            if is_open:
+                is_open = False
+                self.soon(done, result)
+
+        def found(value: Any) -> bool:
+            finish(bytes(value.data))
+            return False
+
+        self._node.get(opendht.InfoHash.get(key), found, lambda ok, nodes: finish(None))
+
+    def watch(self, key: str, heard: Got, done: Callable[[], None]) -> None:
+        """Listen."""
+
+        def came(value: Any, is_expired: bool) -> bool:
+            if not is_expired:
+                self.soon(heard, bytes(value.data))
+            return True
+
+        self._kept.append((came, self._node.listen(opendht.InfoHash.get(key), came)))
+        self.later(LISTENS_AFTER_S, done)
+
+    def holds(self, keys: list[str]) -> list[bool | None]:
+        """Look into the log of the store; the binding holds Python's lock meanwhile, so never under load."""
+        log = self._node.getStorageLog()
+        return [str(opendht.InfoHash.get(key)) in log for key in keys]

@@ -1,0 +1,88 @@
+"""Space: the tuple space, which only this library has: what its verbs cost, and whether they keep their word."""
+
+from __future__ import annotations
+
+import asyncio
+
+from benchmarks.dht.course import Course, Result, times
+from benchmarks.dht.meter import Meter
+from benchmarks.dht.team import Lost, Node
+
+OUTS = 30
+CROWD = 30
+WAKES = 10
+RACES = 10
+TAKERS = 4
+SPACE_S = 5.0
+ASLEEP_S = 0.3
+"""How long a node waits for a tuple before it is put."""
+
+Fields = list[object]
+
+
+async def space(course: Course) -> None:
+    """Put, read and take one tuple at a time; tuples of many writers at once; wake-ups; contested takes."""
+    if "space" not in course.team.entry.can:
+        return
+    count = course.plan.share(OUTS)
+    async with course.phase("tuple space", 180.0):
+        try:
+            for node in course.nodes:
+                await _do(node, "open", [])
+        except Lost as error:
+            course.result.setdefault("skipped", {})["tuple space"] = str(error)
+            return
+        result: Result = course.result.setdefault("space", {})
+        result["put"] = await _singles(course, "put", [["job", n, 7] for n in range(count)])
+        result["read"] = await _singles(course, "read_if_exists", [["job", n, None] for n in range(count)])
+        result["take"] = await _singles(course, "get_if_exists", [["job", n, None] for n in range(count)])
+        result["crowd"] = await _crowd(course)
+        result["wake"] = await _wakes(course)
+        result["race"] = await _races(course)
+
+
+async def _do(node: Node, verb: str, fields: Fields) -> Result:
+    return await node.order("space", SPACE_S + 5.0, verb=verb, fields=fields, limit_s=SPACE_S)
+
+
+async def _singles(course: Course, verb: str, works: list[Fields]) -> Result:
+    """One after the other, each at a random node."""
+    meter = Meter(course.team.pids)
+    done = [await _do(course.rng.choice(course.nodes), verb, fields) for fields in works]
+    good = [each["ms"] for each in done if each["good"]]
+    return {**times(good), "failed": len(done) - len(good), **meter.read().per(len(done), course.idle)}
+
+
+async def _crowd(course: Course) -> Result:
+    """Tuples that random nodes put back to back, and how many of them are found right after."""
+    count = course.plan.share(CROWD)
+    await asyncio.gather(*(_do(course.rng.choice(course.nodes), "put", ["crowd", n, 7]) for n in range(count)))
+    asked = [await _do(course.rng.choice(course.nodes), "read_if_exists", ["crowd", n, None]) for n in range(count)]
+    return {"found_percent": 100 * sum(each["good"] for each in asked) / count}
+
+
+async def _wakes(course: Course) -> Result:
+    """How long after the beginning of a put a taker that waits for the tuple has it."""
+    took: list[float] = []
+    count = course.plan.share(WAKES)
+    for number in range(count):
+        taker, putter = course.rng.sample(course.nodes, 2)
+        waiting = asyncio.ensure_future(_do(taker, "get", ["wake", number, None]))
+        await asyncio.sleep(ASLEEP_S)
+        begun = (await _do(putter, "put", ["wake", number, 7]))["moments"][0]
+        taken = await waiting
+        if taken["good"]:
+            took.append((taken["moments"][1] - begun) * 1000)
+    return {**times(took), "lost": count - len(took), "of": count}
+
+
+async def _races(course: Course) -> Result:
+    """Several nodes take one tuple at once: how often exactly one of them gets it."""
+    single = 0
+    count = course.plan.share(RACES)
+    for number in range(count):
+        putter, *takers = course.rng.sample(course.nodes, min(TAKERS + 1, len(course.nodes)))
+        await _do(putter, "put", ["race", number, 7])
+        taken = await asyncio.gather(*(_do(taker, "get_if_exists", ["race", number, None]) for taker in takers))
+        single += sum(each["good"] for each in taken) == 1
+    return {"single_winner": single, "of": count}

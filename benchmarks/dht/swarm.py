@@ -1,0 +1,124 @@
+"""SwarmPeer: a node of this library on real UDP, sealed, with its store in memory or in a SQLite file."""
+
+from __future__ import annotations
+
+import inspect
+import os
+import random
+import time
+from collections.abc import Callable
+from typing import Any
+
+from twisted.internet import reactor as _reactor
+from twisted.internet.defer import Deferred, maybeDeferred
+
+from benchmarks.dht.contestant import HOST, Done, Got, Prevent
+from middleware.entangled.clock import use_monotonic_time
+from middleware.entangled.identity import Identity
+from middleware.entangled.network.network import Address
+from middleware.entangled.network.udp import UdpNetwork
+from middleware.entangled.node import EntangledNode
+from middleware.entangled.record import Record, hashed_key
+from middleware.entangled.sqlite import SqliteStore
+from middleware.entangled.store import MemoryStore
+
+TEAM_KEY = b"the key of a team that only runs"
+NAME = "bench"
+STANDS_AFTER_S = 0.2
+"""A watch does not tell when its replicas have taken note of it."""
+FAST = ("fast",) if len(inspect.signature(EntangledNode.get).parameters) > 2 else ()
+"""What ``get`` is asked for: the first answer, as the peers give it, where the library has a choice."""
+reactor: Any = _reactor
+
+
+class LossyUdp(UdpNetwork):
+    """Real UDP that loses ``share`` of what it sends."""
+
+    share = 0.0
+
+    def send(self, datagram: bytes, to: Address) -> None:
+        """Send, or not."""
+        if not self.share or random.random() >= self.share:
+            super().send(datagram, to)
+
+
+class SwarmPeer:
+    """A contestant; ``store`` is "memory" or "sqlite"."""
+
+    def __init__(self, folder: str, store: str = "memory") -> None:
+        use_monotonic_time()
+        self._folder = folder if store == "sqlite" else ""
+        self._rng = random.SystemRandom()
+        self._space: Any = None
+
+    def run(self, begin: Callable[[], None]) -> None:
+        """Run the reactor."""
+        reactor.callWhenRunning(begin)
+        reactor.run(installSignalHandlers=False)
+
+    def soon(self, call: Callable[..., object], *arguments: object) -> None:
+        """Call from any thread into the reactor."""
+        reactor.callFromThread(call, *arguments)
+
+    def later(self, seconds: float, call: Callable[..., object], *arguments: object) -> Prevent:
+        """Call after ``seconds``."""
+        timer = reactor.callLater(seconds, call, *arguments)
+        return lambda: timer.cancel() if timer.active() else None
+
+    def start(self, port: int, known: int, done: Callable[[], None]) -> None:
+        """Build the node and join."""
+        store = MemoryStore()
+        if self._folder:
+            store = SqliteStore.open(os.path.join(self._folder, f"{port}.sqlite"), time.monotonic())
+        self._network = LossyUdp(reactor, HOST, port)
+        identity = Identity(self._rng.randbytes(32))
+        self._node = EntangledNode(identity, TEAM_KEY, self._network, store, reactor, self._rng)
+        self._node.start()
+        self._node.join([Address(HOST, known)] if known else []).addCallback(lambda _: done())
+
+    def put(self, key: str, value: bytes, done: Done) -> None:
+        """Store; done when a majority of the holders has it."""
+        _tell(maybeDeferred(self._node.put, hashed_key(key), NAME, value), lambda held: done(held is not None))
+
+    def get(self, key: str, value: bytes, done: Got) -> None:
+        """Read."""
+        _tell(self._node.get(hashed_key(key), *FAST), lambda found: done(found[0].value if found else None))
+
+    def holds(self, keys: list[str]) -> list[bool | None]:
+        """Look into the store."""
+        return [bool(self._node.store.get(hashed_key(key))) for key in keys]
+
+    def watch(self, key: str, heard: Got, done: Callable[[], None]) -> None:
+        """Watch."""
+
+        def changed(records: list[Record]) -> None:
+            for record in records:
+                heard(record.value)
+
+        self._node.watch(hashed_key(key), changed)
+        self.later(STANDS_AFTER_S, done)
+
+    def space(self, verb: str, fields: list[object], limit_s: float, done: Done) -> None:
+        """Do ``verb`` in the tuple space; "open" makes this node a part of it."""
+        if self._space is None:
+            try:
+                from middleware.entangled.space.tuplespace import TupleSpace
+            except ImportError as error:
+                raise NotImplementedError(f"there is no tuple space here: {error}") from None
+            self._space = TupleSpace(self._node, reactor, self._rng, NAME)
+        if verb == "open":
+            done(True)
+        elif verb == "put":
+            self._space.put(tuple(fields)).addCallbacks(lambda _: done(True), lambda _: done(False))
+        else:
+            waiting = {"timeout": limit_s} if verb in ("get", "read") else {}
+            template = tuple(int if field is None else field for field in fields)
+            _tell(getattr(self._space, verb)(template, **waiting), lambda found: done(found is not None))
+
+    def lose(self, share: float) -> None:
+        """Lose datagrams."""
+        self._network.share = share
+
+
+def _tell(outcome: Deferred[Any], tell: Callable[[Any], object]) -> None:
+    outcome.addErrback(lambda _: None).addCallback(tell)
