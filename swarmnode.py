@@ -7,12 +7,14 @@ memory (``rehearsal`` has a whole team of these).
 
 from __future__ import annotations
 
-import importlib
+import ctypes
+import gc
 import random
 import socket
 import sys
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -53,6 +55,8 @@ KEYS: Sequence[tuple[type[Exception], str]] = (
     (MissingExtra, "[node] roles"),
 )
 """Which setting to look at for which fault."""
+SETTLED = 3.0
+"""Seconds after which a node has started and joined."""
 COMING_BACK = 2.0
 """Seconds until a node that could not come back tries again."""
 
@@ -137,17 +141,19 @@ def assembled(settings: Settings, seams: Seams) -> Assembly:
 class NodeService(Service):
     """One node of a team, with what its roles add; it can fall off the network for a while and come back.
 
-    ``web`` makes the page of a node that runs; the page comes and goes with its node.
+    ``fronts`` make what people speak to of a node that runs, such as its page; they come and go with their node.
     """
 
     _log = Logger()
 
-    def __init__(self, settings: Settings, seams: Seams, web: Callable[[SwarmNode], IService] | None = None) -> None:
+    def __init__(
+        self, settings: Settings, seams: Seams, fronts: Sequence[Callable[[SwarmNode], IService]] = ()
+    ) -> None:
         self.settings = settings
         self.assembly = assembled(settings, seams)
         self._seams = seams
-        self._web = web
-        self._page: IService | None = None
+        self._fronts = fronts
+        self._open: list[IService] = []
         self._coming: IDelayedCall | None = None
 
     def startService(self) -> None:
@@ -162,7 +168,7 @@ class NodeService(Service):
             self._coming.cancel()
         ended = self._end_agent()
         self.assembly.node.stopService()
-        down = gatherResults([ended, self._end_page()])
+        down = gatherResults([ended, self._end_fronts()])
         return down.addBoth(lambda _: self._seams.store.close())
 
     def vanish(self) -> None:
@@ -170,7 +176,7 @@ class NodeService(Service):
         # The node first: afterwards the agent can tell nobody, not even that it gives its lease back.
         self.assembly.node.vanish()
         self._end_agent()
-        self._end_page()
+        self._end_fronts()
 
     def leave(self, seconds: float) -> None:
         """Fall off the network, robot and all, and come back after ``seconds``."""
@@ -195,17 +201,17 @@ class NodeService(Service):
         node.startService()
         if agent is not None:
             agent.startService()
-        if self._web is not None:
-            self._page = self._web(node)
-            self._page.startService()
+        for front in self._fronts:
+            self._open.append(front(node))
+            self._open[-1].startService()
 
     def _end_agent(self) -> Deferred[object]:
         agent = self.assembly.agent
         return maybeDeferred(lambda: agent.stopService() if agent is not None and agent.running else None)
 
-    def _end_page(self) -> Deferred[object]:
-        page, self._page = self._page, None
-        return maybeDeferred(lambda: page.stopService() if page is not None else None)
+    def _end_fronts(self) -> Deferred[Any]:
+        ended, self._open = self._open, []
+        return gatherResults([maybeDeferred(front.stopService) for front in ended])
 
 
 # -- the real world ---------------------------------------------------------------------------------------------------
@@ -298,6 +304,23 @@ def web_page(settings: Settings, seams: Seams, reactor: Any, node: SwarmNode) ->
     return _Page(web, operator)
 
 
+def control_socket(settings: Settings, reactor: Any, node: SwarmNode) -> IService:
+    """The socket that ``swarm dht`` and its like speak to; where none can be made, the log says why."""
+    from middleware.entangled.control.place import NoControl, made
+    from middleware.entangled.control.port import ControlPort
+
+    def verbs() -> Any:
+        from middleware.entangled.control.verb import Verbs
+
+        return Verbs.of(node.entangled, node.clock, node.rng)
+
+    try:
+        return ControlPort(reactor, made(settings.node.name), verbs)
+    except NoControl as error:
+        NodeService._log.warn("no control socket: {error}", error=error)
+        return Service()
+
+
 # -- twistd -----------------------------------------------------------------------------------------------------------
 
 
@@ -349,10 +372,20 @@ def makeService(options: Options) -> IService:
     try:
         settings = resolved(settings)
         seams = real_seams(settings, reactor)
-        web = partial(web_page, settings, seams, reactor) if "web" in settings.node.roles else None
-        return _Checked(settings, seams, web)
+        fronts: list[Callable[[SwarmNode], IService]] = [partial(control_socket, settings, reactor)]
+        if "web" in settings.node.roles:
+            fronts.append(partial(web_page, settings, seams, reactor))
+        reactor.callLater(SETTLED, _give_back)
+        return _Checked(settings, seams, fronts)
     except FAULTS as error:
         _refuse(told(error, settings.origin))
+
+
+def _give_back() -> None:
+    """Hand back what only starting needed: glibc keeps it for later, and a small device has other uses for it."""
+    gc.collect()
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 class _Checked(NodeService):
@@ -379,30 +412,3 @@ def _refuse(problem: object) -> NoReturn:
     if stream is not None:
         stream.write(f"swarm-node: {problem}\n")
     raise SystemExit(2)
-
-
-# -- swarm ------------------------------------------------------------------------------------------------------------
-
-
-OURS = ("agents", "drivers", "middleware", "rehearsal", "sim", "webnode")
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """The ``swarm`` command: ``swarm demo``, ``swarm yard``, ``swarm trials``."""
-    words = sys.argv[1:] if arguments is None else arguments
-    verbs: dict[str, tuple[str, str]] = {
-        "demo": ("sim.demo.demonstration", "three robots, a yard and the page, on this machine"),
-        "yard": ("sim.server", "the yard alone"),
-        "trials": ("rehearsal", "both experiments, many times"),
-    }
-    if not words or words[0] not in verbs:
-        sys.stdout.write("usage: swarm VERB [options]\n\n" + "".join(f"  {v:8}{t[1]}\n" for v, t in verbs.items()))
-        return 0 if words[:1] in ([], ["--help"], ["-h"]) else 2
-    verb = words[0]
-    try:
-        module = importlib.import_module(verbs[verb][0])
-    except ModuleNotFoundError as error:
-        if (error.name or "").split(".")[0] in OURS:
-            raise
-        _refuse(MissingExtra(f"swarm {verb}", "all"))
-    return int(module.main(words[1:]) or 0)

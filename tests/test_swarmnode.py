@@ -27,7 +27,7 @@ from middleware.errors import BadSetting, MissingExtra, UnknownAgent
 from middleware.node import SwarmNode
 from middleware.settings import Settings
 from rehearsal import VirtualTeam
-from swarmnode import NodeService, Options, Seams, assembled, identity_in, main, makeService, resolved, told
+from swarmnode import NodeService, Options, Seams, assembled, identity_in, makeService, resolved, told
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -222,7 +222,7 @@ class World:
         """A node that joins through port 7000."""
         known = [] if port == 7000 else ["127.0.0.1:7000"]
         settings = Settings.from_mapping({"node": {"name": name, "port": port, "known_nodes": known}}, "test")
-        return NodeService(settings, self.seams(name, port), self.page if is_web else None)
+        return NodeService(settings, self.seams(name, port), [self.page] if is_web else [])
 
     def page(self, node: SwarmNode) -> Page:
         """The page of a node, which has to run."""
@@ -379,34 +379,6 @@ class WebRoleTests(SynchronousTestCase):
             "x.toml: [node] roles: the web role needs more than the bare node; "
             "install it by: pip install 'swarm-node[web]'",
         )
-
-
-class CommandTests(SynchronousTestCase):
-    def test_help_lists_the_verbs(self) -> None:
-        """Without a verb, or with --help, the verbs are listed; an unknown one is an error."""
-        for words, code in (([], 0), (["--help"], 0), (["fly"], 2)):
-            output = io.StringIO()
-            with contextlib.redirect_stdout(output):
-                self.assertEqual(main(words), code)
-            for verb in ("demo", "yard", "trials"):
-                self.assertIn(verb, output.getvalue())
-
-    def test_each_verb_explains_itself(self) -> None:
-        """Each verb has a help of its own."""
-        for verb in ("demo", "yard", "trials"):
-            output = io.StringIO()
-            with contextlib.redirect_stdout(output), self.assertRaises(SystemExit) as caught:
-                main([verb, "--help"])
-            self.assertEqual(caught.exception.code, 0)
-            self.assertIn("usage", output.getvalue())
-
-    def test_verb_without_its_libraries_names_the_extra(self) -> None:
-        """A verb whose libraries are not installed is refused with the command that installs them."""
-        program = "import sys; sys.modules['pymunk'] = None; import swarmnode; sys.exit(swarmnode.main(['trials']))"
-        child = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=60)
-        self.assertEqual(child.returncode, 2, child.stderr)
-        self.assertEqual(child.stderr.count("\n"), 1, child.stderr)
-        self.assertIn("pip install 'swarm-node[all]'", child.stderr)
 
 
 RUN = """

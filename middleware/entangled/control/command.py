@@ -61,7 +61,9 @@ def _dht(verb: Callable[[str, str], argparse.ArgumentParser]) -> None:
     put.add_argument("key")
     put.add_argument("value", help="text; - reads standard input, @FILE a file")
     put.add_argument("--name", default="", help="which of this node's slots under the key")
-    put.add_argument("--lifetime", choices=("team", "leased"), default="team", help="outlive this node, or leave with it")
+    put.add_argument(
+        "--lifetime", choices=("team", "leased"), default="team", help="outlive this node, or leave with it"
+    )
     put.add_argument("--concern", choices=("one", "majority", "all"), default="majority", help="who must have it")
     put.add_argument("--expect", type=int, metavar="SEQUENCE", help="only where the slot is at this sequence; 0: empty")
     remove = verb("remove", "Remove this node's value under a key.")

@@ -19,7 +19,7 @@ class NoControl(LocalError):
 
 
 def folder() -> Path:
-    """The folder of the sockets: in ``XDG_RUNTIME_DIR`` where there is one, else in ``/tmp`` under the user's number."""
+    """The folder of the sockets: in ``XDG_RUNTIME_DIR``, else in ``/tmp`` under the user's number."""
     runtime = os.environ.get("XDG_RUNTIME_DIR")
     return Path(runtime) / FOLDER if runtime else Path(f"/tmp/{FOLDER}-{os.getuid()}")
 
@@ -42,7 +42,7 @@ def made(name: str) -> Path:
 
 
 def found(name: str | None) -> Path:
-    """The socket of node ``name``, or of the only node of this machine; raises ``NoControl`` and names those there are."""
+    """The socket of node ``name``, or of the only node here; raises ``NoControl``, which names those there are."""
     names = sorted(path.name.removesuffix(ENDING) for path in folder().glob(f"*{ENDING}"))
     if name is None and len(names) == 1:
         name = names[0]

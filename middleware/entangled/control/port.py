@@ -8,16 +8,19 @@ cancels what was asked for.
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from typing import Protocol as Shape
 
-from twisted.internet.defer import CancelledError, Deferred
+from twisted.application.service import Service
+from twisted.internet.defer import CancelledError, Deferred, maybeDeferred
+from twisted.internet.error import CannotListenError
 from twisted.internet.interfaces import IAddress
 from twisted.internet.protocol import Factory, Protocol, connectionDone
 from twisted.logger import Logger
 from twisted.python.failure import Failure
 
-from middleware.entangled.control.verb import Verbs
 from middleware.entangled.errors import EntangledError
 
 MAX_REQUEST = 2_000_000
@@ -93,31 +96,61 @@ class ControlProtocol(Protocol):
             self.transport.write(json.dumps(line, ensure_ascii=False).encode() + b"\n")
 
 
-class ControlPort(Factory):
-    """The open control socket of ``verbs``' node; ``start`` and ``stop`` once."""
+class Runs(Shape):
+    """What does the verbs; ``control.verb.Verbs`` does."""
 
-    noisy = False
+    def run(self, name: object, arguments: object, tell: Callable[[Any], None]) -> Deferred[Any]:
+        """Do what ``name`` says, as ``Verbs.run`` does."""
 
-    def __init__(self, reactor: Any, path: Path, verbs: Verbs) -> None:
-        self.verbs = verbs
+
+class ControlPort(Service):
+    """The control socket of one node, open while the service runs.
+
+    ``verbs`` is called when first somebody asks: a node that nobody speaks to need not load them.
+    """
+
+    _log = Logger()
+
+    def __init__(self, reactor: Any, path: Path, verbs: Callable[[], Runs]) -> None:
         self.open: set[ControlProtocol] = set()
+        self._make_verbs = verbs
+        self._verbs: Runs | None = None
         self._reactor = reactor
         self._path = path
         self._port: Any = None
 
-    def buildProtocol(self, addr: IAddress | None) -> ControlProtocol:  # noqa: D102 (Twisted's)
-        return ControlProtocol(self)
+    @property
+    def verbs(self) -> Runs:
+        """The verbs, made at the first use."""
+        if self._verbs is None:
+            self._verbs = self._make_verbs()
+        return self._verbs
 
-    def start(self) -> None:
-        """Listen; raises ``twisted.internet.error.CannotListenError`` where a living node holds the path."""
-        # With a lock file, so that what a killed node left behind is removed and what a living one holds is not.
-        self._port = self._reactor.listenUNIX(str(self._path), self, mode=0o600, wantPID=True)
+    def startService(self) -> None:
+        """Listen; where that cannot be, the log says why, and the node lives without."""
+        super().startService()
+        factory = _Connections(self)
+        try:
+            # With a lock file: what a killed node left behind is removed, what a living one holds is not.
+            self._port = self._reactor.listenUNIX(str(self._path), factory, mode=0o600, wantPID=True)
+        except (CannotListenError, OSError) as error:
+            self._log.warn("no control socket at {path}: {error}", path=self._path, error=error)
 
-    def stop(self) -> None:
+    def stopService(self) -> Deferred[object]:
         """Close, and cancel what is still asked for."""
-        if self._port is not None:
-            self._port.stopListening()
-            self._port = None
+        super().stopService()
         for connection in list(self.open):
             if connection.transport is not None:
                 connection.transport.loseConnection()
+        port, self._port = self._port, None
+        return maybeDeferred(port.stopListening if port is not None else lambda: None)
+
+
+class _Connections(Factory):
+    noisy = False
+
+    def __init__(self, port: ControlPort) -> None:
+        self._port = port
+
+    def buildProtocol(self, addr: IAddress | None) -> ControlProtocol:
+        return ControlProtocol(self._port)

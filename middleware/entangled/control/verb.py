@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import random
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from twisted.internet.defer import Deferred, maybeDeferred
+from twisted.internet.interfaces import IReactorTime
 
 from middleware.entangled.control import word
 from middleware.entangled.errors import LocalError
@@ -32,11 +34,16 @@ class BadRequest(LocalError):
 
 @dataclass(frozen=True)
 class Verbs:
-    """The verbs of one node.  ``run`` is all that a socket needs."""
+    """The verbs of one node; ``run`` is all that a socket needs."""
 
     node: EntangledNode
     space: TupleSpace
     keywords: Keywords
+
+    @classmethod
+    def of(cls, node: EntangledNode, clock: IReactorTime, rng: random.Random) -> Verbs:
+        """The verbs of ``node``, over the tuple space that has no other name."""
+        return cls(node, TupleSpace(node, clock, rng), Keywords(node))
 
     def run(self, name: object, arguments: object, tell: Tell) -> Deferred[Any]:
         """Do what ``name`` says; events go to ``tell``, the Deferred fires with the answer and may be cancelled.

@@ -57,13 +57,13 @@ def value(field: Any) -> Any:
 
 
 def scalar(word: str) -> Any:
-    """A field out of a word: JSON where it is JSON (``7``, ``1.5``, ``true``, ``null``, ``"7"``), else the text itself."""
+    """A field out of a word: JSON where it is JSON (``7``, ``true``, ``null``, ``"7"``), else the text itself."""
     try:
         read = json.loads(word, parse_constant=_refused)
     except (ValueError, RecursionError):
         return word
     if isinstance(read, list) or (isinstance(read, dict) and set(read) != {"base64"}):
-        raise BadWord(f"a field is a number, text, true, false, null or {{\"base64\": ...}}, not {word[:60]}")
+        raise BadWord(f'a field is a number, text, true, false, null or {{"base64": ...}}, not {word[:60]}')
     return read
 
 

@@ -1,0 +1,1 @@
+"""What things cost: commands that print tables; each can be run by anyone."""

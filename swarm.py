@@ -1,0 +1,46 @@
+"""The ``swarm`` command: the demonstration, the yard, the trials, and the verbs that are asked of a running node."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Sequence
+
+from middleware.errors import MissingExtra
+
+OURS = ("agents", "drivers", "middleware", "rehearsal", "sim", "webnode")
+WORKS: dict[str, tuple[str, str]] = {
+    "demo": ("sim.demo.demonstration", "three robots, a yard and the page, on this machine"),
+    "yard": ("sim.server", "the yard alone"),
+    "trials": ("rehearsal", "both experiments, many times"),
+}
+GROUPS = {
+    "dht": "get, put, find, watch, remove: the distributed hash table",
+    "keyword": "publish, search, watch, remove: what is found by words",
+    "tuple": "put, get, read: the tuple space",
+    "rpc": "call a method of a node",
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the verb that the command line names; returns its exit code."""
+    words = sys.argv[1:] if arguments is None else arguments
+    verb = words[0] if words else ""
+    if verb in GROUPS:
+        # Asked of a node that runs: this needs the standard library alone, and answers at once.
+        from middleware.entangled.control.command import main as command
+
+        return command(verb, words[1:])
+    if verb not in WORKS:
+        about = {**{name: purpose for name, (_, purpose) in WORKS.items()}, **GROUPS}
+        lines = "".join(f"  {name:9}{purpose}\n" for name, purpose in about.items())
+        sys.stdout.write(f"usage: swarm VERB [options]\n\n{lines}\nswarm VERB --help says more.\n")
+        return 0 if verb in ("", "--help", "-h") else 2
+    try:
+        module = importlib.import_module(WORKS[verb][0])
+    except ModuleNotFoundError as error:
+        if (error.name or "").split(".")[0] in OURS:
+            raise
+        sys.stderr.write(f"swarm {verb}: {MissingExtra(f'swarm {verb}', 'all')}\n")
+        return 2
+    return int(module.main(words[1:]) or 0)

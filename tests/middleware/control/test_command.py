@@ -1,0 +1,141 @@
+"""Tests of ``control.command``: command lines in, requests out, answers as text and as JSON."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import os
+import shutil
+import socket
+import tempfile
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.entangled.control.command import asked, main
+from middleware.entangled.control.place import NoControl, made
+
+RECORD = {"owner": "ab" * 32, "name": "", "sequence": 1, "lifetime": "team", "value": "red"}
+
+
+class CommandTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        # Trial's own folders are deeper than the path of a socket may be.
+        runtime = Path(tempfile.mkdtemp())
+        self.addCleanup(shutil.rmtree, runtime)
+        self.patch(os, "environ", {**os.environ, "XDG_RUNTIME_DIR": str(runtime)})
+        made("a").touch()
+        self.requests: list[dict[str, Any]] = []
+        self.replies: list[dict[str, Any]] = [{"answer": None}]
+        self.said = ""
+
+    def ask(self, path: Path, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
+        """A node, played."""
+        self.requests.append(request)
+        yield from self.replies
+
+    def run_command(self, line: str, *replies: dict[str, Any]) -> tuple[int, str]:
+        """Exit code and output of ``swarm LINE`` where the node says ``replies``."""
+        self.replies = list(replies) or [{"answer": None}]
+        group, *words = line.split()
+        output, complaint = io.StringIO(), io.StringIO()
+        with contextlib.redirect_stderr(complaint):
+            code = main(group, words, output, self.ask)
+        self.said = complaint.getvalue()
+        return code, output.getvalue()
+
+    def request(self, line: str) -> dict[str, Any]:
+        """The request that a command line makes."""
+        self.run_command(line)
+        return self.requests[-1]
+
+    def test_requests(self) -> None:
+        """Each command line makes the request that it reads like."""
+        for line, verb, given in (
+            ("dht get a", "dht get", {"key": "a", "concern": "majority"}),
+            ("dht find id:00 --node a", "dht find", {"key": "id:00"}),
+            ("dht remove a --name n", "dht remove", {"key": "a", "name": "n"}),
+            ("keyword search red target", "keyword search", {"words": "red target"}),
+            ("tuple put job 7 true", "tuple put", {"fields": ["job", 7, True]}),
+            ("tuple get job ?int --wait 2", "tuple get", {"template": ["job", {"kind": "int"}], "wait": 2.0}),
+            ("tuple read _ --all", "tuple read", {"template": [{"any": True}], "all": True}),
+            ("rpc h:1 add 2 [3]", "rpc", {"node": "h:1", "method": "add", "arguments": [2, [3]]}),
+        ):
+            request = self.request(line)
+            self.assertEqual(request["verb"], verb)
+            self.assertEqual({k: v for k, v in request["with"].items() if v is not False}, given)
+        put = self.request("dht put a red --lifetime leased --concern all --expect 3")["with"]
+        self.assertEqual((put["lifetime"], put["concern"], put["expect"], put["value"]), ("leased", "all", 3, "red"))
+
+    def test_value_from_a_file(self) -> None:
+        """``@FILE`` sends the bytes of a file; a file that is not there is exit code 2."""
+        path = Path(self.mktemp())
+        path.write_bytes(b"\xff")
+        self.assertEqual(self.request(f"dht put a @{path}")["with"]["value"], {"base64": "/w=="})
+        self.assertEqual(self.run_command("dht put a @/nowhere/at/all")[0], 2)
+        self.assertIn("nowhere", self.said)
+
+    def test_answers_for_people_and_programs(self) -> None:
+        """An answer is lines for a person, and one line of JSON with ``--json``."""
+        self.assertEqual(self.run_command("dht get a", {"answer": [RECORD]}), (0, "ababababab  -  red\n"))
+        code, output = self.run_command("dht get a --json", {"answer": [RECORD]})
+        self.assertEqual((code, json.loads(output)), (0, [RECORD]))
+        for line, answer, shown in (
+            ("dht find a", [{"id": "00ff", "host": "h", "port": 7}], "00ff  h:7\n"),
+            ("dht put a b", {"replicas": 3}, "3 replicas have it\n"),
+            ("tuple get _", ["job", 7], '"job" 7\n'),
+            ("tuple read _ --all", [["a"], [1]], '"a"\n1\n'),
+            ("tuple put a", None, ""),
+            ("rpc h:1 ping", "pong", '"pong"\n'),
+        ):
+            self.assertEqual(self.run_command(line, {"answer": answer}), (0, shown))
+
+    def test_events_are_printed_as_they_come(self) -> None:
+        """A watch prints each change, with a blank line behind it."""
+        code, output = self.run_command("dht watch a", {"event": [RECORD]}, {"event": []}, {"answer": None})
+        self.assertEqual((code, output), (0, "ababababab  -  red\n\n\n"))
+
+    def test_exit_codes(self) -> None:
+        """1: nothing found, or refused; 2: wrong. The reason is one line."""
+        self.assertEqual(self.run_command("dht get a", {"answer": []})[0], 1)
+        self.assertEqual(self.run_command("tuple get _", {"answer": None})[0], 1)
+        self.assertEqual(self.run_command("dht put a b", {"error": "Unavailable", "text": "1 of 3 answered"})[0], 1)
+        self.assertEqual(self.said, "swarm dht: 1 of 3 answered\n")
+        code, output = self.run_command("dht put a b --json", {"error": "Unavailable", "text": "x"})
+        self.assertEqual((code, json.loads(output)["error"]), (1, "Unavailable"))
+        self.assertEqual(self.run_command("dht get a", {"error": "BadRequest", "text": "x"})[0], 2)
+        self.assertEqual(self.run_command("dht get a --node b")[0], 2)
+        self.assertIn("there are a", self.said)
+        self.assertEqual(self.run_command("tuple get ?number")[0], 2)
+        self.assertEqual(self.run_command("dht get a", {"event": []})[0], 1)
+
+    def test_wrong_command_lines(self) -> None:
+        """Command lines that make no sense end with exit code 2 before any node is asked."""
+        for line in ("dht", "dht fly", "dht get", "dht put a", "tuple get", "dht put a b --expect x", "rpc h:1"):
+            caught = self.assertRaises(SystemExit, self.run_command, line)
+            self.assertEqual(caught.code, 2)
+        self.assertEqual(self.requests, [])
+
+    def test_node_that_does_not_answer(self) -> None:
+        """A socket behind which nobody is, and one that speaks another language, are named."""
+        path = made("gone")
+        self.assertIn("does not answer", str(self.assertRaises(NoControl, list, asked(path, {}))))
+        server = socket.socket(socket.AF_UNIX)
+        self.addCleanup(server.close)
+        server.bind(str(path))
+        server.listen(1)
+
+        def speak() -> None:
+            connection, _ = server.accept()
+            connection.recv(100)
+            connection.sendall(b"hello\n")
+            connection.close()
+
+        thread = threading.Thread(target=speak)
+        thread.start()
+        self.assertIn("does not answer", str(self.assertRaises(NoControl, list, asked(path, {}))))
+        thread.join()

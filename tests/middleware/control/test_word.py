@@ -1,0 +1,72 @@
+"""Tests of ``control.word``: values as words of a shell and as JSON."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from hypothesis import given
+from hypothesis import strategies as st
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.entangled.control import word
+
+FIELDS = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text()
+
+
+class WordTests(SynchronousTestCase):
+    @given(st.lists(FIELDS | st.binary()))
+    def test_fields_come_back_from_json(self, fields: list[Any]) -> None:
+        """Every tuple survives the way through JSON and back, bytes included, and no text is taken for bytes."""
+        there = json.loads(json.dumps(word.plain(fields)))
+        back = word.value(there)
+        self.assertEqual(back, fields)
+        self.assertEqual([type(field) for field in back], [type(field) for field in fields])
+
+    @given(FIELDS)
+    def test_json_is_read_as_a_field(self, field: Any) -> None:
+        """A field that is written as JSON is read as that field."""
+        self.assertEqual(word.scalar(json.dumps(field)), field)
+
+    @given(st.text())
+    def test_every_word_is_read_or_refused(self, text: str) -> None:
+        """Whatever stands on a command line is a field, a template's field, or ``BadWord``, and nothing else."""
+        for read in (word.scalar, word.pattern):
+            try:
+                read(text)
+            except word.BadWord:
+                continue
+
+    def test_words_that_are_no_json_are_text(self) -> None:
+        """What is not JSON stands for itself, and so do the numbers that JSON does not have."""
+        for text in ("red", "dog 1", "", "007", "NaN", "[", "-"):
+            self.assertEqual(word.scalar(text), text)
+        self.assertRaises(word.BadWord, word.scalar, "[1, 2]")
+        self.assertRaises(word.BadWord, word.scalar, '{"a": 1}')
+
+    def test_patterns(self) -> None:
+        """A template's words: anything, a kind, a predicate, a value; a quoted one is always a value."""
+        for text, meant in (
+            ("_", {"any": True}),
+            ("?int", {"kind": "int"}),
+            (">5", {"operator": ">", "operand": 5}),
+            ("<=1.5", {"operator": "<=", "operand": 1.5}),
+            ("!=red", {"operator": "!=", "operand": "red"}),
+            ("in:1,b", {"operator": "in", "operand": [1, "b"]}),
+            ("prefix:job-", {"operator": "prefix", "operand": "job-"}),
+            ("7", 7),
+            ("job", "job"),
+            ('"_"', "_"),
+            ('"?int"', "?int"),
+        ):
+            self.assertEqual(word.pattern(text), meant)
+        self.assertIn("?int", str(self.assertRaises(word.BadWord, word.pattern, "?number")))
+
+    def test_bytes_for_people(self) -> None:
+        """A value that is text is shown as text, any other as base64; text that looks like base64 is not bytes."""
+        self.assertEqual(word.text_or_base64("dög".encode()), "dög")
+        self.assertEqual(word.text_or_base64(b"\xff\x00"), {"base64": "/wA="})
+        self.assertRaises(word.BadWord, word.value, {"base64": "!"})
+        self.assertRaises(word.BadWord, word.value, [{"base64": 7}])
+        self.assertEqual(word.plain({"a": float("inf"), b"k": (1, b"x")}), {"a": "inf", "k": [1, {"base64": "eA=="}]})
+        self.assertEqual(word.shown(("job", 7, None)), '"job" 7 null')

@@ -1,0 +1,54 @@
+"""Tests of ``swarm``: the command and its verbs."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import subprocess
+import sys
+from pathlib import Path
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from swarm import main
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+class CommandTests(SynchronousTestCase):
+    def test_help_lists_the_verbs(self) -> None:
+        """Without a verb, or with --help, the verbs are listed; an unknown one is an error."""
+        for words, code in (([], 0), (["--help"], 0), (["fly"], 2)):
+            output = io.StringIO()
+            with contextlib.redirect_stdout(output):
+                self.assertEqual(main(words), code)
+            for verb in ("demo", "yard", "trials", "dht", "tuple", "keyword", "rpc"):
+                self.assertIn(verb, output.getvalue())
+
+    def test_each_verb_explains_itself(self) -> None:
+        """Each verb has a help of its own."""
+        for verb in ("demo", "yard", "trials", "dht", "tuple", "keyword", "rpc"):
+            output = io.StringIO()
+            with contextlib.redirect_stdout(output), self.assertRaises(SystemExit) as caught:
+                main([verb, "--help"])
+            self.assertEqual(caught.exception.code, 0)
+            self.assertIn("usage", output.getvalue())
+
+    def test_verb_without_its_libraries_names_the_extra(self) -> None:
+        """A verb whose libraries are not installed is refused with the command that installs them."""
+        program = "import sys; sys.modules['pymunk'] = None; import swarm; sys.exit(swarm.main(['trials']))"
+        child = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=60)
+        self.assertEqual(child.returncode, 2, child.stderr)
+        self.assertEqual(child.stderr.count("\n"), 1, child.stderr)
+        self.assertIn("pip install 'swarm-node[all]'", child.stderr)
+
+    def test_help_of_a_node_verb_needs_no_twisted(self) -> None:
+        """The verbs that are asked of a node load neither Twisted nor msgpack, so that their help comes at once."""
+        program = (
+            "import sys, swarm\n"
+            "try: swarm.main(['dht', '--help'])\n"
+            "except SystemExit: pass\n"
+            "sys.exit(any(name in sys.modules for name in ('twisted', 'msgpack', 'nacl')))"
+        )
+        child = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=60)
+        self.assertEqual((child.returncode, child.stderr), (0, ""))
