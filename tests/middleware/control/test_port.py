@@ -91,7 +91,7 @@ class ControlTests(SynchronousTestCase):
         self.assertEqual((red["value"], red["name"], red["lifetime"]), ("red", "", "team"))
         self.assertEqual((other["value"], other["name"]), ({"base64": "/wA="}, "other"))
         self.assertEqual(red["owner"], self.fleet.nodes[0].identity.public.hex())
-        self.assertEqual(len(self.answer("dht find", key="a")), 4)
+        self.assertEqual(len(self.answer("dht find", key="a")), 3)
         self.answer("dht remove", key="a", name="other")
         self.assertEqual([r["value"] for r in self.answer("dht get", key="a", concern="fast")], ["red"])
         key = self.fleet.nodes[0].identity.node_id.hex()
@@ -190,7 +190,7 @@ class ControlTests(SynchronousTestCase):
         for byte in b'{"verb": "dht find", "with": {"key": "a"}}\n':
             connection.dataReceived(bytes([byte]))
         self.fleet.run(1.0)
-        self.assertEqual(len(self.lines(transport)[0]["answer"]), 4)
+        self.assertEqual(len(self.lines(transport)[0]["answer"]), 3)
 
     def test_connections_are_bounded(self) -> None:
         """One connection too many is told so; when others have gone there is room again."""
@@ -199,7 +199,7 @@ class ControlTests(SynchronousTestCase):
         self.assertEqual(self.lines(transport)[0]["error"], "Busy")
         for connection, _ in connections:
             connection.connectionLost()
-        self.assertEqual(len(self.answer("dht find", key="a")), 4)
+        self.assertEqual(len(self.answer("dht find", key="a")), 3)
 
     def test_verbs_are_made_when_somebody_asks(self) -> None:
         """A node that nobody speaks to does not load the verbs; one that somebody speaks to loads them once."""
