@@ -7,12 +7,15 @@ memory (``rehearsal`` has a whole team of these).
 
 from __future__ import annotations
 
+import ctypes
+import gc
 import importlib
 import random
 import socket
 import sys
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -53,6 +56,8 @@ KEYS: Sequence[tuple[type[Exception], str]] = (
     (MissingExtra, "[node] roles"),
 )
 """Which setting to look at for which fault."""
+SETTLED = 3.0
+"""Seconds after which a node has started and joined."""
 COMING_BACK = 2.0
 """Seconds until a node that could not come back tries again."""
 
@@ -343,9 +348,17 @@ def makeService(options: Options) -> IService:
         settings = resolved(settings)
         seams = real_seams(settings, reactor)
         web = partial(web_page, settings, seams, reactor) if "web" in settings.node.roles else None
+        reactor.callLater(SETTLED, _give_back)
         return _Checked(settings, seams, web)
     except FAULTS as error:
         _refuse(told(error, settings.origin))
+
+
+def _give_back() -> None:
+    """Hand back what only starting needed: glibc keeps it for later, and a small device has other uses for it."""
+    gc.collect()
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 class _Checked(NodeService):
