@@ -14,7 +14,10 @@ from twisted.trial.unittest import SynchronousTestCase
 ROOT = Path(__file__).resolve().parents[2]
 CHILD = "import os, sys, time; print(os.getpid(), *sys.argv[1:], flush=True); time.sleep(60)"
 PARENT = """
+import signal
 import sys
+# What runs the tests in the background may have told them to ignore it, and children inherit that.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 from pathlib import Path
 from twisted.internet import reactor
 from sim.demo.processes import Team
