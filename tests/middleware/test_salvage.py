@@ -12,6 +12,7 @@ from twisted.logger import ILogObserver, LogEvent, formatEvent, globalLogPublish
 from twisted.trial.unittest import SynchronousTestCase
 from zope.interface import implementer
 
+from middleware.entangled.salvage import set_aside
 from middleware.entangled.sqlite import SqliteStore
 from tests.middleware.test_store import DOG, FOREVER, record
 
@@ -119,6 +120,25 @@ class RottenFileTest(SynchronousTestCase):
         self.assertTrue(Path(self.path + ".rotten-1").exists())
         with closing(SqliteStore.open(self.path, 0.0)) as store:
             self.assertEqual((store.origin, len(store)), ("kept", 0))
+
+    def test_index(self) -> None:
+        """A file of which only the index rotted would still answer, but write wrongly; it is set aside."""
+        with closing(sqlite3.connect(self.path)) as connection:
+            index = "SELECT rootpage FROM sqlite_schema WHERE type = 'index' AND tbl_name = 'records'"
+            (page,) = connection.execute(index).fetchone()
+        self.overwrite(4096 * (page - 1) + 4000, bytes(range(96)))
+        self.assertEqual(self.opened_anew().noted("identity"), DOG.seed)
+
+    def test_parts(self) -> None:
+        """What belongs to a file is set aside with it, under a name that nothing bears yet."""
+        path = self.mktemp()
+        for part in ("", "-wal", "-shm"):
+            Path(path + part).write_text(part)
+        Path(path + ".rotten-1").touch()
+        self.assertEqual(set_aside(path), path + ".rotten-2")
+        for part in ("", "-wal", "-shm"):
+            self.assertEqual(Path(path + ".rotten-2" + part).read_text(), part)
+            self.assertFalse(Path(path + part).exists())
 
     def test_anywhere(self) -> None:
         """Whichever part of a file is overwritten, it opens with nothing that was not put, or is set aside."""
