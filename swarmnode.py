@@ -222,11 +222,12 @@ def real_seams(settings: Settings, reactor: Any) -> Seams:
     from middleware.entangled.network.udp import UdpNetwork
 
     path = settings.node.store
+    quota = settings.node.store_rows, settings.node.store_bytes
     rng = random.SystemRandom()
     store: Store = (
-        MemoryStore(epoch=rng.randbytes(8))
+        MemoryStore(*quota, epoch=rng.randbytes(8))
         if path == IN_MEMORY
-        else SqliteStore.open(Path(path), reactor.seconds(), deliver=reactor.callFromThread)
+        else SqliteStore.open(Path(path), reactor.seconds(), *quota, deliver=reactor.callFromThread)
     )
     network = partial(UdpNetwork, reactor, settings.node.host, settings.node.port)
     return Seams(reactor, network, store, rng, time.time)

@@ -31,7 +31,7 @@ SLOTS = 3000
 TTL = 1e6
 RESTART_S = 2.0
 STALL_S = 0.05
-"""What the reactor may be late by, at the 99th percentile, while the store writes as fast as it can."""
+"""What the reactor may be later by than an idle one, at the 99th percentile, while the store writes all it can."""
 MIB = 2**20
 
 
@@ -216,8 +216,8 @@ class Rate:
         self._left = 0
 
     async def run(self) -> float:
-        """The seconds that it took."""
-        from twisted.internet import reactor
+        """The seconds that it took; where there is nothing to put, a second."""
+        from twisted.internet import reactor, task
         from twisted.internet.defer import Deferred, gatherResults
 
         running = True
@@ -231,6 +231,8 @@ class Rate:
         tick(time.monotonic())
         self._left = self._count
         started = time.monotonic()
+        if not self._count:
+            await task.deferLater(reactor, 1.0)  # type: ignore[arg-type]
         await gatherResults([Deferred.fromCoroutine(self._put_on()) for _ in range(self._in_flight)])
         running = False
         return time.monotonic() - started
@@ -259,6 +261,11 @@ async def _rates(folder: str, outcome: list[bool]) -> None:
         f" {'late p99 ms':>12} {'max ms':>8} {'gets/s':>9} {'RSS MiB':>8}"
     )
     base = 0
+    with closing(SqliteStore.open(os.path.join(folder, "idle.sqlite"), 0.0, deliver=deliver)) as store:
+        idle = Rate(store, 0, 0, 0, 0)
+        await idle.run()
+    usual = _percentile(idle.late, 0.99)
+    _say(f"{'idle':>9} {'':61} {usual * 1000:12.2f} {max(idle.late) * 1000:8.2f}")
     for size, count, in_flight in ((200, 1500, 1), (200, 6000, 64), (10_000, 400, 16), (MIB, 24, 4)):
         if size > MAX_VALUE and size > 10_000:
             _say(f"{size:9} (a record carries at most {MAX_VALUE} bytes)")
@@ -273,7 +280,7 @@ async def _rates(folder: str, outcome: list[bool]) -> None:
                 store.get(key)
             gets = len(keys) * max(1, 20_000 // len(keys)) / (time.perf_counter() - started)
         late = _percentile(rate.late, 0.99)
-        outcome.append(late <= STALL_S)
+        outcome.append(late <= usual + STALL_S)
         _say(
             f"{size:9} {in_flight:10} {count / seconds:8.0f} {_percentile(rate.latencies, 0.5) * 1000:15.2f}"
             f" {_percentile(rate.latencies, 0.99) * 1000:8.2f} {max(rate.latencies) * 1000:8.2f}"
@@ -304,7 +311,10 @@ def rated(folder: str) -> bool:
     except SystemExit as ended:
         outcome.append(not ended.code)
     held = all(outcome)
-    _say(f"target: the reactor at most {STALL_S * 1000:g} ms late at p99: {'held' if held else 'MISSED'}")
+    _say(
+        f"target: the reactor at most {STALL_S * 1000:g} ms later than an idle one at p99:"
+        f" {'held' if held else 'MISSED'}"
+    )
     return held
 
 
@@ -331,7 +341,7 @@ def main() -> int:
         if options.kills:
             started = time.monotonic()
             seen = killed(os.path.join(folder, "kills.sqlite"), options.kills, options.seed)
-            _say(f"{'kills':>6} {'while opening':>14} {'acknowledged':>13} {'lost':>5} {'damaged':>8} {'seconds':>8}")
+            _say(f"{'kills':>6} {'before any':>14} {'acknowledged':>13} {'lost':>5} {'damaged':>8} {'seconds':>8}")
             _say(
                 f"{seen.kills:6} {seen.early:14} {seen.acknowledged:13} {len(seen.lost):5} {len(seen.damaged):8}"
                 f" {time.monotonic() - started:8.0f}"

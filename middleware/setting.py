@@ -80,6 +80,17 @@ def port() -> Rule:
     return _rule(check, _number)
 
 
+def whole(least: int, most: int) -> Rule:
+    """A rule for a whole number."""
+
+    def check(value: object) -> int:
+        if type(value) is not int or not least <= value <= most:
+            raise Wrong(f"must be {least}..{most}, is {shown(value)}", "write a whole number")
+        return value
+
+    return _rule(check, _number)
+
+
 def seconds(least: float, most: float) -> Rule:
     """A rule for a duration in seconds."""
 

@@ -15,6 +15,7 @@ from typing import Any
 
 from middleware import setting
 from middleware.entangled.network.network import Address
+from middleware.entangled.store import MAX_BYTES, MAX_ROWS
 from middleware.errors import BadSetting
 
 IN_MEMORY = ":memory:"
@@ -48,6 +49,13 @@ class NodeSettings:
     store: str = field(default=IN_MEMORY, metadata=setting.text(4000, least=1))
     """The data store's file, relative to the folder of the settings file; ``:memory:`` forgets all when the node ends,
     and so gives the node a new identity each time."""
+
+    store_rows: int = field(default=MAX_ROWS, metadata=setting.whole(100, 1_000_000))
+    """Records that the node holds.  More serves a larger network; fewer spare memory: 1.2 KiB each, and their bytes."""
+
+    store_bytes: int = field(default=MAX_BYTES, metadata=setting.whole(100_000, 2**31))
+    """Bytes that the records may have together.  More holds more large values; fewer spare memory and card.  What has
+    run out, old tombstones and cached copies make room; then the writer is refused, with figures."""
 
     team_key: str = field(default="swarm", metadata=setting.secret(1000), repr=False)
     """What all nodes of a team know and nobody else does.  **The default is no secret: such a team is open to everyone

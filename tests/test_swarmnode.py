@@ -15,7 +15,9 @@ from typing import Any
 
 from twisted.application.service import Service
 from twisted.internet import reactor
+from twisted.logger import ILogObserver, LogEvent, formatEvent, globalLogPublisher
 from twisted.trial.unittest import SynchronousTestCase
+from zope.interface import implementer
 
 import swarmnode
 from middleware.entangled.clock import HeapClock
@@ -267,6 +269,24 @@ class AssemblyTests(SynchronousTestCase):
         store = MemoryStore()
         store.note("identity", b"short")
         self.assertEqual(identity_in(store, random.Random(1)).node_id, identity_in(store, random.Random(1)).node_id)
+
+    def test_lost_identity_is_said(self) -> None:
+        """A node whose store was there before and has no identity any more says that it is a new one."""
+        lines: list[str] = []
+
+        @implementer(ILogObserver)
+        def seen(event: LogEvent) -> None:
+            lines.append(formatEvent(event))
+
+        globalLogPublisher.addObserver(seen)
+        self.addCleanup(globalLogPublisher.removeObserver, seen)
+        store = MemoryStore()
+        identity_in(store, random.Random(1))
+        self.assertEqual(lines, [])
+        lost = MemoryStore()
+        lost.origin = "replaced"
+        identity_in(lost, random.Random(1))
+        self.assertIn("this node is a new one now", "".join(lines))
 
 
 class NodeServiceTests(SynchronousTestCase):

@@ -7,6 +7,7 @@ has run out.  It decides nothing about where records belong; ``node`` does.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import wraps
 
 from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorTime
@@ -58,7 +59,7 @@ class Replica:
         self.on_peer: Callable[[Contact], None] = lambda contact: None
         self.on_goodbye: Callable[[Contact], None] = lambda contact: None
         self._chores = chores
-        endpoint.expose("store", self.answer_store, changes=True)
+        endpoint.expose("store", self._once_written(self.answer_store), changes=True)
         endpoint.expose("find_value", self.answer_find_value)
         endpoint.expose("watch", self.answer_watch, changes=True)
         endpoint.expose("alive", self.answer_alive, changes=True)
@@ -140,6 +141,16 @@ class Replica:
         self.on_goodbye(peer)
 
     # -- inside -----------------------------------------------------------------------------------------------------
+
+    def _once_written(self, answer: Callable[..., list[int]]) -> Callable[..., Deferred[list[int]]]:
+        """``answer``, given only when what it took would survive the end of this process."""
+
+        @wraps(answer)
+        def acknowledged(*arguments: object) -> Deferred[list[int]]:
+            answers = answer(*arguments)
+            return self._store.written().addCallback(lambda _: answers)
+
+        return acknowledged
 
     def _leased(self, owner: bytes) -> list[Record]:
         """What is held of ``owner`` on lease."""

@@ -146,8 +146,6 @@ def make(connection: sqlite3.Connection, version: int) -> None:
 def contents(connection: sqlite3.Connection) -> Contents:
     """What the file holds, in the order in which it came."""
     found = Contents()
-    # Leases ended with the node that watched them.
-    found.repairs.append(("DELETE FROM records WHERE lifetime = 'leased'", ()))
     # Owners and keys stand in many rows; one copy of each is enough.
     known: dict[bytes, bytes] = {}
     for row_id, key, owner, *rest in connection.execute(f"SELECT id, {FIELDS} FROM records ORDER BY id"):
@@ -157,6 +155,8 @@ def contents(connection: sqlite3.Connection) -> Contents:
             found.repairs += _set_aside(row_id)
         elif record.lifetime == "team":
             found.records.append(record)
+    # Leases ended with the node that watched them.
+    found.repairs.append(("DELETE FROM records WHERE lifetime = 'leased'", ()))
     found.notes, bad = notes_in(connection)
     found.rotten += bad
     return found

@@ -5,11 +5,12 @@ from __future__ import annotations
 import random
 from typing import Any
 
+from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.background import Background
 from middleware.entangled.clock import HeapClock
-from middleware.entangled.errors import Refused
+from middleware.entangled.errors import Refused, Unwritable
 from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address
@@ -88,6 +89,25 @@ class ReplicaTests(SynchronousTestCase):
         forged = Record(KEY, "f", DOG.public, 1, "team", 1.0, b"v", bytes(64))
         self.assertEqual(self.stored(record(lifetime="leased"), record("t"), forged, peer=self.cat), [-1, 0, -1])
         self.assertEqual(self.stored(record(lifetime="leased"), forged), [0, -1])
+
+    def test_acknowledged_once_written(self) -> None:
+        """Who stores gets its answer when the record is written, and a named no where it cannot be."""
+        writing: list[Deferred[None]] = []
+        self.store.written = lambda: writing.append(Deferred()) or writing[-1]  # type: ignore[method-assign,func-returns-value]
+        peer = Contact(ME.public, Address("10.0.0.1", 1))
+        for name in ("a", "b"):
+            answer = self.owner.ask(peer, "store", [record(name).packed()], changes=True)
+            self.clock.advance(0.01)
+            self.assertNoResult(answer)
+            self.assertEqual(len(self.store.get(KEY)), len(writing))
+            if name == "a":
+                writing[-1].callback(None)
+                self.clock.advance(0.01)
+                self.assertEqual(self.successResultOf(answer), [0])
+            else:
+                writing[-1].errback(Unwritable("the disk is full"))
+                self.clock.advance(0.01)
+                self.assertIn("the disk is full", str(self.failureResultOf(answer, Refused).value))
 
     def test_full(self) -> None:
         """A full store says so to the writer."""

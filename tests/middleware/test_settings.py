@@ -132,6 +132,8 @@ class SettingsTest(SynchronousTestCase):
                 [7],
             ],
             ("node", "store"): ["", 1],
+            ("node", "store_rows"): [0, 99, 1_000_001, 500.0, True, "500"],
+            ("node", "store_bytes"): [0, 99_999, 2**31 + 1, 1e6],
             ("node", "team_key"): ["", 1],
             ("node", "roles"): [[], "edge", [1], ["boss"]],
             ("node", "presence_lease"): [0, 0.05, 61, True, "1", float("nan"), float("inf")],

@@ -14,24 +14,30 @@ from twisted.logger import ILogObserver, LogEvent, globalLogPublisher
 from twisted.trial.unittest import SynchronousTestCase
 from zope.interface import implementer
 
-from middleware.entangled.errors import BadStore, NotRunning, Refused
-from middleware.entangled.record import Record, hashed_key
-from middleware.entangled.schema import SCHEMA_VERSION
+from middleware.entangled.errors import BadStore, NotRunning, Unwritable
+from middleware.entangled.record import MAX_VALUE, Record, hashed_key
+from middleware.entangled.schema import MAX_ROTTEN, SCHEMA_VERSION
 from middleware.entangled.sqlite import SqliteStore, read_records
+from middleware.entangled.store import MAX_BYTES, Store, weight
 from tests.middleware.test_store import CAT, DOG, FOREVER, KEY, StoreContract, record
 
 
 class SqliteStoreTest(StoreContract, SynchronousTestCase):
-    def make(self, max_rows: int) -> SqliteStore:
-        store = SqliteStore.open(self.mktemp(), 0.0, max_rows)
+    def make(self, max_rows: int, max_bytes: int = MAX_BYTES, hold: float = 30.0) -> SqliteStore:
+        store = SqliteStore.open(self.mktemp(), 0.0, max_rows, max_bytes, hold)
         self.addCleanup(store.close)
         return store
+
+    def settle(self, store: Store) -> None:
+        assert isinstance(store, SqliteStore)
+        store.flush()
 
     def test_after_close(self) -> None:
         """A closed store takes nothing more."""
         self.store.close()
         self.assertRaises(NotRunning, self.store.put, record(), FOREVER)
         self.assertRaises(NotRunning, self.store.note, "seed", b"")
+        self.failureResultOf(self.store.written(), NotRunning)
 
 
 class ReopenTest(SynchronousTestCase):
@@ -92,15 +98,84 @@ class ReopenTest(SynchronousTestCase):
             self.store.put(record(str(number), value=None), FOREVER)
         self.assertEqual(len(self.after_restart()), 1000)
 
-    def test_row_that_is_no_record(self) -> None:
-        """A rotten row is passed over; the others are back."""
-        self.store.put(record("a"), FOREVER)
-        self.store.put(record("b"), FOREVER)
+    def test_rotten_rows(self) -> None:
+        """A row in which anything was changed is counted, set aside and absent; the others are back."""
+        changes = (
+            "sequence = 'x'",
+            "sequence = sequence + 1",
+            "name = CAST(x'ff' AS TEXT)",
+            "value = x'00'",
+            "value = NULL",
+            "ttl = 61.0",
+            "signature = x''",
+            "lifetime = 'leased'",
+            "key = 7",
+            "crc = crc + 1",
+        )
+        for number in range(len(changes) + 1):
+            self.store.put(record(f"r{number}"), FOREVER)
         self.store.close()
         with closing(sqlite3.connect(self.path)) as connection, connection:
-            connection.execute("UPDATE records SET sequence = 'x' WHERE name = 'a'")
-        self.assertEqual(self.reopened(0.0).records(), [record("b")])
-        self.assertEqual(read_records(self.path, KEY), [record("b")])
+            for number, change in enumerate(changes):
+                connection.execute(f"UPDATE records SET {change} WHERE name = 'r{number}'")
+        whole = record(f"r{len(changes)}")
+        self.assertEqual(read_records(self.path, KEY), [whole])
+        store = self.reopened(0.0)
+        self.assertEqual((store.rotten, store.records()), (len(changes), [whole]))
+        self.assertEqual(store.usage.bytes, weight(whole))
+        store.put(record("r0"), FOREVER)
+        store.close()
+        with closing(sqlite3.connect(self.path)) as connection:
+            self.assertEqual(connection.execute("SELECT count(*) FROM rotten").fetchone(), (len(changes),))
+        store = self.reopened(0.0)
+        self.assertEqual((store.rotten, store.records()), (0, [whole, record("r0")]))
+
+    def test_rotten_rows_do_not_pile_up(self) -> None:
+        """Of the rows that are set aside the last few are kept."""
+        for number in range(MAX_ROTTEN + 5):
+            self.store.put(record(str(number)), FOREVER)
+        self.store.close()
+        with closing(sqlite3.connect(self.path)) as connection, connection:
+            connection.execute("UPDATE records SET ttl = 1.0")
+        self.reopened(0.0).close()
+        with closing(sqlite3.connect(self.path)) as connection:
+            self.assertEqual(connection.execute("SELECT count(*) FROM rotten").fetchone(), (MAX_ROTTEN,))
+
+    def test_rotten_note(self) -> None:
+        """A note that rotted is absent, be it the identity, and counted."""
+        self.store.note("identity", DOG.seed)
+        self.store.note("contacts", b"some")
+        self.store.close()
+        with closing(sqlite3.connect(self.path)) as connection, connection:
+            connection.execute("UPDATE notes SET value = zeroblob(32) WHERE name = 'identity'")
+        store = self.reopened(0.0)
+        self.assertEqual((store.noted("identity"), store.noted("contacts"), store.rotten), (None, b"some", 1))
+
+    def test_epoch(self) -> None:
+        """The epoch lasts as long as the file, and another file has another one."""
+        epoch = self.store.epoch
+        store = self.after_restart()
+        self.assertEqual((store.epoch, store.origin), (epoch, "kept"))
+        with closing(SqliteStore.open(self.mktemp(), 0.0)) as other:
+            self.assertNotEqual(other.epoch, epoch)
+        with closing(SqliteStore.open(self.mktemp(), 0.0, fresh_epoch=b"12345678")) as told:
+            self.assertEqual(told.epoch, b"12345678")
+
+    def test_cached_copies_do_not_come_back(self) -> None:
+        """A cached copy never gets to the file, unless it comes to be held for good."""
+        self.store.put(record("a"), FOREVER, cached=True)
+        self.store.put(record("b"), FOREVER, cached=True)
+        self.store.put(record("b"), FOREVER)
+        self.assertEqual(self.after_restart().get(KEY, cached=True), [record("b")])
+
+    def test_large_values(self) -> None:
+        """Values as large as a record carries come back byte by byte, and are counted to the byte."""
+        kept = [record(str(number), value=bytes([number]) * MAX_VALUE) for number in range(4)]
+        for one in kept:
+            self.store.put(one, FOREVER)
+        store = self.after_restart()
+        self.assertEqual(store.records(), kept)
+        self.assertEqual(store.usage.bytes, sum(map(weight, kept)))
 
     def test_killed_in_the_middle(self) -> None:
         """What was flushed is there after the process was killed with more on its way."""
@@ -156,12 +231,47 @@ class FullDiskTest(SynchronousTestCase):
 
     def test_refuses_by_name(self) -> None:
         """On a full disk a node refuses new records with the reason, and still answers, extends and lets go."""
-        error = self.assertRaises(Refused, self.store.put, record("b"), FOREVER)
+        error = self.assertRaises(Unwritable, self.store.put, record("b"), FOREVER)
         self.assertIn("full", str(error))
         self.assertFalse(self.store.put(record("a"), FOREVER))
         self.assertIn(record("a"), self.store.get(KEY))
         self.assertEqual(len(self.store.expire(FOREVER)), 41)
         self.limit(10_000)
+
+    def test_who_waits_is_told(self) -> None:
+        """Who waits for an acknowledgement is refused it as soon as a commit fails, and at once while none succeeds."""
+        self.failureResultOf(self.store.written(), Unwritable)
+        self.limit(10_000)
+        self.store.flush()
+        self.limit(1)
+        for number in range(20):
+            self.store.put(record(f"x{number}", value=bytes(900)), FOREVER)
+        waiting = self.store.written()
+        self.assertRaises(BadStore, self.store.flush, 0.2)
+        self.assertIn("full", str(self.failureResultOf(waiting, Unwritable).value))
+        self.assertIn("full", self.store.trouble)
+        self.limit(10_000)
+        self.store.flush()
+        self.assertEqual(self.store.trouble, "")
+        self.successResultOf(self.store.written())
+
+    def test_copies_are_taken(self) -> None:
+        """What needs no file is not refused for the file's sake."""
+        self.assertTrue(self.store.put(record("copy"), FOREVER, cached=True))
+        self.assertRaises(Unwritable, self.store.put, record("copy"), FOREVER)
+        self.limit(10_000)
+
+    def test_read_only(self) -> None:
+        """A file that comes to be read-only is like a full disk: refused by name, and well again afterwards."""
+        self.limit(10_000)
+        self.store.flush()
+        self.store._connection.execute("PRAGMA query_only = 1")
+        self.store.put(record("x"), FOREVER)
+        self.assertRaises(BadStore, self.store.flush, 0.2)
+        self.assertIn("readonly", str(self.assertRaises(Unwritable, self.store.put, record("y"), FOREVER)))
+        self.store._connection.execute("PRAGMA query_only = 0")
+        self.store.flush()
+        self.assertTrue(self.store.put(record("y"), FOREVER))
 
     def test_recovers(self) -> None:
         """When there is room again what was owed is written, and new records are taken."""

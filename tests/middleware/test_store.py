@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.entangled.errors import Refused
+from middleware.entangled.errors import Full, Refused
 from middleware.entangled.identity import Identity
 from middleware.entangled.record import Lifetime, Record, Slot, hashed_key
-from middleware.entangled.store import MemoryStore, Store
+from middleware.entangled.store import MAX_BYTES, MemoryStore, Store, weight
 
 if TYPE_CHECKING:
     _Case = SynchronousTestCase
@@ -42,9 +42,12 @@ class StoreContract(_Case):
 
     store: Store
 
-    def make(self, max_rows: int) -> Store:
-        """An empty store with room for ``max_rows`` slots; the test case closes it."""
+    def make(self, max_rows: int, max_bytes: int = MAX_BYTES, hold: float = 30.0) -> Store:
+        """An empty store with room for that much; the test case closes it."""
         raise NotImplementedError
+
+    def settle(self, store: Store) -> None:
+        """Let the store write what it has to."""
 
     def setUp(self) -> None:
         self.store = self.make(100)
@@ -190,6 +193,145 @@ class StoreContract(_Case):
         self.assertRaises(Refused, store.put, record("c", value=None), FOREVER)
         self.assertTrue(store.put(record("a", sequence=2, value=None), FOREVER))
 
+    def test_figures_of_a_refusal(self) -> None:
+        """The writer that is refused learns how many rows and bytes there are and may be."""
+        store = self.make(2, 1000)
+        store.put(record("a"), FOREVER)
+        store.put(record("b"), FOREVER)
+        size = 2 * weight(record("a"))
+        line = str(self.assertRaises(Full, store.put, record("c"), FOREVER))
+        self.assertIn(f"2 of 2 rows, {size} of 1000 bytes", line)
+        self.assertNotIn("\n", line)
+
+    def test_bytes_are_counted(self) -> None:
+        """The bytes held are those of the fields of all records, whatever came, changed and went."""
+        self.assertEqual(self.store.usage, (0, 100, 0, MAX_BYTES))
+        held = [record("a", value=bytes(1000)), record("ä" * 3, value=None), record("c", value=b"", owner=CAT)]
+        for one in held:
+            self.store.put(one, FOREVER)
+        self.assertEqual(weight(held[0]), 20 + 32 + 1 + 1000 + 64 + 17)
+        self.assertEqual(weight(held[1]), 20 + 32 + 6 + 64 + 17)
+        self.assertEqual(self.store.usage.bytes, sum(map(weight, held)))
+        self.store.put(record("a", 2, value=b"1"), FOREVER)
+        self.assertEqual(self.store.usage.bytes, sum(map(weight, held)) - 999)
+        self.store.put(record("d"), FOREVER, cached=True)
+        self.store.discard(record("d").slot)
+        self.store.expire(FOREVER)
+        self.assertEqual(self.store.usage[::2], (0, 0))
+
+    def test_full_of_bytes(self) -> None:
+        """A quota of bytes is kept to the byte, for new slots and for those that grow; what shrinks always fits."""
+        small, large = record("b", value=b""), record("a", value=bytes(500))
+        store = self.make(100, weight(large) + weight(small))
+        store.put(large, FOREVER)
+        self.assertRaises(Full, store.put, record("b", value=b"1"), FOREVER)
+        self.assertTrue(store.put(small, FOREVER))
+        self.assertRaises(Full, store.put, record("b", 2, value=b"1"), FOREVER)
+        self.assertTrue(store.put(record("b", 2, value=b""), FOREVER))
+        self.assertTrue(store.put(record("a", 2, value=bytes(499)), FOREVER))
+        self.assertTrue(store.put(record("b", 3, value=b"1"), FOREVER))
+        self.assertRaises(Full, store.put, record("c", value=bytes(600)), FOREVER)
+
+    def test_what_has_run_out_makes_room(self) -> None:
+        """Where the time is told, what has run out goes before anything else, and the next sweep tells of it."""
+        store = self.make(2)
+        store.put(record("a"), 5.0)
+        store.put(record("b", lifetime="leased"), 5.0, cached=True)
+        self.assertTrue(store.put(record("c"), FOREVER, now=4.9))
+        self.assertIsNone(store.slot(record("b").slot))
+        self.assertRaises(Full, store.put, record("d"), FOREVER, now=4.9)
+        self.assertTrue(store.put(record("d"), FOREVER, now=5.0))
+        self.assertEqual(store.expire(5.0), [record("a")])
+        self.assertEqual(store.expire(5.0), [])
+
+    def test_order_of_eviction(self) -> None:
+        """Old tombstones go first, then cached copies, the oldest of each first; what is held for good stays."""
+        store = self.make(4, hold=30.0)
+        old, older = record("old", value=None), record("older", value=None)
+        store.put(older, 60.0)
+        store.put(old, 61.0)
+        store.put(record("kept"), FOREVER)
+        store.put(record("copy1"), FOREVER, cached=True)
+        self.assertRaises(Refused, self.make(0).put, record(), FOREVER)
+        gone: list[str] = []
+        names = {r.name for r in (older, old, record("kept"), record("copy1"))}
+        for number in range(3):
+            store.put(record(f"new{number}"), FOREVER, now=31.0)
+            left = {name for name in names if store.slot(Slot(KEY, DOG.public, name)) is not None}
+            gone += sorted(names - left)
+            names = left
+        self.assertEqual(gone, ["older", "old", "copy1"])
+        self.assertRaises(Full, store.put, record("new3"), FOREVER, now=31.0)
+        self.assertEqual([r.name for r in store.records()], ["kept", "new0", "new1", "new2"])
+        self.assertEqual(store.expire(31.0), [older, old])
+
+    def test_young_tombstones_stay(self) -> None:
+        """A tombstone that has not been held for long enough makes room for nobody."""
+        store = self.make(1, hold=30.0)
+        store.put(record("a", value=None), 60.0)
+        self.assertRaises(Full, store.put, record("b"), FOREVER, now=29.9)
+        self.assertTrue(store.put(record("b"), FOREVER, now=30.0))
+
+    def test_refusal_changes_nothing(self) -> None:
+        """Where all that may go would not be enough, nothing goes."""
+        store = self.make(100, 3 * weight(record("a")))
+        store.put(record("a"), FOREVER)
+        store.put(record("b"), FOREVER, cached=True)
+        before = store.usage
+        self.assertRaises(Full, store.put, record("c", value=bytes(400)), FOREVER)
+        self.assertRaises(Full, store.put, record("b", 2, value=bytes(400)), FOREVER, cached=True)
+        self.assertEqual(store.usage, before)
+        self.assertTrue(store.is_cached(record("b").slot))
+
+    def test_cached_copy_is_out_of_sight(self) -> None:
+        """A cached copy is seen by whoever asks for such, and by nobody else."""
+        copy = record("a", lifetime="leased")
+        self.store.put(copy, 5.0, cached=True)
+        self.assertTrue(self.store.is_cached(copy.slot))
+        self.assertEqual(self.store.slot(copy.slot), copy)
+        self.assertEqual(self.store.get(KEY), [])
+        self.assertEqual(self.store.get(KEY, cached=True), [copy])
+        self.assertEqual(self.store.records(), [])
+        self.assertEqual(self.store.owned(DOG.public), [])
+        self.assertEqual(self.store.extend(DOG.public, FOREVER), 0)
+        self.assertEqual(self.store.expire(5.0), [])
+        self.assertIsNone(self.store.slot(copy.slot))
+        self.store.put(copy, 5.0, cached=True)
+        self.assertEqual(self.store.drop_leased(DOG.public), [])
+        self.assertEqual(len(self.store), 0)
+
+    def test_held_for_good_stays_so(self) -> None:
+        """A copy of what is held for good, be it newer, neither makes it dispensable nor shortens its life."""
+        self.store.put(record(), 50.0)
+        self.assertFalse(self.store.put(record(), 60.0, cached=True))
+        self.assertTrue(self.store.put(record(sequence=2), 5.0, cached=True))
+        self.assertFalse(self.store.is_cached(record().slot))
+        self.assertEqual(self.store.get(KEY), [record(sequence=2)])
+        self.assertEqual(self.store.expire(49.0), [])
+        self.assertEqual(self.store.expire(50.0), [record(sequence=2)])
+
+    def test_copy_becomes_held(self) -> None:
+        """A cached copy that is put for good, by the very same or a newer record, is held for good from then on."""
+        for name, sequence in (("a", 1), ("b", 2)):
+            self.store.put(record(name), 5.0, cached=True)
+            self.assertEqual(self.store.put(record(name, sequence), 9.0), sequence == 2)
+        self.assertEqual(self.store.get(KEY), [record("a"), record("b", 2)])
+        self.assertEqual(self.store.expire(8.0), [])
+        self.assertEqual(len(self.store.expire(9.0)), 2)
+
+    def test_written(self) -> None:
+        """What was put is acknowledged in the end, and at once where nothing is left to be written."""
+        self.store.put(record(), FOREVER)
+        acknowledged = self.store.written()
+        self.settle(self.store)
+        self.successResultOf(acknowledged)
+        self.successResultOf(self.store.written())
+        self.assertEqual(self.store.trouble, "")
+
+    def test_made_now(self) -> None:
+        """A store that was just made says so, has no rotten rows and has an epoch of eight bytes."""
+        self.assertEqual((self.store.origin, self.store.rotten, len(self.store.epoch)), ("new", 0, 8))
+
     def test_discard(self) -> None:
         """A slot that is discarded is empty, whatever its lifetime was, and its room is free; others stay."""
         store = self.make(2)
@@ -218,8 +360,8 @@ class StoreContract(_Case):
 
 
 class MemoryStoreTest(StoreContract, SynchronousTestCase):
-    def make(self, max_rows: int) -> Store:
-        return MemoryStore(max_rows)
+    def make(self, max_rows: int, max_bytes: int = MAX_BYTES, hold: float = 30.0) -> Store:
+        return MemoryStore(max_rows, max_bytes, hold)
 
     def test_expiries_do_not_pile_up(self) -> None:
         """However often slots come and go, the store remembers little more of their expiry than it holds."""
@@ -259,3 +401,34 @@ class MemoryStoreTest(StoreContract, SynchronousTestCase):
                     del plain[slot]
             self.assertEqual(store.get(KEY), [plain[slot][0] for slot in sorted(plain)])
             self.assertEqual(len(store), len(plain))
+            self.assertEqual(store.usage.bytes, sum(weight(held) for held, _ in plain.values()))
+
+    @settings(max_examples=60, deadline=None, derandomize=True, database=None)
+    @given(
+        st.lists(
+            st.tuples(
+                st.integers(0, 9), st.integers(1, 5), st.none() | st.integers(0, 300), st.booleans(), st.integers(0, 99)
+            ),
+            max_size=60,
+        )
+    )
+    def test_quotas_hold(self, puts: list[tuple[int, int, int | None, bool, int]]) -> None:
+        """Whatever comes, the quotas hold, the count of bytes is exact, and nothing held for good gives way."""
+        store, now = MemoryStore(5, 1200, hold=20.0), 0.0
+        for number, sequence, size, cached, step in puts:
+            now += step / 10
+            value = None if size is None else bytes(size)
+            one = Record(KEY, str(number), DOG.public, sequence, "team", 60.0, value, bytes(64))
+            before = {r.slot: r for r in store.records() if r.value is not None}
+            try:
+                store.put(one, now + 60.0, cached, now)
+            except Full:
+                self.assertEqual({r.slot: r for r in store.records() if r.value is not None}, before)
+            gone = {r.slot for r in store.expire(now)}
+            held = {r.slot: r for r in store.records()}
+            self.assertEqual({slot for slot in before if slot not in held} - gone, set())
+            everything = store.get(KEY, tombstones=True, cached=True)
+            self.assertEqual(store.usage.bytes, sum(map(weight, everything)))
+            self.assertLessEqual(sum(r.value is not None for r in everything), 5)
+            self.assertLessEqual(sum(weight(r) for r in everything if r.value is not None), 1200)
+            self.assertLessEqual(len(everything), 10)

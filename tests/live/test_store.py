@@ -1,0 +1,61 @@
+"""Tests of the data store with real processes: what was acknowledged survives ``kill -9``, and a disk that fails."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from benchmarks.store import killed
+
+ROOT = Path(__file__).resolve().parents[2]
+FAILING_DISK = """
+import resource, signal, sys, time
+from benchmarks.store import TTL, written_as
+from middleware.entangled.errors import Unwritable
+from middleware.entangled.sqlite import SqliteStore
+
+store = SqliteStore.open(sys.argv[1], 0.0)
+store.put(written_as(1), TTL)
+store.flush()
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, resource.RLIM_INFINITY))
+number = 1
+try:
+    while True:
+        number += 1
+        store.put(written_as(number), TTL)
+        if number % 20 == 0:
+            time.sleep(0.01)
+except Unwritable as error:
+    assert "cannot be written" in str(error), error
+assert store.slot(written_as(1).slot) == written_as(1)
+resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+store.flush(5.0)
+assert store.put(written_as(number), TTL) and not store.trouble
+store.close()
+again = SqliteStore.open(sys.argv[1], 0.0)
+assert [r.sequence for r in again.records()] == list(range(1, number + 1)), again.usage
+print(number)
+"""
+
+
+class KillTest(SynchronousTestCase):
+    def test_a_handful_of_kills(self) -> None:
+        """A writer that is killed at any moment loses no row that it acknowledged, and damages nothing."""
+        seen = killed(str(Path(self.mktemp()).resolve()), 6, seed=1)
+        self.assertEqual((seen.lost, seen.damaged, seen.kills), ([], [], 6))
+        self.assertGreater(seen.acknowledged, 0)
+
+
+class FailingDiskTest(SynchronousTestCase):
+    def test_lives_on(self) -> None:
+        """Where the system refuses to write, reads go on, writes are refused by name, and all is well afterwards."""
+        path = str(Path(self.mktemp()).resolve())
+        child = subprocess.run(
+            [sys.executable, "-c", FAILING_DISK, path], cwd=ROOT, capture_output=True, text=True, timeout=60
+        )
+        self.assertEqual((child.returncode, child.stderr), (0, ""))
+        self.assertGreater(int(child.stdout), 1)
