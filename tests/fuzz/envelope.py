@@ -14,7 +14,7 @@ MAX_SHOTS = 8
 
 def plaintexts(data: bytes) -> list[bytes]:
     """The plaintexts in an input."""
-    found = []
+    found: list[bytes] = []
     while data and len(found) < MAX_SHOTS:
         length = int.from_bytes(data[:2], "little") % 1372
         found.append(data[2 : 2 + length])

@@ -14,7 +14,8 @@ from collections.abc import Callable
 from types import FunctionType, MethodType
 from typing import Any
 
-from twisted.logger import LogLevel, globalLogPublisher
+from twisted.logger import ILogObserver, LogLevel, globalLogPublisher
+from zope.interface import implementer
 
 from middleware.entangled.clock import HeapClock
 from middleware.entangled.identity import Identity
@@ -36,6 +37,7 @@ class Violation(AssertionError):
     """A shot did what no datagram may do."""
 
 
+@implementer(ILogObserver)
 class Ground:
     """A node ``target`` and a member ``other`` with a session between them; all that came to the target is recorded."""
 
@@ -78,11 +80,11 @@ class Ground:
         self._is_shooting = True
         receiver = self.network.receiver
         assert receiver is not None
-        globalLogPublisher.addObserver(self._on_log)
+        globalLogPublisher.addObserver(self)
         try:
             receiver(datagram, source)
         finally:
-            globalLogPublisher.removeObserver(self._on_log)
+            globalLogPublisher.removeObserver(self)
             self._is_shooting = False
         if self.errors:
             raise Violation(f"logged: {self.errors}")
@@ -116,7 +118,8 @@ class Ground:
         tapped_network: Network = network
         return tapped_network
 
-    def _on_log(self, event: Any) -> None:
+    def __call__(self, event: Any) -> None:
+        """Take note of what is logged while a shot is fired."""
         if event["log_level"] >= LogLevel.warn:
             self.errors.append(str(event.get("log_format")))
 

@@ -81,10 +81,10 @@ def main(name: str, check: Check) -> None:
     except ImportError:
         timed = _Timed(check)
         _mutate(timed, seeds(name), options.seconds, options.seed)
-        print(f"{name}: {timed}; plain mutations")
+        print(f"{name}: {timed}; plain mutations")  # noqa: T201
         return
     found = tempfile.mkdtemp(prefix=f"fuzz-{name}-")
-    print(f"{name}: new inputs go to {found}", flush=True)
+    print(f"{name}: new inputs go to {found}", flush=True)  # noqa: T201
     arguments = [f"-max_total_time={options.seconds}", f"-seed={options.seed}", f"-artifact_prefix={found}/"]
     arguments += ["-max_len=4096", "-print_final_stats=1", found, str(CORPUS / name)]
     for function in _functions():
@@ -116,7 +116,7 @@ def _mutate(check: Check, inputs: list[bytes], seconds: float, seed: int) -> Non
         except Exception:
             path = Path(tempfile.gettempdir()) / f"crash-{hashlib.blake2b(data, digest_size=8).hexdigest()}"
             path.write_bytes(data)
-            print(f"the input is in {path}", file=sys.stderr)
+            print(f"the input is in {path}", file=sys.stderr)  # noqa: T201
             raise
 
 
