@@ -40,7 +40,8 @@ class Dice(random.Random):
 
     def getrandbits(self, k: int) -> int:
         """The next number of ``k`` bits, little-endian."""
-        return int.from_bytes(self.randbytes(8), "little") % 2**k
+        number: int = int.from_bytes(self.randbytes(8), "little") % (1 << k)
+        return number
 
 
 def exchange() -> dict[str, Any]:
@@ -74,7 +75,7 @@ def exchange() -> dict[str, Any]:
     (alice, _), (bob, to_bob) = ends["alice"], ends["bob"]
     bob.expose("echo", lambda peer, value: value)
     bob.expose("add", lambda peer, one, two: one + two, changes=True)
-    Session.seal = noted  # type: ignore[method-assign]
+    Session.seal = noted  # type: ignore[method-assign, assignment]
     try:
         alice.greet(to_bob.address)
         clock.advance(1)
