@@ -383,7 +383,6 @@ class WeatherTests(EndpointCase):
             self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 2)), 2)
             self.assertEqual(len(self.kept(self.to_b, INIT)), before + 1)
 
-
     def test_worn_session_is_renewed(self) -> None:
         """After its number of datagrams a session gets a successor, and after twice as many nothing is sent on it."""
         self.patch(peer, "SESSION_DATAGRAMS", 20)
