@@ -34,7 +34,7 @@ class UdpTests(TestCase):
 
     @inlineCallbacks
     def test_endpoints_talk(self) -> Generator[Deferred[Any], Any, None]:
-        """Two endpoints greet, ask and answer over real sockets."""
+        """Two endpoints greet, ask and answer over real sockets, 1 MiB included."""
         ends = []
         for seed in (1, 2):
             end = Endpoint(Identity(bytes([seed]) * 32), b"k" * 32, self.network(), reactor, random.SystemRandom())
@@ -46,6 +46,10 @@ class UdpTests(TestCase):
         self.assertEqual(contact.public, Identity(b"\x02" * 32).public)
         answer = yield ends[0].ask(contact, "twice", 21, changes=True)
         self.assertEqual(answer, 42)
+        large = random.Random(1).randbytes(2**20)
+        ends[1].expose("echo", lambda peer, value: value)
+        answer = yield ends[0].ask(contact, "echo", large)
+        self.assertTrue(answer == large, "1 MiB comes back as it went")
 
     def test_port_in_use(self) -> None:
         """A port that is held is refused in one line that says which and what to do."""

@@ -383,6 +383,26 @@ class WeatherTests(EndpointCase):
             self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 2)), 2)
             self.assertEqual(len(self.kept(self.to_b, INIT)), before + 1)
 
+    def test_worn_session_is_renewed(self) -> None:
+        """After its number of datagrams a session gets a successor, and after twice as many nothing is sent on it."""
+        self.patch(peer, "SESSION_DATAGRAMS", 20)
+        worn = 0
+        for number in range(100):
+            self.assertEqual(self.got(self.a.ask(self.to_b, "add", number, changes=True)), number)
+            worn = max([worn, *(session.sent for session in self.a._sessions.values())])
+        self.assertEqual(self.runs, list(range(100)))
+        self.assertIn(len(self.kept(self.to_b, INIT)), (4, 5, 6))
+        self.assertLessEqual(worn, 41)
+
+    def test_worn_session_without_successor_is_dropped(self) -> None:
+        """A session that is worn twice over is not used any more, even where nobody answers the handshake."""
+        self.patch(peer, "SESSION_DATAGRAMS", 5)
+        self.got(self.a.ask(self.to_b, "echo", 1))
+        self.board.cut(self.to_a.address, self.to_b.address)
+        for _ in range(30):
+            self.a.tell(self.to_b, "echo", 1)
+        self.assertEqual(self.a._peers.known(self.to_b.public).sessions, [])  # type: ignore[union-attr]
+
 
 class AttackTests(EndpointCase):
     """Datagrams that must change nothing."""

@@ -6,6 +6,8 @@ import math
 
 FIRST_GUESS = 0.1
 SHORTEST = 0.05
+# On an even path the deviation goes to zero; without this the time-out would come together with the answer.
+GRAIN = 0.01
 LONGEST = 1.0
 BACK_OFF = 1.5
 FIRST_WINDOW = 10.0  # RFC 6928
@@ -40,7 +42,7 @@ class RoundTrip:
         else:
             self._smoothed, self._deviation = seconds, seconds / 2
             self.is_measured = True
-        self.wait = min(LONGEST, max(self._shortest, self._smoothed + 4 * self._deviation))
+        self.wait = min(LONGEST, max(self._shortest, self._smoothed + max(GRAIN, 4 * self._deviation)))
 
     @property
     def usual(self) -> float:

@@ -1,0 +1,1 @@
+"""Fuzzing of the wire: four targets, each a module with ``check(data)`` that runs by itself."""

@@ -1,0 +1,51 @@
+"""Envelope: a member in an established session seals what it likes; what is no message must change nothing.
+
+Several plaintexts in one input are several datagrams: each begins with two bytes that give its length.
+"""
+
+from __future__ import annotations
+
+from middleware.entangled.wire.message import PART
+from tests.fuzz.ground import Ground, Violation, state_of
+from tests.fuzz.runner import Again, main
+
+MAX_SHOTS = 8
+
+
+def plaintexts(data: bytes) -> list[bytes]:
+    """The plaintexts in an input."""
+    found: list[bytes] = []
+    while data and len(found) < MAX_SHOTS:
+        length = int.from_bytes(data[:2], "little") % 1372
+        found.append(data[2 : 2 + length])
+        data = data[2 + length :]
+    return found
+
+
+def shot(ground: Ground, data: bytes) -> None:
+    """Fire one input; raises ``Violation``."""
+    session = next(iter(ground.other._sessions.values()))
+    for plain in plaintexts(data):
+        counted = ground.target.counters["malformed"]
+        before = _lasting(ground)
+        ground.shoot(session.seal(plain), ground.other.address)
+        # The last part of a parcel ends it, whatever was in it.
+        is_whole = plain[:1] != bytes([PART])
+        if is_whole and ground.target.counters["malformed"] > counted and _lasting(ground) != before:
+            raise Violation("a malformed message changed the node")
+    ground.clock.advance(0.01)
+
+
+def _lasting(ground: Ground) -> str:
+    """The state without that of the session which carried the datagram: its counters went on, as they must."""
+    target, node = ground.target, ground.node
+    half_open = [target._half_open._responses, list(target._half_open._unconfirmed)]
+    calls = [target._courier, target._answerer._ledger, target._answerer._cancelled, target._asker._inquiries]
+    timers = sorted(call.getTime() for call in ground.clock.getDelayedCalls())
+    return state_of([node.overlay.table, ground.store, half_open, calls, timers])
+
+
+check = Again(shot)
+
+if __name__ == "__main__":
+    main("envelope", check)

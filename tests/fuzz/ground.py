@@ -1,0 +1,164 @@
+"""Ground: the node that the targets are fired at, and what must hold after every shot.
+
+``state_of`` hashes everything that a node remembers, found by walking its objects, so that new state is never forgotten
+here; left out are the counters (those that measure the rate of handshakes among them), the dice, the clock and the
+network.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import random
+from collections import deque
+from collections.abc import Callable
+from types import FunctionType, MethodType
+from typing import Any
+
+from twisted.logger import ILogObserver, LogLevel, globalLogPublisher
+from zope.interface import implementer
+
+from middleware.entangled.clock import HeapClock
+from middleware.entangled.identity import Identity
+from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.network.network import Address, Network
+from middleware.entangled.network.switchboard import Switchboard
+from middleware.entangled.node import EntangledNode
+from middleware.entangled.store import MemoryStore
+from middleware.entangled.wire.courier import MAX_IN_OF_PEER
+from middleware.entangled.wire.endpoint import Endpoint
+
+TEAM = b"k" * 32
+STRANGER = Address("10.0.0.9", 999)
+LEFT_OUT = ("counters", "_counters", "_rng", "_network", "_clock", "_log", "_quiet", "_most")
+PLAIN = (bytes, str, int, float, type(None))
+
+
+class Violation(AssertionError):
+    """A shot did what no datagram may do."""
+
+
+@implementer(ILogObserver)
+class Ground:
+    """A node ``target`` and a member ``other`` with a session between them; all that came to the target is recorded."""
+
+    def __init__(self) -> None:
+        self.errors: list[str] = []
+        self.known = ""  # the hash after the last shot, for targets that let no time pass
+        self._is_shooting = False
+        self.clock = HeapClock()
+        self.board = Switchboard(self.clock, random.Random(1))
+        self.recorded: list[bytes] = []
+        self.sent: list[tuple[bytes, Address]] = []
+        self.network = self.board.network("10.0.0.1", 1)
+        self.store = MemoryStore(1000)
+        self.node = EntangledNode(
+            Identity(b"t" * 32), TEAM, self._tapped(self.network), self.store, self.clock, random.Random(2), 1.0
+        )
+        self.target = self.node.endpoint
+        self.node.start()
+        self.target.expose("echo", lambda peer, value: value)
+        self.target.expose("add", lambda peer, value: value, changes=True)
+        self.contact = Contact(Identity(b"t" * 32).public, self.network.address)
+        self.identity = Identity(b"o" * 32)
+        self.other = Endpoint(self.identity, TEAM, self.board.network("10.0.0.2", 2), self.clock, random.Random(3))
+        self.other.start()
+        self.other.expose("ping", lambda peer: "pong", changes=True)
+        for method, value in (("echo", b"1"), ("add", bytes(3000))):
+            self.other.ask(self.contact, method, value, changes=method == "add")
+            self.clock.advance(0.5)
+        self.other.greet(self.contact.address).addErrback(lambda failure: None)
+        self.clock.advance(0.5)
+
+    def stop(self) -> None:
+        """Leave no timer behind."""
+        self.node.vanish()
+        self.other.stop()
+
+    def shoot(self, datagram: bytes, source: Address = STRANGER) -> int:
+        """Hand one datagram to the target; the number of bytes that it sent to ``source`` because of it."""
+        self.sent.clear()
+        self._is_shooting = True
+        receiver = self.network.receiver
+        assert receiver is not None
+        globalLogPublisher.addObserver(self)
+        try:
+            receiver(datagram, source)
+        finally:
+            globalLogPublisher.removeObserver(self)
+            self._is_shooting = False
+        if self.errors:
+            raise Violation(f"logged: {self.errors}")
+        courier = self.target._courier
+        if courier._bytes_in.total() > MAX_IN_OF_PEER:
+            raise Violation("more is in assembly than one peer may have")
+        return sum(len(datagram) for datagram, to in self.sent if to == source)
+
+    def state(self) -> str:
+        """The hash of what the target remembers: table, store, sessions, calls under way, timers."""
+        timers = sorted(call.getTime() for call in self.clock.getDelayedCalls())
+        return state_of([self.node, self.store, timers])
+
+    def _tapped(self, network: Any) -> Network:
+        listen, send = network.listen, network.send
+
+        def tapped(receiver: Callable[[bytes, Address], None]) -> None:
+            def receive(datagram: bytes, source: Address) -> None:
+                if len(self.recorded) < 40:
+                    self.recorded.append(datagram)
+                receiver(datagram, source)
+
+            listen(receive)
+
+        def noted(datagram: bytes, to: Address) -> None:
+            self.sent.append((datagram, to))
+            if not self._is_shooting:  # what is under way would count as state
+                send(datagram, to)
+
+        network.listen, network.send = tapped, noted
+        tapped_network: Network = network
+        return tapped_network
+
+    def __call__(self, event: Any) -> None:
+        """Take note of what is logged while a shot is fired."""
+        if event["log_level"] >= LogLevel.warn:
+            self.errors.append(str(event.get("log_format")))
+
+
+def state_of(thing: object) -> str:
+    """The hash of everything that can be reached from ``thing``."""
+    digest = hashlib.blake2b(digest_size=16)
+    seen: dict[int, int] = {}
+    _walk(thing, digest.update, seen)
+    return digest.hexdigest()
+
+
+def _walk(thing: object, add: Callable[[bytes], None], seen: dict[int, int]) -> None:
+    kind = type(thing)
+    if kind in PLAIN or isinstance(thing, bool):
+        add(f"{kind.__name__} {thing!r};".encode())
+        return
+    if id(thing) in seen:
+        add(f"again {seen[id(thing)]};".encode())
+        return
+    if isinstance(thing, FunctionType | MethodType | type | random.Random | HeapClock | Switchboard):
+        return
+    seen[id(thing)] = len(seen)
+    if isinstance(thing, dict):
+        add(f"dict {len(thing)};".encode())
+        for key, value in thing.items():
+            _walk(key, add, seen)
+            _walk(value, add, seen)
+    elif isinstance(thing, list | tuple | deque):
+        add(f"{kind.__name__} {len(thing)};".encode())
+        for item in thing:
+            _walk(item, add, seen)
+    elif isinstance(thing, set | frozenset):
+        add(f"set {sorted(map(repr, thing))};".encode())
+    elif kind.__module__.startswith("middleware.") or kind.__module__.startswith("tests."):
+        add(kind.__name__.encode())
+        names = list(getattr(thing, "__dict__", ()))
+        names += [name for one in kind.__mro__ for name in getattr(one, "__slots__", ())]
+        for name in names:
+            if name not in LEFT_OUT and hasattr(thing, name):
+                add(name.encode())
+                _walk(getattr(thing, name), add, seen)

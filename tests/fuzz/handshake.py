@@ -1,0 +1,80 @@
+"""Handshake: a member that holds the team's key makes INIT, RESP and COOKIE with contents of its own choice.
+
+A refused one changes nothing (R1), and nothing that is sent is longer than what came (R3).  The first byte of an input
+says which of the three; for an INIT the second one is the seed of its ephemeral key.
+"""
+
+from __future__ import annotations
+
+import random
+
+from nacl import bindings
+
+from middleware.entangled.identity import Identity, exchange_key
+from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.network.network import MAX_DATAGRAM, Address
+from middleware.entangled.wire.greeting import COOKIE
+from middleware.entangled.wire.noise import Initiator, Responder
+from middleware.entangled.wire.session import INIT, MAC, PROLOGUE, RESP, Credentials, _hashed, derived_key, mac_of
+from tests.fuzz.ground import STRANGER, TEAM, Ground, Violation
+from tests.fuzz.runner import Again, main
+
+OWN = Credentials.of(Identity(b"m" * 32), TEAM)
+AT = Address("10.0.0.3", 3)
+
+
+def init(ground: Ground, data: bytes) -> bytes:
+    """An INIT around a payload; what stands behind the first 600 bytes is changed in the finished datagram."""
+    remote = exchange_key(ground.contact.public)
+    noise = Initiator(OWN.static, remote, random.Random(data[:1]).randbytes(32), PROLOGUE, OWN.psk)
+    payload = data[1:] if data[:1] < b"\x80" else data[1:5] + OWN.public + data[5:]
+    bare = bytes([INIT]) + noise.write(payload[: MAX_DATAGRAM - 200].ljust(520, b"\0"))
+    bare += _hashed(OWN.mac_key, bare)
+    return bare + (bytes(MAC) if len(data) % 2 else data[-MAC:].ljust(MAC, b"\0"))
+
+
+def resp(ground: Ground, asked: bytes, data: bytes) -> bytes:
+    """A RESP to the INIT that the target sent, around a payload."""
+    noise = Responder(OWN.static, bytes(range(32)), PROLOGUE, OWN.psk)
+    payload, _ = noise.read(asked[1 : -2 * MAC])
+    message, _ = noise.write(data[:1300])
+    return bytes([RESP]) + payload[:4] + message
+
+
+def cookie(asked: bytes, data: bytes) -> bytes:
+    """A COOKIE for the INIT that the target sent, around sixteen bytes or any other number."""
+    head, nonce = bytes([COOKIE]) + mac_of(asked), bytes(24)
+    key = derived_key(TEAM, b"cookie")
+    return head + nonce + bindings.crypto_aead_xchacha20poly1305_ietf_encrypt(data[:1300], head, nonce, key)
+
+
+def shot(ground: Ground, data: bytes) -> None:
+    """Fire one input; raises ``Violation``."""
+    kind, data = data[0] % 3 if data else 0, data[1:]
+    source = STRANGER
+    if kind:
+        asked = ground.target.ask(Contact(OWN.public, AT), "echo", 1)
+        asked.addErrback(lambda failure: None)
+        sent = [datagram for datagram, to in ground.sent if to == AT and datagram[0] == INIT]
+        if not sent:
+            return
+        source = AT
+        datagram = resp(ground, sent[-1], data) if kind == 1 else cookie(sent[-1], data)
+    else:
+        datagram = init(ground, data)
+    counters = ground.target.counters
+    refused = counters["forged"] + counters["malformed"]
+    before = ground.state()
+    sent_bytes = ground.shoot(datagram, source)
+    if not kind and sent_bytes > len(datagram):
+        raise Violation(f"{sent_bytes} bytes sent for {len(datagram)} received")
+    # A RESP opens its session whatever message rides in it; only that message is dropped.
+    if kind != 1 and counters["forged"] + counters["malformed"] > refused and ground.state() != before:
+        raise Violation("a refused handshake changed the node")
+    ground.clock.advance(2.0 if kind else 0.02)
+
+
+check = Again(shot)
+
+if __name__ == "__main__":
+    main("handshake", check)

@@ -1,0 +1,83 @@
+"""Tests of the four targets: the kept corpus, and a bounded number of inputs that hypothesis makes."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from twisted.trial.unittest import SynchronousTestCase
+
+from tests.fuzz import decoder, envelope, handshake, raw
+from tests.fuzz.ground import Ground, Violation
+from tests.fuzz.runner import mutated, seeds
+
+BOUNDED = settings(max_examples=150, deadline=None, derandomize=True, database=None)
+
+
+class TargetTests(SynchronousTestCase):
+    """No input breaks a rule: R1 (what is refused changes nothing) and R3 (no reply is larger than its request)."""
+
+    def fire(self, name: str, check: Callable[[bytes], None], count: int) -> None:
+        """Fire the corpus and some mutations of it."""
+        inputs, rng = seeds(name), random.Random(7)
+        self.assertGreater(len(inputs), 5)
+        for data in inputs + [mutated(rng, inputs) for _ in range(count)]:
+            check(data)
+
+    def test_raw(self) -> None:
+        """Strangers change nothing and are sent no more than they sent, with the corpus and with mutations of it."""
+        self.fire("raw", raw.check, 300)
+
+    def test_envelope(self) -> None:
+        """Members' rubbish in a session raises nothing, logs nothing and leaves no trace."""
+        self.fire("envelope", envelope.check, 300)
+
+    def test_handshake(self) -> None:
+        """Members' rubbish in handshakes leaves no trace and gets no longer answer."""
+        self.fire("handshake", handshake.check, 200)
+
+    def test_decoder(self) -> None:
+        """Every decoder gives a message or ``Malformed``."""
+        self.fire("decoder", decoder.check, 3000)
+
+    @BOUNDED
+    @given(st.binary(max_size=1500))
+    def test_any_datagram(self, data: bytes) -> None:
+        """Any bytes at all, from a stranger."""
+        raw.check(b"\0" + data)
+
+    @BOUNDED
+    @given(st.integers(0, 30), st.lists(st.tuples(st.integers(0, 1400), st.integers(1, 255)), max_size=4))
+    def test_any_change(self, which: int, changes: list[tuple[int, int]]) -> None:
+        """Any change of a few bytes in a recorded datagram, and the recording as it was."""
+        raw.check(bytes([raw.RECORDED + which]) + b"".join(w.to_bytes(2, "little") + bytes([b]) for w, b in changes))
+
+    @BOUNDED
+    @given(st.binary(max_size=1371))
+    def test_any_plaintext(self, data: bytes) -> None:
+        """Any bytes at all, sealed by a member."""
+        envelope.check(len(data).to_bytes(2, "little") + data)
+
+    def test_the_ground_notices(self) -> None:
+        """The hash sees new sessions, timers and calls under way; a longer reply is a violation."""
+        ground = Ground()
+        self.addCleanup(ground.stop)
+        before = ground.state()
+        self.assertEqual(ground.state(), before)
+        ground.clock.callLater(1.0, lambda: None)
+        timed = ground.state()
+        self.assertNotEqual(timed, before)
+        ground.target.ask(ground.contact, "echo", 1).addErrback(lambda failure: None)
+        self.assertNotEqual(ground.state(), timed)
+        ground.node.put(bytes(20), "n", b"v").addErrback(lambda failure: None)
+        before = ground.state()
+        ground.shoot(handshake.init(ground, b"\x80" + bytes(6)))
+        self.assertNotEqual(ground.state(), before)
+        send = ground.network.send
+        ground.target._greeter.on_who = lambda datagram, source: send(bytes(500), source)  # type: ignore[method-assign]
+        ground.target._receivers[0x14] = ground.target._greeter.on_who
+        who = next(number for number, one in enumerate(ground.recorded) if one[0] == 0x14)
+        ground.known = ""
+        self.assertRaises(Violation, raw.shot, ground, bytes([raw.RECORDED + who]))

@@ -1,0 +1,148 @@
+"""Tests of what a call carries beside its arguments: deadline, cancellation, typed errors, checked types."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from twisted.internet.defer import CancelledError, Deferred
+
+from middleware.entangled.errors import NoAnswer, Refused
+from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.wire.message import NO_LIMIT_MS, Cancel, Question, aged, decoded, encoded
+from middleware.entangled.wire.method import BadArguments
+from tests.middleware.test_endpoint import DELAY, EndpointCase
+
+
+class Occupied(Exception):
+    """The dog has another bone."""
+
+
+class CallTests(EndpointCase):
+    """Behaviour of ``Answerer``."""
+
+    def setUp(self) -> None:
+        """Open a session."""
+        super().setUp()
+        self.ended: list[str] = []
+        self.works: list[Deferred[Any]] = []
+        self.got(self.a.ask(self.to_b, "echo", 1))
+
+    def equip(self, endpoint: Any) -> None:
+        """Add slow methods, and one that wants its deadline."""
+        super().equip(endpoint)
+        endpoint.expose("slow", self.slow)
+        endpoint.expose("slow change", self.slow, changes=True)
+        endpoint.expose("crawl", self.crawl)
+        endpoint.expose("when", self.when)
+        endpoint.expose("busy", self.occupied)
+
+    def slow(self, peer: Contact) -> Deferred[Any]:
+        """Never end by itself."""
+        work: Deferred[Any] = Deferred()
+        work.addErrback(self.note)
+        self.works.append(work)
+        return work
+
+    def note(self, failure: Any) -> Any:
+        """Remember how a piece of work ended."""
+        self.ended.append(failure.type.__name__)
+        return failure
+
+    async def crawl(self, peer: Contact) -> None:
+        """Wait for something that never comes, as a coroutine."""
+        try:
+            await Deferred()
+        except CancelledError:
+            self.ended.append("coroutine")
+            raise
+
+    def when(self, peer: Contact, *, deadline: float) -> float:
+        """How long the asker still waits."""
+        return deadline - self.clock.seconds()
+
+    def occupied(self, peer: Contact) -> None:
+        """Fail in a way of one's own."""
+        raise Occupied("with a bone")
+
+    def test_cancelling_reaches_the_method(self) -> None:
+        """Cancelling what ``ask`` returned cancels the Deferred or coroutine of the method, one way's delay later."""
+        for name, how in (("slow", "CancelledError"), ("slow change", "CancelledError"), ("crawl", "coroutine")):
+            asked = self.a.ask(self.to_b, name, timeout=60.0, changes=name == "slow change")
+            self.clock.advance(1.0)
+            asked.cancel()
+            self.failureResultOf(asked, CancelledError)
+            self.clock.advance(DELAY)
+            self.assertEqual(self.ended.pop(), how)
+        self.clock.advance(70)
+        self.assertEqual(self.b._answerer._ledger._running, {})
+
+    def test_cancel_overtakes_its_question(self) -> None:
+        """A question that arrives after it was cancelled does not run."""
+        session = next(iter(self.a._sessions.values()))
+        late = session.seal(encoded(Question(5, "add", (1,))))
+        receive = self.taps[self.to_b.address].receiver
+        receive(session.seal(encoded(Cancel(5))), self.to_a.address)
+        receive(late, self.to_a.address)
+        self.assertEqual((self.runs, self.b.counters["cancelled"]), ([], 1))
+
+    def test_a_stranger_cancels_nothing(self) -> None:
+        """A peer cannot cancel what another one asked."""
+        asked = self.a.ask(self.to_b, "slow", timeout=60.0)
+        c, _ = self.endpoint(3)
+        self.got(c.ask(self.to_b, "echo", 1))
+        session = next(iter(c._sessions.values()))
+        number = next(iter(self.a._asker._inquiries))
+        self.taps[self.to_b.address].receiver(session.seal(encoded(Cancel(number))), c.address)
+        self.assertEqual(self.ended, [])
+        self.works[0].callback("done")
+        self.assertEqual(self.got(asked), "done")
+
+    def test_deadline_is_carried(self) -> None:
+        """A method that asks for it learns how long its asker waits, less the way there."""
+        for timeout, least, most in ((None, 1.4, 1.5), (9.0, 8.9, 9.0)):
+            left = self.got(self.a.ask(self.to_b, "when", timeout=timeout))
+            self.assertTrue(least <= left <= most, left)
+
+    def test_what_is_too_late_stops(self) -> None:
+        """When the asker's time is over the work is cancelled, and a question whose time was over never runs."""
+        asked = self.a.ask(self.to_b, "slow", timeout=2.0)
+        self.clock.advance(1.9)
+        self.assertEqual(self.ended, [])
+        self.failed(asked, NoAnswer)
+        self.assertEqual(self.ended, ["CancelledError"])
+        late = aged(encoded(Question(9, "add", (1,))), 0.0)
+        session = next(iter(self.a._sessions.values()))
+        self.taps[self.to_b.address].receiver(session.seal(late), self.to_a.address)
+        self.assertEqual((self.runs, self.b.counters["late"]), ([], 2))
+
+    def test_time_left_travels_in_the_question(self) -> None:
+        """The time left stands in the last four bytes, in milliseconds, and is cut to what these hold."""
+        question = encoded(Question(1, "m", (), 7))
+        for seconds, milliseconds in ((1.5, 1500), (-1.0, 0), (1e9, NO_LIMIT_MS)):
+            self.assertEqual(decoded(aged(question, seconds)), Question(1, "m", (), milliseconds))
+
+    def test_typed_errors(self) -> None:
+        """An exception that both sides named arrives as itself, one named there only as ``Refused`` with its code."""
+        self.b.expose_error(Occupied, "dog.occupied")
+        asked = self.a.ask(self.to_b, "busy")
+        self.clock.advance(1)
+        error = self.failureResultOf(asked, Refused).value
+        self.assertEqual((str(error), error.code), ("with a bone", "dog.occupied"))
+        self.a.expose_error(Occupied, "dog.occupied")
+        self.assertEqual(self.failed(self.a.ask(self.to_b, "busy"), Occupied), "with a bone")
+
+    def test_codes_are_unambiguous(self) -> None:
+        """A code that is taken, or cannot be one, is refused where it is named."""
+        self.a.expose_error(Occupied, "dog.occupied")
+        self.a.expose_error(Occupied, "dog.occupied")
+        for code in ("dog.occupied", "bad-arguments", "", "x" * 65, "ä", "a\nb"):
+            self.assertRaises(ValueError, self.a.expose_error, KeyError, code)
+
+    def test_arguments_are_checked_where_declared(self) -> None:
+        """Arguments of a wrong kind or number are refused before the method runs, in words that name it."""
+        for arguments in ((), ("x",), (1, 2), (1, "a", 3), (True,)):
+            asked = self.a.ask(self.to_b, "whole", *arguments)
+            self.clock.advance(1)
+            error = self.failureResultOf(asked, BadArguments).value
+            self.assertIn("whole: ", str(error))
+        self.assertEqual(self.got(self.a.ask(self.to_b, "whole", 1, None)), [1, None])

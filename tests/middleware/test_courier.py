@@ -1,0 +1,256 @@
+"""Tests of large messages: whole, through loss, within bounds, and under a slow receiver."""
+
+from __future__ import annotations
+
+import random
+from typing import Any
+
+from middleware.entangled.errors import Crowded, NoAnswer, Refused, TooLarge
+from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.network.switchboard import Weather
+from middleware.entangled.wire import courier
+from middleware.entangled.wire.courier import MAX_IN_OF_PEER, MAX_OUT_OF_PEER, Assembly
+from middleware.entangled.wire.flow import IDLE_S
+from middleware.entangled.wire.message import (
+    MAX_MESSAGE,
+    PART,
+    PART_BYTES,
+    RECEIPT,
+    Key,
+    Part,
+    Question,
+    encoded,
+    packed_receipt,
+    part_count,
+    receipt_of,
+)
+from middleware.entangled.wire.session import INIT, MAX_PLAIN
+from tests.middleware.test_endpoint import DELAY, EndpointCase
+
+MIB = 2**20
+LARGE = random.Random(5).randbytes(MIB)
+
+
+class ParcelCase(EndpointCase):
+    """``b`` takes and gives large values."""
+
+    def equip(self, endpoint: Any) -> None:
+        """Add the methods."""
+        super().equip(endpoint)
+        endpoint.expose("size", self.size, changes=True)
+        endpoint.expose("large", lambda peer, size: LARGE[:size])
+
+    def size(self, peer: Contact, value: bytes) -> int:
+        """Count a run."""
+        self.runs.append(len(value))
+        return len(value)
+
+    def part(self, number: int, total: int = MAX_MESSAGE, id_: int = 77, data: bytes | None = None) -> bytes:
+        """A PART of a question, as a member may make it."""
+        data = bytes(min(PART_BYTES, total - number * PART_BYTES)) if data is None else data
+        return (
+            bytes([PART, 2])
+            + id_.to_bytes(8, "little")
+            + total.to_bytes(4, "little")
+            + number.to_bytes(2, "little")
+            + data
+        )
+
+    def fire(self, plain: bytes) -> list[bytes]:
+        """Let ``a`` seal something for ``b``; what ``a`` gets back."""
+        session = next(iter(self.a._sessions.values()))
+        got: list[bytes] = []
+        receivers = self.taps[self.to_a.address]
+        before = len(receivers.kept)
+        self.taps[self.to_b.address].receiver(session.seal(plain), self.to_a.address)
+        self.clock.advance(2 * DELAY)
+        for datagram, _ in receivers.kept[before:]:
+            twin = next(iter(self.a._sessions.values()))
+            twin._seen = 0
+            twin._highest = -1
+            got.append(twin.open(datagram)[0])
+        return got
+
+
+class ParcelTests(ParcelCase):
+    """Large questions and answers."""
+
+    def test_every_size(self) -> None:
+        """A value of any size up to 1 MiB travels both ways unchanged, sizes around those of datagrams included."""
+        around = [n * PART_BYTES + d for n in (1, 2, 10) for d in (-60, -40, -32, -31, -30, -20, -1, 0, 1)]
+        for size in (0, 1, MAX_PLAIN - 40, *around, 65536, MIB):
+            self.assertEqual(self.got(self.a.ask(self.to_b, "echo", LARGE[:size])), LARGE[:size], size)
+
+    def test_the_cap(self) -> None:
+        """What is larger than the cap fails before a byte is sent; what the cap allows arrives."""
+        self.failureResultOf(self.a.ask(self.to_b, "size", bytes(MAX_MESSAGE)), TooLarge)
+        self.assertEqual(self.board.counters["sent"], 0)
+        self.assertEqual(self.got(self.a.ask(self.to_b, "size", bytes(MIB + 4000), changes=True), 9), MIB + 4000)
+
+    def test_no_init_carries_a_large_question(self) -> None:
+        """The INIT of a large first question is as short as any, and nothing runs because of it."""
+        asked = self.a.ask(self.to_b, "echo", LARGE[:5000])
+        self.clock.advance(1.5 * DELAY)
+        self.assertEqual([len(d) for d, _ in self.kept(self.to_b, INIT)], [569])
+        self.assertEqual(self.got(asked), LARGE[:5000])
+
+    def test_loss(self) -> None:
+        """1 MiB there and back arrives unchanged under 5 % loss in 2 s, and under 30 % in 22 s."""
+        for loss, longest in ((0.05, 2.0), (0.3, 22.0)):
+            self.board.weather = Weather(DELAY, DELAY / 4, loss=loss, duplicate=0.02, reorder=0.05)
+            asked = self.a.ask(self.to_b, "echo", LARGE)
+            self.assertEqual(self.got(asked, longest), LARGE, loss)
+
+    def test_large_changes_run_once(self) -> None:
+        """A large question that changes something runs once, whatever is lost and repeated."""
+        self.board.weather = Weather(DELAY, DELAY / 2, loss=0.2, duplicate=0.3, reorder=0.3)
+        for number in range(30):
+            asked = self.a.ask(self.to_b, "size", bytes(3000 + number), changes=True)
+            self.assertEqual(self.got(asked, 10.0), 3000 + number)
+        self.assertEqual(self.runs, [3000 + number for number in range(30)])
+
+    def test_silence_in_the_middle(self) -> None:
+        """A peer that falls silent in mid-transfer fails the question in time, and both sides let go of everything."""
+        self.board.weather = Weather(DELAY)
+        asked = self.a.ask(self.to_b, "echo", LARGE)
+        self.clock.advance(10 * DELAY)
+        self.board.cut(self.to_a.address, self.to_b.address)
+        self.failed(asked, NoAnswer, 4.0)
+        self.clock.advance(IDLE_S + 2)
+        self.assertEqual((self.b._courier._assemblies, dict(self.b._courier._bytes_in)), ({}, {}))
+        self.assertEqual(dict(self.a._courier._bytes_out), {})
+        self.assertEqual(self.b.counters["abandoned"], 1)
+        self.assertEqual(self.clock.getDelayedCalls(), [])
+
+    def test_a_short_break_is_survived(self) -> None:
+        """A transfer goes on after a break of a second, and after the peer lost its sessions."""
+        self.got(self.a.ask(self.to_b, "echo", 1))
+        asked = self.a.ask(self.to_b, "size", LARGE, changes=True)
+        self.clock.advance(4 * DELAY)
+        self.board.cut(self.to_a.address, self.to_b.address)
+        self.clock.advance(1.0)
+        self.board.heal()
+        self.assertEqual(self.got(asked, 8.0), MIB)
+        asked = self.a.ask(self.to_b, "size", LARGE, changes=True)
+        self.clock.advance(4 * DELAY)
+        self.board.kill(self.to_b.address)
+        self.b, self.to_b = self.endpoint(7, port=self.to_b.address.port, identity=2)
+        self.equip(self.b)
+        self.assertEqual(self.got(asked, 8.0), MIB)
+
+    def test_back_pressure(self) -> None:
+        """Never more parts are under way to a receiver than the room that it gave."""
+        asked = self.a.ask(self.to_b, "echo", LARGE)
+        most = 0
+        while not asked.called:
+            self.clock.advance(DELAY / 4)
+            flow = self.a._courier._flows.get(self.to_b.public)
+            most = max(most, len(flow._under_way) if flow is not None else 0)
+        self.assertGreater(most, 100)
+        self.assertLessEqual(most, courier.ROOM_PARTS + 2)
+
+    def test_small_talk_goes_on(self) -> None:
+        """While 4 MiB are under way a small question to the same peer is answered at once."""
+        self.got(self.a.ask(self.to_b, "echo", 1))
+        asked = [self.a.ask(self.to_b, "size", LARGE, changes=True) for _ in range(4)]
+        self.clock.advance(4 * DELAY)
+        self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 2), 2.5 * DELAY), 2)
+        self.clock.advance(10)
+        self.assertEqual([self.successResultOf(one) for one in asked], [MIB] * 4)
+
+    def test_room_is_reserved(self) -> None:
+        """Beyond the room for one peer a large question fails at once as ``Crowded``; later there is room again."""
+        fitting = MAX_OUT_OF_PEER // (MIB + 60)
+        asked = [self.a.ask(self.to_b, "size", LARGE, changes=True) for _ in range(fitting)]
+        self.failureResultOf(self.a.ask(self.to_b, "size", LARGE, changes=True), Crowded)
+        self.clock.advance(30)
+        self.assertEqual([self.successResultOf(one) for one in asked], [MIB] * fitting)
+        self.assertEqual(dict(self.a._courier._bytes_out), {})
+        self.assertEqual(self.got(self.a.ask(self.to_b, "size", LARGE, changes=True), 9), MIB)
+
+    def test_round_trips_without_loss(self) -> None:
+        """On a calm path no part is sent twice."""
+        self.assertEqual(self.got(self.a.ask(self.to_b, "size", LARGE, changes=True), 9), MIB)
+        parts = [d for d, _ in self.taps[self.to_b.address].kept if len(d) == 1400]
+        self.assertLessEqual(len(parts), part_count(MIB + 60) + 2)
+
+
+class HostileTests(ParcelCase):
+    """Parts that a member makes up."""
+
+    def setUp(self) -> None:
+        """Open a session."""
+        super().setUp()
+        self.got(self.a.ask(self.to_b, "echo", 1))
+
+    def test_assembly_is_bounded(self) -> None:
+        """Parcels that never get whole hold no more than a peer's share, the rest is put off, and all go after 10 s."""
+        for number in range(50):
+            self.fire(self.part(0, id_=number))
+        held = self.b._courier._bytes_in[self.to_a.public]
+        self.assertEqual(held, 4 * MAX_MESSAGE)
+        self.assertLessEqual(held, MAX_IN_OF_PEER)
+        self.assertEqual(self.b.counters["crowded"], 46)
+        self.clock.advance(IDLE_S + 2)
+        self.assertEqual((self.b._courier._assemblies, self.b.counters["abandoned"]), ({}, 4))
+        self.assertEqual(self.got(self.a.ask(self.to_b, "size", LARGE, changes=True), 9), MIB)
+
+    def test_parts_that_do_not_fit(self) -> None:
+        """A part with a wrong length, place or total, or of an answer that nobody waits for, changes nothing."""
+        for plain in (
+            self.part(0, data=b""),
+            self.part(0, data=bytes(PART_BYTES - 1)),
+            self.part(5, total=5 * PART_BYTES, data=b"x"),
+            self.part(0, total=MAX_MESSAGE + 1, data=bytes(PART_BYTES)),
+            self.part(0, total=0, data=b"x"),
+            b"\x01\x08" + self.part(0)[2:],
+        ):
+            self.fire(plain)
+        self.assertEqual((self.b.counters["malformed"], self.b._courier._assemblies), (6, {}))
+        self.fire(b"\x01\x03" + self.part(0)[2:])
+        self.assertEqual((self.b.counters["unasked"], self.b._courier._assemblies), (1, {}))
+
+    def test_late_parts_begin_nothing(self) -> None:
+        """A part of a question that was whole before is answered by a receipt that says so, and assembles nothing."""
+        self.got(self.a.ask(self.to_b, "echo", LARGE[:5000]))
+        key = next(iter(self.b._courier._ended))[1]
+        got = self.fire(self.part(1, 5030, key.id))
+        self.assertEqual([receipt_of(plain).is_done for plain in got], [True])
+        self.assertEqual((self.b.counters["repeated"], self.b._courier._assemblies), (1, {}))
+
+    def test_another_total_is_refused(self) -> None:
+        """The parts of one parcel agree on its size; one that does not is dropped."""
+        self.fire(self.part(0))
+        self.fire(self.part(1, total=MAX_MESSAGE - 1))
+        self.assertEqual(self.b.counters["malformed"], 1)
+
+    def test_a_parcel_must_be_what_it_says(self) -> None:
+        """A question under another id than its parcel's is dropped, and nothing runs."""
+        message = encoded(Question(5, "add", (b"x" * 2000,)))
+        for number in range(2):
+            data = message[number * PART_BYTES : (number + 1) * PART_BYTES]
+            self.fire(self.part(number, len(message), 6, data))
+        self.assertEqual((self.b.counters["malformed"], self.runs), (1, []))
+
+    def test_receipts(self) -> None:
+        """A receipt says what is here and what is missing, whatever the order; its packing is minimal."""
+        assembly = Assembly.of(10 * PART_BYTES, 0.0)
+        for number, is_urgent in ((0, False), (1, False), (4, True), (5, False), (4, True), (2, False)):
+            part = Part(Key(False, 1), False, 10 * PART_BYTES, number, bytes(PART_BYTES))
+            self.assertEqual(assembly.add(part, 1.0), is_urgent, number)
+        packed = packed_receipt(Key(True, 9), False, 7, 2, assembly.here)
+        self.assertEqual(len(packed), 17)
+        self.assertEqual(packed[0], RECEIPT)
+        receipt = receipt_of(packed)
+        self.assertEqual((receipt.next, receipt.room, receipt.cause, receipt.here), (3, 7, 2, 0b110111))
+        self.assertFalse(assembly.is_whole)
+
+    def test_receipts_for_nothing(self) -> None:
+        """Receipts for what was never sent, or beyond its end, change nothing."""
+        for here in (1, 2**900, 0):
+            self.fire(packed_receipt(Key(False, 1), False, 9, 3, here))
+        asked = self.b.ask(Contact(self.to_a.public, self.to_a.address), "x", LARGE)
+        self.clock.advance(DELAY)
+        number = next(iter(self.b._asker._inquiries))
+        self.fire(packed_receipt(Key(False, number), False, 65535, 0, 2**900))
+        self.assertFalse(self.failed(asked, Refused) == "")

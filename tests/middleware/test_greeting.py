@@ -1,0 +1,87 @@
+"""Tests of the doorstep: cookies under load."""
+
+from __future__ import annotations
+
+import random
+
+from middleware.entangled.identity import Identity, exchange_key
+from middleware.entangled.network.network import Address
+from middleware.entangled.wire.greeting import COOKIE, COOKIE_BYTES, MOST_RATE, QUIET_RATE, Cookies
+from middleware.entangled.wire.session import INIT, INIT_LEAST, RESP, Credentials, Invitation
+from tests.middleware.test_endpoint import DELAY, TEAM, EndpointCase
+
+HOME, ELSEWHERE = Address("10.0.0.1", 1), Address("10.0.0.1", 2)
+
+
+class CookieTests(EndpointCase):
+    """Behaviour of ``Cookies`` and of endpoints under a flood."""
+
+    def invitation(self, number: int, cookie: bytes = b"") -> bytes:
+        """An INIT of some member."""
+        own = Credentials.of(Identity(b"m" * 32), TEAM)
+        ephemeral = (number << 64).to_bytes(32, "big")
+        return Invitation(own, exchange_key(self.to_b.public), ephemeral, number, b"").datagram(cookie)
+
+    def flood(self, count: int) -> list[bytes]:
+        """What ``b`` sends to an address from which that many INITs come at once."""
+        answers: list[bytes] = []
+        deaf = self.board.network("10.0.0.1", 1)
+        deaf.listen(lambda datagram, source: answers.append(datagram))
+        for number in range(count):
+            self.taps[self.to_b.address].receiver(self.invitation(number), HOME)
+        self.clock.advance(DELAY)
+        deaf.close()
+        return answers
+
+    def test_above_the_rate_comes_a_cookie(self) -> None:
+        """A burst gets as many RESPs as the rate allows and cookies after that, which leave no session behind."""
+        answers = self.flood(300)
+        kinds = [answer[0] for answer in answers]
+        self.assertEqual(kinds, [RESP] * int(QUIET_RATE) + [COOKIE] * (300 - int(QUIET_RATE)))
+        self.assertEqual(len(self.b._sessions), int(QUIET_RATE))
+        self.assertTrue(all(len(answer) <= INIT_LEAST for answer in answers))
+        self.assertEqual({len(answer) for answer in answers if answer[0] == COOKIE}, {COOKIE_BYTES})
+
+    def test_members_get_through(self) -> None:
+        """While a flood goes on a member pays with its cookie, and its question is answered in two round trips."""
+        self.flood(200)
+        self.b._cookies._quiet._tokens = -1e6  # as if it never ended
+        asked = self.a.ask(self.to_b, "echo", 7)
+        self.assertEqual(self.got(asked, 4 * DELAY), 7)
+        self.assertEqual(len(self.kept(self.to_a, COOKIE)), 1)
+        self.assertEqual(len(self.kept(self.to_b, INIT)), 2)
+
+    def test_a_cookie_is_bound_to_its_address_and_time(self) -> None:
+        """A cookie pays from its own address and for at most four minutes; any other last field is unlawful."""
+        cookies = Cookies(b"c" * 32, random.Random(1))
+        cookie = cookies._cookie(HOME, int(1000 / 120))
+        paid = self.invitation(1, cookie)
+        self.assertTrue(cookies.is_lawful(paid, HOME, 1000.0))
+        self.assertTrue(cookies.is_lawful(paid, HOME, 1100.0))
+        self.assertFalse(cookies.is_lawful(paid, HOME, 1400.0))
+        self.assertFalse(cookies.is_lawful(paid, ELSEWHERE, 1000.0))
+        self.assertTrue(cookies.is_lawful(self.invitation(1), ELSEWHERE, 1000.0))
+
+    def test_even_those_who_pay_are_counted(self) -> None:
+        """With cookies, too, no more handshakes are done in a second than the larger rate."""
+        cookies = Cookies(b"c" * 32, random.Random(1))
+        paid = self.invitation(1, cookies._cookie(HOME, 0))
+        admitted = sum(cookies.admits(paid, HOME, 1.0) for _ in range(2 * int(MOST_RATE)))
+        self.assertEqual(admitted, int(MOST_RATE))
+
+    def test_forged_cookies(self) -> None:
+        """A COOKIE from elsewhere, for no INIT of ours or with a wrong seal is counted and changes nothing."""
+        self.b._cookies._quiet._tokens = -1e6
+        self.a.ask(self.to_b, "echo", 7).addErrback(lambda failure: None)
+        self.clock.advance(1.5 * DELAY)
+        tap = self.taps[self.to_a.address]
+        genuine, tap.receiver = tap.receiver, lambda datagram, source: None
+        self.clock.advance(DELAY)
+        cookie, source = self.kept(self.to_a, COOKIE)[0]
+        genuine(cookie, ELSEWHERE)
+        genuine(cookie[:-1] + bytes([cookie[-1] ^ 1]), source)
+        genuine(cookie[:-1], source)
+        genuine(cookie[:1] + bytes(16) + cookie[17:], source)
+        counted = [self.a.counters[name] for name in ("misdirected", "forged", "stale")]
+        self.assertEqual(counted, [1, 2, 1])
+        self.assertEqual(next(iter(self.a._peers._openings.values())).cookie, b"")
