@@ -1,0 +1,1 @@
+"""Benchmarks: what the project costs and withstands; each module is a command."""
