@@ -65,7 +65,7 @@ class Witness:
                     self.bids[place][ballot].add(member)
             return answers
 
-        seat.answer_confirm = confirmed  # type: ignore[method-assign]
+        seat.answer_confirm = confirmed  # type: ignore[method-assign, assignment]
         expose("decree.confirm", confirmed, changes=True)
 
     def takers(self, place: Place) -> set[bytes]:

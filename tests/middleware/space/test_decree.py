@@ -185,7 +185,7 @@ class TallyTests(SynchronousTestCase):
                     if outcome and outcome.result is Result.WON:
                         pending.append((ballot, outcome.value or ballot.taker))
                 if outcome and outcome.result is Result.DECIDED:
-                    decided.add(outcome.value)
+                    decided.add(outcome.value or b"")
             self.assertLessEqual(len(decided), 1, f"seed {seed}")
 
 

@@ -19,6 +19,8 @@ DELAY = Weather(delay_s=0.005, jitter_s=0.002)
 class SpaceCase(FleetCase):
     """A test with one space on each node of a fleet."""
 
+    made: list[TupleSpace]
+
     def spaces(self, n: int, weather: Weather = DELAY, seed: int = 1) -> tuple[Fleet, list[TupleSpace]]:
         """A fleet, and a space on each of its nodes, which are stopped before the fleet is."""
         fleet = self.fleet(n, seed, weather)
@@ -28,7 +30,7 @@ class SpaceCase(FleetCase):
 
     def setUp(self) -> None:
         super().setUp()
-        self.made: list[TupleSpace] = []
+        self.made = []
 
     def tearDown(self) -> None:
         for space in self.made:
@@ -38,7 +40,12 @@ class SpaceCase(FleetCase):
     def moment(self, fleet: Fleet, work: Deferred[Any]) -> list[float]:
         """Where the moment at which ``work`` fires will stand."""
         moments: list[float] = []
-        work.addBoth(lambda result: (moments.append(fleet.clock.seconds()), result)[1])
+
+        def fired(result: object) -> object:
+            moments.append(fleet.clock.seconds())
+            return result
+
+        work.addCallback(fired)
         return moments
 
 
