@@ -31,7 +31,6 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
 
 # Plain objects: bytes and ``now`` in, decisions out.
 PURE = (
-    "agents.behaviour",
     "agents.decision",
     "drivers.errors",
     "drivers.gate",
@@ -45,6 +44,9 @@ PURE = (
     "middleware.entangled.kademlia.routing",
     "middleware.entangled.network.network",
     "middleware.entangled.record",
+    "middleware.entangled.space.decree",
+    "middleware.entangled.space.posting",
+    "middleware.entangled.space.template",
     "middleware.entangled.wire.congestion",
     "middleware.entangled.wire.message",
     "middleware.entangled.wire.noise",
@@ -56,6 +58,7 @@ PURE = (
     "sim.demo.configuration",
     "sim.demo.experiment",
     "sim.demo.story",
+    "agents.behaviour",
 )
 PURE_LAST_NAMES = ("codec",)
 NOT_IN_PURE = ("twisted", "time", "socket", "threading", "asyncio", "selectors", "subprocess", "secrets", "sqlite3")

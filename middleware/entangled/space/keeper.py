@@ -29,8 +29,8 @@ GRACE = 2.0
 TIDY = 30.0
 HURRY = 2.0
 """Seconds until slots are tidied where they run up faster than that."""
-SLACK = 32
-"""Slots that may be in use before that is any hurry."""
+SLACK = 8
+"""Slots in use that are never worth a hurry."""
 
 
 @dataclass

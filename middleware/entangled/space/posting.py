@@ -117,31 +117,30 @@ def place_unpacked(key: bytes, fields: object) -> Place | None:
     return None
 
 
-def standing(records: Iterable[Record]) -> Standing:
-    """The tuples in ``records`` that nobody took, in their order, and what was taken."""
-    return Reader().standing(records)
-
-
 class Reader:
     """Reads the postings of one key again and again; what has not changed is not decoded again."""
 
     def __init__(self) -> None:
-        self._known: dict[Slot, tuple[Record, Posted | Taken | None]] = {}
+        self._known: dict[tuple[bytes, bytes], Posted | Taken | None] = {}
 
     def standing(self, records: Iterable[Record]) -> Standing:
         """The tuples in ``records`` that nobody took, in their order, and what was taken."""
-        known, self._known = self._known, {}
+        before, self._known = self._known, {}
         posted: list[Posted] = []
         taken: dict[Place, Taken] = {}
         for record in records:
-            before = known.get(record.slot)
-            said = before[1] if before is not None and before[0] == record else posting(record)
-            self._known[record.slot] = (record, said)
+            mark = (record.owner, record.signature)
+            said = self._known[mark] = before[mark] if mark in before else posting(record)
             if isinstance(said, Posted):
                 posted.append(said)
             elif said is not None:
                 taken[said.place] = said
         return [one for one in posted if one.place not in taken], taken
+
+
+def standing(records: Iterable[Record]) -> Standing:
+    """The tuples in ``records`` that nobody took, in their order, and what was taken."""
+    return Reader().standing(records)
 
 
 def _member(fields: object) -> Member | None:

@@ -13,7 +13,7 @@ from twisted.internet.defer import Deferred
 from middleware.entangled.background import Background
 from middleware.entangled.node import EntangledNode
 from middleware.entangled.record import Record
-from middleware.entangled.space.posting import Place, Posted, Reader, Taken
+from middleware.entangled.space.posting import Posted, Reader
 from middleware.entangled.watch import Watch
 
 POLL = 0.7
@@ -28,7 +28,6 @@ class Shelf:
     def __init__(self, node: EntangledNode, key: bytes, chores: Background) -> None:
         self.key = key
         self.posted: list[Posted] = []
-        self.taken: dict[Place, Taken] = {}
         self._node = node
         self._chores = chores
         self._reader = Reader()
@@ -85,8 +84,10 @@ class Shelf:
             woken.callback(None)
 
     def _changed(self, records: list[Record]) -> None:
-        self.posted, self.taken = self._reader.standing(records)
-        self.wake()
+        before = {one.place for one in self.posted}
+        self.posted, _ = self._reader.standing(records)
+        if any(one.place not in before for one in self.posted):
+            self.wake()
 
     def _poll(self) -> None:
         self._stop_polling = self._chores.later(POLL, self._poll)

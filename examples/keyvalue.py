@@ -1,0 +1,25 @@
+"""Key-value in ten lines.
+
+``python examples/keyvalue.py 7000`` begins a network, ``... 7001 127.0.0.1:7000 colour red`` joins it, stores and
+stays, ``... 7002 127.0.0.1:7000 colour`` reads.
+"""
+
+import sys
+
+from peer import joined
+from twisted.internet import defer, task
+
+from middleware.entangled.record import hashed_key
+
+
+async def main(reactor, port, known="", key="", value=""):
+    """Store, read, or only be there."""
+    node = await joined(reactor, int(port), known)
+    if value:
+        print("stored on", await node.put(hashed_key(key), "value", value.encode()), "nodes", flush=True)
+    elif key:
+        return print(*[record.value.decode() for record in await node.get(hashed_key(key))], flush=True)
+    await defer.Deferred()
+
+
+task.react(lambda reactor, *words: defer.ensureDeferred(main(reactor, *words)), sys.argv[1:])

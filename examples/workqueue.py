@@ -1,0 +1,70 @@
+"""A work queue whose workers die: a job that a dead worker held comes back, and is done by another.
+
+``python examples/workqueue.py --port 7000 boss 20`` puts twenty jobs and waits for their results.  In other terminals
+``... --port 7001 --known 127.0.0.1:7000 worker ann --dies 0.2``: each job kills the worker with that probability.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import random
+from typing import Any
+
+from peer import joined
+from twisted.internet import defer, task
+
+from middleware.entangled.space.tuplespace import TupleSpace
+
+WORK_S = 0.2
+LEASE_S = 1.5
+"""Longer than a job may take; a dead worker's job is missing for that long."""
+
+
+async def boss(space: TupleSpace, jobs: int) -> None:
+    """Put jobs and collect their results."""
+    for number in range(jobs):
+        await space.put(("job", number))
+    print("jobs are put:", jobs, flush=True)
+    done: dict[object, object] = {}
+    while len(done) < jobs:
+        _, number, worker, result = await space.get(("done", int, str, int))
+        # A worker that dies after its result and before its word that the job is taken lets it be done twice.
+        if number not in done:
+            done[number] = result
+            print(f"{number} squared is {result}, says {worker} ({len(done)} of {jobs})", flush=True)
+
+
+async def work(reactor: Any, space: TupleSpace, name: str, dies: float) -> None:
+    """Do jobs for ever, or until death."""
+    dice = random.SystemRandom()
+    while True:
+        claim = await space.claim(("job", int), lease=LEASE_S)
+        number: Any = claim.fields[1]
+        await task.deferLater(reactor, WORK_S)
+        if dice.random() < dies:
+            print(f"{name} dies over {number}", flush=True)
+            os._exit(1)
+        await space.put(("done", number, name, number * number))
+        await claim.confirm()
+
+
+async def main(reactor: Any, given: argparse.Namespace) -> None:
+    """Be a boss or a worker."""
+    node = await joined(reactor, given.port, given.known)
+    space = TupleSpace(node, reactor, random.SystemRandom())
+    await (boss(space, given.jobs) if given.role == "boss" else work(reactor, space, given.name, given.dies))
+    space.stop()
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--port", type=int, default=0)
+    parser.add_argument("--known", default="", metavar="HOST:PORT")
+    roles = parser.add_subparsers(dest="role", required=True)
+    roles.add_parser("boss").add_argument("jobs", type=int)
+    worker = roles.add_parser("worker")
+    worker.add_argument("name")
+    worker.add_argument("--dies", type=float, default=0.0)
+    given = parser.parse_args()
+    task.react(lambda reactor: defer.ensureDeferred(main(reactor, given)))

@@ -1,0 +1,90 @@
+"""Tests of the examples, as processes over the loopback interface."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+from twisted.trial.unittest import TestCase
+
+ROOT = Path(__file__).resolve().parent.parent.parent
+PATIENCE = 30.0
+
+
+def free_port() -> int:
+    """A UDP port that nobody holds just now."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+        one.bind(("127.0.0.1", 0))
+        return int(one.getsockname()[1])
+
+
+class ExamplesTests(TestCase):
+    """What a newcomer types first."""
+
+    def start(self, name: str, *words: object) -> subprocess.Popen[str]:
+        """Start an example, which is ended after the test, or when it takes too long."""
+        process = subprocess.Popen(
+            [sys.executable, str(ROOT / "examples" / f"{name}.py"), *map(str, words)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+        )
+        watchdog = threading.Timer(PATIENCE, process.kill)
+        watchdog.start()
+
+        def end() -> None:
+            watchdog.cancel()
+            process.kill()
+            process.communicate()
+
+        self.addCleanup(end)
+        return process
+
+    def line(self, process: subprocess.Popen[str]) -> str:
+        """The next line that a process prints, or an empty one where it ended."""
+        assert process.stdout is not None
+        return process.stdout.readline().strip()
+
+    def say(self, process: subprocess.Popen[str], text: str) -> None:
+        """Type a line."""
+        assert process.stdin is not None
+        process.stdin.write(text + "\n")
+        process.stdin.flush()
+
+    def test_keyvalue(self) -> None:
+        """What one process stores another one reads."""
+        first, second = free_port(), free_port()
+        self.start("keyvalue", first)
+        known = f"127.0.0.1:{first}"
+        self.assertEqual(self.line(self.start("keyvalue", second, known, "colour", "red")), "stored on 2 nodes")
+        self.assertEqual(self.line(self.start("keyvalue", free_port(), known, "colour")), "red")
+
+    def test_chat(self) -> None:
+        """A line typed by one is read by the other, and back."""
+        first = free_port()
+        ann = self.start("chat", "--port", first, "ann")
+        self.assertEqual(self.line(ann), "here: ann")
+        bob = self.start("chat", "--port", free_port(), "--known", f"127.0.0.1:{first}", "bob")
+        self.assertEqual(self.line(bob), "here: ann bob")
+        self.say(bob, "good morning")
+        self.assertEqual(self.line(ann), "bob: good morning")
+        self.say(ann, "hello")
+        self.assertEqual(self.line(bob), "ann: hello")
+
+    def test_workqueue(self) -> None:
+        """All jobs are done though a worker dies over its first one."""
+        first = free_port()
+        boss = self.start("workqueue", "--port", first, "boss", 4)
+        self.assertEqual(self.line(boss), "jobs are put: 4")
+        known = ("--known", f"127.0.0.1:{first}")
+        mortal = self.start("workqueue", "--port", free_port(), *known, "worker", "bob", "--dies", "1.0")
+        self.assertTrue(self.line(mortal).startswith("bob dies over"))
+        self.start("workqueue", "--port", free_port(), *known, "worker", "ann")
+        lines = [self.line(boss) for _ in range(4)]
+        for number in range(4):
+            self.assertTrue(any(line.startswith(f"{number} squared is {number**2}, says ann") for line in lines), lines)

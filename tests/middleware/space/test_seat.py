@@ -1,0 +1,279 @@
+"""Tests of what a council member answers, keeps and forgets, and of what stands in records."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from typing import Any
+
+import msgpack
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from twisted.internet.defer import Deferred
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.entangled.clock import HeapClock
+from middleware.entangled.errors import Refused
+from middleware.entangled.identity import Identity
+from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.network.network import Address
+from middleware.entangled.record import Record
+from middleware.entangled.space import seat as module
+from middleware.entangled.space.decree import Kind, reply_unpacked
+from middleware.entangled.space.posting import (
+    Member,
+    Place,
+    Posted,
+    Reader,
+    Taken,
+    packed_taken,
+    packed_tuple,
+    place_unpacked,
+    posting,
+    standing,
+)
+from middleware.entangled.space.seat import MAX_PLACES, Seat, packed_votes, votes_of
+from middleware.entangled.store import MemoryStore
+
+ME = Identity(b"m" * 32)
+PEER = Contact(ME.public, Address("10.0.0.1", 1))
+KEY = b"k" * 20
+FOREIGN: Any = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=4) | st.binary(max_size=33),
+    lambda inner: st.lists(inner, max_size=6),
+    max_leaves=12,
+)
+
+
+def place(number: int, name: str = "t") -> Place:
+    """One of many places."""
+    return Place(KEY, ME.public, f"{name}{number}", number.to_bytes(8, "big"))
+
+
+def record(name: str, value: bytes | None, sequence: int = 1) -> Record:
+    """A record of the space, unsigned."""
+    return Record(KEY, name, ME.public, sequence, "team", 60.0, value, bytes([sequence]) * 64)
+
+
+def tuple_record(where: Place, sequence: int = 1) -> Record:
+    """The record of a tuple at ``where``."""
+    return record(where.name, packed_tuple(where.mark, ("x",), [Member(PEER, b"i" * 8)]), sequence)
+
+
+class Exposed:
+    """Takes down what a seat exposes."""
+
+    def __init__(self) -> None:
+        self.methods: dict[str, Callable[..., object]] = {}
+
+    def expose(self, name: str, answer: Callable[..., object], changes: bool = False) -> None:
+        """Take it down."""
+        self.methods[name] = answer
+
+
+class SeatTests(SynchronousTestCase):
+    """Behaviour of ``Seat``."""
+
+    def setUp(self) -> None:
+        self.clock = HeapClock()
+        self.store = MemoryStore()
+        self.seat = self.made()
+
+    def made(self, seed: int = 1) -> Seat:
+        """The next life of the member, on the same store."""
+        return Seat(Exposed(), self.store, self.clock, random.Random(seed))
+
+    def claim(self, where: Place, counter: int = 1, taker: bytes = b"a", lease: float = 2.0) -> Kind:
+        """What the member answers to a claim."""
+        answer: Any = self.seat.answer_claim(PEER, KEY, [where.packed()], self.seat.incarnation, counter, taker, lease)
+        return self._kind(answer)
+
+    def confirm(self, where: Place, counter: int = 1, taker: bytes = b"a") -> Kind:
+        """What the member answers to a confirm."""
+        life = self.seat.incarnation
+        answer: Any = self.seat.answer_confirm(PEER, KEY, [where.packed()], life, counter, taker, taker)
+        return self._kind(answer)
+
+    def _kind(self, answer: Any) -> Kind:
+        reply = reply_unpacked(answer[0])
+        assert reply is not None
+        return reply.kind
+
+    def test_votes_survive_a_restart(self) -> None:
+        """The next life on the same store is the same member: what was accepted and what is leased still holds."""
+        life = self.seat.incarnation
+        self.claim(place(1))
+        self.confirm(place(1))
+        self.claim(place(2), lease=5.0)
+        self.clock.advance(100.0)
+        self.seat = self.made(2)
+        self.assertEqual(self.seat.incarnation, life)
+        vote = self.seat.vote(place(1))
+        self.assertEqual(vote and vote.value, b"a")
+        self.assertEqual(self.claim(place(2), 2, b"b"), Kind.LEASED)
+        self.clock.advance(5.0)
+        self.assertEqual(self.claim(place(2), 2, b"b"), Kind.PROMISED)
+
+    def test_lost_memory_is_another_life(self) -> None:
+        """A member whose store is empty or rotten has another incarnation, and refuses what counts on the old one."""
+        life = self.seat.incarnation
+        self.claim(place(1))
+        note = module._bucket_name(module._bucket(place(1)))
+        rotten = MemoryStore()
+        rotten.note("decree/incarnation", life)
+        rotten.note(note, b"rotten")
+        for seed, store in enumerate((MemoryStore(), rotten), start=5):
+            self.store = store
+            self.seat = self.made(seed)
+            self.assertNotEqual(self.seat.incarnation, life)
+            self.assertRaises(Refused, self.seat.answer_claim, PEER, KEY, [place(1).packed()], life, 9, b"b", 1.0)
+            self.assertIsNone(self.seat.vote(place(1)))
+            self.assertEqual(self.claim(place(1)), Kind.PROMISED)
+
+    def test_wrong_questions(self) -> None:
+        """What is no lawful question is refused, and changes nothing."""
+        life, where = self.seat.incarnation, place(1).packed()
+        wrong: list[tuple[Any, ...]] = [
+            (KEY[1:], [where], life, 1, b"a", 1.0), (KEY, [], life, 1, b"a", 1.0),
+            (KEY, [where, where], life, 1, b"a", 1.0),
+            (KEY, [[1]], life, 1, b"a", 1.0), (KEY, [where], b"", 1, b"a", 1.0), (KEY, [where], life, 0, b"a", 1.0),
+            (KEY, [where], life, 1, b"", 1.0), (KEY, [where], life, 1, b"a", 0.0), (KEY, [where], life, 1, b"a", 601.0),
+            (KEY, [place(n).packed() for n in range(MAX_PLACES + 1)], life, 1, b"a", 1.0),
+        ]  # fmt: skip
+        for question in wrong:
+            self.assertRaises(Refused, self.seat.answer_claim, PEER, *question)
+        self.assertRaises(Refused, self.seat.answer_confirm, PEER, KEY, [where], life, 1, b"a", b"")
+        self.assertEqual(len(self.seat), 0)
+
+    def test_confirm_needs_a_claim(self) -> None:
+        """A confirm of what was never promised here is refused and not remembered."""
+        self.assertEqual(self.confirm(place(1)), Kind.UNCLAIMED)
+        self.assertEqual(len(self.seat), 0)
+
+    def test_nothing_is_promised_about_what_is_over(self) -> None:
+        """A tuple that its publisher removed, or whose slot holds another one by now, is not given away any more."""
+        self.store.put(tuple_record(place(1)), 99.0)
+        self.assertEqual(self.claim(place(1)), Kind.PROMISED)
+        self.store.put(tuple_record(place(2)), 99.0)
+        self.store.put(record(place(2).name, None, 2), 99.0)
+        self.assertEqual(self.claim(place(2)), Kind.OUTBID)
+        old = place(3)
+        self.store.put(tuple_record(Place(KEY, ME.public, old.name, b"another!")), 99.0)
+        self.assertEqual(self.claim(old), Kind.OUTBID)
+
+    def test_bounded(self) -> None:
+        """A full member forgets what harms nobody, never an open acceptance, and keeps its promises by a floor."""
+        self.patch(module, "MAX_VOTES", 4)
+        for number in range(4):
+            self.claim(place(number), counter=number + 1, lease=100.0)
+            self.confirm(place(number), counter=number + 1)
+        self.assertRaises(Refused, self.claim, place(9))
+        self.store.put(record(place(1).name, None), 99.0)
+        self.assertEqual(self.claim(place(9), counter=1), Kind.PROMISED)
+        self.assertIsNone(self.seat.vote(place(1)))
+        self.assertEqual(self.claim(place(1), counter=9), Kind.OUTBID)
+        self.store.put(record(place(0).name, None), 99.0)
+        self.claim(place(10), counter=9)
+        self.seat = self.made(2)
+        self.assertEqual(self.claim(place(11), counter=1), Kind.OUTBID)
+        self.assertEqual(len(self.seat), 4)
+
+    def test_unsettled(self) -> None:
+        """A confirmation of which no more was heard is named after a while, until it is settled or its tuple gone."""
+        for number in (1, 2, 3):
+            self.store.put(tuple_record(place(number)), 999.0)
+            self.claim(place(number))
+            self.confirm(place(number))
+        self.assertEqual(self.seat.unsettled(), [])
+        self.store.put(record(place(2).name, None, 2), 999.0)
+        self.clock.advance(4.0)
+        self.assertEqual([posted.place for posted in self.seat.unsettled()], [place(1), place(3)])
+        self.assertEqual(self.seat.unsettled(), [])
+        self.seat.settle(place(3))
+        self.clock.advance(4.0)
+        self.assertEqual([posted.place for posted in self.seat.unsettled()], [place(1)])
+        self.seat = self.made(2)
+        self.seat.unsettled()
+        self.clock.advance(4.0)
+        self.assertIn(place(1), [posted.place for posted in self.seat.unsettled()])
+
+    def test_answers_wait_for_the_disk(self) -> None:
+        """Where the store says when it has written, a vote is told only afterwards."""
+        disk: Deferred[None] = Deferred()
+        self.seat.written = lambda: disk
+        life = self.seat.incarnation
+        answer: Any = self.seat.answer_claim(PEER, KEY, [place(1).packed()], life, 1, b"a", 1.0)
+        self.assertNoResult(answer)
+        disk.callback(None)
+        self.assertEqual(self._kind(self.successResultOf(answer)), Kind.PROMISED)
+
+    def test_release(self) -> None:
+        """A released lease lets the next one in."""
+        self.claim(place(1), lease=50.0)
+        self.seat.answer_release(PEER, KEY, [place(1).packed()], self.seat.incarnation, 1, b"a")
+        self.assertEqual(self.claim(place(1), 2, b"b"), Kind.PROMISED)
+
+    @settings(max_examples=300, deadline=None, derandomize=True, database=None)
+    @given(foreign=FOREIGN, noise=st.binary(max_size=60))
+    def test_notes_are_decoded_totally(self, foreign: Any, noise: bytes) -> None:
+        """A rotten note gives None, and never an exception."""
+        good = [KEY, place(1).packed(), 1, b"a", 1.0, None]
+        self.assertIsNotNone(votes_of(packed_votes({})))
+        rows = [[foreign], [[*good[:5], foreign]], [[*good[:5], [1, b"a", foreign]]], foreign]
+        rows += [[[*good[:n], foreign, *good[n + 1 :]]] for n in range(5)]
+        for fields in rows:
+            try:
+                packed = msgpack.packb(fields)
+            except (ValueError, OverflowError):
+                continue
+            found = votes_of(packed)
+            self.assertTrue(found is None or isinstance(found, dict))
+        votes_of(noise)
+
+
+class PostingTests(SynchronousTestCase):
+    """Behaviour of ``posting`` and ``standing``."""
+
+    def test_round_trip(self) -> None:
+        """A tuple and a note come back from their records as they were."""
+        council = (Member(PEER, b"i" * 8),)
+        value = packed_tuple(place(1).mark, ("x", 1, None), council)
+        self.assertEqual(posting(record(place(1).name, value)), Posted(place(1), ("x", 1, None), council))
+        self.assertEqual(posting(record("n", packed_taken(place(1), b"taker"))), Taken(place(1), b"taker"))
+
+    def test_standing(self) -> None:
+        """What was taken does not stand; another tuple in the same slot does."""
+        note = record("n", packed_taken(place(1), b"taker"))
+        posted, taken = standing([tuple_record(place(1)), tuple_record(place(2)), note])
+        self.assertEqual([one.place for one in posted], [place(2)])
+        self.assertEqual(list(taken), [place(1)])
+        newer = Place(KEY, ME.public, place(1).name, b"another!")
+        reader = Reader()
+        for _ in range(2):
+            posted, _ = reader.standing([tuple_record(newer, 2), note])
+            self.assertEqual([one.place for one in posted], [newer])
+
+    def test_unlawful(self) -> None:
+        """Records that are no postings are passed over."""
+        member = [*PEER.packed(), b"i" * 8]
+        for fields in (
+            [1, b"short", ["x"], [member]], [1, b"m" * 8, [], [member]], [1, b"m" * 8, ["x"], []],
+            [1, b"m" * 8, ["x"], [member] * 2], [1, b"m" * 8, ["x"], [member[:3]]],
+            [1, b"m" * 8, ["x"], [[1, 2, 3, 4]]],
+            [2, [ME.public, "n", b"m"], b"t"], [2, place(1).packed(), b""], [3], 5,
+        ):  # fmt: skip
+            self.assertIsNone(posting(record("t", msgpack.packb(fields))), fields)
+        self.assertIsNone(posting(record("t", None)))
+        self.assertIsNone(place_unpacked(KEY, [ME.public, "", b"m" * 8]))
+
+    @settings(max_examples=300, deadline=None, derandomize=True, database=None)
+    @given(foreign=FOREIGN, noise=st.binary(max_size=60))
+    def test_total(self, foreign: Any, noise: bytes) -> None:
+        """Any record gives a posting or None, and never an exception."""
+        posting(record("t", noise))
+        for fields in (foreign, [1, b"m" * 8, foreign, [foreign]], [1, b"m" * 8, ["x"], foreign], [2, foreign, b"t"]):
+            try:
+                packed = msgpack.packb(fields)
+            except (ValueError, OverflowError):
+                continue
+            posting(record("t", packed))

@@ -1,0 +1,149 @@
+"""Tests of tuples and templates."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgpack
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.entangled.errors import Malformed, TooLarge
+from middleware.entangled.space.template import (
+    ANY,
+    OPERATORS,
+    BadTuple,
+    Predicate,
+    template_of,
+    template_unpacked,
+    tuple_of,
+    tuple_unpacked,
+    where,
+)
+
+VALUES = (
+    st.none()
+    | st.booleans()
+    | st.integers(-(2**63), 2**64 - 1)
+    | st.floats(allow_nan=False)
+    | st.text(st.characters(exclude_categories=["Cs"]), max_size=8)
+    | st.binary(max_size=8)
+)
+PREDICATES = (
+    st.builds(lambda o, v: where(o, v), st.sampled_from(["<", "<=", ">", ">="]), st.integers(-9, 9) | st.text("ab"))
+    | st.builds(lambda v: where("!=", v), VALUES)
+    | st.builds(lambda v: where("in", v), st.lists(VALUES, max_size=4))
+    | st.builds(lambda v: where("prefix", v), st.text("ab", max_size=3) | st.binary(max_size=3))
+)
+FIELDS = VALUES | st.just(ANY) | st.sampled_from([int, float, str, bytes, bool]) | PREDICATES
+FOREIGN = st.recursive(
+    VALUES | st.floats(),
+    lambda inner: st.lists(inner, max_size=5) | st.dictionaries(VALUES, inner, max_size=2),
+    max_leaves=12,
+)
+
+
+class TemplateTests(SynchronousTestCase):
+    """Behaviour of ``template_of``, ``where`` and ``matches``."""
+
+    def test_values_match_their_like_only(self) -> None:
+        """One, 1.0 and True are three different values, and None is one as well."""
+        self.assertTrue(template_of(["a", 1, None, b"x"]).matches(("a", 1, None, b"x")))
+        for other in (1.0, True, "1", None):
+            self.assertFalse(template_of([1]).matches((other,)))
+
+    def test_length_counts(self) -> None:
+        """A template matches tuples of its own length only."""
+        self.assertFalse(template_of([ANY]).matches(("a", "b")))
+        self.assertEqual(template_of([ANY, ANY]).arity, 2)
+
+    def test_types_and_wildcards(self) -> None:
+        """A type takes exactly its own values, and ANY takes everything."""
+        self.assertTrue(template_of([int, str, ANY]).matches((1, "a", None)))
+        self.assertFalse(template_of([int]).matches((True,)))
+        self.assertFalse(template_of([float]).matches((1,)))
+
+    def test_predicates(self) -> None:
+        """Each operator holds where it should, compares int with float, and holds for nothing it can't compare."""
+        rows: list[tuple[str, Any, Any, bool]] = [
+            ("<", 5, 4.5, True), ("<", 5, 5, False), ("<", 5, "a", False), ("<", 5, None, False), ("<", 5, True, False),
+            ("<=", 5, 5.0, True), ("<=", "b", "b", True), (">", b"a", b"b", True), (">", b"a", "b", False),
+            (">=", 1.5, 1.5, True), (">=", 1.5, 1, False), ("!=", 1, 2, True), ("!=", 1, 1.0, False),
+            ("!=", 1, True, True), ("!=", None, None, False), ("!=", "a", b"a", True),
+            ("in", ["a", 1], 1, True), ("in", ["a", 1], True, False), ("in", [], 1, False),
+            ("prefix", "job-", "job-1", True), ("prefix", "job-", b"job-1", False), ("prefix", b"j", b"job", True),
+            ("prefix", b"j", "job", False), ("prefix", "j", 1, False),
+        ]  # fmt: skip
+        for operator, operand, value, holds in rows:
+            self.assertEqual(template_of([where(operator, operand)]).matches((value,)), holds, (operator, value))
+
+    def test_wrong_predicates(self) -> None:
+        """What an operator cannot take is refused at once, by name."""
+        wrong: list[tuple[Any, Any]] = [
+            ("=", 1), ("<", None), ("<", True), ("in", 1), ("in", [1] * 33), ("in", [object()]), ("prefix", 1),
+            ("!=", object()), (">", [1]), ("<", float("nan")),
+        ]  # fmt: skip
+        for operator, operand in wrong:
+            self.assertRaises(BadTuple, where, operator, operand)
+
+    def test_wrong_fields(self) -> None:
+        """What is no tuple or template raises at once and says which field is wrong."""
+        for wrong in ([], [1] * 33, "text", b"bytes", [object()], [[1]], [2**64], ["\ud800"], [float("nan")], 5):
+            self.assertRaises(BadTuple, tuple_of, wrong)
+            self.assertRaises(BadTuple, template_of, wrong)
+        self.assertRaises(BadTuple, tuple_of, [ANY])
+        self.assertRaises(BadTuple, template_of, [list])
+        self.assertIn("field 1", str(self.assertRaises(BadTuple, tuple_of, [1, object()])))
+
+    def test_too_large(self) -> None:
+        """A tuple that would not fit into a record is refused before anything is sent."""
+        self.assertRaises(TooLarge, tuple_of, ["x" * 700])
+        self.assertRaises(TooLarge, template_of, [b"x" * 700])
+
+    def test_a_template_is_taken_as_it_is(self) -> None:
+        """A template that was made once may be given again."""
+        template = template_of([1, ANY])
+        self.assertIs(template_of(template), template)
+
+    @settings(max_examples=150, deadline=None, derandomize=True, database=None)
+    @given(fields=st.lists(FIELDS, min_size=1, max_size=6))
+    def test_round_trip(self, fields: list[Any]) -> None:
+        """Every template comes back from a message as it was."""
+        template = template_of(fields)
+        self.assertEqual(template_unpacked(msgpack.unpackb(msgpack.packb(template.packed()))), template)
+
+    @settings(max_examples=150, deadline=None, derandomize=True, database=None)
+    @given(fields=st.lists(VALUES, min_size=1, max_size=8))
+    def test_tuple_round_trip(self, fields: list[Any]) -> None:
+        """Every tuple comes back from a message as it was, and matches itself."""
+        back = tuple_unpacked(msgpack.unpackb(msgpack.packb(list(tuple_of(fields)))))
+        self.assertEqual(repr(back), repr(tuple(fields)))
+        self.assertTrue(template_of(fields).matches(back))
+
+    @settings(max_examples=300, deadline=None, derandomize=True, database=None)
+    @given(foreign=FOREIGN | st.lists(FOREIGN, max_size=4))
+    def test_decoders_are_total(self, foreign: Any) -> None:
+        """Anything gives a tuple or template that can be used, or ``Malformed`` and nothing else."""
+        for decode in (tuple_unpacked, template_unpacked):
+            try:
+                decode(foreign)
+            except Malformed:
+                continue
+        try:
+            template = template_unpacked(foreign)
+        except Malformed:
+            return
+        template.matches((1,) * template.arity)
+
+    @settings(max_examples=200, deadline=None, derandomize=True, database=None)
+    @given(operator=st.sampled_from([*OPERATORS, "=", "", "like"]), operand=FOREIGN, value=VALUES)
+    def test_foreign_predicates(self, operator: str, operand: Any, value: Any) -> None:
+        """A predicate from the wire is lawful and answers for any value, or it is ``Malformed``."""
+        for kind in (3, True, 4, "3"):
+            try:
+                template = template_unpacked([[kind, operator, operand]])
+            except Malformed:
+                continue
+            self.assertIsInstance(template.fields[0], Predicate)
+            self.assertIn(template.matches((value,)), (True, False))

@@ -1,0 +1,348 @@
+"""Tests of tuple spaces over whole nodes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from twisted.internet.defer import CancelledError, Deferred
+
+from middleware.entangled.errors import NotRunning, TooLarge
+from middleware.entangled.network.switchboard import Weather
+from middleware.entangled.space.claim import Claim, ClaimLost
+from middleware.entangled.space.template import ANY, BadTuple, where
+from middleware.entangled.space.tuplespace import NoTuple, TupleSpace
+from tests.fleet import Fleet, FleetCase
+
+DELAY = Weather(delay_s=0.005, jitter_s=0.002)
+
+
+class SpaceCase(FleetCase):
+    """A test with one space on each node of a fleet."""
+
+    made: list[TupleSpace]
+
+    def spaces(self, n: int, weather: Weather = DELAY, seed: int = 1) -> tuple[Fleet, list[TupleSpace]]:
+        """A fleet, and a space on each of its nodes, which are stopped before the fleet is."""
+        fleet = self.fleet(n, seed, weather)
+        spaces = [TupleSpace(node, fleet.clock, fleet.rng(place)) for place, node in enumerate(fleet.nodes)]
+        self.made = spaces
+        return fleet, spaces
+
+    def setUp(self) -> None:
+        super().setUp()
+        self.made = []
+
+    def tearDown(self) -> None:
+        for space in self.made:
+            space.stop()
+        super().tearDown()
+
+    def moment(self, fleet: Fleet, work: Deferred[Any]) -> list[float]:
+        """Where the moment at which ``work`` fires will stand."""
+        moments: list[float] = []
+
+        def fired(result: object) -> object:
+            moments.append(fleet.clock.seconds())
+            return result
+
+        work.addCallback(fired)
+        return moments
+
+
+class TupleSpaceTests(SpaceCase):
+    """Behaviour of ``TupleSpace``."""
+
+    def test_put_and_get(self) -> None:
+        """What one node puts another takes, and then it is gone for everybody."""
+        fleet, (a, b, c) = self.spaces(3)
+        self.done(fleet, a.put(("job", 1, 2.5)))
+        self.assertEqual(self.done(fleet, b.get(("job", int, ANY))), ("job", 1, 2.5))
+        for space in (a, b, c):
+            self.assertIsNone(self.done(fleet, space.get_if_exists(("job", ANY, ANY))))
+            self.assertEqual(self.done(fleet, space.read_all(("job", ANY, ANY))), [])
+
+    def test_reading_leaves_the_tuple(self) -> None:
+        """A tuple that is read stays, for everybody and as often as wanted."""
+        fleet, (a, b, _) = self.spaces(3)
+        self.done(fleet, a.put(("x", None, b"y")))
+        for space in (a, b, b):
+            self.assertEqual(self.done(fleet, space.read(("x", None, bytes))), ("x", None, b"y"))
+            self.assertEqual(self.done(fleet, space.read_if_exists(("x", ANY, ANY))), ("x", None, b"y"))
+        self.assertIsNone(self.done(fleet, a.read_if_exists(("x", int, ANY))))
+
+    def test_read_all_filters(self) -> None:
+        """All tuples that the template matches are read, and no others."""
+        fleet, (a, b, c) = self.spaces(3)
+        for number, space in enumerate((a, b, c, a, b)):
+            self.done(fleet, space.put(("n", number)), 1.0)
+        found = self.done(fleet, c.read_all(("n", where(">=", 2))))
+        self.assertEqual(sorted(found, key=str), [("n", 2), ("n", 3), ("n", 4)])
+
+    def test_equal_tuples_are_several(self) -> None:
+        """A space is a bag: two equal tuples are taken one after the other."""
+        fleet, (a, b, _) = self.spaces(3)
+        for space in (a, a, b):
+            self.done(fleet, space.put(("same",)), 1.0)
+        self.assertEqual(self.done(fleet, b.get_many(("same",), 5)), [("same",)] * 3)
+
+    def test_back_to_back(self) -> None:
+        """Thirty tuples put at once by random nodes are all found at once."""
+        fleet, spaces = self.spaces(8)
+        work = [spaces[number * 5 % 8].put(("n", number, number / 2)) for number in range(30)]
+        fleet.run(1.0)
+        for put in work:
+            self.successResultOf(put)
+        self.assertEqual(len(self.done(fleet, spaces[3].read_all(("n", int, float)), 1.0)), 30)
+
+    def test_one_winner(self) -> None:
+        """Of eight nodes that take one tuple at the same moment exactly one gets it."""
+        fleet, spaces = self.spaces(8)
+        for number in range(6):
+            self.done(fleet, spaces[number].put(("prize", number)), 1.0)
+            races = [space.get_if_exists(("prize", number)) for space in spaces]
+            fleet.run(8.0)
+            results = [self.successResultOf(race) for race in races]
+            self.assertEqual([r for r in results if r is not None], [("prize", number)], results)
+
+    def test_wakes_who_waits(self) -> None:
+        """A blocked read and a blocked get are woken within a second of the put, and each tuple wakes one get."""
+        fleet, spaces = self.spaces(6)
+        reading = self.moment(fleet, spaces[1].read(("go", int)))
+        gets = [space.get(("go", int)) for space in spaces[2:5]]
+        got = [self.moment(fleet, get) for get in gets]
+        fleet.run(7.3)
+        began = fleet.clock.seconds()
+        spaces[0].put(("go", 1))
+        fleet.run(1.0)
+        self.assertLess(reading[0] - began, 0.2)
+        self.assertEqual([len(moments) for moments in got].count(1), 1)
+        for number in (2, 3):
+            spaces[5].put(("go", number))
+            fleet.run(1.0)
+            self.assertEqual([len(moments) for moments in got].count(1), number)
+
+    def test_wait_survives_the_nodes_that_held_it(self) -> None:
+        """Though all of the nodes that would have pushed are dead but two, the next put wakes who waits."""
+        fleet, spaces = self.spaces(6)
+        waiting = self.moment(fleet, spaces[0].read(("go",)))
+        fleet.run(1.0)
+        for place in (2, 3, 4):
+            fleet.board.kill(fleet.address(place))
+            fleet.nodes[place].vanish()
+        fleet.run(12.0)
+        began = fleet.clock.seconds()
+        spaces[5].put(("go",))
+        fleet.run(1.5)
+        self.assertLess(waiting[0] - began, 1.0)
+
+    def test_wakes_when_reconnected(self) -> None:
+        """A reader that was cut off while the tuple was put has it within a second of the cut's end."""
+        fleet, spaces = self.spaces(5)
+        waiting = self.moment(fleet, spaces[0].read(("go",)))
+        fleet.run(1.0)
+        fleet.board.partition([fleet.address(0)])
+        spaces[3].put(("go",))
+        fleet.run(2.0)
+        self.assertEqual(waiting, [])
+        fleet.board.heal()
+        fleet.run(1.0)
+        self.assertEqual(len(waiting), 1)
+
+    def test_timeout(self) -> None:
+        """A blocking call ends by name after its time-out, and leaves nothing behind."""
+        fleet, (a, b, _) = self.spaces(3)
+        calls = [a.get(("none",), timeout=0.5), b.read(("none",), timeout=0.5), b.claim(("none",), timeout=0.5)]
+        fleet.run(0.6)
+        for call in calls:
+            self.failureResultOf(call, NoTuple)
+
+    def test_cancel(self) -> None:
+        """A cancelled get takes nothing: the next tuple goes to the next one who asks."""
+        fleet, (a, b, c) = self.spaces(3)
+        get = a.get(("job",))
+        fleet.run(1.0)
+        get.cancel()
+        self.failureResultOf(get, CancelledError)
+        self.done(fleet, b.put(("job",)), 1.0)
+        self.assertEqual(self.done(fleet, c.get_if_exists(("job",))), ("job",))
+
+    def test_cancelled_too_late(self) -> None:
+        """A get that is cancelled while its take is being confirmed puts the tuple back."""
+        fleet, (a, b, c) = self.spaces(3)
+        for pause in (0.005, 0.012, 0.02, 0.03, 0.04, 0.05):
+            self.done(fleet, b.put(("job", pause)), 1.0)
+            get = a.get(("job", pause))
+            fleet.run(pause)
+            get.addErrback(lambda failure: failure.trap(CancelledError))
+            get.cancel()
+            fleet.run(4.0)
+            if not isinstance(self.successResultOf(get), tuple):
+                self.assertEqual(self.done(fleet, c.get(("job", pause), timeout=4.0)), ("job", pause), pause)
+
+    def test_ttl(self) -> None:
+        """A tuple with a time to live is there until then, and not afterwards."""
+        fleet, (a, b, _) = self.spaces(3)
+        self.done(fleet, a.put(("short",), ttl=5.0), 1.0)
+        self.assertEqual(self.done(fleet, b.read_if_exists(("short",)), 1.0), ("short",))
+        fleet.run(4.0)
+        self.assertIsNone(self.done(fleet, b.read_if_exists(("short",)), 1.0))
+        self.assertIsNone(self.done(fleet, b.get_if_exists(("short",)), 1.0))
+
+    def test_spaces_are_apart(self) -> None:
+        """Spaces of different names, and tuples of different lengths, never mix."""
+        fleet, (a, b, _) = self.spaces(3)
+        other = TupleSpace(fleet.nodes[1], fleet.clock, fleet.rng(9), name="other")
+        self.made.append(other)
+        self.done(fleet, a.put(("x", 1)))
+        self.assertIsNone(self.done(fleet, other.read_if_exists(("x", 1))))
+        self.assertIsNone(self.done(fleet, b.read_if_exists(("x",))))
+
+    def test_the_publisher_may_die(self) -> None:
+        """A tuple whose publisher died is read and taken all the same, once."""
+        fleet, spaces = self.spaces(5)
+        self.done(fleet, spaces[4].put(("legacy", 1)), 1.0)
+        spaces[4].stop()
+        fleet.nodes[4].vanish()
+        fleet.run(3.0)
+        self.assertEqual(self.done(fleet, spaces[0].get(("legacy", int))), ("legacy", 1))
+        self.assertIsNone(self.done(fleet, spaces[1].get_if_exists(("legacy", int))))
+
+    def test_slots_are_used_again(self) -> None:
+        """However many tuples come and go, the slots they leave behind stay as many as a few seconds need."""
+        fleet, (a, b, _) = self.spaces(3)
+        for number in range(150):
+            self.done(fleet, a.put(("n", number)), 0.1)
+            self.assertEqual(self.done(fleet, b.get(("n", number)), 0.2), ("n", number))
+        self.assertLess(len(fleet.stores[0]), 150)
+        fleet.run(95.0)
+        self.assertEqual(self.done(fleet, a.read_all(("n", ANY))), [])
+
+    def test_single_node(self) -> None:
+        """A node that is all alone can use a space, and has nobody to ask."""
+        fleet, (a,) = self.spaces(1)
+        self.done(fleet, a.put(("x",)))
+        self.assertEqual(self.done(fleet, a.get(("x",))), ("x",))
+
+    def test_wrong_use(self) -> None:
+        """What is no tuple raises at once, before anything is sent, and a stopped space says that it is stopped."""
+        fleet, (a, b) = self.spaces(2)
+        fleet.run(1.0)
+        for wrong in ([], [object()], "text"):
+            for call in (a.put, a.get, a.read, a.get_if_exists, a.read_if_exists, a.read_all, a.claim):
+                self.assertRaises(BadTuple, call, wrong)
+        self.assertRaises(TooLarge, a.put, ["x" * 700])
+        waiting = b.get(("x",))
+        b.stop()
+        b.stop()
+        self.failureResultOf(waiting, NotRunning)
+        self.failureResultOf(b.put(("x",)), NotRunning)
+        self.failureResultOf(b.get(("x",)), NotRunning)
+
+
+class ClaimTests(SpaceCase):
+    """Behaviour of ``TupleSpace.claim`` and ``Claim``."""
+
+    def _claimed(self, fleet: Fleet, space: TupleSpace, lease: float = 2.0) -> Claim:
+        claim = self.done(fleet, space.claim(("job", ANY), lease), 1.0)
+        self.assertIsInstance(claim, Claim)
+        return claim
+
+    def test_confirm(self) -> None:
+        """A claimed tuple is out of reach of others, and when it is confirmed it is taken."""
+        fleet, (a, b, c) = self.spaces(3)
+        self.done(fleet, a.put(("job", 1)), 1.0)
+        claim = self._claimed(fleet, b, lease=10.0)
+        self.assertEqual(claim.fields, ("job", 1))
+        self.assertIsNone(self.done(fleet, c.get_if_exists(("job", ANY)), 1.0))
+        self.assertEqual(self.done(fleet, c.read_if_exists(("job", ANY)), 1.0), ("job", 1))
+        self.assertEqual(self.done(fleet, claim.confirm(), 1.0), ("job", 1))
+        self.assertIsNone(self.done(fleet, c.read_if_exists(("job", ANY)), 1.0))
+        self.failureResultOf(claim.confirm(), ClaimLost)
+
+    def test_a_dead_taker_gives_back(self) -> None:
+        """A taker that dies without confirming loses the tuple when its claim ends, publisher alive or not."""
+        fleet, spaces = self.spaces(6)
+        self.done(fleet, spaces[1].put(("job", 1)), 1.0)
+        self._claimed(fleet, spaces[2], lease=3.0)
+        for place in (1, 2):
+            spaces[place].stop()
+            fleet.nodes[place].vanish()
+        got = self.moment(fleet, spaces[3].get(("job", int)))
+        fleet.run(5.5)
+        self.assertEqual(len(got), 1)
+
+    def test_release(self) -> None:
+        """A claim that is released can be had by another at once."""
+        fleet, (a, b, c) = self.spaces(3)
+        self.done(fleet, a.put(("job", 1)), 1.0)
+        claim = self._claimed(fleet, b, lease=60.0)
+        waiting = c.get(("job", ANY))
+        fleet.run(1.0)
+        self.assertNoResult(waiting)
+        claim.release()
+        claim.release()
+        self.assertEqual(self.done(fleet, waiting, 1.0), ("job", 1))
+
+    def test_renew(self) -> None:
+        """A claim that is renewed outlasts its first lease; one that is over cannot be renewed."""
+        fleet, (a, b, c) = self.spaces(3)
+        self.done(fleet, a.put(("job", 1)), 1.0)
+        claim = self._claimed(fleet, b)
+        for _ in range(4):
+            self.assertIsNone(self.done(fleet, claim.renew(), 1.0))
+        self.assertIsNone(self.done(fleet, c.get_if_exists(("job", ANY)), 0.5))
+        self.assertEqual(self.done(fleet, claim.confirm(), 1.0), ("job", 1))
+        self.failureResultOf(claim.renew(), ClaimLost)
+
+    def test_late_confirm(self) -> None:
+        """Who confirms after its claim ended gets the tuple if nobody else did, and ``ClaimLost`` if somebody did."""
+        fleet, (a, b, c) = self.spaces(3)
+        self.done(fleet, a.put(("job", 1)), 1.0)
+        claim = self._claimed(fleet, b, lease=1.0)
+        fleet.run(3.0)
+        self.assertEqual(self.done(fleet, claim.confirm(), 1.0), ("job", 1))
+        self.done(fleet, a.put(("job", 2)), 1.0)
+        claim = self._claimed(fleet, b, lease=1.0)
+        fleet.run(1.0)
+        self.assertEqual(self.done(fleet, c.get(("job", ANY)), 2.0), ("job", 2))
+        confirm = claim.confirm()
+        fleet.run(2.0)
+        self.failureResultOf(confirm, ClaimLost)
+
+    def test_taker_dies_while_confirming(self) -> None:
+        """What a dying taker had accepted by one member is completed or taken by another, and never read again."""
+        fleet, spaces = self.spaces(6)
+        for pause in (0.003, 0.006, 0.009, 0.012, 0.02):
+            self.done(fleet, spaces[1].put(("job", pause)), 1.0)
+            taker = TupleSpace(fleet.nodes[2], fleet.clock, fleet.rng(2))
+            claim = self.done(fleet, taker.claim(("job", pause), 1.0), 1.0)
+            claim.confirm()
+            fleet.run(pause)
+            taker.stop()
+            after = spaces[4].get(("job", pause), timeout=8.0)
+            after.addErrback(lambda failure: failure.trap(NoTuple))
+            fleet.run(9.0)
+            self.assertEqual(self.done(fleet, spaces[5].read_all(("job", pause)), 1.0), [])
+
+
+class RestartTests(SpaceCase):
+    """What council members remember."""
+
+    def test_a_restarted_member_knows_what_it_accepted(self) -> None:
+        """All members die and come back with their stores: a tuple that was taken stays taken."""
+        fleet, spaces = self.spaces(3)
+        self.done(fleet, spaces[0].put(("job", 1)), 1.0)
+        self.done(fleet, spaces[1].get(("job", ANY)), 1.0)
+        lives = [node.seat.incarnation for node in fleet.nodes]
+        for space, node in zip(spaces, fleet.nodes, strict=True):
+            space.stop()
+            node.vanish()
+        for place in range(3):
+            fleet.restart(place, [other for other in range(3) if other != place])
+        fleet.run(5.0)
+        self.made = [TupleSpace(node, fleet.clock, fleet.rng(7)) for node in fleet.nodes]
+        self.assertEqual([node.seat.incarnation for node in fleet.nodes], lives)
+        for space in self.made:
+            self.assertIsNone(self.done(fleet, space.get_if_exists(("job", ANY)), 2.0))
+        self.done(fleet, self.made[0].put(("job", 2)), 1.0)
+        self.assertEqual(self.done(fleet, self.made[2].get(("job", ANY)), 2.0), ("job", 2))
