@@ -150,8 +150,8 @@ def serve(path: str) -> None:
         service.startService()
         _say(len(seams.store), *_memory())
 
-    reactor.callWhenRunning(serving)  # type: ignore[attr-defined]
-    reactor.run()  # type: ignore[attr-defined]
+    reactor.callWhenRunning(serving)
+    reactor.run()
 
 
 def _memory() -> tuple[int, int]:
@@ -226,13 +226,13 @@ class Rate:
             now = time.monotonic()
             self.late.append(now - due)
             if running:
-                reactor.callLater(self.TICK, tick, now + self.TICK)  # type: ignore[attr-defined]
+                reactor.callLater(self.TICK, tick, now + self.TICK)
 
         tick(time.monotonic())
         self._left = self._count
         started = time.monotonic()
         if not self._count:
-            await task.deferLater(reactor, 1.0)  # type: ignore[arg-type]
+            await task.deferLater(reactor, 1.0)
         await gatherResults([Deferred.fromCoroutine(self._put_on()) for _ in range(self._in_flight)])
         running = False
         return time.monotonic() - started
@@ -254,7 +254,7 @@ class Rate:
 async def _rates(folder: str, outcome: list[bool]) -> None:
     from twisted.internet import reactor
 
-    deliver = reactor.callFromThread  # type: ignore[attr-defined]
+    deliver = reactor.callFromThread
     _say(f"disk: {_sync_s(folder) * 1000:.2f} ms for a write and fsync of 4 KiB (median of 100)")
     _say(
         f"{'value':>9} {'in flight':>10} {'puts/s':>8} {'safe after p50':>15} {'p99 ms':>8} {'max ms':>8}"

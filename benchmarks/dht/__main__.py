@@ -60,7 +60,7 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--peers", default=",".join(ENTRIES), help="which of %(default)s; opendht names both of its")
     parser.add_argument("--parts", default=",".join(PARTS), help=f"which of %(default)s; losses from {LEAST} nodes on")
     parser.add_argument("--seed", type=int, default=1, help="who does what (default 1)")
-    parser.add_argument("--profile", default="", help="prefix of files for profiles of the loaded node")
+    parser.add_argument("--profile", default="", help="prefix of files for profiles of two nodes under load")
     parser.add_argument("--out", help="write all figures there, as JSON")
     parser.add_argument("--plot", help="draw the main figures there, as SVG")
     given = parser.parse_args(arguments)
@@ -70,8 +70,8 @@ def main(arguments: Sequence[str]) -> int:
     except ValueError as error:
         parser.error(str(error))
     parts = given.parts.split(",")
-    if min(sizes) < 2 or given.seconds <= 0 or not set(parts) <= set(PARTS):
-        parser.error("it takes 2 nodes, more than 0 seconds, and parts of " + ", ".join(PARTS))
+    if min(sizes) < 3 or given.seconds <= 0 or not set(parts) <= set(PARTS):
+        parser.error("it takes 3 nodes, more than 0 seconds, and parts of " + ", ".join(PARTS))
     keys = min(KEYS, max(10, int(KEYS * given.seconds)))
     plan = Plan(keys, given.seconds, seed=given.seed, profile=given.profile)
     for entry in entries:

@@ -21,6 +21,8 @@ JOINERS = 4
 JOIN_LIMIT_S = 15.0
 LIMIT_S = 15.0
 SINGLE_S = 20.0
+TRIES = 6
+READ_S = 3.0
 PHASE_S = 60.0
 VALUE_BYTES = 100
 LEAST_FAR = 0.1
@@ -77,22 +79,26 @@ class Course:
     # -- what phases are made of ------------------------------------------------------------------------------------
 
     async def begin(self, nodes: list[Node]) -> None:
-        """Start these nodes one after the other, each known to the first one, and let each store something."""
+        """Start these nodes one after the other, each known to the first one, and wait until all are of use.
+
+        Some libraries say that they joined, and that a value is stored, while nobody else can find it yet.
+        """
         first = self.nodes[0]
         for node in nodes:
             await node.order("start", port=node.port, known=0 if node is first else first.port)
         await asyncio.sleep(self.plan.pause(4.0))
         for number, node in enumerate(nodes):
-            await self.stored(node, f"warm {number} {node.port}")
+            await self.stored(node, nodes[number - 1], f"ready {number}")
 
-    async def stored(self, writer: Node, key: str) -> str:
-        """Store a new value, with patience; raises ``Lost``."""
-        value = self.value()
-        for _ in range(6):
-            if (await self.once(writer, "put", key, value))["good"]:
-                return value
+    async def stored(self, writer: Node, reader: Node, key: str) -> tuple[str, str]:
+        """Store a new value that another node finds, with patience: its key and value; raises ``Lost``."""
+        for number in range(TRIES):
+            value = self.value()
+            put = await self.once(writer, "put", f"{key} try {number}", value)
+            if put["good"] and (await self.once(reader, "get", f"{key} try {number}", value, READ_S))["good"]:
+                return f"{key} try {number}", value
             await asyncio.sleep(1.0)
-        raise Lost(f"the node on port {writer.port} could not put anything")
+        raise Lost(f"what the node on port {writer.port} puts is not found by others")
 
     async def once(self, node: Node, kind: str, key: str, value: str | int, limit_s: float = LIMIT_S) -> Result:
         """One operation."""
@@ -128,8 +134,8 @@ class Course:
 
     async def steady(self) -> bool:
         """Join, rest, single operations, operations in flight, memory; False where not even joining went well."""
-        joiners = min(JOINERS, len(self.nodes) // 2)
-        async with self.phase("join", 2 * PHASE_S):
+        joiners = min(JOINERS, len(self.nodes) - 2)
+        async with self.phase("join", 3 * PHASE_S):
             await self.begin(self.nodes[: len(self.nodes) - joiners])
             self.result["join_ms"] = await self._joined(joiners)
         if "trouble" in self.result:
@@ -153,8 +159,8 @@ class Course:
         old = self.nodes[: len(self.nodes) - joiners]
         took: list[float | None] = []
         for number, node in enumerate(self.nodes[len(old) :]):
-            key = f"early {number}"
-            wanted = [key, await self.stored(self.rng.choice(old), key)]
+            writer, reader = self.rng.sample(old, 2)
+            wanted = await self.stored(writer, reader, f"early {number}")
             order = {"port": node.port, "known": self.nodes[0].port, "wanted": wanted, "limit_s": JOIN_LIMIT_S}
             took.append((await node.order("start", **order))["join_ms"])
         return took
@@ -201,13 +207,11 @@ class Course:
         new = [(f"load {n}", self.value()) for n in range(self.plan.load_keys)]
         for name, kind, wanted in (("gets", "get", far), ("puts", "put", new)):
             await asyncio.sleep(self.plan.pause(0.5))
-            if self.plan.profile:
-                await loaded.order("profile", file="")
+            await self._profile(loaded)
             meter = Meter(self.team.pids)
             outcome = await self.loaded(loaded, kind, wanted, self.plan.in_flight, self.plan.seconds, once=False)
             cost = meter.read()
-            if self.plan.profile:
-                await loaded.order("profile", file=f"{self.plan.profile}-{self.team.entry.name}.{kind}")
+            await self._profile(loaded, kind)
             self.result[name] = {
                 "per_s": outcome["good"] / outcome["seconds"],
                 **times(outcome["ms"]),
@@ -216,6 +220,12 @@ class Course:
                 "unfinished": outcome["unfinished"],
                 **cost.per(outcome["good"], self.idle),
             }
+
+    async def _profile(self, loaded: Node, kind: str = "") -> None:
+        """Begin to profile the loaded node and another one, or write what was seen."""
+        prefix = f"{self.plan.profile}-{self.team.entry.name}-{len(self.nodes)}"
+        for node, name in ((loaded, "loaded"), (self.nodes[0], "other")) if self.plan.profile else ():
+            await node.order("profile", file=kind and f"{prefix}-{name}.{kind}")
 
 
 def times(took: list[float]) -> Result:

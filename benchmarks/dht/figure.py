@@ -86,6 +86,7 @@ ROWS: list[tuple[str, Read]] = [
     ("tuple take p50, ms", at("space", "take", "p50")),
     ("tuple take, datagrams", at("space", "take", "datagrams")),
     ("tuple wake-up p50, ms", at("space", "wake", "p50")),
+    ("stored before the losses, of 200", at("silent", "stored")),
     *(
         (f"{part} {loss}: {what}", at(loss, part, field))
         for loss in LOSSES

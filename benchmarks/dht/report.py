@@ -17,7 +17,7 @@ WORDS = {True: "yes", False: "NO", None: "?"}
 def table(results: Results) -> str:
     """Everything that is printed at the end; "x0.50" beside a peer's figure says that ours is half of it."""
     blocks = [_size(size, row) for size, row in results.items()]
-    blocks += [_targets(size, row) for size, row in list(results.items())[-1:]]
+    blocks += [_targets(size, row) for size, row in list(results.items())[-1:] if OURS in row or OURS_IN_MEMORY in row]
     names = [name for name in ENTRIES if any(name in row for row in results.values())]
     blocks.append("\n".join(f"{name}: a finished put means: {ENTRIES[name].promise}" for name in names))
     return "\n\n".join(blocks) + "\n"

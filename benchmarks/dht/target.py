@@ -74,6 +74,7 @@ def verdicts(row: Row) -> list[Verdict]:
     in_memory = put(row.get(OURS_IN_MEMORY, {}))
     race, wake = ours.get("space", {}).get("race", {}), at("space", "wake", "lost")
     gone = [(loss, part) for loss in ("killed", "silent") for part in ("a quarter", "a half")]
+    failed = sum(ours[name]["failed"] for name in ("put", "get", "gets", "puts") if name in ours)
     nothing_done = [
         name for name in ("put", "get", "gets", "puts") if name in ours and ours[name]["tried"] == ours[name]["failed"]
     ] + [name for name in ("silent", "killed") if "trouble" in ours.get(name, {})]
@@ -115,6 +116,7 @@ def verdicts(row: Row) -> list[Verdict]:
             "always done, within 1 s",
             [
                 Limit("phases with nothing done", float(len(nothing_done)) if ours else None, 0.0),
+                Limit("operations failed", float(failed) if ours else None, 0.0),
                 Limit("found % after losses", kept, 100.0, most=False),
                 Limit("slowest ms", slowest(ours), SLOW_MS),
             ],
