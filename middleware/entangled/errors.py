@@ -8,13 +8,15 @@
         Forged
       WeatherError    nobody's fault: try again, with back-off
         NoAnswer
-        Alone
+          NotAcknowledged
+        Unavailable
       LocalError      our caller's fault: let it fly
         NotRunning
         TooLarge
         PortInUse
         BadStore
       Refused         a lawful no: an answer, and no accident
+        Conflict
 """
 
 
@@ -42,8 +44,28 @@ class NoAnswer(WeatherError):
     """The peer did not answer any of the tries."""
 
 
-class Alone(WeatherError):
-    """No other node is known or reachable."""
+class NotAcknowledged(NoAnswer):
+    """A write did not get as many replicas as its concern wants; those that have it keep it, and it may still spread.
+
+    ``acknowledged`` replicas said that they have it, ``needed`` were wanted.
+    """
+
+    def __init__(self, acknowledged: int, needed: int) -> None:
+        super().__init__(f"{acknowledged} replicas have the record, {needed} are needed; try again when more are there")
+        self.acknowledged = acknowledged
+        self.needed = needed
+
+
+class Unavailable(WeatherError):
+    """Too few replicas answered to say what a key holds; it may hold something.
+
+    ``answered`` replicas gave an answer that counts, ``needed`` were wanted.
+    """
+
+    def __init__(self, answered: int, needed: int) -> None:
+        super().__init__(f"{answered} replicas of the key answer, {needed} are needed; try again when more are there")
+        self.answered = answered
+        self.needed = needed
 
 
 class LocalError(EntangledError):
@@ -68,3 +90,12 @@ class BadStore(LocalError):
 
 class Refused(EntangledError):
     """The peer understood and said no; ``str()`` is its reason."""
+
+
+class Conflict(Refused):
+    """A compare-and-set came too late: the slot holds ``sequence`` already."""
+
+    def __init__(self, expected: int, sequence: int) -> None:
+        super().__init__(f"the slot holds number {sequence}, expected was {expected}; read it and decide again")
+        self.expected = expected
+        self.sequence = sequence

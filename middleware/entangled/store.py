@@ -33,6 +33,9 @@ class Store(Protocol):
     def slot(self, slot: Slot) -> Record | None:
         """What ``slot`` holds, be it a tombstone."""
 
+    def expiry(self, slot: Slot) -> float | None:
+        """When what ``slot`` holds runs out, or None where it holds nothing."""
+
     def owned(self, owner: bytes) -> list[Record]:
         """The records of ``owner``, tombstones included, in the order of their slots."""
 
@@ -129,6 +132,11 @@ class MemoryStore:
         """What ``slot`` holds, be it a tombstone."""
         held = self._slots.get(slot)
         return held.record if held else None
+
+    def expiry(self, slot: Slot) -> float | None:
+        """When what ``slot`` holds runs out, or None where it holds nothing."""
+        held = self._slots.get(slot)
+        return held.expires_at if held else None
 
     def owned(self, owner: bytes) -> list[Record]:
         """The records of ``owner``, tombstones included, in the order of their slots."""
