@@ -23,7 +23,7 @@ from middleware.entangled.kademlia.contact import Contact, unpacked
 from middleware.entangled.membership import Membership
 from middleware.entangled.network.network import Address, Network
 from middleware.entangled.overlay import Overlay
-from middleware.entangled.owner import Concern, Owner
+from middleware.entangled.owner import Concern, Owner, Stored
 from middleware.entangled.reader import ReadConcern, Reader
 from middleware.entangled.record import KEY_BYTES, MAX_NAME, MAX_VALUE, TOLERATED_ABSENCE, Lifetime, Record
 from middleware.entangled.replica import Replica
@@ -33,6 +33,7 @@ from middleware.entangled.watch import Changed, Watch
 from middleware.entangled.wire.endpoint import Endpoint
 
 NOTE = 30.0
+"""Seconds between two notes of the time; whoever comes or goes is noted at once."""
 CONTACTS = "contacts"
 LAST_SEEN = "last seen"
 MAX_NOTED = 64
@@ -140,13 +141,14 @@ class EntangledNode:
         lifetime: Lifetime = "team",
         concern: Concern = "majority",
         expect: int | None = None,
-    ) -> Deferred[int]:
+    ) -> Deferred[Stored]:
         """Store ``value`` in the slot (key, this node, name); fires with the number of replicas that have it by then.
 
         ``concern`` says how many that are at least: ``one``, a ``majority`` of the k closest members, the absent ones
         counted in, or ``all`` of these.  Fails with ``NotAcknowledged`` where they cannot be reached; the record may
         spread all the same.  With ``expect`` it is stored only where the slot's sequence is that (0: it was never
-        filled), as that plus one, and fails with ``Conflict`` else: a compare-and-set.
+        filled), and fails with ``Conflict`` else: a compare-and-set.  What it fires with is a number whose ``sequence``
+        says what the slot's is now.
 
         Raises ``TooLarge`` at once for a value over ``MAX_VALUE`` or a name over ``MAX_NAME`` bytes, and
         ``ValueError`` for what is no key.
@@ -155,7 +157,9 @@ class EntangledNode:
             raise TooLarge(f"value of {len(value)} bytes; a record carries at most {MAX_VALUE}")
         return self._put(key, name, value, lifetime, concern, expect)
 
-    def remove(self, key: bytes, name: str, concern: Concern = "majority", expect: int | None = None) -> Deferred[int]:
+    def remove(
+        self, key: bytes, name: str, concern: Concern = "majority", expect: int | None = None
+    ) -> Deferred[Stored]:
         """Empty a slot of this node: a tombstone takes the place of its record; fails as ``put`` does.
 
         The tombstone stays for ``record.TOMBSTONE_TTL``, longer than any absence that is tolerated.
@@ -190,7 +194,7 @@ class EntangledNode:
 
     def _put(
         self, key: bytes, name: str, value: bytes | None, lifetime: Lifetime, concern: Concern, expect: int | None
-    ) -> Deferred[int]:
+    ) -> Deferred[Stored]:
         self._check(key)
         if len(name.encode()) > MAX_NAME:
             raise TooLarge(f"name of {len(name.encode())} bytes; a record's name has at most {MAX_NAME}")
@@ -198,7 +202,7 @@ class EntangledNode:
             record = self._owner.next(key, name, value, lifetime, expect)
         except Conflict as conflict:
             return fail(conflict)
-        return _run(self._owner.put(record, concern, steps_over=expect is None))
+        return _run(self._owner.put(record, concern, expect))
 
     async def _join(self, known: Sequence[Address]) -> None:
         await self._membership.join(known, self._noted_contacts())
@@ -222,6 +226,7 @@ class EntangledNode:
                 self.store.discard(record.slot)
 
     def _welcome(self, contact: Contact) -> None:
+        self._note_contacts()
         for part in (self._owner, self._handover, self._subscriber):
             part.welcome(contact)
 
@@ -237,7 +242,8 @@ class EntangledNode:
     def _note_contacts(self) -> None:
         if self._wall is not None:
             self.store.note(LAST_SEEN, repr(self._wall()).encode())
-        contacts = sorted(self.overlay.contacts(), key=lambda c: c.node_id)[:MAX_NOTED]
+        known = {c.node_id: c for c in [*self.overlay.contacts(), *self.overlay.roster.absent()]}
+        contacts = sorted(known.values(), key=lambda c: c.node_id)[:MAX_NOTED]
         if contacts:
             # One that has lost sight of everybody had better remember whom it knew.
             self.store.note(CONTACTS, msgpack.packb([c.packed() for c in contacts]))

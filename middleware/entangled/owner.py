@@ -33,6 +33,22 @@ REPUBLISH = 3600.0
 BEATS_PER_LEASE = 3
 STEPS = 3
 MAX_SEQUENCE = 2**62
+SEQUENCES = "sequences"
+BLOCK = 1024
+"""Sequence numbers that are noted in the store at once, so that not every write has to note one."""
+
+
+class Stored(int):
+    """How many replicas have a record; ``sequence`` is its number in its slot."""
+
+    sequence: int
+
+    @classmethod
+    def of(cls, replicas: int, sequence: int) -> Stored:
+        """That many replicas have the record of that number."""
+        stored = cls(replicas)
+        stored.sequence = sequence
+        return stored
 
 
 class Owner:
@@ -60,6 +76,7 @@ class Owner:
         self._own: dict[Slot, Record] = {}
         self._owing: dict[Slot, None] = {}
         self._said_at: dict[Slot, float] = {}
+        self._first = self._last = self._noted = 0
         endpoint.expose("missing", self._answer_missing, changes=True)
 
     def start(self) -> None:
@@ -80,38 +97,38 @@ class Owner:
         Raises ``Conflict`` where the slot is known to be past ``expect``.
         """
         slot = Slot(key, self._identity.public, name)
-        known = [r.sequence for r in (self._own.get(slot), self._store.slot(slot)) if r is not None]
-        sequence = max(known, default=0)
-        if expect is not None:
-            if sequence > expect:
-                raise Conflict(expect, sequence)
-            sequence = expect
+        known = max((r.sequence for r in (self._own.get(slot), self._store.slot(slot)) if r is not None), default=0)
+        if expect is not None and known > expect:
+            raise Conflict(expect, known)
         ttl = TOMBSTONE_TTL if value is None else self._lease if lifetime == "leased" else TEAM_TTL
-        return self._take(Record(key, name, slot.owner, sequence + 1, lifetime, ttl, value))
+        sequence = self._next_sequence(max(known, expect or 0))
+        return self._take(Record(key, name, slot.owner, sequence, lifetime, ttl, value))
 
-    async def put(self, record: Record, concern: Concern = "majority", steps_over: bool = True) -> int:
-        """Store ``record`` where it belongs; the number of replicas that have it, as many as ``concern`` wants.
+    async def put(self, record: Record, concern: Concern = "majority", expect: int | None = None) -> Stored:
+        """Store ``record`` where it belongs, at as many replicas as ``concern`` wants.
 
-        A record of an earlier life of this node, which is still out there, is stepped over; where it must not be,
-        raises ``Conflict``.  Raises ``NotAcknowledged`` where too few replicas answer; the record is kept and brought
-        to them when they are back.
+        A record of an earlier life of this node, which is still out there, is stepped over; with ``expect``, raises
+        ``Conflict`` where a replica holds a higher one.  Raises ``NotAcknowledged`` where too few replicas answer; the
+        record is kept and brought to them when they are back.
         """
         for _ in range(STEPS):
-            held, newest = await self.store_everywhere(record, concern)
-            if newest < record.sequence:
-                return held
+            held, newest = await self.store_everywhere(record, concern, expect)
+            if not newest:
+                return Stored.of(held, record.sequence)
             current = self._own.get(record.slot, record)
-            if not steps_over:
+            if expect is not None:
                 if current == record:
                     self._let_go(record.slot)
-                raise Conflict(record.sequence - 1, newest)
+                raise Conflict(expect, newest)
             if current.sequence <= newest:
-                current = self._take(replace(current, sequence=newest + 1))
+                current = self._take(replace(current, sequence=self._next_sequence(newest)))
             # Where a newer value was put meanwhile, it is that one which is to hold.
             record = current
         raise NoAnswer(f"others hold a higher number in this slot, after {STEPS} steps")
 
-    async def store_everywhere(self, record: Record, concern: Concern = "majority") -> tuple[int, int]:
+    async def store_everywhere(
+        self, record: Record, concern: Concern = "majority", expect: int | None = None
+    ) -> tuple[int, int]:
         """Store at every holder: how many took it, and the highest sequence that stood against it (0: none).
 
         Raises ``NotAcknowledged`` where too few took it and nothing stood against it.
@@ -124,7 +141,10 @@ class Owner:
         verdicts: dict[bytes, int] = {}
 
         async def store(contact: Contact) -> None:
-            verdicts[contact.node_id] = await self.store_at(contact, record, left)
+            verdict = await self.store_at(contact, record, left, expect)
+            # A later record of this very life stands there: this one is not lost, it is history.
+            is_history = expect is None and self._first <= verdict <= self._last
+            verdicts[contact.node_id] = 0 if is_history and record.owner == self._identity.public else verdict
             votes = sum(1 for node_id, verdict in verdicts.items() if verdict == 0 and node_id in voters)
             if len(verdicts) == len(targets) and votes > len(voters) // 2:
                 self._settled(record)
@@ -137,21 +157,25 @@ class Owner:
         answers = dict(verdicts)
         newest = max(answers.values(), default=0)
         votes = sum(1 for node_id, verdict in answers.items() if verdict == 0 and counted(node_id))
-        if votes < needed and newest < record.sequence:
+        if votes < needed and not newest:
             raise NotAcknowledged(votes, needed)
         return sum(1 for verdict in answers.values() if verdict == 0), newest
 
-    async def store_at(self, contact: Contact, record: Record, left: float | None = None) -> int:
+    async def store_at(
+        self, contact: Contact, record: Record, left: float | None = None, expect: int | None = None
+    ) -> int:
         """Store at one replica: 0, or the sequence that holds there against ``record``.  Raises ``Refused``.
 
-        ``left`` are the seconds that it is to be kept, where it is not this node's own.
+        ``left`` are the seconds that it is to be kept, where it is not this node's own; ``expect`` is the highest
+        sequence that it may replace.
         """
         if contact.node_id == self._identity.node_id:
-            return self._replica.keep(record, left)
-        lives = () if left is None else ([left],)
-        answer = await self._overlay.ask(contact, "store", [record.packed()], *lives, changes=True)
+            return self._replica.keep(record, left, expect)
+        lives = None if left is None else [left]
+        answer = await self._overlay.ask(contact, "store", [record.packed()], lives, expect, changes=True)
         verdict = answer[0] if isinstance(answer, list) and len(answer) == 1 else None
-        if type(verdict) is int and (verdict == 0 or record.sequence <= verdict < MAX_SEQUENCE):
+        least = record.sequence if expect is None else expect + 1
+        if type(verdict) is int and (verdict == 0 or least <= verdict < MAX_SEQUENCE):
             return verdict
         raise Refused(f"{contact.address} does not take the record")
 
@@ -173,6 +197,21 @@ class Owner:
         return True
 
     # -- inside -----------------------------------------------------------------------------------------------------
+
+    def _next_sequence(self, above: int) -> int:
+        """A number that no earlier record of this node has, not even one that only a lost replica knows."""
+        if not self._noted:
+            try:
+                self._last = int(self._store.noted(SEQUENCES) or 0)
+            except ValueError:  # a rotten file may hold anything
+                self._last = 0
+            self._last = max(self._last, above)
+            self._first = self._last + 1
+        self._last = max(self._last, above) + 1
+        if self._last > self._noted:
+            self._noted = self._last + BLOCK
+            self._store.note(SEQUENCES, b"%d" % self._noted)
+        return self._last
 
     def _take(self, record: Record) -> Record:
         record = record.signed(self._identity)

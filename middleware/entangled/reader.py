@@ -78,7 +78,8 @@ class Reader:
 
     async def _fast(self, key: bytes) -> list[Record]:
         here = self._replica.held(key)
-        if here and self._replica.is_sure():
+        # What is left of a time when this node was among the closest may be old.
+        if here and self._replica.is_sure() and self._overlay.belongs(key, self._overlay.me()):
             return here
         if not self._overlay.is_complete and len(self._overlay.table) >= K:
             return await self._walk(key)
