@@ -24,6 +24,7 @@ from middleware.entangled.kademlia.contact import Contact, unpacked
 from middleware.entangled.kademlia.distance import closest
 from middleware.entangled.network.network import Address, Network
 from middleware.entangled.node import EntangledNode
+from middleware.entangled.owner import Stored
 from middleware.entangled.record import MAX_NAME, Record
 from middleware.entangled.store import Store
 from middleware.entangled.watch import Changed, Watch
@@ -204,7 +205,7 @@ class SwarmNode(Service):
         """Take this node's report back."""
         self._quietly(self.entangled.remove(group_key(task_id), MEMBER))
 
-    def conclude(self, task_id: str, result: Result) -> Deferred[int]:
+    def conclude(self, task_id: str, result: Result) -> Deferred[Stored]:
         """Record how a task ended; stays when this node goes."""
         return self.entangled.put(group_key(task_id), RESULT, result.packed(), "team")
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Iterable
 from typing import Any
 
 from twisted.internet.defer import Deferred
@@ -74,14 +74,18 @@ class Background:
         self._calls.clear()
 
 
-async def first(needed: int, work: list[Coroutine[Any, Any, Any]]) -> list[Any]:
-    """The results of the first ``needed`` of ``work`` that succeed, fewer when all have ended; the others go on."""
+async def until(enough: Callable[[list[Any]], bool], work: Iterable[Coroutine[Any, Any, Any]]) -> list[Any]:
+    """The results of ``work`` as soon as they are ``enough``, or when all of it has ended; the rest goes on.
+
+    What ends in an ``EntangledError`` gives no result.
+    """
     results: list[Any] = []
-    left = len(work)
+    begun = list(work)
+    left = len(begun)
     done: Deferred[None] = Deferred()
 
     def settle() -> None:
-        if not done.called and (len(results) >= needed or left == 0):
+        if not done.called and (left == 0 or enough(results)):
             done.callback(None)
 
     def succeeded(result: Any) -> None:
@@ -96,8 +100,13 @@ async def first(needed: int, work: list[Coroutine[Any, Any, Any]]) -> list[Any]:
         settle()
         failure.trap(EntangledError)
 
-    for coroutine in work:
+    for coroutine in begun:
         Deferred.fromCoroutine(coroutine).addCallbacks(succeeded, failed)
     settle()
     await done
     return list(results)
+
+
+async def first(needed: int, work: Iterable[Coroutine[Any, Any, Any]]) -> list[Any]:
+    """The results of the first ``needed`` of ``work`` that succeed, fewer when all have ended; the others go on."""
+    return await until(lambda results: len(results) >= needed, work)

@@ -8,8 +8,9 @@
         Forged
       WeatherError    nobody's fault: try again, with back-off
         NoAnswer
-        Alone
+          NotAcknowledged
         Crowded
+        Unavailable
       LocalError      our caller's fault: let it fly
         NotRunning
         TooLarge
@@ -18,6 +19,7 @@
       Refused         a lawful no: an answer, and no accident
         Full
         Unwritable
+        Conflict
 """
 
 
@@ -45,8 +47,28 @@ class NoAnswer(WeatherError):
     """The peer did not answer any of the tries."""
 
 
-class Alone(WeatherError):
-    """No other node is known or reachable."""
+class NotAcknowledged(NoAnswer):
+    """A write did not get as many replicas as its concern wants; those that have it keep it, and it may still spread.
+
+    ``acknowledged`` replicas said that they have it, ``needed`` were wanted.
+    """
+
+    def __init__(self, acknowledged: int, needed: int) -> None:
+        super().__init__(f"{acknowledged} replicas have the record, {needed} are needed; try again when more are there")
+        self.acknowledged = acknowledged
+        self.needed = needed
+
+
+class Unavailable(WeatherError):
+    """Too few replicas answered to say what a key holds; it may hold something.
+
+    ``answered`` replicas gave an answer that counts, ``needed`` were wanted.
+    """
+
+    def __init__(self, answered: int, needed: int) -> None:
+        super().__init__(f"{answered} replicas of the key answer, {needed} are needed; try again when more are there")
+        self.answered = answered
+        self.needed = needed
 
 
 class Crowded(WeatherError):
@@ -90,3 +112,12 @@ class Full(Refused):
 
 class Unwritable(Refused):
     """The store's file cannot be written now (full disk, read-only, broken); reads go on, writes do when it can."""
+
+
+class Conflict(Refused):
+    """A compare-and-set came too late: the slot holds ``sequence`` already."""
+
+    def __init__(self, expected: int, sequence: int) -> None:
+        super().__init__(f"the slot holds number {sequence}, expected was {expected}; read it and decide again")
+        self.expected = expected
+        self.sequence = sequence

@@ -1,115 +1,299 @@
-"""Handover: the team records of others, given on when nodes come and go, so that they outlive their writers.
+"""Handover: how what is held reaches those who should hold it, as nodes come, go and come back.
 
-Of the nodes that hold a record the two closest to its key see to it; what the newcomer has already costs one question.
+Two nodes *reconcile*: they compare digests of what both should hold, then the places that differ, and each gives the
+other what it lacks.  Every node does so with whoever is new to it, and now and then with one of the others.  A node
+that was away or is new is not *sure* of what it holds before it has reconciled with a majority; until then its word
+does not count.  What a lost node held goes to the next in line.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import random
+from typing import Any
 
-from middleware.entangled.background import Background
-from middleware.entangled.errors import Refused
+from twisted.internet.defer import Deferred
+from twisted.internet.interfaces import IReactorTime
+
+from middleware.entangled.background import Background, first
+from middleware.entangled.errors import EntangledError, Refused
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.distance import distance
 from middleware.entangled.overlay import K, Overlay
 from middleware.entangled.owner import Owner
-from middleware.entangled.record import Record
+from middleware.entangled.record import Record, Slot, unpacked
 from middleware.entangled.replica import Replica
+from middleware.entangled.roster import STRUCK_S
 from middleware.entangled.store import Store
+from middleware.entangled.watch import digest_of
+from middleware.entangled.wire.endpoint import Endpoint
 
 STEWARDS = 2
 MEND = 10.0
-MENDED_AT_ONCE = 20
-PAGE_BYTES = 2**16
-"""Bytes of values that one question gives on; a larger value goes alone."""
+REPUBLISH = 3600.0
+"""Seconds within which every replica gives on what no other replica gave on (Kademlia, section 2.5)."""
+GROUPS = 16
+"""Parts of the id space with a digest each, so that one difference does not mean to compare everything."""
+PLACES = 12
+"""Places in one message."""
+AT_ONCE = 8
+OUT_OF_TOUCH = STRUCK_S / 2
+"""Seconds without a majority in touch after which a node may have been struck, and is sure of nothing."""
+AGAIN = 1.0
 
 
 class Handover:
-    """What the node ``own_id`` gives on of what it holds for others."""
+    """What one node gives to others and gets from them, beside what clients write and read."""
 
     def __init__(
-        self, own_id: bytes, store: Store, replica: Replica, overlay: Overlay, owner: Owner, chores: Background
+        self,
+        store: Store,
+        replica: Replica,
+        overlay: Overlay,
+        owner: Owner,
+        endpoint: Endpoint,
+        clock: IReactorTime,
+        rng: random.Random,
+        chores: Background,
     ) -> None:
-        self._own_id = own_id
         self._store = store
         self._replica = replica
         self._overlay = overlay
         self._owner = owner
+        self._clock = clock
+        self._rng = rng
         self._chores = chores
-        self._mended = 0
+        self._own_id = overlay.own_id
+        self._is_sure = False
+        self._touched_at = clock.seconds()
+        self._reconciled: dict[bytes, float] = {}
+        self._busy: set[bytes] = set()
+        self._catching_up = False
+        self._stored_at: dict[Slot, float] = {}
+        self._near: dict[bytes, list[bytes]] = {}
+        self._near_version = -1
+        endpoint.expose("digests", self._answer_digests)
+        endpoint.expose("places", self._answer_places)
+        endpoint.expose("fetch", self._answer_fetch)
 
     def start(self) -> None:
-        """Look from time to time whether the records held here are held elsewhere as well."""
+        """Compare with others from time to time, and know when this node has lost touch."""
+        self._touched_at = self._clock.seconds()
         self._chores.every(MEND, self._mend)
+        self._chores.every(AGAIN, self._look_around)
+
+    def is_sure(self) -> bool:
+        """Whether this node has caught up with the others and was in touch with a majority ever since."""
+        if self._is_sure and self._clock.seconds() - self._touched_at > OUT_OF_TOUCH:
+            self._doubt()
+        return self._is_sure
+
+    def joined(self) -> None:
+        """This node knows where it is; alone in its network it has nothing to catch up with."""
+        if not len(self._overlay.roster) and not self._overlay.roster.absent():
+            self._is_sure = True
+        else:
+            self._chores.fork(self._catch_up())
 
     def welcome(self, contact: Contact) -> None:
-        """Give a newcomer the records that it is now among the closest to."""
-        given = []
-        for record in self._records():
-            nearest = self._overlay.responsible(record.key)
-            if _is_among(contact.node_id, nearest) and self._is_steward(nearest, without=contact.node_id):
-                given.append(record)
-        self._chores.fork(self._give(contact, given))
+        """Reconcile with a newcomer."""
+        if self._is_near(contact):
+            self._chores.fork(self._reconcile(contact))
 
     def lost(self, contact: Contact) -> None:
         """Give the records that a lost contact held to the node that takes its place."""
-        given: dict[bytes, tuple[Contact, list[Record]]] = {}
+        self._reconciled.pop(contact.node_id, None)
         for record in self._records():
             nearest = self._overlay.responsible(record.key)
-            if len(nearest) < K or not self._is_steward(nearest):
+            if len(nearest) < K or all(c.node_id != self._own_id for c in nearest[:STEWARDS]):
                 continue
             heir = nearest[-1]
             was_closer = distance(contact.node_id, record.key) < distance(heir.node_id, record.key)
             if was_closer and heir.node_id != self._own_id:
-                given.setdefault(heir.node_id, (heir, []))[1].append(record)
-        for heir, records in given.values():
-            self._chores.fork(self._give(heir, records))
+                self._chores.fork(self._give(heir, record))
+
+    def stored(self, record: Record) -> None:
+        """Another holder or the owner has just given ``record`` on: no need to do so soon."""
+        self._stored_at[record.slot] = self._clock.seconds()
+
+    # -- what peers ask ---------------------------------------------------------------------------------------------
+
+    def _answer_digests(self, peer: Contact) -> list[object]:
+        """DIGESTS: of each part of the id space, what both should hold; and how much the peer alone should."""
+        groups, extra = self._both(peer)
+        return [[digest_of(group) for group in groups], len(extra)]
+
+    def _answer_places(self, peer: Contact, group: int, after: list[object]) -> list[object]:
+        """PLACES: what is held here of a part of the id space (-1: of what only the peer should hold), in order."""
+        groups, extra = self._both(peer)
+        if not -1 <= group < GROUPS:
+            raise Refused(f"a group is a number from -1 to {GROUPS - 1}")
+        cursor = tuple(after)
+        if cursor and [type(part) for part in cursor] != [bytes, bytes, str]:
+            raise Refused("a page begins after a key, an owner and a name")
+        records = sorted(extra if group < 0 else groups[group], key=lambda record: record.slot)
+        later = [record for record in records if not cursor or tuple(record.slot) > cursor]
+        return [[*record.slot, record.sequence, record.signature[:8]] for record in later[:PLACES]]
+
+    def _answer_fetch(self, peer: Contact, key: bytes, owner: bytes, name: str) -> list[object] | None:
+        """FETCH: the record in a slot, and the seconds that are left to it."""
+        record = self._held(Slot(key, owner, name))
+        return None if record is None else [record.packed(), self._replica.left(record)]
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
+    def _held(self, slot: Slot) -> Record | None:
+        return None if slot in self._replica.keepsakes else self._store.slot(slot)
+
     def _records(self) -> list[Record]:
-        """The team records held here whose owners live elsewhere, or nowhere any more; tombstones included."""
-        return [
-            record
-            for record in self._store.records()
-            if record.lifetime == "team"
-            and not self._owner.owns(record.slot)
-            and record.slot not in self._replica.keepsakes
-        ]
+        """The team records that are held here, tombstones included."""
+        kept = self._replica.keepsakes
+        return [r for r in self._store.records() if r.lifetime == "team" and r.slot not in kept]
 
-    async def _give(self, contact: Contact, records: list[Record]) -> None:
-        """Store ``records`` at one node, page after page, so that never more than a page is on its way."""
-        for page in _pages(records):
-            try:
-                await self._overlay.ask(contact, "store", [record.packed() for record in page], changes=True)
-            except Refused:
-                continue  # it has no room for one of them; perhaps it has for the others
+    def _both(self, peer: Contact) -> tuple[list[list[Record]], list[Record]]:
+        """What is held here and should be at the peer as well: by parts, and what should not be here any more."""
+        groups: list[list[Record]] = [[] for _ in range(GROUPS)]
+        extra = []
+        if self._near_version != self._overlay.roster.version or not self._overlay.is_complete:
+            self._near.clear()
+            self._near_version = self._overlay.roster.version
+        for record in self._records():
+            ids = self._near.get(record.key)
+            if ids is None:
+                ids = self._near[record.key] = [c.node_id for c in self._overlay.responsible(record.key)]
+            is_mine, is_theirs = self._own_id in ids, peer.node_id in ids
+            if is_theirs and is_mine:
+                groups[record.key[0] * GROUPS >> 8].append(record)
+            elif is_theirs:
+                extra.append(record)
+        return groups, extra
 
-    def _is_steward(self, nearest: list[Contact], without: bytes = b"") -> bool:
-        return _is_among(self._own_id, [c for c in nearest if c.node_id != without][:STEWARDS])
+    def _is_near(self, contact: Contact) -> bool:
+        """Whether this node and ``contact`` may have records in common."""
+        near = self._overlay.responsible(self._own_id)
+        return self._overlay.is_complete or any(c.node_id == contact.node_id for c in near)
+
+    async def _reconcile(self, contact: Contact) -> None:
+        """Give ``contact`` what it lacks, and get from it what this node lacks."""
+        if contact.node_id in self._busy:
+            return
+        self._busy.add(contact.node_id)
+        try:
+            began = self._clock.seconds()
+            answer = await self._overlay.ask(contact, "digests")
+            digests, extra = answer if isinstance(answer, list) and len(answer) == 2 else ([], 0)
+            mine, to_give = self._both(contact)
+            if not (isinstance(digests, list) and len(digests) == GROUPS):
+                raise Refused(f"{contact.address} gives no digests")
+            for group, digest in enumerate(digests):
+                if digest != digest_of(mine[group]):
+                    await self._compare(contact, group, mine[group])
+            if extra:
+                await self._compare(contact, -1, [])
+            for record in to_give:
+                await self._give(contact, record)
+            self._reconciled[contact.node_id] = began
+        finally:
+            self._busy.discard(contact.node_id)
+
+    async def _compare(self, contact: Contact, group: int, mine: list[Record]) -> None:
+        theirs: dict[Slot, tuple[int, bytes]] = {}
+        after: list[object] = []
+        while True:
+            answer = await self._overlay.ask(contact, "places", group, after)
+            places = [place for place in answer if _is_place(place)] if isinstance(answer, list) else []
+            theirs.update({Slot(*place[:3]): (place[3], place[4]) for place in places})
+            if len(places) < PLACES or places[-1][:3] <= after:
+                break
+            after = places[-1][:3]
+        wanted = [slot for slot, mark in theirs.items() if mark > _mark(self._held(slot))]
+        await first(len(wanted), [self._fetch(contact, slot) for slot in wanted])
+        lacked = [record for record in mine if _mark(record) > theirs.get(record.slot, (-1, b""))]
+        await first(len(lacked), [self._give(contact, record) for record in lacked])
+
+    async def _fetch(self, contact: Contact, slot: Slot) -> None:
+        answer = await self._overlay.ask(contact, "fetch", *slot)
+        fields, left = answer if isinstance(answer, list) and len(answer) == 2 else (None, None)
+        record = unpacked(fields)
+        if record is None or record.slot != slot or type(left) is not float or record.lifetime != "team":
+            return
+        if record.beats(self._held(slot)) and record.is_genuine():
+            self._replica.keep(record, left)
+
+    async def _give(self, contact: Contact, record: Record) -> int:
+        return await self._owner.store_at(contact, record, self._replica.left(record))
+
+    async def _catch_up(self) -> None:
+        """Reconcile with near nodes, so many that nothing acknowledged can be missed."""
+        if self._catching_up:
+            return
+        self._catching_up = True
+        try:
+            while not self._is_sure and not self._chores.is_stopped:
+                began = self._clock.seconds()
+                near = [c for c in self._overlay.responsible(self._own_id) if c.node_id != self._own_id]
+                others = self._overlay.roster.live() if self._overlay.is_complete else near
+                work = [Deferred.fromCoroutine(self._caught_up_with(contact)) for contact in others]
+                done = sum([await each for each in work])
+                roster = self._overlay.roster
+                everybody = 1 + len(others) + (len(roster.absent()) if self._overlay.is_complete else 0)
+                # Whatever a majority of holders has, one of those reached has.
+                is_enough = everybody - 1 - done < min(everybody, K) // 2 + 1
+                if is_enough and self._touched_at >= began - OUT_OF_TOUCH:
+                    self._is_sure = True
+                    return
+                await self._chores.sleep(AGAIN)
+        finally:
+            self._catching_up = False
+
+    async def _caught_up_with(self, contact: Contact) -> bool:
+        try:
+            await self._reconcile(contact)
+        except EntangledError:
+            return False
+        return self._reconciled.get(contact.node_id, -1.0) >= 0.0
+
+    def _doubt(self) -> None:
+        self._is_sure = False
+        self._reconciled.clear()
+        self._chores.fork(self._catch_up())
+
+    def _look_around(self) -> None:
+        now = self._clock.seconds()
+        was = self.is_sure()
+        if self._overlay.roster.in_touch(now, OUT_OF_TOUCH) or not self._overlay.is_complete:
+            self._touched_at = now
+        if not was and not self._catching_up:
+            self._chores.fork(self._catch_up())
 
     def _mend(self) -> None:
+        """Compare with one of the others, and give on what nobody gave on for long."""
+        others = [c for c in self._overlay.responsible(self._own_id) if c.node_id != self._own_id]
+        if self._overlay.is_complete:
+            others = self._overlay.roster.live()
+        if others:
+            self._chores.fork(self._reconcile(others[self._rng.randrange(len(others))]))
+        now = self._clock.seconds()
         records = self._records()
-        page = next(_pages(records[self._mended : self._mended + MENDED_AT_ONCE]), [])
-        for record in page:
-            if self._overlay.responsible(record.key)[0].node_id == self._own_id:
-                self._chores.fork(self._owner.store_everywhere(record))
-        self._mended = self._mended + len(page) if self._mended + len(page) < len(records) else 0
+        slots = {record.slot for record in records}
+        self._stored_at = {slot: at for slot, at in self._stored_at.items() if slot in slots}
+        for record in records:
+            # A different moment for each, so that the first one's word keeps the others quiet.
+            due = self._stored_at.setdefault(record.slot, now - self._rng.random() * REPUBLISH / 2) + REPUBLISH
+            if now > due and not self._owner.owns(record.slot):
+                self._stored_at[record.slot] = now
+                self._chores.fork(self._spread(record))
+
+    async def _spread(self, record: Record) -> Any:
+        targets = await self._overlay.holders(record.key)
+        return await first(len(targets), [self._give(c, record) for c in targets if c.node_id != self._own_id])
 
 
-def _pages(records: list[Record]) -> Iterator[list[Record]]:
-    """``records`` in order, in pages of ``PAGE_BYTES``."""
-    page: list[Record] = []
-    size = 0
-    for record in records:
-        size += len(record.value or b"")
-        if page and (size > PAGE_BYTES or len(page) == MENDED_AT_ONCE):
-            yield page
-            page, size = [], len(record.value or b"")
-        page.append(record)
-    if page:
-        yield page
+def _mark(record: Record | None) -> tuple[int, bytes]:
+    return (-1, b"") if record is None else (record.sequence, record.signature[:8])
 
 
-def _is_among(node_id: bytes, contacts: list[Contact]) -> bool:
-    return any(c.node_id == node_id for c in contacts)
+def _is_place(place: object) -> bool:
+    if not (isinstance(place, list) and len(place) == 5):
+        return False
+    kinds = [bytes, bytes, str, int, bytes]
+    return all(type(part) is kind for part, kind in zip(place, kinds, strict=True))

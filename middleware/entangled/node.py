@@ -1,28 +1,31 @@
 """EntangledNode: the verbs of the library, wired over overlay, replica, owner, subscriber and the sealed endpoint.
 
-It decides nothing itself: who is known stands in ``overlay``, what is held for others in ``replica`` and
-``handover``, what is its own in ``owner``, what it reads in ``subscriber``.
+It decides nothing itself: who is known stands in ``overlay`` and ``membership``, what is held for others in ``replica``
+and ``handover``, what is its own in ``owner``, what it reads in ``reader`` and ``subscriber``.
 """
 
 from __future__ import annotations
 
 import random
-from collections.abc import Coroutine, Sequence
+from collections.abc import Callable, Coroutine, Sequence
 from typing import Any
 
 import msgpack
-from twisted.internet.defer import Deferred
+from twisted.internet.defer import Deferred, fail
 from twisted.internet.interfaces import IReactorTime
+from twisted.logger import Logger
 
 from middleware.entangled.background import Background
-from middleware.entangled.errors import NotRunning, TooLarge
+from middleware.entangled.errors import Conflict, NotRunning, TooLarge
 from middleware.entangled.handover import Handover
 from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact, unpacked
+from middleware.entangled.membership import Membership
 from middleware.entangled.network.network import Address, Network
 from middleware.entangled.overlay import Overlay
-from middleware.entangled.owner import Owner
-from middleware.entangled.record import KEY_BYTES, MAX_NAME, MAX_VALUE, Lifetime, Record
+from middleware.entangled.owner import Concern, Owner, Stored
+from middleware.entangled.reader import ReadConcern, Reader
+from middleware.entangled.record import KEY_BYTES, MAX_NAME, MAX_VALUE, TOLERATED_ABSENCE, Lifetime, Record
 from middleware.entangled.replica import Replica
 from middleware.entangled.space.seat import Seat
 from middleware.entangled.store import Store
@@ -31,7 +34,9 @@ from middleware.entangled.watch import Changed, Watch
 from middleware.entangled.wire.endpoint import Endpoint
 
 NOTE = 30.0
+"""Seconds between two notes of the time; whoever comes or goes is noted at once."""
 CONTACTS = "contacts"
+LAST_SEEN = "last seen"
 MAX_NOTED = 64
 
 
@@ -39,8 +44,12 @@ class EntangledNode:
     """One peer; it lives once, from ``start`` to ``stop``.
 
     ``lease`` is how long, in seconds, what this node owns on lease outlives its last sign of life; more means fewer
-    false losses, less means quicker notice.  ``rng`` and ``clock`` are the only sources of chance and time.
+    false losses, less means quicker notice.  ``rng`` and ``clock`` are the only sources of chance and time; ``wall``
+    gives seconds that go on while the node is off, by which it knows how long it was away (without it, it assumes that
+    it was not for long).
     """
+
+    _log = Logger()
 
     def __init__(
         self,
@@ -51,23 +60,30 @@ class EntangledNode:
         clock: IReactorTime,
         rng: random.Random,
         lease: float = 1.0,
+        wall: Callable[[], float] | None = None,
     ) -> None:
         self.identity = identity
         self.store = store
         self.lease = lease
-        own_id = identity.node_id
         self._network = network
+        self._wall = wall
         self._chores = chores = Background(clock)
         self.endpoint = Endpoint(identity, team_key, network, clock, rng)
         self.overlay = Overlay(lambda: self.contact, self.endpoint, clock, rng, chores)
         self.replica = Replica(store, self.endpoint, clock, chores)
         self._owner = Owner(identity, lease, store, self.replica, self.overlay, self.endpoint, clock, chores)
-        self._handover = Handover(own_id, store, self.replica, self.overlay, self._owner, chores)
-        self._subscriber = Subscriber(own_id, self.replica, self.overlay, self.endpoint, clock, chores)
+        self._membership = Membership(self.overlay, self.endpoint, clock, rng, chores)
+        self._handover = Handover(store, self.replica, self.overlay, self._owner, self.endpoint, clock, rng, chores)
+        self._reader = Reader(self.replica, self.overlay, self._owner, chores)
+        self._subscriber = Subscriber(
+            identity.node_id, self.replica, self.overlay, self._reader, self.endpoint, clock, chores
+        )
+        self.replica.is_sure = self._handover.is_sure
+        self.replica.nearest = self.overlay.nearest
         self.seat = Seat(self.endpoint, store, clock, rng)
         self.overlay.on_newcomer = self._welcome
         self.overlay.on_lost = self._lost
-        self.replica.on_record = self._subscriber.held_here
+        self.replica.on_record = self._held_here
         self.replica.on_gone = self._gone_here
         self.replica.on_silent = self._subscriber.silent
         self.replica.on_peer = self.overlay.heard
@@ -85,7 +101,8 @@ class EntangledNode:
         """Open the port and begin to keep leases, watches and contacts fresh; raises ``PortInUse``."""
         self.endpoint.start()
         self._running = True
-        for part in (self.overlay, self.replica, self._owner, self._handover, self._subscriber):
+        self._forget_after_long_absence()
+        for part in (self._membership, self.replica, self._owner, self._handover, self._subscriber):
             part.start()
         self._chores.every(NOTE, self._note_contacts)
 
@@ -102,7 +119,9 @@ class EntangledNode:
         """Say goodbye, so that what is leased here leaves at once, and close the port."""
         if self._running:
             self._note_contacts()
-            for contact in self.overlay.table.contacts():
+            for contact in {
+                c.node_id: c for c in [*self.overlay.table.contacts(), *self.overlay.roster.live()]
+            }.values():
                 self.endpoint.tell(contact, "goodbye")
         self.vanish()
 
@@ -116,27 +135,49 @@ class EntangledNode:
 
     # -- verbs ------------------------------------------------------------------------------------------------------
 
-    def put(self, key: bytes, name: str, value: bytes, lifetime: Lifetime = "team") -> Deferred[int]:
-        """Store ``value`` in the slot (key, this node, name); fires with the number of replicas once a majority has it.
+    def put(
+        self,
+        key: bytes,
+        name: str,
+        value: bytes,
+        lifetime: Lifetime = "team",
+        concern: Concern = "majority",
+        expect: int | None = None,
+    ) -> Deferred[Stored]:
+        """Store ``value`` in the slot (key, this node, name); fires with the number of replicas that have it by then.
+
+        ``concern`` says how many that are at least: ``one``, a ``majority`` of the k closest members, the absent ones
+        counted in, or ``all`` of these.  Fails with ``NotAcknowledged`` where they cannot be reached; the record may
+        spread all the same.  With ``expect`` it is stored only where the slot's sequence is that (0: it was never
+        filled), and fails with ``Conflict`` else: a compare-and-set.  What it fires with is a number whose ``sequence``
+        says what the slot's is now.
 
         Raises ``TooLarge`` at once for a value over ``MAX_VALUE`` or a name over ``MAX_NAME`` bytes, and
-        ``ValueError`` for what is no key; fails with ``NoAnswer`` where no majority could be reached.
+        ``ValueError`` for what is no key.
         """
         if len(value) > MAX_VALUE:
             raise TooLarge(f"value of {len(value)} bytes; a record carries at most {MAX_VALUE}")
-        return self._put(key, name, value, lifetime)
+        return self._put(key, name, value, lifetime, concern, expect)
 
-    def remove(self, key: bytes, name: str) -> Deferred[int]:
-        """Empty a slot of this node: a tombstone takes the place of its record; fails as ``put`` does."""
-        return self._put(key, name, None, "team")
+    def remove(
+        self, key: bytes, name: str, concern: Concern = "majority", expect: int | None = None
+    ) -> Deferred[Stored]:
+        """Empty a slot of this node: a tombstone takes the place of its record; fails as ``put`` does.
 
-    def get(self, key: bytes) -> Deferred[list[Record]]:
-        """What the network holds under ``key``: the merged answers of the nodes closest to it.
+        The tombstone stays for ``record.TOMBSTONE_TTL``, longer than any absence that is tolerated.
+        """
+        return self._put(key, name, None, "team", concern, expect)
 
-        Fails with ``Alone`` where others should hold it and none of them answers.
+    def get(self, key: bytes, concern: ReadConcern = "majority") -> Deferred[list[Record]]:
+        """What the network holds under ``key``.
+
+        A ``majority`` read never shows less than was acknowledged to any writer or shown to any majority read before.
+        A ``fast`` one asks one replica (another one where it is slow): it may be a moment old, and lack a slot that
+        this replica missed.  Where nothing is found, a majority has said so; where too few answer for that, fails with
+        ``Unavailable``.
         """
         self._check(key)
-        return _run(self._subscriber.read(key))
+        return _run(self._reader.read(key, concern))
 
     def watch(self, key: bytes, changed: Changed, keep: bool = False) -> Watch:
         """Call ``changed`` with all records of ``key`` whenever they differ, until ``stop()`` of what is returned.
@@ -158,31 +199,58 @@ class EntangledNode:
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
-    def _put(self, key: bytes, name: str, value: bytes | None, lifetime: Lifetime) -> Deferred[int]:
+    def _put(
+        self, key: bytes, name: str, value: bytes | None, lifetime: Lifetime, concern: Concern, expect: int | None
+    ) -> Deferred[Stored]:
         self._check(key)
         if len(name.encode()) > MAX_NAME:
             raise TooLarge(f"name of {len(name.encode())} bytes; a record's name has at most {MAX_NAME}")
-        return _run(self._owner.put(self._owner.next(key, name, value, lifetime)))
+        try:
+            record = self._owner.next(key, name, value, lifetime, expect)
+        except Conflict as conflict:
+            return fail(conflict)
+        return _run(self._owner.put(record, concern, expect))
 
     async def _join(self, known: Sequence[Address]) -> None:
-        await self.overlay.join(known, [c.address for c in self._noted_contacts()])
+        await self._membership.join(known, self._noted_contacts())
         if self._running:
+            self._handover.joined()
             self._note_contacts()
 
+    def _held_here(self, record: Record) -> None:
+        self._handover.stored(record)
+        self._subscriber.held_here(record)
+
+    def _forget_after_long_absence(self) -> None:
+        """Re-join empty where this node was away for longer than tombstones are kept."""
+        try:
+            away = self._wall() - float(self.store.noted(LAST_SEEN) or b"nan") if self._wall else 0.0
+        except ValueError:  # a rotten file may hold anything
+            away = 0.0
+        if away > TOLERATED_ABSENCE:
+            self._log.warn("away for {days:.0f} days: what was held is forgotten", days=away / 86400)
+            for record in self.store.records():
+                self.store.discard(record.slot)
+
     def _welcome(self, contact: Contact) -> None:
+        self._note_contacts()
         for part in (self._owner, self._handover, self._subscriber):
             part.welcome(contact)
 
     def _lost(self, contact: Contact) -> None:
         self._subscriber.forget(contact.node_id)
         self._handover.lost(contact)
+        self._membership.lost(contact)
 
     def _gone_here(self, record: Record) -> None:
         if not self._owner.lost_here(record):
             self._subscriber.gone_here(record)
 
     def _note_contacts(self) -> None:
-        contacts = sorted(self.overlay.table.contacts()[:MAX_NOTED], key=lambda c: c.node_id)
+        if self._wall is not None:
+            self.store.note(LAST_SEEN, repr(self._wall()).encode())
+        known = {c.node_id: c for c in [*self.overlay.contacts(), *self.overlay.roster.absent()]}
+        contacts = sorted(known.values(), key=lambda c: c.node_id)[:MAX_NOTED]
         if contacts:
             # One that has lost sight of everybody had better remember whom it knew.
             self.store.note(CONTACTS, msgpack.packb([c.packed() for c in contacts]))

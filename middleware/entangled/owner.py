@@ -1,35 +1,54 @@
 """Owner: what a node does for the records that it owns.
 
-It numbers and signs them, stores them where they belong with the consent of a majority, keeps leases alive, and mends
-what replicas have lost.
+It numbers and signs them, stores them where they belong until as many replicas have them as the write concern wants,
+goes on until all have them, keeps leases alive, and mends what replicas have lost.
 """
 
 from __future__ import annotations
 
 from collections.abc import Coroutine
+from contextlib import suppress
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 from twisted.internet.interfaces import IReactorTime
 
-from middleware.entangled.background import Background, first
-from middleware.entangled.errors import NoAnswer, Refused
+from middleware.entangled.background import Background, until
+from middleware.entangled.errors import Conflict, NoAnswer, NotAcknowledged, Refused
 from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.overlay import Overlay
-from middleware.entangled.record import Lifetime, Record, Slot
+from middleware.entangled.record import TEAM_TTL, TOMBSTONE_TTL, Lifetime, Record, Slot
 from middleware.entangled.replica import Replica
 from middleware.entangled.store import Store
 from middleware.entangled.watch import digest_of
 from middleware.entangled.wire.endpoint import Endpoint
 
-TEAM_TTL = 86400.0
-REPUBLISH = 10.0
+Concern = Literal["one", "majority", "all"]
+"""How many replicas must have a record before its writer is told so."""
+RETRY = 10.0
+"""Seconds between tries to bring a record to replicas that missed it."""
+REPUBLISH = 3600.0
+"""Seconds between two words of an owner about a team record: 24 for each life (Kademlia, section 2.5)."""
 BEATS_PER_LEASE = 3
-TOMBSTONE_ROUNDS = 3
-"""How often a tombstone is stored again, for replicas that missed it."""
 STEPS = 3
 MAX_SEQUENCE = 2**62
+SEQUENCES = "sequences"
+BLOCK = 1024
+"""Sequence numbers that are noted in the store at once, so that not every write has to note one."""
+
+
+class Stored(int):
+    """How many replicas have a record; ``sequence`` is its number in its slot."""
+
+    sequence: int
+
+    @classmethod
+    def of(cls, replicas: int, sequence: int) -> Stored:
+        """That many replicas have the record of that number."""
+        stored = cls(replicas)
+        stored.sequence = sequence
+        return stored
 
 
 class Owner:
@@ -55,7 +74,9 @@ class Owner:
         self._clock = clock
         self._chores = chores
         self._own: dict[Slot, Record] = {}
-        self._rounds: dict[Slot, int] = {}
+        self._owing: dict[Slot, None] = {}
+        self._said_at: dict[Slot, float] = {}
+        self._first = self._last = self._noted = 0
         endpoint.expose("missing", self._answer_missing, changes=True)
 
     def start(self) -> None:
@@ -64,84 +85,152 @@ class Owner:
             if record.lifetime == "team" and not record.is_tombstone:
                 self._own[record.slot] = record
         self._chores.every(self._lease / BEATS_PER_LEASE, self._beat)
-        self._chores.every(REPUBLISH, self._republish)
+        self._chores.every(RETRY, self._republish)
 
     def owns(self, slot: Slot) -> bool:
         """Whether this node looks after what is in ``slot``."""
         return slot in self._own
 
-    def next(self, key: bytes, name: str, value: bytes | None, lifetime: Lifetime) -> Record:
-        """The signed record that follows what the own slot (key, name) holds; from now on it is kept alive."""
+    def next(self, key: bytes, name: str, value: bytes | None, lifetime: Lifetime, expect: int | None = None) -> Record:
+        """The signed record that follows what the own slot (key, name) holds; from now on it is kept alive.
+
+        Raises ``Conflict`` where the slot is known to be past ``expect``.
+        """
         slot = Slot(key, self._identity.public, name)
-        known = [r.sequence for r in (self._own.get(slot), self._store.slot(slot)) if r is not None]
-        ttl = self._lease if lifetime == "leased" else TEAM_TTL
-        return self._take(Record(key, name, slot.owner, max(known, default=0) + 1, lifetime, ttl, value))
+        known = max((r.sequence for r in (self._own.get(slot), self._store.slot(slot)) if r is not None), default=0)
+        if expect is not None and known > expect:
+            raise Conflict(expect, known)
+        ttl = TOMBSTONE_TTL if value is None else self._lease if lifetime == "leased" else TEAM_TTL
+        sequence = self._next_sequence(max(known, expect or 0))
+        return self._take(Record(key, name, slot.owner, sequence, lifetime, ttl, value))
 
-    async def put(self, record: Record) -> int:
-        """Store ``record`` where it belongs; the number of replicas that have it, a majority at least.
+    async def put(self, record: Record, concern: Concern = "majority", expect: int | None = None) -> Stored:
+        """Store ``record`` where it belongs, at as many replicas as ``concern`` wants.
 
-        A record of an earlier life of this node, which is still out there, is stepped over.  Raises ``NoAnswer``.
+        A record of an earlier life of this node, which is still out there, is stepped over; with ``expect``, raises
+        ``Conflict`` where a replica holds a higher one.  Raises ``NotAcknowledged`` where too few replicas answer; the
+        record is kept and brought to them when they are back.
         """
         for _ in range(STEPS):
-            held, newest = await self.store_everywhere(record)
-            if newest < record.sequence:
-                return held
+            held, newest = await self.store_everywhere(record, concern, expect)
+            if not newest:
+                return Stored.of(held, record.sequence)
             current = self._own.get(record.slot, record)
+            if expect is not None:
+                if current == record:
+                    self._let_go(record.slot)
+                raise Conflict(expect, newest)
             if current.sequence <= newest:
-                current = self._take(replace(current, sequence=newest + 1))
+                current = self._take(replace(current, sequence=self._next_sequence(newest)))
             # Where a newer value was put meanwhile, it is that one which is to hold.
             record = current
         raise NoAnswer(f"others hold a higher number in this slot, after {STEPS} steps")
 
-    async def store_everywhere(self, record: Record) -> tuple[int, int]:
+    async def store_everywhere(
+        self, record: Record, concern: Concern = "majority", expect: int | None = None
+    ) -> tuple[int, int]:
         """Store at every holder: how many took it, and the highest sequence that stood against it (0: none).
 
-        Raises ``NoAnswer`` where no majority took it and nothing stood against it.
+        Raises ``NotAcknowledged`` where too few took it and nothing stood against it.
         """
         targets = await self._overlay.holders(record.key)
-        others = [c for c in targets if c.node_id != self._identity.node_id]
-        here = self._kept_here(record) if len(others) < len(targets) else []
-        needed = len(targets) // 2 + 1
-        answers = here + await first(needed - len(here), [self.store_at(c, record) for c in others])
-        held, newest = answers.count(0), max(answers, default=0)
-        if held < needed and newest < record.sequence:
-            raise NoAnswer(f"{held} of {len(targets)} replicas took the record, {needed} are needed")
-        return held, newest
+        voters = frozenset(self._overlay.voters(record.key, targets))
+        needed = {"one": 1, "majority": len(voters) // 2 + 1, "all": len(voters)}[concern]
+        counted = (lambda node_id: True) if concern == "one" else voters.__contains__
+        left = self.left(record)
+        verdicts: dict[bytes, int] = {}
 
-    async def store_at(self, contact: Contact, record: Record) -> int:
-        """Store at one replica: 0, or the sequence that holds there against ``record``.  Raises ``Refused``."""
-        answer = await self._overlay.ask(contact, "store", [record.packed()], changes=True)
+        async def store(contact: Contact) -> None:
+            verdict = await self.store_at(contact, record, left, expect)
+            # A later record of this very life stands there: this one is not lost, it is history.
+            is_history = expect is None and self._first <= verdict <= self._last
+            verdicts[contact.node_id] = 0 if is_history and record.owner == self._identity.public else verdict
+            votes = sum(1 for node_id, verdict in verdicts.items() if verdict == 0 and node_id in voters)
+            if len(verdicts) == len(targets) and votes > len(voters) // 2:
+                self._settled(record)
+
+        work = until(
+            lambda _: sum(map(counted, verdicts)) >= needed,
+            [store(c) for c in sorted(targets, key=lambda c: c.node_id != self._identity.node_id)],
+        )
+        await work
+        answers = dict(verdicts)
+        newest = max(answers.values(), default=0)
+        votes = sum(1 for node_id, verdict in answers.items() if verdict == 0 and counted(node_id))
+        if votes < needed and not newest:
+            raise NotAcknowledged(votes, needed)
+        return sum(1 for verdict in answers.values() if verdict == 0), newest
+
+    async def store_at(
+        self, contact: Contact, record: Record, left: float | None = None, expect: int | None = None
+    ) -> int:
+        """Store at one replica: 0, or the sequence that holds there against ``record``.  Raises ``Refused``.
+
+        ``left`` are the seconds that it is to be kept, where it is not this node's own; ``expect`` is the highest
+        sequence that it may replace.
+        """
+        if contact.node_id == self._identity.node_id:
+            return self._replica.keep(record, left, expect)
+        lives = None if left is None else [left]
+        answer = await self._overlay.ask(contact, "store", [record.packed()], lives, expect, changes=True)
         verdict = answer[0] if isinstance(answer, list) and len(answer) == 1 else None
-        if type(verdict) is int and (verdict == 0 or record.sequence <= verdict < MAX_SEQUENCE):
+        least = record.sequence if expect is None else expect + 1
+        if type(verdict) is int and (verdict == 0 or least <= verdict < MAX_SEQUENCE):
             return verdict
         raise Refused(f"{contact.address} does not take the record")
 
+    def left(self, record: Record) -> float | None:
+        """Seconds that ``record`` is to be kept by whom it is given on to; None for an own one: a whole ttl."""
+        return None if record.owner == self._identity.public else self._replica.left(record)
+
     def welcome(self, contact: Contact) -> None:
-        """Give a newcomer what it is now among the closest to."""
-        self._spread([self.store_at(contact, r) for r in self._own.values() if self._overlay.belongs(r.key, contact)])
+        """Give a newcomer the own leases that it is now among the closest to; other records find it by themselves."""
+        self._spread([self.store_at(contact, r) for r in self._leased() if self._overlay.belongs(r.key, contact)])
 
     def lost_here(self, record: Record) -> bool:
         """Hold ``record`` on where it is one of our own: a late timer must not end our own lease.  Whether it was."""
         own = self._own.get(record.slot)
-        if own is not None:
-            self._kept_here(own)
-        return own is not None
+        if own is None:
+            return False
+        with suppress(Refused):  # no room here; the others may have some
+            self._replica.keep(own)
+        return True
 
     # -- inside -----------------------------------------------------------------------------------------------------
+
+    def _next_sequence(self, above: int) -> int:
+        """A number that no earlier record of this node has, not even one that only a lost replica knows."""
+        if not self._noted:
+            try:
+                self._last = int(self._store.noted(SEQUENCES) or 0)
+            except ValueError:  # a rotten file may hold anything
+                self._last = 0
+            self._last = max(self._last, above)
+            self._first = self._last + 1
+        self._last = max(self._last, above) + 1
+        if self._last > self._noted:
+            self._noted = self._last + BLOCK
+            self._store.note(SEQUENCES, b"%d" % self._noted)
+        return self._last
 
     def _take(self, record: Record) -> Record:
         record = record.signed(self._identity)
         self._own[record.slot] = record
-        self._rounds.pop(record.slot, None)
-        if record.is_tombstone:
-            self._rounds[record.slot] = TOMBSTONE_ROUNDS
+        self._owing[record.slot] = None
         return record
 
-    def _kept_here(self, record: Record) -> list[int]:
-        try:
-            return [self._replica.keep(record)]
-        except Refused:
-            return []  # no room here; the others may have some
+    def _let_go(self, slot: Slot) -> None:
+        for memory in (self._own, self._owing, self._said_at):
+            memory.pop(slot, None)
+
+    def _settled(self, record: Record) -> None:
+        """All who should have ``record`` have it."""
+        if self._own.get(record.slot) != record:
+            return
+        self._owing.pop(record.slot, None)
+        self._said_at[record.slot] = self._clock.seconds()
+        if record.is_tombstone:
+            self._let_go(record.slot)
 
     def _leased(self) -> list[Record]:
         return [r for r in self._own.values() if r.lifetime == "leased"]
@@ -166,11 +255,9 @@ class Owner:
             self._endpoint.tell(peer, "let_go", strange)
 
     def _republish(self) -> None:
-        self._spread([self.store_everywhere(record) for record in self._own.values()])
-        for slot in list(self._rounds):
-            self._rounds[slot] -= 1
-            if not self._rounds[slot]:
-                del self._rounds[slot], self._own[slot]
+        old = self._clock.seconds() - REPUBLISH
+        due = [r for slot, r in self._own.items() if slot in self._owing or self._said_at.get(slot, old) <= old]
+        self._spread([self.store_everywhere(record) for record in due])
 
     def _spread(self, work: list[Coroutine[Any, Any, Any]]) -> None:
         for coroutine in work:

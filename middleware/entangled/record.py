@@ -20,6 +20,13 @@ KEY_BYTES = 20
 MAX_VALUE = 2**20
 MAX_NAME = 64
 MAX_TTL = 30 * 86400.0
+TEAM_TTL = 86400.0
+"""How long a team record outlives the last word of its owner."""
+TOLERATED_ABSENCE = 6 * 86400.0
+"""A node that was away for longer re-joins empty; a robot in its box over the holidays is a new one.  What it holds
+might have been deleted meanwhile, and who could tell it?"""
+TOMBSTONE_TTL = TOLERATED_ABSENCE + 86400.0
+"""A tombstone outlives every absence that is tolerated, by a day for clocks and late deliveries."""
 
 
 class Slot(NamedTuple):

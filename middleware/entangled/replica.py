@@ -1,31 +1,28 @@
 """Replica: what a node does for the records of others that it holds.
 
-It answers STORE, FIND_VALUE and WATCH, keeps the leases of owners, pushes changes to watchers, and lets go of what
-has run out.  It decides nothing about where records belong; ``node`` does.
+It answers STORE and FIND_VALUE, keeps the leases of owners, tells ``pusher`` what changes, and lets go of what has
+run out.  It decides nothing about where records belong; ``overlay`` does.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import wraps
 
-from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorTime
-from twisted.python.failure import Failure
 
 from middleware.entangled.background import Background
-from middleware.entangled.errors import NotRunning, Refused, WeatherError
+from middleware.entangled.cache import PathCache
+from middleware.entangled.errors import Refused
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.keepsake import Keepsakes
+from middleware.entangled.pusher import Pusher
 from middleware.entangled.record import KEY_BYTES, Record, unpacked
 from middleware.entangled.store import Store
 from middleware.entangled.watch import digest_of
 from middleware.entangled.wire.endpoint import Endpoint
 
-WATCH_TTL = 8.0
-MAX_WATCHERS = 1000
-MAX_WATCHED = 10_000
-"""Keys that are watched here at the same time."""
 PAGE_BYTES = 12_000
 """A page of small records goes out in one burst: ten datagrams are the first window of a parcel."""
 RECORD_BYTES = 160
@@ -35,11 +32,16 @@ MAX_LEASE = 3600.0
 MARKS = 100
 """Leased records that are named in one message."""
 
+UNSURE, SURE, CACHED = 0, 1, 2
+"""What an answer is worth: of a replica that has yet to catch up, of one that has, a copy from the path."""
+
 OnRecord = Callable[[Record], None]
 
 
 class Replica:
     """The records of others, held for them; ``keepsakes`` are the node's own copies, which nobody else gets to see.
+
+    ``is_sure`` says whether this node has caught up with the others, ``nearest`` whom it knows close to a key.
 
     ``on_record`` is told of every record that was accepted, ``on_gone`` of every one that is let go of, ``on_silent``
     of every owner (its public key) whose lease ran out or that said goodbye, ``on_peer`` of every peer that stores,
@@ -51,7 +53,10 @@ class Replica:
         self._store = store
         self._endpoint = endpoint
         self._clock = clock
-        self._watchers: dict[bytes, dict[bytes, tuple[Contact, float]]] = {}
+        self.pusher = Pusher(endpoint, clock, chores)
+        self.cache = PathCache()
+        self.is_sure: Callable[[], bool] = lambda: True
+        self.nearest: Callable[[bytes], list[Contact]] = lambda key: []
         self._doubtful: set[bytes] = set()
         self.on_record: OnRecord = lambda record: None
         self.on_gone: OnRecord = lambda record: None
@@ -61,6 +66,7 @@ class Replica:
         self._chores = chores
         endpoint.expose("store", self._once_written(self.answer_store), changes=True)
         endpoint.expose("find_value", self.answer_find_value)
+        endpoint.expose("cache", self.answer_cache, changes=True)
         endpoint.expose("watch", self.answer_watch, changes=True)
         endpoint.expose("alive", self.answer_alive, changes=True)
         endpoint.expose("let_go", self.answer_let_go, changes=True)
@@ -69,50 +75,90 @@ class Replica:
     def start(self) -> None:
         """Let go of what runs out from now on."""
         self._chores.every(SWEEP, self._sweep)
-        self._chores.every(WATCH_TTL, self._prune)
+        self.pusher.start()
 
     def held(self, key: bytes) -> list[Record]:
         """What is held under ``key`` as a replica, tombstones included."""
         return [r for r in self._store.get(key, tombstones=True) if r.slot not in self.keepsakes]
 
-    def keep(self, record: Record) -> int:
-        """Hold ``record`` if it beats what its slot holds; 0 if it does, else the sequence that holds."""
+    def keep(self, record: Record, left: float | None = None, expect: int | None = None) -> int:
+        """Hold ``record`` if it beats what its slot holds; 0 if it does, else the sequence that holds.
+
+        It is held for ``left`` seconds, as long as whoever handed it on would have; by default a whole ttl.
+        With ``expect`` only a record of at most that sequence is replaced.
+        """
         self.keepsakes.release(record.slot)
+        self.cache.drop(record.key)
         before = self._store.slot(record.slot)
-        if self._store.put(record, self._clock.seconds() + record.ttl):
+        if expect is not None and before is not None and before != record and before.sequence > expect:
+            return before.sequence
+        life = record.ttl if left is None else min(left, record.ttl)
+        if self._store.put(record, self._clock.seconds() + life):
             self.on_record(record)
-            self._push(record.key, [record.packed()], [])
+            self.pusher.push(record.key, [record], [])
             return 0
         if before is not None and before.sequence >= record.sequence and before.signature != record.signature:
             return before.sequence
         return 0
 
+    def left(self, record: Record) -> float:
+        """Seconds for which ``record`` is still held here; its ttl where it is not."""
+        expiry = self._store.expiry(record.slot)
+        return record.ttl if expiry is None else expiry - self._clock.seconds()
+
     # -- what peers ask ---------------------------------------------------------------------------------------------
 
-    def answer_store(self, peer: Contact, packed: list[object]) -> list[int]:
-        """STORE: keep records; answers for each 0, or the sequence that beats it, or -1 for a forged one."""
+    def answer_store(
+        self, peer: Contact, packed: list[object], left: list[object] | None = None, expect: int | None = None
+    ) -> list[int]:
+        """STORE: keep records; answers for each 0, or the sequence that beats it, or -1 for a forged one.
+
+        ``left`` are the seconds that each is to be kept, where it does not come from its owner;
+        ``expect`` the highest sequence that they may replace (compare-and-set).
+        """
         self.on_peer(peer)
         records = [record for record in map(unpacked, packed) if record is not None]
-        if len(records) < len(packed):
+        lives = [None] * len(packed) if left is None else [_checked_life(life) for life in left]
+        if len(records) < len(packed) or len(lives) != len(packed):
             raise Refused("not a record")
-        return [self.keep(record) if _is_lawful(record, peer) else -1 for record in records]
+        return [
+            self.keep(record, life, expect) if self.is_lawful(record, peer) else -1
+            for record, life in zip(records, lives, strict=True)
+        ]
 
-    def answer_find_value(self, peer: Contact, key: bytes, after: list[object] | None = None) -> list[object]:
-        """FIND_VALUE: a page of the records under ``key``, and where the next page begins (None: that was all)."""
-        return self._page(_checked_key(key), after)
+    def answer_find_value(
+        self, peer: Contact, key: bytes, after: list[object] | None = None, wants_sure: bool = False
+    ) -> list[object]:
+        """FIND_VALUE: a page of the records under ``key``, where the next page begins (None: that was all), its worth.
 
-    def answer_watch(self, peer: Contact, key: bytes, digest: bytes) -> list[object] | None:
-        """WATCH: push changes of ``key`` to ``peer`` for a while; None if it is up to date, else the first page."""
+        Where nothing is held, the contacts that are closest to the key follow, and a copy from the path may be given
+        unless ``wants_sure``.
+        """
+        page, following = self._page(_checked_key(key), after)
+        if not page and after is None:
+            cached = None if wants_sure else self.cache.get(key, self._clock.seconds())
+            if cached:
+                return [[record.packed() for record in cached], None, CACHED]
+            near = [contact.packed() for contact in self.nearest(key) if contact.node_id != peer.node_id]
+            return [[], None, self._worth(), near]
+        return [page, following, self._worth()]
+
+    def answer_cache(self, peer: Contact, key: bytes, packed: list[object], ttl: float) -> None:
+        """CACHE: keep a copy of what a lookup found, for those whose way leads past here (Kademlia, section 2.3)."""
+        records = [record for record in map(unpacked, packed) if record is not None]
+        if len(records) < len(packed) or any(record.key != _checked_key(key) for record in records):
+            raise Refused("not records of this key")
+        if not self.held(key) and all(record.is_genuine() for record in records):
+            self.cache.put(key, records, ttl, self._clock.seconds())
+
+    def answer_watch(self, peer: Contact, key: bytes, digest: bytes) -> list[object]:
+        """WATCH: push changes of ``key`` to ``peer`` for a while.
+
+        Answers the number of the last push, and the first page (None where ``digest`` is that of what is held).
+        """
         self.on_peer(peer)
-        watchers = self._watchers.get(_checked_key(key), {})
-        is_full = len(watchers) >= MAX_WATCHERS or (not watchers and len(self._watchers) >= MAX_WATCHED)
-        if peer.node_id not in watchers and is_full:
-            raise Refused("too many watchers of this key")
-        watchers[peer.node_id] = (peer, self._clock.seconds() + WATCH_TTL)
-        self._watchers[key] = watchers
-        if digest == digest_of(self.held(key)):
-            return None
-        return self._page(key, None)
+        number = self.pusher.watched(_checked_key(key), peer)
+        return [number, None if digest == digest_of(self.held(key)) else self.first_page(key)]
 
     def answer_alive(self, peer: Contact, lease: float, digest: bytes) -> None:
         """ALIVE: extend the leases of ``peer``; where what is held differs from what it says twice, tell it."""
@@ -135,10 +181,17 @@ class Replica:
         """GOODBYE: the peer leaves, and what it leased leaves with it (thesis, section 4.2.2)."""
         self._gone(self._store.drop_leased(peer.public))
         self.on_silent(peer.public)
-        for watchers in self._watchers.values():
-            watchers.pop(peer.node_id, None)
+        self.pusher.forget(peer)
         self._doubtful.discard(peer.node_id)
         self.on_goodbye(peer)
+
+    def is_lawful(self, record: Record, peer: Contact) -> bool:
+        """Whether ``peer`` may store ``record``.
+
+        Its owner's own session vouches for it; second-hand a signature has to, and a lease is taken from its owner
+        only, for it shall not outlive the owner's own sign of life.
+        """
+        return record.owner == peer.public or (record.lifetime == "team" and record.is_genuine())
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
@@ -156,7 +209,14 @@ class Replica:
         """What is held of ``owner`` on lease."""
         return [r for r in self._store.owned(owner) if r.lifetime == "leased" and r.slot not in self.keepsakes]
 
-    def _page(self, key: bytes, after: list[object] | None) -> list[object]:
+    def first_page(self, key: bytes) -> list[object]:
+        """The first page of what is held under ``key``, and where the next one begins."""
+        return list(self._page(key, None))
+
+    def _worth(self) -> int:
+        return SURE if self.is_sure() else UNSURE
+
+    def _page(self, key: bytes, after: list[object] | None) -> tuple[list[object], list[object] | None]:
         cursor = _checked_cursor(after)
         page: list[object] = []
         last: list[object] | None = None
@@ -166,29 +226,17 @@ class Replica:
                 continue
             size += len(record.value or b"") + len(record.name.encode()) + RECORD_BYTES
             if page and size > PAGE_BYTES:
-                return [page, last]
+                return page, last
             page.append(record.packed())
             last = [record.owner, record.name]
-        return [page, None]
-
-    def _push(self, key: bytes, records: list[object], gone: list[object]) -> None:
-        watchers = self._watchers.get(key)
-        if not watchers:
-            return
-        now = self._clock.seconds()
-        for watcher_id, (watcher, until) in list(watchers.items()):
-            if until < now:
-                del watchers[watcher_id]
-                continue
-            pushed: Deferred[object] = self._endpoint.ask(watcher, "push", key, records, gone, changes=True)
-            pushed.addErrback(_ignore_weather)
+        return page, None
 
     def _gone(self, records: list[Record]) -> None:
         for record in records:
             if record.slot in self.keepsakes:
                 self.keepsakes.release(record.slot)
                 continue
-            self._push(record.key, [], [[record.owner, record.name]])
+            self.pusher.push(record.key, [], [record])
             self.on_gone(record)
 
     def _sweep(self) -> None:
@@ -196,21 +244,6 @@ class Replica:
         self._gone(ended)
         for owner in dict.fromkeys(r.owner for r in ended if r.lifetime == "leased"):
             self.on_silent(owner)
-
-    def _prune(self) -> None:
-        """Forget the watchers that did not ask again."""
-        now = self._clock.seconds()
-        for key, watchers in list(self._watchers.items()):
-            for watcher_id in [w for w, (_, until) in watchers.items() if until < now]:
-                del watchers[watcher_id]
-            if not watchers:
-                del self._watchers[key]
-
-
-def _is_lawful(record: Record, peer: Contact) -> bool:
-    # Only its owner may store a leased record: it shall not outlive the owner's own sign of life.  The owner's session
-    # vouches for it; a team record goes from hand to hand and needs a signature that anybody can check.
-    return record.owner == peer.public if record.lifetime == "leased" else record.is_genuine()
 
 
 def _checked_key(key: object) -> bytes:
@@ -227,5 +260,7 @@ def _checked_cursor(after: list[object] | None) -> tuple[bytes, str] | None:
     return after[0], after[1]
 
 
-def _ignore_weather(failure: Failure) -> None:
-    failure.trap(WeatherError, Refused, NotRunning)
+def _checked_life(life: object) -> float:
+    if type(life) is not float or not math.isfinite(life):
+        raise Refused("what is left of a life is a number of seconds")
+    return life

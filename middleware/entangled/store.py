@@ -104,6 +104,9 @@ class Store(Protocol):
     def is_cached(self, slot: Slot) -> bool:
         """Whether what ``slot`` holds is a cached copy."""
 
+    def expiry(self, slot: Slot) -> float | None:
+        """When what ``slot`` holds runs out, or None where it holds nothing."""
+
     def owned(self, owner: bytes) -> list[Record]:
         """The records of ``owner``, tombstones included and cached copies not, in the order of their slots."""
 
@@ -251,6 +254,11 @@ class MemoryStore:
     def is_cached(self, slot: Slot) -> bool:
         """Whether what ``slot`` holds is a cached copy."""
         return slot in self._cached
+
+    def expiry(self, slot: Slot) -> float | None:
+        """When what ``slot`` holds runs out, or None where it holds nothing."""
+        held = self._slots.get(slot)
+        return held.expires_at if held else None
 
     def owned(self, owner: bytes) -> list[Record]:
         """The records of ``owner``, tombstones included, in the order of their slots."""

@@ -1,6 +1,6 @@
-"""Subscriber: what a node reads from others, once (``read``) or kept up to date (``watch``).
+"""Subscriber: the watches of a node, renewed at the replicas of their keys and kept up to date by what those push.
 
-It asks the replicas of a key, checks what they say, and hands it to the views.
+Pushes are numbered.  A gap means that something was missed, so the replica is asked at once for what it holds.
 """
 
 from __future__ import annotations
@@ -8,22 +8,23 @@ from __future__ import annotations
 from twisted.internet.interfaces import IReactorTime
 from twisted.logger import Logger
 
-from middleware.entangled.background import Background, first
-from middleware.entangled.errors import Alone, EntangledError
+from middleware.entangled.background import Background
+from middleware.entangled.errors import EntangledError
 from middleware.entangled.identity import node_id
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.overlay import Overlay
+from middleware.entangled.reader import Reader
 from middleware.entangled.record import Record, Slot, unpacked
 from middleware.entangled.replica import Replica
-from middleware.entangled.watch import Changed, View, Watch
+from middleware.entangled.watch import Changed, Watch
 from middleware.entangled.wire.endpoint import Endpoint
 
-RENEW = 2.0
-MAX_PAGES = 1000
+RENEW = 4.0
+"""Three renewals in the time for which a replica remembers a watcher."""
 
 
 class Subscriber:
-    """The reads and watches of the node ``own_id``."""
+    """The watches of the node ``own_id``."""
 
     _log = Logger()
 
@@ -32,6 +33,7 @@ class Subscriber:
         own_id: bytes,
         replica: Replica,
         overlay: Overlay,
+        reader: Reader,
         endpoint: Endpoint,
         clock: IReactorTime,
         chores: Background,
@@ -39,6 +41,7 @@ class Subscriber:
         self._own_id = own_id
         self._replica = replica
         self._overlay = overlay
+        self._reader = reader
         self._clock = clock
         self._chores = chores
         self._watches: list[Watch] = []
@@ -52,22 +55,6 @@ class Subscriber:
         """End every watch; nothing is told any more, and no copy is kept."""
         self._watches.clear()
         self._replica.keepsakes.clear()
-
-    async def read(self, key: bytes) -> list[Record]:
-        """The merged answers of all replicas of ``key`` that answer; raises ``Alone`` where none does."""
-        targets = await self._overlay.holders(key)
-        view = View(self._own_id)
-        others = [c for c in targets if c.node_id != self._own_id]
-        if len(others) < len(targets):
-            view.replace(self._own_id, self._replica.held(key))
-
-        async def read_at(contact: Contact) -> None:
-            view.replace(contact.node_id, await self._pages(contact, key, None))
-
-        answered = await first(len(others), [read_at(c) for c in others])
-        if others and not answered:
-            raise Alone("no node that holds this key answers")
-        return view.merged()
 
     def watch(self, key: bytes, changed: Changed, keep: bool) -> Watch:
         """Begin a watch; see ``EntangledNode.watch``."""
@@ -156,10 +143,15 @@ class Subscriber:
         watch.asked.add(contact.node_id)
         try:
             digest = watch.view.digest(contact.node_id)
-            page = await self._overlay.ask(contact, "watch", watch.key, digest, changes=True)
+            answer = await self._overlay.ask(contact, "watch", watch.key, digest, changes=True)
+            number, page = answer if isinstance(answer, list) and len(answer) == 2 else (0, [[], None])
+            if type(number) is not int:
+                return
+            # What was pushed while the answer was under way has moved the count on already.
+            watch.pushed[contact.node_id] = max(number, watch.pushed.get(contact.node_id, 0) if page is None else 0)
             if page is None:
                 return
-            records = await self._pages(contact, watch.key, page)
+            records = (await self._reader.pages(contact, watch.key, page)).records
         except EntangledError:
             if watch in self._watches:
                 watch.forget(contact.node_id)
@@ -169,35 +161,21 @@ class Subscriber:
             watch.view.replace(contact.node_id, records)
             self._settle(watch)
 
-    async def _pages(self, contact: Contact, key: bytes, page: object) -> list[Record]:
-        """What ``contact`` holds under ``key``, from ``page`` on (None: from the first one)."""
-        records: list[Record] = []
-        if page is None:
-            page = await self._overlay.ask(contact, "find_value", key, None)
-        for _ in range(MAX_PAGES):
-            if not (isinstance(page, list) and len(page) == 2 and isinstance(page[0], list) and page[0]):
-                break
-            records += [r for r in map(unpacked, page[0]) if r is not None and self._is_credible(r, key, contact)]
-            if page[1] is None:
-                break
-            page = await self._overlay.ask(contact, "find_value", key, page[1])
-        return records
-
-    def _is_credible(self, record: Record, key: bytes, contact: Contact) -> bool:
-        if record.key != key:
-            return False
-        return record.owner == contact.public or record in self._replica.held(key) or record.is_genuine()
-
-    def _answer_push(self, peer: Contact, key: bytes, packed: list[object], gone: list[object]) -> None:
+    def _answer_push(self, peer: Contact, key: bytes, number: int, packed: list[object], gone: list[object]) -> None:
         self._overlay.heard(peer)
-        records = [r for r in map(unpacked, packed) if r is not None and self._is_credible(r, key, peer)]
+        records = [r for r in map(unpacked, packed) if r is not None and self._reader.is_credible(r, key, peer)]
         slots = [slot for place in gone if (slot := _slot_of(key, place)) is not None]
         for watch in [w for w in self._watches if w.key == key and peer.node_id in w.asked]:
+            last = watch.pushed.get(peer.node_id, 0)
+            watch.pushed[peer.node_id] = max(last, number)
             for record in records:
                 watch.view.add(peer.node_id, record)
-            for slot in slots:
-                watch.view.remove(peer.node_id, slot)
+            if number > last:  # one that was overtaken may speak of what is there again
+                for slot in slots:
+                    watch.view.remove(peer.node_id, slot)
             self._settle(watch)
+            if number != last + 1:
+                self._chores.fork(self._renew_at(watch, peer))
 
 
 def _slot_of(key: bytes, place: object) -> Slot | None:

@@ -84,7 +84,7 @@ class Watch:
     """One subscription to one key; ``records`` is what is known now.
 
     ``asked`` are the node ids of the replicas that were asked to push; nobody else is believed.  ``keep`` says whether
-    what is known is to be kept in the node's own store as well.
+    what is known is to be kept in the node's own store as well.  ``pushed`` is the number of each replica's last push.
     """
 
     def __init__(self, key: bytes, changed: Changed, renewer: Renewer, own_id: bytes = b"", keep: bool = False) -> None:
@@ -92,6 +92,7 @@ class Watch:
         self.view = View(own_id)
         self.records: list[Record] = []
         self.asked: set[bytes] = set()
+        self.pushed: dict[bytes, int] = {}
         self.keep = keep
         self._changed = changed
         self._renewer = renewer
@@ -106,6 +107,7 @@ class Watch:
     def forget(self, replica: bytes) -> None:
         """What ``replica`` says does not count until it is asked again."""
         self.asked.discard(replica)
+        self.pushed.pop(replica, None)
         self.view.forget(replica)
 
     def stop(self) -> None:

@@ -169,7 +169,7 @@ class LoopTests(SynchronousTestCase):
         node = agent._node
         get, tries = node.entangled.get, []
 
-        def silent(key: bytes) -> Any:
+        def silent(key: bytes, concern: str = "majority") -> Any:
             tries.append(key)
             return (
                 get(key)

@@ -9,6 +9,7 @@ from middleware.entangled.kademlia.distance import closest
 from middleware.entangled.network.network import Address
 from middleware.entangled.overlay import K
 from middleware.entangled.record import hashed_key
+from middleware.entangled.roster import Roster
 from tests.fleet import FleetCase
 
 
@@ -34,7 +35,9 @@ class OverlayTests(FleetCase):
         """A contact that is in the table but not there drives none of those that were found out of mind."""
         fleet = self.fleet(14, seed=2)
         node, key = fleet.nodes[0], hashed_key("a")
+        node.overlay.is_whole = False
         found = self.done(fleet, Deferred.fromCoroutine(node.overlay.holders(key)), 0.5)
+        node.overlay.is_whole, node.overlay.roster = False, Roster(node.identity.node_id)
         strangers = [Contact(bytes([n]) * 32, Address("10.0.0.9", n)) for n in range(1, 200)]
         for stranger in closest(strangers, key, 20):
             node.overlay.table.saw(stranger, fleet.clock.seconds())

@@ -15,8 +15,9 @@ from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address
 from middleware.entangled.network.switchboard import Switchboard
+from middleware.entangled.pusher import WATCH_TTL
 from middleware.entangled.record import Lifetime, Record, hashed_key, unpacked
-from middleware.entangled.replica import SWEEP, WATCH_TTL, Replica
+from middleware.entangled.replica import SURE, SWEEP, Replica
 from middleware.entangled.store import MemoryStore
 from middleware.entangled.watch import digest_of
 from middleware.entangled.wire.endpoint import Endpoint
@@ -85,10 +86,10 @@ class ReplicaTests(SynchronousTestCase):
         self.assertEqual(self.stored(weaker), [1])
 
     def test_who_may_store(self) -> None:
-        """A lease comes from its owner only, a team record from anybody, but signed, its owner included."""
+        """A lease comes from its owner only, a team record from anybody; signed, unless the owner's session vouches."""
         forged = Record(KEY, "f", DOG.public, 1, "team", 1.0, b"v", bytes(64))
         self.assertEqual(self.stored(record(lifetime="leased"), record("t"), forged, peer=self.cat), [-1, 0, -1])
-        self.assertEqual(self.stored(record(lifetime="leased"), forged), [0, -1])
+        self.assertEqual(self.stored(record(lifetime="leased"), forged), [0, 0])
 
     def test_acknowledged_once_written(self) -> None:
         """Who stores gets its answer when the record is written, and a named no where it cannot be."""
@@ -187,24 +188,24 @@ class ReplicaTests(SynchronousTestCase):
             self.assertRaises(Refused, self.replica.answer_find_value, self.dog, KEY, after)
         self.assertRaises(Refused, self.replica.answer_find_value, self.dog, b"short")
         self.assertRaises(Refused, self.replica.answer_watch, self.dog, b"short", b"")
-        self.assertEqual(self.replica.answer_find_value(self.dog, KEY, [b"\xff" * 32, ""]), [[], None])
+        self.assertEqual(self.replica.answer_find_value(self.dog, KEY, [b"\xff" * 32, ""]), [[], None, SURE])
 
     def test_watch(self) -> None:
         """A watcher gets the first page unless it is up to date, then each change, until it asks no more."""
         self.stored(record())
         page = self.replica.answer_watch(self.cat, KEY, b"")
-        self.assertEqual(page, [[record().packed()], None])
-        self.assertIsNone(self.replica.answer_watch(self.cat, KEY, digest_of([record()])))
+        self.assertEqual(page, [0, [[record().packed()], None]])
+        self.assertEqual(self.replica.answer_watch(self.cat, KEY, digest_of([record()])), [0, None])
         self.stored(record(sequence=2))
         self.clock.advance(0.5)
-        self.assertEqual(self.heard, [(KEY, [record(sequence=2).packed()], [])])
+        self.assertEqual(self.heard, [(KEY, 1, [record(sequence=2).packed()], [])])
         self.clock.advance(0.6)
-        self.assertEqual(self.heard[1:], [(KEY, [], [[DOG.public, "state"]])])
+        self.assertEqual(self.heard[1:], [(KEY, 2, [], [[DOG.public, "state"]])])
         self.clock.advance(2 * WATCH_TTL)
         self.stored(record(sequence=3))
         self.clock.advance(0.5)
         self.assertEqual(len(self.heard), 2)
-        self.assertEqual(self.replica._watchers, {})
+        self.assertEqual(self.replica.pusher._watchers, {})
 
     def test_too_many_watchers(self) -> None:
         """Watchers are bounded, and one that is in already may stay."""

@@ -1,0 +1,127 @@
+"""What a team costs that does nothing, and what a read and a write cost, in datagrams, bytes and time of a core.
+
+Everything runs in virtual time over a switchboard in one process, so the figures are the same on every machine; only the
+share of a core is measured, and that includes what the simulation itself takes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import random
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+from twisted.internet.defer import Deferred
+
+from middleware.entangled.clock import HeapClock
+from middleware.entangled.errors import EntangledError
+from middleware.entangled.identity import Identity
+from middleware.entangled.network.network import Address
+from middleware.entangled.network.switchboard import Switchboard, SwitchboardNetwork, Weather
+from middleware.entangled.node import EntangledNode
+from middleware.entangled.record import hashed_key
+from middleware.entangled.store import MemoryStore
+
+MAX_BYTES_S = 1000.0
+MAX_CORE = 0.001
+HEADER = 28
+"""Bytes of IP and UDP around a datagram."""
+
+
+class Meter(SwitchboardNetwork):
+    """A network that counts what it sends."""
+
+    datagrams = 0
+    octets = 0
+
+    def send(self, datagram: bytes, to: Address) -> None:
+        """Count a datagram and send it."""
+        Meter.datagrams += 1
+        Meter.octets += len(datagram) + HEADER
+        super().send(datagram, to)
+
+
+class Team:
+    """``n`` nodes that have found each other, 0.2 ms apart."""
+
+    def __init__(self, n: int, seed: int) -> None:
+        self.clock = HeapClock()
+        self.rng = random.Random(seed)
+        self.board = Switchboard(self.clock, random.Random(f"{seed}/board"), Weather(delay_s=0.0002))
+        self.nodes = []
+        for place in range(n):
+            network = Meter(self.board, Address("10.0.0.1", 7000 + place))
+            identity = Identity(random.Random(f"{seed}/{place}").randbytes(32))
+            dice = random.Random(f"{seed}/{place}/dice")
+            node = EntangledNode(identity, b"t" * 32, network, MemoryStore(), self.clock, dice)
+            node.start()
+            node.join([Address("10.0.0.1", 7000)] if place else [])
+            self.nodes.append(node)
+            self.clock.advance(0.3)
+
+    def spent(self, seconds: float) -> tuple[float, float, float]:
+        """Datagrams and bytes that a node sends in a second of rest, and its share of a core."""
+        before, began = (Meter.datagrams, Meter.octets), time.process_time()
+        self.clock.advance(seconds)
+        took = time.process_time() - began
+        each = seconds * len(self.nodes)
+        return (Meter.datagrams - before[0]) / each, (Meter.octets - before[1]) / each, took / each
+
+    def cost(self, work: Callable[[EntangledNode], Deferred[Any]], times: int) -> tuple[float, list[float], int]:
+        """Datagrams for one of ``times`` operations at random nodes, how long each took, and how many failed."""
+        before, took, failed = Meter.datagrams, [], 0
+        for _ in range(times):
+            began, ended = self.clock.seconds(), []
+            done = work(self.rng.choice([node for node in self.nodes if node._running]))
+            done.addErrback(lambda failure: failure.trap(EntangledError))
+            done.addCallback(ended.append)
+            while not ended:
+                self.clock.advance(0.0001)
+            took.append(self.clock.seconds() - began)
+            failed += isinstance(ended[0], type) or ended[0] == []
+        self.clock.advance(0.05)
+        return (Meter.datagrams - before) / times, sorted(took), failed
+
+
+def main() -> int:
+    """Print the table; 1 where the idle team is over its limits."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.idle", description=__doc__)
+    parser.add_argument("--nodes", type=int, default=30)
+    parser.add_argument("--seconds", type=float, default=120.0, help="of virtual time (default 120)")
+    parser.add_argument("--loss", action="store_true", help="read as well after half of the nodes fell silent")
+    arguments = parser.parse_args()
+    team = Team(arguments.nodes, 1)
+    team.clock.advance(30.0)
+    datagrams, octets, core = team.spent(arguments.seconds)
+    print(f"idle, {arguments.nodes} nodes: {datagrams:.1f} datagrams/s, {octets:.0f} bytes/s, {core:.3%} of a core each")
+    numbers = iter(range(10**6))
+    puts = team.cost(lambda node: node.put(hashed_key(f"k{next(numbers)}"), "v", b"x" * 100), 200)
+    report("put", puts)
+    for concern in ("fast", "majority"):
+        report(f"get {concern}", team.cost(lambda node, c=concern: node.get(some(team.rng), c), 200))  # type: ignore
+    if arguments.loss:
+        for node in team.rng.sample(team.nodes, len(team.nodes) // 2):
+            node.vanish()
+        report("get fast, half silent", team.cost(lambda node: node.get(some(team.rng), "fast"), 100))
+    return int(octets > MAX_BYTES_S or core > MAX_CORE)
+
+
+def some(rng: random.Random) -> bytes:
+    """One of the keys that were put."""
+    return hashed_key(f"k{rng.randrange(200)}")
+
+
+def report(what: str, figures: tuple[float, list[float], int]) -> None:
+    """Print one line."""
+    datagrams, took, failed = figures
+    p50, p95 = took[len(took) // 2], took[len(took) * 95 // 100]
+    print(
+        f"{what}: {datagrams:.1f} datagrams, p50 {p50 * 1000:.1f} ms, p95 {p95 * 1000:.1f} ms, "
+        f"max {took[-1] * 1000:.1f} ms, {failed} of {len(took)} without a result"
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

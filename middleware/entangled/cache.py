@@ -1,0 +1,51 @@
+"""PathCache: copies of popular records on the way to them (Kademlia, section 2.3).
+
+A copy is no replica: it is never counted in a majority, never handed on, lives in memory only, and goes first.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+
+from middleware.entangled.record import Record
+
+MAX_KEYS = 256
+MAX_BYTES = 256 * 1024
+MAX_AGE = 60.0
+"""Seconds that a copy at the very next node lives; each node between halves it."""
+
+
+class PathCache:
+    """The copies of one node, at most ``MAX_KEYS`` keys and ``MAX_BYTES``; the least recently read goes first."""
+
+    def __init__(self) -> None:
+        self._copies: OrderedDict[bytes, tuple[float, int, list[Record]]] = OrderedDict()
+        self._bytes = 0
+
+    def put(self, key: bytes, records: list[Record], ttl: float, now: float) -> None:
+        """Keep ``records`` for ``ttl`` seconds, at most ``MAX_AGE``."""
+        size = sum(len(record.value or b"") + len(record.name) + 160 for record in records)
+        self.drop(key)
+        if size > MAX_BYTES or not ttl > 0.0:
+            return
+        self._copies[key] = (now + min(ttl, MAX_AGE), size, records)
+        self._bytes += size
+        while self._bytes > MAX_BYTES or len(self._copies) > MAX_KEYS:
+            self.drop(next(iter(self._copies)))
+
+    def get(self, key: bytes, now: float) -> list[Record] | None:
+        """The copy under ``key``, or None."""
+        copy = self._copies.get(key)
+        if copy is None:
+            return None
+        if copy[0] <= now:
+            self.drop(key)
+            return None
+        self._copies.move_to_end(key)
+        return copy[2]
+
+    def drop(self, key: bytes) -> None:
+        """Let go of the copy under ``key``, if there is one."""
+        copy = self._copies.pop(key, None)
+        if copy is not None:
+            self._bytes -= copy[1]

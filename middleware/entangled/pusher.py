@@ -1,0 +1,101 @@
+"""Pusher: tells those who watch a key what changes here.
+
+Soft state: a watcher counts for ``WATCH_TTL`` seconds after it last asked.  Pushes to one watcher of one key are
+numbered without a gap, so that it notices what it missed, and asks again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from twisted.internet.defer import Deferred
+from twisted.internet.interfaces import IReactorTime
+from twisted.python.failure import Failure
+
+from middleware.entangled.background import Background
+from middleware.entangled.errors import NotRunning, Refused, WeatherError
+from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.record import Record
+from middleware.entangled.wire.endpoint import Endpoint
+
+WATCH_TTL = 12.0
+MAX_WATCHERS = 1000
+MAX_WATCHED = 10_000
+"""Keys that are watched here at the same time."""
+
+
+class _Watcher:
+    """Who watches, until when, and the number of the last push to it."""
+
+    __slots__ = ("contact", "until", "number")
+
+    def __init__(self, contact: Contact, until: float) -> None:
+        self.contact = contact
+        self.until = until
+        self.number = 0
+
+
+class Pusher:
+    """The watchers of the keys that one replica holds."""
+
+    def __init__(
+        self,
+        endpoint: Endpoint,
+        clock: IReactorTime,
+        chores: Background,
+    ) -> None:
+        self._endpoint = endpoint
+        self._clock = clock
+        self._chores = chores
+        self._watchers: dict[bytes, dict[bytes, _Watcher]] = {}
+
+    def start(self) -> None:
+        """Forget who does not ask again, from now on."""
+        self._chores.every(WATCH_TTL, self._prune)
+
+    def watched(self, key: bytes, peer: Contact) -> int:
+        """``peer`` watches ``key`` from now on; the number of the last push to it.  Raises ``Refused``."""
+        watchers = self._watchers.get(key, {})
+        is_full = len(watchers) >= MAX_WATCHERS or (not watchers and len(self._watchers) >= MAX_WATCHED)
+        if peer.node_id not in watchers and is_full:
+            raise Refused("too many watchers of this key")
+        until = self._clock.seconds() + WATCH_TTL
+        watcher = watchers.setdefault(peer.node_id, _Watcher(peer, until))
+        watcher.contact, watcher.until = peer, until
+        self._watchers[key] = watchers
+        return watcher.number
+
+    def push(self, key: bytes, records: Iterable[Record], gone: Iterable[Record]) -> None:
+        """Tell the watchers of ``key`` that ``records`` are held now, and those in ``gone`` no longer."""
+        watchers = self._watchers.get(key)
+        if not watchers:
+            return
+        now = self._clock.seconds()
+        packed = [record.packed() for record in records]
+        places = [[record.owner, record.name] for record in gone]
+        for watcher in list(watchers.values()):
+            if watcher.until < now:
+                del watchers[watcher.contact.node_id]
+                continue
+            watcher.number += 1
+            pushed: Deferred[object] = self._endpoint.ask(
+                watcher.contact, "push", key, watcher.number, packed, places, changes=True
+            )
+            pushed.addErrback(_ignore_weather)
+
+    def forget(self, peer: Contact) -> None:
+        """``peer`` left."""
+        for watchers in self._watchers.values():
+            watchers.pop(peer.node_id, None)
+
+    def _prune(self) -> None:
+        now = self._clock.seconds()
+        for key, watchers in list(self._watchers.items()):
+            for watcher_id in [w for w, watcher in watchers.items() if watcher.until < now]:
+                del watchers[watcher_id]
+            if not watchers:
+                del self._watchers[key]
+
+
+def _ignore_weather(failure: Failure) -> None:
+    failure.trap(WeatherError, Refused, NotRunning)

@@ -1,0 +1,242 @@
+"""Reader: what a key holds, asked of its replicas; fast from one of them, or sure from a majority.
+
+A read never says that nothing is there because replicas could not be reached: it fails with ``Unavailable``.  One that
+does not answer within two round trips is not waited for: somebody else is asked beside it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Literal
+
+from twisted.internet.defer import Deferred
+
+from middleware.entangled.background import Background, until
+from middleware.entangled.cache import MAX_AGE
+from middleware.entangled.errors import EntangledError, Unavailable
+from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.kademlia.lookup import Lookup
+from middleware.entangled.overlay import ALPHA, K, Overlay, contacts_of
+from middleware.entangled.owner import Owner
+from middleware.entangled.record import Record, Slot, unpacked
+from middleware.entangled.replica import CACHED, SURE, UNSURE, Replica
+
+ReadConcern = Literal["fast", "majority"]
+MAX_PAGES = 2000
+
+
+class Answer:
+    """What one replica said: its records, tombstones included, what that is worth, and whom it knows nearer."""
+
+    __slots__ = ("records", "worth", "nearer")
+
+    def __init__(self, records: list[Record], worth: int, nearer: list[Contact]) -> None:
+        self.records = records
+        self.worth = worth
+        self.nearer = nearer
+
+
+class Reader:
+    """The reads of one node."""
+
+    def __init__(self, replica: Replica, overlay: Overlay, owner: Owner, chores: Background) -> None:
+        self._replica = replica
+        self._overlay = overlay
+        self._owner = owner
+        self._chores = chores
+
+    async def read(self, key: bytes, concern: ReadConcern) -> list[Record]:
+        """The records of ``key``, without tombstones, in the order of (owner, name); raises ``Unavailable``."""
+        records = await (self._sure(key) if concern == "majority" else self._fast(key))
+        return sorted((r for r in records if not r.is_tombstone), key=lambda r: (r.owner, r.name))
+
+    async def pages(self, contact: Contact, key: bytes, page: object = None, wants_sure: bool = True) -> Answer:
+        """What ``contact`` holds under ``key``, from ``page`` on (None: from the first one)."""
+        records: list[Record] = []
+        if page is None:
+            page = await self._overlay.ask(contact, "find_value", key, None, wants_sure)
+        worth, nearer = UNSURE, []
+        for _ in range(MAX_PAGES):
+            if not (isinstance(page, list) and len(page) >= 2 and isinstance(page[0], list)):
+                break
+            records += [r for r in map(unpacked, page[0]) if r is not None and self.is_credible(r, key, contact)]
+            # What it was worth at the end counts: it may have fallen behind in between.
+            worth = page[2] if len(page) > 2 and page[2] in (SURE, CACHED) else UNSURE
+            nearer = contacts_of(page[3]) if len(page) > 3 else []
+            if page[1] is None or not page[0]:
+                break
+            page = await self._overlay.ask(contact, "find_value", key, page[1], wants_sure)
+        return Answer(records, worth, nearer)
+
+    def is_credible(self, record: Record, key: bytes, contact: Contact) -> bool:
+        """Whether ``record``, told by ``contact``, is one of ``key`` and its owner's own word."""
+        if record.key != key:
+            return False
+        return record.owner == contact.public or record in self._replica.held(key) or record.is_genuine()
+
+    # -- inside -----------------------------------------------------------------------------------------------------
+
+    async def _fast(self, key: bytes) -> list[Record]:
+        here = self._replica.held(key)
+        # What is left of a time when this node was among the closest may be old.
+        if here and self._replica.is_sure() and self._overlay.belongs(key, self._overlay.me()):
+            return here
+        if not self._overlay.is_complete and len(self._overlay.table) >= K:
+            return await self._walk(key)
+        targets = await self._overlay.holders(key)
+        voters = frozenset(self._overlay.voters(key, targets))
+        answers = await self._asked(key, targets, voters, lambda given: _is_clear(given, voters), width=1)
+        for answer in answers.values():
+            if answer.records:
+                return answer.records
+        return self._nothing(answers, voters)
+
+    async def _sure(self, key: bytes) -> list[Record]:
+        targets = await self._overlay.holders(key)
+        voters = frozenset(self._overlay.voters(key, targets))
+        needed = len(voters) // 2 + 1
+        answers = await self._asked(key, targets, voters, lambda given: _votes(given, voters) >= needed, width=needed)
+        if _votes(answers, voters) < needed:
+            raise Unavailable(_votes(answers, voters), needed)
+        newest = newest_of(answer.records for answer in answers.values())
+        await self._repair(newest, targets, voters, answers)
+        return list(newest.values())
+
+    def _nothing(self, answers: dict[bytes, Answer], voters: frozenset[bytes]) -> list[Record]:
+        """No records, where a majority says so; raises ``Unavailable`` where they cannot be asked."""
+        votes, needed = _votes(answers, voters), len(voters) // 2 + 1
+        if votes < needed:
+            raise Unavailable(votes, needed)
+        return []
+
+    async def _repair(
+        self,
+        newest: dict[Slot, Record],
+        targets: list[Contact],
+        voters: frozenset[bytes],
+        answers: dict[bytes, Answer],
+    ) -> None:
+        """Bring what only some hold to a majority, before anybody is told of it: who reads next shall see no less."""
+        has: dict[Slot, set[bytes]] = {slot: set() for slot in newest}
+        for node_id, answer in answers.items():
+            for record in answer.records:
+                if newest[record.slot] == record:
+                    has[record.slot].add(node_id)
+        for slot, record in newest.items():
+            if record.lifetime == "leased" or len(has[slot] & voters) > len(voters) // 2:
+                continue  # nobody stores a lease but its owner, whose beat mends it
+            holding = has[slot]
+
+            async def mend(contact: Contact, record: Record = record, holding: set[bytes] = holding) -> None:
+                await self._owner.store_at(contact, record, self._owner.left(record))
+                holding.add(contact.node_id)  # it took it, or has a newer one
+
+            lacking = [mend(c) for c in targets if c.node_id not in holding]
+            await until(lambda _, holding=holding: len(holding & voters) > len(voters) // 2, lacking)  # type: ignore
+            if len(holding & voters) <= len(voters) // 2:
+                raise Unavailable(len(holding & voters), len(voters) // 2 + 1)
+
+    async def _asked(
+        self,
+        key: bytes,
+        targets: list[Contact],
+        voters: frozenset[bytes],
+        is_enough: Callable[[dict[bytes, Answer]], bool],
+        width: int,
+    ) -> dict[bytes, Answer]:
+        """The answers of ``targets``, ``width`` of them asked at once and one more beside each that is slow."""
+        answers: dict[bytes, Answer] = {}
+        own_id = self._overlay.own_id
+        if any(c.node_id == own_id for c in targets):
+            answers[own_id] = Answer(self._replica.held(key), SURE if self._replica.is_sure() else UNSURE, [])
+            width -= 1
+        waiting = self._overlay.quickest(c for c in targets if c.node_id != own_id)
+        done: Deferred[None] = Deferred()
+        under_way = 0
+
+        def settle() -> None:
+            if not done.called and (is_enough(answers) or not (waiting or under_way)):
+                done.callback(None)
+
+        def next_one() -> None:
+            if waiting and not done.called:
+                self._chores.fork(ask(waiting.pop(0)))
+
+        def hedge(contact: Contact) -> None:
+            self._overlay.slow(contact)
+            next_one()
+
+        async def ask(contact: Contact) -> None:
+            nonlocal under_way
+            under_way += 1
+            in_time = self._chores.later(self._overlay.hedge(contact), hedge, contact)
+            more = 1
+            try:
+                answer = answers[contact.node_id] = await self.pages(contact, key)
+                if answer.worth == SURE and contact.node_id in voters:
+                    more = 2 if at_first == 1 else 0
+            except EntangledError:
+                pass
+            in_time()
+            under_way -= 1
+            settle()
+            # One at first is to find something; where it finds nothing, a majority is asked, in two or three waves.
+            for _ in range(more if under_way else max(more, 1)):
+                next_one()
+
+        settle()
+        at_first = max(width, 1)
+        for _ in range(at_first):
+            next_one()
+        settle()
+        await done
+        return dict(answers)
+
+    async def _walk(self, key: bytes) -> list[Record]:
+        """FIND_VALUE in a large network: ask nearer and nearer nodes until one has it (Kademlia, section 2.3).
+
+        The nearest node that did not have it gets a copy, which lives the shorter the more nodes are nearer.
+        """
+        lookup = Lookup(key, K, ALPHA, self._overlay.nearest(key), exclude=self._overlay.own_id)
+        found: list[Record] = []
+        answers: dict[bytes, Answer] = {}
+
+        async def visit(contact: Contact) -> None:
+            answer = await self.pages(contact, key, wants_sure=False)
+            if answer.records:
+                found[:] = found or answer.records
+            else:
+                answers[contact.node_id] = answer
+            lookup.answered(contact, answer.nearer)
+
+        await self._overlay.walk(lookup, visit, lambda: bool(found))
+        nearest = lookup.closest()
+        if not found:
+            voters = frozenset(contact.node_id for contact in nearest)
+            self._overlay.note_found(key, nearest)
+            return self._nothing(answers, voters)
+        without = [contact for contact in nearest if contact.node_id in answers]
+        if without and all(record.lifetime == "team" for record in found):
+            between = nearest.index(without[0])
+            packed = [record.packed() for record in found]
+            copy = self._overlay.ask(without[0], "cache", key, packed, MAX_AGE / 2**between, changes=True)
+            self._chores.fork(copy)
+        return found
+
+
+def newest_of(opinions: Iterable[list[Record]]) -> dict[Slot, Record]:
+    """Of each slot the record that beats the others."""
+    newest: dict[Slot, Record] = {}
+    for records in opinions:
+        for record in records:
+            if record.beats(newest.get(record.slot)):
+                newest[record.slot] = record
+    return newest
+
+
+def _votes(answers: dict[bytes, Answer], voters: frozenset[bytes]) -> int:
+    return sum(1 for node_id, answer in answers.items() if answer.worth == SURE and node_id in voters)
+
+
+def _is_clear(answers: dict[bytes, Answer], voters: frozenset[bytes]) -> bool:
+    return any(answer.records for answer in answers.values()) or _votes(answers, voters) > len(voters) // 2

@@ -1,0 +1,172 @@
+"""Schedule: one random run of a fleet under loss, partitions, kills and restarts, with workloads that watch it.
+
+Everything follows from the seed.  After the faults everything heals, those that are to come back come back, and when
+the repair interval is over the workloads give their verdicts.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from middleware.entangled.network.network import Address
+from middleware.entangled.network.switchboard import CALM, Weather
+from middleware.entangled.node import EntangledNode
+from tests.fleet import Fleet
+
+STEP = 0.5
+SETTLE = 45.0
+"""Seconds after which a healed team is as it should be: tries, three rounds of mending, and a struck member."""
+
+
+class Workload(Protocol):
+    """What clients do beside the faults, and what must hold of it."""
+
+    def step(self) -> None:
+        """Do something, every ``STEP`` seconds while the faults last."""
+
+    def settled(self) -> None:
+        """The faults are over and the repair interval has passed: ask what is to be asked; 10 s are left for it."""
+
+    def verdict(self) -> list[str]:
+        """Every violation so far, a line each."""
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Something that happens at ``at`` and ends at ``until``, in seconds of the schedule."""
+
+    at: float
+    until: float
+    kind: str
+    places: tuple[int, ...]
+
+    def __str__(self) -> str:
+        return f"{self.at:.0f}-{self.until:.0f} {self.kind} {','.join(map(str, self.places))}"
+
+
+class Schedule:
+    """The run of ``seed``: a fleet, its weather and its faults.
+
+    ``workloads`` are made with the schedule when the fleet stands.  ``rng`` is for workloads.
+    """
+
+    def __init__(self, seed: int) -> None:
+        self.seed = seed
+        self.rng = random.Random(f"invariants/{seed}")
+        dice = random.Random(f"faults/{seed}")
+        self.n = dice.choice([3, 4, 5, 5, 6, 7, 9, 10, 11])
+        self.seconds = dice.choice([20.0, 30.0, 45.0])
+        self.fleet = Fleet(self.n, seed, Weather(delay_s=0.002))
+        self.liar: int | None = dice.randrange(self.n) if dice.random() < 0.2 else None
+        self.weather = Weather(
+            delay_s=dice.choice([0.001, 0.01, 0.05]),
+            jitter_s=dice.choice([0.0, 0.01]),
+            loss=dice.choice([0.0, 0.0, 0.05, 0.2]),
+            duplicate=dice.choice([0.0, 0.1]),
+            reorder=dice.choice([0.0, 0.2]),
+        )
+        self.faults = self._faults(dice)
+        self.down: set[int] = set()
+        self.dead: set[int] = set()
+
+    @property
+    def line(self) -> str:
+        """The command that replays this run."""
+        return f"python -m tests.invariants --schedules 1 --seed {self.seed}"
+
+    def alive(self) -> list[int]:
+        """The places whose nodes run."""
+        return [place for place in range(self.n) if place not in self.down and place not in self.dead]
+
+    def node(self, place: int) -> EntangledNode:
+        """The node of a place, in its present life."""
+        return self.fleet.nodes[place]
+
+    def addresses(self, places: Sequence[int]) -> list[Address]:
+        """Where those places listen."""
+        return [self.fleet.address(place) for place in places]
+
+    def run(self, workloads: Sequence[Workload]) -> list[str]:
+        """Run everything; the violations, a line each."""
+        fleet = self.fleet
+        fleet.run(2.0)
+        fleet.board.weather = self.weather
+        ahead = sorted(
+            [(fault.at, 0, number) for number, fault in enumerate(self.faults)]
+            + [(fault.until, 1, number) for number, fault in enumerate(self.faults)]
+        )
+        now = 0.0
+        while now < self.seconds:
+            while ahead and ahead[0][0] <= now:
+                _, is_end, number = ahead.pop(0)
+                (self._end if is_end else self._begin)(self.faults[number])
+            for workload in workloads:
+                workload.step()
+            fleet.run(STEP)
+            now += STEP
+        fleet.board.heal()
+        fleet.board.weather = CALM
+        for place in sorted(self.down):
+            self.restart(place)
+        fleet.run(SETTLE)
+        for workload in workloads:
+            workload.settled()
+        fleet.run(10.0)
+        found = [line for workload in workloads for line in workload.verdict()]
+        fleet.stop()
+        return found
+
+    def restart(self, place: int) -> None:
+        """Let the node of a place live again, on the store of its former life."""
+        self.down.discard(place)
+        others = self.alive()
+        known = self.rng.sample(others, min(2, len(others)))
+        self.fleet.restart(place, [other for other in known if other != place])
+
+    # -- inside -----------------------------------------------------------------------------------------------------
+
+    def _faults(self, dice: random.Random) -> list[Fault]:
+        places, faults = list(range(self.n)), []
+        # As many may die for good as a majority can do without, one quorum of the smallest record kept.
+        mortal = dice.sample(places, max(0, (min(self.n, 8) - 1) // 2))
+        for _ in range(dice.randrange(1, 6)):
+            at = dice.uniform(0.0, self.seconds * 0.8)
+            until = at + dice.choice([0.5, 2.0, 8.0, 20.0])
+            kind = dice.choice(["cut", "cut", "one way", "kill", "kill", "kill all", "die"])
+            if kind == "cut":
+                chosen = dice.sample(places, dice.randrange(1, self.n))
+            elif kind == "one way":
+                chosen = dice.sample(places, 2)
+            elif kind == "kill":
+                chosen = dice.sample(places, dice.randrange(1, 1 + self.n // 2))
+            elif kind == "kill all":
+                chosen = places if dice.random() < 0.3 else places[:1]
+            else:
+                chosen = [mortal.pop()] if mortal and dice.random() < 0.5 else []
+            faults.append(Fault(at, until, kind, tuple(chosen)))
+        return faults
+
+    def _begin(self, fault: Fault) -> None:
+        board = self.fleet.board
+        if fault.kind == "cut":
+            board.partition(self.addresses(fault.places))
+        elif fault.kind == "one way":
+            source, target = self.addresses(fault.places)
+            board.cut(source, target, one_way=True)
+        else:
+            for place in fault.places:
+                if place in self.down or place in self.dead:
+                    continue
+                (self.dead if fault.kind == "die" else self.down).add(place)
+                self.node(place).vanish()
+
+    def _end(self, fault: Fault) -> None:
+        if fault.kind in ("cut", "one way"):
+            self.fleet.board.heal()
+        elif fault.kind != "die":
+            for place in fault.places:
+                if place in self.down:
+                    self.restart(place)
