@@ -168,6 +168,18 @@ class ParcelTests(ParcelCase):
         self.assertEqual(dict(self.a._courier._bytes_out), {})
         self.assertEqual(self.got(self.a.ask(self.to_b, "size", LARGE, changes=True), 9), MIB)
 
+    def test_parcels_side_by_side(self) -> None:
+        """Several parcels to one peer take turns, and on a calm path none is sent twice, even with no delay at all."""
+        for delay in (DELAY, 0.0):
+            self.board.weather = Weather(delay)
+            self.got(self.a.ask(self.to_b, "echo", 1))
+            self.taps[self.to_b.address].kept.clear()
+            asked = [self.a.ask(self.to_b, "size", LARGE[: 300_000 + n], changes=True) for n in range(3)]
+            self.clock.advance(5)
+            self.assertEqual([self.successResultOf(one) for one in asked], [300_000, 300_001, 300_002])
+            parts = [d for d, _ in self.taps[self.to_b.address].kept if len(d) == 1400]
+            self.assertLessEqual(len(parts), 3 * part_count(300_060) + 3, delay)
+
     def test_round_trips_without_loss(self) -> None:
         """On a calm path no part is sent twice."""
         self.assertEqual(self.got(self.a.ask(self.to_b, "size", LARGE, changes=True), 9), MIB)

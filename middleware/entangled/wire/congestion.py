@@ -8,6 +8,7 @@ FIRST_GUESS = 0.1
 SHORTEST = 0.05
 # On an even path the deviation goes to zero; without this the time-out would come together with the answer.
 GRAIN = 0.01
+LATE = 0.002
 LONGEST = 1.0
 BACK_OFF = 1.5
 FIRST_WINDOW = 10.0  # RFC 6928
@@ -49,7 +50,7 @@ class RoundTrip:
         """Within how many seconds nearly every answer comes; the first wait where nothing was measured yet."""
         if not self.is_measured:
             return self.wait
-        return max(self._smoothed * 9 / 8, self._smoothed + 4 * self._deviation)
+        return max(self._smoothed * 9 / 8, self._smoothed + max(LATE, 4 * self._deviation))
 
     def ambiguous(self) -> None:
         """Learn from an answer to one of several tries: the wait was perhaps too short."""

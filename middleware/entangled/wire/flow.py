@@ -46,6 +46,7 @@ class Parcel:
         "room",
         "orders",
         "repeated",
+        "_sent",
         "_next",
         "_again",
         "_head",
@@ -60,6 +61,7 @@ class Parcel:
         self.progress_at = now
         self.orders: dict[int, int] = {}  # of the parts under way: the place in the order of sending
         self.repeated = 0  # bit n: part n was sent more than once, so that its receipt measures nothing (Karn)
+        self._sent = 0
         self._next = 0
         self._again: deque[int] = deque()
         self._head = key.id.to_bytes(8, "little") + len(data).to_bytes(4, "little")
@@ -99,6 +101,11 @@ class Parcel:
         self.here, self._next, self.room = 0, 0, MAX_PARTS
         self._again.clear()
         self.orders.clear()
+
+    def is_turn(self) -> bool:
+        """Whether the part that goes out now asks for a receipt: every fourth one does."""
+        self._sent += 1
+        return self._sent % RECEIPT_EVERY == 0
 
     def part(self, number: int, is_wanted: bool) -> bytes:
         """The PART with that number."""
@@ -227,9 +234,10 @@ class Flow:
                 break
             self._enter(parcel, number, now)
             picked.append((parcel, number))
-        last = len(picked) - 1
+        # Each parcel asks for its own receipts: one for the last part of every parcel in the burst, some in between.
+        last = {parcel.key: place for place, (parcel, _) in enumerate(picked)}
         for place, (parcel, number) in enumerate(picked):
-            self._send(parcel.part(number, place == last or place % RECEIPT_EVERY == RECEIPT_EVERY - 1))
+            self._send(parcel.part(number, parcel.is_turn() or place == last[parcel.key]))
         self._arm(now)
 
     def _pick(self) -> tuple[Parcel | None, int]:
