@@ -20,6 +20,9 @@ import time
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import cast
+
+from twisted.internet.interfaces import IReactorFromThreads
 
 from middleware.entangled.record import MAX_VALUE, Record, hashed_key
 from middleware.entangled.sqlite import SqliteStore
@@ -254,7 +257,7 @@ class Rate:
 async def _rates(folder: str, outcome: list[bool]) -> None:
     from twisted.internet import reactor
 
-    deliver = reactor.callFromThread
+    deliver = cast(IReactorFromThreads, reactor).callFromThread
     _say(f"disk: {_sync_s(folder) * 1000:.2f} ms for a write and fsync of 4 KiB (median of 100)")
     _say(
         f"{'value':>9} {'in flight':>10} {'puts/s':>8} {'safe after p50':>15} {'p99 ms':>8} {'max ms':>8}"

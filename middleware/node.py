@@ -252,7 +252,7 @@ class SwarmNode(Service):
     # -- inside -----------------------------------------------------------------------------------------------------
 
     def _announce(self, value: bytes) -> None:
-        def put() -> Deferred[int]:
+        def put() -> Deferred[Stored]:
             return self.entangled.put(DEVICES, self.presence.device.name, bounded(value), "leased")
 
         self._quietly(maybeDeferred(put))

@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable
 from functools import wraps
 
+from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorTime
 
 from middleware.entangled.background import Background

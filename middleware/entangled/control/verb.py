@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast, get_args
 
 from twisted.internet.defer import Deferred, maybeDeferred
 from twisted.internet.interfaces import IReactorTime
@@ -15,7 +15,9 @@ from middleware.entangled.errors import LocalError
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address
 from middleware.entangled.node import EntangledNode
-from middleware.entangled.record import KEY_BYTES, Record, hashed_key
+from middleware.entangled.owner import Concern, Stored
+from middleware.entangled.reader import ReadConcern
+from middleware.entangled.record import KEY_BYTES, Lifetime, Record, hashed_key
 from middleware.entangled.space.keyword import Keywords, Match
 from middleware.entangled.space.template import ANY, Field, where
 from middleware.entangled.space.tuplespace import TupleSpace
@@ -80,19 +82,19 @@ class Verbs:
     # -- dht --------------------------------------------------------------------------------------------------------
 
     def _dht_get(self, a: Arguments, tell: Tell) -> object:
-        concern = a.choice("concern", "majority", ("fast", "majority"))
-        return self.node.get(key_of(a.text("key")), concern).addCallback(_records)  # type: ignore[arg-type]
+        concern = cast(ReadConcern, a.choice("concern", "majority", get_args(ReadConcern)))
+        return self.node.get(key_of(a.text("key")), concern).addCallback(_records)
 
     def _dht_put(self, a: Arguments, tell: Tell) -> object:
-        lifetime = a.choice("lifetime", "team", ("team", "leased"))
-        concern = a.choice("concern", "majority", ("one", "majority", "all"))
+        lifetime = cast(Lifetime, a.choice("lifetime", "team", get_args(Lifetime)))
+        concern = cast(Concern, a.choice("concern", "majority", get_args(Concern)))
         key, name, value = key_of(a.text("key")), a.text("name", ""), a.data("value")
-        put = self.node.put(key, name, value, lifetime, concern, a.whole("expect"))  # type: ignore[arg-type]
-        return put.addCallback(lambda replicas: {"replicas": replicas})
+        put = self.node.put(key, name, value, lifetime, concern, a.whole("expect"))
+        return put.addCallback(_stored)
 
     def _dht_remove(self, a: Arguments, tell: Tell) -> object:
         removed = self.node.remove(key_of(a.text("key")), a.text("name", ""))
-        return removed.addCallback(lambda replicas: {"replicas": replicas})
+        return removed.addCallback(_stored)
 
     def _dht_find(self, a: Arguments, tell: Tell) -> object:
         found = self.node.find_node(key_of(a.text("key")))
@@ -240,6 +242,10 @@ def _field(given: Any) -> Field:
         return word.value(given)  # type: ignore[no-any-return]
     except (word.BadWord, TypeError) as error:
         raise BadRequest(f"template: {error}") from error
+
+
+def _stored(stored: Stored) -> dict[str, int]:
+    return {"replicas": int(stored), "sequence": stored.sequence}
 
 
 def _records(records: Sequence[Record]) -> list[dict[str, Any]]:

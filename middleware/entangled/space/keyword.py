@@ -16,6 +16,7 @@ from twisted.internet.defer import Deferred
 from middleware.entangled.background import first
 from middleware.entangled.errors import LocalError, NoAnswer, TooLarge
 from middleware.entangled.node import EntangledNode
+from middleware.entangled.owner import Stored
 from middleware.entangled.record import MAX_NAME, MAX_VALUE, Record, hashed_key
 from middleware.entangled.watch import Watch
 
@@ -108,11 +109,11 @@ def _checked(text: str) -> list[str]:
     return found
 
 
-async def _all(name: str, work: list[Deferred[int]]) -> None:
+async def _all(name: str, work: list[Deferred[Stored]]) -> None:
     done = await first(len(work), [_awaited(one) for one in work])
     if len(done) < len(work):
         raise NoAnswer(f"{name}: the index of {len(work) - len(done)} of its {len(work)} words did not answer")
 
 
-async def _awaited(work: Deferred[int]) -> int:
+async def _awaited(work: Deferred[Stored]) -> int:
     return await work

@@ -13,7 +13,7 @@ from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorTime
 
 from middleware.entangled.background import Background, first
-from middleware.entangled.errors import Alone, EntangledError, NoAnswer
+from middleware.entangled.errors import EntangledError, NoAnswer
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.distance import closest
 from middleware.entangled.node import EntangledNode
@@ -88,7 +88,7 @@ class Taker:
             asked, left = left[: self._size - len(members)], left[self._size - len(members) :]
             members += [m for m in await first(len(asked), [self._enrol(c) for c in asked]) if m is not None]
         if not members:
-            raise Alone("no node agrees to be in the council of a tuple")
+            raise NoAnswer("no node agrees to be in the council of a tuple")
         self._members[key] = (self._clock.seconds() + ENROLLED, members)
         return members
 
