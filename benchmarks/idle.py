@@ -1,8 +1,7 @@
 """What a team costs that does nothing, and what a read and a write cost, in datagrams, bytes and time of a core.
 
-Everything runs in virtual time over a switchboard in one process, so the figures are the same on every machine; only the
-share of a core is measured, and that includes what the simulation itself takes.
-"""
+Everything runs in virtual time over a switchboard in one process: the figures are the same on every machine but for
+the share of a core, which includes what the simulation itself takes.
 
 from __future__ import annotations
 
@@ -96,7 +95,9 @@ def main() -> int:
     team = Team(arguments.nodes, 1)
     team.clock.advance(30.0)
     datagrams, octets, core = team.spent(arguments.seconds)
-    print(f"idle, {arguments.nodes} nodes: {datagrams:.1f} datagrams/s, {octets:.0f} bytes/s, {core:.3%} of a core each")
+    print(
+        f"idle, {arguments.nodes} nodes: {datagrams:.1f} datagrams/s, {octets:.0f} bytes/s, {core:.3%} of a core each"
+    )
     numbers = iter(range(10**6))
     puts = team.cost(lambda node: node.put(hashed_key(f"k{next(numbers)}"), "v", b"x" * 100), 200)
     report("put", puts)
