@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import random
 from collections.abc import Coroutine, Sequence
-from typing import Any
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import msgpack
 from twisted.internet.defer import Deferred
@@ -24,14 +25,18 @@ from middleware.entangled.overlay import Overlay
 from middleware.entangled.owner import Owner
 from middleware.entangled.record import KEY_BYTES, MAX_NAME, MAX_VALUE, Lifetime, Record
 from middleware.entangled.replica import Replica
-from middleware.entangled.space.seat import Seat
 from middleware.entangled.store import Store
 from middleware.entangled.subscriber import Subscriber
 from middleware.entangled.watch import Changed, Watch
 from middleware.entangled.wire.endpoint import Endpoint
 
+if TYPE_CHECKING:
+    from middleware.entangled.space.seat import Seat
+
 NOTE = 30.0
 CONTACTS = "contacts"
+SEATED = "decree/incarnation"
+"""The note of a node that was in a council in an earlier life, and is asked about it in this one."""
 MAX_NOTED = 64
 
 
@@ -64,7 +69,8 @@ class EntangledNode:
         self._owner = Owner(identity, lease, store, self.replica, self.overlay, self.endpoint, clock, chores)
         self._handover = Handover(own_id, store, self.replica, self.overlay, self._owner, chores)
         self._subscriber = Subscriber(own_id, self.replica, self.overlay, self.endpoint, clock, chores)
-        self.seat = Seat(self.endpoint, store, clock, rng)
+        self._made_of = (clock, rng)
+        self.endpoint.expose("decree.enrol", self._answer_enrol)
         self.overlay.on_newcomer = self._welcome
         self.overlay.on_lost = self._lost
         self.replica.on_record = self._subscriber.held_here
@@ -73,6 +79,14 @@ class EntangledNode:
         self.replica.on_peer = self.overlay.heard
         self.replica.on_goodbye = self.overlay.left
         self._running = False
+
+    @cached_property
+    def seat(self) -> Seat:
+        """This node's seat in the councils of tuple spaces."""
+        # Imported by the first who calls it to one: a node that is in none is spared half a MiB.
+        from middleware.entangled.space.seat import Seat
+
+        return Seat(self.endpoint, self.store, *self._made_of)
 
     # -- life -------------------------------------------------------------------------------------------------------
 
@@ -85,6 +99,8 @@ class EntangledNode:
         """Open the port and begin to keep leases, watches and contacts fresh; raises ``PortInUse``."""
         self.endpoint.start()
         self._running = True
+        if self.store.noted(SEATED) is not None:
+            self.seat.sit()
         for part in (self.overlay, self.replica, self._owner, self._handover, self._subscriber):
             part.start()
         self._chores.every(NOTE, self._note_contacts)
@@ -168,6 +184,9 @@ class EntangledNode:
         await self.overlay.join(known, [c.address for c in self._noted_contacts()])
         if self._running:
             self._note_contacts()
+
+    def _answer_enrol(self, peer: Contact) -> bytes:
+        return self.seat.answer_enrol(peer)
 
     def _welcome(self, contact: Contact) -> None:
         for part in (self._owner, self._handover, self._subscriber):
