@@ -2,6 +2,7 @@
 
 Everything runs in virtual time over a switchboard in one process: the figures are the same on every machine but for
 the share of a core, which includes what the simulation itself takes.
+"""
 
 from __future__ import annotations
 

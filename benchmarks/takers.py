@@ -296,7 +296,7 @@ class Trial:
         gone = {posted.fields for place, posted in self.witness.posted.items() if self.witness.takers(place)}
         lost = [f"{fields} was never taken" for fields in self.acknowledged if fields not in gone]
         left = [posted for posted in self.witness.open() if self.stands(posted)]
-        return lost + [f"{posted.fields} stands and cannot be taken" for posted in left if posted.fields in gone]
+        return lost + [f"{posted.fields} stands and was not taken" for posted in left]
 
     def stands(self, posted: Posted) -> bool:
         """Whether a living node still keeps this tuple; one that was never acknowledged may vanish with its nodes."""

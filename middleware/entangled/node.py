@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable, Coroutine, Sequence
-from typing import Any
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import msgpack
 from twisted.internet.defer import Deferred, fail
@@ -27,16 +28,20 @@ from middleware.entangled.owner import Concern, Owner, Stored
 from middleware.entangled.reader import ReadConcern, Reader
 from middleware.entangled.record import KEY_BYTES, MAX_NAME, MAX_VALUE, TOLERATED_ABSENCE, Lifetime, Record
 from middleware.entangled.replica import Replica
-from middleware.entangled.space.seat import Seat
 from middleware.entangled.store import Store
 from middleware.entangled.subscriber import Subscriber
 from middleware.entangled.watch import Changed, Watch
 from middleware.entangled.wire.endpoint import Endpoint
 
+if TYPE_CHECKING:
+    from middleware.entangled.space.seat import Seat
+
 NOTE = 30.0
 """Seconds between two notes of the time; whoever comes or goes is noted at once."""
 CONTACTS = "contacts"
 LAST_SEEN = "last seen"
+SEATED = "decree/incarnation"
+"""The note of a node that was in a council in an earlier life, and is asked about it in this one."""
 MAX_NOTED = 64
 
 
@@ -80,7 +85,8 @@ class EntangledNode:
         )
         self.replica.is_sure = self._handover.is_sure
         self.replica.nearest = self.overlay.nearest
-        self.seat = Seat(self.endpoint, store, clock, rng)
+        self._made_of = (clock, rng)
+        self.endpoint.expose("decree.enrol", self._answer_enrol)
         self.overlay.on_newcomer = self._welcome
         self.overlay.on_lost = self._lost
         self.replica.on_record = self._held_here
@@ -89,6 +95,14 @@ class EntangledNode:
         self.replica.on_peer = self.overlay.heard
         self.replica.on_goodbye = self.overlay.left
         self._running = False
+
+    @cached_property
+    def seat(self) -> Seat:
+        """This node's seat in the councils of tuple spaces."""
+        # Imported by the first who calls it to one: a node that is in none is spared half a MiB.
+        from middleware.entangled.space.seat import Seat
+
+        return Seat(self.endpoint, self.store, *self._made_of)
 
     # -- life -------------------------------------------------------------------------------------------------------
 
@@ -102,6 +116,8 @@ class EntangledNode:
         self.endpoint.start()
         self._running = True
         self._forget_after_long_absence()
+        if self.store.noted(SEATED) is not None:
+            self.seat.sit()
         for part in (self._membership, self.replica, self._owner, self._handover, self._subscriber):
             part.start()
         self._chores.every(NOTE, self._note_contacts)
@@ -231,6 +247,8 @@ class EntangledNode:
             self._log.warn("away for {days:.0f} days: what was held is forgotten", days=away / 86400)
             for record in self.store.records():
                 self.store.discard(record.slot)
+    def _answer_enrol(self, peer: Contact) -> bytes:
+        return self.seat.answer_enrol(peer)
 
     def _welcome(self, contact: Contact) -> None:
         self._note_contacts()

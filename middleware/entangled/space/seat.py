@@ -73,9 +73,13 @@ class Seat:
     @property
     def incarnation(self) -> bytes:
         """In which life this node is; another one means that it has lost its votes."""
+        self.sit()
+        return self._life
+
+    def sit(self) -> None:
+        """Take up the votes of an earlier life, or begin a new one."""
         if not self._life:
             self._load()
-        return self._life
 
     def vote(self, place: Place) -> Vote | None:
         """How this node has voted about the tuple of ``place``, if it has."""
@@ -86,8 +90,6 @@ class Seat:
 
         Each is named again after ``UNSETTLED`` seconds, until ``settle`` is called.
         """
-        if not self._life and self._store.noted(_INCARNATION) is not None:
-            self._load()
         now = self._clock.seconds()
         late = [place for place, since in self._unsettled.items() if since + UNSETTLED <= now]
         found = []

@@ -33,6 +33,7 @@ class Shelf:
         self._reader = Reader()
         self._watch: Watch | None = None
         self._waiting = 0
+        self._is_visited = False
         self._sleepers: dict[Deferred[None], None] = {}
         self._stop_polling: Callable[[], None] = lambda: None
         self._stop_lingering: Callable[[], None] = lambda: None
@@ -59,6 +60,15 @@ class Shelf:
             self._stop_polling()
             self._stop_lingering = self._chores.later(LINGER, self.close)
 
+    def visit(self) -> None:
+        """Look in: for who comes again soon the shelf is kept up to date, which spares reading it each time."""
+        if self._is_visited:
+            self.enter()
+            self.leave()
+        else:
+            self._is_visited = True
+            self._chores.later(LINGER, self._forget_visit)
+
     def close(self) -> None:
         """End the watch; the next who enters starts it again."""
         if self._watch is not None:
@@ -77,6 +87,9 @@ class Shelf:
         """Rouse everybody who sleeps."""
         for woken in list(self._sleepers):
             self._rouse(woken)
+
+    def _forget_visit(self) -> None:
+        self._is_visited = False
 
     def _rouse(self, woken: Deferred[None]) -> None:
         if woken in self._sleepers:

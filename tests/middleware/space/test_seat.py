@@ -193,7 +193,7 @@ class SeatTests(SynchronousTestCase):
         self.clock.advance(4.0)
         self.assertEqual([posted.place for posted in self.seat.unsettled()], [place(1)])
         self.seat = self.made(2)
-        self.seat.unsettled()
+        self.seat.sit()
         self.clock.advance(4.0)
         self.assertIn(place(1), [posted.place for posted in self.seat.unsettled()])
 
