@@ -1,7 +1,7 @@
 """What a team costs that does nothing, and what a read and a write cost, in datagrams, bytes and time of a core.
 
-Everything runs in virtual time over a switchboard in one process: the figures are the same on every machine but for
-the share of a core, which includes what the simulation itself takes.
+Everything runs in virtual time over a switchboard in one process, so the figures are the same on every machine; only
+the share of a core is measured, and that includes what the simulation itself takes.
 """
 
 from __future__ import annotations
@@ -71,13 +71,12 @@ class Team:
 
     def cost(self, work: Callable[[EntangledNode], Deferred[Any]], times: int) -> tuple[float, list[float], int]:
         """Datagrams for one of ``times`` operations at random nodes, how long each took, and how many failed."""
-        before, failed = Meter.datagrams, 0
-        took: list[float] = []
+        before, took, failed = Meter.datagrams, [], 0
         for _ in range(times):
-            began = self.clock.seconds()
-            ended: list[Any] = []
+            began, ended = self.clock.seconds(), []
             done = work(self.rng.choice([node for node in self.nodes if node._running]))
-            done.addErrback(lambda failure: failure.trap(EntangledError)).addCallback(ended.append)
+            done.addErrback(lambda failure: failure.trap(EntangledError))
+            done.addCallback(ended.append)
             while not ended:
                 self.clock.advance(0.0001)
             took.append(self.clock.seconds() - began)
@@ -96,14 +95,13 @@ def main() -> int:
     team = Team(arguments.nodes, 1)
     team.clock.advance(30.0)
     datagrams, octets, core = team.spent(arguments.seconds)
-    print(
-        f"idle, {arguments.nodes} nodes: {datagrams:.1f} datagrams/s, {octets:.0f} bytes/s, {core:.3%} of a core each"
-    )
+    idle = f"{datagrams:.1f} datagrams/s, {octets:.0f} bytes/s, {core:.3%} of a core each"
+    say(f"idle, {arguments.nodes} nodes: {idle}")
     numbers = iter(range(10**6))
     puts = team.cost(lambda node: node.put(hashed_key(f"k{next(numbers)}"), "v", b"x" * 100), 200)
     report("put", puts)
     for concern in ("fast", "majority"):
-        report(f"get {concern}", team.cost(lambda node, c=concern: node.get(some(team.rng), c), 200))  # type: ignore
+        report(f"get {concern}", team.cost(lambda node, c=concern: node.get(some(team.rng), c), 200))
     if arguments.loss:
         for node in team.rng.sample(team.nodes, len(team.nodes) // 2):
             node.vanish()
@@ -116,11 +114,16 @@ def some(rng: random.Random) -> bytes:
     return hashed_key(f"k{rng.randrange(200)}")
 
 
+def say(line: str) -> None:
+    """Print a line."""
+    sys.stdout.write(line + "\n")
+
+
 def report(what: str, figures: tuple[float, list[float], int]) -> None:
     """Print one line."""
     datagrams, took, failed = figures
     p50, p95 = took[len(took) // 2], took[len(took) * 95 // 100]
-    print(
+    say(
         f"{what}: {datagrams:.1f} datagrams, p50 {p50 * 1000:.1f} ms, p95 {p95 * 1000:.1f} ms, "
         f"max {took[-1] * 1000:.1f} ms, {failed} of {len(took)} without a result"
     )

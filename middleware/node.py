@@ -67,7 +67,7 @@ class SwarmNode(Service):
         self.rng = rng
         self.wall = wall
         self.store = store
-        self.entangled = EntangledNode(identity, team_key, network, store, clock, rng, lease)
+        self.entangled = EntangledNode(identity, team_key, network, store, clock, rng, lease, wall)
         self.uuid = identity.node_id.hex()
         self._chores = Background(clock)
         self.presence = Presence(device, self._announce, self._chores.later)

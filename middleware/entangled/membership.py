@@ -34,6 +34,8 @@ MAX_FORMER = 32
 """Addresses of known nodes and lost contacts that are tried when nobody is left."""
 AGAIN = 4.0
 """Seconds before an absent member, or one that was only named, is tried again."""
+LARGE_FOR = 60.0
+"""Seconds for which one word that the network is too large to be known whole holds against those who do not see it."""
 PAGE = 20
 """Members in one message."""
 
@@ -55,6 +57,7 @@ class Membership:
         self._tried_at: dict[bytes, float] = {}
         self._listed_at: dict[bytes, float] = {}
         self._returning = False
+        self._large_until = float("-inf")
         endpoint.expose("ping", self._answer_ping, changes=True)
         endpoint.expose("members", self._answer_members)
 
@@ -131,8 +134,9 @@ class Membership:
         for _ in range(1 + MAX_MEMBERS // PAGE):
             answer = await self._overlay.ask(contact, "members", after)
             if answer is None:
+                self._large_until = self._clock.seconds() + LARGE_FOR
                 self._overlay.is_whole = False
-                return  # a network too large to be known whole
+                return
             found = contacts_of(answer)
             strangers += [c for c in found if self._is_worth_a_try(c)]
             if len(found) < PAGE:
@@ -140,7 +144,7 @@ class Membership:
             after = found[-1].node_id
         pings = [Deferred.fromCoroutine(self._ping(stranger)) for stranger in strangers]
         await DeferredList(pings, consumeErrors=True)
-        self._overlay.is_whole = True
+        self._overlay.is_whole = self._clock.seconds() > self._large_until
 
     def _is_worth_a_try(self, contact: Contact) -> bool:
         if contact.node_id == self._overlay.own_id or self._overlay.roster.get(contact.node_id) is not None:

@@ -12,12 +12,12 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import msgpack
-from twisted.internet.defer import Deferred, fail
+from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorTime
 from twisted.logger import Logger
 
 from middleware.entangled.background import Background
-from middleware.entangled.errors import Conflict, NotRunning, TooLarge
+from middleware.entangled.errors import NotRunning, TooLarge
 from middleware.entangled.handover import Handover
 from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact, unpacked
@@ -26,7 +26,7 @@ from middleware.entangled.network.network import Address, Network
 from middleware.entangled.overlay import Overlay
 from middleware.entangled.owner import Concern, Owner, Stored
 from middleware.entangled.reader import ReadConcern, Reader
-from middleware.entangled.record import KEY_BYTES, MAX_NAME, MAX_VALUE, TOLERATED_ABSENCE, Lifetime, Record
+from middleware.entangled.record import KEY_BYTES, MAX_NAME, MAX_VALUE, TOLERATED_ABSENCE, Lifetime, Record, Slot
 from middleware.entangled.replica import Replica
 from middleware.entangled.store import Store
 from middleware.entangled.subscriber import Subscriber
@@ -221,11 +221,17 @@ class EntangledNode:
         self._check(key)
         if len(name.encode()) > MAX_NAME:
             raise TooLarge(f"name of {len(name.encode())} bytes; a record's name has at most {MAX_NAME}")
-        try:
-            record = self._owner.next(key, name, value, lifetime, expect)
-        except Conflict as conflict:
-            return fail(conflict)
-        return _run(self._owner.put(record, concern, expect))
+        if expect is not None:
+            return _run(self._compare_and_set(Slot(key, self.identity.public, name), value, lifetime, concern, expect))
+        return _run(self._owner.put(self._owner.next(key, name, value, lifetime), concern))
+
+    async def _compare_and_set(
+        self, slot: Slot, value: bytes | None, lifetime: Lifetime, concern: Concern, expect: int
+    ) -> Stored:
+        # Nobody but this node writes the slot, but an earlier life of it may have.
+        read = None if self._owner.owns(slot) else (await self._reader.newest(slot.key)).get(slot)
+        record = self._owner.next(slot.key, slot.name, value, lifetime, expect, read)
+        return await self._owner.put(record, concern)
 
     async def _join(self, known: Sequence[Address]) -> None:
         await self._membership.join(known, self._noted_contacts())

@@ -26,6 +26,8 @@ from middleware.entangled.wire.endpoint import Endpoint
 
 K = 8
 ALPHA = 3
+CHECK_GAP = 4.0
+"""Seconds before a stranger, or a contact at a new address, is asked again to prove itself."""
 MISS_GAP = 0.5
 """Seconds in which several unanswered questions are one miss: a burst of questions is no proof of death."""
 HEDGE = (0.002, 0.02, 0.15)
@@ -33,6 +35,10 @@ HEDGE = (0.002, 0.02, 0.15)
 and at most; between them, two round trips."""
 MAX_FOUND = 512
 """Keys whose closest nodes, as the last lookup found them, are remembered."""
+
+PLACING, PLACING_STEP = 15, 0.1
+NOBODY = b""
+"""Stands for members that must be there, though none is known yet."""
 
 OnContact = Callable[[Contact], None]
 
@@ -62,6 +68,7 @@ class Overlay:
         self._slow: set[bytes] = set()
         self._found: OrderedDict[bytes, list[Contact]] = OrderedDict()
         self._misses: dict[bytes, tuple[int, float]] = {}
+        self._checked_at: dict[bytes, float] = {}
         endpoint.on_contact = self.proved
         endpoint.expose("find_node", self._answer_find_node)
 
@@ -94,7 +101,14 @@ class Overlay:
         return any(c.node_id == contact.node_id for c in self.responsible(key))
 
     async def holders(self, key: bytes) -> list[Contact]:
-        """The k closest live nodes to ``key``, this one included; looked up where not all nodes are known."""
+        """The k closest live nodes to ``key``, this one included; looked up where not all nodes are known.
+
+        A node that is still joining waits a little, for it knows nobody to ask.
+        """
+        for _ in range(PLACING):
+            if self.is_whole or len(self.roster):
+                break
+            await self._chores.sleep(PLACING_STEP)
         if self.is_complete or len(self.table) < K:
             self._found.pop(key, None)
             return self.responsible(key)
@@ -112,11 +126,13 @@ class Overlay:
     def voters(self, key: bytes, targets: list[Contact]) -> list[bytes]:
         """The ids of the nodes among whom a majority for ``key`` is counted; ``targets`` are its holders.
 
-        In a team that is known whole the absent ones count too (see ``roster``); in a larger network, who was found.
+        In a team small enough for a roster the absent ones count too; in a larger network, who was found.
         """
-        if not self.is_complete or not self.roster.absent():
-            return [contact.node_id for contact in targets]
-        return self.roster.voters(key, K, self.me())
+        if not (self.is_whole or len(self.roster)):
+            # It has not found its team yet: whoever is alone by mistake shall not take itself for a majority.
+            return [self.own_id, NOBODY]
+        absent = [] if self.roster.is_full else self.roster.absent()
+        return [contact.node_id for contact in (_closest([*targets, *absent], key) if absent else targets)]
 
     async def lookup(self, target: bytes) -> list[Contact]:
         """The k live nodes closest to ``target``, this one not included (Kademlia, section 2.3)."""
@@ -222,8 +238,14 @@ class Overlay:
         known = self.roster.get(contact.node_id) or self.table.get(contact.node_id)
         if known == contact:
             self.proved(contact)
-        elif contact.node_id != self.own_id:
-            self._chores.fork(self.check(contact))
+            return
+        now = self._clock.seconds()
+        if contact.node_id == self.own_id or now - self._checked_at.get(contact.node_id, -CHECK_GAP) < CHECK_GAP:
+            return  # in a large network not everybody finds a place here: two such must not ping each other for ever
+        if len(self._checked_at) > MAX_FOUND:
+            self._checked_at.clear()
+        self._checked_at[contact.node_id] = now
+        self._chores.fork(self.check(contact))
 
     def left(self, contact: Contact) -> None:
         """``contact`` said goodbye."""

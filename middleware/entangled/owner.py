@@ -91,44 +91,46 @@ class Owner:
         """Whether this node looks after what is in ``slot``."""
         return slot in self._own
 
-    def next(self, key: bytes, name: str, value: bytes | None, lifetime: Lifetime, expect: int | None = None) -> Record:
+    def next(
+        self,
+        key: bytes,
+        name: str,
+        value: bytes | None,
+        lifetime: Lifetime,
+        expect: int | None = None,
+        read: Record | None = None,
+    ) -> Record:
         """The signed record that follows what the own slot (key, name) holds; from now on it is kept alive.
 
-        Raises ``Conflict`` where the slot is known to be past ``expect``.
+        Raises ``Conflict`` where the slot does not hold the sequence ``expect``; ``read`` is what others hold there.
         """
         slot = Slot(key, self._identity.public, name)
-        known = max((r.sequence for r in (self._own.get(slot), self._store.slot(slot)) if r is not None), default=0)
-        if expect is not None and known > expect:
+        held = (self._own.get(slot), self._store.slot(slot), read)
+        known = max((record.sequence for record in held if record is not None), default=0)
+        if expect is not None and known != expect:
             raise Conflict(expect, known)
         ttl = TOMBSTONE_TTL if value is None else self._lease if lifetime == "leased" else TEAM_TTL
-        sequence = self._next_sequence(max(known, expect or 0))
+        sequence = self._next_sequence(known)
         return self._take(Record(key, name, slot.owner, sequence, lifetime, ttl, value))
 
-    async def put(self, record: Record, concern: Concern = "majority", expect: int | None = None) -> Stored:
+    async def put(self, record: Record, concern: Concern = "majority") -> Stored:
         """Store ``record`` where it belongs, at as many replicas as ``concern`` wants.
 
-        A record of an earlier life of this node, which is still out there, is stepped over; with ``expect``, raises
-        ``Conflict`` where a replica holds a higher one.  Raises ``NotAcknowledged`` where too few replicas answer; the
-        record is kept and brought to them when they are back.
+        A record of an earlier life of this node, which is still out there, is stepped over.  Raises ``NotAcknowledged``
+        where too few replicas answer; the record is kept and brought to them when they are back.
         """
         for _ in range(STEPS):
-            held, newest = await self.store_everywhere(record, concern, expect)
+            held, newest = await self.store_everywhere(record, concern)
             if not newest:
                 return Stored.of(held, record.sequence)
             current = self._own.get(record.slot, record)
-            if expect is not None:
-                if current == record:
-                    self._let_go(record.slot)
-                raise Conflict(expect, newest)
             if current.sequence <= newest:
                 current = self._take(replace(current, sequence=self._next_sequence(newest)))
             # Where a newer value was put meanwhile, it is that one which is to hold.
             record = current
         raise NoAnswer(f"others hold a higher number in this slot, after {STEPS} steps")
 
-    async def store_everywhere(
-        self, record: Record, concern: Concern = "majority", expect: int | None = None
-    ) -> tuple[int, int]:
+    async def store_everywhere(self, record: Record, concern: Concern = "majority") -> tuple[int, int]:
         """Store at every holder: how many took it, and the highest sequence that stood against it (0: none).
 
         Raises ``NotAcknowledged`` where too few took it and nothing stood against it.
@@ -141,9 +143,9 @@ class Owner:
         verdicts: dict[bytes, int] = {}
 
         async def store(contact: Contact) -> None:
-            verdict = await self.store_at(contact, record, left, expect)
+            verdict = await self.store_at(contact, record, left)
             # A later record of this very life stands there: this one is not lost, it is history.
-            is_history = expect is None and self._first <= verdict <= self._last
+            is_history = self._first <= verdict <= self._last
             verdicts[contact.node_id] = 0 if is_history and record.owner == self._identity.public else verdict
             votes = sum(1 for node_id, verdict in verdicts.items() if verdict == 0 and node_id in voters)
             if len(verdicts) == len(targets) and votes > len(voters) // 2:
@@ -161,21 +163,17 @@ class Owner:
             raise NotAcknowledged(votes, needed)
         return sum(1 for verdict in answers.values() if verdict == 0), newest
 
-    async def store_at(
-        self, contact: Contact, record: Record, left: float | None = None, expect: int | None = None
-    ) -> int:
+    async def store_at(self, contact: Contact, record: Record, left: float | None = None) -> int:
         """Store at one replica: 0, or the sequence that holds there against ``record``.  Raises ``Refused``.
 
-        ``left`` are the seconds that it is to be kept, where it is not this node's own; ``expect`` is the highest
-        sequence that it may replace.
+        ``left`` are the seconds that it is to be kept, where it is not this node's own.
         """
         if contact.node_id == self._identity.node_id:
-            return self._replica.keep(record, left, expect)
-        lives = None if left is None else [left]
-        answer = await self._overlay.ask(contact, "store", [record.packed()], lives, expect, changes=True)
+            return self._replica.keep(record, left)
+        lives = () if left is None else ([left],)
+        answer = await self._overlay.ask(contact, "store", [record.packed()], *lives, changes=True)
         verdict = answer[0] if isinstance(answer, list) and len(answer) == 1 else None
-        least = record.sequence if expect is None else expect + 1
-        if type(verdict) is int and (verdict == 0 or least <= verdict < MAX_SEQUENCE):
+        if type(verdict) is int and (verdict == 0 or record.sequence <= verdict < MAX_SEQUENCE):
             return verdict
         raise Refused(f"{contact.address} does not take the record")
 

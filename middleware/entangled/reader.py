@@ -47,7 +47,7 @@ class Reader:
 
     async def read(self, key: bytes, concern: ReadConcern) -> list[Record]:
         """The records of ``key``, without tombstones, in the order of (owner, name); raises ``Unavailable``."""
-        records = await (self._sure(key) if concern == "majority" else self._fast(key))
+        records = list((await self.newest(key)).values()) if concern == "majority" else await self._fast(key)
         return sorted((r for r in records if not r.is_tombstone), key=lambda r: (r.owner, r.name))
 
     async def pages(self, contact: Contact, key: bytes, page: object = None, wants_sure: bool = True) -> Answer:
@@ -79,7 +79,7 @@ class Reader:
     async def _fast(self, key: bytes) -> list[Record]:
         here = self._replica.held(key)
         # What is left of a time when this node was among the closest may be old.
-        if here and self._replica.is_sure() and self._overlay.belongs(key, self._overlay.me()):
+        if _is_something(here) and self._replica.is_sure() and self._overlay.belongs(key, self._overlay.me()):
             return here
         if not self._overlay.is_complete and len(self._overlay.table) >= K:
             return await self._walk(key)
@@ -87,11 +87,12 @@ class Reader:
         voters = frozenset(self._overlay.voters(key, targets))
         answers = await self._asked(key, targets, voters, lambda given: _is_clear(given, voters), width=1)
         for answer in answers.values():
-            if answer.records:
+            if _is_something(answer.records):
                 return answer.records
         return self._nothing(answers, voters)
 
-    async def _sure(self, key: bytes) -> list[Record]:
+    async def newest(self, key: bytes) -> dict[Slot, Record]:
+        """What a majority knows of ``key``, tombstones included; raises ``Unavailable``."""
         targets = await self._overlay.holders(key)
         voters = frozenset(self._overlay.voters(key, targets))
         needed = len(voters) // 2 + 1
@@ -100,7 +101,7 @@ class Reader:
             raise Unavailable(_votes(answers, voters), needed)
         newest = newest_of(answer.records for answer in answers.values())
         await self._repair(newest, targets, voters, answers)
-        return list(newest.values())
+        return newest
 
     def _nothing(self, answers: dict[bytes, Answer], voters: frozenset[bytes]) -> list[Record]:
         """No records, where a majority says so; raises ``Unavailable`` where they cannot be asked."""
@@ -203,7 +204,7 @@ class Reader:
 
         async def visit(contact: Contact) -> None:
             answer = await self.pages(contact, key, wants_sure=False)
-            if answer.records:
+            if _is_something(answer.records):
                 found[:] = found or answer.records
             else:
                 answers[contact.node_id] = answer
@@ -239,4 +240,10 @@ def _votes(answers: dict[bytes, Answer], voters: frozenset[bytes]) -> int:
 
 
 def _is_clear(answers: dict[bytes, Answer], voters: frozenset[bytes]) -> bool:
-    return any(answer.records for answer in answers.values()) or _votes(answers, voters) > len(voters) // 2
+    is_found = any(_is_something(answer.records) for answer in answers.values())
+    return is_found or _votes(answers, voters) > len(voters) // 2
+
+
+def _is_something(records: list[Record]) -> bool:
+    """Whether there is more than tombstones: a replica that has only these may have missed the rest."""
+    return any(not record.is_tombstone for record in records)

@@ -82,17 +82,14 @@ class Replica:
         """What is held under ``key`` as a replica, tombstones included."""
         return [r for r in self._store.get(key, tombstones=True) if r.slot not in self.keepsakes]
 
-    def keep(self, record: Record, left: float | None = None, expect: int | None = None) -> int:
+    def keep(self, record: Record, left: float | None = None) -> int:
         """Hold ``record`` if it beats what its slot holds; 0 if it does, else the sequence that holds.
 
         It is held for ``left`` seconds, as long as whoever handed it on would have; by default a whole ttl.
-        With ``expect`` only a record of at most that sequence is replaced.
         """
         self.keepsakes.release(record.slot)
         self.cache.drop(record.key)
         before = self._store.slot(record.slot)
-        if expect is not None and before is not None and before != record and before.sequence > expect:
-            return before.sequence
         life = record.ttl if left is None else min(left, record.ttl)
         if self._store.put(record, self._clock.seconds() + life):
             self.on_record(record)
@@ -109,13 +106,10 @@ class Replica:
 
     # -- what peers ask ---------------------------------------------------------------------------------------------
 
-    def answer_store(
-        self, peer: Contact, packed: list[object], left: list[object] | None = None, expect: int | None = None
-    ) -> list[int]:
+    def answer_store(self, peer: Contact, packed: list[object], left: list[object] | None = None) -> list[int]:
         """STORE: keep records; answers for each 0, or the sequence that beats it, or -1 for a forged one.
 
-        ``left`` are the seconds that each is to be kept, where it does not come from its owner;
-        ``expect`` the highest sequence that they may replace (compare-and-set).
+        ``left`` are the seconds that each is to be kept, where it does not come from its owner.
         """
         self.on_peer(peer)
         records = [record for record in map(unpacked, packed) if record is not None]
@@ -123,7 +117,7 @@ class Replica:
         if len(records) < len(packed) or len(lives) != len(packed):
             raise Refused("not a record")
         return [
-            self.keep(record, life, expect) if self.is_lawful(record, peer) else -1
+            self.keep(record, life) if self.is_lawful(record, peer) else -1
             for record, life in zip(records, lives, strict=True)
         ]
 

@@ -103,11 +103,11 @@ class Roster:
 
     def closest(self, key: bytes, count: int, me: Contact) -> list[Contact]:
         """The ``count`` live members closest to ``key``, this node (``me``) among them, closest first."""
-        return self._closest(self._live, key, count, me)
-
-    def voters(self, key: bytes, count: int, me: Contact) -> list[bytes]:
-        """The ids of the ``count`` members closest to ``key`` that count in a majority, live or absent."""
-        return [contact.node_id for contact in self._closest([*self._live, *self._absent], key, count, me)]
+        goal = int.from_bytes(key)
+        near = [(member.number ^ goal, member.contact) for member in self._live]
+        near.append((self._own_number ^ goal, me))
+        near.sort(key=lambda pair: pair[0])
+        return [contact for _, contact in near[:count]]
 
     def digest(self) -> bytes:
         """Eight bytes that tell whether two nodes know the same live members, themselves included."""
@@ -131,13 +131,6 @@ class Roster:
         if struck:
             self._sort()
         return [member.contact for member in struck]
-
-    def _closest(self, members: list[_Member], key: bytes, count: int, me: Contact) -> list[Contact]:
-        goal = int.from_bytes(key)
-        near = [(member.number ^ goal, member.contact) for member in members]
-        near.append((self._own_number ^ goal, me))
-        near.sort(key=lambda pair: pair[0])
-        return [contact for _, contact in near[:count]]
 
     def _make_room(self) -> bool:
         if not self._absent:

@@ -25,13 +25,20 @@ def main() -> int:
             found = schedule.run([Records(schedule)])
         if found:
             failed += 1
-            print(f"FAILED  {schedule.line}" + (f" --bug {arguments.bug!r}" if arguments.bug else ""))
-            print(f"        n={schedule.n} {schedule.weather} faults: {'; '.join(map(str, schedule.faults))}")
-            print("".join(f"        {line}\n" for line in found[:6]), end="", flush=True)
+            say(f"FAILED  {schedule.line}" + (f" --bug {arguments.bug!r}" if arguments.bug else ""))
+            say(f"        n={schedule.n} {schedule.weather} faults: {'; '.join(map(str, schedule.faults))}")
+            for line in found[:6]:
+                say(f"        {line}")
             if arguments.bug:
                 break
-    print(f"{failed} of {arguments.schedules} schedules failed, {time.monotonic() - began:.0f} s")
+    say(f"{failed} of {arguments.schedules} schedules failed, {time.monotonic() - began:.0f} s")
     return int(bool(failed) != bool(arguments.bug))
+
+
+def say(line: str) -> None:
+    """Print a line at once."""
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()
 
 
 sys.exit(main())

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
+from middleware.entangled.errors import NotRunning
 from middleware.entangled.network.network import Address
 from middleware.entangled.network.switchboard import CALM, Weather
 from middleware.entangled.node import EntangledNode
@@ -123,8 +124,10 @@ class Schedule:
         """Let the node of a place live again, on the store of its former life."""
         self.down.discard(place)
         others = self.alive()
-        known = self.rng.sample(others, min(2, len(others)))
-        self.fleet.restart(place, [other for other in known if other != place])
+        known = [other for other in self.rng.sample(others, min(2, len(others))) if other != place]
+        node = self.fleet.nodes[place] = self.fleet.made(place)
+        # It may be killed again before it has found anybody.
+        self.fleet.enter(node, self.addresses(known)).addErrback(lambda failure: failure.trap(NotRunning))
 
     # -- inside -----------------------------------------------------------------------------------------------------
 

@@ -1,0 +1,262 @@
+"""Tests of write and read concerns, of compare-and-set and of what else the node promises of records."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from middleware.entangled import handover, record
+from middleware.entangled.errors import Conflict, NotAcknowledged, Unavailable
+from middleware.entangled.kademlia.distance import closest
+from middleware.entangled.node import EntangledNode
+from middleware.entangled.overlay import K
+from middleware.entangled.owner import Concern
+from middleware.entangled.reader import ReadConcern
+from middleware.entangled.record import TOLERATED_ABSENCE, TOMBSTONE_TTL, Record, hashed_key
+from tests.fleet import TEAM, Fleet, FleetCase
+
+KEY = hashed_key("task")
+
+
+class ConcernCase(FleetCase):
+    """A few words for what most tests do."""
+
+    def cut(self, fleet: Fleet, *places: int) -> None:
+        """Cut these nodes off from all others."""
+        fleet.board.partition([fleet.address(place) for place in places])
+
+    def failure(self, fleet: Fleet, work: Any, kind: type[Exception], within: float = 3.0) -> Any:
+        """The exception with which ``work`` fails."""
+        fleet.run(within)
+        return self.failureResultOf(work, kind).value
+
+    def values(self, fleet: Fleet, place: int, concern: Any = "majority", key: bytes = KEY) -> list[bytes | None]:
+        """What a node reads."""
+        return [r.value for r in self.done(fleet, fleet.nodes[place].get(key, concern))]
+
+
+class WriteConcernTests(ConcernCase):
+    def test_how_many_have_it(self) -> None:
+        """Each concern is met before the writer is told, and what it is told is at least that."""
+        fleet = self.fleet(5)
+        concerns: tuple[tuple[Concern, int], ...] = (("one", 1), ("majority", 3), ("all", 5))
+        for concern, least in concerns:
+            stored = self.done(fleet, fleet.nodes[0].put(KEY, "state", b"x", "team", concern))
+            self.assertGreaterEqual(stored, least)
+
+    def test_named_error_says_how_many(self) -> None:
+        """With two of five cut off ``all`` fails and says that three have it; a minority fails ``majority``."""
+        fleet = self.fleet(5)
+        self.cut(fleet, 3, 4)
+        error = self.failure(fleet, fleet.nodes[0].put(KEY, "a", b"x", "team", "all"), NotAcknowledged)
+        self.assertEqual((error.acknowledged, error.needed), (3, 5))
+        error = self.failure(fleet, fleet.nodes[3].put(KEY, "b", b"x"), NotAcknowledged)
+        self.assertEqual((error.acknowledged, error.needed), (2, 3))
+        self.assertEqual(self.done(fleet, fleet.nodes[3].put(KEY, "c", b"x", "team", "one")) >= 1, True)
+
+    def test_the_minority_stays_one(self) -> None:
+        """However small the rest looks to it, a cut-off node takes itself for a minority while the cut may heal."""
+        fleet = self.fleet(5)
+        self.cut(fleet, 4)
+        fleet.run(60.0)
+        self.assertEqual(len(fleet.nodes[4].overlay.roster), 0)
+        self.failure(fleet, fleet.nodes[4].put(KEY, "a", b"x"), NotAcknowledged)
+        self.failure(fleet, fleet.nodes[4].get(KEY), Unavailable)
+        self.assertGreaterEqual(self.done(fleet, fleet.nodes[0].put(KEY, "a", b"x")), 3)
+
+    def test_one_after_the_other_may_die(self) -> None:
+        """A majority that is in touch goes on without the dead, until two of five are left; then writes still work."""
+        fleet = self.fleet(5)
+        for place in (4, 3, 2):
+            fleet.nodes[place].vanish()
+            fleet.run(50.0)
+        self.assertEqual(self.done(fleet, fleet.nodes[0].put(KEY, "a", b"x")), 2)
+
+    def test_what_failed_spreads_when_all_are_back(self) -> None:
+        """A write without a majority is not forgotten: its owner brings it to the others when they are back."""
+        fleet = self.fleet(3)
+        self.cut(fleet, 0)
+        self.failure(fleet, fleet.nodes[0].put(KEY, "a", b"x"), NotAcknowledged)
+        fleet.board.heal()
+        fleet.run(20.0)
+        self.assertEqual(self.values(fleet, 2), [b"x"])
+
+
+class CompareAndSetTests(ConcernCase):
+    def test_only_what_was_expected_is_replaced(self) -> None:
+        """A first write expects 0, the next one the number of the last; any other number is a conflict."""
+        fleet = self.fleet(3)
+        first = self.done(fleet, fleet.nodes[0].put(KEY, "a", b"1", expect=0))
+        conflict = self.failure(fleet, fleet.nodes[0].put(KEY, "a", b"2", expect=0), Conflict)
+        self.assertEqual((conflict.expected, conflict.sequence), (0, first.sequence))
+        second = self.done(fleet, fleet.nodes[0].put(KEY, "a", b"2", expect=first.sequence))
+        self.assertGreater(second.sequence, first.sequence)
+        self.done(fleet, fleet.nodes[0].remove(KEY, "a", expect=second.sequence))
+        self.assertEqual(self.values(fleet, 1), [])
+
+    def test_two_at_once(self) -> None:
+        """Of two writes that expect the same number one wins."""
+        fleet = self.fleet(3)
+        works = [fleet.nodes[0].put(KEY, "a", value, expect=0) for value in (b"1", b"2")]
+        fleet.run(1.0)
+        self.successResultOf(works[0])
+        self.failureResultOf(works[1], Conflict)
+        self.assertEqual(self.values(fleet, 1), [b"1"])
+
+    def test_a_former_life_is_not_overwritten(self) -> None:
+        """A node that lost its store does not replace by compare-and-set what its former life has left."""
+        fleet = self.fleet(3)
+        old = self.done(fleet, fleet.nodes[2].put(KEY, "a", b"old"))
+        fleet.nodes[2].vanish()
+        fleet.stores.pop(2)
+        fleet.restart(2)
+        fleet.run(1.0)
+        fleet.stores[2].discard(Record(KEY, "a", fleet.identity(2).public, 1, "team", 1.0, b"").slot)
+        conflict = self.failure(fleet, fleet.nodes[2].put(KEY, "a", b"new", expect=0), Conflict)
+        self.assertEqual(conflict.sequence, old.sequence)
+        self.assertEqual(self.values(fleet, 0), [b"old"])
+
+
+class ReadConcernTests(ConcernCase):
+    def setUp(self) -> None:
+        super().setUp()
+        self.world = self.fleet(14, seed=4)
+        nodes = closest([node.contact for node in self.world.nodes], KEY, 14)
+        self.order = [contact.address.port - 7000 for contact in nodes]
+        self.reader: EntangledNode = self.world.nodes[self.order[-1]]
+
+    def sent(self) -> int:
+        """Datagrams so far."""
+        return self.world.board.counters["sent"]
+
+    def test_fast_costs_two_datagrams(self) -> None:
+        """Where everybody is known, a fast read is one question and one answer, a write 8 of each."""
+        put = self.reader.put(KEY, "a", b"x")
+        self.world.run(0.001)
+        self.successResultOf(put)
+        before = self.sent()
+        read = self.reader.get(KEY, "fast")
+        self.world.run(0.001)
+        self.assertEqual([r.value for r in self.successResultOf(read)], [b"x"])
+        self.assertEqual(self.sent() - before, 2)
+        before = self.sent()
+        self.reader.put(KEY, "a", b"y")
+        self.world.run(0.001)
+        self.assertEqual(self.sent() - before, 2 * K)
+
+    def test_a_dead_replica_is_not_waited_for(self) -> None:
+        """Right after a death reads are hedged: with half of the holders silent all are answered in 60 ms."""
+        self.done(self.world, self.reader.put(KEY, "a", b"x", "team", "all"))
+        for place in self.order[:4]:
+            self.world.nodes[place].vanish()
+        concerns: tuple[ReadConcern, ...] = ("fast", "majority")
+        for concern in concerns:
+            took = []
+            for _ in range(10):
+                began = self.world.clock.seconds()
+                read = self.reader.get(KEY, concern)
+                out: list[Any] = []
+                read.addBoth(out.append)
+                while not out:
+                    self.world.run(0.001)
+                took.append(self.world.clock.seconds() - began)
+                if concern == "fast":
+                    self.assertEqual([r.value for r in out[0]], [b"x"])
+                else:
+                    self.assertIsInstance(out[0].value, Unavailable)
+                    break
+            if concern == "fast":
+                self.assertLessEqual(max(took), 0.06)
+
+    def test_read_repair(self) -> None:
+        """What a majority read shows, a majority has by then, though one replica only had it before."""
+        writer = self.world.nodes[self.order[0]]
+        made = Record(KEY, "a", writer.identity.public, 7, "team", 6000.0, b"x").signed(writer.identity)
+        self.world.nodes[self.order[1]].replica.keep(made)
+        while not self.done(self.world, self.reader.get(KEY), 0.01):
+            pass
+        holding = [place for place in self.order[:K] if self.world.stores[place].get(KEY)]
+        self.assertGreater(len(holding), K // 2)
+
+    def test_nothing_is_said_by_a_majority_only(self) -> None:
+        """That a key is empty takes a majority to say; while it cannot be asked, a read fails by name."""
+        self.assertEqual(self.values(self.world, self.order[-1], "fast"), [])
+        for place in self.order[:5]:
+            self.world.nodes[place].vanish()
+        error = self.failure(self.world, self.reader.get(KEY, "fast"), Unavailable)
+        self.assertEqual((error.answered, error.needed), (3, 5))
+
+    def test_the_unsure_do_not_count(self) -> None:
+        """Replicas that have yet to catch up do not count in a majority read."""
+        for place in self.order[:4]:
+            self.world.nodes[place].replica.is_sure = lambda: False
+        error = self.failure(self.world, self.reader.get(KEY), Unavailable)
+        self.assertEqual((error.answered, error.needed), (4, 5))
+
+
+class AbsenceTests(ConcernCase):
+    def test_a_delete_stays_one(self) -> None:
+        """A node that was off during a delete does not bring the record back, however it comes back."""
+        fleet = self.fleet(5)
+        self.done(fleet, fleet.nodes[0].put(KEY, "a", b"x", "team", "all"))
+        fleet.nodes[3].vanish()
+        self.cut(fleet, 4)
+        self.done(fleet, fleet.nodes[0].remove(KEY, "a"))
+        fleet.nodes[0].vanish()
+        fleet.run(40.0)
+        fleet.board.heal()
+        fleet.restart(3, [1])
+        fleet.run(30.0)
+        for place in (1, 2, 3, 4):
+            self.assertEqual(self.values(fleet, place), [])
+            self.assertEqual(fleet.stores[place].get(KEY), [])
+
+    def test_long_absence_means_empty(self) -> None:
+        """A node that was away for longer than tombstones are kept re-joins empty, a shorter absence costs nothing."""
+        self.assertGreater(TOMBSTONE_TTL, TOLERATED_ABSENCE)
+        for away, kept in ((TOLERATED_ABSENCE - 60.0, 1), (TOLERATED_ABSENCE + 60.0, 0)):
+            fleet = self.fleet(1)
+            moment = [1000.0]
+            fleet.nodes[0].stop()
+            for expected in (1, kept):
+                node = self.life(fleet, moment)
+                if expected == 1 and not fleet.stores[0].get(KEY):
+                    self.done(fleet, node.put(KEY, "a", b"x"), 0.1)
+                self.assertEqual(len(fleet.stores[0].get(KEY)), expected)
+                node.stop()
+                moment[0] += away
+
+    def life(self, fleet: Fleet, moment: list[float]) -> EntangledNode:
+        """One life of the node of place 0, with a wall clock."""
+        network = fleet.board.network(*fleet.address(0))
+        node = EntangledNode(
+            fleet.identity(0), TEAM, network, fleet.store(0), fleet.clock, fleet.rng(0), wall=lambda: moment[0]
+        )
+        fleet.nodes[0] = node
+        node.start()
+        node.join([])
+        fleet.run(31.0)
+        return node
+
+    def test_numbers_outlive_a_restart(self) -> None:
+        """A node that does not hold its own records numbers on after a restart, past what it ever gave."""
+        fleet = self.fleet(2)
+        numbers = [self.done(fleet, fleet.nodes[0].put(KEY, "a", b"x")).sequence for _ in range(3)]
+        fleet.nodes[0].vanish()
+        for one in fleet.stores[0].records():
+            fleet.stores[0].discard(one.slot)
+        fleet.restart(0, [1])
+        fleet.run(1.0)
+        made = fleet.nodes[0]._owner.next(KEY, "b", b"x", "team")
+        self.assertGreater(made.sequence, max(numbers))
+
+    def test_what_is_given_on_keeps_its_age(self) -> None:
+        """A record that is handed on lives as long as it would have where it came from, and no longer."""
+        fleet = self.fleet(2)
+        owner = fleet.identity(7)
+        made = Record(KEY, "a", owner.public, 1, "team", 60.0, b"x").signed(owner)
+        fleet.nodes[0].replica.keep(made)
+        fleet.run(30.0)
+        self.assertEqual(len(fleet.stores[1].get(KEY)), 1)
+        fleet.run(31.0)
+        self.assertEqual(fleet.stores[1].get(KEY), [])
+        self.assertLess(handover.MEND, record.TEAM_TTL)
