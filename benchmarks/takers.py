@@ -211,7 +211,7 @@ class Trial:
             self.is_open = True
             for place in range(self.takers):
                 self.take(place)
-        waiting = self.number - len(self.told)
+        waiting = len(self.witness.open())
         for _ in range(min(12, max(1, WAITING - waiting), self.tuples - self.number)):
             fields = ("job", self.number, self.number / 2)
             self.number += 1
