@@ -102,7 +102,9 @@ class EntangledNode:
         # Imported by the first who calls it to one: a node that is in none is spared half a MiB.
         from middleware.entangled.space.seat import Seat
 
-        return Seat(self.endpoint, self.store, *self._made_of)
+        seat = Seat(self.endpoint, self.store, *self._made_of)
+        seat.written = self.store.written
+        return seat
 
     # -- life -------------------------------------------------------------------------------------------------------
 
@@ -253,6 +255,7 @@ class EntangledNode:
             self._log.warn("away for {days:.0f} days: what was held is forgotten", days=away / 86400)
             for record in self.store.records():
                 self.store.discard(record.slot)
+
     def _answer_enrol(self, peer: Contact) -> bytes:
         return self.seat.answer_enrol(peer)
 
