@@ -71,12 +71,13 @@ class Team:
 
     def cost(self, work: Callable[[EntangledNode], Deferred[Any]], times: int) -> tuple[float, list[float], int]:
         """Datagrams for one of ``times`` operations at random nodes, how long each took, and how many failed."""
-        before, took, failed = Meter.datagrams, [], 0
+        before, failed = Meter.datagrams, 0
+        took: list[float] = []
         for _ in range(times):
-            began, ended = self.clock.seconds(), []
+            began = self.clock.seconds()
+            ended: list[Any] = []
             done = work(self.rng.choice([node for node in self.nodes if node._running]))
-            done.addErrback(lambda failure: failure.trap(EntangledError))
-            done.addCallback(ended.append)
+            done.addErrback(lambda failure: failure.trap(EntangledError)).addCallback(ended.append)
             while not ended:
                 self.clock.advance(0.0001)
             took.append(self.clock.seconds() - began)
@@ -100,8 +101,8 @@ def main() -> int:
     numbers = iter(range(10**6))
     puts = team.cost(lambda node: node.put(hashed_key(f"k{next(numbers)}"), "v", b"x" * 100), 200)
     report("put", puts)
-    for concern in ("fast", "majority"):
-        report(f"get {concern}", team.cost(lambda node, c=concern: node.get(some(team.rng), c), 200))
+    report("get fast", team.cost(lambda node: node.get(some(team.rng), "fast"), 200))
+    report("get majority", team.cost(lambda node: node.get(some(team.rng), "majority"), 200))
     if arguments.loss:
         for node in team.rng.sample(team.nodes, len(team.nodes) // 2):
             node.vanish()

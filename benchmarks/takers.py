@@ -15,6 +15,8 @@ from collections import defaultdict
 from collections.abc import Callable
 from typing import Any
 
+from twisted.internet.defer import maybeDeferred
+
 from middleware.entangled.clock import HeapClock
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.identity import Identity
@@ -58,12 +60,14 @@ class Witness:
         confirm: Callable[..., Any] = seat.answer_confirm
 
         def confirmed(peer: Contact, key: bytes, places: list[object], incarnation: bytes, *ballot: Any) -> Any:
-            answers = confirm(peer, key, places, incarnation, *ballot)
-            for fields, answer in zip(places, answers, strict=True):
-                place, reply = place_unpacked(key, fields), reply_unpacked(answer)
-                if place is not None and reply is not None and reply.kind is Kind.ACCEPTED:
-                    self.bids[place][ballot].add(member)
-            return answers
+            def noted(answers: list[object]) -> list[object]:
+                for fields, answer in zip(places, answers, strict=True):
+                    place, reply = place_unpacked(key, fields), reply_unpacked(answer)
+                    if place is not None and reply is not None and reply.kind is Kind.ACCEPTED:
+                        self.bids[place][ballot].add(member)
+                return answers
+
+            return maybeDeferred(confirm, peer, key, places, incarnation, *ballot).addCallback(noted)
 
         seat.answer_confirm = confirmed  # type: ignore[method-assign, assignment]
         expose("decree.confirm", confirmed, changes=True)
