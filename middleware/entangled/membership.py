@@ -119,7 +119,7 @@ class Membership:
     def _compare(self, contact: Contact, digest: object) -> None:
         """Ask ``contact`` for its members where it knows others than this node does."""
         now = self._clock.seconds()
-        if self._overlay.is_whole and digest == self._overlay.roster.digest():
+        if now < self._large_until or (self._overlay.is_whole and digest == self._overlay.roster.digest()):
             return
         if now - self._listed_at.get(contact.node_id, -AGAIN) < AGAIN:
             return

@@ -18,7 +18,7 @@ from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.record import Record
 from middleware.entangled.wire.endpoint import Endpoint
 
-WATCH_TTL = 12.0
+WATCH_TTL = 8.0
 MAX_WATCHERS = 1000
 MAX_WATCHED = 10_000
 """Keys that are watched here at the same time."""

@@ -19,8 +19,8 @@ from middleware.entangled.replica import Replica
 from middleware.entangled.watch import Changed, Watch
 from middleware.entangled.wire.endpoint import Endpoint
 
-RENEW = 4.0
-"""Three renewals in the time for which a replica remembers a watcher."""
+RENEW = 2.0
+"""Four renewals in the time for which a replica remembers a watcher."""
 
 
 class Subscriber:
@@ -139,7 +139,7 @@ class Subscriber:
             if contact.node_id != self._own_id:
                 self._chores.fork(self._renew_at(watch, contact))
 
-    async def _renew_at(self, watch: Watch, contact: Contact) -> None:
+    async def _renew_at(self, watch: Watch, contact: Contact, is_first: bool = True) -> None:
         watch.asked.add(contact.node_id)
         try:
             digest = watch.view.digest(contact.node_id)
@@ -153,7 +153,9 @@ class Subscriber:
                 return
             records = (await self._reader.pages(contact, watch.key, page)).records
         except EntangledError:
-            if watch in self._watches:
+            if is_first and watch in self._watches:
+                await self._renew_at(watch, contact, is_first=False)  # one that rain swallowed is no death
+            elif watch in self._watches:
                 watch.forget(contact.node_id)
                 self._settle(watch)
             return

@@ -12,6 +12,7 @@ from middleware.entangled.overlay import K
 from middleware.entangled.owner import Concern
 from middleware.entangled.reader import ReadConcern
 from middleware.entangled.record import TOLERATED_ABSENCE, TOMBSTONE_TTL, Record, hashed_key
+from middleware.entangled.replica import CACHED, SURE
 from tests.fleet import TEAM, Fleet, FleetCase
 
 KEY = hashed_key("task")
@@ -260,3 +261,66 @@ class AbsenceTests(ConcernCase):
         fleet.run(31.0)
         self.assertEqual(fleet.stores[1].get(KEY), [])
         self.assertLess(handover.MEND, record.TEAM_TTL)
+
+
+class WatchNumberTests(ConcernCase):
+    def test_a_gap_is_noticed_and_filled(self) -> None:
+        """A watcher that missed a push sees by the number of the next one that it did, and asks at once."""
+        fleet = self.fleet(2)
+        told: list[list[bytes | None]] = []
+        watch = fleet.nodes[1].watch(KEY, lambda records: told.append([r.value for r in records]))
+        fleet.run(0.5)
+        owner, pusher = fleet.identity(0), fleet.nodes[0].replica.pusher
+        missed = Record(KEY, "a", owner.public, 1, "team", 60.0, b"missed").signed(owner)
+        fleet.stores[0].put(missed, fleet.clock.seconds() + 60.0)
+        watcher = pusher._watchers[KEY][fleet.nodes[1].identity.node_id]
+        watcher.number += 1
+        seen = Record(KEY, "b", owner.public, 2, "team", 60.0, b"seen").signed(owner)
+        fleet.nodes[0].replica.keep(seen)
+        fleet.run(0.1)
+        self.assertEqual(told[-1], [b"missed", b"seen"])
+        self.assertEqual(watch.pushed[fleet.nodes[0].identity.node_id], 2)
+
+
+class SecondHandTests(ConcernCase):
+    def test_only_the_second_hand_is_verified(self) -> None:
+        """Nobody verifies what the owner stores in its own session; whoever gets it from another does."""
+        fleet = self.fleet(3)
+        owner, other = fleet.identity(1), fleet.nodes[2]
+        unsigned = Record(KEY, "x", owner.public, 9, "team", 60.0, b"x", bytes(64))
+        held = fleet.nodes[0].replica
+        self.assertTrue(held.is_lawful(unsigned, fleet.nodes[1].contact))
+        self.assertFalse(held.is_lawful(unsigned, other.contact))
+        self.assertTrue(held.is_lawful(unsigned.signed(owner), other.contact))
+        fleet.stores[0].put(unsigned, fleet.clock.seconds() + 60.0)
+        fleet.run(40.0)
+        self.assertEqual([len(fleet.stores[place].get(KEY)) for place in range(3)], [1, 0, 0])
+
+
+class WalkTests(ConcernCase):
+    def test_copies_on_the_path(self) -> None:
+        """In a network that nobody knows whole a popular value is copied along the way, and never counted as sure."""
+        fleet = self.fleet(30, seed=5)
+        self.done(fleet, fleet.nodes[0].put(KEY, "a", b"x"))
+        for node in fleet.nodes:
+            node._membership._large_until = 1e9
+            node.overlay.is_whole = False
+            for member in node.overlay.roster.live():
+                node.overlay.roster.left(member.node_id)
+        order = closest([node.contact for node in fleet.nodes], KEY, 30)
+        far = fleet.nodes[order[-1].address.port - 7000]
+        for holder in order[:K]:
+            far.overlay.table.remove(holder)
+            far.overlay.roster.left(holder.node_id)
+        read = far.get(KEY, "fast")
+        fleet.run(0.01)
+        self.assertEqual([r.value for r in self.successResultOf(read)], [b"x"])
+        copies = [node for node in fleet.nodes if node.replica.cache.get(KEY, fleet.clock.seconds())]
+        for node in copies:
+            self.assertEqual(node.replica.held(KEY), [])
+            peer = fleet.nodes[0].contact
+            self.assertEqual(node.replica.answer_find_value(peer, KEY, None)[2], CACHED)
+            self.assertEqual(node.replica.answer_find_value(peer, KEY, None, True)[:3], [[], None, SURE])
+        self.assertGreater(len(copies), 0)
+        fleet.run(61.0)
+        self.assertEqual([n for n in fleet.nodes if n.replica.cache.get(KEY, fleet.clock.seconds())], [])

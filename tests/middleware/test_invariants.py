@@ -18,6 +18,7 @@ BITING = {
     "nothing instead of unavailable": (1, "D1"),
     "signature not checked": (2, "D4"),
     "a read from the own store counts as sure": (4, "D1"),
+    "numbers start again after a restart": (337, "D"),
     "any answer counts": (1, "D1"),
 }
 """A seed that shows each bug, and an invariant that it breaks."""

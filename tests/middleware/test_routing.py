@@ -36,10 +36,18 @@ class RoutingTableTest(SynchronousTestCase):
         self.table = RoutingTable(OWN.node_id, k=4)
         self.old = of_bucket(159, 12)
         self.new = self.old[4:]
+        self.near = of_bucket(157, 4)
 
     def fill(self) -> None:
+        """A full bucket of far contacts, and k nearer ones, so that no far newcomer is a neighbour."""
+        for near in self.near:
+            self.table.saw(near, 0.0)
         for moment, known in enumerate(self.old[:4]):
             self.assertIsNone(self.table.saw(known, float(moment)))
+
+    def far(self) -> list[Contact]:
+        """The far contacts in the table."""
+        return [known for known in self.table.contacts() if known in self.old]
 
     def miss(self, missing: Contact, times: int) -> None:
         for _ in range(times):
@@ -79,7 +87,7 @@ class RoutingTableTest(SynchronousTestCase):
         """A newcomer to a full bucket displaces nobody; the least recently seen contact is to be pinged."""
         self.fill()
         self.assertEqual(self.table.saw(self.new[0], 10.0), self.old[0])
-        self.assertEqual(self.table.contacts(), self.old[:4])
+        self.assertEqual(self.far(), self.old[:4])
         self.assertIsNone(self.table.get(self.new[0].node_id))
 
     def test_seen_again_is_asked_later(self) -> None:
@@ -103,8 +111,8 @@ class RoutingTableTest(SynchronousTestCase):
         self.miss(self.old[1], STALE_AFTER - 1)
         self.assertIn(self.old[1], self.table.contacts())
         self.miss(self.old[1], 1)
-        self.assertEqual(self.table.contacts(), [self.old[0], self.old[2], self.old[3], self.new[1]])
-        self.assertEqual(len(self.table), 4)
+        self.assertEqual(self.far(), [self.old[0], self.old[2], self.old[3], self.new[1]])
+        self.assertEqual(len(self.table), 8)
 
     def test_cache_is_bounded(self) -> None:
         """At most k newcomers wait, and the longest unseen leave the queue."""
@@ -113,7 +121,7 @@ class RoutingTableTest(SynchronousTestCase):
             self.table.saw(newcomer, 10.0)
         for known in self.old[:4]:
             self.miss(known, STALE_AFTER)
-        self.assertEqual(sorted(self.table.contacts(), key=self.old.index), self.new[4:])
+        self.assertEqual(sorted(self.far(), key=self.old.index), self.new[4:])
 
     def test_silent_newcomer_leaves_the_cache(self) -> None:
         """A waiting newcomer that does not answer waits no longer."""
@@ -129,8 +137,8 @@ class RoutingTableTest(SynchronousTestCase):
         self.miss(self.old[2], STALE_AFTER)
         self.assertIn(self.old[2], self.table.contacts())
         self.assertIsNone(self.table.saw(self.new[0], 10.0))
-        self.assertEqual(self.table.contacts(), [self.old[0], self.old[1], self.old[3], self.new[0]])
-        self.assertEqual(len(self.table), 4)
+        self.assertEqual(self.far(), [self.old[0], self.old[1], self.old[3], self.new[0]])
+        self.assertEqual(len(self.table), 8)
 
     def test_dropped_after_five(self) -> None:
         """A contact whose place nobody wants is dropped after five misses in a row."""
@@ -163,13 +171,14 @@ class RoutingTableTest(SynchronousTestCase):
         self.table.saw(self.new[1], 10.0)
         self.table.remove(self.new[1])
         self.table.remove(self.old[0])
-        self.assertEqual(self.table.contacts(), [*self.old[1:4], self.new[0]])
-        self.assertEqual(len(self.table), 4)
+        self.assertEqual(self.far(), [*self.old[1:4], self.new[0]])
+        self.assertEqual(len(self.table), 8)
         self.table.remove(contact(999_999))
 
     def test_closest_passes_over_the_stale(self) -> None:
         """Stale contacts are named only where there are not enough others, and then in their place by distance."""
-        self.fill()
+        for known in self.old[:4]:
+            self.table.saw(known, 0.0)
         nearest = closest(self.old[:4], self.old[0].node_id, 4)
         self.assertEqual(self.table.closest(self.old[0].node_id, 2), nearest[:2])
         self.miss(self.old[0], STALE_AFTER)
@@ -178,10 +187,18 @@ class RoutingTableTest(SynchronousTestCase):
 
     def test_order_of_contacts(self) -> None:
         """The nearest bucket comes first, whenever it was filled."""
-        near = of_bucket(150, 1)[0]
-        self.table.saw(self.old[0], 0.0)
-        self.table.saw(near, 1.0)
-        self.assertEqual(self.table.contacts(), [near, self.old[0]])
+        for moment, known in enumerate([*self.old[:4], *self.near]):
+            self.table.saw(known, float(moment))
+        self.assertEqual(self.table.contacts(), [*self.near, *self.old[:4]])
+
+    def test_the_neighbourhood_is_known_whole(self) -> None:
+        """The k closest to the node are in the table, however many share a range with them and came before."""
+        crowd = of_bucket(158, 40)
+        for moment, known in enumerate(crowd):
+            self.table.saw(known, float(moment))
+        nearest = closest(crowd, OWN.node_id, 4)
+        self.assertLessEqual(set(nearest), set(self.table.contacts()))
+        self.assertLess(len(self.table), 40)
 
     def test_nothing_to_refresh(self) -> None:
         """An empty table has nobody to refresh it by."""
@@ -216,6 +233,6 @@ class RoutingTableTest(SynchronousTestCase):
             contacts = table.contacts()
             self.assertEqual(len(table), len(contacts))
             self.assertEqual(len({c.node_id for c in contacts}), len(contacts))
-            indexes = [bucket_index(OWN.node_id, c.node_id) for c in contacts]
-            self.assertTrue(all(indexes.count(index) <= 3 for index in indexes))
+            self.assertTrue(all(len(bucket.entries) <= 3 for bucket in table._buckets))
+            self.assertEqual([b.low for b in table._buckets[1:]], [b.high for b in table._buckets[:-1]])
             self.assertTrue(all(table.get(c.node_id) == c for c in contacts))

@@ -1,13 +1,16 @@
 """Routing table: the contacts of a node, many of them near and few of them far (Kademlia, sections 2.2 and 2.4).
 
-A k-bucket for each length of the prefix shared with the node's own id; the tree of the paper, flattened.  A contact
-that keeps answering is never displaced by a newcomer: nodes that have stayed long are the likeliest to stay, and
-nobody can flush the table by inventing ids.  Newcomers to a full bucket wait in its replacement cache.
+The tree of the paper: a bucket covers a range of ids, one at first.  A full one is split in two where it covers the
+node's own id, and where the newcomer is among the k closest to the node, so that the node knows its whole
+neighbourhood however unbalanced the tree is (section 2.4).  In any other full bucket a contact that keeps answering is
+never displaced: nodes that have stayed long are the likeliest to stay, and nobody can flush the table by inventing
+ids.  The newcomer waits in the bucket's replacement cache.
 """
 
 from __future__ import annotations
 
 import random
+from bisect import bisect_right
 from dataclasses import dataclass, field
 
 from middleware.entangled.identity import ID_BYTES
@@ -38,11 +41,12 @@ class _Entry:
 
 @dataclass
 class _Bucket:
-    """One k-bucket; both dicts are ordered from the least to the most recently seen."""
+    """One k-bucket, of the ids from ``low`` to below ``high``; both dicts begin with the least recently seen."""
 
+    low: int
+    high: int
     entries: dict[bytes, _Entry] = field(default_factory=dict)
     waiting: dict[bytes, Contact] = field(default_factory=dict)
-    searched_at: float = 0.0
 
 
 class RoutingTable:
@@ -55,8 +59,11 @@ class RoutingTable:
     def __init__(self, own_id: bytes, k: int = 8) -> None:
         self._own_id = own_id
         self._k = k
-        self._buckets: dict[int, _Bucket] = {}
+        self._own = int.from_bytes(own_id)
+        self._buckets = [_Bucket(0, 1 << (8 * ID_BYTES))]
         self._size = 0
+        self._lows = [0]
+        self._searched_at: dict[int, float] = {}
 
     def __len__(self) -> int:
         return self._size
@@ -69,7 +76,8 @@ class RoutingTable:
 
     def contacts(self) -> list[Contact]:
         """Every contact, nearest bucket first and in each the least recently seen first."""
-        return [entry.contact for index in sorted(self._buckets) for entry in self._buckets[index].entries.values()]
+        nearest_first = sorted(self._buckets, key=lambda bucket: bucket.low ^ self._own & -(bucket.high - bucket.low))
+        return [entry.contact for bucket in nearest_first for entry in bucket.entries.values()]
 
     def closest(self, target: bytes, count: int | None = None) -> list[Contact]:
         """The ``count`` (default k) contacts closest to ``target``, closest first.
@@ -80,7 +88,7 @@ class RoutingTable:
         wanted = self._k if count is None else count
         stale: list[Contact] = []
         live: list[Contact] = []
-        for bucket in self._buckets.values():
+        for bucket in self._buckets:
             for entry in bucket.entries.values():
                 (stale if entry.is_stale else live).append(entry.contact)
         chosen = closest(live, target, wanted)
@@ -96,8 +104,12 @@ class RoutingTable:
         """
         if contact.node_id == self._own_id:
             return None
-        bucket = self._buckets.setdefault(bucket_index(self._own_id, contact.node_id), _Bucket(searched_at=now))
+        self._searched_at.setdefault(bucket_index(self._own_id, contact.node_id), now)
+        bucket = self._bucket_of(contact.node_id)
         known = contact.node_id in bucket.entries
+        while not known and len(bucket.entries) >= self._k and self._may_split(bucket, contact):
+            self._split(bucket)
+            bucket = self._bucket_of(contact.node_id)
         if not known and len(bucket.entries) >= self._k:
             stale = next((node_id for node_id, entry in bucket.entries.items() if entry.is_stale), None)
             if stale is None:
@@ -137,20 +149,21 @@ class RoutingTable:
                 self._free(bucket, contact.node_id, now)
 
     def searched(self, target: bytes, now: float) -> None:
-        """Take note of a lookup for ``target``, which keeps its bucket fresh."""
+        """Take note of a lookup for ``target``, which keeps its range fresh."""
         if target != self._own_id:
-            self._buckets.setdefault(bucket_index(self._own_id, target), _Bucket()).searched_at = now
+            self._searched_at[bucket_index(self._own_id, target)] = now
 
     def stale_buckets(self, now: float, older_than: float) -> list[int]:
-        """The indexes of buckets to refresh: no lookup went there for ``older_than`` seconds.
+        """The ranges to refresh, by the i of distances from 2**i on: no lookup went there for ``older_than`` seconds.
 
-        Counted from the nearest bucket with a contact to the farthest possible one, for nearer ones have nobody to find
+        Counted from the nearest range with a contact to the farthest possible one, for nearer ones have nobody to find
         (Kademlia, section 2.3).
         """
-        filled = [index for index, bucket in self._buckets.items() if bucket.entries]
+        filled = [bucket_index(self._own_id, contact.node_id) for contact in self.contacts()]
         if not filled:
             return []
-        return [index for index in range(min(filled), 8 * ID_BYTES) if self._is_old(index, now - older_than)]
+        before = now - older_than
+        return [i for i in range(min(filled), 8 * ID_BYTES) if self._searched_at.get(i, before) <= before]
 
     def refresh_target(self, index: int, rng: random.Random) -> bytes:
         """A random id in the range of bucket ``index``; a lookup for it refreshes the bucket."""
@@ -158,7 +171,34 @@ class RoutingTable:
         return (int.from_bytes(self._own_id) ^ apart).to_bytes(ID_BYTES)
 
     def _bucket(self, node_id: bytes) -> _Bucket | None:
-        return None if node_id == self._own_id else self._buckets.get(bucket_index(self._own_id, node_id))
+        return None if node_id == self._own_id else self._bucket_of(node_id)
+
+    def _bucket_of(self, node_id: bytes) -> _Bucket:
+        number = int.from_bytes(node_id)
+        return self._buckets[bisect_right(self._lows, number) - 1]
+
+    def _may_split(self, bucket: _Bucket, newcomer: Contact) -> bool:
+        if bucket.high - bucket.low == 1:
+            return False
+        if bucket.low <= self._own < bucket.high:
+            return True
+        apart = int.from_bytes(newcomer.node_id) ^ self._own
+        nearer = 0
+        for other in self._buckets:
+            nearer += sum(1 for node_id in other.entries if int.from_bytes(node_id) ^ self._own < apart)
+        return nearer < self._k
+
+    def _split(self, bucket: _Bucket) -> None:
+        """Put two buckets, of half the range each, in the place of ``bucket``."""
+        middle = (bucket.low + bucket.high) // 2
+        halves = [_Bucket(bucket.low, middle), _Bucket(middle, bucket.high)]
+        for node_id, entry in bucket.entries.items():
+            halves[int.from_bytes(node_id) >= middle].entries[node_id] = entry
+        for node_id, contact in bucket.waiting.items():
+            halves[int.from_bytes(node_id) >= middle].waiting[node_id] = contact
+        place = self._buckets.index(bucket)
+        self._buckets[place : place + 1] = halves
+        self._lows = [each.low for each in self._buckets]
 
     def _free(self, bucket: _Bucket, node_id: bytes, now: float) -> None:
         """Take a contact out; the most recently seen newcomer, if any, takes its place."""
@@ -181,7 +221,3 @@ class RoutingTable:
             return None
         oldest.questioned_at = now
         return oldest.contact
-
-    def _is_old(self, index: int, before: float) -> bool:
-        bucket = self._buckets.get(index)
-        return bucket is None or bucket.searched_at <= before

@@ -1,0 +1,47 @@
+"""Tests of copies on the path; pure."""
+
+from __future__ import annotations
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.entangled.cache import MAX_AGE, MAX_BYTES, MAX_KEYS, PathCache
+from middleware.entangled.record import Record, hashed_key
+
+
+def copied(key: bytes, size: int = 1) -> list[Record]:
+    """One record of ``key``; copies do not look at signatures."""
+    return [Record(key, "a", bytes(32), 1, "team", 60.0, bytes(size), bytes(64))]
+
+
+class PathCacheTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.cache = PathCache()
+        self.key = hashed_key("a")
+
+    def test_a_copy_runs_out(self) -> None:
+        """A copy is there for its time, at most for the longest that any may have."""
+        for ttl, lives in ((5.0, 5.0), (1e9, MAX_AGE)):
+            self.cache.put(self.key, copied(self.key), ttl, 0.0)
+            self.assertEqual(self.cache.get(self.key, lives - 0.1), copied(self.key))
+            self.assertIsNone(self.cache.get(self.key, lives))
+
+    def test_strange_times(self) -> None:
+        """A copy that has no time left, or none that is a number, is not kept."""
+        for ttl in (0.0, -1.0, float("nan")):
+            self.cache.put(self.key, copied(self.key), ttl, 0.0)
+            self.assertIsNone(self.cache.get(self.key, 0.0))
+
+    def test_bounded(self) -> None:
+        """Keys and bytes are bounded, and what was not read for longest goes first."""
+        keys = [hashed_key(str(number)) for number in range(MAX_KEYS + 1)]
+        for key in keys[:-1]:
+            self.cache.put(key, copied(key), 9.0, 0.0)
+        self.cache.get(keys[0], 0.0)
+        self.cache.put(keys[-1], copied(keys[-1]), 9.0, 0.0)
+        self.assertIsNone(self.cache.get(keys[1], 0.0))
+        self.assertIsNotNone(self.cache.get(keys[0], 0.0))
+        self.cache.put(self.key, copied(self.key, MAX_BYTES + 1), 9.0, 0.0)
+        self.assertIsNone(self.cache.get(self.key, 0.0))
+        self.cache.put(self.key, copied(self.key, MAX_BYTES - 200), 9.0, 0.0)
+        self.assertIsNone(self.cache.get(keys[-1], 0.0))
+        self.assertIsNotNone(self.cache.get(self.key, 0.0))

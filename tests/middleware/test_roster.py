@@ -1,0 +1,84 @@
+"""Tests of who counts in a majority; pure."""
+
+from __future__ import annotations
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.entangled.identity import Identity
+from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.kademlia.distance import closest
+from middleware.entangled.network.network import Address
+from middleware.entangled.roster import COUNTED_S, MAX_MEMBERS, STRUCK_S, Roster
+
+ME = Contact(Identity(bytes(32)).public, Address("10.0.0.1", 1))
+
+
+def contact(number: int) -> Contact:
+    """Somebody."""
+    return Contact(number.to_bytes(32), Address("10.0.0.1", number))
+
+
+class RosterTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.roster = Roster(ME.node_id)
+
+    def fill(self, count: int) -> None:
+        for number in range(1, 1 + count):
+            self.assertTrue(self.roster.heard(contact(number), 0.0))
+
+    def test_closest_with_oneself(self) -> None:
+        """The closest members come with the node itself among them, closest first."""
+        self.fill(6)
+        everybody = [ME, *map(contact, range(1, 7))]
+        for key in (ME.node_id, contact(3).node_id):
+            self.assertEqual(self.roster.closest(key, 4, ME), closest(everybody, key, 4))
+
+    def test_coming_and_going(self) -> None:
+        """Who is lost is absent until it is heard; who said goodbye is gone; the digest tells teams apart."""
+        self.fill(3)
+        before = self.roster.digest()
+        self.assertTrue(self.roster.lost(contact(2).node_id, 1.0))
+        self.assertFalse(self.roster.lost(contact(2).node_id, 1.0))
+        self.assertEqual(self.roster.absent(), [contact(2)])
+        self.assertNotEqual(self.roster.digest(), before)
+        self.assertTrue(self.roster.heard(contact(2), 2.0))
+        self.assertFalse(self.roster.heard(contact(2), 3.0))
+        self.assertEqual(self.roster.digest(), before)
+        self.roster.left(contact(2).node_id)
+        self.assertEqual((len(self.roster), self.roster.absent()), (2, []))
+
+    def test_a_majority_strikes_soon(self) -> None:
+        """Absent members are struck soon where a majority is in touch, in a minority only when no cut lasts so long."""
+        for lost, wait in ((2, STRUCK_S), (3, COUNTED_S)):
+            self.roster = Roster(ME.node_id)
+            self.fill(4)
+            for number in range(1, 1 + lost):
+                self.roster.lost(contact(number).node_id, 10.0)
+            self.assertEqual(self.roster.strike(10.0 + wait), [])
+            self.assertEqual(len(self.roster.strike(10.1 + wait)), lost)
+            self.assertEqual(self.roster.absent(), [])
+
+    def test_in_touch(self) -> None:
+        """A node is in touch while it heard a majority of all, the absent counted in, lately enough."""
+        self.assertTrue(self.roster.in_touch(0.0, 10.0))
+        self.fill(4)
+        self.assertTrue(self.roster.in_touch(10.0, 10.0))
+        self.assertFalse(self.roster.in_touch(11.0, 10.0))
+        for number in (1, 2):
+            self.roster.heard(contact(number), 11.0)
+        self.assertTrue(self.roster.in_touch(11.0, 10.0))
+
+    def test_full(self) -> None:
+        """A full roster takes nobody new, unless somebody absent can make room."""
+        self.fill(MAX_MEMBERS)
+        self.assertTrue(self.roster.is_full)
+        self.assertFalse(self.roster.heard(contact(1000), 0.0))
+        self.roster.lost(contact(1).node_id, 0.0)
+        self.assertTrue(self.roster.heard(contact(1000), 0.0))
+        self.assertEqual(self.roster.absent(), [])
+
+    def test_remembered(self) -> None:
+        """Whom an earlier life knew counts as absent until it is heard."""
+        self.roster.remembered(contact(1), 0.0)
+        self.assertEqual((len(self.roster), self.roster.absent()), (0, [contact(1)]))
+        self.assertFalse(self.roster.in_touch(0.0, 10.0))
