@@ -69,7 +69,8 @@ class SwarmPeer:
         """Build the node and join."""
         store = MemoryStore()
         if self._folder:
-            store = SqliteStore.open(os.path.join(self._folder, f"{port}.sqlite"), time.monotonic())
+            path = os.path.join(self._folder, f"{port}.sqlite")
+            store = SqliteStore.open(path, time.monotonic(), deliver=reactor.callFromThread)
         self._network = LossyUdp(reactor, HOST, port)
         identity = Identity(self._rng.randbytes(32))
         self._node = EntangledNode(identity, TEAM_KEY, self._network, store, reactor, self._rng)
