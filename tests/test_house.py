@@ -31,12 +31,14 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
 
 # Plain objects: bytes and ``now`` in, decisions out.
 PURE = (
+    "agents.behaviour",
     "agents.decision",
     "drivers.errors",
     "drivers.gate",
     "drivers.reading",
     "middleware.consensus.nearest",
     "middleware.consensus.strategy",
+    "middleware.entangled.cache",
     "middleware.entangled.errors",
     "middleware.entangled.identity",
     "middleware.entangled.kademlia.contact",
@@ -44,6 +46,7 @@ PURE = (
     "middleware.entangled.kademlia.routing",
     "middleware.entangled.network.network",
     "middleware.entangled.record",
+    "middleware.entangled.roster",
     "middleware.entangled.space.decree",
     "middleware.entangled.space.posting",
     "middleware.entangled.space.template",
@@ -58,7 +61,6 @@ PURE = (
     "sim.demo.configuration",
     "sim.demo.experiment",
     "sim.demo.story",
-    "agents.behaviour",
 )
 PURE_LAST_NAMES = ("codec",)
 NOT_IN_PURE = ("twisted", "time", "socket", "threading", "asyncio", "selectors", "subprocess", "secrets", "sqlite3")
