@@ -9,7 +9,7 @@ from __future__ import annotations
 import random
 from collections.abc import Callable, Coroutine, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import msgpack
 from twisted.internet.defer import Deferred
@@ -43,6 +43,8 @@ LAST_SEEN = "last seen"
 SEATED = "decree/incarnation"
 """The note of a node that was in a council in an earlier life, and is asked about it in this one."""
 MAX_NOTED = 64
+
+Answers = TypeVar("Answers", bound=Callable[..., object])
 
 
 class EntangledNode:
@@ -209,6 +211,30 @@ class EntangledNode:
         """Ask those that hold a watched key at once whether they hold anything new; else they are asked every 2 s."""
         if self._running:
             self._subscriber.refresh(watch)
+
+    def rpc(self, name: str, changes: bool = False) -> Callable[[Answers], Answers]:
+        """Let peers call the decorated function ``answer(peer, *arguments)`` under ``name``.
+
+        Its plain annotations are checked before it runs; with ``changes`` it runs once for each call, however often the
+        wire repeats it.  What it may return and raise, and ``deadline``, stands at ``Endpoint.expose``.
+        """
+
+        def expose(answer: Answers) -> Answers:
+            self.endpoint.expose(name, answer, changes)
+            return answer
+
+        return expose
+
+    def call(
+        self, contact: Contact, name: str, *arguments: object, timeout: float | None = None, changes: bool = False
+    ) -> Deferred[Any]:
+        """Call a peer's method; say ``changes`` where it was exposed so.
+
+        Fails with ``Refused`` or a named error of the method's own, and with ``NoAnswer``; cancelling it tells the peer.
+        """
+        if not self._running:
+            raise NotRunning("start the node first")
+        return self.endpoint.ask(contact, name, *arguments, timeout=timeout, changes=changes)
 
     def find_node(self, node_id: bytes) -> Deferred[list[Contact]]:
         """The k live nodes closest to ``node_id``, by an iterative lookup (Kademlia, section 2.3)."""

@@ -8,6 +8,7 @@ from typing import Any
 import msgpack
 
 from middleware.entangled.errors import NoAnswer, NotRunning, Refused, TooLarge, Unavailable
+from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.distance import closest
 from middleware.entangled.network.switchboard import Weather
 from middleware.entangled.node import CONTACTS, EntangledNode
@@ -322,6 +323,44 @@ class WatchTests(NodeCase):
             fleet.nodes[1].vanish()
             fleet.run(8.0)
             self.assertEqual({len(told[-1]) for place, told in enumerate(tellings) if place != 1}, {3}, seed)
+
+
+class RpcTests(NodeCase):
+    def test_decorated_function_is_called(self) -> None:
+        """A decorated function answers the calls of peers, with its arguments checked and its refusals by name."""
+        fleet = self.fleet(2)
+        server, client = fleet.nodes
+        counted: list[int] = []
+
+        @server.rpc("divide")
+        def divide(peer: Contact, a: int, b: int) -> float:
+            if b == 0:
+                raise Refused("nothing can be divided by 0", "zero")
+            return a / b
+
+        @server.rpc("count", changes=True)
+        def count(peer: Contact, step: int) -> int:
+            counted.append(step)
+            return sum(counted)
+
+        self.assertEqual(self.done(fleet, client.call(server.contact, "divide", 7, 2), 0.5), 3.5)
+        self.assertEqual(self.done(fleet, client.call(server.contact, "count", 2, changes=True), 0.5), 2)
+        zero, text, unknown = (
+            client.call(server.contact, "divide", 1, 0),
+            client.call(server.contact, "divide", "1", 2),
+            client.call(server.contact, "multiply", 1, 2),
+        )
+        fleet.run(0.5)
+        self.assertEqual(self.failureResultOf(zero, Refused).value.code, "zero")
+        self.assertIn("argument 1 must be int", str(self.failureResultOf(text, Refused).value))
+        self.failureResultOf(unknown, Refused)
+        self.assertEqual(divide(client.contact, 1, 2), 0.5)
+
+    def test_only_a_running_node_calls(self) -> None:
+        """A node that was not started, or has ended, says so at once."""
+        fleet = self.fleet(2)
+        fleet.nodes[1].stop()
+        self.assertRaises(NotRunning, fleet.nodes[1].call, fleet.nodes[0].contact, "ping")
 
 
 class KeepTests(NodeCase):

@@ -34,6 +34,7 @@ def parser(group: str) -> argparse.ArgumentParser:
         rpc.add_argument("node_asked", metavar="NODE", help="HOST:PORT, or the beginning of a known node's id")
         rpc.add_argument("method", help="for instance ping")
         rpc.add_argument("arguments", nargs="*", help="JSON where it is JSON, else text")
+        rpc.add_argument("--changes", action="store_true", help="the method changes something: it is to run once")
         rpc.set_defaults(verb="rpc")
         return rpc
     build = {"dht": _dht, "tuple": _tuple, "keyword": _keyword}[group]

@@ -128,11 +128,13 @@ class Verbs:
     # -- rpc --------------------------------------------------------------------------------------------------------
 
     def _rpc(self, a: Arguments, tell: Tell) -> object:
-        return Deferred.fromCoroutine(self._ask(a.text("node"), a.text("method"), a.fields("arguments")))
+        return Deferred.fromCoroutine(
+            self._ask(a.text("node"), a.text("method"), a.fields("arguments"), a.flag("changes"))
+        )
 
-    async def _ask(self, whom: str, method: str, arguments: Sequence[Any]) -> object:
+    async def _ask(self, whom: str, method: str, arguments: Sequence[Any], is_changing: bool) -> object:
         contact = await self._contact(whom)
-        return word.plain(await self.node.endpoint.ask(contact, method, *arguments))
+        return word.plain(await self.node.call(contact, method, *arguments, changes=is_changing))
 
     async def _contact(self, whom: str) -> Contact:
         host, colon, port = whom.rpartition(":")

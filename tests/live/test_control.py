@@ -1,0 +1,83 @@
+"""A real node asked through its control socket by the real ``swarm`` command, before and after a SIGKILL."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from twisted.trial.unittest import SynchronousTestCase
+
+ROOT = Path(__file__).resolve().parents[2]
+PATIENCE_S = 30.0
+
+
+class ControlTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        # Trial's own folders are deeper than the path of a socket may be.
+        self.runtime = Path(tempfile.mkdtemp())
+        self.addCleanup(shutil.rmtree, self.runtime)
+        inherited = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+        self.environment = {**inherited, "XDG_RUNTIME_DIR": str(self.runtime), "PYTHONPATH": str(ROOT)}
+
+    def start(self) -> subprocess.Popen[bytes]:
+        """A node that has joined."""
+        twistd = str(Path(sys.executable).parent / "twistd")
+        command = [sys.executable, twistd, "-n", "--pidfile=", "swarm-node", "--name", "a", "--store", "a.sqlite"]
+        child = subprocess.Popen(
+            command, cwd=self.runtime, env=self.environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+        )
+        self.addCleanup(child.wait)
+        self.addCleanup(child.kill)
+        assert child.stdout is not None
+        self.addCleanup(child.stdout.close)
+        for line in child.stdout:
+            if b"joined" in line:
+                return child
+        self.fail("the node ended")
+
+    def swarm(self, *words: str) -> subprocess.CompletedProcess[str]:
+        """``swarm WORDS``."""
+        program = "import sys, swarm; sys.exit(swarm.main(sys.argv[1:]))"
+        return subprocess.run(
+            [sys.executable, "-c", program, *words],
+            env=self.environment,
+            capture_output=True,
+            text=True,
+            timeout=PATIENCE_S,
+            check=False,
+        )
+
+    def said(self, *words: str) -> str:
+        """What ``swarm WORDS`` prints, without trouble."""
+        ran = self.swarm(*words)
+        self.assertEqual((ran.returncode, ran.stderr), (0, ""), ran.stdout)
+        return ran.stdout
+
+    def test_shell_and_node_talk(self) -> None:
+        """Values, tuples, keywords and methods through the shell; a SIGKILL later the values are there again."""
+        self.assertIn("no node runs", self.swarm("dht", "get", "a").stderr)
+        child = self.start()
+        self.assertIn("1 replicas", self.said("dht", "put", "colour", "red"))
+        (record,) = json.loads(self.said("dht", "get", "colour", "--json"))
+        self.assertEqual((record["value"], record["sequence"] > 0), ("red", True))
+        self.said("keyword", "publish", "red_target.jpg", "here")
+        self.assertIn("here", self.said("keyword", "search", "target"))
+        self.said("tuple", "put", "job", "7")
+        self.assertEqual(self.said("tuple", "get", "job", "?int"), '"job" 7\n')
+        self.assertEqual(self.swarm("tuple", "get", "job", "?int").returncode, 1)
+        self.assertEqual(self.swarm("tuple", "get", "job", "?number").returncode, 2)
+
+        child.kill()
+        child.wait()
+        self.assertIn("is it running?", self.swarm("dht", "get", "colour").stderr)
+        self.start()
+        deadline = time.monotonic() + PATIENCE_S
+        while self.swarm("dht", "get", "colour").returncode and time.monotonic() < deadline:
+            time.sleep(0.2)
+        self.assertIn("red", self.said("dht", "get", "colour"))
