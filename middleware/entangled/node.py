@@ -230,7 +230,7 @@ class EntangledNode:
     ) -> Deferred[Any]:
         """Call a peer's method; say ``changes`` where it was exposed so.
 
-        Fails with ``Refused`` or a named error of the method's own, and with ``NoAnswer``; cancelling it tells the peer.
+        Fails with ``Refused`` or a named error of the method's own, or ``NoAnswer``; cancelling it tells the peer.
         """
         if not self._running:
             raise NotRunning("start the node first")
