@@ -124,10 +124,10 @@ class Ground:
             self.errors.append(str(event.get("log_format")))
 
 
-def state_of(thing: object) -> str:
-    """The hash of everything that can be reached from ``thing``."""
+def state_of(thing: object, without: object = None) -> str:
+    """The hash of everything that can be reached from ``thing``, but not through ``without``."""
     digest = hashlib.blake2b(digest_size=16)
-    seen: dict[int, int] = {}
+    seen = {id(without): -1}
     _walk(thing, digest.update, seen)
     return digest.hexdigest()
 
