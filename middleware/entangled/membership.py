@@ -55,7 +55,7 @@ class Membership:
         self._tried_at: dict[bytes, float] = {}
         self._listed_at: dict[bytes, float] = {}
         self._returning = False
-        endpoint.expose("ping", self._answer_ping, changes=True)
+        endpoint.expose("ping", self._answer_ping, changes=True, idempotent=True)
         endpoint.expose("members", self._answer_members)
 
     def start(self) -> None:

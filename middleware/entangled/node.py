@@ -247,6 +247,7 @@ class EntangledNode:
             self._log.warn("away for {days:.0f} days: what was held is forgotten", days=away / 86400)
             for record in self.store.records():
                 self.store.discard(record.slot)
+
     def _answer_enrol(self, peer: Contact) -> bytes:
         return self.seat.answer_enrol(peer)
 

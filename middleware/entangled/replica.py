@@ -65,12 +65,12 @@ class Replica:
         self.on_peer: Callable[[Contact], None] = lambda contact: None
         self.on_goodbye: Callable[[Contact], None] = lambda contact: None
         self._chores = chores
-        endpoint.expose("store", self._once_written(self.answer_store), changes=True)
+        endpoint.expose("store", self._once_written(self.answer_store), changes=True, idempotent=True)
         endpoint.expose("find_value", self.answer_find_value)
-        endpoint.expose("cache", self.answer_cache, changes=True)
-        endpoint.expose("watch", self.answer_watch, changes=True)
-        endpoint.expose("alive", self.answer_alive, changes=True)
-        endpoint.expose("let_go", self.answer_let_go, changes=True)
+        endpoint.expose("cache", self.answer_cache, changes=True, idempotent=True)
+        endpoint.expose("watch", self.answer_watch, changes=True, idempotent=True)
+        endpoint.expose("alive", self.answer_alive, changes=True, idempotent=True)
+        endpoint.expose("let_go", self.answer_let_go, changes=True, idempotent=True)
         endpoint.expose("goodbye", self.answer_goodbye, changes=True)
 
     def start(self) -> None:
