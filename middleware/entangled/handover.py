@@ -216,7 +216,7 @@ class Handover:
         record = unpacked(fields)
         if record is None or record.slot != slot or type(left) is not float or record.lifetime != "team":
             return
-        if record.beats(self._held(slot)) and record.is_genuine():
+        if record.beats(self._held(slot)) and self._replica.is_genuine(record):
             self._replica.keep(record, left)
 
     async def _give(self, contact: Contact, record: Record) -> int:
