@@ -28,6 +28,8 @@ K = 8
 ALPHA = 3
 MISS_GAP = 0.5
 """Seconds in which several unanswered questions are one miss: a burst of questions is no proof of death."""
+FRESH = 0.1
+"""Seconds within which one sign of life is as good as many."""
 HEDGE = (0.002, 0.02, 0.15)
 """Seconds after which one more node is asked beside one that does not answer: at least, while it was never measured,
 and at most; between them, two round trips."""
@@ -204,7 +206,10 @@ class Overlay:
         """``contact`` has proved its key and its address: it answered from there."""
         if contact.node_id == self.own_id:
             return
-        now = self._clock.seconds()
+        now, node_id = self._clock.seconds(), contact.node_id
+        is_fresh = now - self._heard_at.get(node_id, -FRESH) < FRESH
+        if is_fresh and node_id not in self._misses and node_id not in self._slow and self._known(node_id) == contact:
+            return  # it was said a moment ago
         is_new = self.table.get(contact.node_id) is None and self.roster.get(contact.node_id) is None
         self._heard_at[contact.node_id] = now
         self._misses.pop(contact.node_id, None)
@@ -219,8 +224,7 @@ class Overlay:
 
     def heard(self, contact: Contact) -> None:
         """``contact`` asked or told us something in its session; a new address it has to prove first."""
-        known = self.roster.get(contact.node_id) or self.table.get(contact.node_id)
-        if known == contact:
+        if self._known(contact.node_id) == contact:
             self.proved(contact)
         elif contact.node_id != self.own_id:
             self._chores.fork(self.check(contact))
@@ -240,6 +244,9 @@ class Overlay:
         await self.ask(contact, "ping", self.roster.digest(), changes=True)
 
     # -- inside -----------------------------------------------------------------------------------------------------
+
+    def _known(self, node_id: bytes) -> Contact | None:
+        return self.roster.get(node_id) or self.table.get(node_id)
 
     def _missed(self, contact: Contact) -> None:
         now = self._clock.seconds()
