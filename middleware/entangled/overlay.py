@@ -42,7 +42,8 @@ OnContact = Callable[[Contact], None]
 class Overlay:
     """Who a node knows; ``on_newcomer`` and ``on_lost`` are told of contacts that come and go.
 
-    ``is_whole`` says whether all members of the team are known; whoever asks around sets it.
+    ``is_whole`` says whether all members of the team are known, ``is_placed`` whether this node has looked around at
+    all, so that where it knows few there are few; whoever asks around sets them.
     """
 
     def __init__(
@@ -57,6 +58,7 @@ class Overlay:
         self.table = RoutingTable(self.own_id, K)
         self.roster = Roster(self.own_id)
         self.is_whole = False
+        self.is_placed = False
         self.on_newcomer: OnContact = lambda contact: None
         self.on_lost: OnContact = lambda contact: None
         self._heard_at: dict[bytes, float] = {}
@@ -73,6 +75,11 @@ class Overlay:
     def is_complete(self) -> bool:
         """Whether everybody is known, so that nothing has to be looked up."""
         return self.is_whole and not self.roster.is_full
+
+    @property
+    def is_sparse(self) -> bool:
+        """Whether there are more nodes than are known here, so that those close to a key have to be looked up."""
+        return not self.is_complete and (len(self.table) >= K or not self.is_placed)
 
     def responsible(self, key: bytes) -> list[Contact]:
         """The k closest live nodes to ``key`` that are known here, this one included, the closest first."""
@@ -97,7 +104,7 @@ class Overlay:
 
     async def holders(self, key: bytes) -> list[Contact]:
         """The k closest live nodes to ``key``, this one included; looked up where not all nodes are known."""
-        if self.is_complete or len(self.table) < K:
+        if not self.is_sparse:
             self._found.pop(key, None)
             return self.responsible(key)
         found = await self.lookup(key)

@@ -81,7 +81,7 @@ class Reader:
         # What is left of a time when this node was among the closest may be old.
         if here and self._replica.is_sure() and self._overlay.belongs(key, self._overlay.me()):
             return here
-        if not self._overlay.is_complete and len(self._overlay.table) >= K:
+        if self._overlay.is_sparse:
             return await self._walk(key)
         targets = await self._overlay.holders(key)
         voters = frozenset(self._overlay.voters(key, targets))
