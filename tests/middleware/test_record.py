@@ -62,7 +62,7 @@ class RecordTest(SynchronousTestCase):
         signed = Signed()
         self.assertTrue(signed.is_genuine(record()))
         for change in ({"value": b"there"}, {"sequence": 2}, {"signature": bytes(64)}, {"owner": CAT.public}):
-            self.assertFalse(signed.is_genuine(replace(record(), **change)), change)  # type: ignore[arg-type]
+            self.assertFalse(signed.is_genuine(replace(record(), **change)), change)
         self.assertEqual(len(signed), 1)
         self.patch(records, "verified", lambda *_: self.fail("checked twice"))
         self.assertTrue(signed.is_genuine(replace(record())))
