@@ -224,11 +224,12 @@ def real_seams(settings: Settings, reactor: Any) -> Seams:
     path = settings.node.store
     quota = settings.node.store_rows, settings.node.store_bytes
     rng = random.SystemRandom()
-    store: Store = (
-        MemoryStore(*quota, epoch=rng.randbytes(8))
-        if path == IN_MEMORY
-        else SqliteStore.open(Path(path), reactor.seconds(), *quota, deliver=reactor.callFromThread)
-    )
+    store: Store
+    if path == IN_MEMORY:
+        store = MemoryStore(*quota, epoch=rng.randbytes(8))
+    else:
+        deliver, durable = reactor.callFromThread, settings.node.durable
+        store = SqliteStore.open(Path(path), reactor.seconds(), *quota, deliver=deliver, durable=durable)
     network = partial(UdpNetwork, reactor, settings.node.host, settings.node.port)
     return Seams(reactor, network, store, rng, time.time)
 

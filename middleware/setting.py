@@ -137,6 +137,18 @@ def addresses() -> Rule:
     return _rule(check, _comma_separated)
 
 
+def one_of(words: Sequence[str]) -> Rule:
+    """A rule for one of ``words``."""
+
+    def check(value: object) -> str:
+        if not isinstance(value, str) or value not in words:
+            near = get_close_matches(str(value), words, n=1, cutoff=0.0)[0]
+            raise Wrong(f"must be one of {', '.join(words)}, is {shown(value)}", f'the nearest is "{near}"')
+        return value
+
+    return _rule(check)
+
+
 def some_of(words: Sequence[str]) -> Rule:
     """A rule for a list of at least one of ``words``."""
 

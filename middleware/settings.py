@@ -15,7 +15,7 @@ from typing import Any
 
 from middleware import setting
 from middleware.entangled.network.network import Address
-from middleware.entangled.store import MAX_BYTES, MAX_ROWS
+from middleware.entangled.store import MAX_BYTES, MAX_ROWS, Durable
 from middleware.errors import BadSetting
 
 IN_MEMORY = ":memory:"
@@ -56,6 +56,10 @@ class NodeSettings:
     store_bytes: int = field(default=MAX_BYTES, metadata=setting.whole(100_000, 2**31))
     """Bytes that the records may have together.  More holds more large values; fewer spare memory and card.  What has
     run out, old tombstones and cached copies make room; then the writer is refused, with figures."""
+
+    durable: Durable = field(default="power", metadata=setting.one_of(("power", "crash")))
+    """What a stored record has outlived before its writer is told: the loss of ``power``, or only a ``crash`` of the
+    node.  ``crash`` waits for no disk, and may lose the last moments with the power; the file stays whole."""
 
     team_key: str = field(default="swarm", metadata=setting.secret(1000), repr=False)
     """What all nodes of a team know and nobody else does.  **The default is no secret: such a team is open to everyone

@@ -58,7 +58,8 @@ class Entry:
     """One column of the comparison.
 
     ``package`` is what must be importable; ``promise`` is what a finished put means; ``largest`` is the longest value
-    that the library says it carries, in bytes; ``can`` names what it has beside put and get.
+    that the library says it carries, in bytes; ``survives`` says of a store on disk if it is safe from less
+    than a loss of power; ``can`` names what it has beside put and get.
     """
 
     name: str
@@ -70,12 +71,14 @@ class Entry:
     largest: int
     is_sealed: bool = False
     is_on_disk: bool = False
+    survives: str = ""
     can: tuple[str, ...] = ()
 
     @property
     def behind(self) -> str:
         """What stands behind its figures: encryption, disk."""
-        return f"{'sealed' if self.is_sealed else 'clear text'}, {'SQLite' if self.is_on_disk else 'memory'}"
+        disk = f"SQLite{self.survives}" if self.is_on_disk else "memory"
+        return f"{'sealed' if self.is_sealed else 'clear text'}, {disk}"
 
     @property
     def is_installed(self) -> bool:
@@ -98,8 +101,9 @@ _VERBS = ("watch", "space", "lose")
 ENTRIES = {
     entry.name: entry
     for entry in (
-        Entry(OURS, "swarm", "SwarmPeer", ("sqlite",), "nacl", _FIVE, MIB, True, True, _VERBS),
-        Entry(OURS_IN_MEMORY, "swarm", "SwarmPeer", (), "nacl", _FIVE, MIB, True, False, _VERBS),
+        Entry(OURS, "swarm", "SwarmPeer", ("sqlite",), "nacl", _FIVE, MIB, True, True, "", _VERBS),
+        Entry("swarm-crash", "swarm", "SwarmPeer", ("crash",), "nacl", _FIVE, MIB, True, True, " (crash only)", _VERBS),
+        Entry(OURS_IN_MEMORY, "swarm", "SwarmPeer", (), "nacl", _FIVE, MIB, True, False, "", _VERBS),
         Entry("kademlia", "kademlia", "KademliaPeer", (), "kademlia", "all 20 were asked, one took it", 8000),
         Entry("opendht", "opendht", "OpenDhtPeer", (), "opendht", _EIGHT, 65_000, can=("watch",)),
         Entry("opendht-free", "opendht", "OpenDhtPeer", ("free",), "opendht", _EIGHT, 65_000, can=("watch",)),

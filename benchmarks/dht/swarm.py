@@ -20,7 +20,7 @@ from middleware.entangled.network.udp import UdpNetwork
 from middleware.entangled.node import EntangledNode
 from middleware.entangled.record import Record, hashed_key
 from middleware.entangled.sqlite import SqliteStore
-from middleware.entangled.store import MemoryStore
+from middleware.entangled.store import Durable, MemoryStore
 
 TEAM_KEY = b"the key of a team that only runs"
 NAME = "bench"
@@ -43,11 +43,12 @@ class LossyUdp(UdpNetwork):
 
 
 class SwarmPeer:
-    """A contestant; ``store`` is "memory" or "sqlite"."""
+    """A contestant; ``store`` is "memory", "sqlite", or "crash": SQLite that does not wait for the disk."""
 
     def __init__(self, folder: str, store: str = "memory") -> None:
         use_monotonic_time()
-        self._folder = folder if store == "sqlite" else ""
+        self._folder = folder if store != "memory" else ""
+        self._durable: Durable = "crash" if store == "crash" else "power"
         self._rng = random.SystemRandom()
         self._space: Any = None
 
@@ -70,7 +71,7 @@ class SwarmPeer:
         store = MemoryStore()
         if self._folder:
             path = os.path.join(self._folder, f"{port}.sqlite")
-            store = SqliteStore.open(path, time.monotonic(), deliver=reactor.callFromThread)
+            store = SqliteStore.open(path, time.monotonic(), deliver=reactor.callFromThread, durable=self._durable)
         self._network = LossyUdp(reactor, HOST, port)
         identity = Identity(self._rng.randbytes(32))
         self._node = EntangledNode(identity, TEAM_KEY, self._network, store, reactor, self._rng)

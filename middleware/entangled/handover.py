@@ -39,6 +39,8 @@ AT_ONCE = 8
 OUT_OF_TOUCH = STRUCK_S / 2
 """Seconds without a majority in touch after which a node may have been struck, and is sure of nothing."""
 AGAIN = 1.0
+WELCOME = 1.0
+"""Seconds, and as much again at most, that a newcomer is left to catch up by itself."""
 
 
 class Handover:
@@ -66,6 +68,7 @@ class Handover:
         self._is_sure = False
         self._touched_at = clock.seconds()
         self._reconciled: dict[bytes, float] = {}
+        self._asked_at: dict[bytes, float] = {}
         self._busy: set[bytes] = set()
         self._catching_up = False
         self._stored_at: dict[Slot, float] = {}
@@ -95,13 +98,14 @@ class Handover:
             self._chores.fork(self._catch_up())
 
     def welcome(self, contact: Contact) -> None:
-        """Reconcile with a newcomer."""
+        """Reconcile with a newcomer, unless it has done so by itself before."""
         if self._is_near(contact):
-            self._chores.fork(self._reconcile(contact))
+            self._chores.later(WELCOME * (1 + self._rng.random()), self._welcome, contact, self._clock.seconds())
 
     def lost(self, contact: Contact) -> None:
         """Give the records that a lost contact held to the node that takes its place."""
         self._reconciled.pop(contact.node_id, None)
+        self._asked_at.pop(contact.node_id, None)
         for record in self._records():
             nearest = self._overlay.responsible(record.key)
             if len(nearest) < K or all(c.node_id != self._own_id for c in nearest[:STEWARDS]):
@@ -120,6 +124,7 @@ class Handover:
     def _answer_digests(self, peer: Contact) -> list[object]:
         """DIGESTS: of each part of the id space, what both should hold; and how much the peer alone should."""
         groups, extra = self._both(peer)
+        self._asked_at[peer.node_id] = self._clock.seconds()
         return [[digest_of(group) for group in groups], len(extra)]
 
     def _answer_places(self, peer: Contact, group: int, after: list[object]) -> list[object]:
@@ -140,6 +145,11 @@ class Handover:
         return None if record is None else [record.packed(), self._replica.left(record)]
 
     # -- inside -----------------------------------------------------------------------------------------------------
+
+    def _welcome(self, contact: Contact, since: float) -> None:
+        compared_at = max(self._reconciled.get(contact.node_id, -1.0), self._asked_at.get(contact.node_id, -1.0))
+        if compared_at < since:
+            self._chores.fork(self._reconcile(contact))
 
     def _held(self, slot: Slot) -> Record | None:
         return None if slot in self._replica.keepsakes else self._store.slot(slot)
@@ -216,7 +226,7 @@ class Handover:
         record = unpacked(fields)
         if record is None or record.slot != slot or type(left) is not float or record.lifetime != "team":
             return
-        if record.beats(self._held(slot)) and record.is_genuine():
+        if record.beats(self._held(slot)) and self._replica.is_genuine(record):
             self._replica.keep(record, left)
 
     async def _give(self, contact: Contact, record: Record) -> int:
@@ -232,8 +242,10 @@ class Handover:
                 began = self._clock.seconds()
                 near = [c for c in self._overlay.responsible(self._own_id) if c.node_id != self._own_id]
                 others = self._overlay.roster.live() if self._overlay.is_complete else near
-                work = [Deferred.fromCoroutine(self._caught_up_with(contact)) for contact in others]
-                done = sum([await each for each in work])
+                # One first, who has most of it; what it gave, the next ones need not give.
+                done = sum([await self._caught_up_with(contact) for contact in others[:STEWARDS]])
+                work = [Deferred.fromCoroutine(self._caught_up_with(contact)) for contact in others[STEWARDS:]]
+                done += sum([await each for each in work])
                 roster = self._overlay.roster
                 everybody = 1 + len(others) + (len(roster.absent()) if self._overlay.is_complete else 0)
                 # Whatever a majority of holders has, one of those reached has.

@@ -36,6 +36,10 @@ AGAIN = 4.0
 """Seconds before an absent member, or one that was only named, is tried again."""
 LARGE_FOR = 60.0
 """Seconds for which one word that the network is too large to be known whole holds against those who do not see it."""
+BREATH = 0.02
+"""Seconds that a newcomer lets its first reads have before it meets everybody, and as much again at most."""
+AT_ONCE = 8
+"""Strangers that are met at the same time: a handshake takes 0.3 ms of a core on each side."""
 PAGE = 20
 """Members in one message."""
 
@@ -58,7 +62,8 @@ class Membership:
         self._listed_at: dict[bytes, float] = {}
         self._returning = False
         self._large_until = float("-inf")
-        endpoint.expose("ping", self._answer_ping, changes=True)
+        self._joining = False
+        endpoint.expose("ping", self._answer_ping, changes=True, idempotent=True)
         endpoint.expose("members", self._answer_members)
 
     def start(self) -> None:
@@ -66,7 +71,7 @@ class Membership:
         self._chores.every(PROBE, self._probe)
 
     async def join(self, known: Sequence[Address], remembered: Sequence[Contact] = ()) -> None:
-        """Greet the known nodes, with back-off until one answers, then look up the own id.
+        """Greet the known nodes, with back-off until one answers.
 
         ``remembered`` are greeted beside them, and waited for only where there are known nodes: without any, this may
         be the first node of its network.  A known node that turns out to be this one is waited for no longer.
@@ -78,7 +83,6 @@ class Membership:
         self._former |= dict.fromkeys([*known, *addresses])
         while others or addresses:
             if await self._greeted(others, addresses):
-                await self._overlay.lookup(self._overlay.own_id)
                 return
             if self._chores.is_stopped:
                 raise NotRunning("the node stopped while it was joining")
@@ -89,6 +93,14 @@ class Membership:
             await self._chores.sleep(pause * (0.75 + self._rng.random() / 2))
             pause = min(pause * 2, BACKOFF[1])
         self._overlay.is_whole = True
+
+    async def settle(self) -> None:
+        """Look up the own id (Kademlia, section 2.3), so that this node knows where it is and is known there."""
+        if not self._overlay.is_whole:
+            await self._chores.sleep(self._breath())
+        if not self._overlay.is_whole:
+            await self._overlay.lookup(self._overlay.own_id)
+        self._overlay.is_placed = True
 
     def lost(self, contact: Contact) -> None:
         """Keep in mind where ``contact`` was."""
@@ -113,20 +125,36 @@ class Membership:
         return any([ok for ok, _ in await DeferredList(pings, consumeErrors=True)])
 
     async def _ping(self, contact: Contact) -> None:
-        answer = await self._overlay.ask(contact, "ping", self._overlay.roster.digest(), changes=True)
+        # Who does not know all members yet has no list to compare.
+        digest = self._overlay.roster.digest() if self._overlay.is_whole else b""
+        answer = await self._overlay.ask(contact, "ping", digest, changes=True)
         self._compare(contact, answer)
 
     def _compare(self, contact: Contact, digest: object) -> None:
         """Ask ``contact`` for its members where it knows others than this node does."""
         now = self._clock.seconds()
-        if now < self._large_until or (self._overlay.is_whole and digest == self._overlay.roster.digest()):
+        if now < self._large_until or not digest or (self._joining and not self._overlay.is_whole):
+            return
+        if self._overlay.is_whole and digest == self._overlay.roster.digest():
             return
         if now - self._listed_at.get(contact.node_id, -AGAIN) < AGAIN:
             return
         if len(self._listed_at) > 4 * MAX_MEMBERS:
             self._listed_at.clear()
         self._listed_at[contact.node_id] = now
-        self._chores.fork(self._list(contact))
+        self._chores.fork(self._list(contact) if self._overlay.is_whole else self._first_list(contact))
+
+    async def _first_list(self, contact: Contact) -> None:
+        """Meet the members of the network that was just joined, after a moment for those who wait for a first read."""
+        self._joining = True
+        try:
+            await self._chores.sleep(self._breath())
+            await self._list(contact)
+        finally:
+            self._joining = False
+
+    def _breath(self) -> float:
+        return BREATH * (1 + self._rng.random())
 
     async def _list(self, contact: Contact) -> None:
         """Ping everybody whom ``contact`` knows and this node does not."""
@@ -142,8 +170,9 @@ class Membership:
             if len(found) < PAGE:
                 break
             after = found[-1].node_id
-        pings = [Deferred.fromCoroutine(self._ping(stranger)) for stranger in strangers]
-        await DeferredList(pings, consumeErrors=True)
+        for first in range(0, len(strangers), AT_ONCE):
+            pings = [Deferred.fromCoroutine(self._ping(stranger)) for stranger in strangers[first : first + AT_ONCE]]
+            await DeferredList(pings, consumeErrors=True)
         self._overlay.is_whole = self._clock.seconds() > self._large_until
 
     def _is_worth_a_try(self, contact: Contact) -> bool:

@@ -129,9 +129,9 @@ class EntangledNode:
     def join(self, known: Sequence[Address]) -> Deferred[None]:
         """Enter the network through ``known`` nodes (thesis, Algorithm 4.1), with back-off until one answers.
 
-        The contacts of an earlier life, which the store remembers, are tried beside them.  Fires when the node has
-        looked up its own id; where ``known`` is empty and nobody is remembered, at once (the first node of a
-        network).
+        The contacts of an earlier life, which the store remembers, are tried beside them.  Fires when one of them has
+        answered, so that keys can be read; where ``known`` is empty and nobody is remembered, at once (the first node
+        of a network).  The node then looks up its own id, meets the others, and takes over what it is to hold.
         """
         return _run(self._join(known))
 
@@ -263,6 +263,10 @@ class EntangledNode:
 
     async def _join(self, known: Sequence[Address]) -> None:
         await self._membership.join(known, self._noted_contacts())
+        self._chores.fork(self._settle())
+
+    async def _settle(self) -> None:
+        await self._membership.settle()
         if self._running:
             self._handover.joined()
             self._note_contacts()

@@ -30,6 +30,8 @@ CHECK_GAP = 4.0
 """Seconds before a stranger, or a contact at a new address, is asked again to prove itself."""
 MISS_GAP = 0.5
 """Seconds in which several unanswered questions are one miss: a burst of questions is no proof of death."""
+FRESH = 0.1
+"""Seconds within which one sign of life is as good as many."""
 HEDGE = (0.002, 0.02, 0.15)
 """Seconds after which one more node is asked beside one that does not answer: at least, while it was never measured,
 and at most; between them, two round trips."""
@@ -46,7 +48,8 @@ OnContact = Callable[[Contact], None]
 class Overlay:
     """Who a node knows; ``on_newcomer`` and ``on_lost`` are told of contacts that come and go.
 
-    ``is_whole`` says whether all members of the team are known; whoever asks around sets it.
+    ``is_whole`` says whether all members of the team are known, ``is_placed`` whether this node has looked around at
+    all, so that where it knows few there are few; whoever asks around sets them.
     """
 
     def __init__(
@@ -61,6 +64,7 @@ class Overlay:
         self.table = RoutingTable(self.own_id, K)
         self.roster = Roster(self.own_id)
         self.is_whole = False
+        self.is_placed = False
         self.on_newcomer: OnContact = lambda contact: None
         self.on_lost: OnContact = lambda contact: None
         self._heard_at: dict[bytes, float] = {}
@@ -78,6 +82,11 @@ class Overlay:
     def is_complete(self) -> bool:
         """Whether everybody is known, so that nothing has to be looked up."""
         return self.is_whole and not self.roster.is_full
+
+    @property
+    def is_sparse(self) -> bool:
+        """Whether there are more nodes than are known here, so that those close to a key have to be looked up."""
+        return not self.is_complete and (len(self.table) >= K or not self.is_placed)
 
     def responsible(self, key: bytes) -> list[Contact]:
         """The k closest live nodes to ``key`` that are known here, this one included, the closest first."""
@@ -109,7 +118,7 @@ class Overlay:
             if self.is_whole or len(self.roster):
                 break
             await self._chores.sleep(PLACING_STEP)
-        if self.is_complete or len(self.table) < K:
+        if not self.is_sparse:
             self._found.pop(key, None)
             return self.responsible(key)
         found = await self.lookup(key)
@@ -220,7 +229,10 @@ class Overlay:
         """``contact`` has proved its key and its address: it answered from there."""
         if contact.node_id == self.own_id:
             return
-        now = self._clock.seconds()
+        now, node_id = self._clock.seconds(), contact.node_id
+        is_fresh = now - self._heard_at.get(node_id, -FRESH) < FRESH
+        if is_fresh and node_id not in self._misses and node_id not in self._slow and self._known(node_id) == contact:
+            return  # it was said a moment ago
         is_new = self.table.get(contact.node_id) is None and self.roster.get(contact.node_id) is None
         self._heard_at[contact.node_id] = now
         self._misses.pop(contact.node_id, None)
@@ -235,8 +247,7 @@ class Overlay:
 
     def heard(self, contact: Contact) -> None:
         """``contact`` asked or told us something in its session; a new address it has to prove first."""
-        known = self.roster.get(contact.node_id) or self.table.get(contact.node_id)
-        if known == contact:
+        if self._known(contact.node_id) == contact:
             self.proved(contact)
             return
         now = self._clock.seconds()
@@ -262,6 +273,9 @@ class Overlay:
         await self.ask(contact, "ping", self.roster.digest(), changes=True)
 
     # -- inside -----------------------------------------------------------------------------------------------------
+
+    def _known(self, node_id: bytes) -> Contact | None:
+        return self.roster.get(node_id) or self.table.get(node_id)
 
     def _missed(self, contact: Contact) -> None:
         now = self._clock.seconds()

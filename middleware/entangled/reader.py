@@ -72,7 +72,7 @@ class Reader:
         """Whether ``record``, told by ``contact``, is one of ``key`` and its owner's own word."""
         if record.key != key:
             return False
-        return record.owner == contact.public or record in self._replica.held(key) or record.is_genuine()
+        return record.owner == contact.public or self._replica.is_genuine(record)
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
@@ -81,7 +81,7 @@ class Reader:
         # What is left of a time when this node was among the closest may be old.
         if _is_something(here) and self._replica.is_sure() and self._overlay.belongs(key, self._overlay.me()):
             return here
-        if not self._overlay.is_complete and len(self._overlay.table) >= K:
+        if self._overlay.is_sparse:
             return await self._walk(key)
         targets = await self._overlay.holders(key)
         voters = frozenset(self._overlay.voters(key, targets))

@@ -19,7 +19,7 @@ from middleware.entangled.errors import Refused
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.keepsake import Keepsakes
 from middleware.entangled.pusher import Pusher
-from middleware.entangled.record import KEY_BYTES, Record, unpacked
+from middleware.entangled.record import KEY_BYTES, Record, Signed, unpacked
 from middleware.entangled.store import Store
 from middleware.entangled.watch import digest_of
 from middleware.entangled.wire.endpoint import Endpoint
@@ -56,6 +56,7 @@ class Replica:
         self._clock = clock
         self.pusher = Pusher(endpoint, clock, chores)
         self.cache = PathCache()
+        self._signed = Signed()
         self.is_sure: Callable[[], bool] = lambda: True
         self.nearest: Callable[[bytes], list[Contact]] = lambda key: []
         self._doubtful: set[bytes] = set()
@@ -65,12 +66,12 @@ class Replica:
         self.on_peer: Callable[[Contact], None] = lambda contact: None
         self.on_goodbye: Callable[[Contact], None] = lambda contact: None
         self._chores = chores
-        endpoint.expose("store", self._once_written(self.answer_store), changes=True)
+        endpoint.expose("store", self._once_written(self.answer_store), changes=True, idempotent=True)
         endpoint.expose("find_value", self.answer_find_value)
-        endpoint.expose("cache", self.answer_cache, changes=True)
-        endpoint.expose("watch", self.answer_watch, changes=True)
-        endpoint.expose("alive", self.answer_alive, changes=True)
-        endpoint.expose("let_go", self.answer_let_go, changes=True)
+        endpoint.expose("cache", self.answer_cache, changes=True, idempotent=True)
+        endpoint.expose("watch", self.answer_watch, changes=True, idempotent=True)
+        endpoint.expose("alive", self.answer_alive, changes=True, idempotent=True)
+        endpoint.expose("let_go", self.answer_let_go, changes=True, idempotent=True)
         endpoint.expose("goodbye", self.answer_goodbye, changes=True)
 
     def start(self) -> None:
@@ -143,7 +144,7 @@ class Replica:
         records = [record for record in map(unpacked, packed) if record is not None]
         if len(records) < len(packed) or any(record.key != _checked_key(key) for record in records):
             raise Refused("not records of this key")
-        if not self.held(key) and all(record.is_genuine() for record in records):
+        if not self.held(key) and all(self.is_genuine(record) for record in records):
             self.cache.put(key, records, ttl, self._clock.seconds())
 
     def answer_watch(self, peer: Contact, key: bytes, digest: bytes) -> list[object]:
@@ -186,7 +187,12 @@ class Replica:
         Its owner's own session vouches for it; second-hand a signature has to, and a lease is taken from its owner
         only, for it shall not outlive the owner's own sign of life.
         """
-        return record.owner == peer.public or (record.lifetime == "team" and record.is_genuine())
+        return record.owner == peer.public or (record.lifetime == "team" and self.is_genuine(record))
+
+    def is_genuine(self, record: Record) -> bool:
+        """Whether ``record`` is its owner's own word: the very one that is held here, or one with a good signature."""
+        is_held = record.slot not in self.keepsakes and self._store.slot(record.slot) == record
+        return is_held or self._signed.is_genuine(record)
 
     # -- inside -----------------------------------------------------------------------------------------------------
 

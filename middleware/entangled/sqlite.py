@@ -27,9 +27,10 @@ from middleware.entangled.schema import (
     open_rows,
     record_of,
 )
-from middleware.entangled.store import HOLD, MAX_BYTES, MAX_ROWS, MemoryStore, Origin
+from middleware.entangled.store import HOLD, MAX_BYTES, MAX_ROWS, Durable, MemoryStore, Origin
 from middleware.entangled.writer import Deliver, Writer
 
+SYNCHRONOUS: dict[Durable, str] = {"power": "FULL", "crash": "NORMAL"}
 EPOCH = "epoch"
 """The note that holds the store's epoch; it never goes from one file to the next."""
 MAX_LOG = 4 * 2**20
@@ -72,6 +73,7 @@ class SqliteStore(MemoryStore):
         hold: float = HOLD,
         deliver: Deliver | None = None,
         fresh_epoch: bytes | None = None,
+        durable: Durable = "power",
     ) -> SqliteStore:
         """The store in the file ``path``, made if there is none; raises ``BadStore`` with the reason and a remedy.
 
@@ -79,13 +81,16 @@ class SqliteStore(MemoryStore):
         are gone, for their owners' leases ended with the node that watched them.  A rotten file is set aside and the
         store starts empty, with those notes that could be saved.  ``deliver`` is ``reactor.callFromThread``, or None
         where nobody awaits ``written``; ``fresh_epoch`` is the epoch if the store is made now (None: drawn).
+        ``durable`` is what ``written`` stands for: that it outlives a loss of ``power``, or only the ``crash`` of this
+        process, which spares a wait for the disk at each commit; with the power the last commits may then go, but
+        nothing else.
         """
         path = os.fspath(path)
         fresh_epoch = os.urandom(8) if fresh_epoch is None else fresh_epoch
         notes: dict[str, bytes] = {}
         origin: Origin = "kept"
         try:
-            connection, lock, version, found = _opened(path)
+            connection, lock, version, found = _opened(path, durable)
         except Rotten as error:
             aside = set_aside(path)
             notes = saved_notes(aside)
@@ -99,7 +104,7 @@ class SqliteStore(MemoryStore):
                 aside=aside,
                 saved=saved,
             )
-            connection, lock, version, found = _opened(path)
+            connection, lock, version, found = _opened(path, durable)
             origin = "replaced"
         if not version and origin == "kept":
             origin = "new"
@@ -196,7 +201,7 @@ def read_records(path: str | os.PathLike[str], key: bytes) -> list[Record]:
             connection.close()
 
 
-def _opened(path: str) -> tuple[sqlite3.Connection, int, int, Contents]:
+def _opened(path: str, durable: Durable) -> tuple[sqlite3.Connection, int, int, Contents]:
     """The file, locked and made ready to be written, the version that it had, and what it holds.
 
     Raises ``BadStore`` where it cannot be used, ``Rotten`` where it is ours and damaged.
@@ -212,8 +217,9 @@ def _opened(path: str) -> tuple[sqlite3.Connection, int, int, Contents]:
         # Only now, for the file of another program is left as it was.
         os.fchmod(lock, 0o600)
         connection.execute("PRAGMA journal_mode = WAL")
-        # Robots lose power at any moment; with less than FULL the last commits would be gone.
-        connection.execute("PRAGMA synchronous = FULL")
+        # Robots lose power at any moment; with less than FULL the last commits would be gone.  Less than NORMAL could
+        # damage the file.
+        connection.execute(f"PRAGMA synchronous = {SYNCHRONOUS[durable]}")
         connection.execute("PRAGMA cache_size = -512")
         connection.execute(f"PRAGMA journal_size_limit = {MAX_LOG}")
         make(connection, version)

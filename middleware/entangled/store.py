@@ -38,6 +38,8 @@ FIXED_BYTES = 17
 
 Origin = Literal["new", "kept", "replaced"]
 """Where a store comes from: made now, back from its file, or made now because its file was rotten."""
+Durable = Literal["power", "crash"]
+"""What that which is written outlives: any loss of power, or a crash of the process only."""
 
 
 class Usage(NamedTuple):

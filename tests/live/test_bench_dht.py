@@ -34,7 +34,7 @@ class BenchDhtTests(SynchronousTestCase):
         ran = self.bench(*small)
         self.assertEqual(ran.returncode, 0, ran.stderr)
         results = json.loads(out.read_text())["results"]["3"]
-        self.assertEqual(list(results), ["swarm-sqlite", "swarm-memory"])
+        self.assertEqual(list(results), ["swarm-sqlite", "swarm-crash", "swarm-memory"])
         for result in results.values():
             self.assertNotIn("singles", result.get("trouble", {}), ran.stdout)
             self.assertNotIn("join", result.get("trouble", {}), ran.stdout)

@@ -74,7 +74,7 @@ class CallTests(EndpointCase):
             self.clock.advance(DELAY)
             self.assertEqual(self.ended.pop(), how)
         self.clock.advance(70)
-        self.assertEqual(self.b._answerer._ledger._running, {})
+        self.assertEqual([account.running for account in self.b._answerer._ledger._accounts.values()], [{}])
 
     def test_cancel_overtakes_its_question(self) -> None:
         """A question that arrives after it was cancelled does not run."""

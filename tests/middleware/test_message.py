@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.errors import Malformed
-from middleware.entangled.wire.message import Answer, Failure, Message, Question, Told, decoded, encoded
+from middleware.entangled.wire.message import Answer, Cancel, Failure, Message, Question, Told, decoded, encoded
 
 _PLAIN = (
     st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats(allow_nan=False) | st.text(max_size=20)
@@ -22,6 +22,33 @@ _VALUES = st.recursive(
 )
 
 
+def by_the_table(kind: object, fields: list[Any]) -> Message | None:
+    """What ``docs/protocol.md`` calls the message of these fields, by patterns, without any haste."""
+    if type(kind) is not int or any(deep(field) > 15 for field in fields):
+        return None
+    match [kind, *fields]:
+        case [0, int(id_), int(behind), str(method), list(arguments), int(left)]:
+            numbers = not any(isinstance(number, bool) for number in (id_, behind, left))
+            if numbers and 0 <= behind <= id_ < 2**64 and 0 <= left < 2**32 and 0 < len(method) <= 64:
+                return Question(id_, method, tuple(arguments), left, behind)
+        case [1, int(id_), value] if not isinstance(id_, bool) and 0 <= id_ < 2**64:
+            return Answer(id_, value)
+        case [2, int(id_), str(code), str(text)] if not isinstance(id_, bool) and 0 <= id_ < 2**64:
+            if 0 < len(code) <= 64 and code.isascii() and code.isprintable() and len(text) <= 300:
+                return Failure(id_, code, text)
+        case [3, str(method), list(arguments)] if 0 < len(method) <= 64:
+            return Told(method, tuple(arguments))
+        case [4, int(id_)] if not isinstance(id_, bool) and 0 <= id_ < 2**64:
+            return Cancel(id_)
+    return None
+
+
+def deep(value: object) -> int:
+    """How many levels there are in a value."""
+    inside = value if isinstance(value, list) else list(value.values()) if isinstance(value, dict) else []
+    return 1 + max(map(deep, inside), default=0)
+
+
 class MessageTests(SynchronousTestCase):
     """Behaviour of ``encoded`` and ``decoded``."""
 
@@ -31,6 +58,7 @@ class MessageTests(SynchronousTestCase):
         """Every kind of message comes back as it was."""
         messages: list[Message] = [
             Question(number, "find", (value, 1)),
+            Question(number, "find", (value, 1), 5, number // 2),
             Answer(number, value),
             Failure(number, "odd", "no"),
             Told("say", (value,)),
@@ -55,12 +83,29 @@ class MessageTests(SynchronousTestCase):
         data[place % len(data)] = byte
         self._decode(bytes(data))
 
+    @settings(max_examples=400, deadline=None, derandomize=True, database=None)
+    @given(
+        kind=st.sampled_from([0, 1, 2, 3, 4, 5, True, 1.0]),
+        fields=st.lists(
+            st.sampled_from([0, 1, 7, -1, True, 2.0, 2**32, "m", "", "busy", "x" * 65, "x" * 301, b"m", None, [], {}])
+            | _VALUES,
+            max_size=6,
+        ),
+    )
+    def test_decoded_reads_as_the_table_says(self, kind: Any, fields: list[Any]) -> None:
+        """Whatever the fields, the message is the one that the table of ``docs/protocol.md`` says, or none."""
+        try:
+            found: Message | None = decoded(msgpack.packb([kind, *fields]))
+        except Malformed:
+            found = None
+        self.assertEqual(found, by_the_table(kind, fields))
+
     def _decode(self, data: bytes) -> None:
         try:
             message = decoded(data)
         except Malformed:
             return
-        self.assertIsInstance(message, Question | Answer | Failure | Told)
+        self.assertIsInstance(message, Message)
 
     def test_refuses_what_is_out_of_shape(self) -> None:
         """Wrong ids, names, kinds and lengths, deep nesting, extensions, huge claims and odd map keys are refused."""
@@ -74,17 +119,21 @@ class MessageTests(SynchronousTestCase):
             None,
             [False, 1, "m", [], 9],
             [1.0, 1, "m"],
-            [0, -1, "m", [], 9],
-            [0, True, "m", [], 9],
-            [0, 1, "", []],
-            [0, 1, "m" * 65, []],
-            [0, 1, b"m", [], 9],
-            [0, 1, "m", {}, 9],
-            [0, 1, "m", []],
-            [0, 1, "m", [], -1],
-            [0, 1, "m", [], 2**32],
-            [0, 1, "m", [], True],
-            [0, 1, "m", [], 1, 1],
+            [0, -1, 0, "m", [], 9],
+            [0, True, 0, "m", [], 9],
+            [0, 1, 0, "", []],
+            [0, 1, 0, "m" * 65, []],
+            [0, 1, 0, b"m", [], 9],
+            [0, 1, 0, "m", {}, 9],
+            [0, 1, 0, "m", []],
+            [0, 1, 0, "m", [], -1],
+            [0, 1, 0, "m", [], 2**32],
+            [0, 1, 0, "m", [], True],
+            [0, 1, 0, "m", [], 1, 1],
+            [0, 1, 2, "m", [], 1],
+            [0, 1, -1, "m", [], 1],
+            [0, 1, True, "m", [], 1],
+            [0, 1, "m", [], 1],
             [1, 1, deep],
             [1, 1.5, 2],
             [2, 1, 256, "x"],

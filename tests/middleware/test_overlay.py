@@ -7,7 +7,7 @@ from twisted.internet.defer import Deferred
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.distance import closest
 from middleware.entangled.network.network import Address
-from middleware.entangled.overlay import K
+from middleware.entangled.overlay import FRESH, K
 from middleware.entangled.record import hashed_key
 from middleware.entangled.roster import Roster
 from tests.fleet import FleetCase
@@ -30,6 +30,25 @@ class OverlayTests(FleetCase):
                     self.assertEqual(found, truth)
                     others = {c.node_id for c in truth} - {node.identity.node_id}
                     self.assertLessEqual(others, {c.node_id for c in node.overlay.keepers(key)})
+
+    def test_one_sign_of_life_is_as_good_as_many(self) -> None:
+        """Who was heard a moment ago changes nothing when heard again, unless it is doubted or comes from elsewhere."""
+        fleet = self.fleet(3)
+        overlay, other = fleet.nodes[0].overlay, fleet.nodes[1].contact
+        seen: list[Contact] = []
+        self.patch(overlay.table, "saw", lambda contact, now: seen.append(contact))
+        fleet.run(2 * FRESH)
+        for _ in range(3):
+            overlay.heard(other)
+        self.assertEqual(seen, [other])
+        fleet.run(2 * FRESH)
+        overlay.heard(other)
+        self.assertEqual(seen, [other] * 2)
+        overlay.slow(other)
+        overlay.heard(other)
+        moved = Contact(other.public, Address("10.0.0.9", 1))
+        overlay.proved(moved)
+        self.assertEqual(seen, [other] * 3 + [moved])
 
     def test_the_found_are_kept_in_mind(self) -> None:
         """A contact that is in the table but not there drives none of those that were found out of mind."""

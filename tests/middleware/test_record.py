@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.entangled.record import MAX_NAME, MAX_TTL, MAX_VALUE, Record, hashed_key, unpacked
+from middleware.entangled import record as records
+from middleware.entangled.record import MAX_NAME, MAX_TTL, MAX_VALUE, Record, Signed, hashed_key, unpacked
 from tests.middleware.test_store import CAT, DOG, KEY, record
 
 ANYTHING = st.recursive(
@@ -55,6 +56,25 @@ class RecordTest(SynchronousTestCase):
         ]
         for change in changes:
             self.assertFalse(replace(record(), **change).is_genuine(), change)  # type: ignore[arg-type]
+
+    def test_good_signatures_are_remembered(self) -> None:
+        """A record with a good signature is checked once; whatever is changed in it is another record."""
+        signed = Signed()
+        self.assertTrue(signed.is_genuine(record()))
+        for change in ({"value": b"there"}, {"sequence": 2}, {"signature": bytes(64)}, {"owner": CAT.public}):
+            self.assertFalse(signed.is_genuine(replace(record(), **change)), change)
+        self.assertEqual(len(signed), 1)
+        self.patch(records, "verified", lambda *_: self.fail("checked twice"))
+        self.assertTrue(signed.is_genuine(replace(record())))
+
+    def test_remembered_signatures_are_bounded(self) -> None:
+        """Of many records those are remembered that were seen last."""
+        self.patch(records, "MAX_SIGNED", 3)
+        signed = Signed()
+        for sequence in (1, 2, 3, 1, 4):
+            self.assertTrue(signed.is_genuine(record(sequence=sequence)))
+        self.patch(records, "verified", lambda *_: False)
+        self.assertEqual([n for n in range(1, 5) if signed.is_genuine(record(sequence=n))], [1, 3, 4])
 
     def test_there_and_back(self) -> None:
         """What was packed into a message comes out of it the same."""

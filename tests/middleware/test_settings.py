@@ -133,6 +133,7 @@ class SettingsTest(SynchronousTestCase):
             ],
             ("node", "store"): ["", 1],
             ("node", "store_rows"): [0, 99, 1_000_001, 500.0, True, "500"],
+            ("node", "durable"): ["", "disk", True, 1],
             ("node", "store_bytes"): [0, 99_999, 2**31 + 1, 1e6],
             ("node", "team_key"): ["", 1],
             ("node", "roles"): [[], "edge", [1], ["boss"]],

@@ -18,7 +18,7 @@ from middleware.entangled.errors import BadStore, NotRunning, Unwritable
 from middleware.entangled.record import MAX_VALUE, Record, hashed_key
 from middleware.entangled.schema import MAX_ROTTEN, SCHEMA_VERSION
 from middleware.entangled.sqlite import SqliteStore, read_records
-from middleware.entangled.store import MAX_BYTES, Store, weight
+from middleware.entangled.store import MAX_BYTES, Durable, Store, weight
 from tests.middleware.test_store import CAT, DOG, FOREVER, KEY, StoreContract, record
 
 
@@ -195,6 +195,32 @@ class ReopenTest(SynchronousTestCase):
         self.assertEqual(ended.returncode, -9)
         store = self.reopened(0.0)
         self.assertEqual({str(number) for number in range(300)} - {r.name for r in store.records()}, set())
+
+    def test_how_durable(self) -> None:
+        """The store waits for the disk at each commit unless a crash is all that it is to outlive."""
+        asked: dict[Durable, str] = {"power": "2", "crash": "1"}
+        for durable, synchronous in asked.items():
+            with closing(SqliteStore.open(self.mktemp(), 0.0, durable=durable)) as store:
+                found = store._connection.execute("PRAGMA synchronous").fetchone()
+                self.assertEqual(str(found[0]), synchronous)
+        self.assertEqual(self.store._connection.execute("PRAGMA synchronous").fetchone(), (2,))
+
+    def test_a_crash_only_store_outlives_a_kill(self) -> None:
+        """What was said to be written is there after the process was killed, though no disk was waited for."""
+        self.store.close()
+        child = (
+            "import os, sys\n"
+            "from middleware.entangled.sqlite import SqliteStore\n"
+            "from tests.middleware.test_store import record\n"
+            "store = SqliteStore.open(sys.argv[1], 0.0, durable='crash')\n"
+            "for number in range(300): store.put(record(str(number), value=None), 9e9)\n"
+            "store.flush()\n"
+            "os.kill(os.getpid(), 9)\n"
+        )
+        root = Path(__file__).parents[2]
+        ended = subprocess.run([sys.executable, "-c", child, os.path.abspath(self.path)], cwd=root, check=False)
+        self.assertEqual(ended.returncode, -9)
+        self.assertEqual(len(self.reopened(0.0).records()), 300)
 
     def test_one_node_a_file(self) -> None:
         """A second node is kept off a file that is in use, and let in when the first has gone."""

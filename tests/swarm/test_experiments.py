@@ -62,7 +62,7 @@ class TeamTests(SynchronousTestCase):
 class ExperimentTests(SynchronousTestCase):
     def test_nearest_dog_reaches_the_target(self) -> None:
         """Experiment 1: all find the target, all name the same dog, it is the nearest, and it gets there."""
-        for seed in (1, 2):
+        for seed in (2, 3):
             outcome = trial(VirtualTeam, 1, seed)
             self.assertEqual(outcome.broken, [], seed)
             self.assertTrue(outcome.held and outcome.found and outcome.agreed and outcome.right, seed)

@@ -79,6 +79,12 @@ class Answerer:
         if (public, question.id) in self._cancelled:
             self._counters["cancelled"] += 1
             return
+        method = self.methods.get(question.method)
+        if method is not None and method.is_once:
+            if self._ledger.is_settled(public, question.id):
+                self._counters["late"] += 1
+                return
+            self._ledger.settle(public, question.id - question.behind, self._clock.seconds())
         entry = self._ledger.entry(public, question.id)
         is_known = entry is not None or self._courier.is_carrying(public, Key(True, question.id))
         if is_known:
@@ -140,7 +146,7 @@ class Answerer:
         if method is None:
             return encoded(Failure(question.id, UNKNOWN_METHOD, f"{question.method}: no such method here"))
         public, entry, now = peer.public, None, self._clock.seconds()
-        if method.changes:
+        if method.is_once:
             entry = self._ledger.begin(public, question.id, session, now, is_bulky)
             if entry is None:
                 return self._busy(question.id)
@@ -179,7 +185,7 @@ class Answerer:
         if entry is None or self._ledger.entry(public, number) is not entry:
             return  # it was turned away, or the node stopped meanwhile
         session = entry.session
-        kept = _kept(number, answer) if method.changes else None
+        kept = _kept(number, answer) if method.is_once else None
         self._ledger.end(public, number, kept, self._clock.seconds())
         if session is not None:
             self._reply(session, number, answer, entry.is_bulky)

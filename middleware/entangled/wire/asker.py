@@ -37,6 +37,12 @@ from middleware.entangled.wire.session import MAX_PLAIN, Session
 PATIENCE = 1.5
 MAX_TELLS = 32
 SILENCE_S = 5.0
+MAX_IN_FLIGHT = 32
+"""Questions that may be on their way to one peer; what is more waits here, in order.  A quarter of what the usual
+receive buffer of 208 KiB holds, for others ask that peer, too."""
+MAX_QUEUED = 8192
+LONGEST_QUEUED = 10.0
+_QUEUED = "it waited in vain for its turn; ask for less at once"
 _CROWDED = "too many handshakes are under way"
 _FULL = "too much is on its way already; ask again later"
 
@@ -46,8 +52,8 @@ class Inquiry:
     """A question of ours that waits for its answer.
 
     ``is_patient``: the caller gave a longer time-out than the usual one; ``is_bulky``: the question goes as a parcel.
-    ``grace`` is how long after a sign of progress of a parcel the answer may still come: none (0) where the caller gave
-    a time-out.
+    ``grace`` is how long the answer may still come after the question had its turn, and after each sign of progress of
+    a parcel: none (0) where the caller gave a time-out.
     """
 
     number: int
@@ -66,6 +72,11 @@ class Inquiry:
     sent_at: float = 0.0
     progress_at: float = -1.0
     timer: IDelayedCall | None = None
+
+    @property
+    def is_counted(self) -> bool:
+        """Whether it takes one of the places for questions on their way: parcels have a window of their own."""
+        return not (self.is_patient or self.is_bulky)
 
 
 class Asker:
@@ -88,6 +99,7 @@ class Asker:
         self._counters = counters
         self._courier = courier
         self._inquiries: dict[int, Inquiry] = {}
+        self._queued = 0
         # Starting anywhere in 62 bits keeps the numbers of a restarted node apart from those it used before.
         self._next_number = rng.getrandbits(62)
         peers.on_unheard = self._unheard
@@ -98,15 +110,18 @@ class Asker:
         """Ask; see ``Endpoint.ask``."""
         number = self._next_number
         try:
-            message = encoded(Question(number, method, arguments))
+            peer = self._peers.peer(contact)
+        except ValueError:
+            return defer.fail(NoAnswer(f"{contact.address}: the key of this contact is no key"))
+        try:
+            message = encoded(Question(number, method, arguments, behind=number - peer.oldest(number)))
         except (TypeError, ValueError, OverflowError) as error:
             return defer.fail(error)
         if len(message) > MAX_MESSAGE:
             return defer.fail(TooLarge(_too_large(method, message, MAX_MESSAGE)))
-        try:
-            peer = self._peers.peer(contact)
-        except ValueError:
-            return defer.fail(NoAnswer(f"{contact.address}: the key of this contact is no key"))
+        if self._queued >= MAX_QUEUED:
+            self._counters["crowded"] += 1
+            return defer.fail(Crowded(f"{method} asked of {contact.address}: {_FULL}"))
         is_bulky = len(message) > MAX_PLAIN
         if is_bulky and not self._courier.reserve(contact.public, len(message)):
             return defer.fail(Crowded(f"{method} asked of {contact.address}: {_FULL}"))
@@ -130,12 +145,15 @@ class Asker:
         )
         self._inquiries[number] = inquiry
         peer.inquiries[number] = None
-        if self._peers.usable(peer) is not None:
+        is_open = self._peers.usable(peer) is not None
+        if is_open and (peer.in_flight < MAX_IN_FLIGHT or not inquiry.is_counted):
             self._try(inquiry)
-        else:
-            self._set_timer(inquiry, patience)
-            if not self._open(inquiry):
-                self._fail(inquiry, _CROWDED)
+            return deferred
+        peer.queue[number] = None
+        self._queued += 1
+        self._set_timer(inquiry, patience)
+        if not is_open and not self._open(inquiry):
+            self._fail(inquiry, _CROWDED)
         return deferred
 
     def tell(self, contact: Contact, method: str, arguments: tuple[object, ...]) -> None:
@@ -163,7 +181,7 @@ class Asker:
         """Cancel every timer and fail every question with ``error``."""
         inquiries = list(self._inquiries.values())
         for inquiry in inquiries:
-            self._forget(inquiry)
+            self._drop(inquiry)
         for inquiry in inquiries:
             inquiry.deferred.errback(error)
 
@@ -203,10 +221,12 @@ class Asker:
             self._send(session, message)
             sent += 1
         peer.tells.clear()
-        for inquiry in self._of(peer):
-            if inquiry.tries == 0 or is_owed:  # of those that were tried, the peer may have lost the session
-                self._try(inquiry)
-                sent += 1
+        if is_owed:  # of those that were tried, the peer may have lost the session
+            for inquiry in self._of(peer):
+                if inquiry.tries:
+                    self._try(inquiry)
+                    sent += 1
+        sent += self._try_queued(peer)
         if is_owed and not sent:
             self._send(session, b"")
 
@@ -217,6 +237,7 @@ class Asker:
         inquiry.tries += 1
         if inquiry.tries == 1:
             inquiry.sent_at = now
+            inquiry.peer.in_flight += inquiry.is_counted
         message = aged(inquiry.message, inquiry.deadline - now)
         if inquiry.is_bulky:
             self._courier.post(inquiry.peer.public, Key(False, inquiry.number), message)
@@ -232,6 +253,15 @@ class Asker:
         """Decide what to do about a question that has waited long enough."""
         now, peer = self._clock.seconds(), inquiry.peer
         left = inquiry.deadline - now
+        if left <= 0 and inquiry.number in peer.queue and peer.session is not None:
+            # It waits for others that the peer is answering: that it is slow is no sign that it is gone.
+            left = min(peer.session.heard_at, inquiry.asked_at + LONGEST_QUEUED) + inquiry.grace - now
+            if left <= 0:
+                self._fail(inquiry, _QUEUED)
+            else:
+                inquiry.deadline = now + left
+                self._set_timer(inquiry, left)
+            return
         if left <= 0:
             self._fail(inquiry, f"no answer in {now - inquiry.asked_at:.2f} s")
             return
@@ -256,6 +286,23 @@ class Asker:
             if is_silent:
                 self._open(inquiry)  # perhaps it restarted and knows no session
             self._try(inquiry)
+
+    def _try_queued(self, peer: Peer) -> int:
+        """Send the next questions to a peer, as many as may be on their way; how many that were."""
+        sent = 0
+        while peer.queue and peer.in_flight < MAX_IN_FLIGHT and self._peers.usable(peer) is not None:
+            inquiry = self._inquiries[next(iter(peer.queue))]
+            self._leave_queue(inquiry)
+            # Where its caller gave no time-out, the time for the answer begins now.
+            inquiry.deadline = max(inquiry.deadline, self._clock.seconds() + inquiry.grace)
+            self._try(inquiry)
+            sent += 1
+        return sent
+
+    def _leave_queue(self, inquiry: Inquiry) -> None:
+        if inquiry.number in inquiry.peer.queue:
+            del inquiry.peer.queue[inquiry.number]
+            self._queued -= 1
 
     def _of(self, peer: Peer) -> list[Inquiry]:
         return [self._inquiries[number] for number in peer.inquiries]
@@ -290,7 +337,7 @@ class Asker:
 
     def _fail(self, inquiry: Inquiry, why: str) -> None:
         self._forget(inquiry)
-        kind = Crowded if why is _CROWDED else NoAnswer
+        kind = Crowded if why in (_CROWDED, _QUEUED) else NoAnswer
         inquiry.deferred.errback(kind(f"{inquiry.method} asked of {inquiry.address}: {why}"))
 
     def _cancel(self, inquiry: Inquiry) -> None:
@@ -301,9 +348,18 @@ class Asker:
             self._send(session, encoded(Cancel(inquiry.number)))
 
     def _forget(self, inquiry: Inquiry) -> None:
+        """Let go of a question, and send the next one in its place."""
+        self._drop(inquiry)
+        self._try_queued(inquiry.peer)
+
+    def _drop(self, inquiry: Inquiry) -> None:
         cancel(inquiry.timer)
-        self._inquiries.pop(inquiry.number, None)
+        if self._inquiries.pop(inquiry.number, None) is None:
+            return
         inquiry.peer.inquiries.pop(inquiry.number, None)
+        self._leave_queue(inquiry)
+        if inquiry.tries:
+            inquiry.peer.in_flight -= inquiry.is_counted
         if inquiry.is_bulky:
             self._courier.drop(inquiry.peer.public, Key(False, inquiry.number))
             self._courier.release(inquiry.peer.public, len(inquiry.message))

@@ -127,19 +127,20 @@ class Endpoint:
         self._courier.stop()
         self._peers.stop()
 
-    def expose(self, name: str, answer: Callable[..., object], changes: bool = False) -> None:
+    def expose(self, name: str, answer: Callable[..., object], changes: bool = False, idempotent: bool = False) -> None:
         """Let peers call ``answer(peer, *arguments)`` under ``name``.
 
         It returns something that msgpack can hold (``MAX_MESSAGE`` at most), a Deferred or a coroutine of it, or raises
         ``Refused`` or an exception that both sides named by ``expose_error``: the asker gets it with its text.
         Arguments that do not fit the function's parameters and plain annotations are refused before it runs; other
         exceptions are logged, and the asker gets ``Refused("internal error")``.  With ``changes`` it runs only in an
-        established session, and at most once for each question.
+        established session, and at most once for each question; a repeated one is given the answer of the first.  Say
+        ``idempotent`` as well where a second run does no harm: then nothing need be kept of the first.
 
         When the asker gives up or its time is over, a Deferred or coroutine is cancelled.  A function with a
         keyword-only parameter ``deadline`` gets that moment, in seconds of this node's clock (infinite where none).
         """
-        self._answerer.methods[name] = Method(name, answer, changes)
+        self._answerer.methods[name] = Method(name, answer, changes, idempotent)
 
     def expose_error(self, kind: type[Exception], code: str) -> None:
         """Let exceptions of ``kind`` cross the wire, both ways, under ``code``, made again from their text alone.
@@ -154,9 +155,10 @@ class Endpoint:
     ) -> Deferred[Any]:
         """Ask a peer, and try again until it answers, at most four times and for ``timeout`` seconds.
 
-        Question and answer may have ``MAX_MESSAGE`` bytes; what does not fit into a datagram goes as a parcel.  Without
-        ``timeout`` the answer has 1.5 s, counted anew at each sign that a parcel makes progress.  With a longer one
-        the tries are spread over it, for methods that take their time.  Say ``changes`` where the method changes
+        Question and answer may have ``MAX_MESSAGE`` bytes; what does not fit into a datagram goes as a parcel.  Of many
+        questions to one peer the later ones wait for their turn.  Without ``timeout`` the answer has 1.5 s, counted
+        from that turn and anew at each sign that a parcel makes progress.  With a longer one the tries are spread over
+        it, for methods that take their time.  Say ``changes`` where the method changes
         something: such a question waits for the session, others ride in the handshake.
 
         Fails with ``NoAnswer``, ``Refused`` (the peer's text), an exception named by ``expose_error``, ``TooLarge``,

@@ -52,6 +52,7 @@ MAX_BITMAP = -(-MAX_PARTS // 8)
 class Question:
     """Asks for ``method``; ``id`` (64 bits) is the asker's and tells a repeated question from a new one.
 
+    The asker waits for nothing any more that it asked this peer more than ``behind`` numbers before this one.
     ``left_ms`` is how long the asker will still wait, in milliseconds.
     """
 
@@ -59,6 +60,7 @@ class Question:
     method: str
     arguments: tuple[object, ...]
     left_ms: int = NO_LIMIT_MS
+    behind: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,10 +101,10 @@ Message = Question | Answer | Failure | Told | Cancel
 def encoded(message: Message) -> bytes:
     """The bytes of ``message``; raises ``TypeError``, ``ValueError`` or ``OverflowError`` for what cannot be packed."""
     match message:
-        case Question(id=number, method=method, arguments=arguments, left_ms=left_ms):
+        case Question(id=number, method=method, arguments=arguments, left_ms=left_ms, behind=behind):
             # The time that is left stands last and always has four bytes, so that ``aged`` can write another one.
-            head = bytes(msgpack.packb([_QUESTION, number, method, arguments]))
-            return b"\x95" + head[1:] + _UINT32 + left_ms.to_bytes(4, "big")
+            head = bytes(msgpack.packb([_QUESTION, number, behind, method, arguments]))
+            return b"\x96" + head[1:] + _UINT32 + left_ms.to_bytes(4, "big")
         case Answer(id=number, value=value):
             fields = [_ANSWER, number, value]
         case Failure(id=number, code=code, text=text):
@@ -140,20 +142,29 @@ def decoded(data: bytes) -> Message:
         )
     except Exception as error:  # foreign code on foreign bytes; more kinds than its manual names have been seen
         raise Malformed(f"not msgpack: {type(error).__name__}") from None
-    if not (isinstance(fields, list) and fields and type(fields[0]) is int):  # True and 1.0 would match 1
+    if type(fields) is not list or not fields or type(fields[0]) is not int:  # True and 1.0 are equal to 1, too
         raise Malformed("no message starts like this")
-    match fields:
-        case [0, id_, method, list(arguments), left] if _is_id(id_) and _is_method(method) and _is_flat(arguments):
-            if type(left) is int and 0 <= left <= NO_LIMIT_MS:
-                return Question(id_, method, tuple(arguments), left)
-        case [1, id_, value] if _is_id(id_) and _is_flat(value):
+    kind, size = fields[0], len(fields)
+    if kind == _QUESTION and size == 6:
+        _, id_, behind, method, arguments, left = fields
+        is_numbered = _is_id(id_) and _is_id(behind) and behind <= id_
+        is_timed = type(left) is int and 0 <= left <= NO_LIMIT_MS
+        if is_numbered and is_timed and _is_method(method) and type(arguments) is list and _is_flat(arguments):
+            return Question(id_, method, tuple(arguments), left, behind)
+    elif kind == _ANSWER and size == 3:
+        _, id_, value = fields
+        if _is_id(id_) and _is_flat(value):
             return Answer(id_, value)
-        case [2, id_, code, str(text)] if _is_id(id_) and is_code(code) and len(text) <= MAX_TEXT:
+    elif kind == _FAILURE and size == 4:
+        _, id_, code, text = fields
+        if _is_id(id_) and is_code(code) and type(text) is str and len(text) <= MAX_TEXT:
             return Failure(id_, code, text)
-        case [3, method, list(arguments)] if _is_method(method) and _is_flat(arguments):
+    elif kind == _TOLD and size == 3:
+        _, method, arguments = fields
+        if _is_method(method) and type(arguments) is list and _is_flat(arguments):
             return Told(method, tuple(arguments))
-        case [4, id_] if _is_id(id_):
-            return Cancel(id_)
+    elif kind == _CANCEL and size == 2 and _is_id(fields[1]):
+        return Cancel(fields[1])
     raise Malformed("no message has this shape")
 
 
@@ -185,20 +196,22 @@ def _is_id(value: object) -> bool:
 
 
 def _is_method(value: object) -> bool:
-    return isinstance(value, str) and 0 < len(value) <= MAX_METHOD
+    return type(value) is str and 0 < len(value) <= MAX_METHOD
 
 
 def _is_flat(value: object) -> bool:
     """Whether nothing is nested deeper than ``MAX_DEPTH``, and nothing is a type that we do not send."""
+    # The unpacker makes nothing but these very types, so none of a derived class can slip through.
     level: list[object] = [value]
     for _ in range(MAX_DEPTH):
         below: list[object] = []
         for item in level:
-            if isinstance(item, list):
-                below += item
-            elif isinstance(item, dict):
-                below += item.values()
-            elif isinstance(item, msgpack.Timestamp):
+            kind = type(item)
+            if kind is list:
+                below += item  # type: ignore[arg-type]
+            elif kind is dict:
+                below += item.values()  # type: ignore[attr-defined]
+            elif kind is msgpack.Timestamp:
                 return False
         if not below:
             return True

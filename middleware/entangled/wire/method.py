@@ -11,7 +11,7 @@ import inspect
 import math
 import types
 import typing
-from collections import Counter
+from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -26,7 +26,11 @@ from middleware.entangled.wire.peer import cancel
 from middleware.entangled.wire.session import Session
 
 KEPT_S = 30.0
-MAX_PER_PEER = 1024
+MAX_PER_PEER = 4096
+LIFE_BITS = 32
+"""Bits of a question's number that an asker counts on in; those above are dice, another throw for each of its lives."""
+MAX_LIVES = 4
+"""Lives of one peer within ``KEPT_S`` of which is known how far they had come."""
 MAX_ENTRIES = 16384
 _PLAIN = (int, float, bool, str, bytes, list, dict, type(None))
 
@@ -39,7 +43,10 @@ class BadArguments(Refused):
 
 @dataclass(frozen=True)
 class Method:
-    """An exposed function; ``changes`` says that it may run only in an established session, and once per question.
+    """An exposed function.
+
+    ``changes`` says that it may run only in an established session, and once for each question; ``is_idempotent`` that
+    a second run does no harm, so that nobody need remember the first one.
 
     A function with a keyword-only parameter ``deadline`` gets there the moment, on the clock of the node, after which
     nobody waits for its answer.
@@ -48,6 +55,7 @@ class Method:
     name: str
     answer: Callable[..., object]
     changes: bool = False
+    is_idempotent: bool = False
     _least: int = field(init=False, repr=False)
     _most: float = field(init=False, repr=False)
     _kinds: tuple[tuple[type, ...] | None, ...] = field(init=False, repr=False)
@@ -70,6 +78,11 @@ class Method:
         wants_deadline = deadline is not None and deadline.kind is inspect.Parameter.KEYWORD_ONLY
         object.__setattr__(self, "_wants_deadline", wants_deadline)
         object.__setattr__(self, "_kinds", tuple(_kinds(hints.get(parameter.name)) for parameter in parameters[1:]))
+
+    @property
+    def is_once(self) -> bool:
+        """Whether it may run only once for each question."""
+        return self.changes and not self.is_idempotent
 
     def run(self, peer: Contact, arguments: tuple[object, ...], deadline: float = math.inf) -> object:
         """Call the function; raises ``BadArguments`` where they do not fit, or what the function raises."""
@@ -152,64 +165,107 @@ class Entry:
     ended_at: float = 0.0
 
 
-class Ledger:
-    """The questions that run, and those that ended in the last ``KEPT_S`` seconds, by (public key, question id).
+@dataclass(slots=True)
+class _Account:
+    """The questions of one peer; ``settled`` has, for each of its lives, the number below which none is open."""
 
-    When it is full new questions are turned away: forgetting an old one early could run a change twice.
+    running: dict[int, Entry] = field(default_factory=dict)
+    ended: dict[int, Entry] = field(default_factory=dict)
+    settled: dict[int, int] = field(default_factory=dict)
+    heard_at: float = 0.0
+
+
+class Ledger:
+    """The questions that run, and those that ended in the last ``KEPT_S`` seconds, by public key and question id.
+
+    An asker says with each question which is the oldest one that it still waits for: what is older is forgotten at
+    once, and does not run if it comes late.  When the ledger is full all the same new questions are turned away:
+    forgetting an old one early could run a change twice.
     """
 
     def __init__(self) -> None:
-        self._running: dict[tuple[bytes, int], Entry] = {}
-        self._ended: dict[tuple[bytes, int], Entry] = {}
-        self._per_peer: Counter[bytes] = Counter()
+        self._accounts: OrderedDict[bytes, _Account] = OrderedDict()
+        self._count = 0
 
     def __len__(self) -> int:
-        return len(self._running) + len(self._ended)
+        return self._count
 
     def entry(self, public: bytes, question: int) -> Entry | None:
         """What is known of a question."""
-        key = (public, question)
-        return self._running.get(key) or self._ended.get(key)
+        account = self._accounts.get(public)
+        return None if account is None else account.running.get(question) or account.ended.get(question)
+
+    def is_settled(self, public: bytes, question: int) -> bool:
+        """Whether the asker has said that it does not wait for this question any more."""
+        account = self._accounts.get(public)
+        return account is not None and question < account.settled.get(question >> LIFE_BITS, 0)
+
+    def settle(self, public: bytes, oldest: int, now: float) -> None:
+        """Forget what ended of the questions of a peer before ``oldest``: it has those answers, or gave them up."""
+        account = self._account(public, now)
+        life = oldest >> LIFE_BITS
+        before = account.settled.get(life)
+        if before is None and len(account.settled) >= MAX_LIVES:
+            del account.settled[next(iter(account.settled))]
+        if before is None or before < oldest:
+            account.settled[life] = oldest
+            had = [number for number in account.ended if number < oldest and number >> LIFE_BITS == life]
+            for number in had:
+                del account.ended[number]
+            self._count -= len(had)
 
     def begin(self, public: bytes, question: int, session: Session | None, now: float, is_bulky: bool) -> Entry | None:
         """Enter a question that is about to run; None where there is no room."""
-        self._expire(now)
-        if len(self) >= MAX_ENTRIES or self._per_peer[public] >= MAX_PER_PEER:
+        account = self._account(public, now)
+        if self._count >= MAX_ENTRIES or len(account.running) + len(account.ended) >= MAX_PER_PEER:
             return None
-        entry = self._running[public, question] = Entry(session, is_bulky)
-        self._per_peer[public] += 1
+        entry = account.running[question] = Entry(session, is_bulky)
+        self._count += 1
         return entry
 
     def end(self, public: bytes, question: int, answer: bytes | None, now: float) -> None:
         """Keep the ``answer`` of a question that ran, or forget the question where it is None and may run again."""
-        entry = self._running.pop((public, question), None)
-        if entry is None:
+        account = self._accounts.get(public)
+        entry = account.running.pop(question, None) if account is not None else None
+        if account is None or entry is None:
             return
         cancel(entry.timer)
         entry.work = None
-        if answer is None:
-            self._count_down(public)
+        if answer is None or self.is_settled(public, question):
+            self._count -= 1
         else:
             entry.answer, entry.ended_at, entry.session = answer, now, None
-            self._ended[public, question] = entry
+            account.ended[question] = entry
 
     def clear(self) -> None:
         """Forget everything, and cancel the timers."""
-        for entry in self._running.values():
-            cancel(entry.timer)
-        self._running.clear()
-        self._ended.clear()
-        self._per_peer.clear()
+        for account in self._accounts.values():
+            for entry in account.running.values():
+                cancel(entry.timer)
+        self._accounts.clear()
+        self._count = 0
 
-    def _expire(self, now: float) -> None:
-        while self._ended:
-            key = next(iter(self._ended))
-            if self._ended[key].ended_at > now - KEPT_S:
+    def _account(self, public: bytes, now: float) -> _Account:
+        """The account of a peer, without what is over; the one that was silent for longest goes, if that is long."""
+        account = self._accounts.get(public)
+        if account is None:
+            account = self._accounts[public] = _Account()
+        self._accounts.move_to_end(public)
+        account.heard_at = now
+        self._expire(account, now)
+        oldest_public, oldest = next(iter(self._accounts.items()))
+        if oldest.heard_at <= now - KEPT_S:
+            self._expire(oldest, now)
+            if oldest.running or oldest.ended:
+                self._accounts.move_to_end(oldest_public)
+            else:
+                del self._accounts[oldest_public]
+        return account
+
+    def _expire(self, account: _Account, now: float) -> None:
+        while account.ended:
+            number, entry = next(iter(account.ended.items()))
+            if entry.ended_at > now - KEPT_S:
                 return
-            del self._ended[key]
-            self._count_down(key[0])
-
-    def _count_down(self, public: bytes) -> None:
-        self._per_peer[public] -= 1
-        if not self._per_peer[public]:
-            del self._per_peer[public]
+            del account.ended[number]
+            self._count -= 1

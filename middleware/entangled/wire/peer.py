@@ -53,12 +53,18 @@ class Peer:
     opening: Opening | None = None
     round_trip: RoundTrip = field(default_factory=RoundTrip)
     tells: list[bytes] = field(default_factory=list)
-    inquiries: dict[int, None] = field(default_factory=dict)  # the numbers of what is asked of it
+    inquiries: dict[int, None] = field(default_factory=dict)  # the numbers of what is asked of it, in order
+    queue: dict[int, None] = field(default_factory=dict)  # those of them that have not been sent yet
+    in_flight: int = 0
 
     @property
     def session(self) -> Session | None:
         """The session that is used for sending: the newest one."""
         return self.sessions[-1] if self.sessions else None
+
+    def oldest(self, number: int) -> int:
+        """The oldest question that is asked of it; ``number`` where there is none."""
+        return next(iter(self.inquiries), number)
 
     @property
     def is_idle(self) -> bool:

@@ -1,0 +1,133 @@
+"""What a put, a get and a join cost, in time of a core and in datagrams, summed over all nodes of a team.
+
+All nodes are in one process on a switchboard and a clock that is turned, so the datagrams are the same on every machine
+and a run can be compared with the run before a change.  The time includes what the simulation itself takes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import cProfile
+import gc
+import math
+import pstats
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable
+from typing import Any
+
+from twisted.internet.defer import Deferred
+
+from benchmarks.idle import Meter, Team
+from middleware.entangled.identity import Identity
+from middleware.entangled.network.network import Address
+from middleware.entangled.node import EntangledNode
+from middleware.entangled.record import hashed_key
+from middleware.entangled.store import MemoryStore
+
+STEP = 0.0001
+SETTLE = 5.0
+QUARTERS = 4
+
+
+class Hot:
+    """A settled team of ``n`` nodes, measured one operation after the other."""
+
+    def __init__(self, n: int) -> None:
+        self.team = Team(n, 1)
+        self.team.clock.advance(SETTLE)
+        self.failed = 0
+
+    def wait(self, work: Deferred[Any]) -> None:
+        """Turn the clock until ``work`` is done."""
+        ended: list[Any] = []
+        work.addErrback(self._count).addCallback(ended.append)
+        while not ended:
+            self.team.clock.advance(STEP)
+
+    def each(self, work: Callable[[int], Deferred[Any]], times: int, wide: int = 1) -> str:
+        """The cost of one of ``times`` operations, ``wide`` of them at a time; the time is that of the best quarter."""
+        self.failed = 0
+        gc.collect()
+        sent, moment = Meter.datagrams, self.team.clock.seconds()
+        quarter, best = -(-times // QUARTERS), math.inf
+        for start in range(0, times, quarter):
+            began, end = time.process_time(), min(times, start + quarter)
+            for first in range(start, end, wide):
+                for waiting in [work(number) for number in range(first, min(end, first + wide))]:
+                    self.wait(waiting)
+            best = min(best, (time.process_time() - began) / (end - start))
+        span = self.team.clock.seconds() - moment
+        cost = f"{best * 1e6:7.0f} us of CPU {(Meter.datagrams - sent) / times:6.1f} datagrams"
+        return f"{cost} {span / times * 1e3:6.2f} ms, {self.failed} failed"
+
+    def _count(self, failure: Any) -> None:
+        self.failed += 1
+
+    def join(self, place: int) -> str:
+        """What a newcomer costs until it has joined, until it has read an old key, and in the five seconds after."""
+        clock = self.team.clock
+        seed = place.to_bytes(32, "big")
+        network = Meter(self.team.board, Address("10.0.0.1", 7000 + place))
+        newcomer = EntangledNode(Identity(seed), b"t" * 32, network, MemoryStore(), clock, self.team.rng)
+        lines = []
+        sent, moment, began = Meter.datagrams, clock.seconds(), time.process_time()
+
+        def lap(what: str) -> None:
+            cpu, span = (time.process_time() - began) * 1e3, (clock.seconds() - moment) * 1e3
+            lines.append(f"{what} {cpu:.1f} ms of CPU, {Meter.datagrams - sent} datagrams, {span:.1f} ms")
+
+        newcomer.start()
+        self.wait(newcomer.join([Address("10.0.0.1", 7000)]))
+        lap("joined:")
+        self.wait(newcomer.get(hashed_key("h7"), "fast"))
+        lap("read:")
+        clock.advance(5.0)
+        lap("5 s later:")
+        self.team.nodes.append(newcomer)
+        return "; ".join(lines)
+
+
+def main() -> int:
+    """Print the table."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.hot", description=__doc__)
+    parser.add_argument("--nodes", type=int, default=16)
+    parser.add_argument("--times", type=int, default=400)
+    parser.add_argument("--joins", type=int, default=3)
+    parser.add_argument("--flood", type=int, default=0, help="puts of one node, 64 at a time")
+    parser.add_argument("--profile", action="store_true", help="show where the time of the puts and gets goes")
+    arguments = parser.parse_args()
+    hot = Hot(arguments.nodes)
+    nodes, times = list(hot.team.nodes), arguments.times
+    key = [hashed_key(f"h{number}") for number in range(times)]
+    profile = cProfile.Profile()
+    if arguments.profile:
+        profile.enable()
+
+    def remote(number: int) -> EntangledNode:
+        """A node that does not hold the key, where there is one."""
+        at = key[number % 50]
+        others = [node for node in nodes if not node.replica.held(at)] or nodes
+        return others[number % len(others)]
+
+    print("put         ", hot.each(lambda n: nodes[n % len(nodes)].put(key[n], "v", b"x" * 100), times))
+    asker = {number: remote(number) for number in range(times)}
+    print("get fast    ", hot.each(lambda n: asker[n].get(key[n % 50], "fast"), times))
+    print("get majority", hot.each(lambda n: asker[n].get(key[n % 50], "majority"), times))
+    if arguments.profile:
+        profile.disable()
+        pstats.Stats(profile).sort_stats("tottime").print_stats(35)
+    if arguments.flood:
+        flooded = hot.each(lambda n: nodes[1].put(hashed_key(f"f{n}"), "v", b"x" * 100), arguments.flood, 64)
+        dropped: Counter[str] = Counter()
+        for node in nodes:
+            dropped += node.endpoint.counters
+        print("flood       ", flooded, dict(dropped))
+    for place in range(arguments.joins):
+        print("join", hot.join(200 + place))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,133 @@
+"""Tests of how many questions are on their way at once, and what becomes of those that wait."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from twisted.internet.defer import CancelledError, Deferred
+
+from middleware.entangled.errors import Crowded, NoAnswer
+from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.wire import asker
+from middleware.entangled.wire.asker import MAX_IN_FLIGHT
+from tests.middleware.test_endpoint import DELAY, EndpointCase
+
+SLOW_S = 0.2
+
+
+class TurnTests(EndpointCase):
+    """Behaviour of ``Asker`` with more questions than may be on their way."""
+
+    def setUp(self) -> None:
+        """Open a session."""
+        super().setUp()
+        self.got(self.a.ask(self.to_b, "echo", 1))
+
+    def equip(self, endpoint: Any) -> None:
+        """Add a method that takes its time."""
+        super().equip(endpoint)
+        endpoint.expose("slow", self.slow)
+
+    def slow(self, peer: Contact, value: int) -> Deferred[int]:
+        """Answer later."""
+        self.runs.append(value)
+        answer: Deferred[int] = Deferred()
+        self.clock.callLater(SLOW_S, answer.callback, value)
+        return answer
+
+    def flood(self, count: int, timeout: float | None = None) -> list[Deferred[Any]]:
+        """Ask many things at the same moment."""
+        return [self.a.ask(self.to_b, "slow", number, timeout=timeout) for number in range(count)]
+
+    def test_the_rest_waits_in_order(self) -> None:
+        """No more are sent than may be on their way; the others follow in order, and all are answered."""
+        sent = self.board.counters["sent"]
+        asked = self.flood(5 * MAX_IN_FLIGHT)
+        self.assertEqual(self.board.counters["sent"] - sent, MAX_IN_FLIGHT)
+        self.clock.advance(DELAY)
+        self.assertEqual(self.runs, list(range(MAX_IN_FLIGHT)))
+        self.clock.advance(6 * (SLOW_S + 2 * DELAY))
+        self.assertEqual([self.successResultOf(one) for one in asked], list(range(5 * MAX_IN_FLIGHT)))
+        self.assertEqual(list(dict.fromkeys(self.runs)), list(range(5 * MAX_IN_FLIGHT)))
+        self.assertEqual(self.places(), (0, 0, 0))
+
+    def test_waiting_for_a_slow_peer_is_no_sign_of_its_death(self) -> None:
+        """Questions wait for their turn longer than for an answer, as long as the peer goes on answering others."""
+        asked = self.flood(12 * MAX_IN_FLIGHT)
+        self.clock.advance(2.0)
+        self.assertTrue(any(not one.called for one in asked))
+        self.clock.advance(2.0)
+        self.assertEqual([self.successResultOf(one) for one in asked], list(range(12 * MAX_IN_FLIGHT)))
+
+    def test_a_dead_peer(self) -> None:
+        """What was sent gets no answer; what never had its turn is said to be crowded, and nothing stays."""
+        self.board.kill(self.to_b.address)
+        asked = self.flood(20 * MAX_IN_FLIGHT)
+        self.clock.advance(30.0)
+        kinds = [self.failureResultOf(one, NoAnswer, Crowded).type for one in asked]
+        self.assertEqual(kinds[0], NoAnswer)
+        self.assertEqual(kinds[-1], Crowded)
+        self.assertEqual(self.places(), (0, 0, 0))
+
+    def test_a_time_out_holds_in_the_queue(self) -> None:
+        """Who gave a time-out is told in time, whether its question had its turn or not."""
+        asked = self.flood(20 * MAX_IN_FLIGHT, timeout=0.5)
+        self.clock.advance(0.5)
+        self.assertTrue(all(one.called for one in asked))
+        for one in asked:
+            one.addErrback(lambda failure: failure.trap(NoAnswer, Crowded))
+
+    def test_cancelled_in_the_queue(self) -> None:
+        """What is cancelled before its turn is never sent, and what is cancelled after it makes room."""
+        asked = self.flood(MAX_IN_FLIGHT + 2)
+        asked[-1].cancel()
+        asked[0].cancel()
+        for one in (asked[0], asked[-1]):
+            self.failureResultOf(one, CancelledError)
+        self.clock.advance(DELAY)
+        self.assertEqual(self.runs, list(range(MAX_IN_FLIGHT + 1)))
+        self.clock.advance(1)
+        self.assertEqual(self.places(), (0, 0, 0))
+
+    def test_long_questions_take_no_place(self) -> None:
+        """Questions with a long time-out, as many as there may be, do not keep short ones from their turn."""
+        for one in self.flood(2 * MAX_IN_FLIGHT, timeout=60.0):
+            one.addErrback(lambda failure: None)
+        self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 7), 2 * DELAY), 7)
+
+    def test_the_queue_is_bounded(self) -> None:
+        """What finds the queue full is refused at once."""
+        self.patch(asker, "MAX_QUEUED", 3)
+        asked = self.flood(MAX_IN_FLIGHT + 5)
+        for one in asked[-2:]:
+            self.failureResultOf(one, Crowded)
+        self.clock.advance(1)
+        for one in asked[:-2]:
+            self.successResultOf(one)
+
+    def test_before_the_session(self) -> None:
+        """Questions that wait for a handshake keep their order and the bound."""
+        third, to_third = self.endpoint(3)
+        self.equip(third)
+        sent = self.board.counters["sent"]
+        asked = [self.a.ask(to_third, "add", number, changes=True) for number in range(2 * MAX_IN_FLIGHT)]
+        self.clock.advance(2 * DELAY)
+        self.assertEqual(self.board.counters["sent"] - sent, 2 + MAX_IN_FLIGHT)
+        self.clock.advance(1)
+        self.assertEqual([self.successResultOf(one) for one in asked], self.runs)
+
+    def test_restart_in_the_middle(self) -> None:
+        """A peer that restarts under a flood answers all of it, or its asker knows by the time-out."""
+        asked = self.flood(4 * MAX_IN_FLIGHT)
+        self.clock.advance(0.05)
+        self.board.kill(self.to_b.address)
+        self.b, _ = self.endpoint(9, port=self.to_b.address.port, identity=2)
+        self.equip(self.b)
+        self.clock.advance(10)
+        self.assertEqual([self.successResultOf(one) for one in asked], list(range(4 * MAX_IN_FLIGHT)))
+
+    def places(self) -> tuple[int, int, int]:
+        """What is on its way, what waits, and what waits in all."""
+        at = self.a._peers.known(self.to_b.public)
+        assert at is not None
+        return at.in_flight, len(at.queue), self.a._asker._queued

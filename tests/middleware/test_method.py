@@ -1,0 +1,126 @@
+"""Tests of the ledger: what is kept of questions that may run only once."""
+
+from __future__ import annotations
+
+import random
+from typing import Any
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.entangled.errors import NoAnswer, Refused
+from middleware.entangled.network.switchboard import Weather
+from middleware.entangled.wire import method
+from middleware.entangled.wire.method import KEPT_S, LIFE_BITS, MAX_LIVES, Ledger
+from tests.middleware.test_endpoint import DELAY, EndpointCase
+
+ANN, BOB = b"a" * 32, b"b" * 32
+LIFE = 1 << LIFE_BITS
+
+
+class LedgerTests(SynchronousTestCase):
+    """Behaviour of ``Ledger``."""
+
+    def setUp(self) -> None:
+        """An empty one."""
+        self.ledger = Ledger()
+
+    def run_one(self, public: bytes, number: int, oldest: int, now: float) -> None:
+        """Let a question come and end at once."""
+        self.ledger.settle(public, oldest, now)
+        self.assertIsNotNone(self.ledger.begin(public, number, None, now, False))
+        self.ledger.end(public, number, b"done", now)
+
+    def test_what_the_asker_has_is_forgotten(self) -> None:
+        """Ended questions older than the oldest that is open go at once; that one and later ones stay."""
+        for number in range(10):
+            self.run_one(ANN, number, 0, 1.0)
+        self.run_one(BOB, 3, 3, 1.0)
+        self.run_one(ANN, 10, 7, 1.0)
+        self.assertEqual([n for n in range(12) if self.ledger.entry(ANN, n)], [7, 8, 9, 10])
+        self.assertEqual([n for n in range(12) if self.ledger.is_settled(ANN, n)], [0, 1, 2, 3, 4, 5, 6])
+        self.assertIsNotNone(self.ledger.entry(BOB, 3))
+        self.assertEqual(len(self.ledger), 5)
+
+    def test_word_that_was_overtaken(self) -> None:
+        """An older word on what is open, which comes later, brings nothing back."""
+        self.ledger.settle(ANN, 7, 1.0)
+        self.ledger.settle(ANN, 4, 1.0)
+        self.assertTrue(self.ledger.is_settled(ANN, 5))
+
+    def test_runs_on_though_given_up(self) -> None:
+        """A question that still runs when its asker has given it up is forgotten when it ends."""
+        self.ledger.begin(ANN, 1, None, 1.0, False)
+        self.ledger.settle(ANN, 5, 1.0)
+        self.assertIsNotNone(self.ledger.entry(ANN, 1))
+        self.ledger.end(ANN, 1, b"late", 2.0)
+        self.assertEqual((self.ledger.entry(ANN, 1), len(self.ledger)), (None, 0))
+
+    def test_another_life(self) -> None:
+        """A restarted asker, whose numbers begin lower, is heard; what its former life settled stays so."""
+        self.run_one(ANN, 9 * LIFE + 5, 9 * LIFE + 5, 1.0)
+        self.run_one(ANN, 2 * LIFE + 1, 2 * LIFE, 2.0)
+        self.assertFalse(self.ledger.is_settled(ANN, 2 * LIFE + 1))
+        self.assertTrue(self.ledger.is_settled(ANN, 9 * LIFE + 4))
+        self.assertIsNotNone(self.ledger.entry(ANN, 9 * LIFE + 5))
+
+    def test_lives_are_bounded(self) -> None:
+        """Of somebody who claims ever new lives only the last few are known."""
+        for life in range(100):
+            self.ledger.settle(ANN, life * LIFE + 7, 1.0)
+        known = [life for life in range(100) if self.ledger.is_settled(ANN, life * LIFE)]
+        self.assertEqual(known, list(range(100 - MAX_LIVES, 100)))
+
+    def test_nothing_is_kept_for_ever(self) -> None:
+        """Accounts of peers that fell silent go, one or so for each that speaks; those with work under way stay."""
+        rng = random.Random(3)
+        for _ in range(50):
+            self.run_one(rng.randbytes(32), 1, 1, 1.0)
+        self.ledger.begin(BOB, 1, None, 1.0, False)
+        for number in range(120):
+            self.run_one(ANN, number, number, 2.0 + KEPT_S)
+        self.assertEqual((len(self.ledger), len(self.ledger._accounts)), (2, 2))
+        self.assertIsNotNone(self.ledger.entry(BOB, 1))
+
+
+class OnceTests(EndpointCase):
+    """Questions that run once, those that may run again, and how many of them there may be."""
+
+    def equip(self, endpoint: Any) -> None:
+        """Add a change that may run twice."""
+        super().equip(endpoint)
+        endpoint.expose("note", self.add, changes=True, idempotent=True)
+
+    def flood(self, name: str, count: int) -> int:
+        """How many of ``count`` questions, a few at a time, were answered."""
+        answered: list[int] = []
+        for number in range(count):
+            asked = self.a.ask(self.to_b, name, number, changes=True)
+            asked.addCallbacks(answered.append, lambda failure: failure.trap(Refused, NoAnswer))
+            if number % 8 == 7:
+                self.clock.advance(3 * DELAY)
+        self.clock.advance(5)
+        return len(answered)
+
+    def test_honest_traffic_is_never_busy(self) -> None:
+        """Thousands of changes in a few seconds are all answered, and hardly anything is kept of them."""
+        self.patch(method, "MAX_PER_PEER", 100)
+        self.board.weather = Weather(DELAY / 4)
+        self.assertEqual(self.flood("add", 3000), 3000)
+        self.assertEqual(self.b.counters["busy"], 0)
+        self.assertLess(len(self.b._answerer._ledger), 20)
+        self.assertEqual(sorted(self.runs), list(range(3000)))
+
+    def test_what_may_run_again_is_not_kept(self) -> None:
+        """An idempotent change leaves nothing in the ledger, runs in a session only, and again where it is repeated."""
+        self.board.weather = Weather(DELAY / 4, loss=0.3)
+        answered = self.flood("note", 500)
+        self.assertGreater(answered, 450)
+        self.assertEqual(len(self.b._answerer._ledger), 0)
+        self.assertGreater(len(self.runs), len(set(self.runs)))
+        self.assertFalse(any(self.a._asker._inquiries))
+
+    def test_in_rough_weather_still_once(self) -> None:
+        """With everything lost, doubled and overtaken, eight at a time, nothing runs twice."""
+        self.board.weather = Weather(DELAY, DELAY, loss=0.2, duplicate=0.3, reorder=0.4)
+        self.assertGreater(self.flood("add", 800), 700)
+        self.assertEqual(len(self.runs), len(set(self.runs)))
