@@ -141,13 +141,14 @@ def serve(path: str) -> None:
     """Start a whole node on the store ``path``; print when it serves, how many rows it holds, and its memory."""
     from twisted.internet import reactor
 
-    import swarmnode
     from middleware.settings import Settings
+    from swarmnode.service import NodeService
+    from swarmnode.world import real_seams
 
     settings = Settings.from_mapping({"node": {"name": "bench", "host": "127.0.0.1", "port": 0}}, "benchmark")
     settings = settings.with_flags(store=path, team_key="of the benchmark, and of nobody else")
-    seams = swarmnode.real_seams(settings, reactor)
-    service = swarmnode.NodeService(settings, seams)
+    seams = real_seams(settings, reactor)
+    service = NodeService(settings, seams)
 
     def serving() -> None:
         service.startService()

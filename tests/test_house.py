@@ -13,8 +13,8 @@ from pathlib import Path
 from twisted.trial.unittest import SynchronousTestCase
 
 ROOT = Path(__file__).resolve().parent.parent
-ROOMS = ("agents", "drivers", "middleware", "sim", "webnode")
-FRONT = ("swarm", "swarmnode", "rehearsal")
+BELOW = ("agents", "drivers", "middleware", "sim", "webnode")
+ROOMS = (*BELOW, "swarmnode")
 
 # From the most special name to the room: what a module may import of the house.  The longest name that fits holds.
 MAY_IMPORT: dict[str, tuple[str, ...]] = {
@@ -24,9 +24,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "sim": ("sim", "drivers"),
     "webnode": ("webnode", "middleware"),
     "agents": ("agents", "middleware", "drivers.driver", "drivers.reading", "drivers.errors"),
-    "swarm": (*FRONT, *ROOMS),
-    "swarmnode": ("swarmnode", *ROOMS),
-    "rehearsal": (*FRONT, *ROOMS),
+    "swarmnode": ROOMS,
 }
 
 # Plain objects: bytes and ``now`` in, decisions out.
@@ -85,8 +83,6 @@ def _files() -> dict[str, Path]:
         for path in sorted((ROOT / room).rglob("*.py")):
             parts = path.relative_to(ROOT).with_suffix("").parts
             found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
-    for module in FRONT:
-        found[module] = ROOT / f"{module}.py"
     return found
 
 
@@ -115,7 +111,7 @@ def _import_names(module: str) -> Iterator[str]:
 
 
 def _ours(module: str) -> list[str]:
-    return [name for name in _imports(module) if _within(name, "tests", *FRONT, *ROOMS)]
+    return [name for name in _imports(module) if _within(name, "tests", *ROOMS)]
 
 
 def _allowed(module: str) -> tuple[str, ...]:
@@ -230,7 +226,7 @@ class PurityTests(SynchronousTestCase):
             if name in FILES
         ]
         program = (
-            f"import sys, importlib; [importlib.import_module(n) for n in {['swarmnode', *wanted]!r}]; "
+            f"import sys, importlib; [importlib.import_module(n) for n in {['swarmnode.plugin', *wanted]!r}]; "
             f"print(*[n for n in {HEAVY!r} if n in sys.modules])"
         )
         child = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=60)
@@ -265,7 +261,7 @@ class PackagingTests(SynchronousTestCase):
         owners = packages_distributions()
         foreign = {
             room: others
-            for room in (*ROOMS, *FRONT)
+            for room in ROOMS
             if (others := sorted({name for name in owners.get(room, []) if name.lower() != "swarm-node"}))
         }
         self.assertEqual(foreign, {}, "give swarm-node a virtual environment of its own")

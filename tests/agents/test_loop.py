@@ -14,7 +14,7 @@ from drivers.errors import NotEnabled
 from drivers.reading import Action
 from middleware.consensus.lease import Lease
 from middleware.tasks import Task
-from rehearsal import VirtualTeam
+from swarmnode.rehearsal import VirtualTeam
 
 
 class LoopTests(SynchronousTestCase):

@@ -43,7 +43,7 @@ class ControlTests(SynchronousTestCase):
 
     def swarm(self, *words: str) -> subprocess.CompletedProcess[str]:
         """``swarm WORDS``."""
-        program = "import sys, swarm; sys.exit(swarm.main(sys.argv[1:]))"
+        program = "import sys; from swarmnode.command import main; sys.exit(main(sys.argv[1:]))"
         return subprocess.run(
             [sys.executable, "-c", program, *words],
             env=self.environment,

@@ -9,9 +9,9 @@ from typing import Any
 from twisted.trial.unittest import SynchronousTestCase
 
 from drivers.sim.link import MemoryLink
-from rehearsal import VirtualTeam
 from sim.demo.experiment import FOOTPRINT_M, TOUCH_M
 from sim.demo.trials import trial
+from swarmnode.rehearsal import VirtualTeam
 
 LOOK_S = 0.05
 

@@ -4,7 +4,7 @@ from twisted.application.service import ServiceMaker
 
 swarm_node = ServiceMaker(
     "swarm node",
-    "swarmnode",
+    "swarmnode.plugin",
     "A node of a swarm: peer-to-peer store, agent and driver of one device, and the page where it is asked for.",
     "swarm-node",
 )

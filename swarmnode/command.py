@@ -8,11 +8,11 @@ from collections.abc import Sequence
 
 from middleware.errors import MissingExtra
 
-OURS = ("agents", "drivers", "middleware", "rehearsal", "sim", "webnode")
+OURS = ("agents", "drivers", "middleware", "sim", "swarmnode", "webnode")
 WORKS: dict[str, tuple[str, str]] = {
     "demo": ("sim.demo.demonstration", "three robots, a yard and the page, on this machine"),
     "yard": ("sim.server", "the yard alone"),
-    "trials": ("rehearsal", "both experiments, many times"),
+    "trials": ("swarmnode.rehearsal", "both experiments, many times"),
 }
 GROUPS = {
     "dht": "get, put, find, watch, remove: the distributed hash table",

@@ -10,9 +10,9 @@ from pathlib import Path
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from swarm import main
+from swarmnode.command import main
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 
 
 class CommandTests(SynchronousTestCase):
@@ -36,7 +36,7 @@ class CommandTests(SynchronousTestCase):
 
     def test_verb_without_its_libraries_names_the_extra(self) -> None:
         """A verb whose libraries are not installed is refused with the command that installs them."""
-        program = "import sys; sys.modules['pymunk'] = None; import swarm; sys.exit(swarm.main(['trials']))"
+        program = "import sys; sys.modules['pymunk'] = None; from swarmnode.command import main; sys.exit(main(['trials']))"
         child = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=60)
         self.assertEqual(child.returncode, 2, child.stderr)
         self.assertEqual(child.stderr.count("\n"), 1, child.stderr)
@@ -45,7 +45,7 @@ class CommandTests(SynchronousTestCase):
     def test_help_of_a_node_verb_needs_no_twisted(self) -> None:
         """The verbs that are asked of a node load neither Twisted nor msgpack, so that their help comes at once."""
         program = (
-            "import sys, swarm\n"
+            "import sys\nfrom swarmnode import command as swarm\n"
             "try: swarm.main(['dht', '--help'])\n"
             "except SystemExit: pass\n"
             "sys.exit(any(name in sys.modules for name in ('twisted', 'msgpack', 'nacl')))"

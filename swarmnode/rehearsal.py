@@ -18,7 +18,8 @@ from middleware.settings import Settings
 from sim.demo.trials import main as run_trials
 from sim.scene import loaded
 from sim.yard import Yard
-from swarmnode import NodeService, Seams
+from swarmnode.assembly import Seams
+from swarmnode.service import NodeService
 from webnode.ledger import state_from
 from webnode.state import Departed
 from webnode.team import TeamDesk

@@ -1,0 +1,108 @@
+"""Assembly: one node with its agent and body, wired as its settings say and not yet started."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from twisted.application.service import Service
+from twisted.internet.interfaces import IReactorTime
+from twisted.logger import Logger
+
+from agents.registry import agent_named
+from drivers.driver import Driver
+from drivers.errors import DriverError
+from drivers.registry import describe, driver_for
+from middleware.entangled.errors import EntangledError
+from middleware.entangled.identity import Identity
+from middleware.entangled.network.network import Network
+from middleware.entangled.store import Store
+from middleware.errors import SwarmError
+from middleware.node import SwarmNode
+from middleware.presence import Device
+from middleware.settings import Settings
+from webnode.errors import WebError
+
+FAULTS = (SwarmError, EntangledError, DriverError, WebError)
+"""What a person can mend, and is told in one line."""
+
+_log = Logger()
+
+
+@dataclass(frozen=True)
+class Seams:
+    """Where a node touches the world; everything else is logic.
+
+    ``network`` makes the node's port each time that it enters the network; ``connector`` opens links to robots and
+    yards (None: TCP); ``wall`` is unix time, for people.
+    """
+
+    clock: IReactorTime
+    network: Callable[[], Network]
+    store: Store
+    rng: random.Random
+    wall: Callable[[], float]
+    connector: Any = None
+
+
+@dataclass
+class Assembly:
+    """One node with its agent and body, wired and not yet started."""
+
+    node: SwarmNode
+    agent: Service | None
+    driver: Driver | None
+
+
+def identity_in(store: Store, rng: random.Random) -> Identity:
+    """The lasting identity that the store keeps, made at the first start."""
+    seed = store.noted("identity")
+    if seed is None or len(seed) != 32:
+        if store.origin != "new":
+            _log.warn("the data store has lost the node's identity: this node is a new one now")
+        seed = rng.randbytes(32)
+        store.note("identity", seed)
+    return Identity(seed)
+
+
+def assembled(settings: Settings, seams: Seams) -> Assembly:
+    """Wire one node as ``settings`` say (thesis, Algorithm 4.1).
+
+    Raises ``SwarmError`` or ``DriverError`` where they cannot be met.
+    """
+    node_settings, driver = settings.node, None
+    capabilities = dict(node_settings.capabilities)
+    kind = node_settings.kind
+    if settings.driver.kind:
+        body = describe(settings.driver.kind, settings.driver.options, node_settings.name)
+        capabilities = {**body.capabilities, **capabilities}
+        kind = kind if kind != "generic" else body.kind
+        driver = driver_for(
+            settings.driver.kind, settings.driver.options, node_settings.name, seams.clock, seams.connector
+        )
+    device = Device(
+        uuid="",
+        name=node_settings.name,
+        kind=kind,
+        description=node_settings.description,
+        capabilities=capabilities,
+        roles=tuple(node_settings.roles),
+    )
+    node = SwarmNode(
+        device,
+        identity_in(seams.store, seams.rng),
+        node_settings.team_secret,
+        list(node_settings.known_nodes),
+        seams.network(),
+        seams.store,
+        seams.clock,
+        seams.rng,
+        seams.wall,
+        node_settings.presence_lease,
+    )
+    agent = None
+    if settings.agent.module and driver is not None:
+        agent = agent_named(settings.agent.module)(node, driver, seams.clock, seams.rng)
+    return Assembly(node, agent, driver)

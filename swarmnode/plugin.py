@@ -1,0 +1,130 @@
+"""Plugin: what ``twistd swarm-node`` takes and makes; every refusal is one line and exit code 2."""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from functools import partial
+from typing import NoReturn
+
+from twisted.application.service import IService
+from twisted.logger import LoggingFile
+from twisted.python import usage
+
+from drivers.errors import DriverError
+from middleware.entangled.clock import use_monotonic_time
+from middleware.entangled.errors import BadStore, PortInUse
+from middleware.errors import BadSetting, MissingExtra, SwarmError, UnknownAgent
+from middleware.node import SwarmNode
+from middleware.settings import COMMAND_LINE, Settings
+from swarmnode.assembly import FAULTS
+from swarmnode.service import NodeService
+from swarmnode.world import control_socket, real_seams, resolved, web_page
+from webnode.errors import PortTaken
+
+use_monotonic_time()
+
+KEYS: Sequence[tuple[type[Exception], str]] = (
+    (PortInUse, "[node] port"),
+    (BadStore, "[node] store"),
+    (UnknownAgent, "[agent] module"),
+    (DriverError, "[driver]"),
+    (PortTaken, "[web] port"),
+    (MissingExtra, "[node] roles"),
+)
+"""Which setting to look at for which fault."""
+SETTLED = 3.0
+"""Seconds after which a node has started and joined."""
+
+
+class Options(usage.Options):
+    """What ``twistd swarm-node`` takes; a flag wins over the file."""
+
+    synopsis = "[--config FILE] [flags]"
+    longdesc = (
+        "Run one node of a swarm: a peer of the network, the agent of a device, and the page if it has the web role."
+    )
+    optParameters = [
+        ["config", "c", None, "TOML file of the node"],
+        ["name", "n", None, "name of the node"],
+        ["kind", "k", None, "kind of the device"],
+        ["host", None, None, "address to listen on"],
+        ["port", "p", None, "UDP port; 0 takes any"],
+        ["known-nodes", None, None, "nodes to join through, as HOST:PORT,HOST:PORT"],
+        ["store", "s", None, "path of the data store, or :memory:"],
+        ["team-key", None, None, "the team's secret"],
+        ["roles", "r", None, "of edge,bootstrap,web"],
+        ["agent-module", "a", None, "agent of the device"],
+        ["driver-kind", "d", None, "driver of its robot"],
+        ["web-host", None, None, "address of the page"],
+        ["web-port", None, None, "TCP port of the page"],
+        ["web-yard", None, None, "yard that the page's map shows, as HOST:PORT"],
+    ]
+    settings: Settings
+
+    def postOptions(self) -> None:
+        """Read the file and the flags; what is wrong is said in one line, with exit code 2."""
+        flags = {name.replace("-", "_"): value for name, value in self.items() if name != "config"}
+        try:
+            if self["config"]:
+                settings = Settings.load(self["config"])
+            elif self["name"] is None:
+                raise BadSetting(COMMAND_LINE, "--name", "is missing", "say --name NAME, or --config FILE")
+            else:
+                settings = Settings.from_mapping({"node": {"name": "unnamed"}}, COMMAND_LINE)
+            self.settings = settings.with_flags(**flags)
+        except SwarmError as error:
+            _refuse(error)
+
+
+def makeService(options: Options) -> IService:
+    """The service that ``twistd`` runs."""
+    from twisted.internet import reactor
+
+    settings = options.settings
+    try:
+        settings = resolved(settings)
+        seams = real_seams(settings, reactor)
+        fronts: list[Callable[[SwarmNode], IService]] = [partial(control_socket, settings, reactor)]
+        if "web" in settings.node.roles:
+            fronts.append(partial(web_page, settings, seams, reactor))
+        reactor.callLater(SETTLED, _give_back)
+        return _Checked(settings, seams, fronts)
+    except FAULTS as error:
+        _refuse(told(error, settings.origin))
+
+
+def _give_back() -> None:
+    """Hand back what only starting needed: glibc keeps it for later, and a small device has other uses for it."""
+    gc.collect()
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)
+
+
+class _Checked(NodeService):
+    """A node service whose failure to start is one line for a person and exit code 2."""
+
+    def startService(self) -> None:
+        try:
+            super().startService()
+        except FAULTS as error:
+            _refuse(told(error, self.settings.origin))
+
+
+def told(error: Exception, origin: str) -> str:
+    """One line that says in which file, at which key, what is wrong and what to do."""
+    if isinstance(error, BadSetting):
+        return str(error)
+    key = next((key for kind, key in KEYS if isinstance(error, kind)), "")
+    return " ".join(": ".join(filter(None, (origin, key, str(error)))).split())
+
+
+def _refuse(problem: object) -> NoReturn:
+    # Once twistd logs, what is written to sys.stderr ends up in the log and not before the person's eyes.
+    stream = sys.__stderr__ if isinstance(sys.stderr, LoggingFile) else sys.stderr
+    if stream is not None:
+        stream.write(f"swarm-node: {problem}\n")
+    raise SystemExit(2)

@@ -1,0 +1,52 @@
+"""Nodes as the front door makes them, on one turned clock, for its tests."""
+
+from __future__ import annotations
+
+import random
+
+from twisted.application.service import Service
+
+from middleware.entangled.clock import HeapClock
+from middleware.entangled.network.switchboard import Switchboard
+from middleware.entangled.store import MemoryStore
+from middleware.node import SwarmNode
+from middleware.settings import Settings
+from swarmnode.assembly import Seams
+from swarmnode.service import NodeService
+
+
+class Page(Service):
+    """A page that only counts."""
+
+    def __init__(self, pages: list[Page]) -> None:
+        pages.append(self)
+
+
+class World:
+    """A board, a clock and nodes on it."""
+
+    def __init__(self) -> None:
+        self.clock = HeapClock()
+        self.board = Switchboard(self.clock, random.Random(1))
+        self.pages: list[Page] = []
+
+    def seams(self, name: str, port: int, store: MemoryStore | None = None) -> Seams:
+        """The seams of one node."""
+        return Seams(
+            self.clock,
+            lambda: self.board.network("127.0.0.1", port),
+            MemoryStore() if store is None else store,
+            random.Random(name),
+            self.clock.seconds,
+        )
+
+    def service(self, name: str, port: int, is_web: bool = False) -> NodeService:
+        """A node that joins through port 7000."""
+        known = [] if port == 7000 else ["127.0.0.1:7000"]
+        settings = Settings.from_mapping({"node": {"name": name, "port": port, "known_nodes": known}}, "test")
+        return NodeService(settings, self.seams(name, port), [self.page] if is_web else [])
+
+    def page(self, node: SwarmNode) -> Page:
+        """The page of a node, which has to run."""
+        assert node.running
+        return Page(self.pages)

@@ -1,0 +1,72 @@
+"""Tests of ``swarmnode.assembly``: what settings make of a node."""
+
+from __future__ import annotations
+
+import random
+from typing import Any
+
+from twisted.logger import ILogObserver, LogEvent, formatEvent, globalLogPublisher
+from twisted.trial.unittest import SynchronousTestCase
+from zope.interface import implementer
+
+from middleware.entangled.store import MemoryStore
+from middleware.settings import Settings
+from swarmnode.assembly import assembled, identity_in
+from tests.swarmnode.team import World
+
+
+class AssemblyTests(SynchronousTestCase):
+    def settings(self, **tables: Any) -> Settings:
+        """Settings of a node called a."""
+        return Settings.from_mapping({"node": {"name": "a", **tables.pop("node", {})}, **tables}, "test")
+
+    def test_driver_brings_kind_and_capabilities(self) -> None:
+        """A node with a driver is of the robot's kind and has its capabilities; what the settings say wins."""
+        world = World()
+        settings = self.settings(
+            node={"capabilities": {"base2d": {"max": 1}, "horn": {}}},
+            driver={"kind": "sim"},
+            agent={"module": "search"},
+        )
+        made = assembled(settings, world.seams("a", 7000))
+        device = made.node.presence.device
+        self.assertEqual(device.kind, "aibo-ers7")
+        self.assertEqual(device.capabilities["base2d"], {"max": 1})
+        self.assertEqual(set(device.capabilities), {"base2d", "horn", "odometry", "ranger", "imu", "power", "camera"})
+        self.assertIsNotNone(made.agent)
+
+    def test_node_without_body_has_no_agent(self) -> None:
+        """A laptop has neither driver nor agent, and its kind is what the settings say."""
+        made = assembled(self.settings(node={"kind": "laptop"}), World().seams("a", 7000))
+        self.assertEqual((made.agent, made.driver, made.node.presence.device.kind), (None, None, "laptop"))
+
+    def test_identity_is_kept_in_the_store(self) -> None:
+        """The store keeps the identity: whatever the dice say, a node is the same after a restart."""
+        store = MemoryStore()
+        first = identity_in(store, random.Random(1))
+        self.assertEqual(identity_in(store, random.Random(2)).node_id, first.node_id)
+        self.assertNotEqual(identity_in(MemoryStore(), random.Random(2)).node_id, first.node_id)
+
+    def test_spoiled_identity_is_made_anew(self) -> None:
+        """A note that is no seed does not keep the node from starting."""
+        store = MemoryStore()
+        store.note("identity", b"short")
+        self.assertEqual(identity_in(store, random.Random(1)).node_id, identity_in(store, random.Random(1)).node_id)
+
+    def test_lost_identity_is_said(self) -> None:
+        """A node whose store was there before and has no identity any more says that it is a new one."""
+        lines: list[str] = []
+
+        @implementer(ILogObserver)
+        def seen(event: LogEvent) -> None:
+            lines.append(formatEvent(event))
+
+        globalLogPublisher.addObserver(seen)
+        self.addCleanup(globalLogPublisher.removeObserver, seen)
+        store = MemoryStore()
+        identity_in(store, random.Random(1))
+        self.assertEqual(lines, [])
+        lost = MemoryStore()
+        lost.origin = "replaced"
+        identity_in(lost, random.Random(1))
+        self.assertIn("this node is a new one now", "".join(lines))

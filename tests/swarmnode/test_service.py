@@ -1,0 +1,96 @@
+"""Tests of ``swarmnode.service``: a node that comes and goes."""
+
+from __future__ import annotations
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.entangled.errors import PortInUse
+from swarmnode.service import NodeService
+from tests.swarmnode.team import World
+
+
+class NodeServiceTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.world = World()
+        self.first = self.world.service("a", 7000)
+        self.second = self.world.service("b", 7001, is_web=True)
+        for service in (self.first, self.second):
+            service.startService()
+            self.addCleanup(self.end, service)
+        self.world.clock.advance(1.0)
+        self.devices = self.first.assembly.node.watch_devices(lambda records: None)
+        self.world.clock.advance(0.5)
+
+    def end(self, service: NodeService) -> None:
+        """Stop it if it runs."""
+        if service.running:
+            self.successResultOf(service.stopService())
+
+    def seen(self) -> int:
+        """How many devices the first node sees."""
+        return len(self.devices.records)
+
+    def test_service_leaves_in_order(self) -> None:
+        """A node that is stopped says goodbye: it is gone before its lease is over, its store is closed."""
+        self.assertEqual(self.seen(), 2)
+        self.end(self.second)
+        self.world.clock.advance(0.1)
+        self.assertEqual(self.seen(), 1)
+        self.assertFalse(self.world.pages[0].running)
+
+    def test_service_vanishes_without_a_word(self) -> None:
+        """A node whose power fails is believed in until its lease is over, and sends nothing any more."""
+        self.second.vanish()
+        self.world.clock.advance(0.3)
+        sent = self.world.board.counters["unsent"]
+        self.assertEqual(self.seen(), 2)
+        self.world.clock.advance(1.2)
+        self.assertEqual(self.seen(), 1)
+        self.assertEqual(self.world.board.counters["unsent"], sent)
+
+    def test_service_leaves_and_returns(self) -> None:
+        """A node told to leave is gone with its page, and comes back with its identity and a page of its new self."""
+        before = self.second.assembly.node
+        self.second.leave(3.0)
+        self.assertFalse(self.world.pages[0].running)
+        self.world.clock.advance(2.5)
+        self.assertEqual(self.seen(), 1)
+        self.world.clock.advance(2.0)
+        after = self.second.assembly.node
+        self.assertEqual(self.seen(), 2)
+        self.assertTrue(after is not before and after.uuid == before.uuid)
+        self.assertEqual([page.running for page in self.world.pages], [0, 1])
+
+    def test_second_wish_to_leave_changes_nothing(self) -> None:
+        """Two wishes to leave, one shortly after the other, bring the node back once."""
+        self.second.leave(2.0)
+        self.second.leave(3.0)
+        self.world.clock.advance(2.5)
+        back = self.second.assembly.node
+        self.world.clock.advance(3.0)
+        self.assertIs(self.second.assembly.node, back)
+        self.assertEqual(self.seen(), 2)
+
+    def test_stopped_while_away_stays_away(self) -> None:
+        """A node that is stopped while it is away does not come back."""
+        self.second.leave(2.0)
+        self.end(self.second)
+        self.world.clock.advance(5.0)
+        self.assertEqual(self.seen(), 1)
+        self.assertFalse(self.second.assembly.node.running)
+
+    def test_port_taken_meanwhile_is_tried_again(self) -> None:
+        """A node whose port was taken while it was away tries again until it is free."""
+        self.second.leave(1.0)
+        squatter = self.world.board.network("127.0.0.1", 7001)
+        squatter.listen(lambda datagram, source: None)
+        self.world.clock.advance(2.0)
+        self.assertFalse(self.second.assembly.node.running)
+        squatter.close()
+        self.world.clock.advance(4.0)
+        self.assertEqual(self.seen(), 2)
+
+    def test_port_in_use_flies_at_the_start(self) -> None:
+        """A node whose port another holds does not start, and says so to its caller."""
+        third = self.world.service("c", 7001)
+        self.assertRaises(PortInUse, third.startService)

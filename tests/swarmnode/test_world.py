@@ -1,0 +1,38 @@
+"""Tests of ``swarmnode.world``: the web role."""
+
+from __future__ import annotations
+
+import sys
+
+from twisted.internet import reactor
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.errors import MissingExtra
+from swarmnode.plugin import told
+from swarmnode.world import web_page
+from tests.swarmnode.team import World
+
+
+class WebRoleTests(SynchronousTestCase):
+    def test_web_role_without_flask_names_the_extra(self) -> None:
+        """Where Flask is not installed the web role is refused with the command that installs it."""
+        hidden = {
+            name: sys.modules.pop(name) for name in list(sys.modules) if name.split(".")[0] in ("flask", "webnode")
+        }
+        sys.modules["flask"] = None  # type: ignore[assignment]
+
+        def restore() -> None:
+            for name in [name for name in sys.modules if name.split(".")[0] in ("flask", "webnode")]:
+                del sys.modules[name]
+            sys.modules.update(hidden)
+
+        self.addCleanup(restore)
+        world = World()
+        service = world.service("a", 7000)
+        settings, seams = service.settings, world.seams("a", 7000)
+        error = self.assertRaises(MissingExtra, web_page, settings, seams, reactor, service.assembly.node)
+        self.assertEqual(
+            told(error, "x.toml"),
+            "x.toml: [node] roles: the web role needs more than the bare node; "
+            "install it by: pip install 'swarm-node[web]'",
+        )
