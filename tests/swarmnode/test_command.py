@@ -36,7 +36,8 @@ class CommandTests(SynchronousTestCase):
 
     def test_verb_without_its_libraries_names_the_extra(self) -> None:
         """A verb whose libraries are not installed is refused with the command that installs them."""
-        program = "import sys; sys.modules['pymunk'] = None; from swarmnode.command import main; sys.exit(main(['trials']))"
+        hidden = "import sys; sys.modules['pymunk'] = None; from swarmnode.command import main"
+        program = f"{hidden}; sys.exit(main(['trials']))"
         child = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=60)
         self.assertEqual(child.returncode, 2, child.stderr)
         self.assertEqual(child.stderr.count("\n"), 1, child.stderr)
