@@ -9,6 +9,8 @@ does not count.  What a lost node held goes to the next in line.
 from __future__ import annotations
 
 import random
+from bisect import bisect_right
+from contextlib import suppress
 from typing import Any
 
 from twisted.internet.defer import Deferred
@@ -21,7 +23,7 @@ from middleware.entangled.kademlia.distance import distance
 from middleware.entangled.overlay import K, Overlay
 from middleware.entangled.owner import Owner
 from middleware.entangled.record import Record, Slot, unpacked
-from middleware.entangled.replica import Replica
+from middleware.entangled.replica import PAGE_BYTES, RECORD_BYTES, Replica
 from middleware.entangled.roster import STRUCK_S
 from middleware.entangled.store import Store
 from middleware.entangled.watch import digest_of
@@ -35,7 +37,9 @@ GROUPS = 16
 """Parts of the id space with a digest each, so that one difference does not mean to compare everything."""
 PLACES = 12
 """Places in one message."""
-AT_ONCE = 8
+LISTED_S = 2.0
+"""Seconds for which who pages through the places gets to see them as they were when it asked for the digests."""
+MAX_LISTED = 8
 OUT_OF_TOUCH = STRUCK_S / 2
 """Seconds without a majority in touch after which a node may have been struck, and is sure of nothing."""
 AGAIN = 1.0
@@ -69,6 +73,7 @@ class Handover:
         self._touched_at = clock.seconds()
         self._reconciled: dict[bytes, float] = {}
         self._asked_at: dict[bytes, float] = {}
+        self._listed: dict[bytes, tuple[float, list[list[Record]]]] = {}
         self._busy: set[bytes] = set()
         self._catching_up = False
         self._stored_at: dict[Slot, float] = {}
@@ -123,26 +128,37 @@ class Handover:
 
     def _answer_digests(self, peer: Contact) -> list[object]:
         """DIGESTS: of each part of the id space, what both should hold; and how much the peer alone should."""
-        groups, extra = self._both(peer)
+        *groups, extra = self._lists(peer)
         self._asked_at[peer.node_id] = self._clock.seconds()
         return [[digest_of(group) for group in groups], len(extra)]
 
     def _answer_places(self, peer: Contact, group: int, after: list[object]) -> list[object]:
         """PLACES: what is held here of a part of the id space (-1: of what only the peer should hold), in order."""
-        groups, extra = self._both(peer)
         if not -1 <= group < GROUPS:
             raise Refused(f"a group is a number from -1 to {GROUPS - 1}")
         cursor = tuple(after)
         if cursor and [type(part) for part in cursor] != [bytes, bytes, str]:
             raise Refused("a page begins after a key, an owner and a name")
-        records = sorted(extra if group < 0 else groups[group], key=lambda record: record.slot)
-        later = [record for record in records if not cursor or tuple(record.slot) > cursor]
-        return [[*record.slot, record.sequence, record.signature[:8]] for record in later[:PLACES]]
+        listed_at, lists = self._listed.get(peer.node_id, (-LISTED_S, []))
+        if self._clock.seconds() - listed_at >= LISTED_S:
+            lists = self._lists(peer)
+        records = lists[group]
+        begin = bisect_right(records, cursor, key=lambda record: record.slot) if cursor else 0
+        return [[*record.slot, record.sequence, record.signature[:8]] for record in records[begin : begin + PLACES]]
 
-    def _answer_fetch(self, peer: Contact, key: bytes, owner: bytes, name: str) -> list[object] | None:
-        """FETCH: the record in a slot, and the seconds that are left to it."""
-        record = self._held(Slot(key, owner, name))
-        return None if record is None else [record.packed(), self._replica.left(record)]
+    def _answer_fetch(self, peer: Contact, slots: list[object]) -> list[object]:
+        """FETCH: of each slot the record in it and the seconds left to that, or None; as many as make a page."""
+        page: list[object] = []
+        size = 0
+        for place in slots[:PLACES]:
+            if not (isinstance(place, list) and [type(part) for part in place] == [bytes, bytes, str]):
+                raise Refused("a slot is a key, an owner and a name")
+            record = self._held(Slot(*place))
+            size += _weight(record)
+            if page and size > PAGE_BYTES:
+                break
+            page.append(None if record is None else [record.packed(), self._replica.left(record)])
+        return page
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
@@ -177,6 +193,16 @@ class Handover:
                 extra.append(record)
         return groups, extra
 
+    def _lists(self, peer: Contact) -> list[list[Record]]:
+        """What both should hold, by parts, and last what only ``peer`` should: in order, and kept while it pages."""
+        groups, extra = self._both(peer)
+        lists = [sorted(records, key=lambda record: record.slot) for records in (*groups, extra)]
+        self._listed.pop(peer.node_id, None)
+        if len(self._listed) >= MAX_LISTED:
+            del self._listed[next(iter(self._listed))]
+        self._listed[peer.node_id] = (self._clock.seconds(), lists)
+        return lists
+
     def _is_near(self, contact: Contact) -> bool:
         """Whether this node and ``contact`` may have records in common."""
         near = self._overlay.responsible(self._own_id)
@@ -199,8 +225,7 @@ class Handover:
                     await self._compare(contact, group, mine[group])
             if extra:
                 await self._compare(contact, -1, [])
-            for record in to_give:
-                await self._give(contact, record)
+            await self._give_all(contact, to_give)
             self._reconciled[contact.node_id] = began
         finally:
             self._busy.discard(contact.node_id)
@@ -216,18 +241,42 @@ class Handover:
                 break
             after = places[-1][:3]
         wanted = [slot for slot, mark in theirs.items() if mark > _mark(self._held(slot))]
-        await first(len(wanted), [self._fetch(contact, slot) for slot in wanted])
+        await self._fetch(contact, wanted)
         lacked = [record for record in mine if _mark(record) > theirs.get(record.slot, (-1, b""))]
-        await first(len(lacked), [self._give(contact, record) for record in lacked])
+        await self._give_all(contact, lacked)
 
-    async def _fetch(self, contact: Contact, slot: Slot) -> None:
-        answer = await self._overlay.ask(contact, "fetch", *slot)
-        fields, left = answer if isinstance(answer, list) and len(answer) == 2 else (None, None)
+    async def _fetch(self, contact: Contact, wanted: list[Slot]) -> None:
+        """Get what ``contact`` holds in the slots, page by page."""
+        while wanted:
+            answer = await self._overlay.ask(contact, "fetch", [list(slot) for slot in wanted[:PLACES]])
+            page = answer if isinstance(answer, list) else []
+            for slot, fields in zip(wanted, page, strict=False):
+                self._take(slot, fields)
+            wanted = wanted[len(page) :] if page else []
+
+    def _take(self, slot: Slot, found: object) -> None:
+        """Keep a record that was fetched, where it is one and beats what is here."""
+        fields, left = found if isinstance(found, list) and len(found) == 2 else (None, None)
         record = unpacked(fields)
         if record is None or record.slot != slot or type(left) is not float or record.lifetime != "team":
             return
         if record.beats(self._held(slot)) and self._replica.is_genuine(record):
             self._replica.keep(record, left)
+
+    async def _give_all(self, contact: Contact, records: list[Record]) -> None:
+        """Store at ``contact``, page by page; what it has no room for it does without."""
+        while records:
+            page = [records[0]]
+            size = _weight(records[0])
+            for record in records[1:PLACES]:
+                size += _weight(record)
+                if size > PAGE_BYTES:
+                    break
+                page.append(record)
+            records = records[len(page) :]
+            lives = [self._replica.left(record) for record in page]
+            with suppress(Refused):
+                await self._overlay.ask(contact, "store", [r.packed() for r in page], lives, changes=True)
 
     async def _give(self, contact: Contact, record: Record) -> int:
         return await self._owner.store_at(contact, record, self._replica.left(record))
@@ -298,6 +347,11 @@ class Handover:
     async def _spread(self, record: Record) -> Any:
         targets = await self._overlay.holders(record.key)
         return await first(len(targets), [self._give(c, record) for c in targets if c.node_id != self._own_id])
+
+
+def _weight(record: Record | None) -> int:
+    """About how many bytes a record takes in a message."""
+    return 0 if record is None else len(record.value or b"") + len(record.name.encode()) + RECORD_BYTES
 
 
 def _mark(record: Record | None) -> tuple[int, bytes]:
