@@ -9,6 +9,7 @@ does not count.  What a lost node held goes to the next in line.
 from __future__ import annotations
 
 import random
+from contextlib import suppress
 from typing import Any
 
 from twisted.internet.defer import Deferred
@@ -18,10 +19,11 @@ from middleware.entangled.background import Background, first
 from middleware.entangled.errors import EntangledError, Refused
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.distance import distance
+from middleware.entangled.overlap import GROUPS, PLACES, Overlap, weight
 from middleware.entangled.overlay import K, Overlay
 from middleware.entangled.owner import Owner
 from middleware.entangled.record import Record, Slot, unpacked
-from middleware.entangled.replica import Replica
+from middleware.entangled.replica import PAGE_BYTES, Replica
 from middleware.entangled.roster import STRUCK_S
 from middleware.entangled.store import Store
 from middleware.entangled.watch import digest_of
@@ -31,11 +33,6 @@ STEWARDS = 2
 MEND = 10.0
 REPUBLISH = 3600.0
 """Seconds within which every replica gives on what no other replica gave on (Kademlia, section 2.5)."""
-GROUPS = 16
-"""Parts of the id space with a digest each, so that one difference does not mean to compare everything."""
-PLACES = 12
-"""Places in one message."""
-AT_ONCE = 8
 OUT_OF_TOUCH = STRUCK_S / 2
 """Seconds without a majority in touch after which a node may have been struck, and is sure of nothing."""
 AGAIN = 1.0
@@ -57,7 +54,6 @@ class Handover:
         rng: random.Random,
         chores: Background,
     ) -> None:
-        self._store = store
         self._replica = replica
         self._overlay = overlay
         self._owner = owner
@@ -68,15 +64,10 @@ class Handover:
         self._is_sure = False
         self._touched_at = clock.seconds()
         self._reconciled: dict[bytes, float] = {}
-        self._asked_at: dict[bytes, float] = {}
         self._busy: set[bytes] = set()
         self._catching_up = False
         self._stored_at: dict[Slot, float] = {}
-        self._near: dict[bytes, list[bytes]] = {}
-        self._near_version = -1
-        endpoint.expose("digests", self._answer_digests)
-        endpoint.expose("places", self._answer_places)
-        endpoint.expose("fetch", self._answer_fetch)
+        self._overlap = Overlap(store, replica, overlay, endpoint, clock)
 
     def start(self) -> None:
         """Compare with others from time to time, and know when this node has lost touch."""
@@ -105,8 +96,8 @@ class Handover:
     def lost(self, contact: Contact) -> None:
         """Give the records that a lost contact held to the node that takes its place."""
         self._reconciled.pop(contact.node_id, None)
-        self._asked_at.pop(contact.node_id, None)
-        for record in self._records():
+        self._overlap.asked_at.pop(contact.node_id, None)
+        for record in self._overlap.records():
             nearest = self._overlay.responsible(record.key)
             if len(nearest) < K or all(c.node_id != self._own_id for c in nearest[:STEWARDS]):
                 continue
@@ -119,63 +110,14 @@ class Handover:
         """Another holder or the owner has just given ``record`` on: no need to do so soon."""
         self._stored_at[record.slot] = self._clock.seconds()
 
-    # -- what peers ask ---------------------------------------------------------------------------------------------
-
-    def _answer_digests(self, peer: Contact) -> list[object]:
-        """DIGESTS: of each part of the id space, what both should hold; and how much the peer alone should."""
-        groups, extra = self._both(peer)
-        self._asked_at[peer.node_id] = self._clock.seconds()
-        return [[digest_of(group) for group in groups], len(extra)]
-
-    def _answer_places(self, peer: Contact, group: int, after: list[object]) -> list[object]:
-        """PLACES: what is held here of a part of the id space (-1: of what only the peer should hold), in order."""
-        groups, extra = self._both(peer)
-        if not -1 <= group < GROUPS:
-            raise Refused(f"a group is a number from -1 to {GROUPS - 1}")
-        cursor = tuple(after)
-        if cursor and [type(part) for part in cursor] != [bytes, bytes, str]:
-            raise Refused("a page begins after a key, an owner and a name")
-        records = sorted(extra if group < 0 else groups[group], key=lambda record: record.slot)
-        later = [record for record in records if not cursor or tuple(record.slot) > cursor]
-        return [[*record.slot, record.sequence, record.signature[:8]] for record in later[:PLACES]]
-
-    def _answer_fetch(self, peer: Contact, key: bytes, owner: bytes, name: str) -> list[object] | None:
-        """FETCH: the record in a slot, and the seconds that are left to it."""
-        record = self._held(Slot(key, owner, name))
-        return None if record is None else [record.packed(), self._replica.left(record)]
-
     # -- inside -----------------------------------------------------------------------------------------------------
 
     def _welcome(self, contact: Contact, since: float) -> None:
-        compared_at = max(self._reconciled.get(contact.node_id, -1.0), self._asked_at.get(contact.node_id, -1.0))
+        compared_at = max(
+            self._reconciled.get(contact.node_id, -1.0), self._overlap.asked_at.get(contact.node_id, -1.0)
+        )
         if compared_at < since:
             self._chores.fork(self._reconcile(contact))
-
-    def _held(self, slot: Slot) -> Record | None:
-        return None if slot in self._replica.keepsakes else self._store.slot(slot)
-
-    def _records(self) -> list[Record]:
-        """The team records that are held here, tombstones included."""
-        kept = self._replica.keepsakes
-        return [r for r in self._store.records() if r.lifetime == "team" and r.slot not in kept]
-
-    def _both(self, peer: Contact) -> tuple[list[list[Record]], list[Record]]:
-        """What is held here and should be at the peer as well: by parts, and what should not be here any more."""
-        groups: list[list[Record]] = [[] for _ in range(GROUPS)]
-        extra = []
-        if self._near_version != self._overlay.roster.version or not self._overlay.is_complete:
-            self._near.clear()
-            self._near_version = self._overlay.roster.version
-        for record in self._records():
-            ids = self._near.get(record.key)
-            if ids is None:
-                ids = self._near[record.key] = [c.node_id for c in self._overlay.responsible(record.key)]
-            is_mine, is_theirs = self._own_id in ids, peer.node_id in ids
-            if is_theirs and is_mine:
-                groups[record.key[0] * GROUPS >> 8].append(record)
-            elif is_theirs:
-                extra.append(record)
-        return groups, extra
 
     def _is_near(self, contact: Contact) -> bool:
         """Whether this node and ``contact`` may have records in common."""
@@ -191,7 +133,7 @@ class Handover:
             began = self._clock.seconds()
             answer = await self._overlay.ask(contact, "digests")
             digests, extra = answer if isinstance(answer, list) and len(answer) == 2 else ([], 0)
-            mine, to_give = self._both(contact)
+            mine, to_give = self._overlap.both(contact)
             if not (isinstance(digests, list) and len(digests) == GROUPS):
                 raise Refused(f"{contact.address} gives no digests")
             for group, digest in enumerate(digests):
@@ -199,8 +141,7 @@ class Handover:
                     await self._compare(contact, group, mine[group])
             if extra:
                 await self._compare(contact, -1, [])
-            for record in to_give:
-                await self._give(contact, record)
+            await self._give_all(contact, to_give)
             self._reconciled[contact.node_id] = began
         finally:
             self._busy.discard(contact.node_id)
@@ -215,19 +156,43 @@ class Handover:
             if len(places) < PLACES or places[-1][:3] <= after:
                 break
             after = places[-1][:3]
-        wanted = [slot for slot, mark in theirs.items() if mark > _mark(self._held(slot))]
-        await first(len(wanted), [self._fetch(contact, slot) for slot in wanted])
+        wanted = [slot for slot, mark in theirs.items() if mark > _mark(self._overlap.held(slot))]
+        await self._fetch(contact, wanted)
         lacked = [record for record in mine if _mark(record) > theirs.get(record.slot, (-1, b""))]
-        await first(len(lacked), [self._give(contact, record) for record in lacked])
+        await self._give_all(contact, lacked)
 
-    async def _fetch(self, contact: Contact, slot: Slot) -> None:
-        answer = await self._overlay.ask(contact, "fetch", *slot)
-        fields, left = answer if isinstance(answer, list) and len(answer) == 2 else (None, None)
+    async def _fetch(self, contact: Contact, wanted: list[Slot]) -> None:
+        """Get what ``contact`` holds in the slots, page by page."""
+        while wanted:
+            answer = await self._overlay.ask(contact, "fetch", [list(slot) for slot in wanted[:PLACES]])
+            page = answer if isinstance(answer, list) else []
+            for slot, fields in zip(wanted, page, strict=False):
+                self._take(slot, fields)
+            wanted = wanted[len(page) :] if page else []
+
+    def _take(self, slot: Slot, found: object) -> None:
+        """Keep a record that was fetched, where it is one and beats what is here."""
+        fields, left = found if isinstance(found, list) and len(found) == 2 else (None, None)
         record = unpacked(fields)
         if record is None or record.slot != slot or type(left) is not float or record.lifetime != "team":
             return
-        if record.beats(self._held(slot)) and self._replica.is_genuine(record):
+        if record.beats(self._overlap.held(slot)) and self._replica.is_genuine(record):
             self._replica.keep(record, left)
+
+    async def _give_all(self, contact: Contact, records: list[Record]) -> None:
+        """Store at ``contact``, page by page; what it has no room for it does without."""
+        while records:
+            page = [records[0]]
+            size = weight(records[0])
+            for record in records[1:PLACES]:
+                size += weight(record)
+                if size > PAGE_BYTES:
+                    break
+                page.append(record)
+            records = records[len(page) :]
+            lives = [self._replica.left(record) for record in page]
+            with suppress(Refused):
+                await self._overlay.ask(contact, "store", [r.packed() for r in page], lives, changes=True)
 
     async def _give(self, contact: Contact, record: Record) -> int:
         return await self._owner.store_at(contact, record, self._replica.left(record))
@@ -285,7 +250,7 @@ class Handover:
         if others:
             self._chores.fork(self._reconcile(others[self._rng.randrange(len(others))]))
         now = self._clock.seconds()
-        records = self._records()
+        records = self._overlap.records()
         slots = {record.slot for record in records}
         self._stored_at = {slot: at for slot, at in self._stored_at.items() if slot in slots}
         for record in records:

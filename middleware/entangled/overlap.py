@@ -1,0 +1,129 @@
+"""Overlap: what this node holds and a peer should hold, too: in parts with a digest each, listed and given in pages.
+
+It answers DIGESTS, PLACES and FETCH; who compares with whom, and when, stands in ``handover``.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+
+from twisted.internet.interfaces import IReactorTime
+
+from middleware.entangled.errors import Refused
+from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.overlay import Overlay
+from middleware.entangled.record import Record, Slot
+from middleware.entangled.replica import PAGE_BYTES, RECORD_BYTES, Replica
+from middleware.entangled.store import Store
+from middleware.entangled.watch import digest_of
+from middleware.entangled.wire.endpoint import Endpoint
+
+GROUPS = 16
+"""Parts of the id space with a digest each, so that one difference does not mean to compare everything."""
+PLACES = 12
+"""Places, and records, in one message."""
+LISTED_S = 2.0
+"""Seconds for which who pages through the places gets to see them as they were when it asked for the digests."""
+MAX_LISTED = 8
+
+
+class Overlap:
+    """The team records of one node, as seen by its peers; ``asked_at`` is when each of them last asked for digests."""
+
+    def __init__(
+        self, store: Store, replica: Replica, overlay: Overlay, endpoint: Endpoint, clock: IReactorTime
+    ) -> None:
+        self.asked_at: dict[bytes, float] = {}
+        self._store = store
+        self._replica = replica
+        self._overlay = overlay
+        self._clock = clock
+        self._own_id = overlay.own_id
+        self._listed: dict[bytes, tuple[float, list[list[Record]]]] = {}
+        self._near: dict[bytes, list[bytes]] = {}
+        self._near_version = -1
+        endpoint.expose("digests", self._answer_digests)
+        endpoint.expose("places", self._answer_places)
+        endpoint.expose("fetch", self._answer_fetch)
+
+    def held(self, slot: Slot) -> Record | None:
+        """What the slot holds here, for others to see."""
+        return None if slot in self._replica.keepsakes else self._store.slot(slot)
+
+    def records(self) -> list[Record]:
+        """The team records that are held here, tombstones included."""
+        kept = self._replica.keepsakes
+        return [r for r in self._store.records() if r.lifetime == "team" and r.slot not in kept]
+
+    def both(self, peer: Contact) -> tuple[list[list[Record]], list[Record]]:
+        """What is held here and should be at the peer as well: by parts, and what should not be here any more."""
+        groups: list[list[Record]] = [[] for _ in range(GROUPS)]
+        extra = []
+        if self._near_version != self._overlay.roster.version or not self._overlay.is_complete:
+            self._near.clear()
+            self._near_version = self._overlay.roster.version
+        for record in self.records():
+            ids = self._near.get(record.key)
+            if ids is None:
+                ids = self._near[record.key] = [c.node_id for c in self._overlay.responsible(record.key)]
+            is_mine, is_theirs = self._own_id in ids, peer.node_id in ids
+            if is_theirs and is_mine:
+                groups[record.key[0] * GROUPS >> 8].append(record)
+            elif is_theirs:
+                extra.append(record)
+        return groups, extra
+
+    # -- what peers ask ---------------------------------------------------------------------------------------------
+
+    def _answer_digests(self, peer: Contact) -> list[object]:
+        """DIGESTS: of each part of the id space, what both should hold; and how much the peer alone should."""
+        *groups, extra = self._lists(peer)
+        self.asked_at[peer.node_id] = self._clock.seconds()
+        return [[digest_of(group) for group in groups], len(extra)]
+
+    def _answer_places(self, peer: Contact, group: int, after: list[object]) -> list[object]:
+        """PLACES: what is held here of a part of the id space (-1: of what only the peer should hold), in order."""
+        if not -1 <= group < GROUPS:
+            raise Refused(f"a group is a number from -1 to {GROUPS - 1}")
+        cursor = tuple(after)
+        if cursor and [type(part) for part in cursor] != [bytes, bytes, str]:
+            raise Refused("a page begins after a key, an owner and a name")
+        listed_at, lists = self._listed.get(peer.node_id, (-LISTED_S, []))
+        if self._clock.seconds() - listed_at >= LISTED_S:
+            lists = self._lists(peer)
+        records = lists[group]
+        begin = bisect_right(records, cursor, key=lambda record: record.slot) if cursor else 0
+        return [[*record.slot, record.sequence, record.signature[:8]] for record in records[begin : begin + PLACES]]
+
+    def _answer_fetch(self, peer: Contact, slots: list[object]) -> list[object]:
+        """FETCH: of each slot the record in it and the seconds left to that, or None; as many as make a page."""
+        page: list[object] = []
+        size = 0
+        for place in slots[:PLACES]:
+            if not (isinstance(place, list) and [type(part) for part in place] == [bytes, bytes, str]):
+                raise Refused("a slot is a key, an owner and a name")
+            record = self.held(Slot(*place))
+            size += weight(record)
+            if page and size > PAGE_BYTES:
+                break
+            page.append(None if record is None else [record.packed(), self._replica.left(record)])
+        return page
+
+    # -- inside -----------------------------------------------------------------------------------------------------
+
+    def _lists(self, peer: Contact) -> list[list[Record]]:
+        """What both should hold, by parts, and last what only ``peer`` should: in order, and kept while it pages."""
+        groups, extra = self.both(peer)
+        lists = [sorted(records, key=lambda record: record.slot) for records in (*groups, extra)]
+        now = self._clock.seconds()
+        self._listed.pop(peer.node_id, None)
+        for other, (at, _) in list(self._listed.items()):
+            if now - at >= LISTED_S or len(self._listed) >= MAX_LISTED:
+                del self._listed[other]  # it may hold what is replaced meanwhile
+        self._listed[peer.node_id] = (now, lists)
+        return lists
+
+
+def weight(record: Record | None) -> int:
+    """About how many bytes a record takes in a message."""
+    return 0 if record is None else len(record.value or b"") + len(record.name.encode()) + RECORD_BYTES
