@@ -84,6 +84,10 @@ class Fleet(World):
         self.run(JOINING)
         return self.nodes[-1]
 
+    def kill(self, place: int) -> None:
+        """End a node as a loss of power does; its store is left as it is."""
+        self.nodes[place].vanish()
+
     def restart(self, place: int, known: Sequence[int] = (0,)) -> EntangledNode:
         """The next life of a node that has ended, on the store of the last one."""
         self.nodes[place] = self.made(place)
