@@ -21,7 +21,7 @@ from tests.invariants.schedule import Schedule
 
 JOB = ("job", int, ANY)
 BELL = ("bell", int)
-MOST_WAITING = 12
+MOST_WAITING = 6
 WAKE = 1.0
 """Seconds within which whoever waits is woken (T6)."""
 SWEEP = (3.0, 6.0)
@@ -52,9 +52,9 @@ class Tuples:
         """A few operations at random nodes."""
         if not self._spaces:
             return
-        if self._rng.random() < 0.6 and len(self._witness.open()) < MOST_WAITING:
+        if self._rng.random() < 0.4 and len(self._witness.open()) < MOST_WAITING:
             self._put()
-        for _ in range(self._rng.randrange(3)):
+        if self._rng.random() < 0.6:
             place = self._rng.choice(sorted(self._spaces))
             act = self._rng.choice([self._take, self._take, self._take_some, self._claim, self._look, self._again])
             act(place, self._spaces[place])
