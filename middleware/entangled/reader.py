@@ -72,7 +72,7 @@ class Reader:
         """Whether ``record``, told by ``contact``, is one of ``key`` and its owner's own word."""
         if record.key != key:
             return False
-        return record.owner == contact.public or record in self._replica.held(key) or record.is_genuine()
+        return record.owner == contact.public or self._replica.holds(record) or record.is_genuine()
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
