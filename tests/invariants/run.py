@@ -11,13 +11,16 @@ from functools import partial
 
 from tests.fleet import Fleet
 from tests.invariants.bug import seeded
+from tests.invariants.disk import DiskFleet
 from tests.invariants.records import Records
 from tests.invariants.schedule import Schedule, Workload
+from tests.invariants.stores import Stores
 from tests.invariants.tuples import Tuples
+from tests.invariants.wire import Wire
 
-WORKLOADS: dict[str, Callable[[Schedule], Workload]] = {"records": Records, "tuples": Tuples}
+WORKLOADS: dict[str, Callable[[Schedule], Workload]] = {"records": Records, "tuples": Tuples, "stores": Stores, "wire": Wire}
 """Each may be asked for by name; the order is the one in which they act."""
-SHARES = {"records": 1.0, "tuples": 0.4}
+SHARES = {"records": 1.0, "tuples": 0.25, "stores": 0.2, "wire": 0.2}
 """The share of schedules in which each takes part, unless it is asked for."""
 
 
@@ -41,7 +44,7 @@ def run(seed: int, only: tuple[str, ...] = (), bug: str | None = None) -> Outcom
     """Run the schedule of ``seed``, with the workloads of ``only`` instead of those drawn, and with a bug put in."""
     names = only or drawn(seed)
     with seeded(bug):
-        schedule = Schedule(seed, Fleet)
+        schedule = Schedule(seed, DiskFleet if "stores" in names else Fleet)
         found = schedule.run([WORKLOADS[name](schedule) for name in WORKLOADS if name in names])
     faults = "; ".join(map(str, schedule.faults))
     title = f"n={schedule.n} {'+'.join(names)} {schedule.weather} faults: {faults}"
