@@ -22,7 +22,7 @@ DEV     := $(VENV)/.stamp-dev
 BROWSER := $(VENV)/.stamp-browser
 BENCH   := $(VENV)/.stamp-bench
 
-.PHONY: help demo test trials check format cov live browser bench-demo bench-dht api dist clean
+.PHONY: help demo test trials check format cov live schedules browser bench-demo bench-dht api dist clean
 
 help:
 	@echo 'make demo [HEADLESS=1] [SEED=1]       three dogs, a red target and the page; HEADLESS: both experiments, then exit'
@@ -32,6 +32,7 @@ help:
 	@echo 'make check                            format, lint, types, and the rules of the house'
 	@echo 'make format                           write the format that "make check" asks for'
 	@echo 'make cov                              the tests with coverage of lines and branches'
+	@echo 'make schedules [N=2000] [SEED=1]      so many random schedules of faults, and the invariants of the library'
 	@echo 'make live                             only the tests with real sockets and processes'
 	@echo 'make browser                          only the tests of the page in Chromium'
 	@echo 'make bench-demo                       what the demonstration costs: memory, datagrams, seconds'
@@ -63,6 +64,9 @@ format: $(DEV)
 cov: $(DEV)
 	$(PY) -m coverage run -m twisted.trial tests
 	$(PY) -m coverage report
+
+schedules: $(DEV)
+	$(PY) -m tests.invariants --schedules $(if $(filter file,$(origin N)),2000,$(N)) --seed $(SEED)
 
 live: $(DEV)
 	$(PY) -m twisted.trial tests.live

@@ -84,6 +84,14 @@ class Fleet(World):
         self.run(JOINING)
         return self.nodes[-1]
 
+    def memory(self, place: int) -> int:
+        """Which memory the node of a place has; another one may lack what was not acknowledged."""
+        return 0
+
+    def kill(self, place: int) -> None:
+        """End a node as a loss of power does; its store is left as it is."""
+        self.nodes[place].vanish()
+
     def restart(self, place: int, known: Sequence[int] = (0,)) -> EntangledNode:
         """The next life of a node that has ended, on the store of the last one."""
         self.nodes[place] = self.made(place)

@@ -6,7 +6,7 @@ no longer shows its record.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 
 from middleware.entangled.errors import NotRunning, Refused
 from middleware.entangled.record import MAX_TTL, Record, Slot
@@ -23,6 +23,10 @@ class Keepsakes:
     def __contains__(self, slot: Slot) -> bool:
         """Whether what the store has in ``slot`` is a copy only."""
         return slot in self._kept.get(slot.key, {})
+
+    def under(self, key: bytes) -> Collection[Slot]:
+        """The slots under ``key`` of which there is a copy only."""
+        return self._kept.get(key, {})
 
     def keep(self, key: bytes, records: Iterable[Record], now: float) -> None:
         """Make the copies under ``key`` those of ``records`` that the store does not hold anyway."""

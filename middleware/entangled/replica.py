@@ -81,7 +81,14 @@ class Replica:
 
     def held(self, key: bytes) -> list[Record]:
         """What is held under ``key`` as a replica, tombstones included."""
-        return [r for r in self._store.get(key, tombstones=True) if r.slot not in self.keepsakes]
+        records = self._store.get(key, tombstones=True)
+        kept = self.keepsakes.under(key)
+        return [r for r in records if r.slot not in kept] if kept else records
+
+    def holds(self, record: Record) -> bool:
+        """Whether this very record is held as a replica."""
+        slot = record.slot
+        return self._store.slot(slot) == record and slot not in self.keepsakes and not self._store.is_cached(slot)
 
     def keep(self, record: Record, left: float | None = None) -> int:
         """Hold ``record`` if it beats what its slot holds; 0 if it does, else the sequence that holds.
@@ -191,8 +198,7 @@ class Replica:
 
     def is_genuine(self, record: Record) -> bool:
         """Whether ``record`` is its owner's own word: the very one that is held here, or one with a good signature."""
-        is_held = record.slot not in self.keepsakes and self._store.slot(record.slot) == record
-        return is_held or self._signed.is_genuine(record)
+        return self.holds(record) or self._signed.is_genuine(record)
 
     # -- inside -----------------------------------------------------------------------------------------------------
 

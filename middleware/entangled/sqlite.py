@@ -9,6 +9,7 @@ from __future__ import annotations
 import fcntl
 import os
 import sqlite3
+from collections.abc import Callable
 from urllib.parse import quote
 
 from twisted.internet.defer import Deferred
@@ -45,6 +46,8 @@ class SqliteStore(MemoryStore):
     """
 
     _log = Logger()
+    make_writer: Callable[[str, sqlite3.Connection, Deliver | None], Writer] = Writer
+    """What writes the file; simulations put in one that has no thread."""
 
     def __init__(
         self,
@@ -109,7 +112,7 @@ class SqliteStore(MemoryStore):
         if not version and origin == "kept":
             origin = "new"
         epoch = found.notes.get(EPOCH, fresh_epoch)
-        writer = Writer(path, connection, deliver)
+        writer = cls.make_writer(path, connection, deliver)
         store = cls(path, connection, lock, writer, max_rows, max_bytes, hold, epoch)
         store.origin = origin
         store._take_in(found, now)

@@ -65,6 +65,9 @@ BUGS: dict[str, list[tuple[Any, str, Any]]] = {
     "any answer counts": [(reader, "_votes", _any_answer)],
 }
 
+FINDERS: dict[str, tuple[str, ...]] = {}
+"""The workloads that look for a bug, where these are not the records."""
+
 
 @contextmanager
 def seeded(name: str | None) -> Iterator[None]:

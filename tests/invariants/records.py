@@ -42,7 +42,7 @@ class Records:
         self._rng = schedule.rng
         self._slots: dict[Slot, _Slot] = {}
         self._found: list[str] = []
-        self._held: dict[tuple[int, Slot], tuple[int, bytes]] = {}
+        self._held: dict[tuple[int, int, Slot], tuple[int, bytes]] = {}
         self._old: list[Record] = []
         self._is_over = False
         self._finds: list[tuple[int, bytes, list[Any]]] = []
@@ -198,7 +198,7 @@ class Records:
                 if other is None or other == place or contact.address != fleet.address(other):
                     self._say("D5", f"node {place} has {contact.address} in its table")
             for record in fleet.stores[place].records():
-                at = (place, record.slot)
+                at = (place, fleet.memory(place), record.slot)
                 mark = (record.sequence, record.signature)
                 if record.lifetime == "team" and mark < self._held.get(at, mark):
                     self._say("D4", f"node {place} went back to {mark[0]} in {record.name}")

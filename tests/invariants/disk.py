@@ -1,0 +1,279 @@
+"""Disk: a fleet whose nodes keep their stores in files, and lose power between any two instructions.
+
+A writer has no thread here: it commits at moments of the simulated clock, so that a run follows from its seed.  A kill
+leaves the files as they are at that moment, perhaps with a torn commit at their end; the next life opens a copy.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import shutil
+import sqlite3
+import tempfile
+from collections import Counter
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+from twisted.internet.defer import Deferred
+from twisted.internet.interfaces import IDelayedCall
+
+from middleware.entangled.clock import HeapClock
+from middleware.entangled.network.switchboard import CALM, Weather
+from middleware.entangled.record import Record, Slot
+from middleware.entangled.sqlite import SqliteStore
+from middleware.entangled.store import Store
+from middleware.entangled.writer import COMMIT_AFTER, TRY_AGAIN, Writer, _Owed
+from tests.fleet import Fleet
+
+PARTS = ("", "-wal")
+MEMORY = "/dev/shm"
+"""Where files cost no time, if the machine has it: what is shown here does not rest on the real disk."""
+
+Facts = dict[Slot | str, Record | bytes | None]
+"""What slots and notes hold."""
+
+
+class TurnedWriter(Writer):
+    """A writer that commits when its clock says so; with ``fault`` set, every commit fails for that reason."""
+
+    def __init__(self, path: str, connection: sqlite3.Connection, clock: HeapClock, rng: random.Random) -> None:
+        super().__init__(path, connection, lambda tell: clock.callLater(0.0, tell))
+        self.fault = ""
+        self._clock = clock
+        self._rng = rng
+        self._timer: IDelayedCall | None = None
+
+    def start(self, statements: list[Any]) -> None:
+        """Begin to write, ``statements`` first."""
+        self._owed.statements += statements
+        self._schedule()
+
+    def owe(self, slot: Slot, record: Record | None) -> None:
+        """Have ``record`` written as what ``slot`` holds, or nothing."""
+        super().owe(slot, record)
+        self._schedule()
+
+    def owe_note(self, name: str, value: bytes) -> None:
+        """Have a note written."""
+        super().owe_note(name, value)
+        self._schedule()
+
+    def turn(self) -> None:
+        """Commit what is owed."""
+        self._timer = None
+        batch, self._owed = self._owed, _Owed()
+        waiting, self._waiting = self._waiting, []
+        self._writing = True
+        self._settle(batch, waiting, self._commit(batch) if batch else "")
+        if self._news and self._deliver is not None:
+            self._deliver(self._tell)
+        self._schedule()
+
+    def tear(self) -> None:
+        """Commit what is owed, and tell nobody: the power fails meanwhile."""
+        self._commit(self._owed)
+
+    def abandon(self) -> None:
+        """Stop without a word."""
+        self._closing = True
+        if self._timer is not None and self._timer.active():
+            self._timer.cancel()
+
+    def _commit(self, batch: _Owed) -> str:
+        return self.fault or super()._commit(batch)
+
+    def _schedule(self) -> None:
+        if self._timer is None and self._owed and not self._closing:
+            wait = TRY_AGAIN if self._trouble else self._rng.uniform(0.0, COMMIT_AFTER)
+            self._timer = self._clock.callLater(wait, self.turn)
+
+
+class DiskStore(SqliteStore):
+    """A store that remembers what it said was safe; ``promised`` is that, ``fresh`` what was changed since."""
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self.promised: Facts = {}
+        self.fresh: Facts = {}
+
+    @property
+    def writer(self) -> TurnedWriter:
+        """What writes the file."""
+        assert isinstance(self._writer, TurnedWriter)
+        return self._writer
+
+    def note(self, name: str, value: bytes) -> None:
+        """Keep a small fact of the node's own under ``name``."""
+        self.fresh[name] = value
+        super().note(name, value)
+
+    def written(self) -> Deferred[None]:
+        """Fire when all that was put until now is in the file."""
+        until_now = dict(self.fresh)
+
+        def safe(_: None) -> None:
+            self.promised.update(until_now)
+            for place, fact in until_now.items():
+                if self.fresh.get(place) is fact:
+                    self.fresh.pop(place, None)
+
+        return super().written().addCallback(safe)
+
+    def lost(self, later: SqliteStore) -> list[str]:
+        """What was promised here and is not in the store of the ``later`` life."""
+        lost = []
+        for place, fact in self.promised.items():
+            if place in self.fresh:
+                continue
+            there = later.noted(place) if isinstance(place, str) else later.slot(place)
+            if isinstance(fact, Record) and fact.lifetime == "leased":
+                continue
+            if there != fact:
+                lost.append(f"{place if isinstance(place, str) else place.name}: {_short(fact)} became {_short(there)}")
+        return lost
+
+    def abandon(self) -> None:
+        """Let go of the file as a kill does."""
+        self.writer.abandon()
+        self._connection.close()
+        os.close(self._lock)
+
+    def _changed(self, slot: Slot, record: Record | None) -> None:
+        self.fresh[slot] = record
+        super()._changed(slot, record)
+
+
+class DiskFleet(Fleet):
+    """A fleet on files in a temporary folder.
+
+    ``decay`` names places and what rots in their file when they are killed next ("row" or "file"); ``lost`` tells what
+    had been promised and was gone in the next life, ``overlooked`` what rotted and was not noticed.
+    """
+
+    def __init__(self, n: int, seed: int = 1, weather: Weather = CALM) -> None:
+        self._folder = tempfile.TemporaryDirectory(prefix="schedule-", dir=MEMORY if os.path.isdir(MEMORY) else None)
+        self._dice = random.Random(f"{seed}/disk")
+        self._memories: Counter[int] = Counter()
+        self._rotten: set[int] = set()
+        self.decay: dict[int, str] = {}
+        self.decayed: list[int] = []
+        self.lost: list[str] = []
+        self.overlooked: list[str] = []
+        super().__init__(n, seed, weather)
+
+    def memory(self, place: int) -> int:
+        """Which memory the node of a place has."""
+        return self._memories[place]
+
+    def disk(self, place: int) -> DiskStore:
+        """The store of the node of a place."""
+        store = self.stores[place]
+        assert isinstance(store, DiskStore)
+        return store
+
+    def store(self, place: int) -> Store:
+        """The store of the next life of the node of this place."""
+        former = self.stores.get(place)
+        store = self.stores[place] = self._opened(self._path(place))
+        if place in self._rotten:
+            self._rotten.discard(place)
+            if not store.rotten and store.origin != "replaced":
+                self.overlooked.append(f"node {place} does not notice that its store has rotted")
+        elif isinstance(former, DiskStore):
+            self.lost += [f"node {place} lost what was safe: {line}" for line in former.lost(store)]
+        return store
+
+    def kill(self, place: int) -> None:
+        """End a node as a loss of power does: its file is left as it is, or with half a commit."""
+        super().kill(place)
+        store, path = self.disk(place), self._path(place)
+        self._memories[place] += 1
+        later = self._path(place)
+        before = _size(path + "-wal")
+        is_torn = self._dice.random() < 0.5
+        if is_torn:
+            store.writer.tear()
+        _copy(path, later)
+        after = _size(later + "-wal")
+        if is_torn and after > before:
+            os.truncate(later + "-wal", self._dice.randrange(before, after + 1))
+        store.abandon()
+        kind = self.decay.get(place)
+        if kind is not None and self._rot(later, kind):
+            del self.decay[place]
+            self._rotten.add(place)
+            self.decayed.append(place)
+
+    def stop(self) -> None:
+        """End every node, and remove the files."""
+        super().stop()
+        for place in range(len(self.nodes)):
+            store = self.disk(place)
+            if not store.writer.is_closed:
+                store.abandon()
+        self._folder.cleanup()
+
+    def differing(self, place: int) -> list[str]:
+        """What the file of a node would give after a kill now and its memory does not hold, or the other way round."""
+        store, path = self.disk(place), f"{self._path(place)}-copy"
+        _copy(self._path(place), path)
+        copy = self._opened(path)
+        found = []
+        if [r for r in store.records() if r.lifetime == "team"] != [r for r in copy.records()]:
+            there, here = set(copy.records()), {r for r in store.records() if r.lifetime == "team"}
+            if there != here:
+                found.append(
+                    f"node {place}: {len(here - there)} records are not in its file, {len(there - here)} too many"
+                )
+        copy.abandon()
+        return found
+
+    # -- inside -----------------------------------------------------------------------------------------------------
+
+    def _path(self, place: int) -> str:
+        return str(Path(self._folder.name) / f"{place}-{self._memories[place]}")
+
+    def _opened(self, path: str) -> DiskStore:
+        dice = random.Random(f"{self._dice.random()}/{path[-8:]}")
+        clock = self.clock
+
+        class Store(DiskStore):
+            make_writer = staticmethod(  # type: ignore[assignment]
+                lambda path, connection, deliver: TurnedWriter(path, connection, clock, dice)
+            )
+
+        store = Store.open(path, clock.seconds(), fresh_epoch=dice.randbytes(8))
+        assert isinstance(store, DiskStore)
+        return store
+
+    def _rot(self, path: str, kind: str) -> bool:
+        """Let a row, or the file, rot; whether there was anything to rot."""
+        with closing(sqlite3.connect(path, isolation_level=None)) as connection:
+            rows = [row for (row,) in connection.execute("SELECT id FROM records WHERE value IS NOT NULL ORDER BY id")]
+            if not rows:
+                return False
+            if kind == "row":
+                for row in rows:
+                    connection.execute("UPDATE records SET value = value || x'00' WHERE id = ?", (row,))
+            connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+        if kind == "file":
+            with open(path, "r+b") as file:
+                file.seek(4096)
+                file.write(self._dice.randbytes(4096))
+        return True
+
+
+def _copy(path: str, to: str) -> None:
+    for part in PARTS:
+        if os.path.exists(path + part):
+            shutil.copyfile(path + part, to + part)
+
+
+def _size(path: str) -> int:
+    return os.path.getsize(path) if os.path.exists(path) else 0
+
+
+def _short(fact: object) -> str:
+    return f"number {fact.sequence}" if isinstance(fact, Record) else repr(fact)[:40]

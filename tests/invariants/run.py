@@ -1,0 +1,73 @@
+"""Run: one schedule with the workloads that its seed draws, in this process or in several."""
+
+from __future__ import annotations
+
+import gc
+import multiprocessing
+import random
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+
+from tests.fleet import Fleet
+from tests.invariants.bug import seeded
+from tests.invariants.disk import DiskFleet
+from tests.invariants.records import Records
+from tests.invariants.schedule import Schedule, Workload
+from tests.invariants.stores import Stores
+from tests.invariants.tuples import Tuples
+from tests.invariants.wire import Wire
+
+WORKLOADS: dict[str, Callable[[Schedule], Workload]] = {
+    "records": Records,
+    "tuples": Tuples,
+    "stores": Stores,
+    "wire": Wire,
+}
+"""Each may be asked for by name; the order is the one in which they act."""
+SHARES = {"records": 1.0, "tuples": 0.25, "stores": 0.2, "wire": 0.2}
+"""The share of schedules in which each takes part, unless it is asked for."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of one schedule: its ``title``, the ``found`` violations, and the hash of every datagram in it."""
+
+    seed: int
+    title: str
+    found: list[str]
+    digest: str
+
+
+def drawn(seed: int) -> list[str]:
+    """The workloads of a seed."""
+    dice = random.Random(f"workloads/{seed}")
+    return [name for name, share in SHARES.items() if dice.random() < share]
+
+
+def run(seed: int, only: tuple[str, ...] = (), bug: str | None = None) -> Outcome:
+    """Run the schedule of ``seed``, with the workloads of ``only`` instead of those drawn, and with a bug put in."""
+    names = only or drawn(seed)
+    with seeded(bug):
+        schedule = Schedule(seed, DiskFleet if "stores" in names else Fleet)
+        found = schedule.run([WORKLOADS[name](schedule) for name in WORKLOADS if name in names])
+    faults = "; ".join(map(str, schedule.faults))
+    title = f"n={schedule.n} {'+'.join(names)} {schedule.weather} faults: {faults}"
+    return Outcome(seed, title, found, schedule.fleet.board.digest())
+
+
+def run_all(seeds: range, jobs: int, only: tuple[str, ...] = (), bug: str | None = None) -> Iterator[Outcome]:
+    """Run many, ``jobs`` at a time, and give what came of each in the order of their seeds."""
+    one = partial(run, only=only, bug=bug)
+    if jobs == 1 or len(seeds) == 1:
+        _spare_the_collector()
+        yield from map(one, seeds)
+        return
+    with multiprocessing.get_context("fork").Pool(jobs, _spare_the_collector) as pool:
+        yield from pool.imap(one, seeds)
+
+
+def _spare_the_collector() -> None:
+    """Look for garbage rarely: a schedule makes much that lives as long as it, and a fifth of the time went there."""
+    gc.freeze()
+    gc.set_threshold(200_000, 20, 20)

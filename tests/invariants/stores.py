@@ -1,0 +1,127 @@
+"""The workload of stores: disks that fill up and rot, and S-a to S-c over nodes that lose power."""
+
+from __future__ import annotations
+
+import random
+from typing import Any
+
+from twisted.python.failure import Failure
+
+from middleware.entangled.errors import EntangledError, Unwritable
+from middleware.entangled.node import EntangledNode
+from middleware.entangled.record import Record, hashed_key
+from tests.invariants.disk import DiskFleet, DiskStore
+from tests.invariants.schedule import Schedule
+
+PROBE = hashed_key("probe of a full disk")
+FULL = "database or disk is full"
+RECOVERY = 2.0
+"""Seconds within which a node writes again when there is room (S-c)."""
+
+
+class Stores:
+    """Fills the disk of one node after the other for a while, and lets one store rot."""
+
+    def __init__(self, schedule: Schedule) -> None:
+        assert isinstance(schedule.fleet, DiskFleet)
+        self._schedule = schedule
+        self._fleet = schedule.fleet
+        self._rng = random.Random(f"stores/{schedule.seed}")
+        self._found: list[str] = []
+        self._full: tuple[int, DiskStore] | None = None
+        self._number = 0
+        voters = min(schedule.n, 8)
+        deaths = sum(len(fault.places) for fault in schedule.faults if fault.kind == "die")
+        # A store that rots is one replica less; beyond what a majority can do without, nothing is promised.
+        if deaths + 1 <= voters // 2:
+            killed = [place for fault in schedule.faults if fault.kind.startswith("kill") for place in fault.places]
+            if killed:
+                schedule.fleet.decay[self._rng.choice(killed)] = self._rng.choice(["row", "file"])
+
+    def step(self) -> None:
+        """Fill a disk, look at one that is full, or make room again."""
+        if self._full is None:
+            alive = self._schedule.alive()
+            if alive and self._rng.random() < 0.1:
+                place = self._rng.choice(alive)
+                self._full = (place, self._fleet.disk(place))
+                self._full[1].writer.fault = FULL
+                # It may outlast the other faults, but not the repair interval.
+                self._fleet.clock.callLater(self._rng.choice([1.0, 4.0, 8.0]), self._make_room)
+            return
+        place, store = self._full
+        if store.trouble and not store.writer.is_closed:
+            self._probe(place, store)
+
+    def settled(self) -> None:
+        """Everything must be written by now, and soon in the file."""
+        for place in self._schedule.alive():
+            store = self._fleet.disk(place)
+            if store.trouble:
+                self._say("S-c", f"node {place} does not write again: {store.trouble}")
+            written = store.written()
+            written.addErrback(lambda failure, at=place: self._say("S-c", f"node {at} cannot write: {failure.value}"))
+
+    def verdict(self) -> list[str]:
+        """What was found, and the files as they are now."""
+        for line in self._fleet.lost:
+            self._say("S-a", line)
+        for line in self._fleet.overlooked:
+            self._say("S-b", line)
+        for place in self._schedule.alive():
+            store = self._fleet.disk(place)
+            while len(store.writer._owed) and not store.trouble:
+                store.writer.turn()
+            for line in self._fleet.differing(place):
+                self._say("S-a", line)
+        return self._found
+
+    # -- a full disk ------------------------------------------------------------------------------------------------
+
+    def _make_room(self) -> None:
+        if self._full is not None:
+            place, store = self._full
+            store.writer.fault = ""
+            self._full = None
+            self._fleet.clock.callLater(RECOVERY, self._recovered, place, store)
+
+    def _recovered(self, place: int, store: DiskStore) -> None:
+        if store.trouble and not store.writer.is_closed and not store.writer.fault:
+            self._say("S-c", f"node {place} does not write {RECOVERY:.0f} s after there was room: {store.trouble}")
+
+    def _probe(self, place: int, store: DiskStore) -> None:
+        """Write to the node with the full disk, from within and from another node; read what it holds."""
+        self._number += 1
+        node = self._schedule.node(place)
+        record = self._record(node)
+        try:
+            store.put(record, 1e9)
+        except Unwritable:
+            pass
+        else:
+            self._say("S-c", f"node {place} takes a record while its disk is full")
+        if not node._running:
+            self._say("S-c", f"node {place} left because its disk is full")
+        others = [other for other in self._schedule.alive() if other != place]
+        if others:
+            asker = self._schedule.node(self._rng.choice(others))
+            asked = asker.endpoint.ask(node.contact, "store", [self._record(asker).packed()], [60.0], changes=True)
+            asked.addCallbacks(self._taken, self._refused, (place, store), {}, (place,))
+
+    def _taken(self, answer: Any, place: int, store: DiskStore) -> None:
+        if store.writer.fault and answer == [0]:
+            self._say("S-c", f"node {place} acknowledges a record while its disk is full")
+
+    def _refused(self, failure: Failure, place: int) -> None:
+        failure.trap(EntangledError)
+        if "internal" in str(failure.value):
+            self._say("S-c", f"node {place} does not say why it takes nothing: {failure.value}")
+
+    def _record(self, node: EntangledNode) -> Record:
+        name = f"probe {self._number}"
+        return Record(PROBE, name, node.identity.public, 1, "team", 60.0, b"1").signed(node.identity)
+
+    def _say(self, invariant: str, text: str) -> None:
+        line = f"{invariant}: {text}"
+        if line not in self._found:
+            self._found.append(line)

@@ -1,0 +1,249 @@
+"""The workload of the wire: shots of what no lawful node sends into live schedules, and R1 to R4 over what they do.
+
+Shots are made of datagrams that were delivered: the same again, changed, cut short, sent to another node, or to the
+next life of the same one.  What a node would send because of a shot is held back, so a shot moves nothing but counters.
+"""
+
+from __future__ import annotations
+
+import random
+from collections import Counter, deque
+from typing import Any
+
+from twisted.logger import LogLevel, globalLogPublisher
+from twisted.python.failure import Failure
+
+from middleware.entangled.errors import EntangledError
+from middleware.entangled.identity import Identity, exchange_key
+from middleware.entangled.network.network import Address
+from middleware.entangled.node import EntangledNode
+from middleware.entangled.overlay import K, MAX_FOUND
+from middleware.entangled.wire.answerer import MAX_CANCELLED
+from middleware.entangled.wire.method import MAX_ENTRIES
+from middleware.entangled.wire.peer import MAX_OPENINGS, MAX_PEERS, MAX_SESSIONS
+from middleware.entangled.wire.session import (
+    INIT,
+    MAX_RESPONSES,
+    MAX_UNCONFIRMED,
+    RESPONSES_S,
+    Credentials,
+    Invitation,
+)
+from tests.fleet import TEAM
+from tests.fuzz.ground import state_of
+from tests.invariants.schedule import Schedule
+
+STRANGER = Address("10.66.6.6", 666)
+REMEMBERED = 24
+"""Datagrams that are remembered of each node."""
+FLOOD = 150
+"""Handshakes that one who holds the team's key begins at once: more than are answered without a cookie."""
+
+
+class Wire:
+    """Shoots at nodes while they work, counts how often a method runs, and looks at every table at the end."""
+
+    def __init__(self, schedule: Schedule) -> None:
+        self._schedule = schedule
+        self._board: Any = schedule.fleet.board
+        self._rng = random.Random(f"wire/{schedule.seed}")
+        self._found: list[str] = []
+        self._heard: dict[Address, deque[tuple[float, Address, bytes]]] = {}
+        self._answered: list[tuple[Address, bytes]] | None = None
+        self._sent_to_stranger = self._got_from_stranger = 0
+        self._logged: list[str] = []
+        self._lives: Counter[int] = Counter()
+        self._runs: Counter[tuple[int, int, int]] = Counter()
+        self._number = 0
+        carry, deliver = self._board._carry, self._board._deliver
+
+        def tapped_carry(network: Any, datagram: bytes, to: Address) -> None:
+            if self._answered is not None:
+                self._answered.append((to, datagram))
+                return
+            if to == STRANGER:
+                self._sent_to_stranger += len(datagram)
+            carry(network, datagram, to)
+
+        def tapped_deliver(source: Address, to: Address, datagram: bytes) -> None:
+            before = self._board.counters["delivered"]
+            deliver(source, to, datagram)
+            if self._board.counters["delivered"] > before:
+                known = self._heard.setdefault(to, deque(maxlen=REMEMBERED))
+                known.append((schedule.fleet.clock.seconds(), source, datagram))
+
+        self._board._carry, self._board._deliver = tapped_carry, tapped_deliver
+        schedule.attend(self._born, self._died)
+
+    def step(self) -> None:
+        """A shot or two, and a question that may run once."""
+        alive = self._schedule.alive()
+        if not alive:
+            return
+        for _ in range(self._rng.randrange(1, 3)):
+            self._shoot(self._rng.choice(alive))
+        if len(alive) > 1:
+            asker, answerer = self._rng.sample(alive, 2)
+            self._ask(asker, answerer)
+
+    def settled(self) -> None:
+        """A few last shots, and a flood of handshakes at one node."""
+        alive = self._schedule.alive()
+        for place in alive:
+            self._shoot(place)
+        self._flood(self._rng.choice(alive))
+
+    def verdict(self) -> list[str]:
+        """What was found, and the sizes of the tables."""
+        for (place, _, number), runs in self._runs.items():
+            if runs > 1:
+                self._say("R2", f"node {place} ran question {number} {runs} times")
+        if self._sent_to_stranger > self._got_from_stranger:
+            self._say("R3", f"{self._sent_to_stranger} bytes to a stranger who sent {self._got_from_stranger}")
+        for place in self._schedule.alive():
+            for what, size, cap in self._tables(self._schedule.node(place)):
+                if size > cap:
+                    self._say("R4", f"node {place} remembers {size} {what}, {cap} are allowed")
+        return self._found
+
+    # -- shots (R1, R3) ---------------------------------------------------------------------------------------------
+
+    def _shoot(self, place: int) -> None:
+        """Send one node something that it must drop, and compare what it remembers before and after."""
+        own = self._schedule.fleet.address(place)
+        shot = self._made(own)
+        if shot is None:
+            return
+        kind, source, datagram = shot
+        node = self._schedule.node(place)
+        receiver = node._network.receiver  # type: ignore[attr-defined]
+        before = self._state(node)
+        self._answered = []
+        globalLogPublisher.addObserver(self._log)
+        try:
+            receiver(datagram, source)
+        except Exception as error:  # whatever it is, it must not come out
+            self._say("R1", f"a {kind} datagram raises {error!r}")
+        finally:
+            globalLogPublisher.removeObserver(self._log)
+        answered, self._answered = self._answered, None
+        if self._state(node) != before:
+            self._say("R1", f"a {kind} datagram of type {datagram[:1].hex()} changes node {place}")
+        if self._logged:
+            self._say("R1", f"a {kind} datagram is logged: {self._logged.pop()}")
+        if sum(len(answer) for _, answer in answered) > len(datagram) or any(to != source for to, _ in answered):
+            self._say("R3", f"a {kind} datagram of {len(datagram)} bytes is answered with {answered}")
+
+    def _made(self, own: Address) -> tuple[str, Address, bytes] | None:
+        """A shot for the node at ``own``: what it is, where it seems to come from, and its bytes."""
+        rng, now = self._rng, self._schedule.fleet.clock.seconds()
+        kind = rng.choice(["replayed", "replayed", "forged", "forged", "truncated", "misdirected", "malformed"])
+        source = rng.choice([STRANGER, None])
+        place = own
+        if kind == "misdirected":
+            others = sorted(address for address in self._heard if address != own)
+            if not others:
+                return None
+            place = rng.choice(others)
+        known = self._heard.get(place)
+        if not known:
+            return None
+        at, sender, datagram = rng.choice(known)
+        if kind == "replayed" and datagram[0] == INIT and at < now - RESPONSES_S:
+            # It opens a session that nobody can use: no key of it is known to who plays the recording.
+            return None
+        if kind == "forged":
+            where = rng.randrange(len(datagram))
+            datagram = datagram[:where] + bytes([datagram[where] ^ 1 << rng.randrange(8)]) + datagram[where + 1 :]
+        elif kind == "truncated":
+            datagram = datagram[: rng.randrange(len(datagram))]
+        elif kind == "malformed":
+            datagram = bytes([rng.choice([0, 0x11, 0x12, 0x13, 0x14, 0x15, 0x16, 0xFF])]) + rng.randbytes(
+                rng.choice([0, 1, 28, 29, 80, 600, 1300, 3000])
+            )
+        return kind, source or sender, datagram
+
+    def _state(self, node: EntangledNode) -> str:
+        clock = self._schedule.fleet.clock
+        return state_of([node, node.store, sorted((time, order) for time, order, call in clock._heap if call.active())])
+
+    def _log(self, event: Any) -> None:
+        if event["log_level"] > LogLevel.debug:
+            self._logged.append(str(event.get("log_format")))
+
+    def _flood(self, place: int) -> None:
+        """Begin more handshakes at once than a node answers; each is from a member that nobody knows."""
+        node = self._schedule.node(place)
+        static = exchange_key(node.identity.public)
+        dice = random.Random(f"flood/{self._schedule.seed}")
+        own = Credentials.of(Identity(dice.randbytes(32)), TEAM)
+        for number in range(FLOOD):
+            datagram = Invitation(own, static, dice.randbytes(32), number, b"").datagram()
+            self._got_from_stranger += len(datagram)
+            node._network.receiver(datagram, STRANGER)  # type: ignore[attr-defined]
+        half_open = node.endpoint._half_open._unconfirmed
+        if len(half_open) > FLOOD * 4 // 5:
+            self._say("R4", f"node {place} began {len(half_open)} handshakes at once with who showed no cookie")
+
+    # -- questions (R2) ---------------------------------------------------------------------------------------------
+
+    def _born(self, place: int, node: EntangledNode) -> None:
+        self._lives[place] += 1
+        life = self._lives[place]
+
+        def run(peer: object, number: int) -> int:
+            self._runs[place, life, number] += 1
+            return number
+
+        node.endpoint.expose("run", run, changes=True)
+
+    def _died(self, place: int, node: EntangledNode) -> None:
+        """The recordings stay: they are fired at the next life."""
+
+    def _ask(self, asker: int, answerer: int) -> None:
+        self._number += 1
+        number, life = self._number, self._lives[answerer]
+        contact = self._schedule.node(answerer).contact
+
+        def answered(answer: object) -> None:
+            runs = self._runs[answerer, life, number]
+            if answer != number or (runs != 1 and self._lives[answerer] == life):
+                self._say("R2", f"question {number} was answered with {answer!r} and ran {runs} times")
+
+        asked = self._schedule.node(asker).endpoint.ask(contact, "run", number, changes=True)
+        asked.addCallbacks(answered, _weather)
+
+    # -- tables (R4) ------------------------------------------------------------------------------------------------
+
+    def _tables(self, node: EntangledNode) -> list[tuple[str, int, int]]:
+        """Everything that peers can fill, and its cap."""
+        endpoint: Any = node.endpoint
+        peers, answerer = endpoint._peers, endpoint._answerer
+        usage = node.store.usage
+        return [
+            ("peers", len(peers._peers), MAX_PEERS),
+            ("handshakes of its own", len(peers._openings), MAX_OPENINGS),
+            ("sessions", len(peers.sessions), MAX_SESSIONS * len(peers._peers) + MAX_UNCONFIRMED),
+            ("sessions that nobody confirmed", len(endpoint._half_open._unconfirmed), MAX_UNCONFIRMED),
+            ("answers to handshakes", len(endpoint._half_open._responses), MAX_RESPONSES),
+            ("questions", len(answerer._ledger), MAX_ENTRIES),
+            ("cancelled questions", len(answerer._cancelled), MAX_CANCELLED),
+            ("found keys", len(node.overlay._found), MAX_FOUND),
+            ("rows", usage.rows, usage.max_rows),
+            ("bytes", usage.bytes, usage.max_bytes),
+            *(("contacts in a bucket", len(bucket.contacts), K) for bucket in _buckets(node)),
+        ]
+
+    def _say(self, invariant: str, text: str) -> None:
+        line = f"{invariant}: {text}"
+        if line not in self._found:
+            self._found.append(line)
+
+
+def _buckets(node: EntangledNode) -> list[Any]:
+    table: Any = node.overlay.table
+    return list(table._buckets)
+
+
+def _weather(failure: Failure) -> None:
+    failure.trap(EntangledError)
