@@ -110,8 +110,9 @@ class MessageTests(SynchronousTestCase):
     def test_refuses_what_is_out_of_shape(self) -> None:
         """Wrong ids, names, kinds and lengths, deep nesting, extensions, huge claims and odd map keys are refused."""
         deep: object = 1
+        deep_maps: object = 1
         for _ in range(40):
-            deep = [deep]
+            deep, deep_maps = [deep], {"in": deep_maps}
         shapes: list[object] = [
             [],
             [0],
@@ -135,6 +136,7 @@ class MessageTests(SynchronousTestCase):
             [0, 1, True, "m", [], 1],
             [0, 1, "m", [], 1],
             [1, 1, deep],
+            [1, 1, deep_maps],
             [1, 1.5, 2],
             [2, 1, 256, "x"],
             [2, 1, 1, "x" * 301],

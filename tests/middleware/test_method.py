@@ -10,11 +10,12 @@ from twisted.trial.unittest import SynchronousTestCase
 from middleware.entangled.errors import NoAnswer, Refused
 from middleware.entangled.network.switchboard import Weather
 from middleware.entangled.wire import method
-from middleware.entangled.wire.method import KEPT_S, LIFE_BITS, MAX_LIVES, Ledger
+from middleware.entangled.wire.message import Question, encoded
+from middleware.entangled.wire.method import KEPT_S, MAX_LIVES, Ledger
 from tests.middleware.test_endpoint import DELAY, EndpointCase
 
 ANN, BOB = b"a" * 32, b"b" * 32
-LIFE = 1 << LIFE_BITS
+LIFE = 2**32
 
 
 class LedgerTests(SynchronousTestCase):
@@ -118,6 +119,16 @@ class OnceTests(EndpointCase):
         self.assertEqual(len(self.b._answerer._ledger), 0)
         self.assertGreater(len(self.runs), len(set(self.runs)))
         self.assertFalse(any(self.a._asker._inquiries))
+
+    def test_a_question_that_was_given_up_does_not_run(self) -> None:
+        """A change that comes once more after its asker said that it has the answer is dropped, not run again."""
+        self.assertEqual([self.got(self.a.ask(self.to_b, "add", n, changes=True)) for n in (1, 2)], [1, 2])
+        session = self.a._peers.known(self.to_b.public).session  # type: ignore[union-attr]
+        assert session is not None
+        first = self.a._asker._next_number - 2
+        self.a._send(session, encoded(Question(first, "add", (1,))))
+        self.clock.advance(1)
+        self.assertEqual((self.runs, self.b.counters["late"]), ([1, 2], 1))
 
     def test_in_rough_weather_still_once(self) -> None:
         """With everything lost, doubled and overtaken, eight at a time, nothing runs twice."""

@@ -21,6 +21,7 @@ class OverlapTests(FleetCase):
         self.whole: Fleet = self.fleet(3)
         for number in range(MANY):
             self.whole.nodes[0].put(hashed_key(str(number)), "state", b"%d" % number)
+            self.whole.nodes[0].put(hashed_key("0"), f"{number}", b"so that a part has several pages")
         self.whole.run(1.0)
 
     def ask(self, method: str, *arguments: object) -> Any:
@@ -43,6 +44,7 @@ class OverlapTests(FleetCase):
         found = [self.places(group) for group in range(GROUPS)]
         for part in found:
             self.assertEqual(part, sorted(part))
+            self.assertEqual(len(part), len({tuple(place[:3]) for place in part}))
         self.assertEqual({place[0] for part in found for place in part}, {hashed_key(str(n)) for n in range(MANY)})
         self.assertEqual(self.places(-1), [])
 
