@@ -53,6 +53,7 @@ class Wire:
         self._sent_to_stranger = self._got_from_stranger = 0
         self._logged: list[str] = []
         self._lives: Counter[int] = Counter()
+        self._born_at: dict[Address, float] = {}
         self._runs: Counter[tuple[int, int, int]] = Counter()
         self._number = 0
         carry, deliver = self._board._carry, self._board._deliver
@@ -149,8 +150,8 @@ class Wire:
         if not known:
             return None
         at, sender, datagram = rng.choice(known)
-        if kind == "replayed" and datagram[0] == INIT and at < now - RESPONSES_S:
-            # It opens a session that nobody can use: no key of it is known to who plays the recording.
+        if kind == "replayed" and datagram[0] == INIT and at < max(now - RESPONSES_S, self._born_at[own]):
+            # It opens a session that nobody can use, for whoever plays the recording knows no key of it.
             return None
         if kind == "forged":
             where = rng.randrange(len(datagram))
@@ -189,6 +190,7 @@ class Wire:
 
     def _born(self, place: int, node: EntangledNode) -> None:
         self._lives[place] += 1
+        self._born_at[self._schedule.fleet.address(place)] = self._schedule.fleet.clock.seconds()
         life = self._lives[place]
 
         def run(peer: object, number: int) -> int:
@@ -231,7 +233,7 @@ class Wire:
             ("found keys", len(node.overlay._found), MAX_FOUND),
             ("rows", usage.rows, usage.max_rows),
             ("bytes", usage.bytes, usage.max_bytes),
-            *(("contacts in a bucket", len(bucket.contacts), K) for bucket in _buckets(node)),
+            *(("contacts in a bucket", len(bucket.entries), K) for bucket in _buckets(node)),
         ]
 
     def _say(self, invariant: str, text: str) -> None:
