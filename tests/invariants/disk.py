@@ -234,7 +234,7 @@ class DiskFleet(Fleet):
         return str(Path(self._folder.name) / f"{place}-{self._memories[place]}")
 
     def _opened(self, path: str) -> DiskStore:
-        dice = random.Random(f"{self._dice.random()}/{path[-8:]}")
+        dice = random.Random(f"{self._dice.random()}/{Path(path).name}")
         clock = self.clock
 
         class Store(DiskStore):
