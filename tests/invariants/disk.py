@@ -239,7 +239,8 @@ class DiskFleet(Fleet):
 
         class Store(DiskStore):
             make_writer = staticmethod(  # type: ignore[assignment]
-                lambda path, connection, deliver: TurnedWriter(path, connection, clock, dice)
+                # By its name alone: refusals name the file to peers, and the folder is another one each time.
+                lambda path, connection, deliver: TurnedWriter(Path(path).name, connection, clock, dice)
             )
 
         store = Store.open(path, clock.seconds(), fresh_epoch=dice.randbytes(8))

@@ -35,7 +35,7 @@ BITING_ELSEWHERE = {
     "who waits is not woken": (1, "T6"),
     "questions are not remembered": (2, "R2"),
     "the window moves before the tag is checked": (1, "R1"),
-    "acknowledged before it is written": (1, "S-a"),
+    "acknowledged before it is written": (6, "S-a"),
     "checksums are not looked at": (1, "S-b"),
     "a full disk takes records": (1, "S-c"),
 }
