@@ -6,7 +6,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from middleware.entangled import overlay, owner, reader
+from twisted.internet.defer import Deferred, succeed
+
+from middleware.entangled import overlay, owner, reader, schema
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.handover import Handover
 from middleware.entangled.overlay import Overlay
@@ -14,6 +16,17 @@ from middleware.entangled.reader import Reader
 from middleware.entangled.record import Record, Slot
 from middleware.entangled.replica import Replica
 from middleware.entangled.roster import Roster
+from middleware.entangled.space.decree import Result, Tally, Vote
+from middleware.entangled.space.keeper import Keeper
+from middleware.entangled.space.seat import Seat
+from middleware.entangled.space.shelf import Shelf
+from middleware.entangled.sqlite import SqliteStore
+from middleware.entangled.store import MemoryStore
+from middleware.entangled.wire import greeting
+from middleware.entangled.wire.greeting import Cookies, Greeter
+from middleware.entangled.wire.method import Ledger
+from middleware.entangled.wire.session import Session
+from middleware.entangled.writer import Writer
 
 
 async def _nothing(*_: object) -> None:
@@ -43,6 +56,52 @@ def _any_answer(answers: dict[bytes, Any], voters: frozenset[bytes]) -> int:
     return len(answers) * 8
 
 
+_GENUINE = {
+    (place, name): getattr(place, name)
+    for place, name in [(Tally, "outcome"), (Vote, "claim"), (Greeter, "on_who"), (Session, "open"), (Seat, "_load")]
+}
+
+
+def _won_by_one(self: Tally) -> Any:
+    outcome = _GENUINE[Tally, "outcome"].fget(self)
+    if outcome is not None and outcome.result in (Result.OUTBID, Result.LEASED, Result.SILENT):
+        if any(reply.kind is self._wanted for reply in self._replies):
+            return outcome._replace(result=Result.WON)
+    return outcome
+
+
+def _claimed_for_ever(self: Vote, ballot: Any, lease: float, now: float) -> Any:
+    return _GENUINE[Vote, "claim"](self, ballot, lease + 1e6, now)
+
+
+def _load_without_votes(self: Seat) -> None:
+    _GENUINE[Seat, "_load"](self)
+    for votes in (self._votes, self._buckets, self._unsettled):
+        votes.clear()
+
+
+def _told_what_is_known(self: Shelf, records: list[Record]) -> None:
+    self.posted, _ = self._reader.standing(records)
+
+
+def _greeted_at_length(self: Greeter, datagram: bytes, source: Any) -> None:
+    _GENUINE[Greeter, "on_who"](self, datagram, source)
+    self._network.send(datagram, source)
+
+
+def _never_known(self: Ledger, public: bytes, question: int) -> None:
+    return None
+
+
+def _moved_before_it_is_opened(self: Session, datagram: bytes) -> Any:
+    self._highest += 1
+    return _GENUINE[Session, "open"](self, datagram)
+
+
+def _safe_already(self: Writer) -> Deferred[None]:
+    return succeed(None)
+
+
 BUGS: dict[str, list[tuple[Any, str, Any]]] = {
     "tombstone dropped too early": [(owner, "TOMBSTONE_TTL", 3.0)],
     "acknowledged by a minority": [(Overlay, "voters", lambda self, key, targets: [targets[0].node_id])],
@@ -63,9 +122,37 @@ BUGS: dict[str, list[tuple[Any, str, Any]]] = {
     "numbers start again after a restart": [(owner, "BLOCK", -(2**40))],
     "the absent are not sought": [(Roster, "absent", lambda self: [])],
     "any answer counts": [(reader, "_votes", _any_answer)],
+    # Tuples.
+    "one promise is a majority": [(Tally, "outcome", property(_won_by_one))],
+    "votes forgotten by a restart": [(Seat, "_load", _load_without_votes)],
+    "the lease of the dead never ends": [(Vote, "claim", _claimed_for_ever)],
+    "a take is not noted": [(Keeper, "note", _nothing), (Keeper, "doubt", _idle)],
+    "who waits is not woken": [(Shelf, "_changed", _told_what_is_known)],
+    # The wire.
+    "questions are not remembered": [(Ledger, "entry", _never_known)],
+    "the window moves before the tag is checked": [(Session, "open", _moved_before_it_is_opened)],
+    "a greeting is answered twice": [(Greeter, "on_who", _greeted_at_length)],
+    "no cookie is asked for": [(greeting, "QUIET_RATE", 1e6), (Cookies, "admits", lambda *_: True)],
+    # Stores.
+    "acknowledged before it is written": [(Writer, "written", _safe_already)],
+    "checksums are not looked at": [(schema, "record_of", lambda row: schema._unchecked(row))],
+    "a full disk takes records": [(SqliteStore, "put", MemoryStore.put)],
 }
 
-FINDERS: dict[str, tuple[str, ...]] = {}
+FINDERS: dict[str, tuple[str, ...]] = {
+    "one promise is a majority": ("tuples",),
+    "votes forgotten by a restart": ("tuples",),
+    "the lease of the dead never ends": ("tuples",),
+    "a take is not noted": ("tuples",),
+    "who waits is not woken": ("tuples",),
+    "questions are not remembered": ("wire",),
+    "the window moves before the tag is checked": ("wire",),
+    "a greeting is answered twice": ("wire",),
+    "no cookie is asked for": ("wire",),
+    "acknowledged before it is written": ("records", "stores"),
+    "checksums are not looked at": ("records", "stores"),
+    "a full disk takes records": ("records", "stores"),
+}
 """The workloads that look for a bug, where these are not the records."""
 
 

@@ -236,12 +236,13 @@ class DiskFleet(Fleet):
         return str(Path(self._folder.name) / f"{place}-{self._memories[place]}")
 
     def _opened(self, path: str) -> DiskStore:
-        dice = random.Random(f"{self._dice.random()}/{path[-8:]}")
+        dice = random.Random(f"{self._dice.random()}/{Path(path).name}")
         clock = self.clock
 
         class Store(DiskStore):
             make_writer = staticmethod(  # type: ignore[assignment]
-                lambda path, connection, deliver: TurnedWriter(path, connection, clock, dice)
+                # By its name alone: refusals name the file to peers, and the folder is another one each time.
+                lambda path, connection, deliver: TurnedWriter(Path(path).name, connection, clock, dice)
             )
 
         store = Store.open(path, clock.seconds(), fresh_epoch=dice.randbytes(8))

@@ -173,7 +173,7 @@ class Records:
         made_up = Record(old.key, old.name, old.owner, old.sequence + 99, "team", 60.0, b"77777", old.signature)
         for contact in node.overlay.responsible(old.key):
             if contact.node_id != node.identity.node_id:
-                asked = node.endpoint.ask(contact, "store", [old.packed()], [60.0], changes=True)
+                asked = node.endpoint.ask(contact, "store", [old.packed()], [old.ttl], changes=True)
                 asked.addErrback(_weather)
                 if contact.public != old.owner and node.identity.public != old.owner:
                     forged = node.endpoint.ask(contact, "store", [made_up.packed()], [60.0], changes=True)

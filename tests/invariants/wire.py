@@ -19,6 +19,7 @@ from middleware.entangled.network.network import Address
 from middleware.entangled.node import EntangledNode
 from middleware.entangled.overlay import K, MAX_FOUND
 from middleware.entangled.wire.answerer import MAX_CANCELLED
+from middleware.entangled.wire.greeting import TOKEN_BYTES, who
 from middleware.entangled.wire.method import MAX_ENTRIES
 from middleware.entangled.wire.peer import MAX_OPENINGS, MAX_PEERS, MAX_SESSIONS
 from middleware.entangled.wire.session import (
@@ -28,14 +29,16 @@ from middleware.entangled.wire.session import (
     RESPONSES_S,
     Credentials,
     Invitation,
+    derived_key,
 )
 from tests.fleet import TEAM
 from tests.fuzz.ground import state_of
 from tests.invariants.schedule import Schedule
 
+KINDS = ("replayed", "replayed", "forged", "forged", "truncated", "misdirected", "malformed", "greeting")
 STRANGER = Address("10.66.6.6", 666)
-REMEMBERED = 24
-"""Datagrams that are remembered of each node."""
+REMEMBERED = 6
+"""Datagrams that are remembered of each type that came to a node."""
 FLOOD = 150
 """Handshakes that one who holds the team's key begins at once: more than are answered without a cookie."""
 
@@ -48,7 +51,7 @@ class Wire:
         self._board: Any = schedule.fleet.board
         self._rng = random.Random(f"wire/{schedule.seed}")
         self._found: list[str] = []
-        self._heard: dict[Address, deque[tuple[float, Address, bytes]]] = {}
+        self._heard: dict[Address, dict[int, deque[tuple[float, Address, bytes]]]] = {}
         self._answered: list[tuple[Address, bytes]] | None = None
         self._sent_to_stranger = self._got_from_stranger = 0
         self._logged: list[str] = []
@@ -70,8 +73,8 @@ class Wire:
             before = self._board.counters["delivered"]
             deliver(source, to, datagram)
             if self._board.counters["delivered"] > before:
-                known = self._heard.setdefault(to, deque(maxlen=REMEMBERED))
-                known.append((schedule.fleet.clock.seconds(), source, datagram))
+                known = self._heard.setdefault(to, {})
+                known.setdefault(datagram[0], deque(maxlen=REMEMBERED)).append((schedule.fleet.clock.seconds(), source, datagram))
 
         self._board._carry, self._board._deliver = tapped_carry, tapped_deliver
         schedule.attend(self._born, self._died)
@@ -138,7 +141,9 @@ class Wire:
     def _made(self, own: Address) -> tuple[str, Address, bytes] | None:
         """A shot for the node at ``own``: what it is, where it seems to come from, and its bytes."""
         rng, now = self._rng, self._schedule.fleet.clock.seconds()
-        kind = rng.choice(["replayed", "replayed", "forged", "forged", "truncated", "misdirected", "malformed"])
+        kind = rng.choice(KINDS)
+        if kind == "greeting":  # lawful, and from nobody who has shown that he hears there
+            return kind, STRANGER, who(derived_key(TEAM, b"greet"), rng.randbytes(TOKEN_BYTES), rng)
         source = rng.choice([STRANGER, None])
         place = own
         if kind == "misdirected":
@@ -149,7 +154,7 @@ class Wire:
         known = self._heard.get(place)
         if not known:
             return None
-        at, sender, datagram = rng.choice(known)
+        at, sender, datagram = rng.choice(known[rng.choice(sorted(known))])
         if kind == "replayed" and datagram[0] == INIT and at < max(now - RESPONSES_S, self._born_at[own]):
             # It opens a session that nobody can use, for whoever plays the recording knows no key of it.
             return None

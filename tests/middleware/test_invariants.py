@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 from twisted.trial.unittest import SynchronousTestCase
 
-from tests.invariants.bug import seeded
+from tests.invariants.bug import FINDERS, seeded
 from tests.invariants.records import Records
+from tests.invariants.run import WORKLOADS, run, run_all
 from tests.invariants.schedule import Schedule
 
 BITING = {
@@ -22,6 +28,20 @@ BITING = {
     "any answer counts": (1, "D1"),
 }
 """A seed that shows each bug, and an invariant that it breaks."""
+
+BITING_ELSEWHERE = {
+    "one promise is a majority": (1, "T1"),
+    "a take is not noted": (1, "T3"),
+    "who waits is not woken": (1, "T6"),
+    "questions are not remembered": (2, "R2"),
+    "the window moves before the tag is checked": (1, "R1"),
+    "acknowledged before it is written": (6, "S-a"),
+    "checksums are not looked at": (1, "S-b"),
+    "a full disk takes records": (1, "S-c"),
+}
+"""The same of the quickest bugs that other workloads look for."""
+ALL = tuple(WORKLOADS)
+DIGEST = f"from tests.invariants.run import run; print(run(7, {ALL!r}).digest)"
 
 
 class InvariantTests(SynchronousTestCase):
@@ -52,3 +72,37 @@ class InvariantTests(SynchronousTestCase):
             schedule.run([Records(schedule)])
             digests.append(schedule.fleet.board.digest())
         self.assertEqual(digests[0], digests[1])
+
+    def test_all_workloads(self) -> None:
+        """Tuples, hostile datagrams and failing disks beside the records break no invariant either."""
+        self.assertEqual({seed: found for seed in (7, 12) if (found := run(seed, ALL).found)}, {})
+
+    def test_the_others_bite(self) -> None:
+        """Bugs of tuples, wire and stores are found by the workloads that look for them."""
+        blind = []
+        for bug, (seed, invariant) in BITING_ELSEWHERE.items():
+            found = run(seed, FINDERS[bug], bug).found
+            if not any(line.startswith(invariant) for line in found):
+                blind.append((bug, found[:2]))
+        self.assertEqual(blind, [])
+
+    def test_same_in_every_process(self) -> None:
+        """A run with all workloads is the same, datagram by datagram, however the process hashes its strings."""
+        digests = set()
+        for hash_seed in ("1", "2"):
+            told = subprocess.run(
+                [sys.executable, "-c", DIGEST],
+                cwd=Path(__file__).resolve().parents[2],
+                env={**os.environ, "PYTHONHASHSEED": hash_seed},
+                capture_output=True,
+                text=True,
+                timeout=60,
+            )
+            self.assertEqual((told.returncode, told.stderr), (0, ""))
+            digests.add(told.stdout)
+        self.assertEqual(len(digests), 1)
+
+    def test_jobs(self) -> None:
+        """Several processes give the same outcomes in the same order as one."""
+        seeds = range(1, 4)
+        self.assertEqual(list(run_all(seeds, 2, ("records",))), [run(seed, ("records",)) for seed in seeds])
