@@ -64,10 +64,9 @@ _GENUINE = {
 
 def _won_by_one(self: Tally) -> Any:
     outcome = _GENUINE[Tally, "outcome"].fget(self)
-    if outcome is not None and outcome.result in (Result.OUTBID, Result.LEASED, Result.SILENT):
-        if any(reply.kind is self._wanted for reply in self._replies):
-            return outcome._replace(result=Result.WON)
-    return outcome
+    lost = outcome is not None and outcome.result in (Result.OUTBID, Result.LEASED, Result.SILENT)
+    is_promised = any(reply.kind is self._wanted for reply in self._replies)
+    return outcome._replace(result=Result.WON) if lost and is_promised else outcome
 
 
 def _claimed_for_ever(self: Vote, ballot: Any, lease: float, now: float) -> Any:

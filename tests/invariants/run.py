@@ -18,7 +18,12 @@ from tests.invariants.stores import Stores
 from tests.invariants.tuples import Tuples
 from tests.invariants.wire import Wire
 
-WORKLOADS: dict[str, Callable[[Schedule], Workload]] = {"records": Records, "tuples": Tuples, "stores": Stores, "wire": Wire}
+WORKLOADS: dict[str, Callable[[Schedule], Workload]] = {
+    "records": Records,
+    "tuples": Tuples,
+    "stores": Stores,
+    "wire": Wire,
+}
 """Each may be asked for by name; the order is the one in which they act."""
 SHARES = {"records": 1.0, "tuples": 0.25, "stores": 0.2, "wire": 0.2}
 """The share of schedules in which each takes part, unless it is asked for."""

@@ -189,9 +189,7 @@ class Tuples:
 
     def _listen(self, who: str, space: TupleSpace) -> None:
         self._listening[who] = None
-        space.read(BELL).addCallbacks(
-            lambda _: self._listening.__setitem__(who, self._clock.seconds()), _weather
-        )
+        space.read(BELL).addCallbacks(lambda _: self._listening.__setitem__(who, self._clock.seconds()), _weather)
 
     def _ring(self) -> None:
         def rung(_: object) -> None:

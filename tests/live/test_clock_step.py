@@ -12,7 +12,14 @@ from twisted.trial.unittest import SynchronousTestCase
 
 ROOT = Path(__file__).resolve().parents[2]
 STEPS = (60.0, -60.0, 3600.0, -3600.0)
-CLOCKS_OF_THE_WALL = ("time.time", "datetime.now", "datetime.utcnow", "datetime.today", "time.localtime", "time.time_ns")
+CLOCKS_OF_THE_WALL = (
+    "time.time",
+    "datetime.now",
+    "datetime.utcnow",
+    "datetime.today",
+    "time.localtime",
+    "time.time_ns",
+)
 ASK_THE_WALL = ("middleware.node", "swarmnode", "webnode", "drivers.sim.link")
 """Where the time of day is shown, noted or handed in; nothing waits for it."""
 NODES = """
