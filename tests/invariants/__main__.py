@@ -8,7 +8,7 @@ import sys
 import time
 
 from tests.invariants.bug import BUGS, FINDERS
-from tests.invariants.run import WORKLOADS, run, run_all
+from tests.invariants.run import WORKLOADS, run_all
 
 BOUND = 400
 """Schedules within which each bug must show, unless fewer are asked for."""

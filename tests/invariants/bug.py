@@ -64,10 +64,9 @@ _GENUINE = {
 
 def _won_by_one(self: Tally) -> Any:
     outcome = _GENUINE[Tally, "outcome"].fget(self)
-    if outcome is not None and outcome.result in (Result.OUTBID, Result.LEASED, Result.SILENT):
-        if any(reply.kind is self._wanted for reply in self._replies):
-            return outcome._replace(result=Result.WON)
-    return outcome
+    lost = outcome is not None and outcome.result in (Result.OUTBID, Result.LEASED, Result.SILENT)
+    is_promised = any(reply.kind is self._wanted for reply in self._replies)
+    return outcome._replace(result=Result.WON) if lost and is_promised else outcome
 
 
 def _claimed_for_ever(self: Vote, ballot: Any, lease: float, now: float) -> Any:
@@ -84,9 +83,9 @@ def _told_what_is_known(self: Shelf, records: list[Record]) -> None:
     self.posted, _ = self._reader.standing(records)
 
 
-def _greeted_at_length(self: Greeter, datagram: bytes, source: Any) -> None:
-    _GENUINE[Greeter, "on_who"](self, datagram, source)
-    self._network.send(datagram, source)
+def _greeted_twice(self: Greeter, datagram: bytes, source: Any) -> None:
+    for _ in range(2):
+        _GENUINE[Greeter, "on_who"](self, datagram, source)
 
 
 def _never_known(self: Ledger, public: bytes, question: int) -> None:
@@ -131,7 +130,7 @@ BUGS: dict[str, list[tuple[Any, str, Any]]] = {
     # The wire.
     "questions are not remembered": [(Ledger, "entry", _never_known)],
     "the window moves before the tag is checked": [(Session, "open", _moved_before_it_is_opened)],
-    "a greeting is answered twice": [(Greeter, "on_who", _greeted_at_length)],
+    "a greeting is answered twice": [(Greeter, "on_who", _greeted_twice)],
     "no cookie is asked for": [(greeting, "QUIET_RATE", 1e6), (Cookies, "admits", lambda *_: True)],
     # Stores.
     "acknowledged before it is written": [(Writer, "written", _safe_already)],

@@ -220,13 +220,13 @@ class DiskFleet(Fleet):
         store, path = self.disk(place), f"{self._path(place)}-copy"
         _copy(self._path(place), path)
         copy = self._opened(path)
+        here = {record for record in store.records() if record.lifetime == "team"}
+        there = set(copy.records())
         found = []
-        if [r for r in store.records() if r.lifetime == "team"] != [r for r in copy.records()]:
-            there, here = set(copy.records()), {r for r in store.records() if r.lifetime == "team"}
-            if there != here:
-                found.append(
-                    f"node {place}: {len(here - there)} records are not in its file, {len(there - here)} too many"
-                )
+        if here != there:
+            found.append(
+                f"node {place}: its file lacks {len(here - there)} records, and has {len(there - here)} too many"
+            )
         copy.abandon()
         return found
 
@@ -240,7 +240,7 @@ class DiskFleet(Fleet):
         clock = self.clock
 
         class Store(DiskStore):
-            make_writer = staticmethod(  # type: ignore[assignment]
+            make_writer = staticmethod(
                 # By its name alone: refusals name the file to peers, and the folder is another one each time.
                 lambda path, connection, deliver: TurnedWriter(Path(path).name, connection, clock, dice)
             )

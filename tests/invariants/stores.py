@@ -60,7 +60,7 @@ class Stores:
             if store.trouble:
                 self._say("S-c", f"node {place} does not write again: {store.trouble}")
             written = store.written()
-            written.addErrback(lambda failure, at=place: self._say("S-c", f"node {at} cannot write: {failure.value}"))
+            written.addErrback(self._unwritten, place)
 
     def verdict(self) -> list[str]:
         """What was found, and the files as they are now."""
@@ -75,6 +75,9 @@ class Stores:
             for line in self._fleet.differing(place):
                 self._say("S-a", line)
         return self._found
+
+    def _unwritten(self, failure: Failure, place: int) -> None:
+        self._say("S-c", f"node {place} cannot write: {failure.value}")
 
     # -- a full disk ------------------------------------------------------------------------------------------------
 

@@ -10,14 +10,15 @@ import random
 from collections import Counter, deque
 from typing import Any
 
-from twisted.logger import LogLevel, globalLogPublisher
+from twisted.logger import ILogObserver, LogLevel, globalLogPublisher
 from twisted.python.failure import Failure
+from zope.interface import implementer
 
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.identity import Identity, exchange_key
 from middleware.entangled.network.network import Address
 from middleware.entangled.node import EntangledNode
-from middleware.entangled.overlay import K, MAX_FOUND
+from middleware.entangled.overlay import MAX_FOUND, K
 from middleware.entangled.wire.answerer import MAX_CANCELLED
 from middleware.entangled.wire.greeting import TOKEN_BYTES, who
 from middleware.entangled.wire.method import MAX_ENTRIES
@@ -43,6 +44,19 @@ FLOOD = 150
 """Handshakes that one who holds the team's key begins at once: more than are answered without a cookie."""
 
 
+@implementer(ILogObserver)
+class Ear:
+    """Hears what is logged above the level of debugging."""
+
+    def __init__(self) -> None:
+        self.heard: list[str] = []
+
+    def __call__(self, event: Any) -> None:
+        """Take note of an event."""
+        if event["log_level"] > LogLevel.debug:
+            self.heard.append(str(event.get("log_format")))
+
+
 class Wire:
     """Shoots at nodes while they work, counts how often a method runs, and looks at every table at the end."""
 
@@ -54,7 +68,7 @@ class Wire:
         self._heard: dict[Address, dict[int, deque[tuple[float, Address, bytes]]]] = {}
         self._answered: list[tuple[Address, bytes]] | None = None
         self._sent_to_stranger = self._got_from_stranger = 0
-        self._logged: list[str] = []
+        self._ear = Ear()
         self._lives: Counter[int] = Counter()
         self._born_at: dict[Address, float] = {}
         self._runs: Counter[tuple[int, int, int]] = Counter()
@@ -74,9 +88,11 @@ class Wire:
             deliver(source, to, datagram)
             if self._board.counters["delivered"] > before:
                 known = self._heard.setdefault(to, {})
-                known.setdefault(datagram[0], deque(maxlen=REMEMBERED)).append((schedule.fleet.clock.seconds(), source, datagram))
+                known.setdefault(datagram[0], deque(maxlen=REMEMBERED)).append(
+                    (schedule.fleet.clock.seconds(), source, datagram)
+                )
 
-        self._board._carry, self._board._deliver = tapped_carry, tapped_deliver
+        vars(self._board).update(_carry=tapped_carry, _deliver=tapped_deliver)
         schedule.attend(self._born, self._died)
 
     def step(self) -> None:
@@ -123,18 +139,18 @@ class Wire:
         receiver = node._network.receiver  # type: ignore[attr-defined]
         before = self._state(node)
         self._answered = []
-        globalLogPublisher.addObserver(self._log)
+        globalLogPublisher.addObserver(self._ear)
         try:
             receiver(datagram, source)
         except Exception as error:  # whatever it is, it must not come out
             self._say("R1", f"a {kind} datagram raises {error!r}")
         finally:
-            globalLogPublisher.removeObserver(self._log)
+            globalLogPublisher.removeObserver(self._ear)
         answered, self._answered = self._answered, None
         if self._state(node) != before:
             self._say("R1", f"a {kind} datagram of type {datagram[:1].hex()} changes node {place}")
-        if self._logged:
-            self._say("R1", f"a {kind} datagram is logged: {self._logged.pop()}")
+        if self._ear.heard:
+            self._say("R1", f"a {kind} datagram is logged: {self._ear.heard.pop()}")
         if sum(len(answer) for _, answer in answered) > len(datagram) or any(to != source for to, _ in answered):
             self._say("R3", f"a {kind} datagram of {len(datagram)} bytes is answered with {answered}")
 
@@ -172,10 +188,6 @@ class Wire:
     def _state(self, node: EntangledNode) -> str:
         clock = self._schedule.fleet.clock
         return state_of([node, node.store, sorted((time, order) for time, order, call in clock._heap if call.active())])
-
-    def _log(self, event: Any) -> None:
-        if event["log_level"] > LogLevel.debug:
-            self._logged.append(str(event.get("log_format")))
 
     def _flood(self, place: int) -> None:
         """Begin more handshakes at once than a node answers; each is from a member that nobody knows."""
