@@ -11,10 +11,13 @@ from middleware.entangled.errors import EntangledError, Unwritable
 from middleware.entangled.node import EntangledNode
 from middleware.entangled.record import Record, hashed_key
 from tests.invariants.disk import DiskFleet, DiskStore
+from tests.invariants.records import KEYS
 from tests.invariants.schedule import Schedule
 
 PROBE = hashed_key("probe of a full disk")
 FULL = "database or disk is full"
+EARLY = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0)
+"""Seconds after which a node with a rotten store is read."""
 RECOVERY = 2.0
 """Seconds within which a node writes again when there is room (S-c)."""
 
@@ -30,6 +33,7 @@ class Stores:
         self._found: list[str] = []
         self._full: tuple[int, DiskStore] | None = None
         self._number = 0
+        schedule.attend(self._born, lambda place, node: None)
         voters = min(schedule.n, 8)
         deaths = sum(len(fault.places) for fault in schedule.faults if fault.kind == "die")
         # A store that rots is one replica less; beyond what a majority can do without, nothing is promised.
@@ -78,6 +82,29 @@ class Stores:
 
     def _unwritten(self, failure: Failure, place: int) -> None:
         self._say("S-c", f"node {place} cannot write: {failure.value}")
+
+    # -- a rotten store ---------------------------------------------------------------------------------------------
+
+    def _born(self, place: int, node: EntangledNode) -> None:
+        if self._fleet.decayed and self._fleet.decayed[-1] == place:
+            for moment in EARLY:
+                self._fleet.clock.callLater(moment, self._read_early, place, node)
+
+    def _read_early(self, place: int, node: EntangledNode) -> None:
+        """Read at a node whose store has rotted: what a majority holds must not be denied."""
+        if place not in self._schedule.alive() or self._schedule.node(place) is not node:
+            return
+        for key in KEYS:
+            if self._is_held(key):
+                node.get(key, "fast").addCallbacks(self._read, _weather, (place, key))
+
+    def _read(self, records: list[Record], place: int, key: bytes) -> None:
+        if not records and self._is_held(key):
+            self._say("S-b", f"node {place}, whose store has rotted, finds nothing under {key.hex()[:6]}")
+
+    def _is_held(self, key: bytes) -> bool:
+        holders = [place for place in self._schedule.alive() if self._fleet.disk(place).get(key)]
+        return 2 * len(holders) > min(self._schedule.n, 8) + 1
 
     # -- a full disk ------------------------------------------------------------------------------------------------
 
@@ -128,3 +155,7 @@ class Stores:
         line = f"{invariant}: {text}"
         if line not in self._found:
             self._found.append(line)
+
+
+def _weather(failure: Failure) -> None:
+    failure.trap(EntangledError)

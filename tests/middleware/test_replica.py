@@ -85,6 +85,18 @@ class ReplicaTests(SynchronousTestCase):
         self.assertEqual(self.stored(stronger), [0])
         self.assertEqual(self.stored(weaker), [1])
 
+    def test_holds(self) -> None:
+        """What is held is that very record as a replica: no older one, no cached copy and no keepsake."""
+        self.stored(record(sequence=5))
+        self.assertTrue(self.replica.holds(record(sequence=5)))
+        self.assertFalse(self.replica.holds(record(sequence=4)))
+        self.store.put(record("cached"), 60.0, cached=True)
+        self.assertFalse(self.replica.holds(record("cached")))
+        self.replica.keepsakes.keep(KEY, [record("kept")], 0.0)
+        self.assertIsNotNone(self.store.slot(record("kept").slot))
+        self.assertFalse(self.replica.holds(record("kept")))
+        self.assertEqual([held.name for held in self.replica.held(KEY)], [record(sequence=5).name])
+
     def test_who_may_store(self) -> None:
         """A lease comes from its owner only, a team record from anybody; signed, unless the owner's session vouches."""
         forged = Record(KEY, "f", DOG.public, 1, "team", 1.0, b"v", bytes(64))
