@@ -145,7 +145,8 @@ class Writer:
 
     def refusal(self, why: str) -> Unwritable:
         """What is said to whoever wants something written while that cannot be."""
-        return Unwritable(f"store {self._path} cannot be written: {why}")
+        # Peers read this as well, and where a file lies is not their business; the log names it.
+        return Unwritable(f"the data store cannot be written: {why}")
 
     def _tell(self) -> None:
         """Pass the news on, in the caller's thread."""
