@@ -20,7 +20,7 @@ from drivers.reading import Observation
 from middleware.consensus.strategy import strategy_for
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.record import Record
-from middleware.entangled.watch import Watch
+from middleware.entangled.replication.watch import Watch
 from middleware.errors import SwarmError
 from middleware.node import CAMERA, SwarmNode
 from middleware.presence import DONE, IDLE

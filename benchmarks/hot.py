@@ -20,11 +20,11 @@ from typing import Any
 from twisted.internet.defer import Deferred
 
 from benchmarks.idle import Meter, Team
+from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.identity import Identity
 from middleware.entangled.network.network import Address
 from middleware.entangled.node import EntangledNode
 from middleware.entangled.record import hashed_key
-from middleware.entangled.store import MemoryStore
 
 STEP = 0.0001
 SETTLE = 5.0

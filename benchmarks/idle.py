@@ -16,13 +16,13 @@ from typing import Any
 from twisted.internet.defer import Deferred
 
 from middleware.entangled.clock import HeapClock
+from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.identity import Identity
 from middleware.entangled.network.network import Address
 from middleware.entangled.network.switchboard import Switchboard, SwitchboardNetwork, Weather
 from middleware.entangled.node import EntangledNode
 from middleware.entangled.record import hashed_key
-from middleware.entangled.store import MemoryStore
 
 MAX_BYTES_S = 1000.0
 MAX_CORE = 0.001

@@ -24,8 +24,8 @@ from typing import cast
 
 from twisted.internet.interfaces import IReactorFromThreads
 
+from middleware.entangled.data.sqlite import SqliteStore
 from middleware.entangled.record import MAX_VALUE, Record, hashed_key
-from middleware.entangled.sqlite import SqliteStore
 
 ROOT = Path(__file__).resolve().parents[1]
 KEY = hashed_key("kills")

@@ -18,6 +18,7 @@ from typing import Any
 from twisted.internet.defer import maybeDeferred
 
 from middleware.entangled.clock import HeapClock
+from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact
@@ -31,7 +32,6 @@ from middleware.entangled.space.posting import Place, Posted, place_unpacked, po
 from middleware.entangled.space.seat import Seat
 from middleware.entangled.space.template import ANY, Tuple
 from middleware.entangled.space.tuplespace import TupleSpace
-from middleware.entangled.store import MemoryStore
 
 TEAM = b"t" * 32
 JOINING = 0.3

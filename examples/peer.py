@@ -6,11 +6,11 @@ import random
 from typing import Any
 
 from middleware.entangled.clock import use_monotonic_time
+from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.identity import Identity
 from middleware.entangled.network.network import Address
 from middleware.entangled.network.udp import UdpNetwork
 from middleware.entangled.node import EntangledNode
-from middleware.entangled.store import MemoryStore
 
 TEAM_KEY = b"everybody who runs the examples."
 """A real team has 32 secret bytes here: who lacks them can neither read nor write."""

@@ -18,16 +18,16 @@ from twisted.logger import Logger
 
 from middleware.consensus.lease import Acceptor, Lessee
 from middleware.entangled.background import Background
+from middleware.entangled.data.store import Store
 from middleware.entangled.errors import EntangledError, NotRunning, Refused, WeatherError
 from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact, unpacked
 from middleware.entangled.kademlia.distance import closest
 from middleware.entangled.network.network import Address, Network
 from middleware.entangled.node import EntangledNode
-from middleware.entangled.owner import Stored
 from middleware.entangled.record import MAX_NAME, Record
-from middleware.entangled.store import Store
-from middleware.entangled.watch import Changed, Watch
+from middleware.entangled.replication.owner import Stored
+from middleware.entangled.replication.watch import Changed, Watch
 from middleware.presence import DEVICES, Device, Presence, devices_of
 from middleware.streams import Streams
 from middleware.tasks import MAX_LEASE_TTL, MEMBER, RESULT, TASKS, Member, Result, Task, group_key

@@ -14,8 +14,8 @@ from dataclasses import MISSING, dataclass, field, fields, replace
 from typing import Any
 
 from middleware import setting
+from middleware.entangled.data.store import MAX_BYTES, MAX_ROWS, Durable
 from middleware.entangled.network.network import Address
-from middleware.entangled.store import MAX_BYTES, MAX_ROWS, Durable
 from middleware.errors import BadSetting
 
 IN_MEMORY = ":memory:"

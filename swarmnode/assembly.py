@@ -15,10 +15,10 @@ from agents.registry import agent_named
 from drivers.driver import Driver
 from drivers.errors import DriverError
 from drivers.registry import describe, driver_for
+from middleware.entangled.data.store import Store
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.identity import Identity
 from middleware.entangled.network.network import Network
-from middleware.entangled.store import Store
 from middleware.errors import SwarmError
 from middleware.node import SwarmNode
 from middleware.presence import Device

@@ -12,8 +12,8 @@ from typing import Any
 from agents.catalogue import DEMO, TASKS
 from drivers.sim.operator import YardOperator
 from middleware.entangled.clock import HeapClock
+from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.network.switchboard import Switchboard, Weather
-from middleware.entangled.store import MemoryStore
 from middleware.settings import Settings
 from sim.demo.trials import main as run_trials
 from sim.scene import loaded

@@ -14,9 +14,10 @@ from typing import Any
 from twisted.application.service import IService, MultiService, Service
 from twisted.logger import Logger
 
+from middleware.entangled.data.memory import MemoryStore
+from middleware.entangled.data.sqlite import SqliteStore, read_records
+from middleware.entangled.data.store import Store
 from middleware.entangled.network.network import Address
-from middleware.entangled.sqlite import SqliteStore, read_records
-from middleware.entangled.store import MemoryStore, Store
 from middleware.errors import BadSetting, MissingExtra
 from middleware.node import SwarmNode
 from middleware.settings import IN_MEMORY, Settings

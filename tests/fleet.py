@@ -10,11 +10,12 @@ from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.clock import HeapClock
+from middleware.entangled.data.memory import MemoryStore
+from middleware.entangled.data.store import Store
 from middleware.entangled.identity import Identity
 from middleware.entangled.network.network import Address
 from middleware.entangled.network.switchboard import CALM, Switchboard, Weather
 from middleware.entangled.node import EntangledNode
-from middleware.entangled.store import MemoryStore, Store
 from middleware.node import SwarmNode
 from middleware.presence import Device
 

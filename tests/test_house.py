@@ -36,7 +36,7 @@ PURE = (
     "drivers.reading",
     "middleware.consensus.nearest",
     "middleware.consensus.strategy",
-    "middleware.entangled.cache",
+    "middleware.entangled.replication.cache",
     "middleware.entangled.errors",
     "middleware.entangled.identity",
     "middleware.entangled.kademlia.contact",
@@ -44,7 +44,7 @@ PURE = (
     "middleware.entangled.kademlia.routing",
     "middleware.entangled.network.network",
     "middleware.entangled.record",
-    "middleware.entangled.roster",
+    "middleware.entangled.kademlia.roster",
     "middleware.entangled.space.decree",
     "middleware.entangled.space.posting",
     "middleware.entangled.space.template",
@@ -69,7 +69,7 @@ EDGES = (
     "middleware.entangled.control.command",
     "middleware.entangled.clock",
     "middleware.entangled.network.udp",
-    "middleware.entangled.writer",
+    "middleware.entangled.data.writer",
 )
 WORLD = ("time", "socket", "threading", "asyncio", "selectors", "subprocess", "secrets", "twisted.internet.reactor")
 GUARDED = ("middleware", "agents", "drivers")

@@ -11,7 +11,7 @@ from twisted.logger import Logger
 
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.record import Record
-from middleware.entangled.watch import Watch
+from middleware.entangled.replication.watch import Watch
 from middleware.node import CAMERA, SwarmNode
 from middleware.presence import DEVICES, devices_of
 from middleware.tasks import CANCELLED, TASKS, Result, Task, group_key, outcome_of, task_of

@@ -14,13 +14,14 @@ from twisted.internet.defer import Deferred, maybeDeferred
 
 from benchmarks.dht.contestant import HOST, Done, Got, Prevent
 from middleware.entangled.clock import use_monotonic_time
+from middleware.entangled.data.memory import MemoryStore
+from middleware.entangled.data.sqlite import SqliteStore
+from middleware.entangled.data.store import Durable
 from middleware.entangled.identity import Identity
 from middleware.entangled.network.network import Address
 from middleware.entangled.network.udp import UdpNetwork
 from middleware.entangled.node import EntangledNode
 from middleware.entangled.record import Record, hashed_key
-from middleware.entangled.sqlite import SqliteStore
-from middleware.entangled.store import Durable, MemoryStore
 
 TEAM_KEY = b"the key of a team that only runs"
 NAME = "bench"

@@ -17,20 +17,20 @@ from twisted.internet.interfaces import IReactorTime
 from twisted.logger import Logger
 
 from middleware.entangled.background import Background
+from middleware.entangled.data.store import Store
 from middleware.entangled.errors import NotRunning, TooLarge
-from middleware.entangled.handover import Handover
 from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact, unpacked
-from middleware.entangled.membership import Membership
+from middleware.entangled.kademlia.membership import Membership
+from middleware.entangled.kademlia.overlay import Overlay
 from middleware.entangled.network.network import Address, Network
-from middleware.entangled.overlay import Overlay
-from middleware.entangled.owner import Concern, Owner, Stored
-from middleware.entangled.reader import ReadConcern, Reader
 from middleware.entangled.record import KEY_BYTES, MAX_NAME, MAX_VALUE, TOLERATED_ABSENCE, Lifetime, Record, Slot
-from middleware.entangled.replica import Replica
-from middleware.entangled.store import Store
-from middleware.entangled.subscriber import Subscriber
-from middleware.entangled.watch import Changed, Watch
+from middleware.entangled.replication.handover import Handover
+from middleware.entangled.replication.owner import Concern, Owner, Stored
+from middleware.entangled.replication.reader import ReadConcern, Reader
+from middleware.entangled.replication.replica import Replica
+from middleware.entangled.replication.subscriber import Subscriber
+from middleware.entangled.replication.watch import Changed, Watch
 from middleware.entangled.wire.endpoint import Endpoint
 
 if TYPE_CHECKING:

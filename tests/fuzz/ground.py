@@ -18,12 +18,12 @@ from twisted.logger import ILogObserver, LogLevel, globalLogPublisher
 from zope.interface import implementer
 
 from middleware.entangled.clock import HeapClock
+from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address, Network
 from middleware.entangled.network.switchboard import Switchboard
 from middleware.entangled.node import EntangledNode
-from middleware.entangled.store import MemoryStore
 from middleware.entangled.wire.courier import MAX_IN_OF_PEER
 from middleware.entangled.wire.endpoint import Endpoint
 

@@ -8,25 +8,27 @@ from typing import Any
 
 from twisted.internet.defer import Deferred, succeed
 
-from middleware.entangled import overlay, owner, reader, schema
+from middleware.entangled.data import schema
+from middleware.entangled.data.memory import MemoryStore
+from middleware.entangled.data.sqlite import SqliteStore
+from middleware.entangled.data.writer import Writer
 from middleware.entangled.errors import EntangledError
-from middleware.entangled.handover import Handover
-from middleware.entangled.overlay import Overlay
-from middleware.entangled.reader import Reader
+from middleware.entangled.kademlia import overlay
+from middleware.entangled.kademlia.overlay import Overlay
+from middleware.entangled.kademlia.roster import Roster
 from middleware.entangled.record import Record, Slot
-from middleware.entangled.replica import Replica
-from middleware.entangled.roster import Roster
+from middleware.entangled.replication import owner, reader
+from middleware.entangled.replication.handover import Handover
+from middleware.entangled.replication.reader import Reader
+from middleware.entangled.replication.replica import Replica
 from middleware.entangled.space.decree import Result, Tally, Vote
 from middleware.entangled.space.keeper import Keeper
 from middleware.entangled.space.seat import Seat
 from middleware.entangled.space.shelf import Shelf
-from middleware.entangled.sqlite import SqliteStore
-from middleware.entangled.store import MemoryStore
 from middleware.entangled.wire import greeting
 from middleware.entangled.wire.greeting import Cookies, Greeter
 from middleware.entangled.wire.method import Ledger
 from middleware.entangled.wire.session import Session
-from middleware.entangled.writer import Writer
 
 
 async def _nothing(*_: object) -> None:

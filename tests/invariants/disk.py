@@ -20,11 +20,11 @@ from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IDelayedCall
 
 from middleware.entangled.clock import HeapClock
+from middleware.entangled.data.sqlite import SqliteStore
+from middleware.entangled.data.store import Store
+from middleware.entangled.data.writer import COMMIT_AFTER, TRY_AGAIN, Writer, _Owed
 from middleware.entangled.network.switchboard import CALM, Weather
 from middleware.entangled.record import Record, Slot
-from middleware.entangled.sqlite import SqliteStore
-from middleware.entangled.store import Store
-from middleware.entangled.writer import COMMIT_AFTER, TRY_AGAIN, Writer, _Owed
 from tests.fleet import Fleet
 
 PARTS = ("", "-wal")

@@ -11,8 +11,8 @@ from twisted.python.failure import Failure
 from middleware.entangled.errors import EntangledError, Unavailable
 from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.distance import closest
+from middleware.entangled.kademlia.overlay import K
 from middleware.entangled.node import EntangledNode
-from middleware.entangled.overlay import K
 from middleware.entangled.record import Record, Slot, hashed_key
 from tests.invariants.schedule import Schedule
 

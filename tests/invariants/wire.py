@@ -16,9 +16,9 @@ from zope.interface import implementer
 
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.identity import Identity, exchange_key
+from middleware.entangled.kademlia.overlay import MAX_FOUND, K
 from middleware.entangled.network.network import Address
 from middleware.entangled.node import EntangledNode
-from middleware.entangled.overlay import MAX_FOUND, K
 from middleware.entangled.wire.answerer import MAX_CANCELLED
 from middleware.entangled.wire.greeting import TOKEN_BYTES, who
 from middleware.entangled.wire.method import MAX_ENTRIES

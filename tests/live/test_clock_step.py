@@ -34,7 +34,7 @@ from middleware.entangled.identity import Identity
 from middleware.entangled.network.udp import UdpNetwork
 from middleware.entangled.node import EntangledNode
 from middleware.entangled.record import hashed_key
-from middleware.entangled.sqlite import SqliteStore
+from middleware.entangled.data.sqlite import SqliteStore
 
 folder, step = sys.argv[1], float(sys.argv[2])
 key, short = hashed_key("device"), hashed_key("short")

@@ -15,7 +15,7 @@ FAILING_DISK = """
 import resource, signal, sys, time
 from benchmarks.store import TTL, written_as
 from middleware.entangled.errors import Unwritable
-from middleware.entangled.sqlite import SqliteStore
+from middleware.entangled.data.sqlite import SqliteStore
 
 store = SqliteStore.open(sys.argv[1], 0.0)
 store.put(written_as(1), TTL)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.entangled.cache import MAX_AGE, MAX_BYTES, MAX_KEYS, PathCache
 from middleware.entangled.record import Record, hashed_key
+from middleware.entangled.replication.cache import MAX_AGE, MAX_BYTES, MAX_KEYS, PathCache
 
 
 def copied(key: bytes, size: int = 1) -> list[Record]:

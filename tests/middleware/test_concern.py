@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from typing import Any
 
-from middleware.entangled import handover, record
+from middleware.entangled import record
 from middleware.entangled.errors import Conflict, NotAcknowledged, Unavailable
 from middleware.entangled.kademlia.distance import closest
+from middleware.entangled.kademlia.overlay import K
 from middleware.entangled.node import EntangledNode
-from middleware.entangled.overlay import K
-from middleware.entangled.owner import Concern
-from middleware.entangled.reader import ReadConcern
 from middleware.entangled.record import TOLERATED_ABSENCE, TOMBSTONE_TTL, Record, hashed_key
-from middleware.entangled.replica import CACHED, SURE
+from middleware.entangled.replication import handover
+from middleware.entangled.replication.owner import Concern
+from middleware.entangled.replication.reader import ReadConcern
+from middleware.entangled.replication.replica import CACHED, SURE
 from tests.fleet import TEAM, Fleet, FleetCase
 
 KEY = hashed_key("task")

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from twisted.trial.unittest import SynchronousTestCase
 
+from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.errors import NotRunning
 from middleware.entangled.identity import Identity
-from middleware.entangled.keepsake import Keepsakes
 from middleware.entangled.record import Record, Slot, hashed_key
-from middleware.entangled.store import MemoryStore
+from middleware.entangled.replication.keepsake import Keepsakes
 
 DOG = Identity(b"\1" * 32)
 KEY = hashed_key("devices")

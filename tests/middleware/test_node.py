@@ -10,11 +10,11 @@ import msgpack
 from middleware.entangled.errors import NoAnswer, NotRunning, Refused, TooLarge, Unavailable
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.distance import closest
+from middleware.entangled.kademlia.overlay import K
 from middleware.entangled.network.switchboard import Weather
 from middleware.entangled.node import CONTACTS, EntangledNode
-from middleware.entangled.overlay import K
 from middleware.entangled.record import MAX_NAME, MAX_VALUE, Record, hashed_key
-from middleware.entangled.replica import SWEEP
+from middleware.entangled.replication.replica import SWEEP
 from tests.fleet import Fleet, FleetCase
 
 KEY = hashed_key("devices")

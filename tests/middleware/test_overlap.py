@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from middleware.entangled.errors import Refused
-from middleware.entangled.overlap import GROUPS, LISTED_S, PLACES
 from middleware.entangled.record import hashed_key
+from middleware.entangled.replication.overlap import GROUPS, LISTED_S, PLACES
 from tests.fleet import Fleet, FleetCase
 
 MANY = 40

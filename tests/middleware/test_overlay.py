@@ -6,10 +6,10 @@ from twisted.internet.defer import Deferred
 
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.distance import closest
+from middleware.entangled.kademlia.overlay import FRESH, K
+from middleware.entangled.kademlia.roster import Roster
 from middleware.entangled.network.network import Address
-from middleware.entangled.overlay import FRESH, K
 from middleware.entangled.record import hashed_key
-from middleware.entangled.roster import Roster
 from tests.fleet import FleetCase
 
 

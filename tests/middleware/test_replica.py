@@ -10,16 +10,16 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.background import Background
 from middleware.entangled.clock import HeapClock
+from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.errors import Refused, Unwritable
 from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address
 from middleware.entangled.network.switchboard import Switchboard
-from middleware.entangled.pusher import WATCH_TTL
 from middleware.entangled.record import Lifetime, Record, hashed_key, unpacked
-from middleware.entangled.replica import SURE, SWEEP, Replica
-from middleware.entangled.store import MemoryStore
-from middleware.entangled.watch import digest_of
+from middleware.entangled.replication.pusher import WATCH_TTL
+from middleware.entangled.replication.replica import SURE, SWEEP, Replica
+from middleware.entangled.replication.watch import digest_of
 from middleware.entangled.wire.endpoint import Endpoint
 
 DOG, CAT, ME = (Identity(bytes([n]) * 32) for n in (1, 2, 3))

@@ -7,8 +7,8 @@ from twisted.trial.unittest import SynchronousTestCase
 from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.distance import closest
+from middleware.entangled.kademlia.roster import COUNTED_S, MAX_MEMBERS, STRUCK_S, Roster
 from middleware.entangled.network.network import Address
-from middleware.entangled.roster import COUNTED_S, MAX_MEMBERS, STRUCK_S, Roster
 
 ME = Contact(Identity(bytes(32)).public, Address("10.0.0.1", 1))
 

@@ -12,8 +12,8 @@ from twisted.logger import ILogObserver, LogEvent, formatEvent, globalLogPublish
 from twisted.trial.unittest import SynchronousTestCase
 from zope.interface import implementer
 
-from middleware.entangled.salvage import set_aside
-from middleware.entangled.sqlite import SqliteStore
+from middleware.entangled.data.salvage import set_aside
+from middleware.entangled.data.sqlite import SqliteStore
 from tests.middleware.test_store import DOG, FOREVER, record
 
 

@@ -7,8 +7,8 @@ from contextlib import closing
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.entangled.schema import APPLICATION_ID, SCHEMA_VERSION, make
-from middleware.entangled.sqlite import SqliteStore
+from middleware.entangled.data.schema import APPLICATION_ID, SCHEMA_VERSION, make
+from middleware.entangled.data.sqlite import SqliteStore
 from tests.middleware.test_store import DOG, FOREVER, KEY, record
 
 OLD = """

@@ -14,11 +14,11 @@ from twisted.logger import ILogObserver, LogEvent, globalLogPublisher
 from twisted.trial.unittest import SynchronousTestCase
 from zope.interface import implementer
 
+from middleware.entangled.data.schema import MAX_ROTTEN, SCHEMA_VERSION
+from middleware.entangled.data.sqlite import SqliteStore, read_records
+from middleware.entangled.data.store import MAX_BYTES, Durable, Store, weight
 from middleware.entangled.errors import BadStore, NotRunning, Unwritable
 from middleware.entangled.record import MAX_VALUE, Record, hashed_key
-from middleware.entangled.schema import MAX_ROTTEN, SCHEMA_VERSION
-from middleware.entangled.sqlite import SqliteStore, read_records
-from middleware.entangled.store import MAX_BYTES, Durable, Store, weight
 from tests.middleware.test_store import CAT, DOG, FOREVER, KEY, StoreContract, record
 
 
@@ -182,7 +182,7 @@ class ReopenTest(SynchronousTestCase):
         self.store.close()
         child = (
             "import os, sys\n"
-            "from middleware.entangled.sqlite import SqliteStore\n"
+            "from middleware.entangled.data.sqlite import SqliteStore\n"
             "from tests.middleware.test_store import record\n"
             "store = SqliteStore.open(sys.argv[1], 0.0)\n"
             "for number in range(300): store.put(record(str(number), value=None), 9e9)\n"
@@ -210,7 +210,7 @@ class ReopenTest(SynchronousTestCase):
         self.store.close()
         child = (
             "import os, sys\n"
-            "from middleware.entangled.sqlite import SqliteStore\n"
+            "from middleware.entangled.data.sqlite import SqliteStore\n"
             "from tests.middleware.test_store import record\n"
             "store = SqliteStore.open(sys.argv[1], 0.0, durable='crash')\n"
             "for number in range(300): store.put(record(str(number), value=None), 9e9)\n"

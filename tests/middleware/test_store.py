@@ -9,10 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 
+from middleware.entangled.data.memory import MemoryStore
+from middleware.entangled.data.store import MAX_BYTES, Store, weight
 from middleware.entangled.errors import Full, Refused
 from middleware.entangled.identity import Identity
 from middleware.entangled.record import Lifetime, Record, Slot, hashed_key
-from middleware.entangled.store import MAX_BYTES, MemoryStore, Store, weight
 
 if TYPE_CHECKING:
     _Case = SynchronousTestCase

@@ -6,7 +6,7 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.identity import Identity
 from middleware.entangled.record import Lifetime, Record, hashed_key
-from middleware.entangled.watch import View, Watch, digest_of
+from middleware.entangled.replication.watch import View, Watch, digest_of
 
 DOG, CAT, ME = (Identity(bytes([n]) * 32) for n in (1, 2, 3))
 KEY = hashed_key("devices")

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from twisted.internet.defer import CancelledError
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.entangled.sqlite import SqliteStore
+from middleware.entangled.data.sqlite import SqliteStore
 from tests.middleware.test_store import FOREVER, KEY, record
 
 

@@ -7,8 +7,8 @@ import random
 from twisted.application.service import Service
 
 from middleware.entangled.clock import HeapClock
+from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.network.switchboard import Switchboard
-from middleware.entangled.store import MemoryStore
 from middleware.node import SwarmNode
 from middleware.settings import Settings
 from swarmnode.assembly import Seams

@@ -9,7 +9,7 @@ from twisted.logger import ILogObserver, LogEvent, formatEvent, globalLogPublish
 from twisted.trial.unittest import SynchronousTestCase
 from zope.interface import implementer
 
-from middleware.entangled.store import MemoryStore
+from middleware.entangled.data.memory import MemoryStore
 from middleware.settings import Settings
 from swarmnode.assembly import assembled, identity_in
 from tests.swarmnode.team import World

@@ -15,13 +15,13 @@ from middleware.entangled.errors import LocalError
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address
 from middleware.entangled.node import EntangledNode
-from middleware.entangled.owner import Concern, Stored
-from middleware.entangled.reader import ReadConcern
 from middleware.entangled.record import KEY_BYTES, Lifetime, Record, hashed_key
+from middleware.entangled.replication.owner import Concern, Stored
+from middleware.entangled.replication.reader import ReadConcern
+from middleware.entangled.replication.watch import Watch
 from middleware.entangled.space.keyword import Keywords, Match
 from middleware.entangled.space.template import ANY, Field, where
 from middleware.entangled.space.tuplespace import TupleSpace
-from middleware.entangled.watch import Watch
 
 RAW = "id:"
 KINDS: Mapping[str, type] = {"int": int, "float": float, "str": str, "bytes": bytes, "bool": bool}

@@ -16,9 +16,9 @@ from twisted.internet.defer import Deferred
 from middleware.entangled.background import first
 from middleware.entangled.errors import LocalError, NoAnswer, TooLarge
 from middleware.entangled.node import EntangledNode
-from middleware.entangled.owner import Stored
 from middleware.entangled.record import MAX_NAME, MAX_VALUE, Record, hashed_key
-from middleware.entangled.watch import Watch
+from middleware.entangled.replication.owner import Stored
+from middleware.entangled.replication.watch import Watch
 
 MAX_WORDS = 16
 

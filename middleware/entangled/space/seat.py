@@ -16,12 +16,12 @@ import msgpack
 from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorTime
 
+from middleware.entangled.data.store import Store
 from middleware.entangled.errors import Refused
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.record import KEY_BYTES
 from middleware.entangled.space.decree import MAX_LEASE, Ballot, Kind, Reply, State, Vote, is_counter, is_name
 from middleware.entangled.space.posting import INCARNATION_BYTES, Place, Posted, place_unpacked, posting
-from middleware.entangled.store import Store
 
 MAX_VOTES = 4096
 MAX_PLACES = 12

@@ -13,8 +13,8 @@ from twisted.internet.defer import Deferred
 from middleware.entangled.background import Background
 from middleware.entangled.node import EntangledNode
 from middleware.entangled.record import Record
+from middleware.entangled.replication.watch import Watch
 from middleware.entangled.space.posting import Posted, Reader
-from middleware.entangled.watch import Watch
 
 POLL = 0.7
 """Seconds; a poll and the answers to it must fit into the one second that a wake-up may take."""

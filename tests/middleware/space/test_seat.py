@@ -13,6 +13,7 @@ from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.clock import HeapClock
+from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.errors import Refused
 from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact
@@ -33,7 +34,6 @@ from middleware.entangled.space.posting import (
     standing,
 )
 from middleware.entangled.space.seat import MAX_PLACES, Seat, packed_votes, votes_of
-from middleware.entangled.store import MemoryStore
 
 ME = Identity(b"m" * 32)
 PEER = Contact(ME.public, Address("10.0.0.1", 1))

@@ -12,14 +12,14 @@ from typing import Literal
 from twisted.internet.defer import Deferred
 
 from middleware.entangled.background import Background, until
-from middleware.entangled.cache import MAX_AGE
 from middleware.entangled.errors import EntangledError, Unavailable
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.lookup import Lookup
-from middleware.entangled.overlay import ALPHA, K, Overlay, contacts_of
-from middleware.entangled.owner import Owner
+from middleware.entangled.kademlia.overlay import ALPHA, K, Overlay, contacts_of
 from middleware.entangled.record import Record, Slot, unpacked
-from middleware.entangled.replica import CACHED, SURE, UNSURE, Replica
+from middleware.entangled.replication.cache import MAX_AGE
+from middleware.entangled.replication.owner import Owner
+from middleware.entangled.replication.replica import CACHED, SURE, UNSURE, Replica
 
 ReadConcern = Literal["fast", "majority"]
 MAX_PAGES = 2000

@@ -14,14 +14,14 @@ from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorTime
 
 from middleware.entangled.background import Background
-from middleware.entangled.cache import PathCache
+from middleware.entangled.data.store import Store
 from middleware.entangled.errors import Refused
 from middleware.entangled.kademlia.contact import Contact
-from middleware.entangled.keepsake import Keepsakes
-from middleware.entangled.pusher import Pusher
 from middleware.entangled.record import KEY_BYTES, Record, Signed, unpacked
-from middleware.entangled.store import Store
-from middleware.entangled.watch import digest_of
+from middleware.entangled.replication.cache import PathCache
+from middleware.entangled.replication.keepsake import Keepsakes
+from middleware.entangled.replication.pusher import Pusher
+from middleware.entangled.replication.watch import digest_of
 from middleware.entangled.wire.endpoint import Endpoint
 
 PAGE_BYTES = 12_000

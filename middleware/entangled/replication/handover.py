@@ -16,17 +16,17 @@ from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorTime
 
 from middleware.entangled.background import Background, first
+from middleware.entangled.data.store import Store
 from middleware.entangled.errors import EntangledError, Refused
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.distance import distance
-from middleware.entangled.overlap import GROUPS, PLACES, Overlap, weight
-from middleware.entangled.overlay import K, Overlay
-from middleware.entangled.owner import Owner
+from middleware.entangled.kademlia.overlay import K, Overlay
+from middleware.entangled.kademlia.roster import STRUCK_S
 from middleware.entangled.record import Record, Slot, unpacked
-from middleware.entangled.replica import PAGE_BYTES, Replica
-from middleware.entangled.roster import STRUCK_S
-from middleware.entangled.store import Store
-from middleware.entangled.watch import digest_of
+from middleware.entangled.replication.overlap import GROUPS, PLACES, Overlap, weight
+from middleware.entangled.replication.owner import Owner
+from middleware.entangled.replication.replica import PAGE_BYTES, Replica
+from middleware.entangled.replication.watch import digest_of
 from middleware.entangled.wire.endpoint import Endpoint
 
 STEWARDS = 2

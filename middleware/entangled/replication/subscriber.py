@@ -12,11 +12,11 @@ from middleware.entangled.background import Background
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.identity import node_id
 from middleware.entangled.kademlia.contact import Contact
-from middleware.entangled.overlay import Overlay
-from middleware.entangled.reader import Reader
+from middleware.entangled.kademlia.overlay import Overlay
 from middleware.entangled.record import Record, Slot, unpacked
-from middleware.entangled.replica import Replica
-from middleware.entangled.watch import Changed, Watch
+from middleware.entangled.replication.reader import Reader
+from middleware.entangled.replication.replica import Replica
+from middleware.entangled.replication.watch import Changed, Watch
 from middleware.entangled.wire.endpoint import Endpoint
 
 RENEW = 2.0

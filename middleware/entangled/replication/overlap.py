@@ -9,13 +9,13 @@ from bisect import bisect_right
 
 from twisted.internet.interfaces import IReactorTime
 
+from middleware.entangled.data.store import Store
 from middleware.entangled.errors import Refused
 from middleware.entangled.kademlia.contact import Contact
-from middleware.entangled.overlay import Overlay
+from middleware.entangled.kademlia.overlay import Overlay
 from middleware.entangled.record import Record, Slot
-from middleware.entangled.replica import PAGE_BYTES, RECORD_BYTES, Replica
-from middleware.entangled.store import Store
-from middleware.entangled.watch import digest_of
+from middleware.entangled.replication.replica import PAGE_BYTES, RECORD_BYTES, Replica
+from middleware.entangled.replication.watch import digest_of
 from middleware.entangled.wire.endpoint import Endpoint
 
 GROUPS = 16

@@ -14,14 +14,14 @@ from typing import Any, Literal
 from twisted.internet.interfaces import IReactorTime
 
 from middleware.entangled.background import Background, until
+from middleware.entangled.data.store import Store
 from middleware.entangled.errors import Conflict, NoAnswer, NotAcknowledged, Refused
 from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact
-from middleware.entangled.overlay import Overlay
+from middleware.entangled.kademlia.overlay import Overlay
 from middleware.entangled.record import TEAM_TTL, TOMBSTONE_TTL, Lifetime, Record, Slot
-from middleware.entangled.replica import Replica
-from middleware.entangled.store import Store
-from middleware.entangled.watch import digest_of
+from middleware.entangled.replication.replica import Replica
+from middleware.entangled.replication.watch import digest_of
 from middleware.entangled.wire.endpoint import Endpoint
 
 Concern = Literal["one", "majority", "all"]

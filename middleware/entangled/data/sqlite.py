@@ -15,10 +15,9 @@ from urllib.parse import quote
 from twisted.internet.defer import Deferred
 from twisted.logger import Logger
 
-from middleware.entangled.errors import BadStore, NotRunning
-from middleware.entangled.record import Record, Slot
-from middleware.entangled.salvage import is_ours, saved_notes, set_aside
-from middleware.entangled.schema import (
+from middleware.entangled.data.memory import MemoryStore
+from middleware.entangled.data.salvage import is_ours, saved_notes, set_aside
+from middleware.entangled.data.schema import (
     SELECT,
     Contents,
     Rotten,
@@ -28,8 +27,10 @@ from middleware.entangled.schema import (
     open_rows,
     record_of,
 )
-from middleware.entangled.store import HOLD, MAX_BYTES, MAX_ROWS, Durable, MemoryStore, Origin
-from middleware.entangled.writer import Deliver, Writer
+from middleware.entangled.data.store import HOLD, MAX_BYTES, MAX_ROWS, Durable, Origin
+from middleware.entangled.data.writer import Deliver, Writer
+from middleware.entangled.errors import BadStore, NotRunning
+from middleware.entangled.record import Record, Slot
 
 SYNCHRONOUS: dict[Durable, str] = {"power": "FULL", "crash": "NORMAL"}
 EPOCH = "epoch"

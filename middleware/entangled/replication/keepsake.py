@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable
 
+from middleware.entangled.data.store import Store
 from middleware.entangled.errors import NotRunning, Refused
 from middleware.entangled.record import MAX_TTL, Record, Slot
-from middleware.entangled.store import Store
 
 
 class Keepsakes:

@@ -20,8 +20,8 @@ from middleware.entangled.errors import EntangledError, NoAnswer, Refused
 from middleware.entangled.kademlia.contact import Contact, unpacked
 from middleware.entangled.kademlia.distance import closest
 from middleware.entangled.kademlia.lookup import Lookup
+from middleware.entangled.kademlia.roster import Roster
 from middleware.entangled.kademlia.routing import STALE_AFTER, RoutingTable
-from middleware.entangled.roster import Roster
 from middleware.entangled.wire.endpoint import Endpoint
 
 K = 8

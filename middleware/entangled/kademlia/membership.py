@@ -17,9 +17,9 @@ from twisted.logger import Logger
 from middleware.entangled.background import Background
 from middleware.entangled.errors import NotRunning, Refused
 from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.kademlia.overlay import Overlay, contacts_of
+from middleware.entangled.kademlia.roster import MAX_MEMBERS
 from middleware.entangled.network.network import Address
-from middleware.entangled.overlay import Overlay, contacts_of
-from middleware.entangled.roster import MAX_MEMBERS
 from middleware.entangled.wire.endpoint import Endpoint
 
 SILENCE = 3.0

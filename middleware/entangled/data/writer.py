@@ -16,9 +16,9 @@ from dataclasses import dataclass, field
 from twisted.internet.defer import Deferred, fail, succeed
 from twisted.logger import Logger
 
+from middleware.entangled.data.schema import DELETE, NOTE, PUT, Statement, note_of, row_of
 from middleware.entangled.errors import BadStore, NotRunning, Unwritable
 from middleware.entangled.record import Record, Slot
-from middleware.entangled.schema import DELETE, NOTE, PUT, Statement, note_of, row_of
 
 COMMIT_AFTER = 0.02
 """Seconds that a change for which nobody waits may wait for others.  More spares the card; less loses less with the

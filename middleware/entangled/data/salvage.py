@@ -11,7 +11,7 @@ import sqlite3
 from contextlib import closing
 from urllib.parse import quote
 
-from middleware.entangled.schema import APPLICATION_ID, MARK, RECORDS, RECORDS_1, notes_in, open_rows
+from middleware.entangled.data.schema import APPLICATION_ID, MARK, RECORDS, RECORDS_1, notes_in, open_rows
 
 PARTS = ("", "-wal", "-shm")
 TRACES = (RECORDS.encode(), RECORDS_1.encode(), MARK)

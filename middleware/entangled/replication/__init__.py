@@ -1,0 +1,1 @@
+"""Replication: what a node holds for others, what it owns, reads and watches."""
