@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from twisted.internet.defer import Deferred
+
 from middleware.entangled import record
 from middleware.entangled.errors import Conflict, NotAcknowledged, Unavailable
 from middleware.entangled.kademlia.distance import closest
@@ -193,6 +195,22 @@ class ReadConcernTests(ConcernCase):
             self.world.nodes[place].replica.is_sure = lambda: False
         error = self.failure(self.world, self.reader.get(KEY), Unavailable)
         self.assertEqual((error.answered, error.needed), (4, 5))
+
+
+class NewcomerTests(ConcernCase):
+    def test_second_node_reads_as_soon_as_it_has_joined(self) -> None:
+        """Of two nodes both have to vote; the one that has just come can read all the same, and surely."""
+
+        async def joined_and_read(fleet: Fleet) -> list[Record]:
+            fleet.nodes.append(fleet.made(1))
+            await fleet.enter(fleet.nodes[1], [fleet.address(0)])
+            return await fleet.nodes[1].get(KEY)
+
+        for seed in range(4):
+            fleet = self.fleet(1, seed)
+            self.done(fleet, fleet.nodes[0].put(KEY, "a", b"red"))
+            read = Deferred.fromCoroutine(joined_and_read(fleet))
+            self.assertEqual([record.value for record in self.done(fleet, read)], [b"red"])
 
 
 class AbsenceTests(ConcernCase):

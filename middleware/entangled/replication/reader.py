@@ -22,6 +22,8 @@ from middleware.entangled.replication.owner import Owner
 from middleware.entangled.replication.replica import CACHED, SURE, UNSURE, Replica
 
 ReadConcern = Literal["fast", "majority"]
+CATCHING_UP, CATCHING_UP_STEP = 1.5, 0.1
+"""Seconds for which a read waits for its own node to catch up, and after which it is tried again."""
 MAX_PAGES = 2000
 
 
@@ -46,8 +48,22 @@ class Reader:
         self._chores = chores
 
     async def read(self, key: bytes, concern: ReadConcern) -> list[Record]:
-        """The records of ``key``, without tombstones, in the order of (owner, name); raises ``Unavailable``."""
-        records = list((await self.newest(key)).values()) if concern == "majority" else await self._fast(key)
+        """The records of ``key``, without tombstones, in the order of (owner, name); raises ``Unavailable``.
+
+        A node that has just come has no vote of its own until it has caught up: its reads give it a moment for that.
+        """
+        over: list[bool] | None = None
+        while True:
+            try:
+                records = list((await self.newest(key)).values()) if concern == "majority" else await self._fast(key)
+                break
+            except Unavailable:
+                if over or self._replica.is_sure():
+                    raise
+            if over is None:
+                over = []
+                self._chores.later(CATCHING_UP, over.append, True)
+            await self._chores.sleep(CATCHING_UP_STEP)
         return sorted((r for r in records if not r.is_tombstone), key=lambda r: (r.owner, r.name))
 
     async def pages(self, contact: Contact, key: bytes, page: object = None, wants_sure: bool = True) -> Answer:
