@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import multiprocessing
 import os
 import statistics
 import subprocess
@@ -216,7 +217,9 @@ def main(arguments: Sequence[str], make_team: MakeTeam) -> int:
     with ExitStack() as stack:
         spread: Callable[..., Iterable[Outcome]] = map
         if given.jobs > 1:
-            spread = stack.enter_context(ProcessPoolExecutor(max_workers=given.jobs)).map
+            # A fork of a process that has threads may stand still for ever.
+            spawn = multiprocessing.get_context("spawn")
+            spread = stack.enter_context(ProcessPoolExecutor(given.jobs, spawn)).map
         for outcome in spread(_one, jobs):
             outcomes.append(outcome)
             word = "ok  " if outcome.held else "FAIL"

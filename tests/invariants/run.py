@@ -63,7 +63,8 @@ def run_all(seeds: range, jobs: int, only: tuple[str, ...] = (), bug: str | None
         _spare_the_collector()
         yield from map(one, seeds)
         return
-    with multiprocessing.get_context("fork").Pool(jobs, _spare_the_collector) as pool:
+    # Not by forking: this may run in a process that has threads and a reactor's signal handlers, which a fork inherits.
+    with multiprocessing.get_context("spawn").Pool(jobs, _spare_the_collector) as pool:
         yield from pool.imap(one, seeds)
 
 
