@@ -14,7 +14,7 @@ from typing import Any
 from sim.demo.story import present
 
 MOVED_M = 0.10
-"""The dog is killed when it has come this much nearer to the target."""
+"""The dog is killed when it has come this much nearer to the target, or half its way where that is less."""
 TOUCH_M = 0.15
 """The gap between the dog's footprint and the target that still counts as having reached it."""
 SAME_M = 0.05
@@ -81,8 +81,11 @@ class Experiment:
             if self.takeover_s is None and any(_moves(snapshot, name) for name in executing):
                 self.takeover_s = now - self._killed_at
         elif self._kills:
+            target = (snapshot or {}).get("target") or {}
             for name in executing:
-                if self._decided[name].get(name, 0.0) - distances.get(name, math.inf) >= MOVED_M:
+                began = self._decided[name].get(name, 0.0)
+                way = began - float(target.get("radius", 0.0)) - FOOTPRINT_M - TOUCH_M
+                if began - distances.get(name, math.inf) >= min(MOVED_M, max(0.0, way) / 2):
                     self.killed, self._killed_at = name, now
                     return name
         return ""
