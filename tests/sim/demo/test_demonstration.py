@@ -77,6 +77,12 @@ class ExperimentTests(SynchronousTestCase):
         named = [self.second.look(x, running, snapshot(1.05 - x, 1.5)) for x in (0.0, 0.05, 0.11, 0.2)]
         self.assertEqual(named, ["", "", "dog1", ""])
 
+    def test_dog_with_a_short_way_is_killed_half_way(self) -> None:
+        """A dog that has less than 0.2 m to go is named when it has gone half of that, before it is there."""
+        running = state("EXECUTING", dog1="EXECUTING", dog2="WAITING")
+        named = [self.second.look(float(n), running, snapshot(x, 1.5)) for n, x in enumerate((0.45, 0.43, 0.39))]
+        self.assertEqual(named, ["", "", "dog1"])
+
     def test_takeover_is_timed_until_another_dog_moves(self) -> None:
         """The takeover lasts from the kill until another dog executes and moves; the lost one no longer counts."""
         running = state("EXECUTING", dog1="EXECUTING", dog2="WAITING")
@@ -93,9 +99,10 @@ class ExperimentTests(SynchronousTestCase):
 
     def test_second_experiment_without_a_loss_fails(self) -> None:
         """A task completed before any dog was lost proves nothing, and fails."""
-        self.second.look(0.0, state("EXECUTING", dog1="EXECUTING"), snapshot(0.3, 1.5))
+        self.second.look(0.0, state("EXECUTING", dog1="EXECUTING"), snapshot(1.0, 1.5))
         self.second.look(1.0, state("COMPLETED", "dog1"), snapshot(0.25, 1.5))
         self.assertFalse(self.second.held)
+        self.assertIn("nobody was lost", table([self.second]))
 
     def test_lost_dog_that_finishes_fails(self) -> None:
         """A result in the name of the dog that was killed is no takeover."""
