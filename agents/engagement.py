@@ -18,9 +18,8 @@ from drivers.driver import Permit
 from drivers.reading import Action, Observation
 from middleware.consensus.lease import Lessee
 from middleware.consensus.strategy import ConsensusAlgorithm
-from middleware.entangled.record import Record
 from middleware.presence import ASSIGNED, DONE, EXECUTING, SEARCHING, WAITING
-from middleware.tasks import COMPLETED, Member, Result, Task, member_of, outcome_of
+from middleware.tasks import COMPLETED, Member, Result, Task
 
 FARTHER, NEARER, STEP = 1.15, 0.85, 0.05
 """A report is renewed when the distance grew by 15 % and 5 cm (the target was moved), or shrank so much while the body
@@ -81,12 +80,10 @@ class Engagement:
         """Whether the task has an outcome."""
         return self.result is not None
 
-    def heard(self, records: list[Record]) -> None:
-        """Take in what the group's key holds now."""
-        outcome = outcome_of(records)
+    def heard(self, members: list[Member], outcome: Result | None) -> None:
+        """Take in who is present and what they report, and how the task ended."""
         if outcome is not None and self.result is None:
             self._end(outcome)
-        members = [m for r in records if (m := member_of(r)) is not None]
         self._others = {m.uuid: m for m in members if m.uuid != self.me.uuid}
 
     def look(self, seen: Observation) -> None:

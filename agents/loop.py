@@ -20,8 +20,8 @@ from drivers.reading import Observation
 from middleware.consensus.strategy import strategy_for
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.record import Record
-from middleware.entangled.replication.watch import Watch
 from middleware.errors import SwarmError
+from middleware.group import Group
 from middleware.node import CAMERA, SwarmNode
 from middleware.presence import DONE, IDLE
 from middleware.tasks import Member, Result, Task, group_key, outcome_of, refusals, task_of
@@ -46,7 +46,7 @@ class Agent(Service):
         self._ended: set[str] = set()
         self._checking: set[str] = set()
         self._engagement: Engagement | None = None
-        self._group: Watch | None = None
+        self._group: Group | None = None
         self._tick: IDelayedCall | None = None
         self._unsubscribe: Callable[[], None] | None = None
         self._token = 0
@@ -161,20 +161,20 @@ class Agent(Service):
         )
         engagement.lessee = self._node.lessee(task, self._turn_now, self._token)
         self._engagement = engagement
-        self._group = self._node.watch_group(task.task_id, engagement.heard)
-        self._node.report(task.task_id, engagement.me)
+        self._group = self._node.group(task.task_id, engagement.heard)
+        self._group.report(engagement.me)
         self._node.presence.change(task=task.task_id, status=engagement.me.status)
         self._say(f"assigned: {task.title}")
 
     def _disengage(self) -> None:
         engagement, self._engagement = self._engagement, None
-        if self._group is not None:
-            self._group.stop()
-            self._group = None
+        group, self._group = self._group, None
         if engagement is not None:
             engagement.abandon()
+        if group is not None:
+            group.leave()
             if self.running:
-                self._node.withdraw(engagement.task.task_id)
+                group.withdraw()
 
     # -- act --------------------------------------------------------------------------------------------------------
 
@@ -228,18 +228,18 @@ class Agent(Service):
     # -- publish ----------------------------------------------------------------------------------------------------
 
     def _tell(self, member: Member) -> None:
-        engagement = self._engagement
-        if engagement is not None:
-            self._node.report(engagement.task.task_id, member)
+        engagement, group = self._engagement, self._group
+        if engagement is not None and group is not None:
+            group.report(member)
             if not engagement.is_over:
                 # What the device is after the task, its end says.
                 self._node.presence.change(status=member.status)
 
     def _conclude(self, result: Result) -> None:
-        engagement = self._engagement
-        if engagement is None:
+        engagement, group = self._engagement, self._group
+        if engagement is None or group is None:
             return
-        concluded = self._node.conclude(engagement.task.task_id, result)
+        concluded = group.conclude(result)
         concluded.addErrback(self._not_concluded, engagement.task.task_id, result)
 
     def _not_concluded(self, failure: Any, task_id: str, result: Result) -> None:

@@ -28,9 +28,10 @@ from middleware.entangled.node import EntangledNode
 from middleware.entangled.record import MAX_NAME, Record
 from middleware.entangled.replication.owner import Stored
 from middleware.entangled.replication.watch import Changed, Watch
+from middleware.group import Group, Heard
 from middleware.presence import DEVICES, Device, Presence, devices_of
 from middleware.streams import Streams
-from middleware.tasks import MAX_LEASE_TTL, MEMBER, RESULT, TASKS, Member, Result, Task, group_key
+from middleware.tasks import MAX_LEASE_TTL, RESULT, TASKS, Result, Task, group_key
 from middleware.value import bounded
 
 COUNCIL = 3
@@ -197,16 +198,12 @@ class SwarmNode(Service):
         """Follow the reports and the outcome of one task; ``keep`` leaves them in the store as well."""
         return self.entangled.watch(group_key(task_id), changed, keep)
 
-    def report(self, task_id: str, member: Member) -> None:
-        """Tell the other participants of a task; gone with this node, should it go."""
-        self._quietly(self.entangled.put(group_key(task_id), MEMBER, member.packed(), "leased"))
-
-    def withdraw(self, task_id: str) -> None:
-        """Take this node's report back."""
-        self._quietly(self.entangled.remove(group_key(task_id), MEMBER))
+    def group(self, task_id: str, heard: Heard) -> Group:
+        """Take part in a task: a place among its participants."""
+        return Group(task_id, self.entangled, heard, self._quietly)
 
     def conclude(self, task_id: str, result: Result) -> Deferred[Stored]:
-        """Record how a task ended; stays when this node goes."""
+        """Record how a task ended, as somebody who takes no part in it."""
         return self.entangled.put(group_key(task_id), RESULT, result.packed(), "team")
 
     def lessee(self, task: Task, changed: Callable[[], None], floor: int) -> Lessee:

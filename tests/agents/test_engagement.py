@@ -11,9 +11,8 @@ from middleware.consensus.lease import Lease
 from middleware.consensus.nearest import Nearest
 from middleware.entangled.clock import HeapClock
 from middleware.entangled.identity import Identity
-from middleware.entangled.record import Record
 from middleware.presence import ASSIGNED, DONE, EXECUTING, SEARCHING, WAITING
-from middleware.tasks import CANCELLED, COMPLETED, MEMBER, RESULT, Member, Result, Task, group_key
+from middleware.tasks import CANCELLED, COMPLETED, Member, Result, Task
 
 TASK = Task("t1", "find-target", "Find it", waiting_period=2.0)
 LOOK, GO, HOLD = {"base.wz": 1.0}, {"base.vx": 0.1}, {"base.wz": 0.0}
@@ -102,16 +101,17 @@ class EngagementTests(SynchronousTestCase):
         )
         self.engagement.lessee = self.council  # type: ignore[assignment]
 
-    def report(self, number: int, cost: float | None, status: str = WAITING) -> Record:
-        """What another dog reports, as it comes from the network."""
-        owner = self.others[number]
-        member = Member(owner.node_id.hex(), f"dog{number}", status, cost)
-        return Record(group_key("t1"), MEMBER, owner.public, 1, "leased", 1.0, member.packed())
+    def report(self, number: int, cost: float | None, status: str = WAITING) -> Member:
+        """What another dog reports."""
+        return Member(self.others[number].node_id.hex(), f"dog{number}", status, cost)
 
-    def outcome(self, outcome: str, by: str) -> Record:
-        """How the task ended."""
-        value = Result(outcome, by, 1.0, 5).packed()
-        return Record(group_key("t1"), RESULT, self.others[2].public, 1, "team", 60.0, value)
+    def hear(self, *members: Member) -> None:
+        """Let the group tell who is present, while the task is open."""
+        self.engagement.heard(list(members), None)
+
+    def end(self, outcome: str, by: str) -> None:
+        """Let the group tell how the task ended."""
+        self.engagement.heard([], Result(outcome, by, 1.0, 5))
 
     def see(self, cost: float | None) -> None:
         """Let the body measure."""
@@ -125,7 +125,7 @@ class EngagementTests(SynchronousTestCase):
 
     def acting(self, token: int = 5) -> None:
         """Bring the agent to where it acts: nearest of two, lease granted."""
-        self.engagement.heard([self.report(2, 2.0)])
+        self.hear(self.report(2, 2.0))
         self.see(1.0)
         self.step()
         self.council.grant(token)
@@ -134,21 +134,21 @@ class EngagementTests(SynchronousTestCase):
     def test_states_follow_the_thesis(self) -> None:
         """An agent is ASSIGNED, SEARCHING until it can report, then WAITING, EXECUTING with the lease, DONE."""
         self.assertEqual(self.engagement.me.status, ASSIGNED)
-        self.engagement.heard([self.report(2, None)])
+        self.hear(self.report(2, None))
         self.assertEqual(self.step().action, LOOK)
         self.see(1.0)
         self.assertEqual(self.step().action, HOLD)
-        self.engagement.heard([self.report(2, 2.0)])
+        self.hear(self.report(2, 2.0))
         self.step()
         self.council.grant(5)
         self.assertEqual(self.step().action, GO)
-        self.engagement.heard([self.outcome(COMPLETED, "dog1")])
+        self.end(COMPLETED, "dog1")
         statuses = list(dict.fromkeys(member.status for member in self.told))
         self.assertEqual(statuses, [SEARCHING, WAITING, EXECUTING, DONE])
 
     def test_nothing_is_executed_without_a_lease(self) -> None:
         """The one that should act only stands by until the council grants, and again when the lease has run out."""
-        self.engagement.heard([self.report(2, 2.0)])
+        self.hear(self.report(2, 2.0))
         self.see(1.0)
         for _ in range(5):
             self.assertEqual(self.step().action, HOLD)
@@ -169,7 +169,7 @@ class EngagementTests(SynchronousTestCase):
 
     def test_lease_is_not_claimed_by_those_that_stand_by(self) -> None:
         """An agent that is not the assigned one claims nothing."""
-        self.engagement.heard([self.report(2, 0.5)])
+        self.hear(self.report(2, 0.5))
         self.see(1.0)
         self.step()
         self.assertFalse(self.council.is_wanted)
@@ -178,7 +178,7 @@ class EngagementTests(SynchronousTestCase):
     def test_body_stops_before_the_lease_goes_back(self) -> None:
         """When a better report takes the task away, the body is stopped first and the lease is given back after."""
         self.acting()
-        self.engagement.heard([self.report(2, 0.5)])
+        self.hear(self.report(2, 0.5))
         self.assertEqual(self.step().action, HOLD)
         self.assertEqual(self.events, ["halted", "released"])
         self.assertIn("gives the task back", self.said)
@@ -186,17 +186,17 @@ class EngagementTests(SynchronousTestCase):
     def test_report_within_the_hysteresis_changes_nothing(self) -> None:
         """A late report that is hardly better leaves the task where it is."""
         self.acting()
-        self.engagement.heard([self.report(2, 0.95)])
+        self.hear(self.report(2, 0.95))
         self.assertEqual(self.step().action, GO)
         self.assertEqual(self.events, [])
 
     def test_member_that_left_is_decided_without(self) -> None:
         """When the assigned agent disappears, the next one claims the lease at its next step."""
-        self.engagement.heard([self.report(2, 0.5, EXECUTING), self.report(3, 3.0)])
+        self.hear(self.report(2, 0.5, EXECUTING), self.report(3, 3.0))
         self.see(1.0)
         self.step()
         self.assertFalse(self.council.is_wanted)
-        self.engagement.heard([self.report(3, 3.0)])
+        self.hear(self.report(3, 3.0))
         self.step()
         self.assertTrue(self.council.is_wanted)
 
@@ -208,7 +208,7 @@ class EngagementTests(SynchronousTestCase):
         self.see(1.5)
         self.see(0.6)
         self.assertEqual([m.cost for m in self.told], [1.0, 1.5, 0.6])
-        self.engagement.heard([self.report(2, 2.0)])
+        self.hear(self.report(2, 2.0))
         self.step()
         self.council.grant(5)
         self.step()
@@ -260,14 +260,14 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual([(r.outcome, r.by, r.token) for r in self.results], [(COMPLETED, "dog1", 5)])
         self.assertEqual(self.results[0].bids, (("dog1", 1.0), ("dog2", 2.0)))
         self.assertEqual(self.events, ["halted"])
-        self.engagement.heard([self.outcome(COMPLETED, "dog1")])
+        self.end(COMPLETED, "dog1")
         self.engagement.abandon()
         self.assertEqual(self.events[-1], "released")
 
     def test_outcome_of_another_ends_it_at_once(self) -> None:
         """A task that was cancelled or done by another is over: the body stops and no step follows."""
         self.acting()
-        self.engagement.heard([self.outcome(CANCELLED, "vaio")])
+        self.end(CANCELLED, "vaio")
         self.assertTrue(self.engagement.is_over)
         self.assertEqual(self.events, ["halted"])
         self.assertIsNone(self.engagement.step())
@@ -277,14 +277,14 @@ class EngagementTests(SynchronousTestCase):
     def test_own_report_from_the_network_is_not_a_second_member(self) -> None:
         """The agent's own record that comes back does not count as another's."""
         own = Member(ME.node_id.hex(), "dog1", WAITING, 9.0)
-        self.engagement.heard([Record(group_key("t1"), MEMBER, ME.public, 1, "leased", 1.0, own.packed())])
+        self.hear(own)
         self.see(1.0)
         self.step()
         self.assertEqual(self.engagement.me.why, "dog1, 1.00, best of 1")
 
     def test_unchanged_reports_are_told_once(self) -> None:
         """Deciding the same again tells nobody anything."""
-        self.engagement.heard([self.report(2, 0.5)])
+        self.hear(self.report(2, 0.5))
         self.see(1.0)
         self.step()
         before = len(self.told)

@@ -101,8 +101,11 @@ class SwarmNodeTests(FleetCase):
         fleet.nodes[3].watch_tasks(lambda records: seen.extend(map(task_of, records)))
         group: list[list[Record]] = []
         fleet.nodes[3].watch_group("t1", group.append, keep=True)
-        for node in fleet.nodes[1:3]:
-            node.report("t1", Member(node.uuid, node.presence.device.name, "WAITING", 1.0))
+        heard: list[tuple[list[str], Result | None]] = []
+        places = [node.group("t1", lambda *news: None) for node in fleet.nodes[1:3]]
+        places.append(fleet.nodes[3].group("t1", lambda members, end: heard.append(([m.name for m in members], end))))
+        for node, place in zip(fleet.nodes[1:3], places, strict=False):
+            place.report(Member(node.uuid, node.presence.device.name, "WAITING", 1.0))
         fleet.run(1.0)
         self.assertEqual(seen, [task])
         self.assertEqual(
@@ -111,11 +114,13 @@ class SwarmNodeTests(FleetCase):
             if fleet.nodes[1].entangled.identity.public < fleet.nodes[2].entangled.identity.public
             else ["dog2", "dog1"],
         )
-        fleet.nodes[1].withdraw("t1")
-        self.done(fleet, fleet.nodes[2].conclude("t1", Result(COMPLETED, "dog2", 3.0, 1)), 1.0)
+        self.assertEqual((sorted(heard[-1][0]), heard[-1][1]), (["dog1", "dog2"], None))
+        places[0].withdraw()
+        self.done(fleet, places[1].conclude(Result(COMPLETED, "dog2", 3.0, 1)), 1.0)
         fleet.nodes[2].vanish()
         fleet.run(2.0)
         self.assertEqual(outcome_of(group[-1]), Result(COMPLETED, "dog2", 3.0, 1))
+        self.assertEqual(heard[-1], ([], Result(COMPLETED, "dog2", 3.0, 1)))
         self.assertEqual(len(group[-1]), 1)
         self.assertEqual(fleet.nodes[3].store.get(group_key("t1")), group[-1])
         self.assertEqual(len(fleet.nodes[3].store.get(TASKS)), 1)
