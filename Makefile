@@ -22,7 +22,7 @@ DEV     := $(VENV)/.stamp-dev
 BROWSER := $(VENV)/.stamp-browser
 BENCH   := $(VENV)/.stamp-bench
 
-.PHONY: help demo test trials check format cov live schedules browser bench-demo bench-dht api dist clean
+.PHONY: help demo test trials check format cov live schedules browser bench-demo bench-dht bench-takeover api dist clean
 
 help:
 	@echo 'make demo [HEADLESS=1] [SEED=1]       three dogs, a red target and the page; HEADLESS: both experiments, then exit'
@@ -37,6 +37,7 @@ help:
 	@echo 'make browser                          only the tests of the page in Chromium'
 	@echo 'make bench-demo                       what the demonstration costs: memory, datagrams, seconds'
 	@echo 'make bench-dht [NODES=8,32] [SECONDS=5] [PEERS=..]   the peer-to-peer library beside others of its kind'
+	@echo 'make bench-takeover [N=200] [REAL=20]   seconds to take over, for each way to lose who acts'
 	@echo 'make api                              the reference of every class, from the docstrings, in build/api'
 	@echo 'make dist                             sdist and wheel, installed into a fresh environment and asked for help'
 	@echo 'make clean                            remove what the above left behind, the environment included'
@@ -84,6 +85,9 @@ bench-dht: $(BENCH)
 	    --out build/bench-dht.json --plot build/bench-dht.svg; \
 	if unshare -rn ip link set lo up 2>/dev/null; \
 	then exec unshare -rn sh -c 'ip link set lo up; exec "$$@"' sh "$$@"; else exec "$$@"; fi
+
+bench-takeover: $(RUNTIME)
+	$(PY) -m benchmarks.takeover --count $(if $(filter file,$(origin N)),200,$(N)) --real $(REAL) --seed $(SEED)
 
 api: $(DEV)
 	$(PIP) 'pydoctor>=25.10,<26'

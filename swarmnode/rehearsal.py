@@ -6,31 +6,36 @@ It wires what the front door wires, with the twins in memory of clock, wire and 
 from __future__ import annotations
 
 import random
-from functools import partial
 from typing import Any
 
 from agents.catalogue import DEMO, TASKS
+from drivers.sim.link import MemoryConnector
 from drivers.sim.operator import YardOperator
 from middleware.entangled.clock import HeapClock
 from middleware.entangled.data.memory import MemoryStore
+from middleware.entangled.network.network import Address
 from middleware.entangled.network.switchboard import Switchboard, Weather
 from middleware.settings import Settings
 from sim.demo.trials import main as run_trials
 from sim.scene import loaded
 from sim.yard import Yard
 from swarmnode.assembly import Seams
+from swarmnode.frost import Frost
 from swarmnode.service import NodeService
 from webnode.ledger import state_from
 from webnode.state import Departed
 from webnode.team import TeamDesk
+
+LAN = Weather(delay_s=0.002, jitter_s=0.001)
+"""A quiet network in one house."""
 
 
 class VirtualTeam:
     """A laptop and its dogs; a seed replays them exactly.
 
     What runs is what runs on a robot: the real node, agent, driver, yard and detection.  ``dogs`` are those that are
-    there from the start, the yard has a body for each of ``DOGS``; ``delay`` in seconds and ``loss`` (0 to 1) are those
-    of a datagram.
+    there from the start, the yard has a body for each of ``DOGS``; ``others`` are nodes without a body, which join
+    before the dogs; ``weather`` is that of every link.
     """
 
     BOOTSTRAP = "vaio"
@@ -41,19 +46,21 @@ class VirtualTeam:
         self,
         seed: int,
         camera_fps: float = 10.0,
-        delay: float = 0.002,
-        loss: float = 0.0,
+        weather: Weather = LAN,
         dogs: tuple[str, ...] = DOGS,
+        others: tuple[str, ...] = (),
     ) -> None:
         self.clock = HeapClock()
-        weather = Weather(delay_s=delay, jitter_s=delay / 2, loss=loss)
         self.board = Switchboard(self.clock, random.Random(f"{seed}/board"), weather)
         self.yard = Yard(self.clock, random.Random(f"{seed}/yard"), loaded("three-dogs"))
         self.yard.start()
         self.services: dict[str, NodeService] = {}
+        self.frosts: dict[str, Frost] = {}
+        self.connectors: dict[str, MemoryConnector] = {}
+        self._names = (self.BOOTSTRAP, *self.DOGS, *others)
         self._seed = seed
         self._fps = camera_fps
-        for name in (self.BOOTSTRAP, *dogs):
+        for name in (self.BOOTSTRAP, *others, *dogs):
             self.add(name)
             self.clock.advance(self.JOINING)
         self._operator = YardOperator(self.yard.connector(), self.clock)
@@ -63,24 +70,30 @@ class VirtualTeam:
         self.clock.advance(self.JOINING)
 
     def add(self, name: str) -> None:
-        """Start the node ``name``, the laptop or one of the dogs."""
-        place = (self.BOOTSTRAP, *self.DOGS).index(name)
-        port = 7000 + place
+        """Start the node ``name``, the laptop, one of the dogs or of the others."""
+        port = self.address(name).port
         mapping: dict[str, Any] = {"node": {"name": name, "port": port, "team_key": str(self._seed)}}
-        if place:
-            mapping["node"]["known_nodes"] = ["127.0.0.1:7000"]
+        if name != self.BOOTSTRAP:
+            mapping["node"]["known_nodes"] = [str(self.address(self.BOOTSTRAP))]
+        if name in self.DOGS:
             mapping["agent"] = {"module": "search"}
             mapping["driver"] = {"kind": "sim", "options": {"robot": name, "camera_fps": self._fps}}
+        frost = self.frosts[name] = Frost(self.clock)
+        connector = self.connectors[name] = self.yard.connector()
         seams = Seams(
-            self.clock,
-            partial(self.board.network, "127.0.0.1", port),
+            frost,
+            lambda: frost.network(self.board.network(*self.address(name))),
             MemoryStore(),
             random.Random(f"{self._seed}/{name}"),
             self.clock.seconds,
-            self.yard.connector(),
+            frost.connector(connector),
         )
         self.services[name] = NodeService(Settings.from_mapping(mapping, f"seed {self._seed}"), seams)
         self.services[name].startService()
+
+    def address(self, name: str) -> Address:
+        """Where the node ``name`` listens."""
+        return Address("127.0.0.1", 7000 + self._names.index(name))
 
     def run_demo(self) -> str:
         """Press the Run Demo button; returns the task's id."""
@@ -101,6 +114,20 @@ class VirtualTeam:
     def kill(self, name: str) -> None:
         """End a node as SIGKILL does: without a word to anybody."""
         self.services[name].vanish()
+
+    def freeze(self, name: str) -> None:
+        """Stop a node as SIGSTOP does; its body is another machine, and goes on."""
+        self.frosts[name].freeze()
+
+    def thaw(self, name: str) -> None:
+        """Let a frozen node go on."""
+        self.frosts[name].thaw()
+
+    def silence(self, name: str, one_way: bool = False) -> None:
+        """Let nothing pass between a node and the others; ``one_way``: it still hears them."""
+        for other in self._names:
+            if other != name:
+                self.board.cut(self.address(name), self.address(other), one_way)
 
     def stop(self) -> None:
         """End everything."""

@@ -74,7 +74,7 @@ class LoopTests(SynchronousTestCase):
         """A link that breaks while the motors are switched on is tried again until the robot is awake."""
         self.team.add("dog3")
         service = self.team.services["dog3"]
-        connector = service._seams.connector
+        connector = self.team.connectors["dog3"]
         driver: Any = service.assembly.driver
         while driver.state == "connecting" or not connector.links:
             self.team.clock.advance(0.0005)

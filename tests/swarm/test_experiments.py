@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
@@ -11,7 +12,7 @@ from twisted.trial.unittest import SynchronousTestCase
 from drivers.sim.link import MemoryLink
 from sim.demo.experiment import FOOTPRINT_M, TOUCH_M
 from sim.demo.trials import trial
-from swarmnode.rehearsal import VirtualTeam
+from swarmnode.rehearsal import LAN, VirtualTeam
 
 LOOK_S = 0.05
 
@@ -21,7 +22,7 @@ class TeamTests(SynchronousTestCase):
 
     def team(self, seed: int = 3, dogs: tuple[str, ...] = VirtualTeam.DOGS, loss: float = 0.0) -> VirtualTeam:
         """A team that ends with the test."""
-        team = VirtualTeam(seed, loss=loss, dogs=dogs)
+        team = VirtualTeam(seed, weather=replace(LAN, loss=loss), dogs=dogs)
         self.addCleanup(team.stop)
         return team
 
@@ -262,7 +263,7 @@ class WeatherTests(TeamTests):
         team = self.team()
         driver = team.services["dog1"].assembly.driver
         assert driver is not None
-        connector = team.services["dog1"]._seams.connector
+        connector = team.connectors["dog1"]
         link = next(one for one in connector.links if isinstance(one, MemoryLink))
         garbage = [bytes([n % 256]) * 37 for n in range(0, 256, 5)] + [b"\xff" * 400, b"\x00" * 400]
         team.run_demo()
@@ -280,7 +281,7 @@ class WeatherTests(TeamTests):
         team.run_demo()
         self.until(team, lambda: bool(self.executing(team)))
         first = self.executing(team)[0]
-        connector = team.services[first]._seams.connector
+        connector = team.connectors[first]
         connector.is_open = False
         connector.cut()
         self.until(team, lambda: self.executing(team) not in ([], [first]), 20.0)

@@ -1,0 +1,1 @@
+"""How long a task stands still when who does it is lost, by cause."""

@@ -1,0 +1,106 @@
+"""``make bench-takeover``: how long a task stands still when who does it is lost, for each cause.
+
+``--count`` trials of each cause in virtual time, at ``--loss`` of the datagrams, and ``--real`` with processes, each
+node in a network namespace of its own.  Prints a table, writes every trial as JSON and the histograms as SVG.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import os
+import sys
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import suppress
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from twisted.internet.defer import Deferred
+from twisted.internet.task import react
+
+from benchmarks.takeover.cause import Cause, Trial
+from benchmarks.takeover.lan import within
+from benchmarks.takeover.rehearsed import trial
+from benchmarks.takeover.report import drawn, table
+
+INSIDE = "--inside"
+
+
+def rehearsed(causes: Sequence[Cause], count: int, seed: int, loss: float, jobs: int) -> list[Trial]:
+    """``count`` trials of each cause in virtual time, ``jobs`` at a time."""
+    wanted = [(cause, seed + number) for cause in causes for number in range(count)]
+    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
+        done = pool.map(partial(trial, loss=loss), *zip(*wanted, strict=True)) if wanted else ()
+        return [_told(one) for one in done]
+
+
+def real(causes: Sequence[Cause], count: int, seed: int) -> list[Trial]:
+    """``count`` trials of each cause with processes; to be called inside of ``lan.within``."""
+    from benchmarks.takeover.real import trial as real_trial
+
+    trials = []
+
+    async def run(reactor: Any) -> None:
+        for cause in causes:
+            for number in range(count):
+                trials.append(_told(await real_trial(reactor, cause, seed + number)))
+
+    with suppress(SystemExit):  # how ``react`` says that it is over; what went wrong it has printed
+        react(lambda reactor: Deferred.fromCoroutine(run(reactor)))
+    return trials
+
+
+def _told(one: Trial) -> Trial:
+    took = "never" if one.takeover is None else f"{one.takeover:.2f} s"
+    word = "ok  " if one.held else "FAIL"
+    sys.stdout.write(
+        f"{word} {one.cause} seed {one.seed}: {one.lost or 'nobody'} lost, {one.by or 'nobody'} done, {took}\n"
+    )
+    sys.stdout.flush()
+    return one
+
+
+def main(arguments: Sequence[str] = tuple(sys.argv[1:])) -> int:
+    """The command line; returns 0 where every trial held."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.takeover", description="Seconds to take over, by cause."
+    )
+    parser.add_argument("--count", type=int, default=200, help="trials of each cause in virtual time (%(default)s)")
+    parser.add_argument("--real", type=int, default=0, help="trials of each cause with real processes (%(default)s)")
+    parser.add_argument("--seed", type=int, default=1, help="the first seed")
+    parser.add_argument("--loss", type=float, default=0.1, help="share of datagrams lost in virtual time (%(default)s)")
+    parser.add_argument("--cause", choices=[c.name.lower() for c in Cause], action="append", help="only this one")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="trials at the same time")
+    parser.add_argument("--out", type=Path, default=Path("build"), help="folder for the JSON and the pictures")
+    parser.add_argument(INSIDE, action="store_true", help=argparse.SUPPRESS)
+    given = parser.parse_args(list(arguments))
+    causes = [cause for cause in Cause if not given.cause or cause.name.lower() in given.cause]
+    given.out.mkdir(parents=True, exist_ok=True)
+    if given.inside:
+        real_ones = real(causes, given.real, given.seed)
+        return _reported(real_ones, given.out, "real", f"real processes, {given.real} a cause")
+    worst = 0
+    if given.count:
+        title = f"virtual time, {given.count} a cause, {given.loss:.0%} of the datagrams lost"
+        worst = _reported(
+            rehearsed(causes, given.count, given.seed, given.loss, given.jobs), given.out, "virtual", title
+        )
+    if given.real:
+        worst = max(worst, within(["-m", "benchmarks.takeover", INSIDE, *arguments]))
+    return worst
+
+
+def _reported(trials: Sequence[Trial], folder: Path, name: str, title: str) -> int:
+    file = folder / f"bench-takeover-{name}"
+    file.with_suffix(".json").write_text(json.dumps([asdict(one) for one in trials], indent=1), encoding="utf-8")
+    file.with_suffix(".svg").write_text(drawn(trials), encoding="utf-8")
+    sys.stdout.write(f"\n{title}\n{table(trials)}\n{file}.json, .svg\n")
+    return 0 if all(one.held for one in trials) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,59 @@
+"""Cause: the ways in which the one that acts is lost, and what is counted of each trial."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+WEB, WITNESSES = "page", ("witness1", "witness2")
+"""The nodes beside the bootstrap node and the dogs.  With seven members three may die at once, and four still agree."""
+
+
+class Cause(Enum):
+    """What happens to the dog that acts."""
+
+    CRASH = "crash"
+    FREEZE = "freeze"
+    LOST_RADIO = "lost radio"
+    ONE_WAY_RADIO = "one-way radio"
+    POLITE_LEAVE = "polite leave"
+    TRIPLE_KILL = "triple kill"
+
+
+SAYS = {
+    Cause.CRASH: "its node dies (SIGKILL)",
+    Cause.FREEZE: "its node stands still (SIGSTOP) for two leases and more, and goes on",
+    Cause.LOST_RADIO: "nothing passes between it and the others",
+    Cause.ONE_WAY_RADIO: "it hears the others, and they do not hear it",
+    Cause.POLITE_LEAVE: "its node stops in order",
+    Cause.TRIPLE_KILL: "it, the bootstrap node and the web node die at the same moment",
+}
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What came of one loss.
+
+    ``takeover`` is in seconds from the loss until another dog moves, None where none ever did; ``done`` whether the
+    task was completed, by ``by``; ``overlaps`` counts the looks at which two dogs moved at once, ``zombies`` those at
+    which the lost one moved after another had taken over.
+    """
+
+    cause: str
+    seed: int
+    lost: str
+    by: str
+    done: bool
+    takeover: float | None
+    overlaps: int
+    zombies: int
+
+    @property
+    def held(self) -> bool:
+        """Whether the task was completed by another, and no two ever acted at once."""
+        return self.done and self.by not in ("", self.lost) and self.takeover is not None and not self.bad
+
+    @property
+    def bad(self) -> int:
+        """Looks at which something moved that must not."""
+        return self.overlaps + self.zombies

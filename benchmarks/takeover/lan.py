@@ -1,0 +1,92 @@
+"""Lan: a network namespace for each node and a router between them, whose rules can silence one.
+
+Needs Linux with ``unshare`` and ``ip`` and no privilege: ``python -m benchmarks.takeover --real`` runs itself in a user
+and network namespace of its own, where this process is the router.  A robot's body hangs on the router itself, so that
+a node whose radio is lost keeps its body.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+RULE = "100"
+PORT = 7000
+
+
+def within(arguments: Sequence[str]) -> int:
+    """Run this program's ``arguments`` as the router of a network of its own; returns its exit code."""
+    own = ["unshare", "--user", "--map-root-user", "--net", "--kill-child", "--fork", "--pid", "--mount-proc"]
+    return subprocess.run([*own, sys.executable, *arguments], check=False).returncode
+
+
+class Lan:
+    """Nodes by name, each in a namespace of its own; made inside of ``within``."""
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self._numbers = {name: number for number, name in enumerate(names, start=1)}
+        self._holders: dict[str, subprocess.Popen[bytes]] = {}
+        _ip("link", "set", "lo", "up")
+        Path("/proc/sys/net/ipv4/ip_forward").write_text("1", encoding="ascii")
+        for name in names:
+            self._join(name)
+
+    def host(self, name: str) -> str:
+        """The address of the node ``name``."""
+        return f"10.9.{self._numbers[name]}.2"
+
+    def router(self, name: str) -> str:
+        """The address at which the node ``name`` reaches the router, where its body is."""
+        return f"10.9.{self._numbers[name]}.1"
+
+    def command(self, name: str, arguments: Sequence[str]) -> list[str]:
+        """``arguments`` as a command that runs in the namespace of ``name``."""
+        return ["nsenter", "--net", f"--target={self._holders[name].pid}", *arguments]
+
+    def silence(self, name: str, one_way: bool = False) -> None:
+        """Let nothing pass from a node to the others, and unless ``one_way`` nothing to it."""
+        _ip("rule", "add", "iif", self._link(name), "blackhole", "priority", RULE)
+        for other in self._numbers if not one_way else ():
+            if other != name:
+                _ip("rule", "add", "iif", self._link(other), "to", self.host(name), "blackhole", "priority", RULE)
+
+    def close(self) -> None:
+        """End every namespace, and what still runs in it."""
+        for holder in self._holders.values():
+            holder.kill()
+            holder.wait()
+        for name in self._numbers:
+            subprocess.run(["ip", "link", "delete", self._link(name)], check=False, stderr=subprocess.DEVNULL)
+        while (
+            subprocess.run(["ip", "rule", "del", "priority", RULE], check=False, stderr=subprocess.DEVNULL).returncode
+            == 0
+        ):
+            pass
+
+    def _link(self, name: str) -> str:
+        return f"way{self._numbers[name]}"
+
+    def _join(self, name: str) -> None:
+        holder = self._holders[name] = subprocess.Popen(["unshare", "--net", "sleep", "600"])
+        here = os.readlink("/proc/self/ns/net")
+        while os.readlink(f"/proc/{holder.pid}/ns/net") == here:
+            time.sleep(0.005)
+        link, host, router = self._link(name), self.host(name), self.router(name)
+        _ip("link", "add", link, "type", "veth", "peer", "name", "air", "netns", str(holder.pid))
+        _ip("address", "add", f"{router}/24", "dev", link)
+        _ip("link", "set", link, "up")
+        for words in (
+            ["link", "set", "lo", "up"],
+            ["address", "add", f"{host}/24", "dev", "air"],
+            ["link", "set", "air", "up"],
+            ["route", "add", "default", "via", router],
+        ):
+            subprocess.run(self.command(name, ["ip", *words]), check=True)
+
+
+def _ip(*words: str) -> None:
+    subprocess.run(["ip", *words], check=True)

@@ -1,0 +1,201 @@
+"""Real: one loss with real processes, each node in a network namespace of its own (``lan``)."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import os
+import random
+import signal
+import sqlite3
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from twisted.internet.defer import Deferred
+from twisted.internet.task import deferLater
+
+from benchmarks.takeover.cause import WEB, WITNESSES, Cause, Trial
+from benchmarks.takeover.lan import PORT, Lan
+from drivers.sim.link import TcpConnector
+from drivers.sim.operator import YardOperator
+from middleware.entangled.data.sqlite import read_records
+from middleware.entangled.errors import EntangledError
+from middleware.tasks import COMPLETED, group_key, outcome_of
+from sim.demo.configuration import BOOTSTRAP, DOGS, toml
+from sim.demo.processes import on_leash
+
+YARD_PORT, WEB_PORT = 7400, 8080
+LOOK_S = 0.01
+PHASE_S = (0.2, 2.0)
+FROZEN_S = (3.0, 5.0)
+START_S, LIMIT_S = 60.0, 30.0
+RATE = 31.0
+
+
+class Stalled(Exception):
+    """Something did not happen in time; says what."""
+
+
+class Team:
+    """The processes of one trial: a yard on the router, and the nodes; ``reactor`` says what time it is."""
+
+    def __init__(self, reactor: Any, others: tuple[str, ...], folder: Path, seed: int) -> None:
+        self.web = WEB if WEB in others else BOOTSTRAP
+        self._reactor = reactor
+        self._folder = folder
+        self._names = (BOOTSTRAP, *others, *DOGS)
+        self._lan = Lan(self._names)
+        self._processes: dict[str, subprocess.Popen[bytes]] = {}
+        key = random.Random(seed).randbytes(32).hex()
+        yard = on_leash(["-m", "sim.server", "--host", "0.0.0.0", "--port", str(YARD_PORT), "--seed", str(seed)])
+        self._start("yard", yard)
+        twistd = str(Path(sys.executable).parent / "twistd")
+        for name in self._names:
+            file = folder / f"{name}.toml"
+            file.write_text(self._configuration(name, key), encoding="utf-8")
+            node = on_leash([twistd, "-n", "--pidfile=", "swarm-node", "--config", str(file)])
+            self._start(name, self._lan.command(name, node))
+        self.operator = YardOperator(TcpConnector(reactor), reactor, "127.0.0.1", YARD_PORT, rate=RATE)
+        self.operator.connect().addErrback(lambda _: None)
+
+    def page(self, path: str, body: object = None) -> Any:
+        """Ask the page, or (with a ``body``) tell it something."""
+        connection = http.client.HTTPConnection(self._lan.host(self.web), WEB_PORT, timeout=2.0)
+        try:
+            headers = {"X-Swarm": "1", "Content-Type": "application/json"}
+            if body is None:
+                connection.request("GET", path, headers=headers)
+            else:
+                connection.request("POST", path, json.dumps(body), headers)
+            return json.loads(connection.getresponse().read())
+        finally:
+            connection.close()
+
+    def is_complete(self) -> bool:
+        """Whether the page lists the dogs."""
+        try:
+            here = {device["name"] for device in self.page("/api/state")["devices"]}
+        except (OSError, http.client.HTTPException, ValueError):
+            return False
+        return here >= set(self._names) and self.operator.snapshot is not None
+
+    def moving(self) -> list[str]:
+        """The dogs that move."""
+        snapshot = self.operator.snapshot or {"dogs": ()}
+        return [dog["name"] for dog in snapshot["dogs"] if dog["moving"]]
+
+    def outcome(self, task_id: str, lost: str) -> Any:
+        """How the task ended, as a dog that is left has it in its file; None while it is open."""
+        for name in DOGS:
+            if name != lost:
+                try:
+                    outcome = outcome_of(read_records(self._folder / f"{name}.sqlite", group_key(task_id)))
+                except (EntangledError, sqlite3.Error):
+                    continue
+                if outcome is not None:
+                    return outcome
+        return None
+
+    def lose(self, cause: Cause, name: str) -> None:
+        """Let the dog ``name`` be lost."""
+        match cause:
+            case Cause.CRASH:
+                self._processes[name].kill()
+            case Cause.FREEZE:
+                os.kill(self._processes[name].pid, signal.SIGSTOP)
+            case Cause.LOST_RADIO:
+                self._lan.silence(name)
+            case Cause.ONE_WAY_RADIO:
+                self._lan.silence(name, one_way=True)
+            case Cause.POLITE_LEAVE:
+                self._processes[name].terminate()
+            case Cause.TRIPLE_KILL:
+                for each in (name, BOOTSTRAP, WEB):
+                    self._processes[each].kill()
+
+    def thaw(self, name: str) -> None:
+        """Let a frozen node go on."""
+        os.kill(self._processes[name].pid, signal.SIGCONT)
+
+    def stop(self) -> None:
+        """End everything that this team started."""
+        self.operator.disconnect()
+        for process in self._processes.values():
+            process.kill()
+            process.wait()
+        self._lan.close()
+
+    def _start(self, name: str, command: list[str]) -> None:
+        log = (self._folder / f"{name}.log").open("ab")
+        self._processes[name] = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=log, stderr=log)
+        log.close()
+
+    def _configuration(self, name: str, key: str) -> str:
+        node: dict[str, object] = {
+            "name": name,
+            "host": self._lan.host(name),
+            "port": PORT,
+            "known_nodes": [] if name == BOOTSTRAP else [f"{self._lan.host(BOOTSTRAP)}:{PORT}"],
+            "store": str(self._folder / f"{name}.sqlite"),
+            "team_key": key,
+        }
+        tables: dict[str, Any] = {"node": node}
+        if name == self.web:
+            node["roles"] = ["edge", "web"]
+            tables["web"] = {"host": self._lan.host(name), "port": WEB_PORT}
+        if name in DOGS:
+            options = {"host": self._lan.router(name), "port": YARD_PORT, "robot": name, "camera_fps": 0.1}
+            tables["agent"] = {"module": "search"}
+            tables["driver"] = {"kind": "sim", "options": options}
+        return toml(tables)
+
+
+async def trial(reactor: Any, cause: Cause, seed: int) -> Trial:
+    """Lose the dog that acts in a team of real processes, and watch what the others do."""
+    dice = random.Random(f"takeover/real/{cause.value}/{seed}")
+    with tempfile.TemporaryDirectory(prefix="takeover-") as folder:
+        team = Team(reactor, (WEB, *WITNESSES) if cause is Cause.TRIPLE_KILL else (), Path(folder), seed)
+        try:
+            return await _trial(reactor, cause, seed, team, dice)
+        finally:
+            team.stop()
+
+
+async def _trial(reactor: Any, cause: Cause, seed: int, team: Team, dice: random.Random) -> Trial:
+    await _until(reactor, team.is_complete, "the page does not list all devices", 0.2)
+    task_id = str(team.page("/api/tasks", {"name": "turn-around"})["id"])
+    await _until(reactor, lambda: bool(team.moving()), "no dog goes", LOOK_S)
+    lost = team.moving()[0]
+    await deferLater(reactor, dice.uniform(*PHASE_S))
+    began = time.monotonic()
+    team.lose(cause, lost)
+    thaw_at = began + dice.uniform(*FROZEN_S) if cause is Cause.FREEZE else None
+    takeover, overlaps, zombies, outcome = None, 0, 0, None
+    while (outcome is None and time.monotonic() < began + LIMIT_S) or thaw_at is not None:
+        await deferLater(reactor, LOOK_S)
+        now = time.monotonic()
+        if thaw_at is not None and now >= thaw_at:
+            thaw_at = None
+            team.thaw(lost)
+        moving = team.moving()
+        overlaps += len(moving) > 1
+        if takeover is None:
+            takeover = now - began if any(name != lost for name in moving) else None
+        else:
+            zombies += lost in moving
+            outcome = outcome or team.outcome(task_id, lost)
+    done = outcome is not None and outcome.outcome == COMPLETED
+    return Trial(cause.value, seed, lost, outcome.by if outcome else "", done, takeover, overlaps, zombies)
+
+
+async def _until(reactor: Any, holds: Any, problem: str, pause: float) -> None:
+    end = time.monotonic() + START_S
+    while not holds():
+        if time.monotonic() > end:
+            raise Stalled(f"{problem} after {START_S:g} s")
+        pausing: Deferred[None] = deferLater(reactor, pause)
+        await pausing

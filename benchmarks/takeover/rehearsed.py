@@ -1,0 +1,99 @@
+"""Rehearsed: one loss in virtual time, with the real node, agent, driver and yard (``swarmnode.rehearsal``)."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import replace
+
+from twisted.internet.defer import Deferred
+
+from agents.catalogue import task_named
+from benchmarks.takeover.cause import WEB, WITNESSES, Cause, Trial
+from middleware.entangled.network.switchboard import Weather
+from middleware.entangled.record import Record
+from middleware.tasks import COMPLETED, outcome_of
+from sim.dog import REST
+from swarmnode.rehearsal import VirtualTeam
+
+WEATHER = Weather(delay_s=0.03, jitter_s=0.01)
+"""One way takes 20 to 40 ms, as on a busy wireless network."""
+LOOK_S = 0.01
+PHASE_S = (0.2, 2.0)
+"""Seconds from the first move to the loss: anywhere in a period of renewal, and before the task is done."""
+FROZEN_S = (3.0, 5.0)
+START_S, LIMIT_S, AFTER_S = 20.0, 25.0, 1.0
+
+
+def trial(cause: Cause, seed: int, loss: float = 0.1) -> Trial:
+    """Lose the dog that acts in the team of ``seed``, and watch what the others do.  ``loss`` is that of a datagram."""
+    dice = random.Random(f"takeover/{cause.value}/{seed}")
+    others = (WEB, *WITNESSES) if cause is Cause.TRIPLE_KILL else ()
+    team = VirtualTeam(seed, 0.1, others=others)
+    team.scatter(seed)
+    asker = WEB if others else VirtualTeam.BOOTSTRAP
+    node = team.services[asker].assembly.node
+    task = replace(task_named("turn-around", f"turn{seed}", 0.0), waiting_period=1.0)
+    Deferred.fromCoroutine(node.submit(task))
+    team.board.weather = replace(WEATHER, loss=loss)
+    watcher = team.services[WITNESSES[0] if others else asker].assembly.node
+    group: list[Record] = []
+    watcher.watch_group(task.task_id, lambda records: group.__setitem__(slice(None), records))
+    lost = _until_one_moves(team)
+    if lost is None:
+        team.stop()
+        return Trial(cause.value, seed, "", "", False, None, 0, 0)
+    team.clock.advance(dice.uniform(*PHASE_S))
+    _lose(team, cause, lost)
+    began = team.clock.seconds()
+    thaw_at = began + dice.uniform(*FROZEN_S) if cause is Cause.FREEZE else None
+    takeover, overlaps, zombies, ended = None, 0, 0, None
+    while team.clock.seconds() < (began + LIMIT_S if ended is None else ended + AFTER_S) or thaw_at is not None:
+        team.clock.advance(LOOK_S)
+        now = team.clock.seconds()
+        if thaw_at is not None and now >= thaw_at:
+            thaw_at = None
+            team.thaw(lost)
+        moving = _moving(team)
+        overlaps += len(moving) > 1
+        if takeover is None:
+            takeover = now - began if any(name != lost for name in moving) else None
+        else:
+            zombies += lost in moving
+        outcome = outcome_of(group)
+        if outcome is not None and ended is None:
+            ended = now
+    outcome = outcome_of(group)
+    team.stop()
+    done = outcome is not None and outcome.outcome == COMPLETED
+    return Trial(cause.value, seed, lost, outcome.by if outcome else "", done, takeover, overlaps, zombies)
+
+
+def _moving(team: VirtualTeam) -> list[str]:
+    return [name for name, dog in team.yard.world.dogs.items() if dog.command != REST]
+
+
+def _until_one_moves(team: VirtualTeam) -> str | None:
+    end = team.clock.seconds() + START_S
+    while team.clock.seconds() < end:
+        team.clock.advance(LOOK_S)
+        moving = _moving(team)
+        if moving:
+            return moving[0]
+    return None
+
+
+def _lose(team: VirtualTeam, cause: Cause, name: str) -> None:
+    match cause:
+        case Cause.CRASH:
+            team.kill(name)
+        case Cause.FREEZE:
+            team.freeze(name)
+        case Cause.LOST_RADIO:
+            team.silence(name)
+        case Cause.ONE_WAY_RADIO:
+            team.silence(name, one_way=True)
+        case Cause.POLITE_LEAVE:
+            team.services[name].stopService()
+        case Cause.TRIPLE_KILL:
+            for each in (name, team.BOOTSTRAP, WEB):
+                team.kill(each)

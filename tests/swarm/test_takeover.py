@@ -1,0 +1,62 @@
+"""Whole teams in memory: the dog that acts is lost, in each of the ways of ``make bench-takeover``."""
+
+from __future__ import annotations
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from benchmarks.takeover.cause import Cause, Trial
+from benchmarks.takeover.rehearsed import trial
+from benchmarks.takeover.report import drawn, table
+
+
+class TakeoverTests(SynchronousTestCase):
+    def take_over(self, cause: Cause, seed: int) -> None:
+        """The task is completed by another, soon, and no two ever move."""
+        one = trial(cause, seed)
+        self.assertTrue(one.held, one)
+        self.assertNotEqual(one.by, one.lost)
+        self.assertLess(one.takeover or 99.0, 2.5)
+
+    def test_crash(self) -> None:
+        """A dead node is replaced."""
+        self.take_over(Cause.CRASH, 1)
+
+    def test_freeze(self) -> None:
+        """A node that stands still is replaced, and its robot does nothing when it goes on."""
+        self.take_over(Cause.FREEZE, 1)
+
+    def test_lost_radio(self) -> None:
+        """A node that nobody reaches is replaced, and stops its robot before that."""
+        self.take_over(Cause.LOST_RADIO, 1)
+
+    def test_one_way_radio(self) -> None:
+        """A node that hears and is not heard is replaced, and stops its robot before that."""
+        self.take_over(Cause.ONE_WAY_RADIO, 1)
+
+    def test_polite_leave(self) -> None:
+        """A node that leaves in order is replaced."""
+        self.take_over(Cause.POLITE_LEAVE, 2)
+
+
+class ReportTests(SynchronousTestCase):
+    def trials(self, *seconds: float | None) -> list[Trial]:
+        """Crashes that took so long to be mended."""
+        return [Trial("crash", n, "dog1", "dog2", s is not None, s, 0, 0) for n, s in enumerate(seconds)]
+
+    def test_table_says_who_held_and_whether_the_target_is_reached(self) -> None:
+        """Counts, percentiles and the verdict of each cause stand in its line."""
+        line = table(self.trials(1.0, 1.2, 1.4, None)).splitlines()[1].split()
+        self.assertEqual(line[:7], ["crash", "4", "3", "1.20", "1.40", "1.40", "1.40"])
+        self.assertEqual(line[-1], "yes")
+        self.assertTrue(table(self.trials(1.0, 2.1)).endswith("no"))
+
+    def test_zombie_is_no_success(self) -> None:
+        """A trial in which the lost one moved after the takeover did not hold."""
+        self.assertFalse(Trial("freeze", 1, "dog1", "dog2", True, 1.0, 0, 1).held)
+        self.assertFalse(Trial("freeze", 1, "dog1", "dog1", True, 1.0, 0, 0).held)
+
+    def test_picture_has_a_bar_for_each_tenth(self) -> None:
+        """The highest bar stands where most trials are."""
+        picture = drawn(self.trials(1.01, 1.02, 1.55))
+        self.assertIn('height="60.0"', picture)
+        self.assertIn('height="30.0"', picture)
