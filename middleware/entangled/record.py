@@ -21,6 +21,8 @@ KEY_BYTES = 20
 MAX_VALUE = 2**20
 MAX_NAME = 64
 MAX_SIGNED = 512
+FRAME_BYTES = 160
+"""What a record takes in a message beside its name and value."""
 MAX_TTL = 30 * 86400.0
 TEAM_TTL = 86400.0
 """How long a team record outlives the last word of its owner."""
@@ -65,6 +67,11 @@ class Record:
     def is_tombstone(self) -> bool:
         """Whether this record says that its slot is empty."""
         return self.value is None
+
+    @property
+    def message_bytes(self) -> int:
+        """About how many bytes this record takes in a message; what it takes in a store is ``data.store.weight``."""
+        return len(self.value or b"") + len(self.name.encode()) + FRAME_BYTES
 
     def beats(self, other: Record | None) -> bool:
         """Whether this record holds against ``other`` of the same slot; a total order, so replicas agree."""

@@ -81,6 +81,12 @@ class RecordTest(SynchronousTestCase):
         for one in (record(), record(value=None, lifetime="leased"), record("", value=bytes(MAX_VALUE))):
             self.assertEqual(unpacked(msgpack.unpackb(msgpack.packb(one.packed()))), one)
 
+    def test_message_bytes(self) -> None:
+        """The bytes that a record is said to take in a message are enough for it, and not many more."""
+        for one in (record(), record(value=None), record("ä" * 64, sequence=2**63 - 1), record(value=bytes(20_000))):
+            taken = len(msgpack.packb(one.packed()))
+            self.assertTrue(taken <= one.message_bytes < taken + 40, (taken, one.message_bytes))
+
     def test_limits(self) -> None:
         """Whatever is out of its limits, or of another type, is no record."""
         bad: dict[int, list[object]] = {

@@ -23,7 +23,7 @@ from middleware.entangled.kademlia.distance import distance
 from middleware.entangled.kademlia.overlay import K, Overlay
 from middleware.entangled.kademlia.roster import STRUCK_S
 from middleware.entangled.record import Record, Slot, unpacked
-from middleware.entangled.replication.overlap import GROUPS, PLACES, Overlap, weight
+from middleware.entangled.replication.overlap import GROUPS, PLACES, Overlap
 from middleware.entangled.replication.owner import Owner
 from middleware.entangled.replication.replica import PAGE_BYTES, Replica
 from middleware.entangled.replication.watch import digest_of
@@ -183,9 +183,9 @@ class Handover:
         """Store at ``contact``, page by page; what it has no room for it does without."""
         while records:
             page = [records[0]]
-            size = weight(records[0])
+            size = records[0].message_bytes
             for record in records[1:PLACES]:
-                size += weight(record)
+                size += record.message_bytes
                 if size > PAGE_BYTES:
                     break
                 page.append(record)

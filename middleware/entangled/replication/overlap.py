@@ -14,7 +14,7 @@ from middleware.entangled.errors import Refused
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.overlay import Overlay
 from middleware.entangled.record import Record, Slot
-from middleware.entangled.replication.replica import PAGE_BYTES, RECORD_BYTES, Replica
+from middleware.entangled.replication.replica import PAGE_BYTES, Replica
 from middleware.entangled.replication.watch import digest_of
 from middleware.entangled.wire.endpoint import Endpoint
 
@@ -103,7 +103,7 @@ class Overlap:
             if not (isinstance(place, list) and [type(part) for part in place] == [bytes, bytes, str]):
                 raise Refused("a slot is a key, an owner and a name")
             record = self.held(Slot(*place))
-            size += weight(record)
+            size += 0 if record is None else record.message_bytes
             if page and size > PAGE_BYTES:
                 break
             page.append(None if record is None else [record.packed(), self._replica.left(record)])
@@ -122,8 +122,3 @@ class Overlap:
                 del self._listed[other]  # it may hold what is replaced meanwhile
         self._listed[peer.node_id] = (now, lists)
         return lists
-
-
-def weight(record: Record | None) -> int:
-    """About how many bytes a record takes in a message."""
-    return 0 if record is None else len(record.value or b"") + len(record.name.encode()) + RECORD_BYTES
