@@ -161,13 +161,6 @@ class ReopenTest(SynchronousTestCase):
         with closing(SqliteStore.open(self.mktemp(), 0.0, fresh_epoch=b"12345678")) as told:
             self.assertEqual(told.epoch, b"12345678")
 
-    def test_cached_copies_do_not_come_back(self) -> None:
-        """A cached copy never gets to the file, unless it comes to be held for good."""
-        self.store.put(record("a"), FOREVER, cached=True)
-        self.store.put(record("b"), FOREVER, cached=True)
-        self.store.put(record("b"), FOREVER)
-        self.assertEqual(self.after_restart().get(KEY, cached=True), [record("b")])
-
     def test_large_values(self) -> None:
         """Values as large as a record carries come back byte by byte, and are counted to the byte."""
         kept = [record(str(number), value=bytes([number]) * MAX_VALUE) for number in range(4)]
@@ -280,12 +273,6 @@ class FullDiskTest(SynchronousTestCase):
         self.store.flush()
         self.assertEqual(self.store.trouble, "")
         self.successResultOf(self.store.written())
-
-    def test_copies_are_taken(self) -> None:
-        """What needs no file is not refused for the file's sake."""
-        self.assertTrue(self.store.put(record("copy"), FOREVER, cached=True))
-        self.assertRaises(Unwritable, self.store.put, record("copy"), FOREVER)
-        self.limit(10_000)
 
     def test_read_only(self) -> None:
         """A file that comes to be read-only is like a full disk: refused by name, and well again afterwards."""

@@ -85,8 +85,7 @@ class Replica:
 
     def holds(self, record: Record) -> bool:
         """Whether this very record is held as a replica."""
-        slot = record.slot
-        return self._store.slot(slot) == record and slot not in self.keepsakes and not self._store.is_cached(slot)
+        return self._store.slot(record.slot) == record and record.slot not in self.keepsakes
 
     def keep(self, record: Record, left: float | None = None) -> int:
         """Hold ``record`` if it beats what its slot holds; 0 if it does, else the sequence that holds.
