@@ -133,6 +133,13 @@ def unpacked(fields: object) -> Record | None:
     return Record(key, name, owner, sequence, lifetime, ttl, value, signature) if lawful else None
 
 
+def slot_unpacked(fields: object) -> Slot | None:
+    """The slot that stands in a message as a list of key, owner and name, or None where the fields cannot be one."""
+    if not isinstance(fields, list) or [type(part) for part in fields] != [bytes, bytes, str]:
+        return None
+    return Slot(*fields)
+
+
 class Signed:
     """Remembers which records had a good signature, the last ``MAX_SIGNED`` of them; to check one takes 80 us."""
 

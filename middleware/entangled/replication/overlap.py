@@ -13,7 +13,7 @@ from middleware.entangled.data.store import Store
 from middleware.entangled.errors import Refused
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.overlay import Overlay
-from middleware.entangled.record import Record, Slot
+from middleware.entangled.record import Record, Slot, slot_unpacked
 from middleware.entangled.replication.replica import PAGE_BYTES, Replica
 from middleware.entangled.replication.watch import digest_of
 from middleware.entangled.wire.endpoint import Endpoint
@@ -85,8 +85,8 @@ class Overlap:
         """PLACES: what is held here of a part of the id space (-1: of what only the peer should hold), in order."""
         if not -1 <= group < GROUPS:
             raise Refused(f"a group is a number from -1 to {GROUPS - 1}")
-        cursor = tuple(after)
-        if cursor and [type(part) for part in cursor] != [bytes, bytes, str]:
+        cursor = slot_unpacked(after)
+        if after and cursor is None:
             raise Refused("a page begins after a key, an owner and a name")
         listed_at, lists = self._listed.get(peer.node_id, (-LISTED_S, []))
         if self._clock.seconds() - listed_at >= LISTED_S:
@@ -100,9 +100,10 @@ class Overlap:
         page: list[object] = []
         size = 0
         for place in slots[:PLACES]:
-            if not (isinstance(place, list) and [type(part) for part in place] == [bytes, bytes, str]):
+            slot = slot_unpacked(place)
+            if slot is None:
                 raise Refused("a slot is a key, an owner and a name")
-            record = self.held(Slot(*place))
+            record = self.held(slot)
             size += 0 if record is None else record.message_bytes
             if page and size > PAGE_BYTES:
                 break
