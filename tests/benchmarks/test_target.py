@@ -36,7 +36,7 @@ def row() -> dict[str, dict[str, Any]]:
     """A whole run in which every target is reached."""
     peer = {"remote_get": {"p50": 1.0}, "put": {"p50": 1.0}, "watch": {"p50": 1.0}}
     peer |= {name: {"per_s": 6000.0, "cpu_ms": 1.0} for name in ("gets", "puts")}
-    return {OURS: measured(), OURS_IN_MEMORY: measured(), TORRENT: peer, OPENDHT: peer}
+    return {OURS: measured(), OURS_IN_MEMORY: measured(), TORRENT: peer, OPENDHT: peer | {"put": {"p50": 2.0}}}
 
 
 class TargetTests(SynchronousTestCase):
