@@ -353,7 +353,8 @@ class BadFileTest(SynchronousTestCase):
         Path(path).write_text("a letter to a friend\n" * 100)
         self.refusal(path)
         os.remove(path)
-        SqliteStore.open(path, 0.0).close()
+        with closing(SqliteStore.open(path, 0.0)) as store:
+            self.assertEqual((store.origin, len(store)), ("new", 0))
 
 
 class ReadRecordsTest(SynchronousTestCase):

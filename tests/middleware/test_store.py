@@ -277,7 +277,8 @@ class StoreContract(_Case):
         store.put(record("b", value=None), 60.0)
         before = store.usage
         self.assertRaises(Full, store.put, record("c", value=bytes(400)), FOREVER, now=59.0)
-        self.assertRaises(Full, store.put, record("b", 2, value=bytes(400)), FOREVER, now=59.0)
+        grown = record("b", 2, value=bytes(weight(record("a")) + 5))  # a byte more than there is room for
+        self.assertRaises(Full, store.put, grown, FOREVER, now=59.0)
         self.assertEqual(store.usage, before)
         self.assertEqual(store.slot(record("b").slot), record("b", value=None))
 
@@ -316,9 +317,11 @@ class StoreContract(_Case):
         self.assertEqual(self.store.noted("contacts"), b"")
 
     def test_close_twice(self) -> None:
-        """A store may be closed again."""
-        self.store.close()
-        self.store.close()
+        """A store may be closed again, which changes nothing."""
+        self.store.put(record(), FOREVER)
+        for _ in range(2):
+            self.store.close()
+            self.assertEqual((self.store.records(), self.store.trouble), ([record()], ""))
 
 
 class MemoryStoreTest(StoreContract, SynchronousTestCase):
