@@ -105,8 +105,7 @@ class Reader:
         for answer in answers.values():
             if _is_something(answer.records):
                 return answer.records
-        _check_votes(_votes(answers, voters), voters)
-        return []
+        return self._nothing(answers, voters)
 
     async def newest(self, key: bytes) -> dict[Slot, Record]:
         """What a majority knows of ``key``, tombstones included; raises ``Unavailable``."""
@@ -118,6 +117,11 @@ class Reader:
         newest = newest_of(answer.records for answer in answers.values())
         await self._repair(newest, targets, voters, answers)
         return newest
+
+    def _nothing(self, answers: dict[bytes, Answer], voters: frozenset[bytes]) -> list[Record]:
+        """No records, where a majority says so; raises ``Unavailable`` where they cannot be asked."""
+        _check_votes(_votes(answers, voters), voters)
+        return []
 
     async def _repair(
         self,
@@ -223,8 +227,7 @@ class Reader:
         if not found:
             voters = frozenset(contact.node_id for contact in nearest)
             self._overlay.note_found(key, nearest)
-            _check_votes(_votes(answers, voters), voters)
-            return []
+            return self._nothing(answers, voters)
         without = [contact for contact in nearest if contact.node_id in answers]
         if without and all(record.lifetime == "team" for record in found):
             between = nearest.index(without[0])
