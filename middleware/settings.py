@@ -55,7 +55,7 @@ class NodeSettings:
 
     store_bytes: int = field(default=MAX_BYTES, metadata=setting.whole(100_000, 2**31))
     """Bytes that the records may have together.  More holds more large values; fewer spare memory and card.  What has
-    run out, old tombstones and cached copies make room; then the writer is refused, with figures."""
+    run out and old tombstones make room; then the writer is refused, with figures."""
 
     durable: Durable = field(default="power", metadata=setting.one_of(("power", "crash")))
     """What a stored record has outlived before its writer is told: the loss of ``power``, or only a ``crash`` of the

@@ -42,6 +42,18 @@ def create_app(
     app.config["MAX_CONTENT_LENGTH"] = MAX_BODY
     app.json.sort_keys = False  # type: ignore[attr-defined]
 
+    _guard(app, hosts)
+    _explain(app)
+    _serve_page(app, read)
+    _serve_tasks(app, read, desk, on_reactor)
+    _serve_devices(app, read, desk, on_reactor)
+    _serve_target(app, desk, on_reactor)
+    return app
+
+
+def _guard(app: Flask, hosts: Collection[str]) -> None:
+    """Let in who comes by a name of this machine and from its own page, and send the headers that keep it so."""
+
     @app.before_request
     def admit() -> None:
         host = request.headers.get("Host", "")
@@ -62,6 +74,10 @@ def create_app(
         response.headers.setdefault("Cache-Control", "no-store")
         return response
 
+
+def _explain(app: Flask) -> None:
+    """Answer whatever goes wrong with what, where, and what to do."""
+
     @app.errorhandler(Refusal)
     def refused(error: Refusal) -> tuple[Response, int]:
         return jsonify(error.fields), error.status
@@ -77,6 +93,8 @@ def create_app(
         app.logger.error("%s %s failed", request.method, request.path, exc_info=error)
         return jsonify(Refusal(request.path, "the web node failed", "try again; its log says why").fields), 500
 
+
+def _serve_page(app: Flask, read: Callable[[], State]) -> None:
     @app.get("/")
     def page() -> Response:
         response = app.make_response(render_template("index.html", node=read()["node"]))
@@ -89,10 +107,8 @@ def create_app(
     def state() -> Response:
         return jsonify(read())
 
-    @app.get("/api/devices")
-    def devices() -> Response:
-        return jsonify(read()["devices"])
 
+def _serve_tasks(app: Flask, read: Callable[[], State], desk: Desk, on_reactor: OnReactor) -> None:
     @app.get("/api/tasks")
     def tasks() -> Response:
         return jsonify(read()["tasks"])
@@ -118,6 +134,12 @@ def create_app(
         on_reactor(desk.cancel, task_id)
         return jsonify({"id": task_id}), 202
 
+
+def _serve_devices(app: Flask, read: Callable[[], State], desk: Desk, on_reactor: OnReactor) -> None:
+    @app.get("/api/devices")
+    def devices() -> Response:
+        return jsonify(read()["devices"])
+
     @app.post("/api/message")
     def announce() -> tuple[Response, int]:
         on_reactor(desk.message, "", _words("text", MAX_MESSAGE))
@@ -138,6 +160,8 @@ def create_app(
         on_reactor(desk.disconnect, uuid, seconds)
         return jsonify({"id": uuid, "seconds": seconds}), 202
 
+
+def _serve_target(app: Flask, desk: Desk, on_reactor: OnReactor) -> None:
     @app.post("/api/target")
     def move_target() -> tuple[Response, int]:
         x, y = _number("x"), _number("y")
@@ -149,8 +173,6 @@ def create_app(
     def clear_target() -> tuple[Response, int]:
         on_reactor(desk.clear_target)
         return jsonify({}), 202
-
-    return app
 
 
 def _body() -> dict[str, Any]:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 from benchmarks.dht.contestant import OURS, OURS_IN_MEMORY
-from benchmarks.dht.figure import Read, Result, at, joined, slowest
+from benchmarks.dht.figure import LOSSES, PARTS, Read, Result, at, joined, slowest
 
 ENTANGLED_JOIN_MS = 3.4
 ENTANGLED_OUT_MS, ENTANGLED_OUT_DATAGRAMS = 190.0, 520.0
@@ -18,7 +18,12 @@ ENTANGLED_DURABLE_PUTS = 81.0
 LIBP2P_LONG_MS = 92.0
 SLOW_MS = 1000.0
 
+TORRENT, OPENDHT = "libtorrent-free", "opendht-free"
+OPERATIONS = ("put", "get", "gets", "puts")
+
 Row = Mapping[str, Result]
+"""The results of one size of network, by library."""
+Figure = Callable[[Row], float | None]
 
 
 class Limit(NamedTuple):
@@ -55,111 +60,158 @@ class Verdict(NamedTuple):
         return False if False in held else None if None in held else True
 
 
-def verdicts(row: Row) -> list[Verdict]:
-    """All fourteen, for the results of one size of network."""
-    ours: Result = row.get(OURS) or row.get(OURS_IN_MEMORY) or {}
+class Wanted(NamedTuple):
+    """Which figure of a row must not be above (``most``), or else not below, which bound."""
 
-    def peer(read: Read, *names: str, factor: float, best: Callable[..., float] = min) -> float | None:
+    what: str
+    figure: Figure
+    bound: Figure | float
+    most: bool = True
+
+    def limit(self, row: Row) -> Limit:
+        """The limit, with the figures of ``row``."""
+        bound = self.bound if isinstance(self.bound, float) else self.bound(row)
+        return Limit(self.what, self.figure(row), bound, self.most)
+
+
+class Target(NamedTuple):
+    """What is wanted, all of it, under one title."""
+
+    title: str
+    wanted: tuple[Wanted, ...]
+
+
+# -- what figures are read from -------------------------------------------------------------------------------------
+
+
+def own(row: Row) -> Result:
+    """Our results in ``row``: with SQLite, else in memory."""
+    return row.get(OURS) or row.get(OURS_IN_MEMORY) or {}
+
+
+def ours(read: Read) -> Figure:
+    """The figure that ``read`` finds in our results."""
+    return lambda row: read(own(row))
+
+
+def peer(read: Read, *names: str, factor: float) -> Figure:
+    """``factor`` times the least figure that ``read`` finds in the results of the libraries ``names``."""
+
+    def least(row: Row) -> float | None:
         found = [value for name in names if (value := read(row.get(name, {}))) is not None]
-        return factor * best(found) if found else None
+        return factor * min(found) if found else None
 
-    torrent, opendht = "libtorrent-free", "opendht-free"
-    remote, put, gets, puts = at("remote_get", "p50"), at("put", "p50"), at("gets", "per_s"), at("puts", "per_s")
-    get_cpu, put_cpu, watch, long = (
-        at("gets", "cpu_ms"),
-        at("puts", "cpu_ms"),
-        at("watch", "p50"),
-        at("long", "put", "p50"),
-    )
-    in_memory = put(row.get(OURS_IN_MEMORY, {}))
-    race, wake = ours.get("space", {}).get("race", {}), at("space", "wake", "lost")
-    gone = [(loss, part) for loss in ("killed", "silent") for part in ("a quarter", "a half")]
-    failed = sum(ours[name]["failed"] for name in ("put", "get", "gets", "puts") if name in ours)
-    nothing_done = [
-        name for name in ("put", "get", "gets", "puts") if name in ours and ours[name]["tried"] == ours[name]["failed"]
-    ] + [name for name in ("silent", "killed") if "trouble" in ours.get(name, {})]
-    lost = [v for g in gone if (v := at(*g, "found_percent")(ours)) is not None]
-    kept = min(lost) if len(lost) == len(gone) else None
+    return least
+
+
+def idle_phases(result: Result) -> float | None:
+    """How many phases came to nothing: every operation failed, or the losses could not be tried."""
+    idle = [name for name in OPERATIONS if name in result and result[name]["tried"] == result[name]["failed"]]
+    stuck = [loss for loss in LOSSES if "trouble" in result.get(loss, {})]
+    return float(len(idle) + len(stuck)) if result else None
+
+
+def failed(result: Result) -> float | None:
+    """How many operations failed while all nodes were well."""
+    return float(sum(result[name]["failed"] for name in OPERATIONS if name in result)) if result else None
+
+
+def found_after_losses(result: Result) -> float | None:
+    """The least share of keys found after any of the losses, in percent; None where not all were tried."""
+    found = [at(loss, part, "found_percent")(result) for loss in LOSSES for part in PARTS]
+    known = [value for value in found if value is not None]
+    return min(known) if len(known) == len(found) else None
+
+
+# -- the targets ----------------------------------------------------------------------------------------------------
+
+_REMOTE, _PUT, _GETS, _PUTS = at("remote_get", "p50"), at("put", "p50"), at("gets", "per_s"), at("puts", "per_s")
+_GET_CPU, _PUT_CPU, _WATCH = at("gets", "cpu_ms"), at("puts", "cpu_ms"), at("watch", "p50")
+
+TARGETS = (
+    Target("remote get", (Wanted("p50 ms", ours(_REMOTE), peer(_REMOTE, TORRENT, factor=0.9)),)),
+    Target("put, a majority acked", (Wanted("p50 ms", ours(_PUT), peer(_PUT, TORRENT, OPENDHT, factor=0.9)),)),
+    Target("gets/s", (Wanted("gets/s", ours(_GETS), peer(_GETS, TORRENT, factor=1.2), most=False),)),
+    Target("puts/s", (Wanted("puts/s", ours(_PUTS), peer(_PUTS, OPENDHT, factor=1.4), most=False),)),
+    Target(
+        "datagrams",
+        (
+            Wanted("a remote get", ours(at("remote_get", "datagrams")), 3.0),
+            Wanted("a put", ours(at("put", "datagrams")), 18.0),
+        ),
+    ),
+    Target(
+        "CPU of all nodes",
+        (
+            Wanted("ms a get", ours(_GET_CPU), peer(_GET_CPU, TORRENT, factor=0.8)),
+            Wanted("ms a put", ours(_PUT_CPU), peer(_PUT_CPU, OPENDHT, factor=0.8)),
+        ),
+    ),
+    Target("join (Entangled 2011)", (Wanted("ms", ours(joined), ENTANGLED_JOIN_MS),)),
+    Target(
+        "a half silent",
+        (
+            Wanted("found %", ours(at("silent", "a half", "found_percent")), 100.0, most=False),
+            Wanted("p95 ms", ours(at("silent", "a half", "p95")), 20.0),
+            Wanted("max ms", ours(at("silent", "a half", "max")), 60.0),
+        ),
+    ),
+    Target(
+        "always done, within 1 s",
+        (
+            Wanted("phases with nothing done", ours(idle_phases), 0.0),
+            Wanted("operations failed", ours(failed), 0.0),
+            Wanted("found % after losses", ours(found_after_losses), 100.0, most=False),
+            Wanted("slowest ms", ours(slowest), SLOW_MS),
+        ),
+    ),
+    Target(
+        "watch",
+        (
+            Wanted("p50 ms", ours(_WATCH), peer(_WATCH, OPENDHT, factor=0.8)),
+            Wanted("lost", ours(at("watch", "lost")), 0.0),
+        ),
+    ),
+    Target(
+        "tuple put (Entangled 2011)",
+        (
+            Wanted("p50 ms", ours(at("space", "put", "p50")), ENTANGLED_OUT_MS / 35),
+            Wanted("datagrams", ours(at("space", "put", "datagrams")), ENTANGLED_OUT_DATAGRAMS / 10),
+        ),
+    ),
+    Target(
+        "tuples are there, taken once",
+        (
+            Wanted("found %", ours(at("space", "crowd", "found_percent")), 100.0, most=False),
+            Wanted(
+                "races with one winner",
+                ours(at("space", "race", "single_winner")),
+                ours(at("space", "race", "of")),
+                most=False,
+            ),
+            Wanted("wake-ups lost", ours(at("space", "wake", "lost")), 0.0),
+        ),
+    ),
+    Target(
+        "1 MiB (libp2p)",
+        (
+            Wanted("put p50 ms", ours(at("long", "put", "p50")), LIBP2P_LONG_MS),
+            Wanted("failed at 5 % loss", ours(at("long_lossy", "failed")), 0.0),
+        ),
+    ),
+    Target(
+        "durable put",
+        (
+            Wanted("p50 ms", ours(_PUT), peer(_PUT, OURS_IN_MEMORY, factor=1.2)),
+            Wanted("puts/s", peer(_PUTS, OURS, factor=1.0), 20 * ENTANGLED_DURABLE_PUTS, most=False),
+        ),
+    ),
+)
+
+
+def verdicts(row: Row) -> list[Verdict]:
+    """What became of all fourteen, for the results of one size of network."""
     return [
-        Verdict(1, "remote get", [Limit("p50 ms", remote(ours), peer(remote, torrent, factor=0.9))]),
-        Verdict(2, "put, a majority acked", [Limit("p50 ms", put(ours), peer(put, torrent, opendht, factor=0.9))]),
-        Verdict(3, "gets/s", [Limit("gets/s", gets(ours), peer(gets, torrent, factor=1.2), most=False)]),
-        Verdict(4, "puts/s", [Limit("puts/s", puts(ours), peer(puts, opendht, factor=1.4), most=False)]),
-        Verdict(
-            5,
-            "datagrams",
-            [
-                Limit("a remote get", at("remote_get", "datagrams")(ours), 3.0),
-                Limit("a put", at("put", "datagrams")(ours), 18.0),
-            ],
-        ),
-        Verdict(
-            6,
-            "CPU of all nodes",
-            [
-                Limit("ms a get", get_cpu(ours), peer(get_cpu, torrent, factor=0.8)),
-                Limit("ms a put", put_cpu(ours), peer(put_cpu, opendht, factor=0.8)),
-            ],
-        ),
-        Verdict(7, "join (Entangled 2011)", [Limit("ms", joined(ours), ENTANGLED_JOIN_MS)]),
-        Verdict(
-            8,
-            "a half silent",
-            [
-                Limit("found %", at("silent", "a half", "found_percent")(ours), 100.0, most=False),
-                Limit("p95 ms", at("silent", "a half", "p95")(ours), 20.0),
-                Limit("max ms", at("silent", "a half", "max")(ours), 60.0),
-            ],
-        ),
-        Verdict(
-            9,
-            "always done, within 1 s",
-            [
-                Limit("phases with nothing done", float(len(nothing_done)) if ours else None, 0.0),
-                Limit("operations failed", float(failed) if ours else None, 0.0),
-                Limit("found % after losses", kept, 100.0, most=False),
-                Limit("slowest ms", slowest(ours), SLOW_MS),
-            ],
-        ),
-        Verdict(
-            10,
-            "watch",
-            [
-                Limit("p50 ms", watch(ours), peer(watch, opendht, factor=0.8)),
-                Limit("lost", at("watch", "lost")(ours), 0.0),
-            ],
-        ),
-        Verdict(
-            11,
-            "tuple put (Entangled 2011)",
-            [
-                Limit("p50 ms", at("space", "put", "p50")(ours), ENTANGLED_OUT_MS / 35),
-                Limit("datagrams", at("space", "put", "datagrams")(ours), ENTANGLED_OUT_DATAGRAMS / 10),
-            ],
-        ),
-        Verdict(
-            12,
-            "tuples are there, taken once",
-            [
-                Limit("found %", at("space", "crowd", "found_percent")(ours), 100.0, most=False),
-                Limit("races with one winner", race.get("single_winner"), race.get("of"), most=False),
-                Limit("wake-ups lost", wake(ours), 0.0),
-            ],
-        ),
-        Verdict(
-            13,
-            "1 MiB (libp2p)",
-            [
-                Limit("put p50 ms", long(ours), LIBP2P_LONG_MS),
-                Limit("failed at 5 % loss", at("long_lossy", "failed")(ours), 0.0),
-            ],
-        ),
-        Verdict(
-            14,
-            "durable put",
-            [
-                Limit("p50 ms", put(ours), None if in_memory is None else 1.2 * in_memory),
-                Limit("puts/s", puts(row.get(OURS, {})), 20 * ENTANGLED_DURABLE_PUTS, most=False),
-            ],
-        ),
+        Verdict(number, target.title, [wanted.limit(row) for wanted in target.wanted])
+        for number, target in enumerate(TARGETS, 1)
     ]

@@ -21,6 +21,8 @@ KEY_BYTES = 20
 MAX_VALUE = 2**20
 MAX_NAME = 64
 MAX_SIGNED = 512
+FRAME_BYTES = 160
+"""What a record takes in a message beside its name and value."""
 MAX_TTL = 30 * 86400.0
 TEAM_TTL = 86400.0
 """How long a team record outlives the last word of its owner."""
@@ -65,6 +67,11 @@ class Record:
     def is_tombstone(self) -> bool:
         """Whether this record says that its slot is empty."""
         return self.value is None
+
+    @property
+    def message_bytes(self) -> int:
+        """About how many bytes this record takes in a message; what it takes in a store is ``data.store.weight``."""
+        return len(self.value or b"") + len(self.name.encode()) + FRAME_BYTES
 
     def beats(self, other: Record | None) -> bool:
         """Whether this record holds against ``other`` of the same slot; a total order, so replicas agree."""
@@ -124,6 +131,13 @@ def unpacked(fields: object) -> Record | None:
         and len(signature) == 64
     )
     return Record(key, name, owner, sequence, lifetime, ttl, value, signature) if lawful else None
+
+
+def slot_unpacked(fields: object) -> Slot | None:
+    """The slot that stands in a message as a list of key, owner and name, or None where the fields cannot be one."""
+    if not isinstance(fields, list) or [type(part) for part in fields] != [bytes, bytes, str]:
+        return None
+    return Slot(*fields)
 
 
 class Signed:

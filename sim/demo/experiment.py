@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from sim.demo.story import present
+from sim.scene import FOOTPRINT
 
 MOVED_M = 0.10
 """The dog is killed when it has come this much nearer to the target, or half its way where that is less."""
@@ -19,7 +20,6 @@ TOUCH_M = 0.15
 """The gap between the dog's footprint and the target that still counts as having reached it."""
 SAME_M = 0.05
 """Two distances that differ by less are the same to a robot's sensor."""
-FOOTPRINT_M = 0.12
 LIMIT_S = 150.0
 
 State = Mapping[str, Any]
@@ -84,7 +84,7 @@ class Experiment:
             target = (snapshot or {}).get("target") or {}
             for name in executing:
                 began = self._decided[name].get(name, 0.0)
-                way = began - float(target.get("radius", 0.0)) - FOOTPRINT_M - TOUCH_M
+                way = began - float(target.get("radius", 0.0)) - FOOTPRINT - TOUCH_M
                 if began - distances.get(name, math.inf) >= min(MOVED_M, max(0.0, way) / 2):
                     self.killed, self._killed_at = name, now
                     return name
@@ -99,7 +99,7 @@ class Experiment:
             self.by = str(result.get("by", ""))
             target = (snapshot or {}).get("target")
             if target and self.by in distances:
-                self.gap_m = distances[self.by] - float(target["radius"]) - FOOTPRINT_M
+                self.gap_m = distances[self.by] - float(target["radius"]) - FOOTPRINT
         elif now - self._started > LIMIT_S:
             self._end = f"out of time, task {status}"
         return bool(self._end)

@@ -118,7 +118,7 @@ class VisionTests(SynchronousTestCase):
         studio.target(1.0)
         whole = studio.camera.jpeg(studio.world.dogs["dog1"])
         for end in range(0, len(whole), 61):
-            find_target(whole[:end], SIZE)
+            self.assertIsInstance(find_target(whole[:end], SIZE), Sighting | None)
 
     def test_few_red_pixels_are_noise(self) -> None:
         """A red speck is not a target."""

@@ -100,9 +100,10 @@ class CodecTests(SynchronousTestCase):
         @example(payload("hello", 1, "dog1", 15.0) + b"more")
         def check(data: bytes) -> None:
             try:
-                decoded(data)
+                message = decoded(data)
             except BadFrame:
                 return
+            self.assertIsInstance(message, Message)
 
         check()
 
@@ -151,12 +152,13 @@ class FrameReaderTests(SynchronousTestCase):
         self.assertEqual(list(self.reader.read(self.stream)), MESSAGES)
 
     def test_survives_any_stream(self) -> None:
-        """Any bytes, cut anywhere, raise nothing."""
+        """Any bytes, cut anywhere, give messages or nothing, and raise nothing."""
 
         @given(st.lists(st.binary(max_size=60) | st.sampled_from([MARKER, encoded(Halt()), encoded(Alive())[:5]])))
         def check(chunks: list[bytes]) -> None:
             reader = FrameReader()
             for chunk in chunks:
-                list(reader.read(chunk))
+                for message in reader.read(chunk):
+                    self.assertIsInstance(message, Message)
 
         check()

@@ -45,3 +45,35 @@ class PathCacheTests(SynchronousTestCase):
         self.cache.put(self.key, copied(self.key, MAX_BYTES - 200), 9.0, 0.0)
         self.assertIsNone(self.cache.get(keys[-1], 0.0))
         self.assertIsNotNone(self.cache.get(self.key, 0.0))
+
+    def test_bytes_are_counted(self) -> None:
+        """Copies fill the cache to the byte; beyond, the least recently read one goes, and what goes frees its room."""
+        half = MAX_BYTES // 2 - copied(self.key, 0)[0].message_bytes
+        keys = [hashed_key(str(number)) for number in range(4)]
+        for key in (keys[0], keys[1], keys[1]):
+            self.cache.put(key, copied(key, half), 9.0, 0.0)
+        self.assertEqual(self.held(keys), [0, 1])
+        self.cache.get(keys[0], 0.0)
+        self.cache.put(keys[2], copied(keys[2], half), 9.0, 0.0)
+        self.assertEqual(self.held(keys), [0, 2])
+        self.cache.drop(keys[0])
+        self.cache.drop(keys[0])
+        self.cache.put(keys[3], copied(keys[3], half), 9.0, 0.0)
+        self.assertEqual(self.held(keys), [2, 3])
+        self.cache.get(keys[2], 9.0)
+        self.cache.get(keys[3], 9.0)
+        self.cache.put(self.key, copied(self.key, 2 * half), 9.0, 9.0)
+        self.assertIsNotNone(self.cache.get(self.key, 9.0))
+
+    def test_a_new_copy_replaces_the_old_one(self) -> None:
+        """The copy that came last is the one under its key, for its own time; one that is not kept leaves none."""
+        newer = copied(self.key, 2)
+        self.cache.put(self.key, copied(self.key), 30.0, 0.0)
+        self.cache.put(self.key, newer, 9.0, 0.0)
+        self.assertEqual(self.cache.get(self.key, 8.9), newer)
+        self.cache.put(self.key, copied(self.key, MAX_BYTES), 30.0, 8.9)
+        self.assertIsNone(self.cache.get(self.key, 8.9))
+
+    def held(self, keys: list[bytes]) -> list[int]:
+        """Which of ``keys`` have a copy, by number; each of these is then read, in that order."""
+        return [number for number, key in enumerate(keys) if self.cache.get(key, 0.0) is not None]

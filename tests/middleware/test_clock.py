@@ -24,8 +24,8 @@ class HeapClockTests(SynchronousTestCase):
 
     def test_provides_interfaces(self) -> None:
         """Clock and call provide what Twisted's interfaces ask for."""
-        verifyObject(IReactorTime, self.clock)
-        verifyObject(IDelayedCall, self.clock.callLater(1, self.called.append, 1))
+        self.assertTrue(verifyObject(IReactorTime, self.clock))
+        self.assertTrue(verifyObject(IDelayedCall, self.clock.callLater(1, self.called.append, 1)))
 
     def test_calls_in_order(self) -> None:
         """Calls come by time, and at the same time in the order in which they were scheduled."""

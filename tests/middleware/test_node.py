@@ -518,9 +518,10 @@ class JoinTests(NodeCase):
             node = fleet.made(1)
             fleet.nodes.append(node)
             joined = fleet.enter(node, [fleet.address(9)])
-            joined.addErrback(lambda failure: failure.trap(NotRunning))
             fleet.run(seconds)
+            self.assertNoResult(joined)
             node.stop()
+            self.failureResultOf(joined, NotRunning)
 
     def test_rejoin_through_remembered_contacts(self) -> None:
         """A restarted node finds the team by those it remembers, though the node that it is told to join by is dead."""

@@ -10,7 +10,16 @@ from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled import record as records
-from middleware.entangled.record import MAX_NAME, MAX_TTL, MAX_VALUE, Record, Signed, hashed_key, unpacked
+from middleware.entangled.record import (
+    MAX_NAME,
+    MAX_TTL,
+    MAX_VALUE,
+    Record,
+    Signed,
+    hashed_key,
+    slot_unpacked,
+    unpacked,
+)
 from tests.middleware.test_store import CAT, DOG, KEY, record
 
 ANYTHING = st.recursive(
@@ -81,6 +90,12 @@ class RecordTest(SynchronousTestCase):
         for one in (record(), record(value=None, lifetime="leased"), record("", value=bytes(MAX_VALUE))):
             self.assertEqual(unpacked(msgpack.unpackb(msgpack.packb(one.packed()))), one)
 
+    def test_message_bytes(self) -> None:
+        """The bytes that a record is said to take in a message are enough for it, and not many more."""
+        for one in (record(), record(value=None), record("ä" * 64, sequence=2**63 - 1), record(value=bytes(20_000))):
+            taken = len(msgpack.packb(one.packed()))
+            self.assertTrue(taken <= one.message_bytes < taken + 40, (taken, one.message_bytes))
+
     def test_limits(self) -> None:
         """Whatever is out of its limits, or of another type, is no record."""
         bad: dict[int, list[object]] = {
@@ -107,6 +122,20 @@ class RecordTest(SynchronousTestCase):
     def test_total(self, fields: object) -> None:
         """Anything a message can hold is a record or is not; nothing makes an accident."""
         self.assertTrue(unpacked(fields) is None or isinstance(unpacked(fields), Record))
+
+    def test_slots(self) -> None:
+        """A slot that was sent as a list comes back; what is no list of a key, an owner and a name is no slot."""
+        self.assertEqual(slot_unpacked(list(record().slot)), record().slot)
+        wrong: list[object] = [
+            [],
+            [KEY, DOG.public],
+            [KEY, DOG.public, b"a"],
+            [KEY, 1, "a"],
+            tuple(record().slot),
+            None,
+        ]
+        for fields in wrong:
+            self.assertIsNone(slot_unpacked(fields), fields)
 
     def test_keys_of_texts(self) -> None:
         """The key of a text has 160 bits, is the same everywhere, and another text has another one."""

@@ -86,11 +86,11 @@ class ReplicaTests(SynchronousTestCase):
         self.assertEqual(self.stored(weaker), [1])
 
     def test_holds(self) -> None:
-        """What is held is that very record as a replica: no older one, no cached copy and no keepsake."""
+        """What is held is that very record as a replica: no older one, no copy from the path and no keepsake."""
         self.stored(record(sequence=5))
         self.assertTrue(self.replica.holds(record(sequence=5)))
         self.assertFalse(self.replica.holds(record(sequence=4)))
-        self.store.put(record("cached"), 60.0, cached=True)
+        self.replica.cache.put(KEY, [record("cached")], 60.0, 0.0)
         self.assertFalse(self.replica.holds(record("cached")))
         self.replica.keepsakes.keep(KEY, [record("kept")], 0.0)
         self.assertIsNotNone(self.store.slot(record("kept").slot))

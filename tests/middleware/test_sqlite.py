@@ -54,6 +54,23 @@ class ReopenTest(SynchronousTestCase):
         self.store.close()
         return self.reopened(now)
 
+    def after_a_kill(self, durable: Durable, late: str = "") -> SqliteStore:
+        """The store that another process left, killed when it had flushed 300 records and done ``late``."""
+        self.store.close()
+        child = (
+            "import os, sys\n"
+            "from middleware.entangled.data.sqlite import SqliteStore\n"
+            "from tests.middleware.test_store import record\n"
+            f"store = SqliteStore.open(sys.argv[1], 0.0, durable={durable!r})\n"
+            "for number in range(300): store.put(record(str(number), value=None), 9e9)\n"
+            f"store.flush()\n{late}"
+            "os.kill(os.getpid(), 9)\n"
+        )
+        root = Path(__file__).parents[2]
+        ended = subprocess.run([sys.executable, "-c", child, os.path.abspath(self.path)], cwd=root, check=False)
+        self.assertEqual(ended.returncode, -9)
+        return self.reopened(0.0)
+
     def test_team_records_come_back(self) -> None:
         """After a restart the team records and tombstones are back, to live a whole ttl from then."""
         kept = [record("a"), record("b", sequence=3, value=None), record("c", value=b"")]
@@ -161,13 +178,6 @@ class ReopenTest(SynchronousTestCase):
         with closing(SqliteStore.open(self.mktemp(), 0.0, fresh_epoch=b"12345678")) as told:
             self.assertEqual(told.epoch, b"12345678")
 
-    def test_cached_copies_do_not_come_back(self) -> None:
-        """A cached copy never gets to the file, unless it comes to be held for good."""
-        self.store.put(record("a"), FOREVER, cached=True)
-        self.store.put(record("b"), FOREVER, cached=True)
-        self.store.put(record("b"), FOREVER)
-        self.assertEqual(self.after_restart().get(KEY, cached=True), [record("b")])
-
     def test_large_values(self) -> None:
         """Values as large as a record carries come back byte by byte, and are counted to the byte."""
         kept = [record(str(number), value=bytes([number]) * MAX_VALUE) for number in range(4)]
@@ -179,21 +189,8 @@ class ReopenTest(SynchronousTestCase):
 
     def test_killed_in_the_middle(self) -> None:
         """What was flushed is there after the process was killed with more on its way."""
-        self.store.close()
-        child = (
-            "import os, sys\n"
-            "from middleware.entangled.data.sqlite import SqliteStore\n"
-            "from tests.middleware.test_store import record\n"
-            "store = SqliteStore.open(sys.argv[1], 0.0)\n"
-            "for number in range(300): store.put(record(str(number), value=None), 9e9)\n"
-            "store.flush()\n"
-            "for number in range(300): store.put(record('late' + str(number), value=None), 9e9)\n"
-            "os.kill(os.getpid(), 9)\n"
-        )
-        root = Path(__file__).parents[2]
-        ended = subprocess.run([sys.executable, "-c", child, os.path.abspath(self.path)], cwd=root, check=False)
-        self.assertEqual(ended.returncode, -9)
-        store = self.reopened(0.0)
+        late = "for number in range(300): store.put(record('late' + str(number), value=None), 9e9)\n"
+        store = self.after_a_kill("power", late)
         self.assertEqual({str(number) for number in range(300)} - {r.name for r in store.records()}, set())
 
     def test_how_durable(self) -> None:
@@ -207,20 +204,7 @@ class ReopenTest(SynchronousTestCase):
 
     def test_a_crash_only_store_outlives_a_kill(self) -> None:
         """What was said to be written is there after the process was killed, though no disk was waited for."""
-        self.store.close()
-        child = (
-            "import os, sys\n"
-            "from middleware.entangled.data.sqlite import SqliteStore\n"
-            "from tests.middleware.test_store import record\n"
-            "store = SqliteStore.open(sys.argv[1], 0.0, durable='crash')\n"
-            "for number in range(300): store.put(record(str(number), value=None), 9e9)\n"
-            "store.flush()\n"
-            "os.kill(os.getpid(), 9)\n"
-        )
-        root = Path(__file__).parents[2]
-        ended = subprocess.run([sys.executable, "-c", child, os.path.abspath(self.path)], cwd=root, check=False)
-        self.assertEqual(ended.returncode, -9)
-        self.assertEqual(len(self.reopened(0.0).records()), 300)
+        self.assertEqual(len(self.after_a_kill("crash").records()), 300)
 
     def test_one_node_a_file(self) -> None:
         """A second node is kept off a file that is in use, and let in when the first has gone."""
@@ -280,12 +264,6 @@ class FullDiskTest(SynchronousTestCase):
         self.store.flush()
         self.assertEqual(self.store.trouble, "")
         self.successResultOf(self.store.written())
-
-    def test_copies_are_taken(self) -> None:
-        """What needs no file is not refused for the file's sake."""
-        self.assertTrue(self.store.put(record("copy"), FOREVER, cached=True))
-        self.assertRaises(Unwritable, self.store.put, record("copy"), FOREVER)
-        self.limit(10_000)
 
     def test_read_only(self) -> None:
         """A file that comes to be read-only is like a full disk: refused by name, and well again afterwards."""
@@ -375,7 +353,8 @@ class BadFileTest(SynchronousTestCase):
         Path(path).write_text("a letter to a friend\n" * 100)
         self.refusal(path)
         os.remove(path)
-        SqliteStore.open(path, 0.0).close()
+        with closing(SqliteStore.open(path, 0.0)) as store:
+            self.assertEqual((store.origin, len(store)), ("new", 0))
 
 
 class ReadRecordsTest(SynchronousTestCase):

@@ -155,9 +155,10 @@ class DecoderTests(SynchronousTestCase):
         for one in values:
             task = task_of(record("t1", one))
             if task is not None:
-                refusals({"camera": {"width": 1}}, task.requirements)
-            member_of(record(MEMBER, one))
-            outcome_of([record(RESULT, one)])
+                lacking = refusals({"camera": {"width": 1}}, task.requirements)
+                self.assertTrue(all(isinstance(line, str) for line in lacking), lacking)
+            self.assertIsInstance(member_of(record(MEMBER, one)), Member | None)
+            self.assertIsInstance(outcome_of([record(RESULT, one)]), Result | None)
 
 
 class OutcomeTests(SynchronousTestCase):

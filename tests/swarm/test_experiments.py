@@ -10,8 +10,9 @@ from typing import Any
 from twisted.trial.unittest import SynchronousTestCase
 
 from drivers.sim.link import MemoryLink
-from sim.demo.experiment import FOOTPRINT_M, TOUCH_M
+from sim.demo.experiment import TOUCH_M
 from sim.demo.trials import trial
+from sim.scene import FOOTPRINT
 from swarmnode.rehearsal import LAN, VirtualTeam
 
 LOOK_S = 0.05
@@ -57,7 +58,7 @@ class TeamTests(SynchronousTestCase):
         """Metres between the dog's footprint and the target."""
         dog, target = team.yard.world.dogs[name], team.yard.world.target
         assert target is not None
-        return math.hypot(dog.x - target.x, dog.y - target.y) - target.radius - FOOTPRINT_M
+        return math.hypot(dog.x - target.x, dog.y - target.y) - target.radius - FOOTPRINT
 
 
 class ExperimentTests(SynchronousTestCase):

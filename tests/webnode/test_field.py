@@ -45,4 +45,5 @@ class FieldTests(SynchronousTestCase):
     def test_survive_anything(self, value: object) -> None:
         """Whatever a record holds, the outcome is JSON that a browser can parse, in UTF-8."""
         outcome = [text(value), number(value), count(value), distance(value), texts(value), properties(value)]
-        json.dumps(outcome, allow_nan=False, ensure_ascii=False).encode()
+        sent = json.dumps(outcome, allow_nan=False, ensure_ascii=False).encode()
+        self.assertEqual(json.loads(sent), outcome)

@@ -20,7 +20,6 @@ class _Held:
     record: Record
     expires_at: float
     queued_at: float
-    is_cached: bool
 
 
 class MemoryStore:
@@ -47,14 +46,13 @@ class MemoryStore:
         self._by_owner: dict[bytes, dict[Slot, _Held]] = {}
         # In the order in which they may be let go of.
         self._tombstones: dict[Slot, _Held] = {}
-        self._cached: dict[Slot, _Held] = {}
         self._made_room: list[Record] = []
         self._sorted: dict[bytes, list[_Held]] = {}
         self._heap: list[tuple[float, Slot]] = []
         self._notes: dict[str, bytes] = {}
 
     def __len__(self) -> int:
-        """How many slots are held, the empty and the cached ones included."""
+        """How many slots are held, the empty ones included."""
         return len(self._slots)
 
     @property
@@ -67,7 +65,7 @@ class MemoryStore:
         """Rows and bytes held, and how many may be."""
         return Usage(len(self._slots), self._max_rows, self._bytes, self._max_bytes)
 
-    def put(self, record: Record, expires_at: float, cached: bool = False, now: float | None = None) -> bool:
+    def put(self, record: Record, expires_at: float, now: float | None = None) -> bool:
         """Hold ``record`` if it beats what its slot holds; see ``Store.put``."""
         if now is not None:
             self._now = max(self._now, now)
@@ -77,24 +75,22 @@ class MemoryStore:
         held = self._slots.get(slot)
         if held is not None and not record.beats(held.record):
             if record == held.record:
-                self._stay(held, expires_at, cached)
+                held.expires_at = max(held.expires_at, expires_at)
+                self._sort_in(slot, held)
             return False
-        if held is not None and cached and not held.is_cached:
-            cached, expires_at = False, max(expires_at, held.expires_at)
         self._make_room(record, held)
         if held is None:
-            self._insert(record, expires_at, cached)
+            self._insert(record, expires_at)
         else:
-            self._replace(held, record, expires_at, cached)
-        if not cached:
-            self._changed(slot, record)
+            self._replace(held, record, expires_at)
+        self._changed(slot, record)
         return True
 
     def written(self) -> Deferred[None]:
         """Fire at once: what is in memory gets no safer."""
         return succeed(None)
 
-    def get(self, key: bytes, tombstones: bool = False, cached: bool = False) -> list[Record]:
+    def get(self, key: bytes, tombstones: bool = False) -> list[Record]:
         """The records under ``key``; see ``Store.get``."""
         holding = self._sorted.get(key)
         if holding is None:
@@ -103,20 +99,12 @@ class MemoryStore:
                 return []
             # Large keys are read page by page, so the order is worth keeping between two changes.
             holding = self._sorted[key] = [slots[slot] for slot in sorted(slots)]
-        return [
-            held.record
-            for held in holding
-            if (tombstones or held.record.value is not None) and (cached or not held.is_cached)
-        ]
+        return [held.record for held in holding if tombstones or held.record.value is not None]
 
     def slot(self, slot: Slot) -> Record | None:
-        """What ``slot`` holds, be it a tombstone or a cached copy."""
+        """What ``slot`` holds, be it a tombstone."""
         held = self._slots.get(slot)
         return held.record if held else None
-
-    def is_cached(self, slot: Slot) -> bool:
-        """Whether what ``slot`` holds is a cached copy."""
-        return slot in self._cached
 
     def expiry(self, slot: Slot) -> float | None:
         """When what ``slot`` holds runs out, or None where it holds nothing."""
@@ -126,13 +114,13 @@ class MemoryStore:
     def owned(self, owner: bytes) -> list[Record]:
         """The records of ``owner``, tombstones included, in the order of their slots."""
         slots = self._by_owner.get(owner, {})
-        return [slots[slot].record for slot in sorted(slots) if not slots[slot].is_cached]
+        return [slots[slot].record for slot in sorted(slots)]
 
     def extend(self, owner: bytes, expires_at: float) -> int:
         """Let all leased records of ``owner`` live until ``expires_at`` at least; returns how many there are."""
         leased = 0
         for held in self._by_owner.get(owner, {}).values():
-            if held.record.lifetime == "leased" and not held.is_cached:
+            if held.record.lifetime == "leased":
                 # The heap is not told: it will find out at the old moment and look again at the new one.
                 held.expires_at = max(held.expires_at, expires_at)
                 leased += 1
@@ -146,9 +134,6 @@ class MemoryStore:
 
     def drop_leased(self, owner: bytes) -> list[Record]:
         """Let go of all leased records of ``owner`` and return them in the order of their slots."""
-        for slot in [slot for slot in self._by_owner.get(owner, {}) if slot in self._cached]:
-            if self._slots[slot].record.lifetime == "leased":
-                self._remove(slot)
         return [self._remove(record.slot) for record in self.owned(owner) if record.lifetime == "leased"]
 
     def discard(self, slot: Slot) -> bool:
@@ -159,8 +144,8 @@ class MemoryStore:
         return held
 
     def records(self) -> list[Record]:
-        """Every record held for good, tombstones included, in the order in which their slots came."""
-        return [held.record for held in self._slots.values() if not held.is_cached]
+        """Every record held, tombstones included, in the order in which their slots came."""
+        return [held.record for held in self._slots.values()]
 
     def keys(self) -> list[bytes]:
         """Every key that has a slot, in the order in which they came."""
@@ -199,11 +184,7 @@ class MemoryStore:
                 raise Full(f"store full: it holds {self.usage}, no room for {size} bytes; remove some, or allow more")
             leaving.append(slot)
             rows, size = rows - 1, size - weight(self._slots[slot].record)
-        for slot in leaving:
-            is_cached = slot in self._cached
-            gone = self._remove(slot)
-            if not is_cached:
-                self._made_room.append(gone)
+        self._made_room += [self._remove(slot) for slot in leaving]
 
     def _dispensable(self, spared: Slot) -> Iterator[Slot]:
         """What may be let go of, in that order, but for ``spared``."""
@@ -212,16 +193,15 @@ class MemoryStore:
                 break
             if slot != spared:
                 yield slot
-        yield from (slot for slot in self._cached if slot != spared)
 
     # -- inside ------------------------------------------------------------------------------------------------------
 
     def _changed(self, slot: Slot, record: Record | None) -> None:
-        """Learn that ``slot`` holds ``record`` for good from now on, or nothing."""
+        """Learn that ``slot`` holds ``record`` from now on, or nothing."""
 
-    def _insert(self, record: Record, expires_at: float, cached: bool) -> None:
+    def _insert(self, record: Record, expires_at: float) -> None:
         slot = record.slot
-        held = _Held(record, expires_at, expires_at, cached)
+        held = _Held(record, expires_at, expires_at)
         self._slots[slot] = held
         self._by_key.setdefault(slot.key, {})[slot] = held
         self._by_owner.setdefault(slot.owner, {})[slot] = held
@@ -230,32 +210,17 @@ class MemoryStore:
         self._sort_in(slot, held)
         self._queue(held)
 
-    def _replace(self, held: _Held, record: Record, expires_at: float, cached: bool) -> None:
+    def _replace(self, held: _Held, record: Record, expires_at: float) -> None:
         self._bytes += weight(record) - weight(held.record)
-        held.record, held.expires_at, held.is_cached = record, expires_at, cached
+        held.record, held.expires_at = record, expires_at
         self._sort_in(record.slot, held)
         if expires_at < held.queued_at:
             self._queue(held)
 
-    def _stay(self, held: _Held, expires_at: float, cached: bool) -> None:
-        """Let ``held`` live until ``expires_at`` at least, and for good unless that is for a cached copy."""
-        if cached and not held.is_cached:
-            return
-        held.expires_at = max(held.expires_at, expires_at)
-        becomes_held = held.is_cached and not cached
-        held.is_cached = cached
-        slot = held.record.slot
-        self._sort_in(slot, held)
-        if becomes_held:
-            self._changed(slot, held.record)
-
     def _sort_in(self, slot: Slot, held: _Held) -> None:
-        """Put ``held`` at the end of whichever row it is to wait in until room is needed."""
-        self._cached.pop(slot, None)
+        """Put ``held``, if it is a tombstone, at the end of those that wait until room is needed."""
         self._tombstones.pop(slot, None)
-        if held.is_cached:
-            self._cached[slot] = held
-        elif held.record.is_tombstone:
+        if held.record.is_tombstone:
             self._tombstones[slot] = held
 
     def _run_out(self, now: float) -> list[Record]:
@@ -268,10 +233,7 @@ class MemoryStore:
             if held.expires_at > now:
                 self._queue(held)
             else:
-                is_cached = held.is_cached
-                record = self._remove(slot)
-                if not is_cached:
-                    gone.append((held.expires_at, slot, record))
+                gone.append((held.expires_at, slot, self._remove(slot)))
         # One whose lease was extended comes off the heap at its old moment.
         gone.sort(key=lambda ended: ended[:2])
         return [record for _, _, record in gone]
@@ -294,7 +256,5 @@ class MemoryStore:
         self._sorted.pop(slot.key, None)
         self._bytes -= weight(held.record)
         self._tombstones.pop(slot, None)
-        self._cached.pop(slot, None)
-        if not held.is_cached:
-            self._changed(slot, None)
+        self._changed(slot, None)
         return held.record

@@ -122,12 +122,12 @@ class SqliteStore(MemoryStore):
             store.note(name, value)
         return store
 
-    def put(self, record: Record, expires_at: float, cached: bool = False, now: float | None = None) -> bool:
+    def put(self, record: Record, expires_at: float, now: float | None = None) -> bool:
         """Hold ``record`` if it beats what its slot holds; see ``Store.put``."""
         self._check_open()
-        if not cached and self._writer.trouble and self._is_change(record):
+        if self._writer.trouble and record.beats(self.slot(record.slot)):
             raise self._writer.refusal(self._writer.trouble)
-        return super().put(record, expires_at, cached, now)
+        return super().put(record, expires_at, now)
 
     def written(self) -> Deferred[None]:
         """Fire when all that was put until now is in the file; fail with ``Unwritable`` if it cannot be written."""
@@ -164,7 +164,7 @@ class SqliteStore(MemoryStore):
     def _take_in(self, found: Contents, now: float) -> None:
         """Take in what an earlier life left; only before the writer runs."""
         for record in found.records:
-            self._insert(record, now + record.ttl, cached=False)
+            self._insert(record, now + record.ttl)
         self._notes.update(found.notes)
         self.rotten = found.rotten
         if found.rotten:
@@ -177,10 +177,6 @@ class SqliteStore(MemoryStore):
     def _check_open(self) -> None:
         if self._writer.is_closed:
             raise NotRunning(f"store {self._path} is closed")
-
-    def _is_change(self, record: Record) -> bool:
-        held = self.slot(record.slot)
-        return record.beats(held) or self.is_cached(record.slot)
 
     def _changed(self, slot: Slot, record: Record | None) -> None:
         self._writer.owe(slot, record)

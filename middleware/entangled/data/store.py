@@ -6,11 +6,10 @@ seconds on one clock of the caller, who says when something expires and what the
 Where there is no room for a record, room is made in this order, and no further than is needed:
 
 1. what has run out;
-2. tombstones that are older than ``hold``, the oldest first: whoever was away for longer than that re-joins empty;
-3. cached copies, the oldest first: others hold them for good.
+2. tombstones that are older than ``hold``, the oldest first: whoever was away for longer than that re-joins empty.
 
-What is held for good is never let go of for the sake of something else: if that is not enough, the writer is told
-``Full``, with figures, and nothing has changed but 1.
+Nothing else is ever let go of for the sake of something: if that is not enough, the writer is told ``Full``, with
+figures, and nothing has changed but 1.
 """
 
 from __future__ import annotations
@@ -51,11 +50,7 @@ class Usage(NamedTuple):
 
 
 class Store(Protocol):
-    """What every data store does; one thread uses it.
-
-    A *cached* copy is one that nobody was promised: it is in memory only, may be let go of at any time without a word,
-    and is not seen unless asked for.
-    """
+    """What every data store does; one thread uses it."""
 
     @property
     def epoch(self) -> bytes:
@@ -71,17 +66,16 @@ class Store(Protocol):
 
     @property
     def usage(self) -> Usage:
-        """Rows and bytes held, cached copies and tombstones included, and how many may be."""
+        """Rows and bytes held, tombstones included, and how many may be."""
 
     @property
     def trouble(self) -> str:
         """Why nothing can be written at present; empty if it can."""
 
-    def put(self, record: Record, expires_at: float, cached: bool = False, now: float | None = None) -> bool:
+    def put(self, record: Record, expires_at: float, now: float | None = None) -> bool:
         """Hold ``record`` if it beats what its slot holds, and say whether it did.
 
-        The very record that is already held only stays longer, and for good if it was a cached copy so far.  A slot
-        that is held for good stays so whatever is cached in it.  ``now``: what has run out by then makes room first.
+        The very record that is already held only stays longer.  ``now``: what has run out by then makes room first.
 
         Raises ``Full`` where there is no room, ``Unwritable`` where it cannot be written.  It is safe, and may be
         acknowledged, once ``written`` has fired.
@@ -90,32 +84,23 @@ class Store(Protocol):
     def written(self) -> Deferred[None]:
         """Fire when all that was put until now survives the end of the process; fail with ``Unwritable`` if not."""
 
-    def get(self, key: bytes, tombstones: bool = False, cached: bool = False) -> list[Record]:
-        """The records under ``key`` in the order of (owner, name).
-
-        ``tombstones``: with the empty slots; ``cached``: with the cached copies.
-        """
+    def get(self, key: bytes, tombstones: bool = False) -> list[Record]:
+        """The records under ``key`` in the order of (owner, name); ``tombstones``: with the empty slots."""
 
     def slot(self, slot: Slot) -> Record | None:
-        """What ``slot`` holds, be it a tombstone or a cached copy."""
-
-    def is_cached(self, slot: Slot) -> bool:
-        """Whether what ``slot`` holds is a cached copy."""
+        """What ``slot`` holds, be it a tombstone."""
 
     def expiry(self, slot: Slot) -> float | None:
         """When what ``slot`` holds runs out, or None where it holds nothing."""
 
     def owned(self, owner: bytes) -> list[Record]:
-        """The records of ``owner``, tombstones included and cached copies not, in the order of their slots."""
+        """The records of ``owner``, tombstones included, in the order of their slots."""
 
     def extend(self, owner: bytes, expires_at: float) -> int:
         """Let all leased records of ``owner`` live until ``expires_at`` at least; returns how many there are."""
 
     def expire(self, now: float) -> list[Record]:
-        """Let go of what has run out by ``now``; return it, the earliest first, and before it what had to make room.
-
-        Cached copies go without being told of.
-        """
+        """Let go of what has run out by ``now``; return it, the earliest first, and before it what had to make room."""
 
     def drop_leased(self, owner: bytes) -> list[Record]:
         """Let go of all leased records of ``owner`` (it said goodbye) and return them in the order of their slots."""
@@ -124,10 +109,10 @@ class Store(Protocol):
         """Let go of what ``slot`` holds, whatever its lifetime, and say whether it held anything."""
 
     def records(self) -> list[Record]:
-        """Every record held for good, tombstones included, in the order in which their slots came."""
+        """Every record held, tombstones included, in the order in which their slots came."""
 
     def keys(self) -> list[bytes]:
-        """Every key that has a slot, cached or not, in the order in which they came."""
+        """Every key that has a slot, in the order in which they came."""
 
     def note(self, name: str, value: bytes) -> None:
         """Keep a small fact of the node's own (its seed, its contacts) under ``name``."""
@@ -139,7 +124,7 @@ class Store(Protocol):
         """Write what is to be written and let go; may be called twice."""
 
     def __len__(self) -> int:
-        """How many slots are held, the empty and the cached ones included."""
+        """How many slots are held, the empty ones included."""
 
 
 def weight(record: Record) -> int:

@@ -24,7 +24,7 @@ class PathCache:
 
     def put(self, key: bytes, records: list[Record], ttl: float, now: float) -> None:
         """Keep ``records`` for ``ttl`` seconds, at most ``MAX_AGE``."""
-        size = sum(len(record.value or b"") + len(record.name) + 160 for record in records)
+        size = sum(record.message_bytes for record in records)
         self.drop(key)
         if size > MAX_BYTES or not ttl > 0.0:
             return

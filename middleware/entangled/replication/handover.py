@@ -22,17 +22,15 @@ from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.distance import distance
 from middleware.entangled.kademlia.overlay import K, Overlay
 from middleware.entangled.kademlia.roster import STRUCK_S
-from middleware.entangled.record import Record, Slot, unpacked
-from middleware.entangled.replication.overlap import GROUPS, PLACES, Overlap, weight
-from middleware.entangled.replication.owner import Owner
+from middleware.entangled.record import Record, Slot, slot_unpacked, unpacked
+from middleware.entangled.replication.overlap import GROUPS, PLACES, Overlap
+from middleware.entangled.replication.owner import REPUBLISH, Owner
 from middleware.entangled.replication.replica import PAGE_BYTES, Replica
 from middleware.entangled.replication.watch import digest_of
 from middleware.entangled.wire.endpoint import Endpoint
 
 STEWARDS = 2
 MEND = 10.0
-REPUBLISH = 3600.0
-"""Seconds within which every replica gives on what no other replica gave on (Kademlia, section 2.5)."""
 OUT_OF_TOUCH = STRUCK_S / 2
 """Seconds without a majority in touch after which a node may have been struck, and is sure of nothing."""
 AGAIN = 1.0
@@ -148,14 +146,14 @@ class Handover:
 
     async def _compare(self, contact: Contact, group: int, mine: list[Record]) -> None:
         theirs: dict[Slot, tuple[int, bytes]] = {}
-        after: list[object] = []
+        after: Slot | None = None
         while True:
-            answer = await self._overlay.ask(contact, "places", group, after)
-            places = [place for place in answer if _is_place(place)] if isinstance(answer, list) else []
-            theirs.update({Slot(*place[:3]): (place[3], place[4]) for place in places})
-            if len(places) < PLACES or places[-1][:3] <= after:
+            answer = await self._overlay.ask(contact, "places", group, [] if after is None else list(after))
+            places = [place for place in map(_place, answer) if place is not None] if isinstance(answer, list) else []
+            theirs.update(places)
+            if len(places) < PLACES or (after is not None and places[-1][0] <= after):
                 break
-            after = places[-1][:3]
+            after = places[-1][0]
         wanted = [slot for slot, mark in theirs.items() if mark > _mark(self._overlap.held(slot))]
         await self._fetch(contact, wanted)
         lacked = [record for record in mine if _mark(record) > theirs.get(record.slot, (-1, b""))]
@@ -183,9 +181,9 @@ class Handover:
         """Store at ``contact``, page by page; what it has no room for it does without."""
         while records:
             page = [records[0]]
-            size = weight(records[0])
+            size = records[0].message_bytes
             for record in records[1:PLACES]:
-                size += weight(record)
+                size += record.message_bytes
                 if size > PAGE_BYTES:
                     break
                 page.append(record)
@@ -269,8 +267,9 @@ def _mark(record: Record | None) -> tuple[int, bytes]:
     return (-1, b"") if record is None else (record.sequence, record.signature[:8])
 
 
-def _is_place(place: object) -> bool:
-    if not (isinstance(place, list) and len(place) == 5):
-        return False
-    kinds = [bytes, bytes, str, int, bytes]
-    return all(type(part) is kind for part, kind in zip(place, kinds, strict=True))
+def _place(fields: object) -> tuple[Slot, tuple[int, bytes]] | None:
+    """A slot and the mark of what it holds, as PLACES tells them, or None where the fields cannot be that."""
+    if not isinstance(fields, list) or [type(part) for part in fields[3:]] != [int, bytes]:
+        return None
+    slot = slot_unpacked(fields[:3])
+    return None if slot is None else (slot, (fields[3], fields[4]))

@@ -13,8 +13,8 @@ from middleware.entangled.data.store import Store
 from middleware.entangled.errors import Refused
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.overlay import Overlay
-from middleware.entangled.record import Record, Slot
-from middleware.entangled.replication.replica import PAGE_BYTES, RECORD_BYTES, Replica
+from middleware.entangled.record import Record, Slot, slot_unpacked
+from middleware.entangled.replication.replica import PAGE_BYTES, Replica
 from middleware.entangled.replication.watch import digest_of
 from middleware.entangled.wire.endpoint import Endpoint
 
@@ -85,8 +85,8 @@ class Overlap:
         """PLACES: what is held here of a part of the id space (-1: of what only the peer should hold), in order."""
         if not -1 <= group < GROUPS:
             raise Refused(f"a group is a number from -1 to {GROUPS - 1}")
-        cursor = tuple(after)
-        if cursor and [type(part) for part in cursor] != [bytes, bytes, str]:
+        cursor = slot_unpacked(after)
+        if after and cursor is None:
             raise Refused("a page begins after a key, an owner and a name")
         listed_at, lists = self._listed.get(peer.node_id, (-LISTED_S, []))
         if self._clock.seconds() - listed_at >= LISTED_S:
@@ -100,10 +100,11 @@ class Overlap:
         page: list[object] = []
         size = 0
         for place in slots[:PLACES]:
-            if not (isinstance(place, list) and [type(part) for part in place] == [bytes, bytes, str]):
+            slot = slot_unpacked(place)
+            if slot is None:
                 raise Refused("a slot is a key, an owner and a name")
-            record = self.held(Slot(*place))
-            size += weight(record)
+            record = self.held(slot)
+            size += 0 if record is None else record.message_bytes
             if page and size > PAGE_BYTES:
                 break
             page.append(None if record is None else [record.packed(), self._replica.left(record)])
@@ -122,8 +123,3 @@ class Overlap:
                 del self._listed[other]  # it may hold what is replaced meanwhile
         self._listed[peer.node_id] = (now, lists)
         return lists
-
-
-def weight(record: Record | None) -> int:
-    """About how many bytes a record takes in a message."""
-    return 0 if record is None else len(record.value or b"") + len(record.name.encode()) + RECORD_BYTES

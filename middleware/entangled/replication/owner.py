@@ -29,7 +29,8 @@ Concern = Literal["one", "majority", "all"]
 RETRY = 10.0
 """Seconds between tries to bring a record to replicas that missed it."""
 REPUBLISH = 3600.0
-"""Seconds between two words of an owner about a team record: 24 for each life (Kademlia, section 2.5)."""
+"""Seconds between two words of an owner about a team record: 24 for each life (Kademlia, section 2.5).  Within as many
+every replica gives on what no other one gave on."""
 BEATS_PER_LEASE = 3
 STEPS = 3
 MAX_SEQUENCE = 2**62

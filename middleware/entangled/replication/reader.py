@@ -111,19 +111,16 @@ class Reader:
         """What a majority knows of ``key``, tombstones included; raises ``Unavailable``."""
         targets = await self._overlay.holders(key)
         voters = frozenset(self._overlay.voters(key, targets))
-        needed = len(voters) // 2 + 1
+        needed = _majority(voters)
         answers = await self._asked(key, targets, voters, lambda given: _votes(given, voters) >= needed, width=needed)
-        if _votes(answers, voters) < needed:
-            raise Unavailable(_votes(answers, voters), needed)
+        _check_votes(_votes(answers, voters), voters)
         newest = newest_of(answer.records for answer in answers.values())
         await self._repair(newest, targets, voters, answers)
         return newest
 
     def _nothing(self, answers: dict[bytes, Answer], voters: frozenset[bytes]) -> list[Record]:
         """No records, where a majority says so; raises ``Unavailable`` where they cannot be asked."""
-        votes, needed = _votes(answers, voters), len(voters) // 2 + 1
-        if votes < needed:
-            raise Unavailable(votes, needed)
+        _check_votes(_votes(answers, voters), voters)
         return []
 
     async def _repair(
@@ -140,7 +137,7 @@ class Reader:
                 if newest[record.slot] == record:
                     has[record.slot].add(node_id)
         for slot, record in newest.items():
-            if record.lifetime == "leased" or len(has[slot] & voters) > len(voters) // 2:
+            if record.lifetime == "leased" or len(has[slot] & voters) >= _majority(voters):
                 continue  # nobody stores a lease but its owner, whose beat mends it
             holding = has[slot]
 
@@ -149,9 +146,8 @@ class Reader:
                 holding.add(contact.node_id)  # it took it, or has a newer one
 
             lacking = [mend(c) for c in targets if c.node_id not in holding]
-            await until(lambda _, holding=holding: len(holding & voters) > len(voters) // 2, lacking)  # type: ignore
-            if len(holding & voters) <= len(voters) // 2:
-                raise Unavailable(len(holding & voters), len(voters) // 2 + 1)
+            await until(lambda _, holding=holding: len(holding & voters) >= _majority(voters), lacking)  # type: ignore
+            _check_votes(len(holding & voters), voters)
 
     async def _asked(
         self,
@@ -255,9 +251,19 @@ def _votes(answers: dict[bytes, Answer], voters: frozenset[bytes]) -> int:
     return sum(1 for node_id, answer in answers.items() if answer.worth == SURE and node_id in voters)
 
 
+def _majority(voters: frozenset[bytes]) -> int:
+    return len(voters) // 2 + 1
+
+
+def _check_votes(votes: int, voters: frozenset[bytes]) -> None:
+    """Raise ``Unavailable`` where ``votes`` are fewer than a majority of ``voters``."""
+    if votes < _majority(voters):
+        raise Unavailable(votes, _majority(voters))
+
+
 def _is_clear(answers: dict[bytes, Answer], voters: frozenset[bytes]) -> bool:
     is_found = any(_is_something(answer.records) for answer in answers.values())
-    return is_found or _votes(answers, voters) > len(voters) // 2
+    return is_found or _votes(answers, voters) >= _majority(voters)
 
 
 def _is_something(records: list[Record]) -> bool:

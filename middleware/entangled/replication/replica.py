@@ -26,8 +26,6 @@ from middleware.entangled.wire.endpoint import Endpoint
 
 PAGE_BYTES = 12_000
 """A page of small records goes out in one burst: ten datagrams are the first window of a parcel."""
-RECORD_BYTES = 160
-"""What a record weighs in a message beside its name and value."""
 SWEEP = 0.1
 MAX_LEASE = 3600.0
 MARKS = 100
@@ -87,8 +85,7 @@ class Replica:
 
     def holds(self, record: Record) -> bool:
         """Whether this very record is held as a replica."""
-        slot = record.slot
-        return self._store.slot(slot) == record and slot not in self.keepsakes and not self._store.is_cached(slot)
+        return self._store.slot(record.slot) == record and record.slot not in self.keepsakes
 
     def keep(self, record: Record, left: float | None = None) -> int:
         """Hold ``record`` if it beats what its slot holds; 0 if it does, else the sequence that holds.
@@ -231,7 +228,7 @@ class Replica:
         for record in self.held(key):
             if cursor is not None and (record.owner, record.name) <= cursor:
                 continue
-            size += len(record.value or b"") + len(record.name.encode()) + RECORD_BYTES
+            size += record.message_bytes
             if page and size > PAGE_BYTES:
                 return page, last
             page.append(record.packed())

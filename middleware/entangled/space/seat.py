@@ -124,8 +124,7 @@ class Seat:
         lease: float,
     ) -> Answers:
         """CLAIM: promise the ballot for each of ``places`` under ``key`` and lease it, or say why not."""
-        wanted = self._checked(key, places, incarnation)
-        ballot = _ballot(counter, taker)
+        wanted, ballot = self._question(key, places, incarnation, counter, taker)
         if not 0.0 < lease <= MAX_LEASE:
             raise Refused(f"a lease lasts more than 0 and at most {MAX_LEASE:.0f} seconds")
         now = self._clock.seconds()
@@ -142,8 +141,7 @@ class Seat:
         value: bytes,
     ) -> Answers:
         """CONFIRM: accept ``value`` as the taker of each of ``places`` under the ballot, or say why not."""
-        wanted = self._checked(key, places, incarnation)
-        ballot = _ballot(counter, taker)
+        wanted, ballot = self._question(key, places, incarnation, counter, taker)
         if not is_name(value):
             raise Refused("decree.confirm takes the name of a taker")
         now = self._clock.seconds()
@@ -158,14 +156,16 @@ class Seat:
         self, peer: Contact, key: bytes, places: list[object], incarnation: bytes, counter: int, taker: bytes
     ) -> Answers:
         """RELEASE: end the lease of the ballot on each of ``places``."""
-        wanted = self._checked(key, places, incarnation)
-        ballot = _ballot(counter, taker)
+        wanted, ballot = self._question(key, places, incarnation, counter, taker)
         now = self._clock.seconds()
         return [self._votes.get(place, Vote()).release(ballot, now).packed() for place in wanted]
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
-    def _checked(self, key: bytes, places: list[object], incarnation: bytes) -> list[Place]:
+    def _question(
+        self, key: bytes, places: list[object], incarnation: bytes, counter: int, taker: bytes
+    ) -> tuple[list[Place], Ballot]:
+        """What every question names: tuples, and the ballot that it is asked under; raises ``Refused``."""
         if incarnation != self.incarnation:
             raise Refused("this member has lost its votes since it was called to that council")
         if len(key) != KEY_BYTES or not 0 < len(places) <= MAX_PLACES:
@@ -173,7 +173,9 @@ class Seat:
         wanted = [place for place in (place_unpacked(key, fields) for fields in places) if place is not None]
         if len(wanted) < len(places) or len(set(wanted)) < len(wanted):
             raise Refused("a place is an owner, a name and a mark, and a question names each place once")
-        return wanted
+        if not (is_counter(counter) and is_name(taker)):
+            raise Refused("a ballot is a positive number and the name of a taker")
+        return wanted, Ballot(counter, taker)
 
     def _claimed(self, place: Place, ballot: Ballot, lease: float, now: float) -> Reply:
         vote = self._votes.get(place)
@@ -299,9 +301,3 @@ def _bucket(place: Place) -> int:
 
 def _bucket_name(number: int) -> str:
     return f"decree/{number:02x}"
-
-
-def _ballot(counter: int, taker: bytes) -> Ballot:
-    if not (is_counter(counter) and is_name(taker)):
-        raise Refused("a ballot is a positive number and the name of a taker")
-    return Ballot(counter, taker)

@@ -33,9 +33,10 @@ class WordTests(SynchronousTestCase):
         """Whatever stands on a command line is a field, a template's field, or ``BadWord``, and nothing else."""
         for read in (word.scalar, word.pattern):
             try:
-                read(text)
+                field = read(text)
             except word.BadWord:
                 continue
+            self.assertIsInstance(field, bool | int | float | str | dict | None)
 
     def test_words_that_are_no_json_are_text(self) -> None:
         """What is not JSON stands for itself, and so do the numbers that JSON does not have."""

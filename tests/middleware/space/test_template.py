@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from typing import Any
 
 import msgpack
@@ -125,16 +126,13 @@ class TemplateTests(SynchronousTestCase):
     @given(foreign=FOREIGN | st.lists(FOREIGN, max_size=4))
     def test_decoders_are_total(self, foreign: Any) -> None:
         """Anything gives a tuple or template that can be used, or ``Malformed`` and nothing else."""
-        for decode in (tuple_unpacked, template_unpacked):
-            try:
-                decode(foreign)
-            except Malformed:
-                continue
+        with contextlib.suppress(Malformed):
+            self.assertIsInstance(tuple_unpacked(foreign), tuple)
         try:
             template = template_unpacked(foreign)
         except Malformed:
             return
-        template.matches((1,) * template.arity)
+        self.assertIn(template.matches((1,) * template.arity), (True, False))
 
     @settings(max_examples=200, deadline=None, derandomize=True, database=None)
     @given(operator=st.sampled_from([*OPERATORS, "=", "", "like"]), operand=FOREIGN, value=VALUES)
