@@ -23,9 +23,9 @@ from middleware.entangled.kademlia.distance import distance
 from middleware.entangled.kademlia.overlay import K, Overlay
 from middleware.entangled.kademlia.roster import STRUCK_S
 from middleware.entangled.record import Record, Slot, unpacked
-from middleware.entangled.replication.overlap import GROUPS, PLACES, Overlap, weight
+from middleware.entangled.replication.overlap import BITS, GROUPS, PLACES, Mark, Overlap, mark_of, pages_of
 from middleware.entangled.replication.owner import Owner
-from middleware.entangled.replication.replica import PAGE_BYTES, Replica
+from middleware.entangled.replication.replica import Replica
 from middleware.entangled.replication.watch import digest_of
 from middleware.entangled.wire.endpoint import Endpoint
 
@@ -36,6 +36,11 @@ REPUBLISH = 3600.0
 OUT_OF_TOUCH = STRUCK_S / 2
 """Seconds without a majority in touch after which a node may have been struck, and is sure of nothing."""
 AGAIN = 1.0
+LONGER = 60.0
+"""Seconds by which another holder's word must exceed what is left of a record here before it counts: its way here does
+not make a record older, and may take seconds."""
+MUCH_LONGER = 1800
+"""Seconds by which the lives of a part may differ in sum before they are looked at one by one."""
 WELCOME = 1.0
 """Seconds, and as much again at most, that a newcomer is left to catch up by itself."""
 
@@ -67,6 +72,7 @@ class Handover:
         self._busy: set[bytes] = set()
         self._catching_up = False
         self._stored_at: dict[Slot, float] = {}
+        self._given: dict[bytes, bytes] = {}
         self._overlap = Overlap(store, replica, overlay, endpoint, clock)
 
     def start(self) -> None:
@@ -97,6 +103,8 @@ class Handover:
         """Give the records that a lost contact held to the node that takes its place."""
         self._reconciled.pop(contact.node_id, None)
         self._overlap.asked_at.pop(contact.node_id, None)
+        self._given.pop(contact.node_id, None)
+        heirs: dict[bytes, tuple[Contact, list[Record]]] = {}
         for record in self._overlap.records():
             nearest = self._overlay.responsible(record.key)
             if len(nearest) < K or all(c.node_id != self._own_id for c in nearest[:STEWARDS]):
@@ -104,7 +112,9 @@ class Handover:
             heir = nearest[-1]
             was_closer = distance(contact.node_id, record.key) < distance(heir.node_id, record.key)
             if was_closer and heir.node_id != self._own_id:
-                self._chores.fork(self._give(heir, record))
+                heirs.setdefault(heir.node_id, (heir, []))[1].append(record)
+        for heir, records in heirs.values():
+            self._chores.fork(self._give_all(heir, records))
 
     def stored(self, record: Record) -> None:
         """Another holder or the owner has just given ``record`` on: no need to do so soon."""
@@ -131,35 +141,50 @@ class Handover:
         self._busy.add(contact.node_id)
         try:
             began = self._clock.seconds()
-            answer = await self._overlay.ask(contact, "digests")
-            digests, extra = answer if isinstance(answer, list) and len(answer) == 2 else ([], 0)
+            bit = self._rng.randrange(BITS)
+            answer = await self._overlay.ask(contact, "digests", bit)
+            digests, extra, lives = answer if isinstance(answer, list) and len(answer) == 3 else ([], 0, [])
             mine, to_give = self._overlap.both(contact)
-            if not (isinstance(digests, list) and len(digests) == GROUPS):
+            if not (_is_list_of(digests, bytes) and _is_list_of(lives, int)):
                 raise Refused(f"{contact.address} gives no digests")
-            for group, digest in enumerate(digests):
-                if digest != digest_of(mine[group]):
+            for group, (digest, life) in enumerate(zip(digests, lives, strict=True)):
+                is_longer = life > self._overlap.life(mine[group], bit) + MUCH_LONGER
+                if is_longer or digest != digest_of(mine[group]):
                     await self._compare(contact, group, mine[group])
             if extra:
                 await self._compare(contact, -1, [])
-            await self._give_all(contact, to_give)
+            await self._give_lacking(contact, to_give)
             self._reconciled[contact.node_id] = began
         finally:
             self._busy.discard(contact.node_id)
 
     async def _compare(self, contact: Contact, group: int, mine: list[Record]) -> None:
-        theirs: dict[Slot, tuple[int, bytes]] = {}
+        theirs: dict[Slot, Mark] = {}
         after: list[object] = []
         while True:
             answer = await self._overlay.ask(contact, "places", group, after)
             places = [place for place in answer if _is_place(place)] if isinstance(answer, list) else []
             theirs.update({Slot(*place[:3]): (place[3], place[4]) for place in places})
+            for place in places:
+                self._stay(Slot(*place[:3]), (place[3], place[4]), float(place[5]))
             if len(places) < PLACES or places[-1][:3] <= after:
                 break
             after = places[-1][:3]
-        wanted = [slot for slot, mark in theirs.items() if mark > _mark(self._overlap.held(slot))]
+        wanted = [slot for slot, mark in theirs.items() if mark > mark_of(self._overlap.held(slot))]
         await self._fetch(contact, wanted)
-        lacked = [record for record in mine if _mark(record) > theirs.get(record.slot, (-1, b""))]
+        lacked = [record for record in mine if mark_of(record) > theirs.get(record.slot, (-1, b""))]
         await self._give_all(contact, lacked)
+
+    def _stay(self, slot: Slot, mark: Mark, left: float) -> None:
+        """Hold what ``slot`` holds for ``left`` seconds, where that is longer and the very record is meant.
+
+        So the longest life that any holder names is that of all: one that names a short one ends nothing.
+        """
+        record = self._overlap.held(slot)
+        if record is None or record.lifetime != "team" or mark_of(record) != mark:
+            return
+        if min(left, record.ttl) > self._replica.left(record) + LONGER:
+            self._replica.keep(record, left)
 
     async def _fetch(self, contact: Contact, wanted: list[Slot]) -> None:
         """Get what ``contact`` holds in the slots, page by page."""
@@ -179,17 +204,26 @@ class Handover:
         if record.beats(self._overlap.held(slot)) and self._replica.is_genuine(record):
             self._replica.keep(record, left)
 
+    async def _give_lacking(self, contact: Contact, records: list[Record]) -> None:
+        """Store at ``contact`` what it lacks of ``records``, none of which should be here.
+
+        Once it has them, no more is said until there are others.
+        """
+        digest = digest_of(records)
+        if not records or self._given.get(contact.node_id) == digest:
+            return
+        for begin in range(0, len(records), PLACES):
+            page = records[begin : begin + PLACES]
+            places = [[*record.slot, *mark_of(record)] for record in page]
+            answer = await self._overlay.ask(contact, "lacking", places)
+            if not (isinstance(answer, list) and len(answer) == len(page)):
+                raise Refused(f"{contact.address} does not say what it lacks")
+            await self._give_all(contact, [record for record, lacks in zip(page, answer, strict=True) if lacks])
+        self._given[contact.node_id] = digest
+
     async def _give_all(self, contact: Contact, records: list[Record]) -> None:
         """Store at ``contact``, page by page; what it has no room for it does without."""
-        while records:
-            page = [records[0]]
-            size = weight(records[0])
-            for record in records[1:PLACES]:
-                size += weight(record)
-                if size > PAGE_BYTES:
-                    break
-                page.append(record)
-            records = records[len(page) :]
+        for page in pages_of(records, PLACES):
             lives = [self._replica.left(record) for record in page]
             with suppress(Refused):
                 await self._overlay.ask(contact, "store", [r.packed() for r in page], lives, changes=True)
@@ -265,12 +299,12 @@ class Handover:
         return await first(len(targets), [self._give(c, record) for c in targets if c.node_id != self._own_id])
 
 
-def _mark(record: Record | None) -> tuple[int, bytes]:
-    return (-1, b"") if record is None else (record.sequence, record.signature[:8])
+def _is_list_of(parts: object, kind: type) -> bool:
+    return isinstance(parts, list) and len(parts) == GROUPS and all(type(part) is kind for part in parts)
 
 
 def _is_place(place: object) -> bool:
-    if not (isinstance(place, list) and len(place) == 5):
+    if not (isinstance(place, list) and len(place) == 6):
         return False
-    kinds = [bytes, bytes, str, int, bytes]
+    kinds = [bytes, bytes, str, int, bytes, int]
     return all(type(part) is kind for part, kind in zip(place, kinds, strict=True))

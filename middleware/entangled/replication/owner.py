@@ -6,20 +6,20 @@ goes on until all have them, keeps leases alive, and mends what replicas have lo
 
 from __future__ import annotations
 
-from collections.abc import Coroutine
 from contextlib import suppress
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Literal
 
 from twisted.internet.interfaces import IReactorTime
 
-from middleware.entangled.background import Background, until
+from middleware.entangled.background import Background, paced, until
 from middleware.entangled.data.store import Store
 from middleware.entangled.errors import Conflict, NoAnswer, NotAcknowledged, Refused
 from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.overlay import Overlay
 from middleware.entangled.record import TEAM_TTL, TOMBSTONE_TTL, Lifetime, Record, Slot
+from middleware.entangled.replication.overlap import pages_of
 from middleware.entangled.replication.replica import Replica
 from middleware.entangled.replication.watch import digest_of
 from middleware.entangled.wire.endpoint import Endpoint
@@ -32,6 +32,8 @@ REPUBLISH = 3600.0
 """Seconds between two words of an owner about a team record: 24 for each life (Kademlia, section 2.5)."""
 BEATS_PER_LEASE = 3
 STEPS = 3
+AT_ONCE = 32
+"""Own records that are brought to their holders at the same time: more is sooner, and lets other questions wait."""
 MAX_SEQUENCE = 2**62
 SEQUENCES = "sequences"
 BLOCK = 1024
@@ -76,6 +78,8 @@ class Owner:
         self._own: dict[Slot, Record] = {}
         self._owing: dict[Slot, None] = {}
         self._said_at: dict[Slot, float] = {}
+        self._bringing: set[bytes] = set()
+        self._republishing = False
         self._first = self._last = self._noted = 0
         endpoint.expose("missing", self._answer_missing, changes=True)
 
@@ -183,7 +187,7 @@ class Owner:
 
     def welcome(self, contact: Contact) -> None:
         """Give a newcomer the own leases that it is now among the closest to; other records find it by themselves."""
-        self._spread([self.store_at(contact, r) for r in self._leased() if self._overlay.belongs(r.key, contact)])
+        self._chores.fork(self._bring(contact, [r for r in self._leased() if self._overlay.belongs(r.key, contact)]))
 
     def lost_here(self, record: Record) -> bool:
         """Hold ``record`` on where it is one of our own: a late timer must not end our own lease.  Whether it was."""
@@ -247,7 +251,7 @@ class Owner:
         """Store at ``peer`` what it lacks of our leases, and tell it what it holds in vain."""
         there = [r for r in self._leased() if any(c.node_id == peer.node_id for c in self._overlay.keepers(r.key))]
         lawful = [digest_of([r]) for r in there]
-        self._spread([self.store_at(peer, r) for r, mark in zip(there, lawful, strict=True) if mark not in marks])
+        self._chores.fork(self._bring(peer, [r for r, mark in zip(there, lawful, strict=True) if mark not in marks]))
         strange = [mark for mark in marks if mark not in lawful]
         if strange:
             self._endpoint.tell(peer, "let_go", strange)
@@ -255,8 +259,25 @@ class Owner:
     def _republish(self) -> None:
         old = self._clock.seconds() - REPUBLISH
         due = [r for slot, r in self._own.items() if slot in self._owing or self._said_at.get(slot, old) <= old]
-        self._spread([self.store_everywhere(record) for record in due])
+        if due and not self._republishing:
+            self._chores.fork(self._say_again(due))
 
-    def _spread(self, work: list[Coroutine[Any, Any, Any]]) -> None:
-        for coroutine in work:
-            self._chores.fork(coroutine)
+    async def _say_again(self, due: list[Record]) -> None:
+        """Bring ``due`` to their holders; what was succeeded meanwhile is left out."""
+        self._republishing = True
+        try:
+            await paced(AT_ONCE, (self.store_everywhere(r) for r in due if self._own.get(r.slot) is r))
+        finally:
+            self._republishing = False
+
+    async def _bring(self, contact: Contact, records: list[Record]) -> None:
+        """Store own records at ``contact``, page by page; one such work at a time for each contact."""
+        if contact.node_id in self._bringing:
+            return
+        self._bringing.add(contact.node_id)
+        try:
+            for page in pages_of(records):
+                with suppress(Refused):  # it has no room for one of them; the next page may have smaller ones
+                    await self._overlay.ask(contact, "store", [r.packed() for r in page], changes=True)
+        finally:
+            self._bringing.discard(contact.node_id)
