@@ -23,7 +23,18 @@ from middleware.entangled.kademlia.distance import distance
 from middleware.entangled.kademlia.overlay import K, Overlay
 from middleware.entangled.kademlia.roster import STRUCK_S
 from middleware.entangled.record import Record, Slot, unpacked
-from middleware.entangled.replication.overlap import BITS, GROUPS, PLACES, Mark, Overlap, mark_of, pages_of
+from middleware.entangled.replication.overlap import (
+    BITS,
+    ELDER,
+    GROUPS,
+    NOVICE,
+    PLACES,
+    SURE,
+    Mark,
+    Overlap,
+    mark_of,
+    pages_of,
+)
 from middleware.entangled.replication.owner import Owner
 from middleware.entangled.replication.replica import Replica
 from middleware.entangled.replication.watch import digest_of
@@ -41,6 +52,9 @@ LONGER = 60.0
 not make a record older, and may take seconds."""
 MUCH_LONGER = 1800
 """Seconds by which the lives of a part may differ in sum before they are looked at one by one."""
+SETTLED = "settled"
+"""The note of a node that once was sure: what it acknowledged since then counts."""
+NOT_YET = 0.1
 WELCOME = 1.0
 """Seconds, and as much again at most, that a newcomer is left to catch up by itself."""
 
@@ -68,15 +82,31 @@ class Handover:
         self._own_id = overlay.own_id
         self._is_sure = False
         self._touched_at = clock.seconds()
+        self._store = store
         self._reconciled: dict[bytes, float] = {}
+        self._standings: dict[bytes, int] = {}
+        self._has_memory = False
+        self._lost_memory = False
         self._busy: set[bytes] = set()
         self._catching_up = False
         self._stored_at: dict[Slot, float] = {}
         self._given: dict[bytes, bytes] = {}
         self._overlap = Overlap(store, replica, overlay, endpoint, clock)
+        self._overlap.standing = self._standing
+        endpoint.expose("settled", self._answer_settled, changes=True, idempotent=True)
 
-    def start(self) -> None:
-        """Compare with others from time to time, and know when this node has lost touch."""
+    def start(self, forgot: bool = False) -> None:
+        """Compare with others from time to time, and know when this node has lost touch.
+
+        ``forgot``: what an earlier life held is not here any more, though others may count on it.
+        """
+        was_settled = self._store.noted(SETTLED) == b"1"
+        self._lost_memory = was_settled and (forgot or self._store.origin == "replaced" or self._store.rotten > 0)
+        self._has_memory = self._overlay.roster.is_settled = was_settled and not self._lost_memory
+        if self._lost_memory:
+            self._store.note(SETTLED, b"lost")
+        elif self._store.noted(SETTLED) == b"lost":
+            self._lost_memory = True
         self._touched_at = self._clock.seconds()
         self._chores.every(MEND, self._mend)
         self._chores.every(AGAIN, self._look_around)
@@ -90,7 +120,7 @@ class Handover:
     def joined(self) -> None:
         """This node knows where it is; alone in its network it has nothing to catch up with."""
         if not len(self._overlay.roster) and not self._overlay.roster.absent():
-            self._is_sure = True
+            self._settle()
         else:
             self._chores.fork(self._catch_up())
 
@@ -142,8 +172,10 @@ class Handover:
         try:
             began = self._clock.seconds()
             bit = self._rng.randrange(BITS)
-            answer = await self._overlay.ask(contact, "digests", bit)
-            digests, extra, lives = answer if isinstance(answer, list) and len(answer) == 3 else ([], 0, [])
+            answer = await self._overlay.ask(contact, "digests", bit, self._standing())
+            digests, extra, lives, standing = (
+                answer if isinstance(answer, list) and len(answer) == 4 else ([], 0, [], 0)
+            )
             mine, to_give = self._overlap.both(contact)
             if not (_is_list_of(digests, bytes) and _is_list_of(lives, int)):
                 raise Refused(f"{contact.address} gives no digests")
@@ -155,6 +187,8 @@ class Handover:
                 await self._compare(contact, -1, [])
             await self._give_lacking(contact, to_give)
             self._reconciled[contact.node_id] = began
+            self._standings[contact.node_id] = standing if standing in (ELDER, SURE) else NOVICE
+            self._overlay.roster.settle(contact.node_id, standing in (ELDER, SURE))
         finally:
             self._busy.discard(contact.node_id)
 
@@ -238,30 +272,62 @@ class Handover:
         self._catching_up = True
         try:
             while not self._is_sure and not self._chores.is_stopped:
+                if not self._overlay.is_complete and len(self._overlay.table) < K:
+                    await self._chores.sleep(NOT_YET)  # it has yet to hear who is there
+                    continue
                 began = self._clock.seconds()
                 near = [c for c in self._overlay.responsible(self._own_id) if c.node_id != self._own_id]
                 others = self._overlay.roster.live() if self._overlay.is_complete else near
                 # One first, who has most of it; what it gave, the next ones need not give.
-                done = sum([await self._caught_up_with(contact) for contact in others[:STEWARDS]])
+                reached = [await self._caught_up_with(contact) for contact in others[:STEWARDS]]
                 work = [Deferred.fromCoroutine(self._caught_up_with(contact)) for contact in others[STEWARDS:]]
-                done += sum([await each for each in work])
-                roster = self._overlay.roster
-                everybody = 1 + len(others) + (len(roster.absent()) if self._overlay.is_complete else 0)
-                # Whatever a majority of holders has, one of those reached has.
-                is_enough = everybody - 1 - done < min(everybody, K) // 2 + 1
-                if is_enough and self._touched_at >= began - OUT_OF_TOUCH:
-                    self._is_sure = True
+                reached += [await each for each in work]
+                away = len(self._overlay.roster.absent()) if self._overlay.is_complete else 0
+                if self._is_enough(reached, away) and self._touched_at >= began - OUT_OF_TOUCH:
+                    self._settle()
                     return
                 await self._chores.sleep(AGAIN)
         finally:
             self._catching_up = False
 
-    async def _caught_up_with(self, contact: Contact) -> bool:
+    def _is_enough(self, reached: list[int | None], away: int) -> bool:
+        """Whether whatever a majority holds is held by one of those reached, whose standings these are (None: not).
+
+        Who never caught up has nothing to tell, and no part in a majority.  Where somebody is sure, only such count:
+        the others may come from a time when there were other members.  A memory that was lost may have been one vote.
+        A newcomer is let in by a majority of those before it, or two halves could each grow to a majority.
+        """
+        missing = reached.count(None) + away
+        sure, elders = reached.count(SURE), reached.count(ELDER)
+        if not (self._has_memory or self._lost_memory) and missing and (sure or elders) <= missing:
+            return False
+        lost = 1 if self._lost_memory else 0
+        own = 1 if self._lost_memory or (self._has_memory and not sure) else 0
+        return missing + lost < min((sure or elders) + missing + own, K) // 2 + 1
+
+    async def _caught_up_with(self, contact: Contact) -> int | None:
+        """The standing of ``contact`` once this node has reconciled with it; None where that fails."""
         try:
             await self._reconcile(contact)
         except EntangledError:
-            return False
-        return self._reconciled.get(contact.node_id, -1.0) >= 0.0
+            return None
+        return self._standings[contact.node_id] if self._reconciled.get(contact.node_id, -1.0) >= 0.0 else None
+
+    def _standing(self) -> int:
+        return SURE if self.is_sure() else ELDER if self._has_memory else NOVICE
+
+    def _settle(self) -> None:
+        """From now on this node is sure, and counts."""
+        self._is_sure = self._has_memory = self._overlay.roster.is_settled = True
+        if self._lost_memory or self._store.noted(SETTLED) != b"1":
+            self._lost_memory = False
+            self._store.note(SETTLED, b"1")
+            for contact in self._overlay.roster.live():
+                self._chores.fork(self._overlay.ask(contact, "settled", changes=True))
+
+    def _answer_settled(self, peer: Contact) -> None:
+        """SETTLED: the peer has caught up for the first time, and counts."""
+        self._overlay.roster.settle(peer.node_id)
 
     def _doubt(self) -> None:
         self._is_sure = False

@@ -6,7 +6,7 @@ It answers DIGESTS, PLACES, FETCH and LACKING; who compares with whom, and when,
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 from twisted.internet.interfaces import IReactorTime
 
@@ -29,17 +29,24 @@ MAX_LISTED = 8
 BITS = 512
 """Bits of a signature: one of them, which the asker draws, says which records are in a sum of lives."""
 
+NOVICE, ELDER, SURE = range(3)
+"""The standing of a node: it never caught up; it once did, and holds what it acknowledged; it is sure now."""
+
 Mark = tuple[int, bytes]
 """Which record a slot holds: its sequence and the first bytes of its signature; (-1, b"") where it holds none."""
 
 
 class Overlap:
-    """The team records of one node, as seen by its peers; ``asked_at`` is when each of them last asked for digests."""
+    """The team records of one node, as seen by its peers; ``asked_at`` is when each of them last asked for digests.
+
+    ``standing`` says that of this node.
+    """
 
     def __init__(
         self, store: Store, replica: Replica, overlay: Overlay, endpoint: Endpoint, clock: IReactorTime
     ) -> None:
         self.asked_at: dict[bytes, float] = {}
+        self.standing: Callable[[], int] = lambda: SURE
         self._store = store
         self._replica = replica
         self._overlay = overlay
@@ -91,13 +98,18 @@ class Overlap:
 
     # -- what peers ask ---------------------------------------------------------------------------------------------
 
-    def _answer_digests(self, peer: Contact, bit: int) -> list[object]:
-        """DIGESTS: of each part of the id space, what both should hold; how much the peer alone should; the lives."""
+    def _answer_digests(self, peer: Contact, bit: int, standing: int) -> list[object]:
+        """DIGESTS: of each part of the id space, what both should hold; how much the peer alone should; the lives.
+
+        The standings of both are told along with it.
+        """
         if not 0 <= bit < BITS:
             raise Refused(f"a signature has the bits 0 to {BITS - 1}")
         *groups, extra = self._lists(peer)
         self.asked_at[peer.node_id] = self._clock.seconds()
-        return [[digest_of(group) for group in groups], len(extra), [self.life(group, bit) for group in groups]]
+        self._overlay.roster.settle(peer.node_id, standing > NOVICE)
+        lives = [self.life(group, bit) for group in groups]
+        return [[digest_of(group) for group in groups], len(extra), lives, self.standing()]
 
     def _answer_places(self, peer: Contact, group: int, after: list[object]) -> list[object]:
         """PLACES: what is held here of a part of the id space (-1: of what only the peer should hold), in order."""

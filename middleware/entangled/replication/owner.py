@@ -20,7 +20,7 @@ from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.overlay import Overlay
 from middleware.entangled.record import TEAM_TTL, TOMBSTONE_TTL, Lifetime, Record, Slot
 from middleware.entangled.replication.overlap import pages_of
-from middleware.entangled.replication.replica import Replica
+from middleware.entangled.replication.replica import HELD, Replica
 from middleware.entangled.replication.watch import digest_of
 from middleware.entangled.wire.endpoint import Endpoint
 
@@ -32,6 +32,8 @@ REPUBLISH = 3600.0
 """Seconds between two words of an owner about a team record: 24 for each life (Kademlia, section 2.5)."""
 BEATS_PER_LEASE = 3
 STEPS = 3
+UNSURE_FOR = (0.1, 0.2, 0.4, 0.8)
+"""Seconds after which a replica that is not sure yet, and whose word would count, is asked again."""
 AT_ONCE = 32
 """Own records that are brought to their holders at the same time: more is sooner, and lets other questions wait."""
 MAX_SEQUENCE = 2**62
@@ -142,12 +144,20 @@ class Owner:
         targets = await self._overlay.holders(record.key)
         voters = frozenset(self._overlay.voters(record.key, targets))
         needed = {"one": 1, "majority": len(voters) // 2 + 1, "all": len(voters)}[concern]
-        counted = (lambda node_id: True) if concern == "one" else voters.__contains__
+
+        def is_vote(node_id: bytes, verdict: int) -> bool:
+            return concern == "one" or (node_id in voters and verdict != HELD)
+
         left = self.left(record)
         verdicts: dict[bytes, int] = {}
 
         async def store(contact: Contact) -> None:
             verdict = await self.store_at(contact, record, left)
+            for pause in UNSURE_FOR if concern != "one" and contact.node_id in voters else ():
+                if verdict != HELD:
+                    break
+                await self._chores.sleep(pause)
+                verdict = await self.store_at(contact, record, left)
             # A later record of this very life stands there: this one is not lost, it is history.
             is_history = self._first <= verdict <= self._last
             verdicts[contact.node_id] = 0 if is_history and record.owner == self._identity.public else verdict
@@ -156,28 +166,29 @@ class Owner:
                 self._settled(record)
 
         work = until(
-            lambda _: sum(map(counted, verdicts)) >= needed,
+            lambda _: sum(1 for node_id, verdict in verdicts.items() if is_vote(node_id, verdict)) >= needed,
             [store(c) for c in sorted(targets, key=lambda c: c.node_id != self._identity.node_id)],
         )
         await work
         answers = dict(verdicts)
-        newest = max(answers.values(), default=0)
-        votes = sum(1 for node_id, verdict in answers.items() if verdict == 0 and counted(node_id))
+        newest = max([0, *answers.values()])
+        held = sum(1 for verdict in answers.values() if verdict in (0, HELD))
+        votes = sum(1 for node_id, verdict in answers.items() if verdict in (0, HELD) and is_vote(node_id, verdict))
         if votes < needed and not newest:
             raise NotAcknowledged(votes, needed)
-        return sum(1 for verdict in answers.values() if verdict == 0), newest
+        return held, newest
 
     async def store_at(self, contact: Contact, record: Record, left: float | None = None) -> int:
-        """Store at one replica: 0, or the sequence that holds there against ``record``.  Raises ``Refused``.
+        """Store at one replica: 0, ``HELD``, or the sequence that holds there against ``record``.  Raises ``Refused``.
 
         ``left`` are the seconds that it is to be kept, where it is not this node's own.
         """
         if contact.node_id == self._identity.node_id:
-            return self._replica.keep(record, left)
+            return self._replica.store(record, left)
         lives = () if left is None else ([left],)
         answer = await self._overlay.ask(contact, "store", [record.packed()], *lives, changes=True)
         verdict = answer[0] if isinstance(answer, list) and len(answer) == 1 else None
-        if type(verdict) is int and (verdict == 0 or record.sequence <= verdict < MAX_SEQUENCE):
+        if type(verdict) is int and (verdict in (0, HELD) or record.sequence <= verdict < MAX_SEQUENCE):
             return verdict
         raise Refused(f"{contact.address} does not take the record")
 

@@ -19,7 +19,7 @@ from middleware.entangled.kademlia.overlay import ALPHA, K, Overlay, contacts_of
 from middleware.entangled.record import Record, Slot, unpacked
 from middleware.entangled.replication.cache import MAX_AGE
 from middleware.entangled.replication.owner import Owner
-from middleware.entangled.replication.replica import CACHED, SURE, UNSURE, Replica
+from middleware.entangled.replication.replica import CACHED, HELD, SURE, UNSURE, Replica
 
 ReadConcern = Literal["fast", "majority"]
 CATCHING_UP, CATCHING_UP_STEP = 1.5, 0.1
@@ -145,8 +145,8 @@ class Reader:
             holding = has[slot]
 
             async def mend(contact: Contact, record: Record = record, holding: set[bytes] = holding) -> None:
-                await self._owner.store_at(contact, record, self._owner.left(record))
-                holding.add(contact.node_id)  # it took it, or has a newer one
+                if await self._owner.store_at(contact, record, self._owner.left(record)) != HELD:
+                    holding.add(contact.node_id)  # it took it, or has a newer one
 
             lacking = [mend(c) for c in targets if c.node_id not in holding]
             await until(lambda _, holding=holding: len(holding & voters) > len(voters) // 2, lacking)  # type: ignore

@@ -36,6 +36,9 @@ MARKS = 100
 UNSURE, SURE, CACHED = 0, 1, 2
 """What an answer is worth: of a replica that has yet to catch up, of one that has, a copy from the path."""
 
+HELD = -2
+"""Answer to a STORE of a replica that is not sure: the record is held, and yet that is no vote."""
+
 OnRecord = Callable[[Record], None]
 
 
@@ -107,6 +110,11 @@ class Replica:
             return before.sequence
         return 0
 
+    def store(self, record: Record, left: float | None = None) -> int:
+        """Keep ``record``, and say what that is worth: as ``keep``, or ``HELD`` where this replica is not sure."""
+        verdict = self.keep(record, left)
+        return HELD if not verdict and not self.is_sure() else verdict
+
     def left(self, record: Record) -> float:
         """Seconds for which ``record`` is still held here; its ttl where it is not."""
         expiry = self._store.expiry(record.slot)
@@ -115,7 +123,7 @@ class Replica:
     # -- what peers ask ---------------------------------------------------------------------------------------------
 
     def answer_store(self, peer: Contact, packed: list[object], left: list[object] | None = None) -> list[int]:
-        """STORE: keep records; answers for each 0, or the sequence that beats it, or -1 for a forged one.
+        """STORE: keep records; answers for each what ``store`` says, or -1 for a forged one.
 
         ``left`` are the seconds that each is to be kept, where it does not come from its owner.
         """
@@ -125,7 +133,7 @@ class Replica:
         if len(records) < len(packed) or len(lives) != len(packed):
             raise Refused("not a record")
         return [
-            self.keep(record, life) if self.is_lawful(record, peer) else -1
+            self.store(record, life) if self.is_lawful(record, peer) else -1
             for record, life in zip(records, lives, strict=True)
         ]
 
