@@ -25,11 +25,8 @@ from middleware.entangled.kademlia.roster import STRUCK_S
 from middleware.entangled.record import Record, Slot, unpacked
 from middleware.entangled.replication.overlap import (
     BITS,
-    ELDER,
     GROUPS,
-    NOVICE,
     PLACES,
-    SURE,
     Mark,
     Overlap,
     mark_of,
@@ -37,6 +34,7 @@ from middleware.entangled.replication.overlap import (
 )
 from middleware.entangled.replication.owner import Owner
 from middleware.entangled.replication.replica import Replica
+from middleware.entangled.replication.standing import ELDER, NOVICE, SURE, Standing
 from middleware.entangled.replication.watch import digest_of
 from middleware.entangled.wire.endpoint import Endpoint
 
@@ -52,8 +50,6 @@ LONGER = 60.0
 not make a record older, and may take seconds."""
 MUCH_LONGER = 1800
 """Seconds by which the lives of a part may differ in sum before they are looked at one by one."""
-SETTLED = "settled"
-"""The note of a node that once was sure: what it acknowledged since then counts."""
 NOT_YET = 0.1
 WELCOME = 1.0
 """Seconds, and as much again at most, that a newcomer is left to catch up by itself."""
@@ -80,19 +76,16 @@ class Handover:
         self._rng = rng
         self._chores = chores
         self._own_id = overlay.own_id
-        self._is_sure = False
         self._touched_at = clock.seconds()
-        self._store = store
+        self._standing = Standing(store)
         self._reconciled: dict[bytes, float] = {}
         self._standings: dict[bytes, int] = {}
-        self._has_memory = False
-        self._lost_memory = False
         self._busy: set[bytes] = set()
         self._catching_up = False
         self._stored_at: dict[Slot, float] = {}
         self._given: dict[bytes, bytes] = {}
         self._overlap = Overlap(store, replica, overlay, endpoint, clock)
-        self._overlap.standing = self._standing
+        self._overlap.standing = self._standing_now
         endpoint.expose("settled", self._answer_settled, changes=True, idempotent=True)
 
     def start(self, forgot: bool = False) -> None:
@@ -100,22 +93,17 @@ class Handover:
 
         ``forgot``: what an earlier life held is not here any more, though others may count on it.
         """
-        was_settled = self._store.noted(SETTLED) == b"1"
-        self._lost_memory = was_settled and (forgot or self._store.origin == "replaced" or self._store.rotten > 0)
-        self._has_memory = self._overlay.roster.is_settled = was_settled and not self._lost_memory
-        if self._lost_memory:
-            self._store.note(SETTLED, b"lost")
-        elif self._store.noted(SETTLED) == b"lost":
-            self._lost_memory = True
+        self._standing.start(forgot)
+        self._overlay.roster.is_settled = self._standing.now != NOVICE
         self._touched_at = self._clock.seconds()
         self._chores.every(MEND, self._mend)
         self._chores.every(AGAIN, self._look_around)
 
     def is_sure(self) -> bool:
         """Whether this node has caught up with the others and was in touch with a majority ever since."""
-        if self._is_sure and self._clock.seconds() - self._touched_at > OUT_OF_TOUCH:
+        if self._standing.is_sure and self._clock.seconds() - self._touched_at > OUT_OF_TOUCH:
             self._doubt()
-        return self._is_sure
+        return self._standing.is_sure
 
     def joined(self) -> None:
         """This node knows where it is; alone in its network it has nothing to catch up with."""
@@ -172,7 +160,7 @@ class Handover:
         try:
             began = self._clock.seconds()
             bit = self._rng.randrange(BITS)
-            answer = await self._overlay.ask(contact, "digests", bit, self._standing())
+            answer = await self._overlay.ask(contact, "digests", bit, self._standing_now())
             digests, extra, lives, standing = (
                 answer if isinstance(answer, list) and len(answer) == 4 else ([], 0, [], 0)
             )
@@ -271,7 +259,7 @@ class Handover:
             return
         self._catching_up = True
         try:
-            while not self._is_sure and not self._chores.is_stopped:
+            while not self._standing.is_sure and not self._chores.is_stopped:
                 if not self._overlay.is_complete and len(self._overlay.table) < K:
                     await self._chores.sleep(NOT_YET)  # it has yet to hear who is there
                     continue
@@ -283,27 +271,12 @@ class Handover:
                 work = [Deferred.fromCoroutine(self._caught_up_with(contact)) for contact in others[STEWARDS:]]
                 reached += [await each for each in work]
                 away = len(self._overlay.roster.absent()) if self._overlay.is_complete else 0
-                if self._is_enough(reached, away) and self._touched_at >= began - OUT_OF_TOUCH:
+                if self._standing.is_enough(reached, away) and self._touched_at >= began - OUT_OF_TOUCH:
                     self._settle()
                     return
                 await self._chores.sleep(AGAIN)
         finally:
             self._catching_up = False
-
-    def _is_enough(self, reached: list[int | None], away: int) -> bool:
-        """Whether whatever a majority holds is held by one of those reached, whose standings these are (None: not).
-
-        Who never caught up has nothing to tell, and no part in a majority.  Where somebody is sure, only such count:
-        the others may come from a time when there were other members.  A memory that was lost may have been one vote.
-        A newcomer is let in by a majority of those before it, or two halves could each grow to a majority.
-        """
-        missing = reached.count(None) + away
-        sure, elders = reached.count(SURE), reached.count(ELDER)
-        if not (self._has_memory or self._lost_memory) and missing and (sure or elders) <= missing:
-            return False
-        lost = 1 if self._lost_memory else 0
-        own = 1 if self._lost_memory or (self._has_memory and not sure) else 0
-        return missing + lost < min((sure or elders) + missing + own, K) // 2 + 1
 
     async def _caught_up_with(self, contact: Contact) -> int | None:
         """The standing of ``contact`` once this node has reconciled with it; None where that fails."""
@@ -313,15 +286,14 @@ class Handover:
             return None
         return self._standings[contact.node_id] if self._reconciled.get(contact.node_id, -1.0) >= 0.0 else None
 
-    def _standing(self) -> int:
-        return SURE if self.is_sure() else ELDER if self._has_memory else NOVICE
+    def _standing_now(self) -> int:
+        self.is_sure()
+        return self._standing.now
 
     def _settle(self) -> None:
         """From now on this node is sure, and counts."""
-        self._is_sure = self._has_memory = self._overlay.roster.is_settled = True
-        if self._lost_memory or self._store.noted(SETTLED) != b"1":
-            self._lost_memory = False
-            self._store.note(SETTLED, b"1")
+        self._overlay.roster.is_settled = True
+        if self._standing.settle():
             for contact in self._overlay.roster.live():
                 self._chores.fork(self._overlay.ask(contact, "settled", changes=True))
 
@@ -330,7 +302,7 @@ class Handover:
         self._overlay.roster.settle(peer.node_id)
 
     def _doubt(self) -> None:
-        self._is_sure = False
+        self._standing.is_sure = False
         self._reconciled.clear()
         self._chores.fork(self._catch_up())
 

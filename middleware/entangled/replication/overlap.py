@@ -16,6 +16,7 @@ from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.overlay import Overlay
 from middleware.entangled.record import Record, Slot
 from middleware.entangled.replication.replica import PAGE_BYTES, RECORD_BYTES, Replica
+from middleware.entangled.replication.standing import NOVICE, SURE
 from middleware.entangled.replication.watch import digest_of
 from middleware.entangled.wire.endpoint import Endpoint
 
@@ -28,9 +29,6 @@ LISTED_S = 2.0
 MAX_LISTED = 8
 BITS = 512
 """Bits of a signature: one of them, which the asker draws, says which records are in a sum of lives."""
-
-NOVICE, ELDER, SURE = range(3)
-"""The standing of a node: it never caught up; it once did, and holds what it acknowledged; it is sure now."""
 
 Mark = tuple[int, bytes]
 """Which record a slot holds: its sequence and the first bytes of its signature; (-1, b"") where it holds none."""
