@@ -183,10 +183,8 @@ class Schedule:
         newcomers = range(self.n, 2 * self.n - 2 * len(few) + 1)
         at = dice.uniform(2.0, self.seconds * 0.5)
         faults = [Fault(at, at + dice.choice([8.0, 15.0]), "cut", (*few, *newcomers))]
-        for number, place in enumerate(newcomers):
-            joins_at = at + dice.choice([0.5, 2.0]) + number
-            faults.append(Fault(joins_at, joins_at, "join", (place, *few)))
-        return faults
+        first = at + dice.choice([0.5, 2.0, 5.0])
+        return faults + [Fault(first + n, first + n, "join", (place, *few)) for n, place in enumerate(newcomers)]
 
     def _join(self, place: int, known: Sequence[int]) -> None:
         """A newcomer joins through ``known``."""
