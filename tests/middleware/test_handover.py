@@ -137,7 +137,28 @@ class GivingTests(FleetCase):
 
 
 class ManyTests(FleetCase):
-    """Thousands of own records at once."""
+    """Thousands of own records at once, and reads of many."""
+
+    def test_a_holder_reads_no_record_again(self) -> None:
+        """A majority read at a holder moves digests where the others hold the same, and records where they do not."""
+        fleet = self.fleet(5)
+        for number in range(300):
+            fleet.nodes[0].put(KEY, str(number), b"x" * 100, "team", "all")
+        fleet.run(3.0)
+
+        def cost(expected: int) -> int:
+            before = fleet.board.counters["sent"]
+            self.assertEqual(len(self.done(fleet, fleet.nodes[1].get(KEY), 0.2)), expected)
+            return fleet.board.counters["sent"] - before
+
+        self.assertLess(cost(300), 25)
+        owner = fleet.identity(0)
+        newer = Record(KEY, "newer", owner.public, 2**40, "team", 60.0, b"y").signed(owner)
+        for place in (0, 2, 3, 4):
+            fleet.nodes[place].replica.keep(newer)
+        self.assertGreater(cost(301), 60)
+        fleet.run(40.0)  # it was mended meanwhile
+        self.assertLess(cost(301), 25)
 
     def test_newcomers_get_all_leases(self) -> None:
         """Five thousand own leases all arrive at newcomers, and nothing is given up because too much is on its way."""

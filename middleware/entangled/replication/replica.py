@@ -138,13 +138,20 @@ class Replica:
         ]
 
     def answer_find_value(
-        self, peer: Contact, key: bytes, after: list[object] | None = None, wants_sure: bool = False
+        self,
+        peer: Contact,
+        key: bytes,
+        after: list[object] | None = None,
+        wants_sure: bool = False,
+        digest: bytes = b"",
     ) -> list[object]:
         """FIND_VALUE: a page of the records under ``key``, where the next page begins (None: that was all), its worth.
 
         Where nothing is held, the contacts that are closest to the key follow, and a copy from the path may be given
-        unless ``wants_sure``.
+        unless ``wants_sure``.  Where ``digest`` is that of all that is held, None stands for the records.
         """
+        if digest and digest == digest_of(self.held(_checked_key(key))):
+            return [None, None, self._worth()]
         page, following = self._page(_checked_key(key), after)
         if not page and after is None:
             cached = None if wants_sure else self.cache.get(key, self._clock.seconds())
