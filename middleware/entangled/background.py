@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Coroutine, Iterable
+from contextlib import suppress
 from typing import Any
 
 from twisted.internet.defer import Deferred
@@ -105,6 +106,21 @@ async def until(enough: Callable[[list[Any]], bool], work: Iterable[Coroutine[An
     settle()
     await done
     return list(results)
+
+
+async def paced(width: int, work: Iterable[Coroutine[Any, Any, Any]]) -> None:
+    """Run all of ``work``, at most ``width`` at a time; what ends in an ``EntangledError`` is let be.
+
+    ``work`` is best a generator, so that what is not begun yet costs nothing.
+    """
+    turns = iter(work)
+
+    async def lane() -> None:
+        for coroutine in turns:
+            with suppress(EntangledError):
+                await coroutine
+
+    await until(lambda _: False, [lane() for _ in range(width)])
 
 
 async def first(needed: int, work: Iterable[Coroutine[Any, Any, Any]]) -> list[Any]:

@@ -22,6 +22,8 @@
         Conflict
 """
 
+_WAIT = "try again when members are back, or in two minutes, when the absent count no more"
+
 
 class EntangledError(Exception):
     """The root of what the library raises."""
@@ -54,7 +56,9 @@ class NotAcknowledged(NoAnswer):
     """
 
     def __init__(self, acknowledged: int, needed: int) -> None:
-        super().__init__(f"{acknowledged} replicas have the record, {needed} are needed; try again when more are there")
+        super().__init__(
+            f"{acknowledged} replicas acknowledge the record, {needed} are needed; {_WAIT}, or write with 'one'"
+        )
         self.acknowledged = acknowledged
         self.needed = needed
 
@@ -66,7 +70,7 @@ class Unavailable(WeatherError):
     """
 
     def __init__(self, answered: int, needed: int) -> None:
-        super().__init__(f"{answered} replicas of the key answer, {needed} are needed; try again when more are there")
+        super().__init__(f"{answered} replicas of the key answer, {needed} are needed; {_WAIT}, or read 'fast'")
         self.answered = answered
         self.needed = needed
 

@@ -119,10 +119,11 @@ class EntangledNode:
         """Open the port and begin to keep leases, watches and contacts fresh; raises ``PortInUse``."""
         self.endpoint.start()
         self._running = True
-        self._forget_after_long_absence()
+        forgot = self._forget_after_long_absence()
         if self.store.noted(SEATED) is not None:
             self.seat.sit()
-        for part in (self._membership, self.replica, self._owner, self._handover, self._subscriber):
+        self._handover.start(forgot)
+        for part in (self._membership, self.replica, self._owner, self._subscriber):
             part.start()
         self._chores.every(NOTE, self._note_contacts)
 
@@ -275,16 +276,17 @@ class EntangledNode:
         self._handover.stored(record)
         self._subscriber.held_here(record)
 
-    def _forget_after_long_absence(self) -> None:
-        """Re-join empty where this node was away for longer than tombstones are kept."""
+    def _forget_after_long_absence(self) -> bool:
+        """Re-join empty where this node was away for longer than tombstones are kept; whether it was."""
         try:
             away = self._wall() - float(self.store.noted(LAST_SEEN) or b"nan") if self._wall else 0.0
         except ValueError:  # a rotten file may hold anything
             away = 0.0
-        if away > TOLERATED_ABSENCE:
+        if is_long := away > TOLERATED_ABSENCE:
             self._log.warn("away for {days:.0f} days: what was held is forgotten", days=away / 86400)
             for record in self.store.records():
                 self.store.discard(record.slot)
+        return is_long
 
     def _answer_enrol(self, peer: Contact) -> bytes:
         return self.seat.answer_enrol(peer)

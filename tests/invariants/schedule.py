@@ -17,6 +17,8 @@ from middleware.entangled.network.switchboard import CALM, Weather
 from middleware.entangled.node import EntangledNode
 from tests.fleet import Fleet
 
+STRANDED = 0.15
+"""The share of schedules in which a cut leaves a few with newcomers of their own."""
 STEP = 0.5
 SETTLE = 45.0
 """Seconds after which a healed team is as it should be: tries, three rounds of mending, and a struck member."""
@@ -75,6 +77,9 @@ class Schedule:
             reorder=dice.choice([0.0, 0.2]),
         )
         self.faults = self._faults(dice)
+        dice = random.Random(f"stranded/{seed}")
+        if dice.random() < STRANDED and self.n <= 7:
+            self.faults += self._stranded(dice)
         self.down: set[int] = set()
         self.dead: set[int] = set()
         self._on_birth: list[Watcher] = []
@@ -172,9 +177,29 @@ class Schedule:
             faults.append(Fault(at, until, kind, tuple(chosen)))
         return faults
 
+    def _stranded(self, dice: random.Random) -> list[Fault]:
+        """Less than half are cut off, and so many newcomers join them that together they are more than half."""
+        few = dice.sample(range(self.n), (self.n - 1) // 2)
+        newcomers = range(self.n, 2 * self.n - 2 * len(few) + 1)
+        at = dice.uniform(2.0, self.seconds * 0.5)
+        faults = [Fault(at, at + dice.choice([8.0, 15.0]), "cut", (*few, *newcomers))]
+        first = at + dice.choice([0.5, 2.0, 5.0])
+        return faults + [Fault(first + n, first + n, "join", (place, *few)) for n, place in enumerate(newcomers)]
+
+    def _join(self, place: int, known: Sequence[int]) -> None:
+        """A newcomer joins through ``known``."""
+        node = self.fleet.made(place)
+        self.fleet.nodes.append(node)
+        self.n += 1
+        for born in self._on_birth:
+            born(place, node)
+        self.fleet.enter(node, self.addresses(known)).addErrback(lambda failure: failure.trap(NotRunning))
+
     def _begin(self, fault: Fault) -> None:
         board = self.fleet.board
-        if fault.kind == "cut":
+        if fault.kind == "join":
+            self._join(fault.places[0], fault.places[1:])
+        elif fault.kind == "cut":
             board.partition(self.addresses(fault.places))
         elif fault.kind == "one way":
             source, target = self.addresses(fault.places)
@@ -191,7 +216,7 @@ class Schedule:
     def _end(self, fault: Fault) -> None:
         if fault.kind in ("cut", "one way"):
             self.fleet.board.heal()
-        elif fault.kind != "die":
+        elif fault.kind not in ("die", "join"):
             for place in fault.places:
                 if place in self.down:
                     self.restart(place)

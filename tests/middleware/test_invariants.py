@@ -23,6 +23,7 @@ BITING = {
     "absent members do not count": (1, "D1"),
     "nothing instead of unavailable": (1, "D1"),
     "signature not checked": (2, "D4"),
+    "sure before it has caught up": (6, "D1"),
     "a read from the own store counts as sure": (4, "D1"),
     "numbers start again after a restart": (337, "D"),
     "any answer counts": (1, "D1"),

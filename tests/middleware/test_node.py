@@ -222,7 +222,7 @@ class TeamRecordTests(NodeCase):
             fleet.enter(fleet.nodes[-1], [fleet.address(place)])
             fleet.run(2.0)
             fleet.nodes[place].vanish()
-            fleet.run(12.0)
+            fleet.run(40.0)  # until the others have struck it
         self.assertEqual(self.values(fleet, 5), [b"do it"])
         self.assertEqual(len(fleet.stores[5].get(KEY, tombstones=True)), 2)
 

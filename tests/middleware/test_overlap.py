@@ -6,7 +6,7 @@ from typing import Any
 
 from middleware.entangled.errors import Refused
 from middleware.entangled.record import hashed_key
-from middleware.entangled.replication.overlap import GROUPS, LISTED_S, PLACES
+from middleware.entangled.replication.overlap import BITS, GROUPS, LISTED_S, PLACES
 from tests.fleet import Fleet, FleetCase
 
 MANY = 40
@@ -40,7 +40,7 @@ class OverlapTests(FleetCase):
 
     def test_every_place_is_listed_once(self) -> None:
         """The pages of all parts have each record once, in order, without what came in between."""
-        self.ask("digests")
+        self.ask("digests", 7, 2)
         found = [self.places(group) for group in range(GROUPS)]
         for part in found:
             self.assertEqual(part, sorted(part))
@@ -52,7 +52,7 @@ class OverlapTests(FleetCase):
         """What is stored after the digests were given is listed after the next ones, or when the list is old."""
         late = hashed_key("late")
         group = late[0] * GROUPS >> 8
-        self.ask("digests")
+        self.ask("digests", 7, 2)
         self.whole.nodes[0].put(late, "state", b"x")
         self.whole.run(0.1)
         self.assertNotIn(late, [place[0] for place in self.places(group)])
@@ -77,11 +77,14 @@ class OverlapTests(FleetCase):
         """Parts, cursors and slots that cannot be are refused."""
         to, asker = self.whole.nodes[2].contact, self.whole.nodes[1].endpoint
         wrong: list[tuple[object, ...]] = [
+            ("digests", BITS, 2),
             ("places", GROUPS, []),
             ("places", 0, [b"", b""]),
             ("fetch", [[b"", b""]]),
             ("fetch", [[b"", b"", 1]]),
             ("fetch", ["x"]),
+            ("lacking", ["x"]),
+            ("lacking", [[b"", b"", "", 1]]),
         ]
         for method, *arguments in wrong:
             asked = asker.ask(to, str(method), *arguments)

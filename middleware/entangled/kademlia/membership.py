@@ -16,7 +16,7 @@ from twisted.logger import Logger
 
 from middleware.entangled.background import Background
 from middleware.entangled.errors import NotRunning, Refused
-from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.kademlia.contact import Contact, unpacked
 from middleware.entangled.kademlia.overlay import Overlay, contacts_of
 from middleware.entangled.kademlia.roster import MAX_MEMBERS
 from middleware.entangled.network.network import Address
@@ -65,6 +65,7 @@ class Membership:
         self._joining = False
         endpoint.expose("ping", self._answer_ping, changes=True, idempotent=True)
         endpoint.expose("members", self._answer_members)
+        endpoint.expose("known", self._answer_known)
 
     def start(self) -> None:
         """Keep the contacts fresh from now on."""
@@ -173,7 +174,22 @@ class Membership:
         for first in range(0, len(strangers), AT_ONCE):
             pings = [Deferred.fromCoroutine(self._ping(stranger)) for stranger in strangers[first : first + AT_ONCE]]
             await DeferredList(pings, consumeErrors=True)
+        if not self._overlay.is_whole and not self._overlay.roster.is_settled:
+            await self._count_absent()
         self._overlay.is_whole = self._clock.seconds() > self._large_until
+
+    async def _count_absent(self) -> None:
+        """Count as absent whom others know and this newcomer cannot reach, or it would take its side of a cut for all.
+
+        Nobody is counted whom no more than half of those asked name: one that lies makes no members up.
+        """
+        asked = [self._overlay.ask(contact, "known") for contact in self._overlay.roster.live()[:AT_ONCE]]
+        answers = await DeferredList([Deferred.fromCoroutine(each) for each in asked], consumeErrors=True)
+        opinions = [_known_of(answer) for ok, answer in answers if ok and isinstance(answer, list)]
+        for contact in dict.fromkeys(contact for opinion in opinions for contact in opinion):
+            named = [opinion[contact] for opinion in opinions if contact in opinion]
+            if 2 * len(named) > len(opinions) and contact.node_id != self._overlay.own_id:
+                self._overlay.roster.remembered(contact, self._clock.seconds() - max(named))
 
     def _is_worth_a_try(self, contact: Contact) -> bool:
         if contact.node_id == self._overlay.own_id or self._overlay.roster.get(contact.node_id) is not None:
@@ -228,6 +244,13 @@ class Membership:
         self._compare(peer, digest)
         return self._overlay.roster.digest()
 
+    def _answer_known(self, peer: Contact) -> list[object] | None:
+        """KNOWN: the settled members, and for how long each has been absent; a newcomer has nothing to say."""
+        if not self._overlay.roster.is_settled:
+            return None
+        known = [(self._overlay.me(), 0.0), *self._overlay.roster.known(self._clock.seconds())]
+        return [[contact.packed(), int(away)] for contact, away in known]
+
     def _answer_members(self, peer: Contact, after: bytes) -> list[object] | None:
         if len(after) not in (0, len(peer.node_id)):
             raise Refused("members takes nothing or a node id of 20 bytes")
@@ -235,3 +258,14 @@ class Membership:
             return None
         later = [c for c in self._overlay.roster.live() if c.node_id > after]
         return [c.packed() for c in later[:PAGE]]
+
+
+def _known_of(answer: list[object]) -> dict[Contact, int]:
+    """The members in an answer to KNOWN, and the seconds of their absence; what is none is left out."""
+    found: dict[Contact, int] = {}
+    for fields in answer[:MAX_MEMBERS]:
+        named, away = fields if isinstance(fields, list) and len(fields) == 2 else (None, None)
+        contact = unpacked(named)
+        if contact is not None and type(away) is int and away >= 0:
+            found[contact] = away
+    return found

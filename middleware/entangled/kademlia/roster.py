@@ -6,6 +6,9 @@ share a member, whatever side they were formed on.  An absent member stops to co
 all members is in touch and has gone on without it for ``STRUCK_S`` (dynamic voting; Jajodia and Mutchler, 1990), so
 that one after the other may leave; or after ``COUNTED_S``, whoever is in touch: longer than that no partition is
 waited for.
+
+A newcomer is *settled* when it has once caught up with a majority of those before it; until then it counts in no
+majority of members, or the few behind a cut could strike the many with the help of strangers.
 """
 
 from __future__ import annotations
@@ -23,19 +26,20 @@ COUNTED_S = 120.0
 class _Member:
     """A member; ``lost_at`` is None while it lives, as far as is known."""
 
-    __slots__ = ("contact", "number", "heard_at", "lost_at")
+    __slots__ = ("contact", "number", "heard_at", "lost_at", "is_settled")
 
     def __init__(self, contact: Contact, now: float, lost_at: float | None = None) -> None:
         self.contact = contact
         self.number = int.from_bytes(contact.node_id)
         self.heard_at = now
         self.lost_at = lost_at
+        self.is_settled = True
 
 
 class Roster:
     """The members that the node ``own_id`` knows, itself not among them; moments are seconds of one clock.
 
-    ``version`` is another one whenever somebody came or went.
+    ``version`` is another one whenever somebody came or went; ``is_settled`` says whether this node itself is settled.
     """
 
     def __init__(self, own_id: bytes) -> None:
@@ -44,6 +48,7 @@ class Roster:
         self._live: list[_Member] = []
         self._absent: list[_Member] = []
         self.version = 0
+        self.is_settled = True
 
     def __len__(self) -> int:
         return len(self._live)
@@ -74,7 +79,7 @@ class Roster:
         return True
 
     def remembered(self, contact: Contact, now: float) -> None:
-        """Count ``contact``, known in an earlier life, as absent until it is heard."""
+        """Count ``contact``, known in an earlier life or to others, as absent since ``now`` until it is heard."""
         if contact.node_id not in self._members and not self.is_full:
             self._members[contact.node_id] = _Member(contact, now, lost_at=now)
             self._sort()
@@ -93,6 +98,12 @@ class Roster:
         if self._members.pop(node_id, None) is not None:
             self._sort()
 
+    def settle(self, node_id: bytes, is_settled: bool = True) -> None:
+        """Take note whether a member has once caught up, so that it counts; who says nothing else does."""
+        member = self._members.get(node_id)
+        if member is not None:
+            member.is_settled = is_settled
+
     def live(self) -> list[Contact]:
         """The members that live, in the order of their ids."""
         return [member.contact for member in self._live]
@@ -100,6 +111,11 @@ class Roster:
     def absent(self) -> list[Contact]:
         """The members that are absent and still count, in the order of their ids."""
         return [member.contact for member in self._absent]
+
+    def known(self, now: float) -> list[tuple[Contact, float]]:
+        """The settled members, and for how many seconds they have been absent."""
+        there = [(m.contact, 0.0) for m in self._live if m.is_settled]
+        return there + [(m.contact, now - m.lost_at) for m in self._absent if m.lost_at is not None and m.is_settled]
 
     def closest(self, key: bytes, count: int, me: Contact) -> list[Contact]:
         """The ``count`` live members closest to ``key``, this node (``me``) among them, closest first."""
@@ -117,20 +133,23 @@ class Roster:
         return (mixed & (2**64 - 1)).to_bytes(8)
 
     def in_touch(self, now: float, within: float) -> bool:
-        """Whether a majority of all members was heard in the last ``within`` seconds, this node counted in."""
-        heard = 1 + sum(1 for member in self._live if now - member.heard_at <= within)
-        return 2 * heard > 1 + len(self._members)
+        """Whether a majority of all settled members was heard in the last ``within`` seconds, this node counted in."""
+        return self._is_majority([member for member in self._live if now - member.heard_at <= within])
 
     def strike(self, now: float) -> list[Contact]:
         """Strike absent members as the module says, and return them."""
-        has_majority = 2 * (1 + len(self._live)) > 1 + len(self._members)
-        wait = STRUCK_S if has_majority else COUNTED_S
+        wait = STRUCK_S if self._is_majority(self._live) else COUNTED_S
         struck = [m for m in self._absent if m.lost_at is not None and now - m.lost_at > wait]
         for member in struck:
             del self._members[member.contact.node_id]
         if struck:
             self._sort()
         return [member.contact for member in struck]
+
+    def _is_majority(self, there: list[_Member]) -> bool:
+        """Whether these and this node are a majority of the settled members; before there are any, everybody is."""
+        everybody = self.is_settled + sum(member.is_settled for member in self._members.values())
+        return not everybody or 2 * (self.is_settled + sum(member.is_settled for member in there)) > everybody
 
     def _make_room(self) -> bool:
         if not self._absent:

@@ -1,11 +1,12 @@
 """Overlap: what this node holds and a peer should hold, too: in parts with a digest each, listed and given in pages.
 
-It answers DIGESTS, PLACES and FETCH; who compares with whom, and when, stands in ``handover``.
+It answers DIGESTS, PLACES, FETCH and LACKING; who compares with whom, and when, stands in ``handover``.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_right
+from collections.abc import Callable, Iterator
 
 from twisted.internet.interfaces import IReactorTime
 
@@ -15,6 +16,7 @@ from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.overlay import Overlay
 from middleware.entangled.record import Record, Slot, slot_unpacked
 from middleware.entangled.replication.replica import PAGE_BYTES, Replica
+from middleware.entangled.replication.standing import NOVICE, SURE
 from middleware.entangled.replication.watch import digest_of
 from middleware.entangled.wire.endpoint import Endpoint
 
@@ -25,15 +27,24 @@ PLACES = 12
 LISTED_S = 2.0
 """Seconds for which who pages through the places gets to see them as they were when it asked for the digests."""
 MAX_LISTED = 8
+BITS = 512
+"""Bits of a signature: one of them, which the asker draws, says which records are in a sum of lives."""
+
+Mark = tuple[int, bytes]
+"""Which record a slot holds: its sequence and the first bytes of its signature; (-1, b"") where it holds none."""
 
 
 class Overlap:
-    """The team records of one node, as seen by its peers; ``asked_at`` is when each of them last asked for digests."""
+    """The team records of one node, as seen by its peers; ``asked_at`` is when each of them last asked for digests.
+
+    ``standing`` says that of this node.
+    """
 
     def __init__(
         self, store: Store, replica: Replica, overlay: Overlay, endpoint: Endpoint, clock: IReactorTime
     ) -> None:
         self.asked_at: dict[bytes, float] = {}
+        self.standing: Callable[[], int] = lambda: SURE
         self._store = store
         self._replica = replica
         self._overlay = overlay
@@ -45,6 +56,7 @@ class Overlap:
         endpoint.expose("digests", self._answer_digests)
         endpoint.expose("places", self._answer_places)
         endpoint.expose("fetch", self._answer_fetch)
+        endpoint.expose("lacking", self._answer_lacking)
 
     def held(self, slot: Slot) -> Record | None:
         """What the slot holds here, for others to see."""
@@ -73,13 +85,29 @@ class Overlap:
                 extra.append(record)
         return groups, extra
 
+    def life(self, group: list[Record], bit: int) -> int:
+        """Whole seconds left to the records of ``group``, summed over those whose signature has that bit.
+
+        What is left of a life is no owner's word, so the digest cannot have it.  Who named a short one to one holder
+        could hide that in the sum of all by records of its own, but not in that of a part which it does not know.
+        """
+        byte, mask = bit >> 3, 1 << (bit & 7)
+        return sum(int(self._replica.left(r)) for r in group if len(r.signature) > byte and r.signature[byte] & mask)
+
     # -- what peers ask ---------------------------------------------------------------------------------------------
 
-    def _answer_digests(self, peer: Contact) -> list[object]:
-        """DIGESTS: of each part of the id space, what both should hold; and how much the peer alone should."""
+    def _answer_digests(self, peer: Contact, bit: int, standing: int) -> list[object]:
+        """DIGESTS: of each part of the id space, what both should hold; how much the peer alone should; the lives.
+
+        The standings of both are told along with it.
+        """
+        if not 0 <= bit < BITS:
+            raise Refused(f"a signature has the bits 0 to {BITS - 1}")
         *groups, extra = self._lists(peer)
         self.asked_at[peer.node_id] = self._clock.seconds()
-        return [[digest_of(group) for group in groups], len(extra)]
+        self._overlay.roster.settle(peer.node_id, standing > NOVICE)
+        lives = [self.life(group, bit) for group in groups]
+        return [[digest_of(group) for group in groups], len(extra), lives, self.standing()]
 
     def _answer_places(self, peer: Contact, group: int, after: list[object]) -> list[object]:
         """PLACES: what is held here of a part of the id space (-1: of what only the peer should hold), in order."""
@@ -93,7 +121,10 @@ class Overlap:
             lists = self._lists(peer)
         records = lists[group]
         begin = bisect_right(records, cursor, key=lambda record: record.slot) if cursor else 0
-        return [[*record.slot, record.sequence, record.signature[:8]] for record in records[begin : begin + PLACES]]
+        return [
+            [*record.slot, record.sequence, record.signature[:8], int(self._replica.left(record))]
+            for record in records[begin : begin + PLACES]
+        ]
 
     def _answer_fetch(self, peer: Contact, slots: list[object]) -> list[object]:
         """FETCH: of each slot the record in it and the seconds left to that, or None; as many as make a page."""
@@ -110,6 +141,15 @@ class Overlap:
             page.append(None if record is None else [record.packed(), self._replica.left(record)])
         return page
 
+    def _answer_lacking(self, peer: Contact, places: list[object]) -> list[bool]:
+        """LACKING: of each place whether the record in it is newer than what is held here."""
+        answer = []
+        for place in places[:PLACES]:
+            if not (isinstance(place, list) and [type(part) for part in place] == [bytes, bytes, str, int, bytes]):
+                raise Refused("a place is a key, an owner, a name, a number and a signature's first bytes")
+            answer.append((place[3], place[4]) > mark_of(self.held(Slot(*place[:3]))))
+        return answer
+
     # -- inside -----------------------------------------------------------------------------------------------------
 
     def _lists(self, peer: Contact) -> list[list[Record]]:
@@ -123,3 +163,22 @@ class Overlap:
                 del self._listed[other]  # it may hold what is replaced meanwhile
         self._listed[peer.node_id] = (now, lists)
         return lists
+
+
+def mark_of(record: Record | None) -> Mark:
+    """What tells ``record`` from others in its slot, and which of two is newer."""
+    return (-1, b"") if record is None else (record.sequence, record.signature[:8])
+
+
+def pages_of(records: list[Record], most: int | None = None) -> Iterator[list[Record]]:
+    """``records``, in order, in pages of about ``PAGE_BYTES`` and at most ``most`` each."""
+    page: list[Record] = []
+    size = 0
+    for record in records:
+        size += record.message_bytes
+        if page and (size > PAGE_BYTES or len(page) == most):
+            yield page
+            page, size = [], record.message_bytes
+        page.append(record)
+    if page:
+        yield page

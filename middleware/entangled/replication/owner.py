@@ -6,21 +6,21 @@ goes on until all have them, keeps leases alive, and mends what replicas have lo
 
 from __future__ import annotations
 
-from collections.abc import Coroutine
 from contextlib import suppress
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Literal
 
 from twisted.internet.interfaces import IReactorTime
 
-from middleware.entangled.background import Background, until
+from middleware.entangled.background import Background, paced, until
 from middleware.entangled.data.store import Store
 from middleware.entangled.errors import Conflict, NoAnswer, NotAcknowledged, Refused
 from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.overlay import Overlay
 from middleware.entangled.record import TEAM_TTL, TOMBSTONE_TTL, Lifetime, Record, Slot
-from middleware.entangled.replication.replica import Replica
+from middleware.entangled.replication.overlap import pages_of
+from middleware.entangled.replication.replica import HELD, Replica
 from middleware.entangled.replication.watch import digest_of
 from middleware.entangled.wire.endpoint import Endpoint
 
@@ -33,6 +33,10 @@ REPUBLISH = 3600.0
 every replica gives on what no other one gave on."""
 BEATS_PER_LEASE = 3
 STEPS = 3
+UNSURE_FOR = (0.1, 0.2, 0.4, 0.8)
+"""Seconds after which a replica that is not sure yet, and whose word would count, is asked again."""
+AT_ONCE = 32
+"""Own records that are brought to their holders at the same time: more is sooner, and lets other questions wait."""
 MAX_SEQUENCE = 2**62
 SEQUENCES = "sequences"
 BLOCK = 1024
@@ -77,6 +81,8 @@ class Owner:
         self._own: dict[Slot, Record] = {}
         self._owing: dict[Slot, None] = {}
         self._said_at: dict[Slot, float] = {}
+        self._bringing: set[bytes] = set()
+        self._republishing = False
         self._first = self._last = self._noted = 0
         endpoint.expose("missing", self._answer_missing, changes=True)
 
@@ -139,12 +145,20 @@ class Owner:
         targets = await self._overlay.holders(record.key)
         voters = frozenset(self._overlay.voters(record.key, targets))
         needed = {"one": 1, "majority": len(voters) // 2 + 1, "all": len(voters)}[concern]
-        counted = (lambda node_id: True) if concern == "one" else voters.__contains__
+
+        def is_vote(node_id: bytes, verdict: int) -> bool:
+            return concern == "one" or (node_id in voters and verdict != HELD)
+
         left = self.left(record)
         verdicts: dict[bytes, int] = {}
 
         async def store(contact: Contact) -> None:
             verdict = await self.store_at(contact, record, left)
+            for pause in UNSURE_FOR if concern != "one" and contact.node_id in voters else ():
+                if verdict != HELD:
+                    break
+                await self._chores.sleep(pause)
+                verdict = await self.store_at(contact, record, left)
             # A later record of this very life stands there: this one is not lost, it is history.
             is_history = self._first <= verdict <= self._last
             verdicts[contact.node_id] = 0 if is_history and record.owner == self._identity.public else verdict
@@ -153,28 +167,29 @@ class Owner:
                 self._settled(record)
 
         work = until(
-            lambda _: sum(map(counted, verdicts)) >= needed,
+            lambda _: sum(1 for node_id, verdict in verdicts.items() if is_vote(node_id, verdict)) >= needed,
             [store(c) for c in sorted(targets, key=lambda c: c.node_id != self._identity.node_id)],
         )
         await work
         answers = dict(verdicts)
-        newest = max(answers.values(), default=0)
-        votes = sum(1 for node_id, verdict in answers.items() if verdict == 0 and counted(node_id))
+        newest = max([0, *answers.values()])
+        held = sum(1 for verdict in answers.values() if verdict in (0, HELD))
+        votes = sum(1 for node_id, verdict in answers.items() if verdict in (0, HELD) and is_vote(node_id, verdict))
         if votes < needed and not newest:
             raise NotAcknowledged(votes, needed)
-        return sum(1 for verdict in answers.values() if verdict == 0), newest
+        return held, newest
 
     async def store_at(self, contact: Contact, record: Record, left: float | None = None) -> int:
-        """Store at one replica: 0, or the sequence that holds there against ``record``.  Raises ``Refused``.
+        """Store at one replica: 0, ``HELD``, or the sequence that holds there against ``record``.  Raises ``Refused``.
 
         ``left`` are the seconds that it is to be kept, where it is not this node's own.
         """
         if contact.node_id == self._identity.node_id:
-            return self._replica.keep(record, left)
+            return self._replica.store(record, left)
         lives = () if left is None else ([left],)
         answer = await self._overlay.ask(contact, "store", [record.packed()], *lives, changes=True)
         verdict = answer[0] if isinstance(answer, list) and len(answer) == 1 else None
-        if type(verdict) is int and (verdict == 0 or record.sequence <= verdict < MAX_SEQUENCE):
+        if type(verdict) is int and (verdict in (0, HELD) or record.sequence <= verdict < MAX_SEQUENCE):
             return verdict
         raise Refused(f"{contact.address} does not take the record")
 
@@ -184,7 +199,7 @@ class Owner:
 
     def welcome(self, contact: Contact) -> None:
         """Give a newcomer the own leases that it is now among the closest to; other records find it by themselves."""
-        self._spread([self.store_at(contact, r) for r in self._leased() if self._overlay.belongs(r.key, contact)])
+        self._chores.fork(self._bring(contact, [r for r in self._leased() if self._overlay.belongs(r.key, contact)]))
 
     def lost_here(self, record: Record) -> bool:
         """Hold ``record`` on where it is one of our own: a late timer must not end our own lease.  Whether it was."""
@@ -248,7 +263,7 @@ class Owner:
         """Store at ``peer`` what it lacks of our leases, and tell it what it holds in vain."""
         there = [r for r in self._leased() if any(c.node_id == peer.node_id for c in self._overlay.keepers(r.key))]
         lawful = [digest_of([r]) for r in there]
-        self._spread([self.store_at(peer, r) for r, mark in zip(there, lawful, strict=True) if mark not in marks])
+        self._chores.fork(self._bring(peer, [r for r, mark in zip(there, lawful, strict=True) if mark not in marks]))
         strange = [mark for mark in marks if mark not in lawful]
         if strange:
             self._endpoint.tell(peer, "let_go", strange)
@@ -256,8 +271,25 @@ class Owner:
     def _republish(self) -> None:
         old = self._clock.seconds() - REPUBLISH
         due = [r for slot, r in self._own.items() if slot in self._owing or self._said_at.get(slot, old) <= old]
-        self._spread([self.store_everywhere(record) for record in due])
+        if due and not self._republishing:
+            self._chores.fork(self._say_again(due))
 
-    def _spread(self, work: list[Coroutine[Any, Any, Any]]) -> None:
-        for coroutine in work:
-            self._chores.fork(coroutine)
+    async def _say_again(self, due: list[Record]) -> None:
+        """Bring ``due`` to their holders; what was succeeded meanwhile is left out."""
+        self._republishing = True
+        try:
+            await paced(AT_ONCE, (self.store_everywhere(r) for r in due if self._own.get(r.slot) is r))
+        finally:
+            self._republishing = False
+
+    async def _bring(self, contact: Contact, records: list[Record]) -> None:
+        """Store own records at ``contact``, page by page; one such work at a time for each contact."""
+        if contact.node_id in self._bringing:
+            return
+        self._bringing.add(contact.node_id)
+        try:
+            for page in pages_of(records):
+                with suppress(Refused):  # it has no room for one of them; the next page may have smaller ones
+                    await self._overlay.ask(contact, "store", [r.packed() for r in page], changes=True)
+        finally:
+            self._bringing.discard(contact.node_id)

@@ -19,7 +19,8 @@ from middleware.entangled.kademlia.overlay import ALPHA, K, Overlay, contacts_of
 from middleware.entangled.record import Record, Slot, unpacked
 from middleware.entangled.replication.cache import MAX_AGE
 from middleware.entangled.replication.owner import Owner
-from middleware.entangled.replication.replica import CACHED, SURE, UNSURE, Replica
+from middleware.entangled.replication.replica import CACHED, HELD, SURE, UNSURE, Replica
+from middleware.entangled.replication.watch import digest_of
 
 ReadConcern = Literal["fast", "majority"]
 CATCHING_UP, CATCHING_UP_STEP = 1.5, 0.1
@@ -66,11 +67,24 @@ class Reader:
             await self._chores.sleep(CATCHING_UP_STEP)
         return sorted((r for r in records if not r.is_tombstone), key=lambda r: (r.owner, r.name))
 
-    async def pages(self, contact: Contact, key: bytes, page: object = None, wants_sure: bool = True) -> Answer:
-        """What ``contact`` holds under ``key``, from ``page`` on (None: from the first one)."""
+    async def pages(
+        self,
+        contact: Contact,
+        key: bytes,
+        page: object = None,
+        wants_sure: bool = True,
+        same: list[Record] | None = None,
+    ) -> Answer:
+        """What ``contact`` holds under ``key``, from ``page`` on (None: from the first one).
+
+        Where it holds just what is in ``same``, it sends no record.
+        """
         records: list[Record] = []
         if page is None:
-            page = await self._overlay.ask(contact, "find_value", key, None, wants_sure)
+            digest = (digest_of(same),) if same else ()
+            page = await self._overlay.ask(contact, "find_value", key, None, wants_sure, *digest)
+            if same and isinstance(page, list) and len(page) == 3 and page[0] is None:
+                return Answer(same, SURE if page[2] == SURE else UNSURE, [])
         worth, nearer = UNSURE, []
         for _ in range(MAX_PAGES):
             if not (isinstance(page, list) and len(page) >= 2 and isinstance(page[0], list)):
@@ -142,8 +156,8 @@ class Reader:
             holding = has[slot]
 
             async def mend(contact: Contact, record: Record = record, holding: set[bytes] = holding) -> None:
-                await self._owner.store_at(contact, record, self._owner.left(record))
-                holding.add(contact.node_id)  # it took it, or has a newer one
+                if await self._owner.store_at(contact, record, self._owner.left(record)) != HELD:
+                    holding.add(contact.node_id)  # it took it, or has a newer one
 
             lacking = [mend(c) for c in targets if c.node_id not in holding]
             await until(lambda _, holding=holding: len(holding & voters) >= _majority(voters), lacking)  # type: ignore
@@ -160,8 +174,10 @@ class Reader:
         """The answers of ``targets``, ``width`` of them asked at once and one more beside each that is slow."""
         answers: dict[bytes, Answer] = {}
         own_id = self._overlay.own_id
+        here: list[Record] = []
         if any(c.node_id == own_id for c in targets):
-            answers[own_id] = Answer(self._replica.held(key), SURE if self._replica.is_sure() else UNSURE, [])
+            here = self._replica.held(key)
+            answers[own_id] = Answer(here, SURE if self._replica.is_sure() else UNSURE, [])
             width -= 1
         waiting = self._overlay.quickest(c for c in targets if c.node_id != own_id)
         done: Deferred[None] = Deferred()
@@ -185,7 +201,7 @@ class Reader:
             in_time = self._chores.later(self._overlay.hedge(contact), hedge, contact)
             more = 1
             try:
-                answer = answers[contact.node_id] = await self.pages(contact, key)
+                answer = answers[contact.node_id] = await self.pages(contact, key, same=here)
                 if answer.worth == SURE and contact.node_id in voters:
                     more = 2 if at_first == 1 else 0
             except EntangledError:

@@ -34,6 +34,9 @@ MARKS = 100
 UNSURE, SURE, CACHED = 0, 1, 2
 """What an answer is worth: of a replica that has yet to catch up, of one that has, a copy from the path."""
 
+HELD = -2
+"""Answer to a STORE of a replica that is not sure: the record is held, and yet that is no vote."""
+
 OnRecord = Callable[[Record], None]
 
 
@@ -104,6 +107,11 @@ class Replica:
             return before.sequence
         return 0
 
+    def store(self, record: Record, left: float | None = None) -> int:
+        """Keep ``record``, and say what that is worth: as ``keep``, or ``HELD`` where this replica is not sure."""
+        verdict = self.keep(record, left)
+        return HELD if not verdict and not self.is_sure() else verdict
+
     def left(self, record: Record) -> float:
         """Seconds for which ``record`` is still held here; its ttl where it is not."""
         expiry = self._store.expiry(record.slot)
@@ -112,7 +120,7 @@ class Replica:
     # -- what peers ask ---------------------------------------------------------------------------------------------
 
     def answer_store(self, peer: Contact, packed: list[object], left: list[object] | None = None) -> list[int]:
-        """STORE: keep records; answers for each 0, or the sequence that beats it, or -1 for a forged one.
+        """STORE: keep records; answers for each what ``store`` says, or -1 for a forged one.
 
         ``left`` are the seconds that each is to be kept, where it does not come from its owner.
         """
@@ -122,18 +130,25 @@ class Replica:
         if len(records) < len(packed) or len(lives) != len(packed):
             raise Refused("not a record")
         return [
-            self.keep(record, life) if self.is_lawful(record, peer) else -1
+            self.store(record, life) if self.is_lawful(record, peer) else -1
             for record, life in zip(records, lives, strict=True)
         ]
 
     def answer_find_value(
-        self, peer: Contact, key: bytes, after: list[object] | None = None, wants_sure: bool = False
+        self,
+        peer: Contact,
+        key: bytes,
+        after: list[object] | None = None,
+        wants_sure: bool = False,
+        digest: bytes = b"",
     ) -> list[object]:
         """FIND_VALUE: a page of the records under ``key``, where the next page begins (None: that was all), its worth.
 
         Where nothing is held, the contacts that are closest to the key follow, and a copy from the path may be given
-        unless ``wants_sure``.
+        unless ``wants_sure``.  Where ``digest`` is that of all that is held, None stands for the records.
         """
+        if digest and digest == digest_of(self.held(_checked_key(key))):
+            return [None, None, self._worth()]
         page, following = self._page(_checked_key(key), after)
         if not page and after is None:
             cached = None if wants_sure else self.cache.get(key, self._clock.seconds())

@@ -1,0 +1,213 @@
+"""Tests of how what is held reaches those who should hold it, where many records or a liar are in the way."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+from twisted.internet.defer import Deferred, succeed
+
+from middleware.entangled.background import paced
+from middleware.entangled.errors import NoAnswer
+from middleware.entangled.node import EntangledNode
+from middleware.entangled.record import TEAM_TTL, Record, hashed_key
+from tests.fleet import Fleet, FleetCase
+
+KEY = hashed_key("colour")
+MANY = 5000
+HOUR = 3600.0
+
+
+def counted(node: EntangledNode) -> Counter[str]:
+    """The methods that ``node`` asks of others from now on, and under ``records`` how many records it gives them."""
+    seen: Counter[str] = Counter()
+    ask = node.overlay.ask
+
+    def counting(contact: Any, method: str, *arguments: Any, **how: Any) -> Any:
+        seen[method] += 1
+        seen["records"] += len(arguments[0]) if method == "store" else 0
+        return ask(contact, method, *arguments, **how)
+
+    node.overlay.ask = counting  # type: ignore[method-assign]
+    return seen
+
+
+class LifeTests(FleetCase):
+    """How long a record lives where it was handed on by others than its owner."""
+
+    def left(self, fleet: Fleet, place: int, name: str = "a") -> float:
+        """Seconds left to the record of node 0 at another node."""
+        slot = Record(KEY, name, fleet.identity(0).public, 1, "team", 1.0, b"").slot
+        expiry = fleet.stores[place].expiry(slot)
+        return 0.0 if expiry is None else expiry - fleet.clock.seconds()
+
+    def newcomer_that_meets_a_liar(self, told: float) -> Fleet:
+        """Five nodes; the last came while it saw only node 1, which names ``told`` seconds for whatever it gives on."""
+        fleet = self.fleet(4)
+        for number in range(40):
+            fleet.nodes[0].put(KEY, "a" if not number else f"other {number}", b"x", "team", "all")
+        fleet.run(1.0)
+        fleet.nodes[1].replica.left = lambda record: told  # type: ignore[method-assign]
+        fleet.board.partition([fleet.address(place) for place in (1, 4)])
+        fleet.nodes.append(fleet.made(4))
+        fleet.enter(fleet.nodes[4], [fleet.address(1)])
+        fleet.run(2.5)
+        self.assertLess(abs(self.left(fleet, 4) - told), 3.0)
+        fleet.board.heal()
+        return fleet
+
+    def test_a_liar_shortens_no_life(self) -> None:
+        """A newcomer that was given a record with a short life learns the longer one from an honest holder."""
+        fleet = self.newcomer_that_meets_a_liar(2 * HOUR)
+        fleet.run(30.0)
+        self.assertGreater(self.left(fleet, 4), TEAM_TTL - 60.0)
+
+    def test_nor_behind_records_of_its_own(self) -> None:
+        """Longer lives of the liar's own records, at the newcomer only, do not hide what it shortened."""
+        fleet = self.newcomer_that_meets_a_liar(2 * HOUR)
+        liar = fleet.identity(1)
+        for number in range(60):
+            made = Record(KEY, f"mask {number}", liar.public, 1, "team", 20 * TEAM_TTL, b"x").signed(liar)
+            for place in range(5):
+                fleet.nodes[place].replica.keep(made, None if place == 4 else HOUR)
+        fleet.run(60.0)
+        self.assertGreater(self.left(fleet, 4), TEAM_TTL - 120.0)
+        self.assertLessEqual(self.left(fleet, 4), TEAM_TTL)
+
+    def test_lives_do_not_creep(self) -> None:
+        """Whoever compares lives again and again makes none longer: an owner that is gone is outlived by one ttl."""
+        fleet = self.fleet(4)
+        self.done(fleet, fleet.nodes[0].put(KEY, "a", b"x", "team", "all"), 1.0)
+        fleet.nodes[0].vanish()
+        began = fleet.clock.seconds()
+        fleet.run(600.0)
+        for place in (1, 2, 3):
+            self.assertLess(self.left(fleet, place) + fleet.clock.seconds() - began, TEAM_TTL + 1.0)
+
+    def test_a_life_names_the_very_record(self) -> None:
+        """A longer life that is named for another record of the slot, or beyond the ttl, makes nothing longer."""
+        fleet = self.fleet(2)
+        self.done(fleet, fleet.nodes[0].put(KEY, "a", b"x", "team", "all"), 1.0)
+        handover: Any = fleet.nodes[1]._handover
+        [record] = fleet.nodes[1].replica.held(KEY)
+        fleet.clock.advance(100.0)
+        handover._stay(record.slot, (record.sequence, b"anothers"), TEAM_TTL)
+        self.assertLess(self.left(fleet, 1), TEAM_TTL - 90.0)
+        handover._stay(record.slot, (record.sequence, record.signature[:8]), 9e9)
+        self.assertLess(abs(self.left(fleet, 1) - TEAM_TTL), 1.0)
+
+
+class GivingTests(FleetCase):
+    """What is given to those who should hold it, by one who should not."""
+
+    def test_only_what_is_lacking(self) -> None:
+        """Who holds records that belong to others gives each of them what it lacks, once, and then is silent."""
+        fleet = self.fleet(12)
+        stranger = fleet.identity(99)
+        made = [
+            Record(hashed_key(str(n)), "a", stranger.public, 1, "team", HOUR, b"x").signed(stranger) for n in range(60)
+        ]
+        giver = fleet.nodes[0]
+        extra = [r for r in made if not giver.overlay.belongs(r.key, giver.contact)]
+        self.assertGreater(len(extra), 10)
+        for record in extra:
+            giver.replica.keep(record)
+        fleet.run(120.0)
+        peer = next(
+            node for node in fleet.nodes[1:] if sum(node.overlay.belongs(r.key, node.contact) for r in extra) > 5
+        )
+        there = [r for r in extra if peer.overlay.belongs(r.key, peer.contact)]
+        self.assertEqual([r for r in there if not peer.replica.held(r.key)], [])
+        handover: Any = giver._handover
+        self.reconcile(fleet, handover, peer)
+        seen = counted(giver)
+        self.reconcile(fleet, handover, peer)
+        self.assertEqual((seen["records"], seen["lacking"]), (0, 0))
+        # Another record more: it alone is given.
+        more = Record(there[0].key, "b", stranger.public, 1, "team", HOUR, b"x").signed(stranger)
+        giver.replica.keep(more)
+        self.reconcile(fleet, handover, peer)
+        self.assertEqual(seen["records"], 1)
+        self.assertEqual([r.name for r in peer.replica.held(more.key)], ["a", "b"])
+
+    def reconcile(self, fleet: Fleet, handover: Any, peer: EntangledNode) -> None:
+        """Let one node compare with another."""
+        fleet.run(0.5)
+        self.done(fleet, Deferred.fromCoroutine(handover._reconcile(peer.contact)), 0.5)
+
+
+class ManyTests(FleetCase):
+    """Thousands of own records at once, and reads of many."""
+
+    def test_a_holder_reads_no_record_again(self) -> None:
+        """A majority read at a holder moves digests where the others hold the same, and records where they do not."""
+        fleet = self.fleet(5)
+        for number in range(300):
+            fleet.nodes[0].put(KEY, str(number), b"x" * 100, "team", "all")
+        fleet.run(3.0)
+
+        def cost(expected: int) -> int:
+            before = fleet.board.counters["sent"]
+            self.assertEqual(len(self.done(fleet, fleet.nodes[1].get(KEY), 0.2)), expected)
+            return fleet.board.counters["sent"] - before
+
+        self.assertLess(cost(300), 25)
+        owner = fleet.identity(0)
+        newer = Record(KEY, "newer", owner.public, 2**40, "team", 60.0, b"y").signed(owner)
+        for place in (0, 2, 3, 4):
+            fleet.nodes[place].replica.keep(newer)
+        self.assertGreater(cost(301), 60)
+        fleet.run(40.0)  # it was mended meanwhile
+        self.assertLess(cost(301), 25)
+
+    def test_newcomers_get_all_leases(self) -> None:
+        """Five thousand own leases all arrive at newcomers, and nothing is given up because too much is on its way."""
+        fleet = self.fleet(1)
+        owner = fleet.nodes[0]
+        for number in range(MANY):
+            owner.put(KEY, str(number), b"x", "leased")
+        fleet.run(0.5)
+        self.assertEqual(len(owner.replica.held(KEY)), MANY)
+        for place in (1, 2, 3):
+            fleet.nodes.append(fleet.made(place))
+            fleet.enter(fleet.nodes[place], [fleet.address(0)])
+        fleet.run(6.0)
+        self.assertEqual([len(node.replica.held(KEY)) for node in fleet.nodes], [MANY] * 4)
+        self.assertEqual(owner.endpoint.counters["crowded"], 0)
+
+    def test_what_is_owed_is_paced(self) -> None:
+        """Five thousand own records that no one else could take at first are all there soon after others are."""
+        fleet = self.fleet(3)
+        owner = fleet.nodes[0]
+        fleet.board.partition([fleet.address(0)])
+        fleet.run(15.0)
+        for number in range(MANY):
+            owner.put(KEY, str(number), b"x", "team").addErrback(lambda failure: failure.trap(NoAnswer))
+        fleet.run(4.0)
+        fleet.board.heal()
+        self.assertEqual([len(node.replica.held(KEY)) for node in fleet.nodes], [MANY, 0, 0])
+        fleet.run(25.0)
+        self.assertEqual([len(node.replica.held(KEY)) for node in fleet.nodes], [MANY] * 3)
+        self.assertEqual(owner.endpoint.counters["crowded"], 0)
+
+    def test_paced(self) -> None:
+        """So many are at work at a time, what fails does not stop the others, and nothing is begun ahead."""
+        begun: list[int] = []
+        waiting: dict[int, Deferred[None]] = {}
+
+        async def work(number: int) -> None:
+            begun.append(number)
+            if number == 2:
+                raise NoAnswer("nobody there")
+            await (succeed(None) if number == 3 else waiting.setdefault(number, Deferred()))
+
+        done = Deferred.fromCoroutine(paced(2, (work(number) for number in range(6))))
+        self.assertEqual(begun, [0, 1])
+        waiting[1].callback(None)
+        self.assertEqual(begun, [0, 1, 2, 3, 4])
+        waiting[0].callback(None)
+        self.assertEqual(begun, [0, 1, 2, 3, 4, 5])
+        self.assertNoResult(done)
+        for number in (4, 5):
+            waiting[number].callback(None)
+        self.successResultOf(done)
