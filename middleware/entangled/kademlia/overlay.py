@@ -22,6 +22,7 @@ from middleware.entangled.kademlia.distance import closest
 from middleware.entangled.kademlia.lookup import Lookup
 from middleware.entangled.kademlia.roster import Roster
 from middleware.entangled.kademlia.routing import STALE_AFTER, RoutingTable
+from middleware.entangled.wire.congestion import RoundTrip
 from middleware.entangled.wire.endpoint import Endpoint
 
 K = 8
@@ -32,9 +33,9 @@ MISS_GAP = 0.5
 """Seconds in which several unanswered questions are one miss: a burst of questions is no proof of death."""
 FRESH = 0.1
 """Seconds within which one sign of life is as good as many."""
-HEDGE = (0.002, 0.02, 0.15)
-"""Seconds after which one more node is asked beside one that does not answer: at least, while it was never measured,
-and at most; between them, two round trips."""
+FIRST_HEDGE, MOST_HEDGE = 0.01, 0.15
+"""Seconds after which others are asked beside one that does not answer: while nobody was measured yet, and at most;
+else those within which nearly every answer comes."""
 MAX_FOUND = 512
 """Keys whose closest nodes, as the last lookup found them, are remembered."""
 
@@ -59,7 +60,8 @@ class Overlay:
         self.own_id = me().node_id
         self._endpoint = endpoint
         self._clock = clock
-        self._rng = rng
+        # These only spread the load: the dice of the machine would be a system call each.
+        self._dice = random.Random(rng.getrandbits(64))
         self._chores = chores
         self.table = RoutingTable(self.own_id, K)
         self.roster = Roster(self.own_id)
@@ -68,7 +70,8 @@ class Overlay:
         self.on_newcomer: OnContact = lambda contact: None
         self.on_lost: OnContact = lambda contact: None
         self._heard_at: dict[bytes, float] = {}
-        self._round_trips: dict[bytes, float] = {}
+        self._round_trips: dict[bytes, RoundTrip] = {}
+        self._usual = RoundTrip(FIRST_HEDGE)
         self._slow: set[bytes] = set()
         self._found: OrderedDict[bytes, list[Contact]] = OrderedDict()
         self._misses: dict[bytes, tuple[int, float]] = {}
@@ -195,21 +198,19 @@ class Overlay:
     ) -> Any:
         """Ask ``contact``; one that does not answer is on its way out."""
         began = self._clock.seconds()
+        is_met = self._endpoint.is_met(contact)
         try:
             answer = await self._endpoint.ask(contact, method, *arguments, changes=changes, timeout=timeout)
         except NoAnswer:
             self._missed(contact)
             raise
-        took = self._clock.seconds() - began
-        before = self._round_trips.get(contact.node_id, took)
-        self._round_trips[contact.node_id] = before + (took - before) / 8
+        if is_met:  # else it was a handshake, too
+            self._took(contact, self._clock.seconds() - began)
         return answer
 
     def hedge(self, contact: Contact) -> float:
         """Seconds after which somebody else is asked beside ``contact``."""
-        least, first, most = HEDGE
-        measured = self._round_trips.get(contact.node_id)
-        return first if measured is None else min(most, max(least, 2 * measured))
+        return min(MOST_HEDGE, self._round_trips.get(contact.node_id, self._usual).usual)
 
     def slow(self, contact: Contact) -> None:
         """``contact`` took longer than it should; until it is heard, others are asked first."""
@@ -218,7 +219,7 @@ class Overlay:
     def quickest(self, contacts: Iterable[Contact]) -> list[Contact]:
         """``contacts`` in an order that spreads the load, those that are slow at the moment last."""
         shuffled = list(contacts)
-        self._rng.shuffle(shuffled)
+        self._dice.shuffle(shuffled)
         return sorted(shuffled, key=lambda contact: contact.node_id in self._slow)
 
     def silence(self, contact: Contact) -> float:
@@ -273,6 +274,14 @@ class Overlay:
         await self.ask(contact, "ping", self.roster.digest(), changes=True)
 
     # -- inside -----------------------------------------------------------------------------------------------------
+
+    def _took(self, contact: Contact, seconds: float) -> None:
+        """Learn from a round trip, of this contact and of the team: who was not measured yet is like the others."""
+        own = self._round_trips.get(contact.node_id)
+        if own is None:
+            own = self._round_trips[contact.node_id] = RoundTrip()
+        own.measured(seconds)
+        self._usual.measured(seconds)
 
     def _known(self, node_id: bytes) -> Contact | None:
         return self.roster.get(node_id) or self.table.get(node_id)

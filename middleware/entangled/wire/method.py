@@ -14,6 +14,8 @@ import typing
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
+from typing import NamedTuple
 
 from twisted.internet.defer import CancelledError, Deferred
 from twisted.internet.interfaces import IDelayedCall
@@ -41,6 +43,15 @@ class BadArguments(Refused):
     code = BAD_ARGUMENTS
 
 
+class _Form(NamedTuple):
+    """What a function takes beside the peer: how many arguments, of which kinds (None: any), and a deadline."""
+
+    least: int
+    most: float
+    kinds: tuple[tuple[type, ...] | None, ...]
+    wants_deadline: bool
+
+
 @dataclass(frozen=True)
 class Method:
     """An exposed function.
@@ -56,12 +67,10 @@ class Method:
     answer: Callable[..., object]
     changes: bool = False
     is_idempotent: bool = False
-    _least: int = field(init=False, repr=False)
-    _most: float = field(init=False, repr=False)
-    _kinds: tuple[tuple[type, ...] | None, ...] = field(init=False, repr=False)
-    _wants_deadline: bool = field(init=False, repr=False)
 
-    def __post_init__(self) -> None:
+    @cached_property
+    def _form(self) -> _Form:
+        """Found out at the first call: to look into all methods would be half of what it takes to make a node."""
         signature = inspect.signature(self.answer)
         try:
             hints = typing.get_type_hints(self.answer)
@@ -71,13 +80,13 @@ class Method:
         parameters = [parameter for parameter in signature.parameters.values() if parameter.kind in positional]
         is_open = any(p.kind is inspect.Parameter.VAR_POSITIONAL for p in signature.parameters.values())
         required = sum(1 for parameter in parameters if parameter.default is inspect.Parameter.empty)
-        # The first parameter is the peer.
-        object.__setattr__(self, "_least", max(0, required - 1))
-        object.__setattr__(self, "_most", math.inf if is_open else len(parameters) - 1)
         deadline = signature.parameters.get("deadline")
-        wants_deadline = deadline is not None and deadline.kind is inspect.Parameter.KEYWORD_ONLY
-        object.__setattr__(self, "_wants_deadline", wants_deadline)
-        object.__setattr__(self, "_kinds", tuple(_kinds(hints.get(parameter.name)) for parameter in parameters[1:]))
+        return _Form(
+            max(0, required - 1),  # the first parameter is the peer
+            math.inf if is_open else len(parameters) - 1,
+            tuple(_kinds(hints.get(parameter.name)) for parameter in parameters[1:]),
+            deadline is not None and deadline.kind is inspect.Parameter.KEYWORD_ONLY,
+        )
 
     @property
     def is_once(self) -> bool:
@@ -86,14 +95,15 @@ class Method:
 
     def run(self, peer: Contact, arguments: tuple[object, ...], deadline: float = math.inf) -> object:
         """Call the function; raises ``BadArguments`` where they do not fit, or what the function raises."""
-        if not self._least <= len(arguments) <= self._most:
-            count = f"{self._least}" if self._least == self._most else f"{self._least} to {self._most}"
+        least, most, all_kinds, wants_deadline = self._form
+        if not least <= len(arguments) <= most:
+            count = f"{least}" if least == most else f"{least} to {most}"
             raise BadArguments(f"{self.name}: takes {count} arguments, was given {len(arguments)}")
-        for place, (kinds, argument) in enumerate(zip(self._kinds, arguments, strict=False), start=1):
+        for place, (kinds, argument) in enumerate(zip(all_kinds, arguments, strict=False), start=1):
             if kinds is not None and type(argument) not in kinds:
                 wanted = " or ".join("None" if kind is type(None) else kind.__name__ for kind in kinds)
                 raise BadArguments(f"{self.name}: argument {place} must be {wanted}, is {type(argument).__name__}")
-        if self._wants_deadline:
+        if wants_deadline:
             return self.answer(peer, *arguments, deadline=deadline)
         return self.answer(peer, *arguments)
 
