@@ -21,6 +21,7 @@ from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.overlay import Overlay
 from middleware.entangled.record import TEAM_TTL, TOMBSTONE_TTL, Lifetime, Record, Slot
 from middleware.entangled.replication.replica import Replica
+from middleware.entangled.replication.shipper import Shipper
 from middleware.entangled.replication.watch import digest_of
 from middleware.entangled.wire.endpoint import Endpoint
 
@@ -73,6 +74,7 @@ class Owner:
         self._endpoint = endpoint
         self._clock = clock
         self._chores = chores
+        self._shipper = Shipper(overlay, chores)
         self._own: dict[Slot, Record] = {}
         self._owing: dict[Slot, None] = {}
         self._said_at: dict[Slot, float] = {}
@@ -170,9 +172,12 @@ class Owner:
         """
         if contact.node_id == self._identity.node_id:
             return self._replica.keep(record, left)
-        lives = () if left is None else ([left],)
-        answer = await self._overlay.ask(contact, "store", [record.packed()], *lives, changes=True)
-        verdict = answer[0] if isinstance(answer, list) and len(answer) == 1 else None
+        verdict: object = None
+        if left is None:
+            verdict = await self._shipper.store(contact, record)
+        else:
+            answer = await self._overlay.ask(contact, "store", [record.packed()], [left], changes=True)
+            verdict = answer[0] if isinstance(answer, list) and len(answer) == 1 else None
         if type(verdict) is int and (verdict == 0 or record.sequence <= verdict < MAX_SEQUENCE):
             return verdict
         raise Refused(f"{contact.address} does not take the record")
