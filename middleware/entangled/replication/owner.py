@@ -11,11 +11,12 @@ from contextlib import suppress
 from dataclasses import replace
 from typing import Any, Literal
 
+from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorTime
 
 from middleware.entangled.background import Background, until
 from middleware.entangled.data.store import Store
-from middleware.entangled.errors import Conflict, NoAnswer, NotAcknowledged, Refused
+from middleware.entangled.errors import Conflict, EntangledError, NoAnswer, NotAcknowledged, Refused
 from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.overlay import Overlay
@@ -33,6 +34,10 @@ REPUBLISH = 3600.0
 """Seconds between two words of an owner about a team record: 24 for each life (Kademlia, section 2.5)."""
 BEATS_PER_LEASE = 3
 STEPS = 3
+LONG = 2**16
+"""Bytes of a value from which on its copies are sent in two waves."""
+SPARE_S = 0.5
+"""Seconds after which the second wave is not held back any longer, whatever became of the first."""
 MAX_SEQUENCE = 2**62
 SEQUENCES = "sequences"
 BLOCK = 1024
@@ -143,9 +148,21 @@ class Owner:
         counted = (lambda node_id: True) if concern == "one" else voters.__contains__
         left = self.left(record)
         verdicts: dict[bytes, int] = {}
+        spare = self._spare(record, targets, [c for c in targets if counted(c.node_id)], needed)
+        released: Deferred[None] = Deferred()
+
+        def release() -> None:
+            if not released.called:
+                released.callback(None)
 
         async def store(contact: Contact) -> None:
-            verdict = await self.store_at(contact, record, left)
+            if contact.node_id in spare:
+                await released
+            try:
+                verdict = await self.store_at(contact, record, left)
+            except EntangledError:
+                release()
+                raise
             # A later record of this very life stands there: this one is not lost, it is history.
             is_history = self._first <= verdict <= self._last
             verdicts[contact.node_id] = 0 if is_history and record.owner == self._identity.public else verdict
@@ -157,7 +174,10 @@ class Owner:
             lambda _: sum(map(counted, verdicts)) >= needed,
             [store(c) for c in sorted(targets, key=lambda c: c.node_id != self._identity.node_id)],
         )
+        in_time = self._chores.later(SPARE_S, release) if spare else release
         await work
+        in_time()
+        release()
         answers = dict(verdicts)
         newest = max(answers.values(), default=0)
         votes = sum(1 for node_id, verdict in answers.items() if verdict == 0 and counted(node_id))
@@ -200,6 +220,17 @@ class Owner:
         return True
 
     # -- inside -----------------------------------------------------------------------------------------------------
+
+    def _spare(
+        self, record: Record, targets: list[Contact], counted: list[Contact], needed: int
+    ) -> frozenset[bytes]:
+        """Of a long record, those that get it only when enough others have it: all at once would share the way."""
+        if len(record.value or b"") < LONG or len(counted) < needed:
+            return frozenset()
+        likely = self._overlay.quickest(c for c in counted if c.node_id != self._identity.node_id)
+        has_own = len(likely) < len(counted)
+        at_first = {c.node_id for c in likely[: needed - has_own]} | {self._identity.node_id}
+        return frozenset(c.node_id for c in targets if c.node_id not in at_first)
 
     def _next_sequence(self, above: int) -> int:
         """A number that no earlier record of this node has, not even one that only a lost replica knows."""
