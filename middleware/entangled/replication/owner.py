@@ -221,9 +221,7 @@ class Owner:
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
-    def _spare(
-        self, record: Record, targets: list[Contact], counted: list[Contact], needed: int
-    ) -> frozenset[bytes]:
+    def _spare(self, record: Record, targets: list[Contact], counted: list[Contact], needed: int) -> frozenset[bytes]:
         """Of a long record, those that get it only when enough others have it: all at once would share the way."""
         if len(record.value or b"") < LONG or len(counted) < needed:
             return frozenset()

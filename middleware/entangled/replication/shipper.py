@@ -1,7 +1,7 @@
 """Shipper: brings a node's own records to their replicas, those that come close together in one question.
 
-After Nagle (RFC 896): a record for a replica that has not yet answered earlier ones waits for that answer, and goes with
-all that came meanwhile.  So a single write loses no time, and a flood of them shares datagrams and their cost.
+After Nagle (RFC 896): a record for a replica that has not yet answered earlier ones waits for that answer, and goes
+with all that came meanwhile.  So a single write loses no time, and a flood of them shares datagrams and their cost.
 """
 
 from __future__ import annotations

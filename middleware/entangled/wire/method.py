@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import inspect
 import math
+import re
 import types
 import typing
 from collections import OrderedDict
@@ -35,6 +36,9 @@ MAX_LIVES = 4
 """Lives of one peer within ``KEPT_S`` of which is known how far they had come."""
 MAX_ENTRIES = 16384
 _PLAIN = (int, float, bool, str, bytes, list, dict, type(None))
+_BY_NAME: dict[str, tuple[type, ...]] = {kind.__name__: (kind,) for kind in _PLAIN}
+_BY_NAME |= {"None": (type(None),), "float": (float, int)}
+_INSIDE = re.compile(r"\[[^\[\]]*\]")
 
 
 class BadArguments(Refused):
@@ -72,10 +76,6 @@ class Method:
     def _form(self) -> _Form:
         """Found out at the first call: to look into all methods would be half of what it takes to make a node."""
         signature = inspect.signature(self.answer)
-        try:
-            hints = typing.get_type_hints(self.answer)
-        except Exception:  # hints are foreign code too: names imported for type checkers only, partials, callables
-            hints = {}
         positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
         parameters = [parameter for parameter in signature.parameters.values() if parameter.kind in positional]
         is_open = any(p.kind is inspect.Parameter.VAR_POSITIONAL for p in signature.parameters.values())
@@ -84,9 +84,20 @@ class Method:
         return _Form(
             max(0, required - 1),  # the first parameter is the peer
             math.inf if is_open else len(parameters) - 1,
-            tuple(_kinds(hints.get(parameter.name)) for parameter in parameters[1:]),
+            self._kinds(parameters[1:]),
             deadline is not None and deadline.kind is inspect.Parameter.KEYWORD_ONLY,
         )
+
+    def _kinds(self, parameters: list[inspect.Parameter]) -> tuple[tuple[type, ...] | None, ...]:
+        """What the annotations admit; most are plain names, which need not be compiled to be understood."""
+        named = [_named(parameter.annotation) for parameter in parameters]
+        if all(named):
+            return tuple(named)
+        try:
+            hints = typing.get_type_hints(self.answer)
+        except Exception:  # hints are foreign code too: names imported for type checkers only, partials, callables
+            hints = {}
+        return tuple(_kinds(hints.get(parameter.name)) for parameter in parameters)
 
     @property
     def is_once(self) -> bool:
@@ -106,6 +117,16 @@ class Method:
         if wants_deadline:
             return self.answer(peer, *arguments, deadline=deadline)
         return self.answer(peer, *arguments)
+
+
+def _named(annotation: object) -> tuple[type, ...]:
+    """The plain types that are named in an annotation; none where it is no text, or names anything else."""
+    if not isinstance(annotation, str):
+        return ()
+    while (bare := _INSIDE.sub("", annotation)) != annotation:
+        annotation = bare
+    kinds = [_BY_NAME.get(name.strip(), ()) for name in annotation.split("|")]
+    return sum(kinds, ()) if all(kinds) else ()
 
 
 def _kinds(hint: object) -> tuple[type, ...] | None:
