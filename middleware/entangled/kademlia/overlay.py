@@ -70,8 +70,7 @@ class Overlay:
         self.on_newcomer: OnContact = lambda contact: None
         self.on_lost: OnContact = lambda contact: None
         self._heard_at: dict[bytes, float] = {}
-        self._round_trips: dict[bytes, RoundTrip] = {}
-        self._usual = RoundTrip(FIRST_HEDGE)
+        self._round_trip = RoundTrip(FIRST_HEDGE)
         self._slow: set[bytes] = set()
         self._found: OrderedDict[bytes, list[Contact]] = OrderedDict()
         self._misses: dict[bytes, tuple[int, float]] = {}
@@ -180,7 +179,7 @@ class Overlay:
             step()
 
         async def go(contact: Contact) -> None:
-            in_time = self._chores.later(self.hedge(contact), hedge, contact)
+            in_time = self._chores.later(self.hedge(), hedge, contact)
             try:
                 await visit(contact)
             except EntangledError:
@@ -205,12 +204,16 @@ class Overlay:
             self._missed(contact)
             raise
         if is_met:  # else it was a handshake, too
-            self._took(contact, self._clock.seconds() - began)
+            self._round_trip.measured(self._clock.seconds() - began)
         return answer
 
-    def hedge(self, contact: Contact) -> float:
-        """Seconds after which somebody else is asked beside ``contact``."""
-        return min(MOST_HEDGE, self._round_trips.get(contact.node_id, self._usual).usual)
+    def hedge(self) -> float:
+        """Seconds after which others are asked beside one that does not answer: hardly any of this team takes longer.
+
+        The time of all is a better measure than a contact's own, of which there are few samples and old ones; to ask
+        one that is much farther away than the others costs a question or two more.
+        """
+        return min(MOST_HEDGE, self._round_trip.usual)
 
     def slow(self, contact: Contact) -> None:
         """``contact`` took longer than it should; until it is heard, others are asked first."""
@@ -275,14 +278,6 @@ class Overlay:
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
-    def _took(self, contact: Contact, seconds: float) -> None:
-        """Learn from a round trip, of this contact and of the team: who was not measured yet is like the others."""
-        own = self._round_trips.get(contact.node_id)
-        if own is None:
-            own = self._round_trips[contact.node_id] = RoundTrip()
-        own.measured(seconds)
-        self._usual.measured(seconds)
-
     def _known(self, node_id: bytes) -> Contact | None:
         return self.roster.get(node_id) or self.table.get(node_id)
 
@@ -302,7 +297,7 @@ class Overlay:
             self._forget(contact)
 
     def _forget(self, contact: Contact) -> None:
-        for memory in (self._heard_at, self._misses, self._round_trips):
+        for memory in (self._heard_at, self._misses):
             memory.pop(contact.node_id, None)
         self._slow.discard(contact.node_id)
         for found in self._found.values():

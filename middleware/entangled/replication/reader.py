@@ -1,7 +1,7 @@
 """Reader: what a key holds, asked of its replicas; fast from one of them, or sure from a majority.
 
 A read never says that nothing is there because replicas could not be reached: it fails with ``Unavailable``.  One that
-does not answer within two round trips is not waited for: somebody else is asked beside it.
+takes longer than nearly all answers in this team is not waited for: others are asked beside it.
 """
 
 from __future__ import annotations
@@ -190,7 +190,7 @@ class Reader:
         async def ask(contact: Contact) -> None:
             nonlocal under_way
             under_way += 1
-            in_time = self._chores.later(self._overlay.hedge(contact), hedge, contact)
+            in_time = self._chores.later(self._overlay.hedge(), hedge, contact)
             more = 1
             try:
                 answer = answers[contact.node_id] = await self.pages(contact, key)
