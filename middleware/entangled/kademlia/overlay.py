@@ -53,15 +53,13 @@ class Overlay:
     all, so that where it knows few there are few; whoever asks around sets them.
     """
 
-    def __init__(
-        self, me: Callable[[], Contact], endpoint: Endpoint, clock: IReactorTime, rng: random.Random, chores: Background
-    ) -> None:
+    def __init__(self, me: Callable[[], Contact], endpoint: Endpoint, clock: IReactorTime, chores: Background) -> None:
         self.me = me
         self.own_id = me().node_id
         self._endpoint = endpoint
         self._clock = clock
-        # These only spread the load: the dice of the machine would be a system call each.
-        self._dice = random.Random(rng.getrandbits(64))
+        # They only spread the load, so anybody may foretell them; those of the machine would be a system call each.
+        self._dice = random.Random(int.from_bytes(self.own_id))
         self._chores = chores
         self.table = RoutingTable(self.own_id, K)
         self.roster = Roster(self.own_id)
