@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 from nacl import bindings
 from nacl.exceptions import CryptoError
@@ -42,6 +43,7 @@ def node_id(public: bytes) -> bytes:
     return hashlib.blake2s(public, digest_size=ID_BYTES).digest()
 
 
+@lru_cache(maxsize=128)  # a handshake needs it twice, and it takes as long as a key exchange
 def exchange_key(public: bytes) -> bytes:
     """The X25519 key that belongs to the Ed25519 key ``public``; raises ``ValueError`` where it is no key."""
     try:

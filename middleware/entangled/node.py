@@ -76,7 +76,7 @@ class EntangledNode:
         self._wall = wall
         self._chores = chores = Background(clock)
         self.endpoint = Endpoint(identity, team_key, network, clock, rng)
-        self.overlay = Overlay(lambda: self.contact, self.endpoint, clock, rng, chores)
+        self.overlay = Overlay(lambda: self.contact, self.endpoint, clock, chores)
         self.replica = Replica(store, self.endpoint, clock, chores)
         self._owner = Owner(identity, lease, store, self.replica, self.overlay, self.endpoint, clock, chores)
         self._membership = Membership(self.overlay, self.endpoint, clock, rng, chores)

@@ -11,11 +11,33 @@ from middleware.entangled.errors import NoAnswer, Refused
 from middleware.entangled.network.switchboard import Weather
 from middleware.entangled.wire import method
 from middleware.entangled.wire.message import Question, encoded
-from middleware.entangled.wire.method import KEPT_S, MAX_LIVES, Ledger
+from middleware.entangled.wire.method import KEPT_S, MAX_LIVES, Ledger, Method
 from tests.middleware.test_endpoint import DELAY, EndpointCase
 
 ANN, BOB = b"a" * 32, b"b" * 32
 LIFE = 2**32
+
+
+class FormTests(SynchronousTestCase):
+    """What a ``Method`` finds out about its function."""
+
+    def kinds(self, *annotations: object) -> tuple[tuple[type, ...] | None, ...]:
+        """The kinds of arguments that a function with these annotations takes."""
+
+        def answer(peer: object, one: Any, two: Any = None) -> None: ...
+
+        answer.__annotations__.update(zip(("one", "two"), annotations, strict=True))
+        return Method("answer", answer)._form.kinds
+
+    def test_kinds_by_name(self) -> None:
+        """Plain annotations are understood by their names, unions and what is in brackets included."""
+        kinds = self.kinds("dict[str, list[int | None]] | None", "list[object]|float")
+        self.assertEqual(kinds, ((dict, type(None)), (list, float, int)))
+
+    def test_kinds_that_are_no_names(self) -> None:
+        """Types, and texts that name something else, are understood all the same, or admit anything."""
+        self.assertEqual(self.kinds(bytes | None, "Any"), ((bytes, type(None)), None))
+        self.assertEqual(self.kinds("bytes", "Nobody"), (None, None))
 
 
 class LedgerTests(SynchronousTestCase):

@@ -37,7 +37,8 @@ AGAIN = 4.0
 LARGE_FOR = 60.0
 """Seconds for which one word that the network is too large to be known whole holds against those who do not see it."""
 BREATH = 0.02
-"""Seconds that a newcomer lets its first reads have before it meets everybody, and as much again at most."""
+"""Seconds that a newcomer lets its first reads, and those of others, have before it meets the next few strangers, and
+as much again at most."""
 AT_ONCE = 8
 """Strangers that are met at the same time: a handshake takes 0.3 ms of a core on each side."""
 PAGE = 20
@@ -174,6 +175,8 @@ class Membership:
         for first in range(0, len(strangers), AT_ONCE):
             pings = [Deferred.fromCoroutine(self._ping(stranger)) for stranger in strangers[first : first + AT_ONCE]]
             await DeferredList(pings, consumeErrors=True)
+            if first + AT_ONCE < len(strangers):
+                await self._chores.sleep(self._breath())
         if not self._overlay.is_whole and not self._overlay.roster.is_settled:
             await self._count_absent()
         self._overlay.is_whole = self._clock.seconds() > self._large_until

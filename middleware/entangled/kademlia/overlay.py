@@ -22,6 +22,7 @@ from middleware.entangled.kademlia.distance import closest
 from middleware.entangled.kademlia.lookup import Lookup
 from middleware.entangled.kademlia.roster import Roster
 from middleware.entangled.kademlia.routing import STALE_AFTER, RoutingTable
+from middleware.entangled.wire.congestion import RoundTrip
 from middleware.entangled.wire.endpoint import Endpoint
 
 K = 8
@@ -32,9 +33,9 @@ MISS_GAP = 0.5
 """Seconds in which several unanswered questions are one miss: a burst of questions is no proof of death."""
 FRESH = 0.1
 """Seconds within which one sign of life is as good as many."""
-HEDGE = (0.002, 0.02, 0.15)
-"""Seconds after which one more node is asked beside one that does not answer: at least, while it was never measured,
-and at most; between them, two round trips."""
+FIRST_HEDGE, MOST_HEDGE = 0.01, 0.15
+"""Seconds after which others are asked beside one that does not answer: while nobody was measured yet, and at most;
+else those within which nearly every answer comes."""
 MAX_FOUND = 512
 """Keys whose closest nodes, as the last lookup found them, are remembered."""
 
@@ -52,14 +53,13 @@ class Overlay:
     all, so that where it knows few there are few; whoever asks around sets them.
     """
 
-    def __init__(
-        self, me: Callable[[], Contact], endpoint: Endpoint, clock: IReactorTime, rng: random.Random, chores: Background
-    ) -> None:
+    def __init__(self, me: Callable[[], Contact], endpoint: Endpoint, clock: IReactorTime, chores: Background) -> None:
         self.me = me
         self.own_id = me().node_id
         self._endpoint = endpoint
         self._clock = clock
-        self._rng = rng
+        # They only spread the load, so anybody may foretell them; those of the machine would be a system call each.
+        self._dice = random.Random(int.from_bytes(self.own_id))
         self._chores = chores
         self.table = RoutingTable(self.own_id, K)
         self.roster = Roster(self.own_id)
@@ -68,7 +68,7 @@ class Overlay:
         self.on_newcomer: OnContact = lambda contact: None
         self.on_lost: OnContact = lambda contact: None
         self._heard_at: dict[bytes, float] = {}
-        self._round_trips: dict[bytes, float] = {}
+        self._round_trip = RoundTrip(FIRST_HEDGE)
         self._slow: set[bytes] = set()
         self._found: OrderedDict[bytes, list[Contact]] = OrderedDict()
         self._misses: dict[bytes, tuple[int, float]] = {}
@@ -177,7 +177,7 @@ class Overlay:
             step()
 
         async def go(contact: Contact) -> None:
-            in_time = self._chores.later(self.hedge(contact), hedge, contact)
+            in_time = self._chores.later(self.hedge(), hedge, contact)
             try:
                 await visit(contact)
             except EntangledError:
@@ -195,21 +195,23 @@ class Overlay:
     ) -> Any:
         """Ask ``contact``; one that does not answer is on its way out."""
         began = self._clock.seconds()
+        is_met = self._endpoint.is_met(contact)
         try:
             answer = await self._endpoint.ask(contact, method, *arguments, changes=changes, timeout=timeout)
         except NoAnswer:
             self._missed(contact)
             raise
-        took = self._clock.seconds() - began
-        before = self._round_trips.get(contact.node_id, took)
-        self._round_trips[contact.node_id] = before + (took - before) / 8
+        if is_met:  # else it was a handshake, too
+            self._round_trip.measured(self._clock.seconds() - began)
         return answer
 
-    def hedge(self, contact: Contact) -> float:
-        """Seconds after which somebody else is asked beside ``contact``."""
-        least, first, most = HEDGE
-        measured = self._round_trips.get(contact.node_id)
-        return first if measured is None else min(most, max(least, 2 * measured))
+    def hedge(self) -> float:
+        """Seconds after which others are asked beside one that does not answer: hardly any of this team takes longer.
+
+        The time of all is a better measure than a contact's own, of which there are few samples and old ones; to ask
+        one that is much farther away than the others costs a question or two more.
+        """
+        return min(MOST_HEDGE, self._round_trip.usual)
 
     def slow(self, contact: Contact) -> None:
         """``contact`` took longer than it should; until it is heard, others are asked first."""
@@ -218,7 +220,7 @@ class Overlay:
     def quickest(self, contacts: Iterable[Contact]) -> list[Contact]:
         """``contacts`` in an order that spreads the load, those that are slow at the moment last."""
         shuffled = list(contacts)
-        self._rng.shuffle(shuffled)
+        self._dice.shuffle(shuffled)
         return sorted(shuffled, key=lambda contact: contact.node_id in self._slow)
 
     def silence(self, contact: Contact) -> float:
@@ -293,7 +295,7 @@ class Overlay:
             self._forget(contact)
 
     def _forget(self, contact: Contact) -> None:
-        for memory in (self._heard_at, self._misses, self._round_trips):
+        for memory in (self._heard_at, self._misses):
             memory.pop(contact.node_id, None)
         self._slow.discard(contact.node_id)
         for found in self._found.values():

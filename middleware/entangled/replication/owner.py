@@ -10,17 +10,19 @@ from contextlib import suppress
 from dataclasses import replace
 from typing import Literal
 
+from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorTime
 
 from middleware.entangled.background import Background, paced, until
 from middleware.entangled.data.store import Store
-from middleware.entangled.errors import Conflict, NoAnswer, NotAcknowledged, Refused
+from middleware.entangled.errors import Conflict, EntangledError, NoAnswer, NotAcknowledged, Refused
 from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.overlay import Overlay
 from middleware.entangled.record import TEAM_TTL, TOMBSTONE_TTL, Lifetime, Record, Slot
 from middleware.entangled.replication.overlap import pages_of
 from middleware.entangled.replication.replica import HELD, Replica
+from middleware.entangled.replication.shipper import Shipper
 from middleware.entangled.replication.watch import digest_of
 from middleware.entangled.wire.endpoint import Endpoint
 
@@ -37,6 +39,10 @@ UNSURE_FOR = (0.1, 0.2, 0.4, 0.8)
 """Seconds after which a replica that is not sure yet, and whose word would count, is asked again."""
 AT_ONCE = 32
 """Own records that are brought to their holders at the same time: more is sooner, and lets other questions wait."""
+LONG = 2**16
+"""Bytes of a value from which on its copies are sent in two waves."""
+SPARE_S = 0.5
+"""Seconds after which the second wave is not held back any longer, whatever became of the first."""
 MAX_SEQUENCE = 2**62
 SEQUENCES = "sequences"
 BLOCK = 1024
@@ -78,6 +84,7 @@ class Owner:
         self._endpoint = endpoint
         self._clock = clock
         self._chores = chores
+        self._shipper = Shipper(overlay, chores)
         self._own: dict[Slot, Record] = {}
         self._owing: dict[Slot, None] = {}
         self._said_at: dict[Slot, float] = {}
@@ -151,12 +158,26 @@ class Owner:
 
         left = self.left(record)
         verdicts: dict[bytes, int] = {}
+        counted = [c for c in targets if concern == "one" or c.node_id in voters]
+        spare = self._spare(record, targets, counted, needed)
+        released: Deferred[None] = Deferred()
+
+        def release() -> None:
+            if not released.called:
+                released.callback(None)
 
         async def store(contact: Contact) -> None:
-            verdict = await self.store_at(contact, record, left)
+            if contact.node_id in spare:
+                await released
+            try:
+                verdict = await self.store_at(contact, record, left)
+            except EntangledError:
+                release()
+                raise
             for pause in UNSURE_FOR if concern != "one" and contact.node_id in voters else ():
                 if verdict != HELD:
                     break
+                release()
                 await self._chores.sleep(pause)
                 verdict = await self.store_at(contact, record, left)
             # A later record of this very life stands there: this one is not lost, it is history.
@@ -170,7 +191,10 @@ class Owner:
             lambda _: sum(1 for node_id, verdict in verdicts.items() if is_vote(node_id, verdict)) >= needed,
             [store(c) for c in sorted(targets, key=lambda c: c.node_id != self._identity.node_id)],
         )
+        in_time = self._chores.later(SPARE_S, release) if spare else release
         await work
+        in_time()
+        release()
         answers = dict(verdicts)
         newest = max([0, *answers.values()])
         held = sum(1 for verdict in answers.values() if verdict in (0, HELD))
@@ -186,9 +210,12 @@ class Owner:
         """
         if contact.node_id == self._identity.node_id:
             return self._replica.store(record, left)
-        lives = () if left is None else ([left],)
-        answer = await self._overlay.ask(contact, "store", [record.packed()], *lives, changes=True)
-        verdict = answer[0] if isinstance(answer, list) and len(answer) == 1 else None
+        verdict: object = None
+        if left is None:
+            verdict = await self._shipper.store(contact, record)
+        else:
+            answer = await self._overlay.ask(contact, "store", [record.packed()], [left], changes=True)
+            verdict = answer[0] if isinstance(answer, list) and len(answer) == 1 else None
         if type(verdict) is int and (verdict in (0, HELD) or record.sequence <= verdict < MAX_SEQUENCE):
             return verdict
         raise Refused(f"{contact.address} does not take the record")
@@ -211,6 +238,15 @@ class Owner:
         return True
 
     # -- inside -----------------------------------------------------------------------------------------------------
+
+    def _spare(self, record: Record, targets: list[Contact], counted: list[Contact], needed: int) -> frozenset[bytes]:
+        """Of a long record, those that get it only when enough others have it: all at once would share the way."""
+        if len(record.value or b"") < LONG or len(counted) < needed:
+            return frozenset()
+        likely = self._overlay.quickest(c for c in counted if c.node_id != self._identity.node_id)
+        has_own = len(likely) < len(counted)
+        at_first = {c.node_id for c in likely[: needed - has_own]} | {self._identity.node_id}
+        return frozenset(c.node_id for c in targets if c.node_id not in at_first)
 
     def _next_sequence(self, above: int) -> int:
         """A number that no earlier record of this node has, not even one that only a lost replica knows."""

@@ -178,6 +178,11 @@ class Endpoint:
             raise NotRunning("the endpoint is not running; start it first")
         self._asker.tell(contact, method, arguments)
 
+    def is_met(self, contact: Contact) -> bool:
+        """Whether there is a session with ``contact``, so that a question needs one round trip and no handshake."""
+        peer = self._peers.known(contact.public)
+        return peer is not None and peer.session is not None
+
     def greet(self, address: Address, timeout: float = PATIENCE) -> Deferred[Contact]:
         """Learn who listens at ``address``; fails with ``NoAnswer``.  The contact has not proved its key yet."""
         if not self.is_running:

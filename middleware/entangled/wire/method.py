@@ -9,11 +9,14 @@ from __future__ import annotations
 import contextlib
 import inspect
 import math
+import re
 import types
 import typing
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
+from typing import NamedTuple
 
 from twisted.internet.defer import CancelledError, Deferred
 from twisted.internet.interfaces import IDelayedCall
@@ -33,12 +36,24 @@ MAX_LIVES = 4
 """Lives of one peer within ``KEPT_S`` of which is known how far they had come."""
 MAX_ENTRIES = 16384
 _PLAIN = (int, float, bool, str, bytes, list, dict, type(None))
+_BY_NAME: dict[str, tuple[type, ...]] = {kind.__name__: (kind,) for kind in _PLAIN}
+_BY_NAME |= {"None": (type(None),), "float": (float, int)}
+_INSIDE = re.compile(r"\[[^\[\]]*\]")
 
 
 class BadArguments(Refused):
     """The number or the kinds of the arguments do not fit the method."""
 
     code = BAD_ARGUMENTS
+
+
+class _Form(NamedTuple):
+    """What a function takes beside the peer: how many arguments, of which kinds (None: any), and a deadline."""
+
+    least: int
+    most: float
+    kinds: tuple[tuple[type, ...] | None, ...]
+    wants_deadline: bool
 
 
 @dataclass(frozen=True)
@@ -56,28 +71,33 @@ class Method:
     answer: Callable[..., object]
     changes: bool = False
     is_idempotent: bool = False
-    _least: int = field(init=False, repr=False)
-    _most: float = field(init=False, repr=False)
-    _kinds: tuple[tuple[type, ...] | None, ...] = field(init=False, repr=False)
-    _wants_deadline: bool = field(init=False, repr=False)
 
-    def __post_init__(self) -> None:
+    @cached_property
+    def _form(self) -> _Form:
+        """Found out at the first call: to look into all methods would be half of what it takes to make a node."""
         signature = inspect.signature(self.answer)
-        try:
-            hints = typing.get_type_hints(self.answer)
-        except Exception:  # hints are foreign code too: names imported for type checkers only, partials, callables
-            hints = {}
         positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
         parameters = [parameter for parameter in signature.parameters.values() if parameter.kind in positional]
         is_open = any(p.kind is inspect.Parameter.VAR_POSITIONAL for p in signature.parameters.values())
         required = sum(1 for parameter in parameters if parameter.default is inspect.Parameter.empty)
-        # The first parameter is the peer.
-        object.__setattr__(self, "_least", max(0, required - 1))
-        object.__setattr__(self, "_most", math.inf if is_open else len(parameters) - 1)
         deadline = signature.parameters.get("deadline")
-        wants_deadline = deadline is not None and deadline.kind is inspect.Parameter.KEYWORD_ONLY
-        object.__setattr__(self, "_wants_deadline", wants_deadline)
-        object.__setattr__(self, "_kinds", tuple(_kinds(hints.get(parameter.name)) for parameter in parameters[1:]))
+        return _Form(
+            max(0, required - 1),  # the first parameter is the peer
+            math.inf if is_open else len(parameters) - 1,
+            self._kinds(parameters[1:]),
+            deadline is not None and deadline.kind is inspect.Parameter.KEYWORD_ONLY,
+        )
+
+    def _kinds(self, parameters: list[inspect.Parameter]) -> tuple[tuple[type, ...] | None, ...]:
+        """What the annotations admit; most are plain names, which need not be compiled to be understood."""
+        named = [_named(parameter.annotation) for parameter in parameters]
+        if all(named):
+            return tuple(named)
+        try:
+            hints = typing.get_type_hints(self.answer)
+        except Exception:  # hints are foreign code too: names imported for type checkers only, partials, callables
+            hints = {}
+        return tuple(_kinds(hints.get(parameter.name)) for parameter in parameters)
 
     @property
     def is_once(self) -> bool:
@@ -86,16 +106,27 @@ class Method:
 
     def run(self, peer: Contact, arguments: tuple[object, ...], deadline: float = math.inf) -> object:
         """Call the function; raises ``BadArguments`` where they do not fit, or what the function raises."""
-        if not self._least <= len(arguments) <= self._most:
-            count = f"{self._least}" if self._least == self._most else f"{self._least} to {self._most}"
+        least, most, all_kinds, wants_deadline = self._form
+        if not least <= len(arguments) <= most:
+            count = f"{least}" if least == most else f"{least} to {most}"
             raise BadArguments(f"{self.name}: takes {count} arguments, was given {len(arguments)}")
-        for place, (kinds, argument) in enumerate(zip(self._kinds, arguments, strict=False), start=1):
+        for place, (kinds, argument) in enumerate(zip(all_kinds, arguments, strict=False), start=1):
             if kinds is not None and type(argument) not in kinds:
                 wanted = " or ".join("None" if kind is type(None) else kind.__name__ for kind in kinds)
                 raise BadArguments(f"{self.name}: argument {place} must be {wanted}, is {type(argument).__name__}")
-        if self._wants_deadline:
+        if wants_deadline:
             return self.answer(peer, *arguments, deadline=deadline)
         return self.answer(peer, *arguments)
+
+
+def _named(annotation: object) -> tuple[type, ...]:
+    """The plain types that are named in an annotation; none where it is no text, or names anything else."""
+    if not isinstance(annotation, str):
+        return ()
+    while (bare := _INSIDE.sub("", annotation)) != annotation:
+        annotation = bare
+    kinds = [_BY_NAME.get(name.strip(), ()) for name in annotation.split("|")]
+    return sum(kinds, ()) if all(kinds) else ()
 
 
 def _kinds(hint: object) -> tuple[type, ...] | None:

@@ -1,0 +1,90 @@
+"""Tests of how a node's own records come to their replicas, many of them in one question."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from twisted.internet.defer import Deferred
+
+from middleware.entangled.errors import EntangledError, Refused
+from middleware.entangled.identity import Identity
+from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.record import TEAM_TTL, Record, hashed_key
+from middleware.entangled.replication.replica import Replica
+from middleware.entangled.replication.shipper import ROOM, Shipper
+from middleware.entangled.wire.asker import PATIENCE
+from tests.fleet import Fleet, FleetCase
+
+KEY = hashed_key("flood")
+FLOOD = 40
+
+
+class ShipperTests(FleetCase):
+    def setUp(self) -> None:
+        super().setUp()
+        self.world: Fleet = self.fleet(2)
+        self.asked: list[int] = []
+        writer = self.world.nodes[0]
+        self.shipper = Shipper(writer.overlay, writer._chores)
+        self.there: Contact = self.world.nodes[1].contact
+
+    def record(self, number: int, size: int = 50) -> Record:
+        """A record of the writer's."""
+        identity: Identity = self.world.nodes[0].identity
+        return Record(KEY, f"{number}", identity.public, number + 1, "team", TEAM_TTL, b"x" * size).signed(identity)
+
+    def stored(self, *records: Record) -> list[Deferred[object]]:
+        """Store them all at once."""
+        return [Deferred.fromCoroutine(self.shipper.store(self.there, record)) for record in records]
+
+    def count_questions(self) -> None:
+        """Note how many records each question brings."""
+        replica, answer = self.world.nodes[1].replica, Replica.answer_store
+
+        def counted(peer: Contact, packed: list[object], *left: Any) -> list[int]:
+            self.asked.append(len(packed))
+            return answer(replica, peer, packed, *left)
+
+        self.world.nodes[1].endpoint.expose("store", counted, changes=True, idempotent=True)
+
+    def test_a_flood_shares_questions(self) -> None:
+        """Of forty records the first goes alone and at once; the others share questions of one datagram each."""
+        self.count_questions()
+        verdicts = self.stored(*[self.record(number) for number in range(FLOOD)])
+        self.world.run(0.1)
+        self.assertEqual([self.successResultOf(verdict) for verdict in verdicts], [0] * FLOOD)
+        self.assertEqual(self.asked, [1] + [ROOM // self.record(1).message_bytes] * 6 + [3])
+        self.assertEqual(len(self.world.nodes[1].store.get(KEY)), FLOOD)
+        self.assertEqual(self.shipper._quays, {})
+
+    def test_one_that_is_refused_goes_alone(self) -> None:
+        """A replica without room for one of the records takes the others that came with it."""
+        replica, keep = self.world.nodes[1].replica, Replica.keep
+
+        def picky(record: Record, left: float | None = None) -> int:
+            if record.name == "3":
+                raise Refused("not this one")
+            return keep(replica, record, left)
+
+        self.patch(replica, "keep", picky)
+        verdicts = self.stored(*[self.record(number) for number in range(6)])
+        self.world.run(0.1)
+        self.failureResultOf(verdicts.pop(3), Refused)
+        self.assertEqual([self.successResultOf(verdict) for verdict in verdicts], [0] * 5)
+
+    def test_a_silent_replica_is_not_asked_in_turn(self) -> None:
+        """Where the first question gets no answer, all that wait get their own chance at once, and end together."""
+        self.world.kill(1)
+        verdicts = self.stored(*[self.record(number) for number in range(FLOOD)])
+        self.world.run(2 * PATIENCE + 0.1)
+        for verdict in verdicts:
+            self.failureResultOf(verdict, EntangledError)
+        self.assertEqual(self.shipper._quays, {})
+
+    def test_a_long_record_holds_up_nobody(self) -> None:
+        """A record that needs a parcel goes by itself; a short one that comes after it is asked for at once."""
+        self.count_questions()
+        verdicts = self.stored(self.record(0, size=50_000), self.record(1))
+        self.world.run(0.5)
+        self.assertEqual([self.successResultOf(verdict) for verdict in verdicts], [0, 0])
+        self.assertEqual(self.asked, [1, 1])
