@@ -28,7 +28,7 @@ class SwarmNodeTests(FleetCase):
 
     def submitted(self, fleet: SwarmFleet, task: Task = TASK) -> Task:
         """A task as it was published."""
-        return self.done(fleet, Deferred.fromCoroutine(fleet.nodes[0].submit(task)), 1.0)
+        return self.done(fleet, Deferred.fromCoroutine(fleet.nodes[0].submit(task)), 5.0)
 
     def asked(self, fleet: SwarmFleet, method: str, *arguments: object) -> Deferred[Any]:
         """A call of dog1 to dog0."""

@@ -15,7 +15,7 @@ from twisted.internet.interfaces import IReactorTime
 from twisted.logger import Logger
 
 from middleware.entangled.background import Background
-from middleware.entangled.errors import NotRunning, Refused
+from middleware.entangled.errors import NoAnswer, NotRunning, Refused
 from middleware.entangled.kademlia.contact import Contact, unpacked
 from middleware.entangled.kademlia.overlay import Overlay, contacts_of
 from middleware.entangled.kademlia.roster import MAX_MEMBERS
@@ -147,11 +147,21 @@ class Membership:
         self._chores.fork(self._list(contact) if self._overlay.is_whole else self._first_list(contact))
 
     async def _first_list(self, contact: Contact) -> None:
-        """Meet the members of the network that was just joined, after a moment for those who wait for a first read."""
+        """Meet the members of the network that was just joined, after a moment for those who wait for a first read.
+
+        A newcomer has no say before it has met them: whom the question does not reach is asked again, or another.
+        """
         self._joining = True
         try:
-            await self._chores.sleep(self._breath())
-            await self._list(contact)
+            while not self._chores.is_stopped:
+                await self._chores.sleep(self._breath())
+                try:
+                    return await self._list(contact)
+                except NoAnswer:
+                    there = self._overlay.roster.live()
+                    if not there:
+                        return  # who greets next is asked
+                    contact = there[self._rng.randrange(len(there))]
         finally:
             self._joining = False
 
