@@ -1,0 +1,203 @@
+"""Party: all that one node has to do with one auction: bid in it, relay it, or count it; pure.
+
+What comes in is told to it, ``errands`` says what goes out, ``due`` when to ask for that again.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Callable, Iterable
+
+from middleware.consensus.strategy import Report
+from middleware.dissemination.announcement import Announcement
+from middleware.dissemination.auction import Auction
+from middleware.dissemination.audience import Audience
+from middleware.dissemination.bid import Bid
+from middleware.dissemination.check import Check
+from middleware.dissemination.direct import Direct
+from middleware.dissemination.errand import Errand, Notice, Offer
+from middleware.dissemination.flood import Flood
+from middleware.dissemination.rule import Rule
+from middleware.dissemination.scale import DIRECT
+from middleware.dissemination.summary import Summary
+from middleware.dissemination.teller import Teller
+from middleware.dissemination.tree import Branch
+from middleware.entangled.kademlia.contact import Contact
+
+RELAY_SILENCE = 0.4
+"""Seconds of silence after which a node asks for all that are behind it, before they do so themselves."""
+
+OnSummary = Callable[[tuple[Report, ...]], None]
+"""Told of the reports that stand, each time that these are others."""
+
+
+class Party:
+    """The part of the node ``me`` in ``auction``; ``sign`` makes its signature, ``contacts`` gives the nodes it knows."""
+
+    def __init__(
+        self,
+        auction: Auction,
+        me: Contact,
+        rule: Rule,
+        contacts: Callable[[], Iterable[Contact]],
+        rng: random.Random,
+        sign: Callable[[bytes], bytes],
+    ) -> None:
+        self.auction = auction
+        self.announcement: Announcement | None = None
+        self.on_summary: OnSummary = lambda reports: None
+        self.audience = Audience()
+        self._me = me
+        self._rule = rule
+        self._rank = auction.rank(me.node_id)
+        self._teller = Teller(auction, self._rank, rule, sign) if self._rank is not None else None
+        self._branch = Branch(auction, me.node_id, rule, contacts)
+        self._check = Check(auction, me.node_id, rule, rng)
+        self._direct = Direct(auction, me.node_id)
+        self._flood = Flood(me.node_id, rule, contacts, rng)
+        self._flooded_at = math.inf
+        self._told: tuple[Report, ...] = ()
+        self._first_at = math.inf
+        self._is_relay = False
+        if self._teller is not None:
+            for member in auction.council:
+                if member.node_id != me.node_id:
+                    self.audience.add(member, is_shared=True)
+
+    @property
+    def summary(self) -> Summary:
+        """The bids that this node has gathered."""
+        return self._teller.summary if self._teller is not None else self._branch.summary
+
+    @property
+    def due(self) -> float:
+        """When there is something to do, if nothing happens before."""
+        if self._teller is not None:
+            return min(self._direct.due, self._teller.due, self._flooded_at)
+        return min(self._direct.due, self._branch.due, self._check.due, self._flooded_at)
+
+    def expect(self, bidders: int) -> None:
+        """Close the bidding as soon as that many agents have bid or abstained."""
+        if self._teller is not None:
+            self._teller.expected = bidders
+
+    def bid(self, bid: Bid, way: str, now: float) -> None:
+        """Make the own bid, or take it back."""
+        self._first_at = min(self._first_at, now)
+        is_direct = way == DIRECT
+        if is_direct:
+            self._direct.bid(bid, now)
+        if self._teller is not None:
+            self._teller.join([bid], self._me.node_id, is_direct, now - self._first_at, now)
+        else:
+            if not is_direct:
+                self._branch.join([bid], now)
+            self._check.bid(bid, self.announcement, is_direct, now)
+        if self._flooded_at != math.inf or self._flood.summary.standing:
+            self._cry(now)
+
+    def offered(
+        self, bids: Iterable[Bid], sender: Contact, age: float, is_shared: bool, now: float
+    ) -> Announcement | None:
+        """Take what ``sender`` offers; what it is to be told in return."""
+        self._first_at = min(self._first_at, now - age)
+        self.audience.add(sender, is_shared and self._teller is not None)
+        if self._teller is not None:
+            self._teller.join(bids, sender.node_id, is_shared, age, now)
+        else:
+            self._branch.join(bids, now)
+            if not self._is_relay and self.announcement is None:
+                self._is_relay = True
+                self._check.expect(self._first_at, RELAY_SILENCE)
+        if self.announcement is not None:
+            self.audience.knows(sender, self.announcement)
+        return self.announcement
+
+    def announced(self, announcement: Announcement, now: float) -> bool:
+        """Take a genuine announcement; whether it is newer than the one known."""
+        if self.announcement is not None and announcement.precedence <= self.announcement.precedence:
+            return False
+        self.announcement = announcement
+        if self._teller is not None:
+            self._teller.heard(announcement)
+        self._check.heard(announcement, now)
+        self._tell()
+        return True
+
+    def cried(self, bids: Iterable[Bid], sender: Contact, now: float) -> None:
+        """Take what a neighbour cries; an exclusive task is not decided so."""
+        if self.auction.exclusive:
+            return
+        self._first_at = min(self._first_at, now)
+        if self._flood.join(bids, sender):
+            if self._check.own is not None:
+                self._flood.join([self._check.own])
+            self._flooded_at = min(self._flooded_at, max(now, self._first_at + self.auction.waiting))
+
+    def errands(self, now: float) -> list[Errand]:
+        """What goes out now."""
+        age = max(0.0, now - self._first_at) if self._first_at != math.inf else 0.0
+        out: list[Errand] = []
+        if self._teller is not None:
+            made = self._teller.announcement(self.announcement, self.audience.is_shared, now)
+            if made is not None:
+                self.announced(made, now)
+            out += self._teller.offers(age, now)
+        else:
+            out += self._branch.offers(age, now)
+            out += self._check.offers(self.announcement, age, now)
+        out += self._direct.offers(age, now)
+        is_mine = self.announcement is not None and self.announcement.rank == self._rank
+        out += self.audience.notices(self.announcement, is_mine)
+        out += self._flood.cries()
+        if now >= self._flooded_at:
+            self._flooded_at = math.inf
+            self._tell()
+        return out
+
+    def answered(self, errand: Errand, now: float) -> None:
+        """Take note that an errand was confirmed; what came in return was told before."""
+        if isinstance(errand, Notice):
+            self.audience.answered(errand)
+        elif isinstance(errand, Offer):
+            if errand.is_straight:
+                self._check.answered(self.announcement, now)
+            elif errand.is_shared:
+                self._direct.answered(errand)
+            elif self._teller is not None:
+                self._teller.answered(errand, now)
+            else:
+                self._branch.answered(errand, now)
+
+    def failed(self, errand: Errand, now: float) -> None:
+        """Take note that nobody answered an errand."""
+        if isinstance(errand, Notice):
+            self.audience.failed(errand)
+        elif isinstance(errand, Offer):
+            if errand.is_straight:
+                self._check.failed(errand.to, now)
+            elif errand.is_shared:
+                self._direct.failed(errand, now)
+            elif self._teller is not None:
+                self._teller.failed(errand, now)
+            else:
+                self._branch.failed(errand, now)
+            is_alone = self._check.is_alone or self._direct.is_alone or self._branch.is_alone
+            if is_alone and not self.auction.exclusive and self._teller is None:
+                self._cry(now)
+
+    def _cry(self, now: float) -> None:
+        """No council is in reach: let the neighbours know."""
+        own = self._check.own
+        if own is not None and not self.auction.exclusive and self._flood.join([own]):
+            self._flooded_at = min(self._flooded_at, max(now, self._first_at + self.auction.waiting))
+
+    def _tell(self) -> None:
+        """Tell what stands, of the announcement and of what was cried."""
+        announced = self.announcement.reports if self.announcement is not None else ()
+        cried = self._flood.summary.standing
+        reports = self._rule.merged(announced, cried) if cried else announced
+        if reports != self._told:
+            self._told = reports
+            self.on_summary(reports)
