@@ -37,7 +37,7 @@ BITS = 160
 K = 8
 TRIES = (0.0, 0.1, 0.25)
 PATIENCE = 0.4
-"""When an errand is sent again, and when it has failed: the endpoint's first wait, its back-off, and the shell's time."""
+"""When an errand is sent again, and when it has failed: as the endpoint does it within the shell's time."""
 SMALL_COUNCIL, LARGE_COUNCIL, LARGE_FROM = 3, 5, 50
 AT_LEAST = 0.99
 MESSAGES = {3: 10.0, 30: 10.0, 100: 6.0, 1_000: 6.0, 10_000: 6.0}
@@ -84,7 +84,7 @@ class Weather:
 
 @dataclass
 class Outcome:
-    """What one auction came to: ``took`` is, for each agent that is right, seconds from the end of the waiting period."""
+    """What one auction came to; ``took`` has, of each agent that is right, seconds since the waiting period was over."""
 
     messages: float
     busiest: int
@@ -241,9 +241,9 @@ class Crowd:
         party, sender = self.parties[to], self.ring.contacts[place]
         if isinstance(errand, Offer):
             reply = party.offered(errand.bids, sender, errand.age, errand.is_shared, self.now)
-            if to == self._places[self.auction.council[0].node_id] and self.gathered == math.inf:
-                if any(report.agent == self.best for report in party.summary.standing):
-                    self.gathered = self.now
+            has_best = any(report.agent == self.best for report in party.summary.standing)
+            if has_best and self.auction.rank(self.ring.contacts[to].node_id) == 0:
+                self.gathered = min(self.gathered, self.now)
             return reply
         assert isinstance(errand, Notice)
         party.announced(errand.announcement, self.now)

@@ -33,7 +33,7 @@ OnSummary = Callable[[tuple[Report, ...]], None]
 
 
 class Party:
-    """The part of the node ``me`` in ``auction``; ``sign`` makes its signature, ``contacts`` gives the nodes it knows."""
+    """The part of the node ``me`` in ``auction``; ``sign`` makes its signature, ``contacts`` gives whom it knows."""
 
     def __init__(
         self,

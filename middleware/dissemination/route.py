@@ -19,15 +19,15 @@ MAX_HOPS = 4
 def hops(auction: Auction, own_id: bytes, contacts: Iterable[Contact]) -> list[Contact]:
     """Whom to send to, in the order of trying: the nearest contacts to the key, then the council.
 
-    Only contacts nearer than this node count.  Where a member of the council is as near as any other, it is first: it
-    is the goal.
+    Only contacts nearer than this node count.  Where the nearest is a member of the council it is the goal, and the
+    other members follow.
     """
     own = distance(own_id, auction.key)
     nearer = [c for c in contacts if distance(c.node_id, auction.key) < own]
     found = closest(nearer, auction.key, MAX_HOPS)
     council = [member for member in auction.council if member.node_id != own_id]
     if found and auction.rank(found[0].node_id) is not None:
-        return council
+        return [found[0], *(member for member in council if member.node_id != found[0].node_id)]
     return [*(c for c in found if auction.rank(c.node_id) is None), *council]
 
 

@@ -1,4 +1,4 @@
-"""Summary: what one node knows of the bids of one auction: a join that gives the same in any order, however often; pure.
+"""Summary: what one node knows of the bids of one auction; a join, the same in any order and however often; pure.
 
 Of each agent only the bid of the highest revision counts.  Of those the auction's rule says which stand, and only they
 travel on.  A bid that took the place of another is kept and travels even where it does not stand: else a late copy of

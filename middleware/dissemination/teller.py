@@ -20,9 +20,13 @@ from middleware.dissemination.summary import Summary
 STAND_IN = 0.4
 """Seconds after which the next member announces what the one before it should have: the tries of one errand."""
 LATER = 0.05
-"""Seconds over which what comes one by one is gathered."""
-AGAIN = 1.0
-"""Seconds after which a fellow that did not answer is tried again."""
+"""Seconds over which what comes after the announcement is gathered."""
+GATHER = 0.1
+"""Seconds over which what comes one by one is gathered for the fellows."""
+INFORMED = 2
+"""Fellows that are kept informed: the first of the council that answer, who announce and stand in."""
+AGAIN, MOST_PAUSE = 1.0, 30.0
+"""Seconds after which a fellow that did not answer is tried again, at first and at most; doubled each time."""
 MAX_COUNTED = 4096
 
 
@@ -43,6 +47,7 @@ class Teller:
         self._fellows = [member for member in auction.council if member.node_id != auction.council[rank].node_id]
         self._known: dict[bytes, dict[str, tuple[int, bytes]]] = {member.node_id: {} for member in self._fellows}
         self._under_way: set[bytes] = set()
+        self._silent: dict[bytes, int] = {}
         self._send_at = dict.fromkeys(self._known, math.inf)
 
     @property
@@ -60,8 +65,7 @@ class Teller:
         for fellow in self._known:
             if is_shared or fellow == sender:
                 self._knows(fellow, bids)
-            if self._fresh_for(fellow):
-                self._send_at[fellow] = min(self._send_at[fellow], now + LATER)
+        self._inform(now + GATHER)
         if self._closes_at == math.inf and bids:
             self._closes_at = now + max(0.0, self._auction.waiting - age)
             self._speak_at = self._closes_at + self._rank * STAND_IN
@@ -106,13 +110,23 @@ class Teller:
         """A fellow has confirmed."""
         self._under_way.discard(offer.to.node_id)
         self._knows(offer.to.node_id, offer.bids)
-        if self._fresh_for(offer.to.node_id):
-            self._send_at[offer.to.node_id] = min(self._send_at[offer.to.node_id], now + LATER)
+        self._silent.pop(offer.to.node_id, None)
+        self._inform(now + GATHER)
 
     def failed(self, offer: Offer, now: float) -> None:
         """A fellow did not answer."""
         self._under_way.discard(offer.to.node_id)
-        self._send_at[offer.to.node_id] = min(self._send_at[offer.to.node_id], now + AGAIN)
+        tries = self._silent.get(offer.to.node_id, 0)
+        self._silent[offer.to.node_id] = tries + 1
+        pause = min(MOST_PAUSE, AGAIN * 2.0 ** min(tries, 8))
+        self._send_at[offer.to.node_id] = min(self._send_at[offer.to.node_id], now + pause)
+        self._inform(now)
+
+    def _inform(self, moment: float) -> None:
+        """Let the first fellows that answer have what they do not have, from ``moment`` on."""
+        for fellow in [node_id for node_id in self._known if node_id not in self._silent][:INFORMED]:
+            if self._fresh_for(fellow):
+                self._send_at[fellow] = min(self._send_at[fellow], moment)
 
     def _knows(self, fellow: bytes, bids: Iterable[Bid]) -> None:
         """Take note that a fellow has ``bids``; only what has to travel on is kept in mind."""

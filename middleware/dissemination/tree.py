@@ -24,8 +24,8 @@ HOLD_SHARE = 0.5
 """The longest such wait, as a share of the waiting period."""
 LATER = 0.05
 """Seconds over which what comes after the first message is gathered."""
-AGAIN = 1.0
-"""Seconds after which all are tried again where none of them answered."""
+AGAIN, MOST_PAUSE = 1.0, 30.0
+"""Seconds after which all are tried again where none of them answered, at first and at most; doubled each time."""
 
 
 class Branch:
@@ -45,6 +45,7 @@ class Branch:
         self._under_way: Offer | None = None
         self._send_at = math.inf
         self._has_sent = False
+        self._rounds = 0
 
     @property
     def due(self) -> float:
@@ -73,7 +74,7 @@ class Branch:
 
     def answered(self, offer: Offer, now: float) -> None:
         """The parent has confirmed."""
-        self.is_alone = False
+        self.is_alone, self._rounds = False, 0
         self._settled(offer, now)
         self._confirmed.update((bid.agent, bid.rank) for bid in offer.bids)
 
@@ -87,7 +88,8 @@ class Branch:
         if self._parent is None:
             self.is_alone = True
             self._refused.clear()
-            self._send_at = now + AGAIN
+            self._send_at = now + min(MOST_PAUSE, AGAIN * 2.0 ** min(self._rounds, 8))
+            self._rounds += 1
 
     def _settled(self, offer: Offer, now: float) -> None:
         if offer is self._under_way:
