@@ -84,7 +84,7 @@ class Weather:
 
 @dataclass
 class Outcome:
-    """What one auction came to; ``took`` has, of each agent that is right, seconds since the waiting period was over."""
+    """What one auction came to; ``took`` has, of each agent that is right, seconds since the waiting period ended."""
 
     messages: float
     busiest: int
@@ -330,7 +330,7 @@ def targets(row: dict[str, object]) -> list[tuple[str, bool]]:
         if limit is not None:
             goals.append(("agreement", float(str(row["p95"])) <= limit))
         goals.append(("right", float(str(row["right"])) >= AT_LEAST))
-    goals.append(("busiest", int(str(row["busiest"])) <= BUSIEST))
+        goals.append(("busiest", int(str(row["busiest"])) <= BUSIEST))
     return goals
 
 

@@ -9,7 +9,8 @@ from __future__ import annotations
 import random
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 from twisted.application.service import Service
 from twisted.internet.defer import Deferred, maybeDeferred
@@ -33,6 +34,9 @@ from middleware.presence import DEVICES, Device, Presence, devices_of
 from middleware.streams import Streams
 from middleware.tasks import MAX_LEASE_TTL, RESULT, TASKS, Result, Task, group_key
 from middleware.value import bounded
+
+if TYPE_CHECKING:
+    from middleware.dissemination.dissemination import Dissemination
 
 COUNCIL = 3
 CAMERA = "camera"
@@ -82,6 +86,9 @@ class SwarmNode(Service):
         expose = self.entangled.endpoint.expose
         expose("lease.claim", self._answer_claim, changes=True)
         expose("lease.release", self._answer_release, changes=True)
+        expose("bid.offer", self._answer_offer, changes=True, idempotent=True)
+        expose("bid.announce", self._answer_announcement, changes=True, idempotent=True)
+        expose("bid.cry", self._take_cry, changes=True)
         expose("device.message", self._answer_message, changes=True)
         expose("device.disconnect", self._answer_disconnect, changes=True)
 
@@ -104,6 +111,8 @@ class SwarmNode(Service):
     def _leave(self, leave: Callable[[], None]) -> None:
         self._chores.stop()
         self.streams.stop()
+        if "dissemination" in self.__dict__:
+            self.dissemination.stop()
         leave()
         super().stopService()
 
@@ -219,7 +228,34 @@ class SwarmNode(Service):
         ttl = float(task.lease_ttl)
         return Lessee(task.task_id, self.uuid, ttl, len(task.council), ask, self.clock, self.rng, changed, floor)
 
+    @cached_property
+    def dissemination(self) -> Dissemination:
+        """How the bids for tasks travel through this node."""
+        # Imported by the first bid: a node that never carries one is spared the memory.
+        from middleware.consensus.strategy import strategy_for
+        from middleware.dissemination.dissemination import Dissemination, Surroundings
+        from middleware.dissemination.scale import team_size
+
+        entangled = self.entangled
+
+        def size() -> int:
+            return team_size(entangled.identity.node_id, entangled.overlay.contacts())
+
+        around = Surroundings(lambda: entangled.contact, entangled.overlay.contacts, size, strategy_for)
+        return Dissemination(entangled.identity, entangled.endpoint, around, self.clock, self.rng)
+
     # -- what peers ask ---------------------------------------------------------------------------------------------
+
+    def _answer_offer(
+        self, peer: Contact, auction: list[object], bids: list[object], age_ms: int, is_shared: bool
+    ) -> list[object] | None:
+        return self.dissemination.answer_offer(peer, auction, bids, age_ms, is_shared)
+
+    def _answer_announcement(self, peer: Contact, auction: list[object], announcement: list[object]) -> None:
+        self.dissemination.answer_announcement(peer, auction, announcement)
+
+    def _take_cry(self, peer: Contact, auction: list[object], bids: list[object]) -> None:
+        self.dissemination.take_cry(peer, auction, bids)
 
     def _answer_claim(self, peer: Contact, task_id: str, token: int, ttl: float) -> list[object]:
         if len(task_id) > MAX_NAME or not 0 < token < 2**62:

@@ -28,6 +28,9 @@ from middleware.entangled.kademlia.contact import Contact
 RELAY_SILENCE = 0.4
 """Seconds of silence after which a node asks for all that are behind it, before they do so themselves."""
 
+MOST_REVISION = 2**32
+"""What is announced beyond it was made up, and is not outbid."""
+
 OnSummary = Callable[[tuple[Report, ...]], None]
 """Told of the reports that stand, each time that these are others."""
 
@@ -57,7 +60,8 @@ class Party:
         self._direct = Direct(auction, me.node_id)
         self._flood = Flood(me.node_id, rule, contacts, rng)
         self._flooded_at = math.inf
-        self._told: tuple[Report, ...] = ()
+        self.told: tuple[Report, ...] = ()
+        self.next_revision = 0
         self._first_at = math.inf
         self._is_relay = False
         if self._teller is not None:
@@ -77,6 +81,16 @@ class Party:
             return min(self._direct.due, self._teller.due, self._flooded_at)
         return min(self._direct.due, self._branch.due, self._check.due, self._flooded_at)
 
+    @property
+    def own(self) -> Bid | None:
+        """The last bid of this node's own agent."""
+        return self._check.own
+
+    @property
+    def is_outlived(self) -> bool:
+        """Whether a bid of this agent's former life is announced in place of the own one, which has to be made anew."""
+        return self.own is not None and self.own.revision < self.next_revision - 1
+
     def expect(self, bidders: int) -> None:
         """Close the bidding as soon as that many agents have bid or abstained."""
         if self._teller is not None:
@@ -85,15 +99,15 @@ class Party:
     def bid(self, bid: Bid, way: str, now: float) -> None:
         """Make the own bid, or take it back."""
         self._first_at = min(self._first_at, now)
+        self.next_revision = max(self.next_revision, bid.revision + 1)
         is_direct = way == DIRECT
         if is_direct:
             self._direct.bid(bid, now)
         if self._teller is not None:
             self._teller.join([bid], self._me.node_id, is_direct, now - self._first_at, now)
-        else:
-            if not is_direct:
-                self._branch.join([bid], now)
-            self._check.bid(bid, self.announcement, is_direct, now)
+        elif not is_direct:
+            self._branch.join([bid], now)
+        self._check.bid(bid, self.announcement, is_direct, now)
         if self._flooded_at != math.inf or self._flood.summary.standing:
             self._cry(now)
 
@@ -122,6 +136,11 @@ class Party:
         if self._teller is not None:
             self._teller.heard(announcement)
         self._check.heard(announcement, now)
+        for entry in announcement.entries:
+            if entry.report.agent == self._me.node_id.hex() and entry.revision < MOST_REVISION:
+                own = self.own
+                is_mine = own is not None and (own.revision, own.report) == (entry.revision, entry.report)
+                self.next_revision = max(self.next_revision, entry.revision + (1 if is_mine else 2))
         self._tell()
         return True
 
@@ -198,6 +217,6 @@ class Party:
         announced = self.announcement.reports if self.announcement is not None else ()
         cried = self._flood.summary.standing
         reports = self._rule.merged(announced, cried) if cried else announced
-        if reports != self._told:
-            self._told = reports
+        if reports != self.told:
+            self.told = reports
             self.on_summary(reports)

@@ -40,7 +40,7 @@ class Summary:
     def join(self, bids: Iterable[Bid]) -> bool:
         """Take ``bids`` in; whether anything is another than before."""
         before = dict(self._bids)
-        newer = {}
+        newer: dict[str, Bid] = {}
         for bid in bids:
             known = newer.get(bid.agent) or self._bids.get(bid.agent)
             if known is None or bid.rank > known.rank:
