@@ -7,7 +7,6 @@ revision and takes the place of the earlier; one without a report takes it back.
 from __future__ import annotations
 
 import hashlib
-import math
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field, fields, replace
 from functools import cached_property
@@ -17,9 +16,10 @@ import msgpack
 from middleware.consensus.strategy import Report
 from middleware.dissemination.auction import Auction
 from middleware.entangled.identity import Identity, node_id, verified
-from middleware.value import LARGEST, is_whole
+from middleware.value import is_number, is_whole
 
 MAX_TEXT = 200
+MAX_ITEMS = 16
 _DEFAULTS = {f.name: f.default for f in fields(Report) if f.default is not MISSING}
 
 
@@ -89,21 +89,33 @@ def report_of(content: object, agent: str) -> Report | None:
     """The report of ``agent`` in what ``packed_report`` made, or None; a cost that is no finite distance is none."""
     if not isinstance(content, Mapping) or not is_cost(content.get("cost")):
         return None
-    others = {name: value for name, value in content.items() if name != "cost"}
+    others = {name: _as_sent(value) for name, value in content.items() if name != "cost"}
     for name, value in others.items():
         usual = _DEFAULTS.get(name, MISSING)
         if usual is MISSING or not _is_like(value, usual):
             return None
-    return Report(agent, float(content["cost"]), **others)
+    # Numbers stay as they came: the signature is over their bytes.
+    return Report(agent, content["cost"], **others)
 
 
 def is_cost(value: object) -> bool:
     """Whether ``value`` is what acting may cost: finite, not negative, not enormous."""
-    return type(value) in (int, float) and 0 <= value <= LARGEST  # type: ignore[operator]
+    return is_number(value) and value >= 0  # type: ignore[operator]
+
+
+def _as_sent(value: object) -> object:
+    """What was packed: a tuple travels as a list."""
+    return tuple(value) if isinstance(value, list) else value
 
 
 def _is_like(value: object, usual: object) -> bool:
     """Whether a field that is usually ``usual`` may have ``value``."""
+    if isinstance(value, tuple):
+        return isinstance(usual, tuple) and len(value) <= MAX_ITEMS and all(map(_is_item, value))
     if isinstance(usual, float):
-        return type(value) in (int, float) and math.isfinite(value)  # type: ignore[arg-type]
-    return type(value) is type(usual) and (not isinstance(value, str) or len(value) <= MAX_TEXT)
+        return is_number(value)
+    return type(value) is type(usual) and (isinstance(value, bool) or _is_item(value))
+
+
+def _is_item(value: object) -> bool:
+    return len(value) <= MAX_TEXT if isinstance(value, str) else is_number(value)

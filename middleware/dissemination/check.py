@@ -83,7 +83,7 @@ class Check:
         combined = self._rule.merged(announcement.reports, (self.own.report,))
         if self._is_strict and self.own.report in combined:
             return False
-        return self._rule.assigned(combined) == self._rule.assigned(announcement.reports)
+        return self._rule.decided(combined) == self._rule.decided(announcement.reports)
 
     def offers(self, announcement: Announcement | None, age: float, now: float) -> list[Offer]:
         """The question to the council, where it is time."""

@@ -42,14 +42,23 @@ class Rule:
 
     def assigned(self, reports: Sequence[Report]) -> str | None:
         """The agent that should act, going by these reports."""
+        return self._consensus(reports)[0]
+
+    def decided(self, reports: Sequence[Report]) -> tuple[str | None, str]:
+        """What is decided by these reports, all but who stands by: equal where nothing depends on the difference."""
+        return self._consensus(reports)
+
+    def _consensus(self, reports: Sequence[Report]) -> tuple[str | None, str]:
         try:
-            agent = self._find(tuple(reports)).assigned_agent
+            consensus = self._find(tuple(reports))
+            agent = consensus.assigned_agent
+            others = repr([getattr(consensus, name, None) for name in ("assigned", "value", "choice")])
         except Exception as error:  # somebody else's code
             self._blame("find", error)
         else:
             if agent is None or any(report.agent == agent for report in reports):
-                return agent  # type: ignore[no-any-return]
-        return min(reports, key=_order).agent if reports else None
+                return agent, others
+        return (min(reports, key=_order).agent if reports else None), ""
 
 
 def leading(a: Sequence[Report], b: Sequence[Report], room: int = LEADING) -> tuple[Report, ...]:

@@ -148,7 +148,7 @@ class Teller:
         combined = self._rule.merged(_current(last.entries, self.summary), tuple(e.report for e in entries))
         if is_strict and set(combined) != set(announced):
             return True
-        return self._rule.assigned(combined) != self._rule.assigned(announced)
+        return self._rule.decided(combined) != self._rule.decided(announced)
 
 
 def _current(entries: tuple[Entry, ...], summary: Summary) -> tuple[Report, ...]:
