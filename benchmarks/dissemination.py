@@ -271,9 +271,9 @@ class Crowd:
         def contacts() -> list[Contact]:
             if not known:
                 table = self.ring.table(place)
+                # Ten thousand whole tables would not fit; only the way to the key is asked for, but by a flood.
                 everybody = table.contacts()
-                known.extend(closest(everybody, self.auction.key, K))
-                known.extend(c for c in everybody if c not in known) if len(everybody) <= 4 * K else None
+                known.extend(closest(everybody, self.auction.key, K) if self.auction.exclusive else everybody)
             return known
 
         dice = random.Random(f"{self.auction.task_id}/{place}")
