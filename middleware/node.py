@@ -36,7 +36,9 @@ from middleware.tasks import MAX_LEASE_TTL, RESULT, TASKS, Result, Task, group_k
 from middleware.value import bounded
 
 if TYPE_CHECKING:
+    from middleware.dissemination.bidding import Bidding
     from middleware.dissemination.dissemination import Dissemination
+    from middleware.dissemination.party import OnSummary
 
 COUNCIL = 3
 CAMERA = "camera"
@@ -210,6 +212,15 @@ class SwarmNode(Service):
     def group(self, task_id: str, heard: Heard) -> Group:
         """Take part in a task: a place among its participants."""
         return Group(task_id, self.entangled, heard, self._quietly)
+
+    def bidding(self, task: Task, epoch: int, on_summary: OnSummary) -> Bidding:
+        """Bid for ``task`` in ``epoch``: ``on_summary`` is told which bids the task's council announces."""
+        from middleware.dissemination.auction import Auction
+
+        exclusive = getattr(task, "exclusive", True)
+        waiting = float(task.waiting_period)
+        auction = Auction(task.task_id, epoch, task.council, task.strategy, waiting, exclusive)
+        return self.dissemination.enter(auction, on_summary)
 
     def conclude(self, task_id: str, result: Result) -> Deferred[Stored]:
         """Record how a task ended, as somebody who takes no part in it."""

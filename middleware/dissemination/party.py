@@ -203,7 +203,7 @@ class Party:
             else:
                 self._branch.failed(errand, now)
             is_alone = self._check.is_alone or self._direct.is_alone or self._branch.is_alone
-            if is_alone and not self.auction.exclusive and self._teller is None:
+            if is_alone and self._teller is None:
                 self._cry(now)
 
     def _cry(self, now: float) -> None:

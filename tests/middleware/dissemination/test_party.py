@@ -172,16 +172,18 @@ class BidderTests(SynchronousTestCase):
     def test_silence(self) -> None:
         """A bidder that is announced nothing asks the council, one member after the other."""
         self.party.bid(bid(5, 2.0), TREE, 0.0)
-        asked = []
+        asked: list[Contact] = []
         now = 0.0
-        while len(asked) < 4:
-            now = max(now, self.party.due)
+        for _ in range(20):
+            now = max(now, min(self.party.due, 5.0))
             for offer in offers(self.party.errands(now)):
                 if offer.is_straight:
                     asked.append(offer.to)
                     self.party.failed(offer, now)
                 else:
                     self.party.answered(offer, now)
+            if len(asked) == 4:
+                break
         self.assertEqual(asked, [*COUNCIL, COUNCIL[0]])
         self.assertTrue(now < 5.0)
 
@@ -226,10 +228,22 @@ class BranchTests(SynchronousTestCase):
         self.assertEqual([b.agent for b in up.bids], sorted(AGENTS[place].node_id.hex() for place in (6, 7, 8)))
         self.assertEqual(up.to, hops(AUCTION, CONTACTS[5].node_id, CONTACTS)[0])
 
+    def test_nearer_ones_wait_longer(self) -> None:
+        """The nearer a node is to the key the longer it waits for what is behind it, up to half the waiting period."""
+        waits = []
+        for contact in sorted(CONTACTS[3:], key=lambda c: shared_bits(c.node_id, AUCTION.key)):
+            one = party(CONTACTS.index(contact))
+            one.offered([bid(6, 1.0)], CONTACTS[6], 0.0, False, 0.0)
+            waits.append(one.due)
+        self.assertEqual(waits, sorted(waits))
+        self.assertEqual(waits[0], 0.0)
+        self.assertTrue(0.02 < waits[-1] <= AUCTION.waiting / 2)
+
     def test_next_nearest(self) -> None:
         """Where the parent does not answer, everything goes to the next nearest contact, and at last to the council."""
         self.party.offered([bid(6, 1.0)], CONTACTS[6], 0.0, False, 0.0)
         expected = hops(AUCTION, CONTACTS[5].node_id, [c for c in CONTACTS if c is not CONTACTS[5]])
+        self.assertEqual(len(expected), 4 + len(COUNCIL))
         asked = []
         for _ in expected:
             [up] = [o for o in offers(self.party.errands(self.party.due)) if not o.is_straight]
@@ -301,6 +315,7 @@ class TellerTests(SynchronousTestCase):
         self.take(self.second, 5, 2.0, 0.0)
         self.second.errands(0.6)
         self.assertIsNone(self.second.announcement)
+        self.assertTrue(0.6 < self.second.due < 1.0)
         self.second.errands(self.second.due)
         assert self.second.announcement is not None
         self.assertEqual(self.second.announcement.precedence, (1, -1))

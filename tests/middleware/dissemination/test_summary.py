@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 from collections.abc import Sequence
 
 from hypothesis import given, settings
@@ -15,6 +16,7 @@ from middleware.dissemination.rule import LEADING, MAX_REPORTS, Rule, leading
 from middleware.dissemination.summary import MAX_SUPERSEDING, Summary
 from tests.middleware.dissemination.ground import AGENTS, bid, rule
 
+Spoken = tuple[int, float | None, int]
 places = st.integers(0, 7)
 costs = st.sampled_from([0.0, 1.0, 2.0, 3.0, None])
 batches = st.lists(st.lists(st.tuples(places, costs, st.integers(0, 2)), max_size=4), max_size=6)
@@ -45,9 +47,7 @@ class SummaryTests(SynchronousTestCase):
 
     @given(batches, st.randoms(use_true_random=False))
     @settings(max_examples=80, deadline=None)
-    def test_join_is_idempotent_and_takes_any_order(
-        self, batches: list[list[tuple[int, float | None, int]]], dice
-    ) -> None:  # type: ignore[no-untyped-def]
+    def test_join_is_idempotent_and_takes_any_order(self, batches: list[list[Spoken]], dice: random.Random) -> None:
         """However often and in whatever order bids come, what stands is the same."""
         batch = [[unsigned(*each) for each in one] for one in batches]
         straight, mixed = Summary(rule()), Summary(rule())
