@@ -9,7 +9,7 @@ from __future__ import annotations
 import random
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 from twisted.application.service import Service
@@ -209,9 +209,13 @@ class SwarmNode(Service):
         """Follow the reports and the outcome of one task; ``keep`` leaves them in the store as well."""
         return self.entangled.watch(group_key(task_id), changed, keep)
 
-    def group(self, task_id: str, heard: Heard) -> Group:
-        """Take part in a task: a place among its participants."""
-        return Group(task_id, self.entangled, heard, self._quietly)
+    def group(self, task_id: str, heard: Heard, task: Task | None = None) -> Group:
+        """Take part in a task: a place among its participants; with ``task`` bids go to its council, too."""
+        if task is None or not task.council:
+            return Group(task_id, self.entangled, heard, self._quietly)
+        generation = getattr(task, "generation", 0)
+        enter = partial(self.bidding, task, generation)
+        return Group(task_id, self.entangled, heard, self._quietly, enter)
 
     def bidding(self, task: Task, epoch: int, on_summary: OnSummary) -> Bidding:
         """Bid for ``task`` in ``epoch``: ``on_summary`` is told which bids the task's council announces."""

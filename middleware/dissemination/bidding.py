@@ -30,6 +30,11 @@ class Bidding:
         self._last: Report | None = None
         self._has_bid = False
 
+    @property
+    def is_standing(self) -> bool:
+        """Whether there is a bid that was not taken back."""
+        return self._last is not None
+
     def report(self, report: Report) -> None:
         """Bid, or bid anew; an equal bid is not sent again.  Raises ``ValueError`` for a cost that is none."""
         if not self._has_bid or report != self._last:
