@@ -219,10 +219,10 @@ class SwarmNode(Service):
 
     def bidding(self, task: Task, epoch: int, on_summary: OnSummary) -> Bidding:
         """Bid for ``task`` in ``epoch``: ``on_summary`` is told which bids the task's council announces."""
-        from middleware.dissemination.auction import Auction
+        from middleware.dissemination.auction import MAX_WAITING, Auction
 
         exclusive = getattr(task, "exclusive", True)
-        waiting = float(task.waiting_period)
+        waiting = min(float(task.waiting_period), MAX_WAITING)
         auction = Auction(task.task_id, epoch, task.council, task.strategy, waiting, exclusive)
         return self.dissemination.enter(auction, on_summary)
 

@@ -144,10 +144,9 @@ class Dissemination:
         except UnknownStrategy:
             strategy = self._around.strategy_for(FALLBACK)
         rule = Rule(strategy, self._blame)
-        sign, dice = self._identity.sign, random.Random(self._rng.getrandbits(64))
-        party = Party(auction, self._around.me(), rule, self._around.contacts, dice, sign)
+        party = Party(auction, self._around.me(), rule, self._around.contacts, self._rng, self._identity.sign)
         party.on_summary = lambda reports: self._tell(auction.digest, reports)
-        for gone in self._parties.add(party, opener):
+        for gone in self._parties.add(party, opener, self._clock.seconds()):
             self._disarm(gone.auction.digest)
         return party
 
@@ -226,6 +225,7 @@ class Dissemination:
         if self._is_stopped or digest in self._pumping or self._parties.get(digest) is not party:
             return
         self._pumping.add(digest)
+        self._parties.touch(digest, self._clock.seconds())
         try:
             while errands := party.errands(self._clock.seconds()):
                 for errand in errands:

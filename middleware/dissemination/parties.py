@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from middleware.dissemination.party import Party
 
 MAX_PARTIES = 256
+LIFE_S = 300.0
+"""Seconds after which a party in which nothing happens is forgotten, unless it is this node's own."""
 OWN = b""
 
 
@@ -19,6 +21,7 @@ OWN = b""
 class _Held:
     party: Party
     opener: bytes
+    touched_at: float
 
 
 class Parties:
@@ -38,9 +41,16 @@ class Parties:
         held = self._held.get(digest)
         return held.party if held is not None else None
 
-    def add(self, party: Party, opener: bytes) -> list[Party]:
+    def touch(self, digest: bytes, now: float) -> None:
+        """Take note that something happened in a party."""
+        held = self._held.get(digest)
+        if held is not None:
+            held.touched_at = now
+
+    def add(self, party: Party, opener: bytes, now: float) -> list[Party]:
         """Keep ``party``, which ``opener`` (a node id, or ``OWN``) asked for; those that had to go for it."""
-        gone = []
+        idle = [d for d, held in self._held.items() if held.opener != OWN and held.touched_at < now - LIFE_S]
+        gone = [self._held.pop(digest).party for digest in idle]
         while len(self._held) >= MAX_PARTIES:
             counts = Counter(held.opener for held in self._held.values() if held.opener != OWN)
             if not counts:
@@ -48,7 +58,7 @@ class Parties:
             busiest = counts.most_common(1)[0][0]
             digest = next(digest for digest, held in self._held.items() if held.opener == busiest)
             gone.append(self._held.pop(digest).party)
-        self._held[party.auction.digest] = _Held(party, opener)
+        self._held[party.auction.digest] = _Held(party, opener, now)
         return gone
 
     def own(self, digest: bytes, is_own: bool, opener: bytes = b"left") -> None:

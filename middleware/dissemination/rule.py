@@ -32,12 +32,12 @@ class Rule:
         """The join of two summaries: reports out of either, each agent once, in an order of its own."""
         given = {*a, *b}
         try:
-            chosen = {report for report in self._merge(tuple(a), tuple(b)) if report in given}
+            chosen = list(dict.fromkeys(report for report in self._merge(tuple(a), tuple(b)) if report in given))
         except Exception as error:  # somebody else's code
             self._blame("merge", error)
             return leading(a, b)
         if len(chosen) > MAX_REPORTS or len({report.agent for report in chosen}) < len(chosen):
-            return leading(tuple(chosen), (), MAX_REPORTS)
+            return leading(chosen, (), MAX_REPORTS)
         return tuple(sorted(chosen, key=_order))
 
     def assigned(self, reports: Sequence[Report]) -> str | None:
@@ -64,9 +64,12 @@ class Rule:
 def leading(a: Sequence[Report], b: Sequence[Report], room: int = LEADING) -> tuple[Report, ...]:
     """The ``room`` cheapest reports of both, each agent once; equal costs are decided by the agent's id."""
     once: dict[str, Report] = {}
-    for report in sorted({*a, *b}, key=_order):
-        once.setdefault(report.agent, report)
-    return tuple(once.values())[:room]
+    for report in (*a, *b):
+        known = once.get(report.agent)
+        # Two different reports of one agent are rare; then what they say decides, and not which came first.
+        if known is None or (report != known and (report.cost, repr(report)) < (known.cost, repr(known))):
+            once[report.agent] = report
+    return tuple(sorted(once.values(), key=_order)[:room])
 
 
 def _order(report: Report) -> tuple[float, str]:

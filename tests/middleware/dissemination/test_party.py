@@ -11,7 +11,7 @@ from middleware.dissemination.auction import Auction
 from middleware.dissemination.audience import MAX_LISTENERS, MAX_TRIES, Audience
 from middleware.dissemination.check import MAX_RELAYED
 from middleware.dissemination.errand import MAX_BIDS, Cry, Errand, Notice, Offer
-from middleware.dissemination.parties import MAX_PARTIES, OWN, Parties
+from middleware.dissemination.parties import LIFE_S, MAX_PARTIES, OWN, Parties
 from middleware.dissemination.party import Party
 from middleware.dissemination.route import hops, shared_bits
 from middleware.dissemination.scale import DIRECT, LEAST_TREE, MOST_DIRECT, TREE, Scale, team_size
@@ -415,10 +415,21 @@ class PartiesTests(SynchronousTestCase):
         """A peer that invents auctions drives out its own; those of this node stay."""
         parties = Parties()
         own, honest = self.made(0), self.made(1)
-        parties.add(own, OWN)
-        parties.add(honest, b"honest")
+        parties.add(own, OWN, 0.0)
+        parties.add(honest, b"honest", 0.0)
         for number in range(2, MAX_PARTIES + 50):
-            parties.add(self.made(number), b"liar")
+            parties.add(self.made(number), b"liar", 1.0)
         self.assertEqual(len(parties), MAX_PARTIES)
         self.assertIs(parties.get(own.auction.digest), own)
         self.assertIs(parties.get(honest.auction.digest), honest)
+
+    def test_idle_ones_are_forgotten(self) -> None:
+        """A party in which nothing happens any more goes when another comes; those of this node stay."""
+        parties = Parties()
+        own, old, busy = self.made(0), self.made(1), self.made(2)
+        parties.add(own, OWN, 0.0)
+        parties.add(old, b"peer", 0.0)
+        parties.add(busy, b"peer", 0.0)
+        parties.touch(busy.auction.digest, LIFE_S)
+        self.assertEqual(parties.add(self.made(3), b"peer", LIFE_S + 1.0), [old])
+        self.assertEqual(len(parties), 3)
