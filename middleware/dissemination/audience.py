@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from middleware.dissemination.announcement import Announcement
@@ -10,8 +11,8 @@ from middleware.entangled.kademlia.contact import Contact
 
 MAX_LISTENERS = 1024
 """Beyond it the one that came first goes; it will ask by itself."""
-MAX_TRIES = 2
-"""Errands in a row that may fail before a listener is left to ask by itself."""
+PAUSES = (0.0, 1.0, 2.0, 4.0)
+"""Seconds after each failed errand until the next; after the last a listener is left to ask by itself."""
 NOTHING = (0, 0)
 
 
@@ -24,6 +25,7 @@ class _Listener:
     knows: tuple[int, int] = NOTHING
     is_asked: bool = False
     failures: int = 0
+    ask_at: float = 0.0
 
 
 class Audience:
@@ -49,7 +51,7 @@ class Audience:
         """Let ``contact`` hear what is announced; it has shown that it lives."""
         known = self._listeners.get(contact.node_id)
         if known is not None:
-            known.contact, known.failures = contact, 0
+            known.contact, known.failures, known.ask_at = contact, 0, 0.0
             known.is_shared = known.is_shared and is_shared
             return
         if len(self._listeners) >= MAX_LISTENERS:
@@ -62,29 +64,44 @@ class Audience:
         if listener is not None:
             listener.knows = max(listener.knows, announcement.precedence)
 
-    def notices(self, announcement: Announcement | None, is_mine: bool) -> list[Notice]:
+    def due(self, announcement: Announcement | None, is_mine: bool) -> float:
+        """When somebody is owed something."""
+        owed = self._owed(announcement, is_mine)
+        return min((listener.ask_at for listener in owed), default=math.inf)
+
+    def notices(self, announcement: Announcement | None, is_mine: bool, now: float) -> list[Notice]:
         """What is owed now; nobody is owed two things at once."""
-        if announcement is None:
-            return []
-        owed = []
-        for listener in self._listeners.values():
-            is_late = listener.knows < announcement.precedence and listener.failures < MAX_TRIES
-            if is_late and not listener.is_asked and (is_mine or not listener.is_shared):
+        out = []
+        for listener in self._owed(announcement, is_mine):
+            if announcement is not None and listener.ask_at <= now:
                 listener.is_asked = True
-                owed.append(Notice(listener.contact, announcement))
-        return owed
+                out.append(Notice(listener.contact, announcement))
+        return out
 
     def answered(self, notice: Notice) -> None:
         """Take note that a listener confirmed."""
-        self._settled(notice, 0)
+        listener = self._listeners.get(notice.to.node_id)
+        if listener is not None:
+            listener.is_asked, listener.failures, listener.ask_at = False, 0, 0.0
         self.knows(notice.to, notice.announcement)
 
-    def failed(self, notice: Notice) -> None:
+    def failed(self, notice: Notice, now: float) -> None:
         """Take note that a listener did not answer."""
-        self._settled(notice, 1)
-
-    def _settled(self, notice: Notice, failures: int) -> None:
         listener = self._listeners.get(notice.to.node_id)
         if listener is not None:
             listener.is_asked = False
-            listener.failures = listener.failures + 1 if failures else 0
+            is_last = listener.failures >= len(PAUSES)
+            listener.ask_at = math.inf if is_last else now + PAUSES[listener.failures]
+            listener.failures += 1
+
+    def _owed(self, announcement: Announcement | None, is_mine: bool) -> list[_Listener]:
+        """The listeners that do not know ``announcement`` and are not being told it."""
+        if announcement is None:
+            return []
+        return [
+            listener
+            for listener in self._listeners.values()
+            if listener.knows < announcement.precedence
+            and not listener.is_asked
+            and (is_mine or not listener.is_shared)
+        ]

@@ -77,9 +77,10 @@ class Party:
     @property
     def due(self) -> float:
         """When there is something to do, if nothing happens before."""
+        always = min(self._direct.due, self._flooded_at, self.audience.due(self.announcement, self._is_mine))
         if self._teller is not None:
-            return min(self._direct.due, self._teller.due, self._flooded_at)
-        return min(self._direct.due, self._branch.due, self._check.due, self._flooded_at)
+            return min(always, self._teller.due)
+        return min(always, self._branch.due, self._check.due)
 
     @property
     def own(self) -> Bid | None:
@@ -167,8 +168,7 @@ class Party:
             out += self._branch.offers(age, now)
             out += self._check.offers(self.announcement, age, now)
         out += self._direct.offers(age, now)
-        is_mine = self.announcement is not None and self.announcement.rank == self._rank
-        out += self.audience.notices(self.announcement, is_mine)
+        out += self.audience.notices(self.announcement, self._is_mine, now)
         out += self._flood.cries()
         if now >= self._flooded_at:
             self._flooded_at = math.inf
@@ -192,7 +192,7 @@ class Party:
     def failed(self, errand: Errand, now: float) -> None:
         """Take note that nobody answered an errand."""
         if isinstance(errand, Notice):
-            self.audience.failed(errand)
+            self.audience.failed(errand, now)
         elif isinstance(errand, Offer):
             if errand.is_straight:
                 self._check.failed(errand.to, now)
@@ -205,6 +205,11 @@ class Party:
             is_alone = self._check.is_alone or self._direct.is_alone or self._branch.is_alone
             if is_alone and self._teller is None:
                 self._cry(now)
+
+    @property
+    def _is_mine(self) -> bool:
+        """Whether what is announced is this node's own word."""
+        return self.announcement is not None and self.announcement.rank == self._rank
 
     def _cry(self, now: float) -> None:
         """No council is in reach: let the neighbours know."""

@@ -8,7 +8,7 @@ import random
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.dissemination.auction import Auction
-from middleware.dissemination.audience import MAX_LISTENERS, MAX_TRIES, Audience
+from middleware.dissemination.audience import MAX_LISTENERS, PAUSES, Audience
 from middleware.dissemination.check import MAX_RELAYED
 from middleware.dissemination.errand import MAX_BIDS, Cry, Errand, Notice, Offer
 from middleware.dissemination.parties import LIFE_S, MAX_PARTIES, OWN, Parties
@@ -93,29 +93,33 @@ class ScaleTests(SynchronousTestCase):
 
 class AudienceTests(SynchronousTestCase):
     def test_told_once(self) -> None:
-        """A listener is told each announcement once, and again after a loss, but not for ever."""
+        """A listener is told each announcement once, again after losses with longer and longer pauses, not for ever."""
         audience = Audience()
         audience.add(CONTACTS[5])
         one = announced(1, 0)
-        [notice] = audience.notices(one, True)
-        self.assertEqual(audience.notices(one, True), [])
-        for _ in range(MAX_TRIES - 1):
-            audience.failed(notice)
-            [notice] = audience.notices(one, True)
-        audience.failed(notice)
-        self.assertEqual(audience.notices(one, True), [])
+        [notice] = audience.notices(one, True, 0.0)
+        self.assertEqual(audience.notices(one, True, 0.0), [])
+        now = 0.0
+        for pause in PAUSES:
+            audience.failed(notice, now)
+            self.assertEqual(audience.due(one, True), now + pause)
+            now += pause
+            [notice] = audience.notices(one, True, now)
+        audience.failed(notice, now)
+        self.assertEqual(audience.due(one, True), math.inf)
+        self.assertEqual(audience.notices(one, True, 1e9), [])
         audience.add(CONTACTS[5])
-        [notice] = audience.notices(one, True)
+        [notice] = audience.notices(one, True, now)
         audience.answered(notice)
-        self.assertEqual(audience.notices(one, True), [])
-        self.assertEqual(len(audience.notices(announced(2, 0), True)), 1)
+        self.assertEqual(audience.notices(one, True, now), [])
+        self.assertEqual(len(audience.notices(announced(2, 0), True, now)), 1)
 
     def test_shared_listeners(self) -> None:
         """Who told the whole council hears an announcement from the member who made it only."""
         audience = Audience()
         audience.add(CONTACTS[5], is_shared=True)
-        self.assertEqual(audience.notices(announced(1, 1), False), [])
-        self.assertEqual(len(audience.notices(announced(1, 1), True)), 1)
+        self.assertEqual(audience.notices(announced(1, 1), False, 0.0), [])
+        self.assertEqual(len(audience.notices(announced(1, 1), True, 0.0)), 1)
 
     def test_room(self) -> None:
         """The one that came first goes when there is no more room."""
