@@ -28,12 +28,19 @@ def unsigned(place: int, cost: float | None, revision: int) -> Bid:
     return Bid(agent.public, None if cost is None else Report(agent.node_id.hex(), cost), revision)
 
 
+class Finding:
+    """A strategy that has no summary of its own."""
+
+    find = Nearest().find
+
+
 class SummaryTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.summary = Summary(rule())
 
     def test_best_stand(self) -> None:
-        """The cheapest stand, whatever the order in which they come."""
+        """Where the strategy does not say how many, the cheapest stand, whatever the order in which they come."""
+        self.summary = Summary(Rule(Finding()))
         for place, cost in ((3, 4.0), (4, 1.0), (5, 9.0), (6, 2.0), (7, 3.0), (8, 8.0)):
             self.summary.join([bid(place, cost)])
         self.assertEqual([report.cost for report in self.summary.standing], [1.0, 2.0, 3.0, 4.0])
