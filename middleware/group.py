@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 from twisted.internet.defer import Deferred
 
 from middleware.consensus.strategy import Report
-from middleware.dissemination.roll import Roll
 from middleware.entangled.node import EntangledNode
 from middleware.entangled.record import Record
 from middleware.entangled.replication.owner import Stored
@@ -46,6 +45,9 @@ class Group:
         self._entangled = entangled
         self._heard = heard
         self._quietly = quietly
+        # Imported by the first who takes part: a plain node has no group.
+        from middleware.dissemination.roll import Roll
+
         self._roll = Roll()
         self._outcome: Result | None = None
         self._bidding = enter(self._announced) if enter is not None else None
