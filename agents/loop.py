@@ -161,7 +161,7 @@ class Agent(Service):
         )
         engagement.lessee = self._node.lessee(task, self._turn_now, self._token)
         self._engagement = engagement
-        self._group = self._node.group(task.task_id, engagement.heard)
+        self._group = self._node.group(task.task_id, engagement.heard, task)
         self._group.report(engagement.me)
         self._node.presence.change(task=task.task_id, status=engagement.me.status)
         self._say(f"assigned: {task.title}")

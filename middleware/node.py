@@ -9,7 +9,8 @@ from __future__ import annotations
 import random
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Any
 
 from twisted.application.service import Service
 from twisted.internet.defer import Deferred, maybeDeferred
@@ -33,6 +34,11 @@ from middleware.presence import DEVICES, Device, Presence, devices_of
 from middleware.streams import Streams
 from middleware.tasks import MAX_LEASE_TTL, RESULT, TASKS, Result, Task, group_key
 from middleware.value import bounded
+
+if TYPE_CHECKING:
+    from middleware.dissemination.bidding import Bidding
+    from middleware.dissemination.dissemination import Dissemination
+    from middleware.dissemination.party import OnSummary
 
 COUNCIL = 3
 CAMERA = "camera"
@@ -82,6 +88,9 @@ class SwarmNode(Service):
         expose = self.entangled.endpoint.expose
         expose("lease.claim", self._answer_claim, changes=True)
         expose("lease.release", self._answer_release, changes=True)
+        expose("bid.offer", self._answer_offer, changes=True, idempotent=True)
+        expose("bid.announce", self._answer_announcement, changes=True, idempotent=True)
+        expose("bid.cry", self._take_cry, changes=True)
         expose("device.message", self._answer_message, changes=True)
         expose("device.disconnect", self._answer_disconnect, changes=True)
 
@@ -104,6 +113,8 @@ class SwarmNode(Service):
     def _leave(self, leave: Callable[[], None]) -> None:
         self._chores.stop()
         self.streams.stop()
+        if "dissemination" in self.__dict__:
+            self.dissemination.stop()
         leave()
         super().stopService()
 
@@ -198,9 +209,22 @@ class SwarmNode(Service):
         """Follow the reports and the outcome of one task; ``keep`` leaves them in the store as well."""
         return self.entangled.watch(group_key(task_id), changed, keep)
 
-    def group(self, task_id: str, heard: Heard) -> Group:
-        """Take part in a task: a place among its participants."""
-        return Group(task_id, self.entangled, heard, self._quietly)
+    def group(self, task_id: str, heard: Heard, task: Task | None = None) -> Group:
+        """Take part in a task: a place among its participants; with ``task`` bids go to its council, too."""
+        if task is None or not task.council:
+            return Group(task_id, self.entangled, heard, self._quietly)
+        generation = getattr(task, "generation", 0)
+        enter = partial(self.bidding, task, generation)
+        return Group(task_id, self.entangled, heard, self._quietly, enter)
+
+    def bidding(self, task: Task, epoch: int, on_summary: OnSummary) -> Bidding:
+        """Bid for ``task`` in ``epoch``: ``on_summary`` is told which bids the task's council announces."""
+        from middleware.dissemination.auction import MAX_WAITING, Auction
+
+        exclusive = getattr(task, "exclusive", True)
+        waiting = min(float(task.waiting_period), MAX_WAITING)
+        auction = Auction(task.task_id, epoch, task.council, task.strategy, waiting, exclusive)
+        return self.dissemination.enter(auction, on_summary)
 
     def conclude(self, task_id: str, result: Result) -> Deferred[Stored]:
         """Record how a task ended, as somebody who takes no part in it."""
@@ -219,7 +243,34 @@ class SwarmNode(Service):
         ttl = float(task.lease_ttl)
         return Lessee(task.task_id, self.uuid, ttl, len(task.council), ask, self.clock, self.rng, changed, floor)
 
+    @cached_property
+    def dissemination(self) -> Dissemination:
+        """How the bids for tasks travel through this node."""
+        # Imported by the first bid: a node that never carries one is spared the memory.
+        from middleware.consensus.strategy import strategy_for
+        from middleware.dissemination.dissemination import Dissemination, Surroundings
+        from middleware.dissemination.scale import team_size
+
+        entangled = self.entangled
+
+        def size() -> int:
+            return team_size(entangled.identity.node_id, entangled.overlay.contacts())
+
+        around = Surroundings(lambda: entangled.contact, entangled.overlay.contacts, size, strategy_for)
+        return Dissemination(entangled.identity, entangled.endpoint, around, self.clock, self.rng)
+
     # -- what peers ask ---------------------------------------------------------------------------------------------
+
+    def _answer_offer(
+        self, peer: Contact, auction: list[object], bids: list[object], age_ms: int, is_shared: bool
+    ) -> list[object] | None:
+        return self.dissemination.answer_offer(peer, auction, bids, age_ms, is_shared)
+
+    def _answer_announcement(self, peer: Contact, auction: list[object], announcement: list[object]) -> None:
+        self.dissemination.answer_announcement(peer, auction, announcement)
+
+    def _take_cry(self, peer: Contact, auction: list[object], bids: list[object]) -> None:
+        self.dissemination.take_cry(peer, auction, bids)
 
     def _answer_claim(self, peer: Contact, task_id: str, token: int, ttl: float) -> list[object]:
         if len(task_id) > MAX_NAME or not 0 < token < 2**62:

@@ -1,0 +1,374 @@
+"""How bids reach the council and the announcement returns: messages, time and agreement, up to 10,000 agents.
+
+The parties are the product's own; links are light (a heap of events, one way 20 ms + Exp(10 ms), independent loss), and
+an errand is repeated as the endpoint repeats it.  The next hops come out of real routing tables.  Signatures are left
+out: they cost time of a core and no message.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import heapq
+import json
+import math
+import random
+import sys
+import time
+from bisect import bisect_left
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from middleware.consensus.strategy import Report, strategy_for
+from middleware.dissemination.announcement import Announcement
+from middleware.dissemination.auction import Auction
+from middleware.dissemination.bid import Bid
+from middleware.dissemination.errand import Cry, Errand, Notice, Offer
+from middleware.dissemination.party import Party
+from middleware.dissemination.rule import Rule
+from middleware.dissemination.scale import Scale
+from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.kademlia.distance import closest
+from middleware.entangled.kademlia.routing import RoutingTable
+from middleware.entangled.network.network import Address
+
+BITS = 160
+K = 8
+TRIES = (0.0, 0.1, 0.25)
+PATIENCE = 0.4
+"""When an errand is sent again, and when it has failed: as the endpoint does it within the shell's time."""
+SMALL_COUNCIL, LARGE_COUNCIL, LARGE_FROM = 3, 5, 50
+AT_LEAST = 0.99
+MESSAGES = {3: 10.0, 30: 10.0, 100: 6.0, 1_000: 6.0, 10_000: 6.0}
+BUSIEST = 1_000
+AGREEMENT = {0.0: {100: 0.2, 1_000: 0.3, 10_000: 0.4}, 0.1: {100: 0.6, 1_000: 0.8, 10_000: 1.0}}
+
+
+class Ring:
+    """``n`` contacts with random ids, and what each would have in its routing table."""
+
+    def __init__(self, n: int, rng: random.Random) -> None:
+        self.contacts = [Contact(rng.randbytes(32), Address("10.0.0.1", 1 + i % 65_000)) for i in range(n)]
+        self._sorted = sorted((int.from_bytes(c.node_id), i) for i, c in enumerate(self.contacts))
+        self._ids = [number for number, _ in self._sorted]
+        self._rng = rng
+
+    def table(self, place: int) -> RoutingTable:
+        """The routing table of the node at ``place``: up to k contacts out of each range of distances."""
+        own = self._ids_of(place)
+        table = RoutingTable(self.contacts[place].node_id, K)
+        for bit in reversed(range(BITS)):
+            low = ((own >> bit) ^ 1) << bit
+            first, end = bisect_left(self._ids, low), bisect_left(self._ids, low + (1 << bit))
+            for at in self._rng.sample(range(first, end), min(K, end - first)):
+                table.saw(self.contacts[self._sorted[at][1]], 0.0)
+            near = low & ~((1 << (bit + 1)) - 1)
+            if bisect_left(self._ids, near + (1 << (bit + 1))) - bisect_left(self._ids, near) <= 1:
+                break
+        return table
+
+    def _ids_of(self, place: int) -> int:
+        return int.from_bytes(self.contacts[place].node_id)
+
+
+@dataclass
+class Weather:
+    """What befalls datagrams: ``loss`` and ``dead`` are shares, ``twice`` is how many come a second time."""
+
+    loss: float = 0.0
+    dead: float = 0.0
+    twice: float = 0.0
+    delay: Callable[[random.Random], float] = lambda rng: 0.02 + rng.expovariate(100.0)
+
+
+@dataclass
+class Outcome:
+    """What one auction came to; ``took`` has, of each agent that is right, seconds since the waiting period ended."""
+
+    messages: float
+    busiest: int
+    right: float
+    took: list[float] = field(repr=False)
+    gathered: float
+    digest: str
+
+
+class Crowd:
+    """``n`` agents that all bid for one task within ``spread`` seconds; replayed by ``seed``."""
+
+    def __init__(
+        self,
+        n: int,
+        seed: int,
+        weather: Weather,
+        waiting: float = 0.5,
+        spread: float = 0.1,
+        way: str = "",
+        council_is_dead: bool = False,
+        exclusive: bool = True,
+    ) -> None:
+        self.rng = random.Random(f"{seed}/links")
+        self.now = 0.0
+        self.ring = Ring(n, random.Random(f"{seed}/ring"))
+        contacts = self.ring.contacts
+        task = f"task-{seed}"
+        key = Auction(task, 1, (contacts[0],)).key
+        council = closest(contacts, key, LARGE_COUNCIL if n >= LARGE_FROM else SMALL_COUNCIL)
+        self.auction = Auction(task, 1, tuple(council), waiting=waiting, exclusive=exclusive)
+        self.way = way or Scale().counted(n)
+        self.weather = weather
+        self.sent = [0] * n
+        self.handled = [0] * n
+        self.views: list[tuple[Report, ...]] = [()] * n
+        self.changed_at = [math.inf] * n
+        self.gathered = math.inf
+        self._places = {c.node_id: i for i, c in enumerate(contacts)}
+        self._heap: list[tuple[float, int, Callable[..., None], tuple[object, ...]]] = []
+        self._order = 0
+        self._due = [math.inf] * n
+        self._rule = Rule(strategy_for("nearest"))
+        members = {self._places[c.node_id] for c in council}
+        dice = random.Random(f"{seed}/dead")
+        self.dead = {i for i in range(n) if i not in members and dice.random() < weather.dead}
+        if council_is_dead:
+            self.dead |= members
+        self.parties = [self._party(i) for i in range(n)]
+        self.costs = [self.rng.uniform(1.0, 100.0) for _ in range(n)]
+        for i in range(n):
+            if i not in self.dead:
+                self.at(self.rng.uniform(0.0, spread) if i else 0.0, self.bid, i, self.costs[i])
+        self.best = self.right_one()
+
+    def right_one(self) -> str:
+        """Who should win: the cheapest of those that live."""
+        alive = [(self.costs[i], self.agent(i)) for i in range(len(self.costs)) if i not in self.dead]
+        return min(alive)[1]
+
+    def agent(self, place: int) -> str:
+        """The uuid of the agent at ``place``."""
+        return self.ring.contacts[place].node_id.hex()
+
+    def at(self, moment: float, call: Callable[..., None], *arguments: object) -> None:
+        """Make ``call`` at ``moment``."""
+        self._order += 1
+        heapq.heappush(self._heap, (moment, self._order, call, arguments))
+
+    def bid(self, place: int, cost: float | None, revision: int = 0) -> None:
+        """Let the agent at ``place`` bid, or take its bid back."""
+        public = self.ring.contacts[place].public
+        report = None if cost is None else Report(self.agent(place), cost)
+        self.parties[place].bid(Bid(public, report, revision), self.way, self.now)
+        self.pump(place)
+
+    def run(self, until: float) -> None:
+        """Let everything happen up to the moment ``until``."""
+        while self._heap and self._heap[0][0] <= until:
+            self.now, _, call, arguments = heapq.heappop(self._heap)
+            call(*arguments)
+        self.now = until
+
+    def outcome(self) -> Outcome:
+        """What it has come to by now."""
+        alive = [i for i in range(len(self.costs)) if i not in self.dead]
+        right = [i for i in alive if self.assigned(i) == self.best]
+        over = self.auction.waiting
+        took = sorted(max(0.0, self.changed_at[i] - over) for i in right)
+        text = "".join(f"{self.sent[i]}/{self.changed_at[i]:.9f};" for i in alive)
+        digest = hashlib.blake2s(text.encode(), digest_size=8).hexdigest()
+        return Outcome(
+            sum(self.sent) / len(alive), max(self.handled), len(right) / len(alive), took, self.gathered, digest
+        )
+
+    def assigned(self, place: int) -> str | None:
+        """Whom the agent at ``place`` takes for the winner."""
+        return self._rule.assigned(self.views[place])
+
+    # -- links ------------------------------------------------------------------------------------------------------
+
+    def pump(self, place: int) -> None:
+        """Send what a party has to send, and come back when it is due."""
+        party = self.parties[place]
+        for errand in party.errands(self.now):
+            self._carry(place, errand)
+        due = party.due
+        if due != math.inf and due < self._due[place]:
+            self._due[place] = due
+            self.at(max(due, self.now), self._woken, place, due)
+
+    def _woken(self, place: int, due: float) -> None:
+        if self._due[place] == due:
+            self._due[place] = math.inf
+            self.pump(place)
+
+    def _carry(self, place: int, errand: Errand) -> None:
+        to = self._places[errand.to.node_id]
+        if isinstance(errand, Cry):
+            self._send(place, to, self._heard_cry, place, to, errand)
+            return
+        state: dict[str, object] = {}
+        for wait in TRIES:
+            self.at(self.now + wait, self._try, place, to, errand, state)
+        self.at(self.now + PATIENCE, self._given_up, place, errand, state)
+
+    def _try(self, place: int, to: int, errand: Errand, state: dict[str, object]) -> None:
+        if "settled" not in state:
+            self._send(place, to, self._arrived, place, to, errand, state)
+
+    def _send(self, place: int, to: int, call: Callable[..., None], *arguments: object) -> None:
+        self.sent[place] += 1
+        self.handled[place] += 1
+        copies = 2 if self.weather.twice and self.rng.random() < self.weather.twice else 1
+        for _ in range(copies):
+            if self.rng.random() >= self.weather.loss and to not in self.dead:
+                self.at(self.now + self.weather.delay(self.rng), self._received, to, call, arguments)
+
+    def _received(self, to: int, call: Callable[..., None], arguments: tuple[object, ...]) -> None:
+        self.handled[to] += 1
+        call(*arguments)
+
+    def _heard_cry(self, place: int, to: int, cry: Cry) -> None:
+        self.parties[to].cried(cry.bids, self.ring.contacts[place], self.now)
+        self.pump(to)
+
+    def _arrived(self, place: int, to: int, errand: Errand, state: dict[str, object]) -> None:
+        if "reply" not in state or self.weather.twice:  # with copies, also the method runs again (it is idempotent)
+            state["reply"] = self._taken(place, to, errand)
+        self._send(to, place, self._confirmed, place, errand, state)
+        self.pump(to)
+
+    def _taken(self, place: int, to: int, errand: Errand) -> Announcement | None:
+        party, sender = self.parties[to], self.ring.contacts[place]
+        if isinstance(errand, Offer):
+            reply = party.offered(errand.bids, sender, errand.age, errand.is_shared, self.now)
+            has_best = any(report.agent == self.best for report in party.summary.standing)
+            if has_best and self.auction.rank(self.ring.contacts[to].node_id) == 0:
+                self.gathered = min(self.gathered, self.now)
+            return reply
+        assert isinstance(errand, Notice)
+        party.announced(errand.announcement, self.now)
+        return None
+
+    def _confirmed(self, place: int, errand: Errand, state: dict[str, object]) -> None:
+        if "settled" in state:
+            return
+        state["settled"] = True
+        reply = state["reply"]
+        if isinstance(reply, Announcement):
+            self.parties[place].announced(reply, self.now)
+        self.parties[place].answered(errand, self.now)
+        self.pump(place)
+
+    def _given_up(self, place: int, errand: Errand, state: dict[str, object]) -> None:
+        if "settled" not in state:
+            state["settled"] = True
+            self.parties[place].failed(errand, self.now)
+            self.pump(place)
+
+    def _party(self, place: int) -> Party:
+        known: list[Contact] = []
+
+        def contacts() -> list[Contact]:
+            if not known:
+                table = self.ring.table(place)
+                # Ten thousand whole tables would not fit; only the way to the key is asked for, but by a flood.
+                everybody = table.contacts()
+                known.extend(closest(everybody, self.auction.key, K) if self.auction.exclusive else everybody)
+            return known
+
+        dice = random.Random(f"{self.auction.task_id}/{place}")
+        party = Party(self.auction, self.ring.contacts[place], self._rule, contacts, dice, lambda message: b"")
+        party.on_summary = lambda reports: self._told(place, reports)
+        return party
+
+    def _told(self, place: int, reports: tuple[Report, ...]) -> None:
+        before = self._rule.assigned(self.views[place])
+        self.views[place] = reports
+        if self._rule.assigned(reports) != before:
+            self.changed_at[place] = self.now
+
+
+def percentile(values: Sequence[float], share: float) -> float:
+    """The value below which that share of ``values`` lies; infinite where there are none."""
+    ordered = sorted(values)
+    return ordered[min(len(ordered) - 1, int(share * len(ordered)))] if ordered else math.inf
+
+
+def measured(n: int, loss: float, dead: float, runs: int, seed: int, **options: object) -> dict[str, object]:
+    """The figures of ``runs`` auctions."""
+    outcomes = []
+    for run in range(runs):
+        crowd = Crowd(n, seed + run, Weather(loss, dead), **options)  # type: ignore[arg-type]
+        crowd.run(8.0)
+        outcomes.append(crowd.outcome())
+    took = [t for outcome in outcomes for t in outcome.took]
+    row: dict[str, object] = {
+        "n": n,
+        "way": Scale().counted(n),
+        "loss": loss,
+        "dead": dead,
+        "runs": runs,
+        "messages": sum(o.messages for o in outcomes) / runs,
+        "busiest": max(o.busiest for o in outcomes),
+        "p50": percentile(took, 0.5),
+        "p95": percentile(took, 0.95),
+        "last": max(took, default=math.inf),
+        "right": sum(o.right for o in outcomes) / runs,
+    }
+    row["missed"] = [name for name, holds in targets(row) if not holds]
+    return row
+
+
+def targets(row: dict[str, object]) -> list[tuple[str, bool]]:
+    """What the row should have reached, and whether it did."""
+    n, loss, dead = row["n"], row["loss"], row["dead"]
+    assert isinstance(n, int) and isinstance(loss, float)
+    goals = []
+    if loss <= 0.1 and not dead:
+        goals.append(("messages", float(str(row["messages"])) <= MESSAGES.get(n, 10.0)))
+        limit = AGREEMENT.get(loss, {}).get(n)
+        if limit is not None:
+            goals.append(("agreement", float(str(row["p95"])) <= limit))
+        goals.append(("right", float(str(row["right"])) >= AT_LEAST))
+        goals.append(("busiest", int(str(row["busiest"])) <= BUSIEST))
+    return goals
+
+
+def main(arguments: list[str]) -> int:
+    """Print the table; 1 where a target was missed."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.dissemination", description=__doc__)
+    parser.add_argument("--n", type=int, nargs="+", default=[3, 30, 100, 1_000, 10_000], help="numbers of agents")
+    parser.add_argument("--loss", type=float, nargs="+", default=[0.0, 0.1, 0.3], help="shares of datagrams lost")
+    parser.add_argument("--dead", type=float, nargs="+", default=[0.0, 0.01], help="shares of agents silently dead")
+    parser.add_argument("--runs", type=int, default=0, help="auctions a row (0: fewer where there are more agents)")
+    parser.add_argument("--spread", type=float, default=0.1, help="seconds within which all bid")
+    parser.add_argument("--waiting", type=float, default=0.5, help="the waiting period in seconds")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--json", help="write the rows to this file as well")
+    chosen = parser.parse_args(arguments)
+    print(
+        "     n way     loss  dead  runs  messages/agent  busiest  agreed p50   p95  last  right     targets",
+        flush=True,
+    )
+    rows = []
+    for n in chosen.n:
+        for dead in chosen.dead:
+            for loss in chosen.loss:
+                runs = chosen.runs or max(1, min(40, 3_000 // n))
+                began = time.process_time()
+                row = measured(n, loss, dead, runs, chosen.seed, waiting=chosen.waiting, spread=chosen.spread)
+                row["cpu"] = time.process_time() - began
+                rows.append(row)
+                verdict = "yes" if not row["missed"] else "NO: " + ", ".join(row["missed"])  # type: ignore[arg-type]
+                print(
+                    f"{n:6} {row['way']:7} {loss:4.0%} {dead:5.0%} {runs:5} {row['messages']:15.2f} {row['busiest']:8} "
+                    f"{row['p50']:11.3f} {row['p95']:5.3f} {row['last']:5.3f} {row['right']:8.4%}  {verdict}",
+                    flush=True,
+                )
+    if chosen.json:
+        Path(chosen.json).write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+    return 1 if any(row["missed"] for row in rows) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
