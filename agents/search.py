@@ -10,7 +10,7 @@ import math
 import random
 from collections.abc import Mapping
 
-from agents.behaviour import STAND
+from agents.behaviour import STAND, Context
 from agents.exploration import TURN_GAIN, TURN_SPEED, WALK, Exploration, Pose, clipped
 from agents.vision import Sighting, Size, find_target
 from drivers.reading import Action, Observation
@@ -122,8 +122,9 @@ class SearchAndApproach:
         """Stand and keep facing the target, ready to take over."""
         return self.search(now)
 
-    def execute(self, now: float) -> Action | None:
+    def execute(self, context: Context) -> Action | None:
         """Walk up to the target and stop before touching it; None once the dog stands there."""
+        now = context.now
         if self._target is None:
             return self.search(now)
         bearing, gap = self._bearing, self._gap

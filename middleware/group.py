@@ -12,6 +12,7 @@ from twisted.internet.defer import Deferred
 from middleware.entangled.node import EntangledNode
 from middleware.entangled.record import Record
 from middleware.entangled.replication.owner import Stored
+from middleware.order import Order, order_of
 from middleware.tasks import MEMBER, RESULT, Member, Result, group_key, member_of, outcome_of
 
 Heard = Callable[[list[Member], Result | None], None]
@@ -19,14 +20,23 @@ Heard = Callable[[list[Member], Result | None], None]
 
 
 class Group:
-    """One participant's place in the group of ``task_id``; ``quietly`` takes what may fail without anybody waiting."""
+    """One participant's place in the group of ``task_id``.
+
+    ``quietly`` takes what may fail without anybody waiting, ``ordered`` what an operator wants of the task.
+    """
 
     def __init__(
-        self, task_id: str, entangled: EntangledNode, heard: Heard, quietly: Callable[[Deferred[Stored]], None]
+        self,
+        task_id: str,
+        entangled: EntangledNode,
+        heard: Heard,
+        quietly: Callable[[Deferred[Stored]], None],
+        ordered: Callable[[Order | None], None] = lambda order: None,
     ) -> None:
         self._key = group_key(task_id)
         self._entangled = entangled
         self._heard = heard
+        self._ordered = ordered
         self._quietly = quietly
         self._watch = entangled.watch(self._key, self._changed)
 
@@ -48,3 +58,4 @@ class Group:
 
     def _changed(self, records: list[Record]) -> None:
         self._heard([m for record in records if (m := member_of(record)) is not None], outcome_of(records))
+        self._ordered(order_of(records))

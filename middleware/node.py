@@ -29,6 +29,7 @@ from middleware.entangled.record import MAX_NAME, Record
 from middleware.entangled.replication.owner import Stored
 from middleware.entangled.replication.watch import Changed, Watch
 from middleware.group import Group, Heard
+from middleware.order import ORDER, Order
 from middleware.presence import DEVICES, Device, Presence, devices_of
 from middleware.streams import Streams
 from middleware.tasks import MAX_LEASE_TTL, RESULT, TASKS, Result, Task, group_key
@@ -198,9 +199,13 @@ class SwarmNode(Service):
         """Follow the reports and the outcome of one task; ``keep`` leaves them in the store as well."""
         return self.entangled.watch(group_key(task_id), changed, keep)
 
-    def group(self, task_id: str, heard: Heard) -> Group:
+    def group(self, task_id: str, heard: Heard, ordered: Callable[[Order | None], None] = lambda order: None) -> Group:
         """Take part in a task: a place among its participants."""
-        return Group(task_id, self.entangled, heard, self._quietly)
+        return Group(task_id, self.entangled, heard, self._quietly, ordered)
+
+    def order(self, task_id: str, order: Order) -> Deferred[Stored]:
+        """Record what an operator wants of a task that is under way."""
+        return self.entangled.put(group_key(task_id), ORDER, order.packed(), "team")
 
     def conclude(self, task_id: str, result: Result) -> Deferred[Stored]:
         """Record how a task ended, as somebody who takes no part in it."""

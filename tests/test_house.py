@@ -30,7 +30,12 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
 # Plain objects: bytes and ``now`` in, decisions out.
 PURE = (
     "agents.behaviour",
+    "agents.circle",
     "agents.decision",
+    "agents.docket",
+    "agents.epoch",
+    "agents.execution",
+    "agents.state",
     "drivers.errors",
     "drivers.gate",
     "drivers.reading",
@@ -53,6 +58,7 @@ PURE = (
     "middleware.entangled.wire.noise",
     "middleware.entangled.wire.session",
     "middleware.errors",
+    "middleware.order",
     "middleware.presence",
     "middleware.settings",
     "middleware.tasks",

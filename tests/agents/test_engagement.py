@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from agents.behaviour import STAND
+from agents.behaviour import STAND, Context
 from agents.engagement import SEARCH_TTL, Deed, Engagement
 from drivers.reading import Action, Observation
 from middleware.consensus.lease import Lease
@@ -40,7 +40,7 @@ class Dog:
         """Stand."""
         return HOLD
 
-    def execute(self, now: float) -> Action | None:
+    def execute(self, context: Context) -> Action | None:
         """Go on, from where it was."""
         self.executed += 1
         return None if self.executed > self.steps else GO

@@ -238,7 +238,7 @@ class MembershipTests(TeamTests):
             team.clock.advance(0.02)
             leases = []
             for name, service in team.services.items():
-                engagement = getattr(service.assembly.agent, "_engagement", None)
+                engagement = getattr(service.assembly.agent, "engagement", None)
                 if engagement is not None and engagement.lessee is not None and engagement.lessee.lease is not None:
                     leases.append(name)
             self.assertLessEqual(len(leases), 1, leases)
