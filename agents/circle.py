@@ -13,6 +13,9 @@ from dataclasses import replace
 from agents.epoch import is_older
 from middleware.tasks import Member, is_bid, is_stale
 
+LINGERING = 3.0
+"""Seconds for which a late report of who left is still known to be old."""
+
 
 class Circle:
     """The participants other than ``uuid``."""
@@ -21,8 +24,13 @@ class Circle:
         self._uuid = uuid
         self._known: dict[str, Member] = {}
         self._came: dict[str, float] = {}
+        self._left: dict[str, tuple[Member, float]] = {}
         self.echo: Member | None = None
         """The newest report of this participant itself that came back: after a restart it is an older life's."""
+
+    def __len__(self) -> int:
+        """How many others are present."""
+        return len(self._known)
 
     def hear(self, members: Sequence[Member], now: float) -> None:
         """Take in who is present, and what they report."""
@@ -33,9 +41,13 @@ class Circle:
                 self.echo = told
                 continue
             before = known.get(told.uuid, self._known.get(told.uuid))
+            if before is None and told.uuid in self._left and is_older(told, self._left[told.uuid][0]):
+                continue
             is_news = before is None or (told != before and not is_older(told, before))
             known[told.uuid] = told if is_news or before is None else before
             came[told.uuid] = now if is_news else self._came[told.uuid]
+        self._left = {uuid: (member, at) for uuid, (member, at) in self._left.items() if now - at < LINGERING}
+        self._left.update((uuid, (member, now)) for uuid, member in self._known.items() if uuid not in known)
         self._known, self._came = known, came
 
     def members(self, now: float) -> list[Member]:

@@ -86,6 +86,7 @@ class Engagement:
         self.load = 1
         self._fault = ""
         self._concluding = False
+        self._is_new = True
 
     @property
     def is_over(self) -> bool:
@@ -114,7 +115,9 @@ class Engagement:
         if outcome is not None and (self.result is None or outcome.rank > self.result.rank):
             self._end(outcome)
         self._circle.hear(members, self._clock.seconds())
-        self._epoch.hear(self._circle.epoch)
+        # Who comes is the first to know it: it opens a round, in which nothing that it said in an older life counts.
+        self._epoch.hear(self._circle.epoch + (self._is_new and bool(self._circle)))
+        self._is_new = self._is_new and not self._circle
         echo = self._circle.echo
         if echo is not None and (echo.epoch, echo.serial) > (self.me.epoch, self.me.serial):
             # An older life of this agent got that far: the others ignore what comes before it.
@@ -172,9 +175,11 @@ class Engagement:
         return self._stand_by(decision, now)
 
     def fence(self) -> None:
-        """The body has obeyed a newer token than this agent's: another holds the task, or held it."""
-        self._stop(State.FENCED)
-        if self.lessee is not None:
+        """The body has obeyed a newer token than the one it acts under: another holds the task, or held it.
+
+        To an agent that only stands by it says nothing: the body remembers what a former life of its agent did.
+        """
+        if self._stop(State.FENCED) and self.lessee is not None:
             self.lessee.release()
 
     def put_aside(self, why: str) -> None:
