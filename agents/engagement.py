@@ -18,6 +18,7 @@ from agents.circle import Circle
 from agents.decision import Decision, decide
 from agents.epoch import Epoch
 from agents.execution import Execution
+from agents.formation import Formation
 from agents.report import Reporter
 from agents.state import Course, State
 from drivers.driver import Permit
@@ -80,6 +81,7 @@ class Engagement:
         self._halt = halt
         self._circle = Circle(me.uuid)
         self._epoch = Epoch()
+        self._formation = Formation(me.uuid, behaviour)
         self._first_report_at: float | None = None
         self._began = clock.seconds()
         self._age = age
@@ -112,9 +114,12 @@ class Engagement:
 
     def heard(self, members: list[Member], outcome: Result | None) -> None:
         """Take in who is present and what they report, and how the task ended.  An outcome absorbs all that follows."""
+        now = self._clock.seconds()
         if outcome is not None and (self.result is None or outcome.rank > self.result.rank):
             self._end(outcome)
-        self._circle.hear(members, self._clock.seconds())
+        self._circle.hear(members, now)
+        if self._formation.hear(self._circle.members(now)) and not self.is_over:
+            self._say(f"one left, {len(self._circle) + 1} here: spreads out")
         # Who comes is the first to know it: it opens a round, in which nothing that it said in an older life counts.
         self._epoch.hear(self._circle.epoch + (self._is_new and bool(self._circle)))
         self._is_new = self._is_new and not self._circle
@@ -231,7 +236,8 @@ class Engagement:
 
     def _stand_by(self, decision: Decision, now: float) -> Deed:
         self._place(decision)
-        self._publish_decision(decision, 0, None)
+        post = self._formation.close_up(self.me, self._circle.members(now), decision.assigned)
+        self._publish_decision(decision, 0, post=post)
         searching = self.me.cost is None
         action = self._behaviour.search(now) if searching else self._behaviour.hold(now)
         return Deed(action, Permit(self.token, now + SEARCH_TTL))
@@ -256,11 +262,14 @@ class Engagement:
         is_executing = self.course.state is State.EXECUTING and self.me.cost is not None
         return is_executing and decision.assigned is not None and not self._execution.is_safe
 
-    def _publish_decision(self, decision: Decision, token: int, progress: float | None) -> None:
+    def _publish_decision(
+        self, decision: Decision, token: int, progress: float | None = None, post: float | None = None
+    ) -> None:
         assigned = decision.assigned or ""
         if assigned and assigned != self.me.assigned and assigned != self.me.uuid:
             self._say(f"stands by: {decision.why}")
-        self._publish(assigned=assigned, digest=decision.digest, token=token, why=decision.why, progress=progress)
+        told: dict[str, Any] = {"assigned": assigned, "digest": decision.digest, "why": decision.why}
+        self._publish(token=token, progress=progress, post=post, **told)
 
     def _publish(self, again: bool = False, **changes: object) -> None:
         status, state = self.course.state.status, str(self.course)

@@ -14,8 +14,8 @@ from drivers.reading import Action
 
 SHARE = 0.01
 """Less progress than this is none."""
-TOLD = 0.1
-"""The others are told of each tenth."""
+TOLD = 0.25
+"""The others are told of each quarter."""
 
 
 @dataclass(frozen=True)

@@ -31,10 +31,12 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
 PURE = (
     "agents.behaviour",
     "agents.circle",
+    "agents.circling",
     "agents.decision",
     "agents.docket",
     "agents.epoch",
     "agents.execution",
+    "agents.formation",
     "agents.state",
     "drivers.errors",
     "drivers.gate",

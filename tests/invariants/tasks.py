@@ -212,7 +212,7 @@ class Tasks:
             since: float | None,
         ) -> Decision:
             listed = list(members)
-            decision = genuine(listed, strategy, hysteresis, period, since)
+            decision: Decision = genuine(listed, strategy, hysteresis, period, since)
             self.check(listed, decision, hysteresis)
             return decision
 
