@@ -36,6 +36,7 @@ class Circle:
         """Take in who is present, and what they report."""
         known: dict[str, Member] = {}
         came: dict[str, float] = {}
+        self._left = {uuid: (member, at) for uuid, (member, at) in self._left.items() if now - at < LINGERING}
         for told in members:
             if told.uuid == self._uuid:
                 self.echo = told
@@ -46,7 +47,6 @@ class Circle:
             is_news = before is None or (told != before and not is_older(told, before))
             known[told.uuid] = told if is_news or before is None else before
             came[told.uuid] = now if is_news else self._came[told.uuid]
-        self._left = {uuid: (member, at) for uuid, (member, at) in self._left.items() if now - at < LINGERING}
         self._left.update((uuid, (member, now)) for uuid, member in self._known.items() if uuid not in known)
         self._known, self._came = known, came
 

@@ -177,6 +177,7 @@ class Engagement:
         if decision.assigned == self.me.uuid or self._must_go_on(decision):
             return self._act(decision, now)
         self._give_back()
+        self._place(decision)
         return self._stand_by(decision, now)
 
     def fence(self) -> None:
@@ -220,7 +221,8 @@ class Engagement:
         self.lessee.want()
         lease = self.lessee.lease
         if lease is None:
-            self._stop(State.FENCED)
+            if not self._stop(State.FENCED):
+                self._place(decision)
             return self._stand_by(decision, now)
         if self.course.state is not State.EXECUTING:
             self._place(decision)
@@ -235,7 +237,6 @@ class Engagement:
         return Deed(turn.action, self._permit(lease))
 
     def _stand_by(self, decision: Decision, now: float) -> Deed:
-        self._place(decision)
         post = self._formation.close_up(self.me, self._circle.members(now), decision.assigned)
         self._publish_decision(decision, 0, post=post)
         searching = self.me.cost is None
