@@ -14,9 +14,8 @@ from typing import Any
 from twisted.internet.interfaces import IReactorTime
 
 from agents.behaviour import STAND, Behaviour
-from agents.circle import Circle
-from agents.decision import Decision, decide
-from agents.epoch import Epoch
+from agents.conference import Conference
+from agents.decision import Decision
 from agents.execution import Execution
 from agents.formation import Formation
 from agents.report import Reporter
@@ -26,7 +25,6 @@ from drivers.reading import Action, Observation
 from middleware.consensus.lease import Lease, Lessee
 from middleware.consensus.strategy import ConsensusAlgorithm
 from middleware.order import PAUSE, Order
-from middleware.presence import EXECUTING
 from middleware.tasks import COMPLETED, FAILED, Member, Result, Task
 
 SEARCH_TTL = 0.5
@@ -73,22 +71,18 @@ class Engagement:
         self._reporter = Reporter(behaviour, clock)
         self._behaviour = behaviour
         self._execution = Execution(behaviour, task.stall_limit)
-        self._strategy = strategy
         self._clock = clock
         self._tell = tell
         self._conclude = conclude
         self._say = say
         self._halt = halt
-        self._circle = Circle(me.uuid)
-        self._epoch = Epoch()
+        self._conference = Conference(me.uuid, strategy)
         self._formation = Formation(me.uuid, behaviour)
-        self._first_report_at: float | None = None
         self._began = clock.seconds()
         self._age = age
         self.load = 1
         self._fault = ""
         self._concluding = False
-        self._is_new = True
 
     @property
     def is_over(self) -> bool:
@@ -117,17 +111,9 @@ class Engagement:
         now = self._clock.seconds()
         if outcome is not None and (self.result is None or outcome.rank > self.result.rank):
             self._end(outcome)
-        self._circle.hear(members, now)
-        if self._formation.hear(self._circle.members(now)) and not self.is_over:
-            self._say(f"one left, {len(self._circle) + 1} here: spreads out")
-        # Who comes is the first to know it: it opens a round, in which nothing that it said in an older life counts.
-        self._epoch.hear(self._circle.epoch + (self._is_new and bool(self._circle)))
-        self._is_new = self._is_new and not self._circle
-        echo = self._circle.echo
-        if echo is not None and (echo.epoch, echo.serial) > (self.me.epoch, self.me.serial):
-            # An older life of this agent got that far: the others ignore what comes before it.
-            self._epoch.hear(echo.epoch)
-            self.me = replace(self.me, epoch=echo.epoch, serial=echo.serial)
+        self.me = self._conference.hear(members, self.me, now)
+        if self._formation.hear(self._conference.others(now)) and not self.is_over:
+            self._say(f"one left, {len(self._conference) + 1} here: spreads out")
 
     def ordered(self, order: Order | None) -> None:
         """Take in what an operator wants of the task."""
@@ -161,7 +147,7 @@ class Engagement:
         if self.is_over or self._concluding:
             return None
         now = self._clock.seconds()
-        if self._is_late(now) and self._falls_to_me(now):
+        if self._is_late(now) and (self.course.state is State.EXECUTING or self._conference.is_first(now)):
             self._finish(FAILED, f"past its deadline of {self.task.deadline:g} s")
             return None
         if self.lessee is None or self.is_paused:
@@ -201,16 +187,7 @@ class Engagement:
     # -- inside -----------------------------------------------------------------------------------------------------
 
     def _decision(self, now: float) -> Decision:
-        others = self._circle.members(now)
-        members = [self.me, *others]
-        if not any(m.cost is not None for m in members):
-            self._first_report_at = None
-        elif self._first_report_at is None:
-            self._first_report_at = now
-        since = None if self._first_report_at is None else now - self._first_report_at
-        decision = decide(members, self._strategy, self.task.hysteresis, self.task.waiting_period, since)
-        basis = (*decision.basis, self.task.generation, self.task.configuration)
-        self._epoch.decide(basis, decision.assigned or "", decision.digest, others)
+        decision = self._conference.decide(self.task, self.me, now)
         if decision.fault and decision.fault != self._fault:
             self._say(decision.fault)
         self._fault = decision.fault
@@ -237,7 +214,7 @@ class Engagement:
         return Deed(turn.action, self._permit(lease))
 
     def _stand_by(self, decision: Decision, now: float) -> Deed:
-        post = self._formation.close_up(self.me, self._circle.members(now), decision.assigned)
+        post = self._formation.close_up(self.me, self._conference.others(now), decision.assigned)
         self._publish_decision(decision, 0, post=post)
         searching = self.me.cost is None
         action = self._behaviour.search(now) if searching else self._behaviour.hold(now)
@@ -274,7 +251,7 @@ class Engagement:
 
     def _publish(self, again: bool = False, **changes: object) -> None:
         status, state = self.course.state.status, str(self.course)
-        told = replace(self.me, status=status, state=state, epoch=self._epoch.number, **changes)  # type: ignore[arg-type]
+        told = replace(self.me, status=status, state=state, epoch=self._conference.epoch, **changes)  # type: ignore[arg-type]
         if again or told != self.me:
             self.me = replace(told, load=self.load, serial=self.me.serial + 1 if told.epoch == self.me.epoch else 0)
             self._tell(self.me)
@@ -307,20 +284,13 @@ class Engagement:
         now = self._clock.seconds()
         lease = None if self.lessee is None else self.lessee.lease
         self._stop(State.RELEASING)
-        members = [self.me, *self._circle.members(now)]
+        members = [self.me, *self._conference.others(now)]
         bids = sorted((m.name, m.cost) for m in members if m.cost is not None)
         token = 0 if lease is None else lease.token
         self._conclude(Result(outcome, self.me.name, round(now - self._began, 2), token, tuple(bids), why))
 
     def _is_late(self, now: float) -> bool:
         return 0.0 < self.task.deadline < self._age + now - self._began
-
-    def _falls_to_me(self, now: float) -> bool:
-        """Whether it is this agent that says that the task has failed: who acts, or else the first of those here."""
-        others = self._circle.members(now)
-        if self.course.state is State.EXECUTING:
-            return True
-        return not any(m.status == EXECUTING for m in others) and all(self.me.uuid < m.uuid for m in others)
 
     def _end(self, outcome: Result) -> None:
         is_first, self.result = self.result is None, outcome

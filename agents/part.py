@@ -11,7 +11,9 @@ from agents.behaviour import Behaviour
 from agents.engagement import Engagement
 from middleware.consensus.strategy import ConsensusAlgorithm
 from middleware.entangled.errors import EntangledError
+from middleware.entangled.record import Record
 from middleware.node import SwarmNode
+from middleware.order import order_of
 from middleware.presence import IDLE
 from middleware.tasks import Member, Result, Task
 
@@ -42,7 +44,7 @@ class Part:
         self.engagement = Engagement(
             task, me, behaviour, strategy, clock, token, self._tell, self._conclude, self._say, halt, age
         )
-        self._group = node.group(task.task_id, self.engagement.heard, self.engagement.ordered)
+        self._group = node.group(task.task_id, self.engagement.heard, self._ordered)
 
     def report(self) -> None:
         """Tell the others how things stand."""
@@ -55,6 +57,9 @@ class Part:
         self._group.leave()
         if is_running:
             self._group.withdraw()
+
+    def _ordered(self, records: list[Record]) -> None:
+        self.engagement.ordered(order_of(records))
 
     def _tell(self, member: Member) -> None:
         self._group.report(member)

@@ -12,7 +12,6 @@ from twisted.internet.defer import Deferred
 from middleware.entangled.node import EntangledNode
 from middleware.entangled.record import Record
 from middleware.entangled.replication.owner import Stored
-from middleware.order import Order, order_of
 from middleware.tasks import MEMBER, RESULT, Member, Result, group_key, member_of, outcome_of
 
 Heard = Callable[[list[Member], Result | None], None]
@@ -22,7 +21,8 @@ Heard = Callable[[list[Member], Result | None], None]
 class Group:
     """One participant's place in the group of ``task_id``.
 
-    ``quietly`` takes what may fail without anybody waiting, ``ordered`` what an operator wants of the task.
+    ``quietly`` takes what may fail without anybody waiting, ``ordered`` all records there are, for an operator's orders
+    among them.
     """
 
     def __init__(
@@ -31,7 +31,7 @@ class Group:
         entangled: EntangledNode,
         heard: Heard,
         quietly: Callable[[Deferred[Stored]], None],
-        ordered: Callable[[Order | None], None] = lambda order: None,
+        ordered: Callable[[list[Record]], None] = lambda records: None,
     ) -> None:
         self._key = group_key(task_id)
         self._entangled = entangled
@@ -58,4 +58,4 @@ class Group:
 
     def _changed(self, records: list[Record]) -> None:
         self._heard([m for record in records if (m := member_of(record)) is not None], outcome_of(records))
-        self._ordered(order_of(records))
+        self._ordered(records)

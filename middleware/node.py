@@ -29,10 +29,9 @@ from middleware.entangled.record import MAX_NAME, Record
 from middleware.entangled.replication.owner import Stored
 from middleware.entangled.replication.watch import Changed, Watch
 from middleware.group import Group, Heard
-from middleware.order import ORDER, Order
 from middleware.presence import DEVICES, Device, Presence, devices_of
 from middleware.streams import Streams
-from middleware.tasks import MAX_LEASE_TTL, RESULT, TASKS, Result, Task, group_key
+from middleware.tasks import MAX_LEASE_TTL, ORDER, RESULT, TASKS, Result, Task, group_key
 from middleware.value import bounded
 
 COUNCIL = 3
@@ -199,13 +198,13 @@ class SwarmNode(Service):
         """Follow the reports and the outcome of one task; ``keep`` leaves them in the store as well."""
         return self.entangled.watch(group_key(task_id), changed, keep)
 
-    def group(self, task_id: str, heard: Heard, ordered: Callable[[Order | None], None] = lambda order: None) -> Group:
+    def group(self, task_id: str, heard: Heard, ordered: Changed = lambda records: None) -> Group:
         """Take part in a task: a place among its participants."""
         return Group(task_id, self.entangled, heard, self._quietly, ordered)
 
-    def order(self, task_id: str, order: Order) -> Deferred[Stored]:
-        """Record what an operator wants of a task that is under way."""
-        return self.entangled.put(group_key(task_id), ORDER, order.packed(), "team")
+    def order(self, task_id: str, order: bytes) -> Deferred[Stored]:
+        """Record what an operator wants of a task that is under way (``middleware.order``, packed)."""
+        return self.entangled.put(group_key(task_id), ORDER, order, "team")
 
     def conclude(self, task_id: str, result: Result) -> Deferred[Stored]:
         """Record how a task ended, as somebody who takes no part in it."""

@@ -7,9 +7,9 @@ from dataclasses import asdict, dataclass, fields
 import msgpack
 
 from middleware.entangled.record import Record
+from middleware.tasks import ORDER
 from middleware.value import bounded, is_number, mapping_of
 
-ORDER = "order"
 PAUSE, RESUME = "PAUSE", "RESUME"
 WORDS = (PAUSE, RESUME)
 

@@ -32,6 +32,7 @@ PURE = (
     "agents.behaviour",
     "agents.circle",
     "agents.circling",
+    "agents.conference",
     "agents.decision",
     "agents.docket",
     "agents.epoch",

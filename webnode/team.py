@@ -150,7 +150,8 @@ class TeamDesk:
                 self._groups[task.task_id] = self._node.watch_group(task.task_id, lambda records: None, keep=True)
 
     def _order(self, task_id: str, word: str) -> None:
-        self._quietly(self._node.order(task_id, Order(word, self._node.presence.device.name, self._node.wall())))
+        order = Order(word, self._node.presence.device.name, self._node.wall())
+        self._quietly(self._node.order(task_id, order.packed()))
 
     def _open_tasks(self) -> list[Task]:
         tasks = filter(None, map(task_of, self._tasks.records))

@@ -423,7 +423,7 @@ class EngagementTests(SynchronousTestCase):
                 """Fail."""
                 raise ZeroDivisionError("no luck")
 
-        self.engagement._strategy = Broken()
+        self.engagement._conference.strategy = Broken()
         self.hear(self.report(2, 0.5))
         self.see(1.0)
         self.step()

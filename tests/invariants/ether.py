@@ -19,7 +19,7 @@ from middleware.entangled.clock import HeapClock
 from middleware.entangled.errors import Unavailable
 from middleware.entangled.record import Record
 from middleware.order import Order
-from middleware.tasks import RESULT, TASKS, Member, Result, Task, group_key
+from middleware.tasks import ORDER, RESULT, TASKS, Member, Result, Task, group_key
 
 PRESENCE = 1.0
 REPEAT = 0.5
@@ -145,7 +145,9 @@ class Ether:
             del members[uuid]
         for heard, ordered in list(node.groups.get(task_id, [])):
             heard([member for member, _ in members.values()], self.outcome(place, task_id))
-            ordered(self.replicas[place].orders.get(task_id))
+            order = self.replicas[place].orders.get(task_id)
+            packed = [] if order is None else [order.packed()]
+            ordered([Record(group_key(task_id), ORDER, bytes(32), 1, "team", 1.0, one, bytes(64)) for one in packed])
 
     def listed(self, place: int) -> None:
         """Tell the agent of the node which tasks there are."""

@@ -175,7 +175,7 @@ class Tasks:
         """Let time pass, and look on."""
         until = self.clock.seconds() + seconds
         while self.clock.seconds() < until - 1e-9:
-            self.clock.advance(0.05)
+            self.clock.advance(0.1)
             self.watch()
 
     # -- what must hold ---------------------------------------------------------------------------------------------
@@ -201,7 +201,7 @@ class Tasks:
     @contextmanager
     def _recorded(self) -> Iterator[None]:
         """Each decision of each agent goes through here."""
-        place: Any = import_module("agents.engagement")
+        place: Any = import_module("agents.conference")
         genuine = place.decide
 
         def decide(
