@@ -102,6 +102,8 @@ class Engagement:
     @property
     def may_be_put_aside(self) -> bool:
         """Whether the body may go to another task of a higher priority now."""
+        if self._concluding:
+            return False
         return not self.is_acting or (self.task.preemptible and self._execution.is_safe)
 
     # -- what comes in ----------------------------------------------------------------------------------------------
@@ -176,6 +178,8 @@ class Engagement:
 
     def put_aside(self, why: str) -> None:
         """Leave the body to another task: stop it where it acts, give the lease back, and say that it is not free."""
+        if self._concluding:
+            return  # the lease is kept until the outcome is known
         self._rest_aside(why)
         self.lessee = None
 

@@ -360,6 +360,18 @@ class EngagementTests(SynchronousTestCase):
         me = self.engagement.me
         self.assertEqual((me.status, me.state, me.why, me.available), (ASSIGNED, "IDLE", "busy with T", False))
 
+    def test_lease_is_kept_while_the_outcome_is_on_its_way(self) -> None:
+        """A pause or another task that comes between the deed and its record does not give the lease to another."""
+        self.dog.steps = 1
+        self.acting()
+        self.step()
+        self.assertFalse(self.engagement.may_be_put_aside)
+        self.engagement.put_aside("busy with T")
+        self.assertEqual(self.events, ["halted"])
+        self.end(COMPLETED, "dog1")
+        self.engagement.abandon()
+        self.assertEqual(self.events, ["halted", "released"])
+
     def test_deadline_fails_the_task_once(self) -> None:
         """Past its deadline the task fails by whoever acts, or by the first of those present, and by nobody else."""
         self.engagement.task = replace(TASK, deadline=5.0)
