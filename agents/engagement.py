@@ -157,7 +157,7 @@ class Engagement:
             return None
         if self.course.state is State.IDLE:
             self.course.go(State.OBSERVING)
-            self._publish(available=True)
+            self.me = replace(self.me, available=True)
         if self._execution.has_stalled(now) and self.me.cost is not None:
             self._say("makes no progress")
             self._publish(cost=None, available=False)
@@ -256,7 +256,7 @@ class Engagement:
     def _publish(self, again: bool = False, **changes: object) -> None:
         status, state = self.course.state.status, str(self.course)
         told = replace(self.me, status=status, state=state, epoch=self._conference.epoch, **changes)  # type: ignore[arg-type]
-        if again or told != self.me:
+        if again or told != replace(self.me, epoch=told.epoch):  # a round alone is told with the next report
             self.me = replace(told, load=self.load, serial=self.me.serial + 1 if told.epoch == self.me.epoch else 0)
             self._tell(self.me)
 

@@ -52,7 +52,7 @@ class Execution:
             self._best, self._best_at = progress, now
         elif 0.0 < self._stall_limit < now - self._best_at:
             self._stalled_at, self._best_at = now, now
-        return Turn(action, math.floor(progress / TOLD + 1e-9) * TOLD)
+        return Turn(action, math.floor(max(progress, self._best) / TOLD + 1e-9) * TOLD)
 
     def has_stalled(self, now: float) -> bool:
         """Whether it came to nothing lately: another is to try, for as long as this one tried in vain."""

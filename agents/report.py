@@ -38,7 +38,7 @@ class Reporter:
         if valid_for != known.valid_for:
             news["valid_for"] = valid_for
         angle = _number(getattr(self._behaviour, "angle", None))
-        if angle is not None and (known.angle is None or _apart(angle, known.angle) > TURNED):
+        if angle is not None and cost is not None and (known.angle is None or _apart(angle, known.angle) > TURNED):
             news["angle"] = round(angle, 3)
         now = self._clock.seconds()
         if not news and cost is not None and 0.0 < valid_for < 2.0 * (now - self._told_at):
