@@ -89,6 +89,6 @@ def behaviour_for(task: Task, rng: random.Random) -> Behaviour:
         raise UnknownTask(f"the behaviour for {task.kind!r} cannot be loaded: {error}") from error
     try:
         made: Behaviour = make(task.parameters, rng)
-    except (TypeError, ValueError, AttributeError) as error:
+    except (TypeError, ValueError, AttributeError, LookupError) as error:
         raise UnknownTask(f"a task of kind {task.kind!r} cannot have these parameters: {error}") from error
     return made

@@ -13,6 +13,7 @@ from dataclasses import replace
 from importlib import import_module
 from typing import Any
 
+from agents.behaviour import KINDS
 from agents.decision import Decision
 from agents.loop import Agent
 from agents.state import State
@@ -217,10 +218,12 @@ class Tasks:
             return decision
 
         place.decide = decide
+        KINDS["walk"] = "tests.invariants.walk:Walk"
         try:
             yield
         finally:
             place.decide = genuine
+            del KINDS["walk"]
 
     def check(self, members: list[Member], decision: Decision, hysteresis: float) -> None:
         """Of the same reports the same, never by an older report, and nothing changes hands for little."""

@@ -8,13 +8,11 @@ from types import SimpleNamespace
 
 from twisted.internet.defer import Deferred, succeed
 
-from agents.behaviour import KINDS, STAND, Context
+from agents.behaviour import STAND, Context
 from drivers.driver import Permit
 from drivers.gate import Gate
 from drivers.reading import Action, Observation
 from middleware.entangled.clock import HeapClock
-
-KINDS["walk"] = "tests.invariants.walk:Walk"
 
 
 class Walk:

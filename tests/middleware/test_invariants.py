@@ -40,7 +40,7 @@ BITING_ELSEWHERE = {
     "a full disk takes records": (1, "S-c"),
     "the end of a task is forgotten": (1, "E4"),
     "equal bids have no order": (1, "E7"),
-    "a little better is enough": (10, "E6"),
+    "a little better is enough": (5, "E6"),
     "old rounds count": (2, "E7"),
 }
 """The same of the quickest bugs that other workloads look for."""
