@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import random
+from dataclasses import dataclass
 from typing import Protocol
 
 from drivers.reading import Action, Observation
@@ -23,8 +24,28 @@ VISION = ("cv2", "numpy")
 STAND = {"base.vx": 0.0, "base.vy": 0.0, "base.wz": 0.0}
 
 
+@dataclass(frozen=True)
+class Context:
+    """Under which right a body acts ``now``: the lease's ``token``, and its ``deadline`` on the same clock.
+
+    ``is_resumed`` says that the token is the one of the call before, so that nobody acted in between: go on.  With a
+    new token, held since ``began``, another may have acted: what was done so far is still remembered, and may be void.
+    """
+
+    now: float
+    token: int = 0
+    deadline: float = 0.0
+    began: float = 0.0
+    is_resumed: bool = False
+
+
 class Behaviour(Protocol):
-    """One body at one task."""
+    """One body at one task.
+
+    A behaviour may also have: ``is_safe``, whether the task may change hands now (usually it always may);
+    ``progress``, the share that is done, 0 to 1; ``valid_for``, the seconds for which its cost counts (usually as long
+    as its node lives); ``angle`` and ``spread``, see ``agents.formation``.
+    """
 
     def look(self, seen: Observation, now: float) -> None:
         """Take in what the body senses now."""
@@ -39,7 +60,7 @@ class Behaviour(Protocol):
     def hold(self, now: float) -> Action:
         """What to do while another acts."""
 
-    def execute(self, now: float) -> Action | None:
+    def execute(self, context: Context) -> Action | None:
         """What to do next to get it done; None when it is done."""
 
 
@@ -68,6 +89,6 @@ def behaviour_for(task: Task, rng: random.Random) -> Behaviour:
         raise UnknownTask(f"the behaviour for {task.kind!r} cannot be loaded: {error}") from error
     try:
         made: Behaviour = make(task.parameters, rng)
-    except (TypeError, ValueError, AttributeError) as error:
+    except (TypeError, ValueError, AttributeError, LookupError) as error:
         raise UnknownTask(f"a task of kind {task.kind!r} cannot have these parameters: {error}") from error
     return made

@@ -9,21 +9,24 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 from twisted.internet.interfaces import IReactorTime
 
 from agents.behaviour import STAND, Behaviour
-from agents.decision import Decision, decide
+from agents.conference import Conference
+from agents.decision import Decision
+from agents.execution import Execution
+from agents.formation import Formation
+from agents.report import Reporter
+from agents.state import Course, State
 from drivers.driver import Permit
 from drivers.reading import Action, Observation
-from middleware.consensus.lease import Lessee
+from middleware.consensus.lease import Lease, Lessee
 from middleware.consensus.strategy import ConsensusAlgorithm
-from middleware.presence import ASSIGNED, DONE, EXECUTING, SEARCHING, WAITING
-from middleware.tasks import COMPLETED, Member, Result, Task
+from middleware.order import PAUSE, Order
+from middleware.tasks import COMPLETED, FAILED, Member, Result, Task
 
-FARTHER, NEARER, STEP = 1.15, 0.85, 0.05
-"""A report is renewed when the distance grew by 15 % and 5 cm (the target was moved), or shrank so much while the body
-does not act."""
 SEARCH_TTL = 0.5
 """Seconds for which a motion that needs no lease (to look around) is allowed at a time."""
 
@@ -40,8 +43,8 @@ class Engagement:
     """One agent at one task.
 
     ``tell`` publishes this agent's report; ``conclude`` records the outcome; ``say`` writes a line for people; ``halt``
-    stops the body now; ``token`` is the highest token that the body has obeyed so far.  ``lessee`` is to be set before
-    the first step.
+    stops the body now; ``token`` is the highest token that the body has obeyed so far; ``age`` is how old the task was
+    when the agent took it up.  With a ``lessee`` the agent has its body for this task, without one it only listens.
     """
 
     def __init__(
@@ -56,23 +59,29 @@ class Engagement:
         conclude: Callable[[Result], None],
         say: Callable[[str], None],
         halt: Callable[[], object],
+        age: float = 0.0,
     ) -> None:
         self.task = task
-        self.me = replace(me, status=ASSIGNED)
+        self.course = Course()
+        self.me = replace(me, status=State.IDLE.status)
         self.result: Result | None = None
+        self.order: Order | None = None
         self.token = token
         self.lessee: Lessee | None = None
+        self._reporter = Reporter(behaviour, clock)
         self._behaviour = behaviour
-        self._strategy = strategy
+        self._execution = Execution(behaviour, task.stall_limit)
         self._clock = clock
         self._tell = tell
         self._conclude = conclude
         self._say = say
         self._halt = halt
-        self._others: dict[str, Member] = {}
-        self._first_report_at: float | None = None
+        self._conference = Conference(me.uuid, strategy)
+        self._formation = Formation(me.uuid, behaviour)
         self._began = clock.seconds()
-        self._acting = False
+        self._age = age
+        self.load = 1
+        self._fault = ""
         self._concluding = False
 
     @property
@@ -80,24 +89,52 @@ class Engagement:
         """Whether the task has an outcome."""
         return self.result is not None
 
+    @property
+    def is_paused(self) -> bool:
+        """Whether an operator wants the task to rest."""
+        return self.order is not None and self.order.word == PAUSE
+
+    @property
+    def is_acting(self) -> bool:
+        """Whether the body acts for this task, or is about to."""
+        return self.course.state in (State.CLAIMING, State.EXECUTING)
+
+    @property
+    def may_be_put_aside(self) -> bool:
+        """Whether the body may go to another task of a higher priority now."""
+        if self._concluding:
+            return False
+        return not self.is_acting or (self.task.preemptible and self._execution.is_safe)
+
+    # -- what comes in ----------------------------------------------------------------------------------------------
+
     def heard(self, members: list[Member], outcome: Result | None) -> None:
-        """Take in who is present and what they report, and how the task ended."""
-        if outcome is not None and self.result is None:
+        """Take in who is present and what they report, and how the task ended.  An outcome absorbs all that follows."""
+        now = self._clock.seconds()
+        if outcome is not None and (self.result is None or outcome.rank > self.result.rank):
             self._end(outcome)
-        self._others = {m.uuid: m for m in members if m.uuid != self.me.uuid}
+        self.me = self._conference.hear(members, self.me, now)
+        if self._formation.hear(self._conference.others(now)) and not self.is_over:
+            self._say(f"one left, {len(self._conference) + 1} here: spreads out")
+
+    def ordered(self, order: Order | None) -> None:
+        """Take in what an operator wants of the task."""
+        was_paused, self.order = self.is_paused, order
+        if order is not None and was_paused != self.is_paused and not self.is_over:
+            self._say(f"{'paused' if self.is_paused else 'resumed'} by {order.by}")
 
     def look(self, seen: Observation) -> None:
         """Take in what the body senses, and report when it is new to the others."""
-        self._behaviour.look(seen, self._clock.seconds())
-        cost = self._behaviour.cost
-        known = self.me.cost
-        if cost is None or known is None:
-            news = (cost is None) != (known is None)
-        else:
-            news = cost > known * FARTHER + STEP or (not self._acting and cost < known * NEARER - STEP)
-        if news:
-            self._say("lost sight of it" if cost is None else f"reports {cost:.2f} m")
-            self._publish(cost=cost)
+        now = self._clock.seconds()
+        self._behaviour.look(seen, now)
+        if self.lessee is None or self.is_paused or self.is_over or self._execution.has_stalled(now):
+            return
+        news = self._reporter.news(self.me, self.course.state is State.EXECUTING)
+        if news is not None:
+            if "cost" in news:
+                cost = news["cost"]
+                self._say("lost sight of it" if cost is None else f"reports {cost:.2f} m")
+            self._publish(again=True, **news)
 
     def lose_body(self) -> None:
         """Take the report back: the body does not answer, so another has to act.  The next look reports again."""
@@ -105,32 +142,46 @@ class Engagement:
             self._say("has lost its robot")
             self._publish(cost=None)
 
+    # -- what goes out ----------------------------------------------------------------------------------------------
+
     def step(self) -> Deed | None:
-        """Decide again and say what to do now; None where the task is over."""
+        """Decide again and say what to do now; None where there is nothing to do for this task."""
         if self.is_over or self._concluding:
             return None
         now = self._clock.seconds()
+        if self._is_late(now) and (self.course.state is State.EXECUTING or self._conference.is_first(now)):
+            self._finish(FAILED, f"past its deadline of {self.task.deadline:g} s")
+            return None
+        if self.lessee is None or self.is_paused:
+            self._rest_aside("paused" if self.is_paused else self.me.why)
+            return None
+        if self.course.state is State.IDLE:
+            self.course.go(State.OBSERVING)
+            self.me = replace(self.me, available=True)
+        if self._execution.has_stalled(now) and self.me.cost is not None:
+            self._say("makes no progress")
+            self._publish(cost=None, available=False)
         decision = self._decision(now)
-        mine = decision.assigned == self.me.uuid
-        if not mine:
-            self._give_back()
-            return self._stand_by(decision, now)
-        assert self.lessee is not None
-        self.lessee.want()
-        lease = self.lessee.lease
-        if lease is None:
-            self._rest()
-            return self._stand_by(decision, now)
-        if not self._acting:
-            self._acting = True
-            self._say(f"goes: {decision.why}")
-        self.token = max(self.token, lease.token)
-        self._publish_decision(EXECUTING, decision, lease.token)
-        action = self._behaviour.execute(now)
-        if action is None:
-            self._complete(lease.token)
-            return Deed(STAND, Permit(lease.token, lease.deadline))
-        return Deed(action, Permit(lease.token, lease.deadline))
+        if decision.assigned == self.me.uuid or self._must_go_on(decision):
+            return self._act(decision, now)
+        self._give_back()
+        self._place(decision)
+        return self._stand_by(decision, now)
+
+    def fence(self) -> None:
+        """The body has obeyed a newer token than the one it acts under: another holds the task, or held it.
+
+        To an agent that only stands by it says nothing: the body remembers what a former life of its agent did.
+        """
+        if self._stop(State.FENCED) and self.lessee is not None:
+            self.lessee.release()
+
+    def put_aside(self, why: str) -> None:
+        """Leave the body to another task: stop it where it acts, give the lease back, and say that it is not free."""
+        if self._concluding:
+            return  # the lease is kept until the outcome is known
+        self._rest_aside(why)
+        self.lessee = None
 
     def abandon(self) -> None:
         """Leave the task: the lease is given back (the caller has stopped the body)."""
@@ -140,57 +191,118 @@ class Engagement:
     # -- inside -----------------------------------------------------------------------------------------------------
 
     def _decision(self, now: float) -> Decision:
-        members = [self.me, *self._others.values()]
-        if not any(m.cost is not None for m in members):
-            self._first_report_at = None
-        elif self._first_report_at is None:
-            self._first_report_at = now
-        since = None if self._first_report_at is None else now - self._first_report_at
-        return decide(members, self._strategy, self.task.hysteresis, self.task.waiting_period, since)
+        decision = self._conference.decide(self.task, self.me, now)
+        if decision.fault and decision.fault != self._fault:
+            self._say(decision.fault)
+        self._fault = decision.fault
+        return decision
+
+    def _act(self, decision: Decision, now: float) -> Deed:
+        assert self.lessee is not None
+        self.lessee.want()
+        lease = self.lessee.lease
+        if lease is None:
+            if not self._stop(State.FENCED):
+                self._place(decision)
+            return self._stand_by(decision, now)
+        if self.course.state is not State.EXECUTING:
+            self._place(decision)
+            self.course.go(State.EXECUTING)
+            self._say(f"goes: {decision.why}")
+        self.token = max(self.token, lease.token)
+        turn = self._execution.go_on(now, lease.token, lease.deadline)
+        self._publish_decision(decision, lease.token, turn.progress)
+        if turn.action is None:
+            self._finish(COMPLETED)
+            return Deed(STAND, self._permit(lease))
+        return Deed(turn.action, self._permit(lease))
 
     def _stand_by(self, decision: Decision, now: float) -> Deed:
+        post = self._formation.close_up(self.me, self._conference.others(now), decision.assigned)
+        self._publish_decision(decision, 0, post=post)
         searching = self.me.cost is None
-        status = SEARCHING if searching else WAITING
-        self._publish_decision(status, decision, 0)
         action = self._behaviour.search(now) if searching else self._behaviour.hold(now)
         return Deed(action, Permit(self.token, now + SEARCH_TTL))
 
-    def _publish_decision(self, status: str, decision: Decision, token: int) -> None:
+    def _permit(self, lease: Lease) -> Permit:
+        return Permit(lease.token, lease.deadline)
+
+    def _place(self, decision: Decision) -> None:
+        """Go to the state that the decision means for who does not execute."""
+        if self.me.cost is None:
+            self.course.reach(State.OBSERVING)
+        elif decision.assigned is None:
+            self.course.reach(State.REPORTED)
+        elif decision.assigned == self.me.uuid:
+            self.course.reach(State.CLAIMING)
+        else:
+            order = decision.order
+            self.course.reach(State.WAITING, order.index(self.me.uuid) if self.me.uuid in order else 0)
+
+    def _must_go_on(self, decision: Decision) -> bool:
+        """Whether another should act, and this agent is at no point where the task may change hands."""
+        is_executing = self.course.state is State.EXECUTING and self.me.cost is not None
+        return is_executing and decision.assigned is not None and not self._execution.is_safe
+
+    def _publish_decision(
+        self, decision: Decision, token: int, progress: float | None = None, post: float | None = None
+    ) -> None:
         assigned = decision.assigned or ""
         if assigned and assigned != self.me.assigned and assigned != self.me.uuid:
             self._say(f"stands by: {decision.why}")
-        self._publish(status=status, assigned=assigned, digest=decision.digest, token=token, why=decision.why)
+        told: dict[str, Any] = {"assigned": assigned, "digest": decision.digest, "why": decision.why}
+        self._publish(token=token, progress=progress, post=post, **told)
 
-    def _publish(self, **changes: object) -> None:
-        told = replace(self.me, **changes)  # type: ignore[arg-type]
-        if told != self.me:
-            self.me = told
-            self._tell(told)
+    def _publish(self, again: bool = False, **changes: object) -> None:
+        status, state = self.course.state.status, str(self.course)
+        told = replace(self.me, status=status, state=state, epoch=self._conference.epoch, **changes)  # type: ignore[arg-type]
+        if again or told != replace(self.me, epoch=told.epoch):  # a round alone is told with the next report
+            self.me = replace(told, load=self.load, serial=self.me.serial + 1 if told.epoch == self.me.epoch else 0)
+            self._tell(self.me)
 
     def _give_back(self) -> None:
-        if self._rest():
+        """Stop the body where it acts, and only then give the lease back."""
+        if self._stop(State.RELEASING):
             self._say("gives the task back")
         if self.lessee is not None:
             self.lessee.release()
 
-    def _rest(self) -> bool:
-        """Stop the body where it acts; whether it did."""
-        was_acting, self._acting = self._acting, False
-        if was_acting:
-            self._halt()
-        return was_acting
+    def _stop(self, state: State) -> bool:
+        """Stop the body where it acts, which leads to ``state``; whether it did."""
+        if self.course.state is not State.EXECUTING:
+            return False
+        self._halt()
+        self.course.go(state)
+        return True
 
-    def _complete(self, token: int) -> None:
+    def _rest_aside(self, why: str) -> None:
+        """Have no body for this task; who is to be asked for a report is another."""
+        self._give_back()
+        self.course.go(State.IDLE)
+        nothing: dict[str, Any] = {"cost": None, "assigned": "", "digest": "", "token": 0, "progress": None}
+        self._publish(available=False, why=why, post=None, **nothing)
+
+    def _finish(self, outcome: str, why: str = "") -> None:
         """Record the outcome; the lease is kept until the outcome is known, so that nobody starts over in between."""
         self._concluding = True
-        self._halt()
-        bids = sorted((m.name, m.cost) for m in [self.me, *self._others.values()] if m.cost is not None)
-        took = round(self._clock.seconds() - self._began, 2)
-        self._conclude(Result(COMPLETED, self.me.name, took, token, tuple(bids)))
+        now = self._clock.seconds()
+        lease = None if self.lessee is None else self.lessee.lease
+        self._stop(State.RELEASING)
+        members = [self.me, *self._conference.others(now)]
+        bids = sorted((m.name, m.cost) for m in members if m.cost is not None)
+        token = 0 if lease is None else lease.token
+        self._conclude(Result(outcome, self.me.name, round(now - self._began, 2), token, tuple(bids), why))
+
+    def _is_late(self, now: float) -> bool:
+        return 0.0 < self.task.deadline < self._age + now - self._began
 
     def _end(self, outcome: Result) -> None:
-        self.result = outcome
+        is_first, self.result = self.result is None, outcome
+        if not is_first:
+            return
         by_me = outcome.outcome == COMPLETED and outcome.by == self.me.name
-        self._say("done" if by_me else f"{outcome.outcome.lower()} by {outcome.by}")
-        self._rest()
-        self._publish(status=DONE)
+        why = f": {outcome.why}" if outcome.why else ""
+        self._say("done" if by_me else f"{outcome.outcome.lower()} by {outcome.by}{why}")
+        self._stop(State.RELEASING)
+        self.course.go(State.DONE)
+        self._publish()

@@ -35,6 +35,8 @@ class Exploration:
         self._openness: list[tuple[float, float]] = []
         self._heading: float | None = None
         self._leg_from: tuple[float, float] | None = None
+        self.sector: tuple[float, float] | None = None
+        """The middle and the width of the headings that are this robot's to search; None: all."""
 
     def saw(self, pose: Pose, turned: float, ahead: float) -> None:
         """Take in the pose, the turn since the last time, and the range ahead (NaN: nothing within reach)."""
@@ -60,9 +62,14 @@ class Exploration:
         return {**STAND, "base.vx": WALK, "base.wz": clipped(TURN_GAIN * off, TURN_SPEED)}
 
     def _most_open(self) -> float:
-        """A heading with room ahead and beside it; chance decides among the best."""
-        best = max(openness for openness, _ in self._openness)
-        return self._rng.choice([yaw for openness, yaw in self._openness if openness >= 0.95 * best])
+        """A heading with room ahead and beside it, in the own sector if there is one; chance decides among the best."""
+        seen = self._openness
+        if self.sector is not None:
+            middle, width = self.sector
+            own = [(o, yaw) for o, yaw in seen if abs(math.remainder(yaw - middle, math.tau)) <= width / 2]
+            seen = own if any(openness >= CLEARANCE + LEG for openness, _ in own) else seen
+        best = max(openness for openness, _ in seen)
+        return self._rng.choice([yaw for openness, yaw in seen if openness >= 0.95 * best])
 
     def _begin_turn(self) -> None:
         self._turned = 0.0

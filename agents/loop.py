@@ -3,99 +3,83 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Callable
 from typing import Any
 
 from twisted.application.service import Service
 from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IDelayedCall, IReactorTime
-from twisted.internet.task import deferLater
-from twisted.logger import Logger
 
 from agents.behaviour import behaviour_for
+from agents.body import Body
+from agents.docket import Docket, next_task
 from agents.engagement import Engagement
+from agents.part import Part
 from drivers.driver import Driver
-from drivers.errors import DriverError, LinkError, UsageError
 from drivers.reading import Observation
 from middleware.consensus.strategy import strategy_for
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.record import Record
 from middleware.errors import SwarmError
-from middleware.group import Group
 from middleware.node import CAMERA, SwarmNode
 from middleware.presence import DONE, IDLE
-from middleware.tasks import Member, Result, Task, group_key, outcome_of, refusals, task_of
+from middleware.tasks import Member, Task, group_key, outcome_of, refusals, task_of
 
 TICK = 0.05
 REENGAGE = 0.5
-PATIENCE = 0.5
-"""Seconds for which a robot may fall silent before its agent takes its report back."""
 
 
 class Agent(Service):
-    """One device's agent: one turn a tick, in the order observe, decide, act, publish."""
+    """One device's agent: one turn a tick, in the order observe, decide, act, publish.
 
-    _log = Logger()
+    It takes part in every open task that its body can do.  One of them has the body; the others are told that it is
+    not free.
+    """
 
     def __init__(self, node: SwarmNode, driver: Driver, clock: IReactorTime, rng: random.Random) -> None:
         self._node = node
-        self._driver = driver
         self._clock = clock
         self._rng = rng
-        self._open: dict[str, Task] = {}
-        self._ended: set[str] = set()
+        self._body = Body(driver, clock, self._seen, self._no_body)
+        self._docket = Docket()
         self._checking: set[str] = set()
-        self._engagement: Engagement | None = None
-        self._group: Group | None = None
+        self._parts: dict[str, Part] = {}
+        self._holder: Part | None = None
         self._tick: IDelayedCall | None = None
-        self._unsubscribe: Callable[[], None] | None = None
         self._token = 0
-        self._is_awake = False
-        self._answered_at = clock.seconds()
+
+    @property
+    def engagement(self) -> Engagement | None:
+        """The engagement that has the body."""
+        return None if self._holder is None else self._holder.engagement
 
     def startService(self) -> None:
         """Connect the body, and follow the tasks once the node has joined."""
         super().startService()
-        self._unsubscribe = self._driver.subscribe(self._seen)
-        Deferred.fromCoroutine(self._wake()).addErrback(self._no_body)
+        self._body.start()
         self._node.joined.addCallback(self._follow)
         self._tick = self._clock.callLater(TICK, self._turn)
 
     def stopService(self) -> Deferred[None]:
         """Stop the body first, then give back what is held."""
         super().stopService()
-        self._driver.stop()
+        self._body.stop()
         if self._tick is not None and self._tick.active():
             self._tick.cancel()
-        if self._unsubscribe is not None:
-            self._unsubscribe()
-        self._disengage()
-        return self._driver.disconnect()
-
-    async def _wake(self) -> None:
-        """Have the body connected and its motors on; a link that goes away in between is tried again."""
-        await self._driver.connect()
-        while self.running and not self._is_awake:
-            try:
-                self._is_awake = await self._driver.enable()
-            except LinkError as error:
-                self._log.info("motors not on yet: {error}", error=error)
-                await deferLater(self._clock, REENGAGE)
-
-    def _no_body(self, failure: Any) -> None:
-        failure.trap(DriverError)
-        if self.running:
-            reason = failure.getErrorMessage()
-            self._log.warn("no robot: {reason}", reason=reason)
-            self._node.presence.say(self._node.wall(), f"has no robot: {reason}")
+        for task_id in list(self._parts):
+            self._leave(task_id)
+        return self._body.driver.disconnect()
 
     # -- observe ----------------------------------------------------------------------------------------------------
 
     def _seen(self, seen: Observation) -> None:
         if seen.frame is not None:
             self._node.streams.offer(CAMERA, seen.frame.seq, seen.frame.data)
-        if self._engagement is not None and not self._engagement.is_over:
-            self._engagement.look(seen)
+        engagement = self.engagement
+        if engagement is not None and not engagement.is_over:
+            engagement.look(seen)
+
+    def _no_body(self, reason: str) -> None:
+        self._say(f"has no robot: {reason}")
 
     # -- tasks ------------------------------------------------------------------------------------------------------
 
@@ -105,11 +89,18 @@ class Agent(Service):
         return _
 
     def _tasks(self, records: list[Record]) -> None:
-        for task in sorted(filter(None, map(task_of, records)), key=lambda t: (t.created, t.task_id)):
-            new = task.task_id not in self._open and task.task_id not in self._ended | self._checking
-            if new and not refusals(self._driver.description.capabilities, task.requirements):
-                self._checking.add(task.task_id)
+        listed = {task.task_id: task for task in filter(None, map(task_of, records))}
+        self._docket.forget(listed, self._clock.seconds())
+        for task_id, task in sorted(listed.items()):
+            if refusals(self._body.driver.description.capabilities, task.requirements):
+                continue
+            if self._docket.is_new(task_id) and task_id not in self._checking:
+                self._checking.add(task_id)
                 self._check(task)
+            elif task_id in self._docket.open:
+                self._docket.add(task)
+                if task_id in self._parts:
+                    self._parts[task_id].engagement.task = task
 
     def _check(self, task: Task) -> None:
         if self.running:
@@ -121,10 +112,9 @@ class Agent(Service):
         """A task heard of: it may be an old one that is done."""
         self._checking.discard(task.task_id)
         if outcome_of(records) is not None:
-            self._ended.add(task.task_id)
-        else:
-            self._open[task.task_id] = task
-            self._engage_next()
+            self._docket.bury(task.task_id, self._clock.seconds())
+        elif self._docket.add(task):
+            self._arrange()
 
     def _unchecked(self, failure: Any, task: Task) -> None:
         """Nobody could tell whether the task is still open: ask again in a while."""
@@ -132,49 +122,60 @@ class Agent(Service):
         if self.running:
             self._clock.callLater(REENGAGE, self._check, task)
 
-    def _engage_next(self) -> None:
-        busy = self._engagement is not None and not self._engagement.is_over
-        if busy or not self._open or not self.running:
+    def _arrange(self) -> None:
+        """Take part in what is open, and give the body to the task that it is due to."""
+        if not self.running:
             return
-        self._disengage()
-        task = min(self._open.values(), key=lambda t: (t.created, t.task_id))
-        try:
-            behaviour = behaviour_for(task, self._rng)
-            strategy = strategy_for(task.strategy)
-        except SwarmError as error:
-            self._ended.add(task.task_id)
-            del self._open[task.task_id]
-            self._node.presence.say(self._node.wall(), str(error))
-            return self._engage_next()
-        me = Member(self._node.uuid, self._node.presence.device.name, IDLE)
-        engagement = Engagement(
-            task,
-            me,
-            behaviour,
-            strategy,
-            self._clock,
-            self._token,
-            self._tell,
-            self._conclude,
-            self._say,
-            self._driver.stop,
+        followed = self._docket.followed()
+        for task in followed:
+            if task.task_id not in self._parts:
+                self._engage(task)
+        active = [part for part in self._parts.values() if not (part.engagement.is_over or part.engagement.is_paused)]
+        tasks = {part.engagement.task.task_id: part for part in active}
+        holder = self._holder if self._holder in active else None
+        current = None if holder is None else holder.engagement
+        wanted = next_task(
+            [part.engagement.task for part in active],
+            None if current is None else current.task,
+            current is None or current.may_be_put_aside,
         )
-        engagement.lessee = self._node.lessee(task, self._turn_now, self._token)
-        self._engagement = engagement
-        self._group = self._node.group(task.task_id, engagement.heard, task)
-        self._group.report(engagement.me)
-        self._node.presence.change(task=task.task_id, status=engagement.me.status)
-        self._say(f"assigned: {task.title}")
+        part = None if wanted is None else tasks[wanted.task_id]
+        if part is not self._holder:
+            self._give_body(part)
 
-    def _disengage(self) -> None:
-        engagement, self._engagement = self._engagement, None
-        group, self._group = self._group, None
-        if engagement is not None:
-            engagement.abandon()
-        if group is not None:
-            group.leave()
-            if self.running:
-                group.withdraw()
+    def _engage(self, task: Task) -> None:
+        try:
+            behaviour, strategy = behaviour_for(task, self._rng), strategy_for(task.strategy)
+        except SwarmError as error:
+            self._docket.bury(task.task_id, self._clock.seconds())
+            return self._say(str(error))
+        stop = self._body.driver.stop
+        part = Part(task, self._node, behaviour, strategy, self._clock, self._token, self._told, stop)
+        self._parts[task.task_id] = part
+        self._say(f"assigned: {task.title}")
+        if self._holder is not None:
+            part.engagement.put_aside(f"busy with {self._holder.engagement.task.title}")
+        part.report()
+
+    def _give_body(self, part: Part | None) -> None:
+        """Take the body from the task that has it, and give it to that of ``part``."""
+        before, self._holder = self._holder, part
+        if before is not None and not before.engagement.is_over:
+            self._body.driver.stop()
+            why = f"busy with {part.engagement.task.title}" if part is not None else "paused"
+            before.engagement.put_aside(why)
+        if part is None:
+            return self._node.presence.change(task="", status=IDLE)
+        engagement = part.engagement
+        engagement.token = self._token
+        engagement.lessee = self._node.lessee(engagement.task, self._turn_now, self._token)
+        self._node.presence.change(task=engagement.task.task_id, status=engagement.me.status)
+
+    def _leave(self, task_id: str) -> None:
+        part = self._parts.pop(task_id)
+        part.leave(bool(self.running))
+        if part is self._holder:
+            self._holder = None
 
     # -- act --------------------------------------------------------------------------------------------------------
 
@@ -183,70 +184,44 @@ class Agent(Service):
         self._turn_now()
 
     def _turn_now(self) -> None:
-        engagement = self._engagement
-        if engagement is None or not self.running:
+        if not self.running:
             return
-        if engagement.is_over:
-            return self._finished(engagement)
-        has_body = self._has_body
+        for part in list(self._parts.values()):
+            if part.engagement.is_over:
+                self._finished(part)
+        self._arrange()
+        for part in list(self._parts.values()):
+            part.engagement.load = len(self._parts)
+            if part is not self._holder:
+                part.engagement.step()
+        engagement = self.engagement
+        if engagement is None:
+            return
+        has_body = self._body.answers
         if not has_body:
             engagement.lose_body()
         deed = engagement.step()
         self._token = max(self._token, engagement.token)
-        if deed is None or not has_body or self._driver.state != "ready":
-            return
-        try:
-            self._driver.act(deed.action, deed.permit)
-        except UsageError as error:
-            self._driver.stop()
-            self._log.debug("the body refused: {error}", error=error)
-        except DriverError as error:
-            self._log.info("the body does not answer: {error}", error=error)
+        if deed is not None and has_body and not self._body.do(deed):
+            engagement.fence()
 
-    @property
-    def _has_body(self) -> bool:
-        """Whether the robot answers with its motors on, or did so a moment ago."""
-        seen = self._driver.observe()
-        has_motors = seen is None or seen.values.get("estop.engaged") is not True
-        now = self._clock.seconds()
-        if self._is_awake and has_motors and self._driver.state == "ready":
-            self._answered_at = now
-        return self._is_awake and has_motors and now - self._answered_at <= PATIENCE
-
-    def _finished(self, engagement: Engagement) -> None:
-        task_id = engagement.task.task_id
-        if task_id in self._ended:
-            return
-        self._driver.stop()
-        self._ended.add(task_id)
-        self._open.pop(task_id, None)
-        engagement.abandon()
-        by_me = engagement.result is not None and engagement.result.by == engagement.me.name
-        self._node.presence.change(task="", status=DONE if by_me else IDLE)
-        self._engage_next()
+    def _finished(self, part: Part) -> None:
+        engagement = part.engagement
+        had_body = part is self._holder
+        if had_body:
+            self._body.driver.stop()
+        self._docket.bury(engagement.task.task_id, self._clock.seconds())
+        self._leave(engagement.task.task_id)
+        if had_body:
+            by_me = engagement.result is not None and engagement.result.by == engagement.me.name
+            self._node.presence.change(task="", status=DONE if by_me else IDLE)
 
     # -- publish ----------------------------------------------------------------------------------------------------
 
-    def _tell(self, member: Member) -> None:
-        engagement, group = self._engagement, self._group
-        if engagement is not None and group is not None:
-            group.report(member)
-            if not engagement.is_over:
-                # What the device is after the task, its end says.
-                self._node.presence.change(status=member.status)
-
-    def _conclude(self, result: Result) -> None:
-        engagement, group = self._engagement, self._group
-        if engagement is None or group is None:
-            return
-        concluded = group.conclude(result)
-        concluded.addErrback(self._not_concluded, engagement.task.task_id, result)
-
-    def _not_concluded(self, failure: Any, task_id: str, result: Result) -> None:
-        """No majority could be told: try again for as long as the task is ours to conclude."""
-        failure.trap(EntangledError)
-        if self.running and self._engagement is not None and self._engagement.task.task_id == task_id:
-            self._clock.callLater(REENGAGE, self._conclude, result)
+    def _told(self, part: Part, member: Member) -> None:
+        if part is self._holder and not part.engagement.is_over:
+            # What the device is after the task, its end says.
+            self._node.presence.change(status=member.status)
 
     def _say(self, text: str) -> None:
         self._node.presence.say(self._node.wall(), text)

@@ -10,8 +10,10 @@ import math
 import random
 from collections.abc import Mapping
 
-from agents.behaviour import STAND
+from agents.behaviour import STAND, Context
+from agents.circling import Circling
 from agents.exploration import TURN_GAIN, TURN_SPEED, WALK, Exploration, Pose, clipped
+from agents.formation import Post
 from agents.vision import Sighting, Size, find_target
 from drivers.reading import Action, Observation
 
@@ -41,13 +43,16 @@ class SearchAndApproach:
         self._side = rng.choice((-1.0, 1.0))
         self._exploration = Exploration(rng)
         self._target: tuple[float, float] | None = None
-        self._seen_at = -math.inf
+        self._seen_at = self._looked_at = -math.inf
         self._frame = -1
         self._ranges: dict[str, float] = {}
         self._pose: Pose = (0.0, 0.0, 0.0)
         self._has_pose = False
         self._distances: list[float] = []
         self._done_for = 0
+        self._circling = Circling()
+        self._way = 0.0
+        self._north: float | None = None
 
     # -- observing --------------------------------------------------------------------------------------------------
 
@@ -60,17 +65,21 @@ class SearchAndApproach:
         self._pose, self._has_pose = (x, y, yaw), True
         for name in ("near", "far"):
             self._ranges[name] = float(values.get(f"range.{name}", math.nan))
+        heading = values.get("compass.heading")
+        self._north = None if heading is None else math.remainder(float(heading) - yaw, math.tau)
         self._exploration.saw(self._pose, math.remainder(yaw - before[2], math.tau), self._ahead)
         if seen.frame is not None and seen.frame.seq != self._frame:
             self._frame = seen.frame.seq
             self._saw(find_target(seen.frame.data, self._size), now)
-        if now - self._seen_at > MEMORY:
+        if self._circling.is_walking:
+            self._looked_at = now  # it looks elsewhere, and the target stays where it is
+        if now - self._looked_at > MEMORY:
             self._forget()
 
     def _saw(self, sighting: Sighting | None, now: float) -> None:
         if sighting is None:
             return
-        self._seen_at = now
+        self._seen_at = self._looked_at = now
         # Where it stands in the robot's own odometry: between pictures the body turns and walks, the target does not.
         x, y, yaw = self._pose
         reach, towards = sighting.distance + CAMERA_AHEAD, yaw + sighting.bearing
@@ -112,6 +121,20 @@ class SearchAndApproach:
         ordered = sorted(self._distances)
         return ordered[len(ordered) // 2]
 
+    @property
+    def angle(self) -> float | None:
+        """Where the dog stands as seen from the target, by the compass; None without target or compass."""
+        if self._target is None or self._north is None:
+            return None
+        x, y, _ = self._pose
+        outward = math.atan2(y - self._target[1], x - self._target[0])
+        return math.remainder(outward + self._north, math.tau)
+
+    @property
+    def progress(self) -> float | None:
+        """The share of the way that is done, from where the dog stood by; None where it did not, or sees nothing."""
+        return None if self._target is None or not self._way else max(0.0, 1.0 - self._gap / self._way)
+
     # -- acting -----------------------------------------------------------------------------------------------------
 
     def search(self, now: float) -> Action:
@@ -119,11 +142,23 @@ class SearchAndApproach:
         return self._exploration.step(self._pose, self._ahead) if self._target is None else self._face()
 
     def hold(self, now: float) -> Action:
-        """Stand and keep facing the target, ready to take over."""
-        return self.search(now)
+        """Stand at the post and keep facing the target, ready to take over."""
+        if self._target is None:
+            return self.search(now)
+        self._way = self._gap
+        is_facing = abs(self._bearing) < FACING and now - self._seen_at <= FRESH
+        return self._circling.step(self._pose, self._target, self.angle, self._ahead, is_facing) or self._face()
 
-    def execute(self, now: float) -> Action | None:
+    def take_post(self, post: Post) -> None:
+        """Stand there from now on while another acts, and search that sector while there is nothing to be seen."""
+        self._circling.send(post.angle)
+        if self._north is not None:
+            self._exploration.sector = math.remainder(post.sector[0] - self._north, math.tau), post.sector[1]
+
+    def execute(self, context: Context) -> Action | None:
         """Walk up to the target and stop before touching it; None once the dog stands there."""
+        now = context.now
+        self._circling.rest()
         if self._target is None:
             return self.search(now)
         bearing, gap = self._bearing, self._gap

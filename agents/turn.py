@@ -6,7 +6,7 @@ import math
 import random
 from collections.abc import Mapping
 
-from agents.behaviour import STAND
+from agents.behaviour import STAND, Context
 from drivers.reading import Action, Observation
 
 SPEED = 1.2
@@ -44,9 +44,17 @@ class TurnAround:
 
     def hold(self, now: float) -> Action:
         """Stand still."""
+        self._acting = False
         return STAND
 
-    def execute(self, now: float) -> Action | None:
-        """Turn left until the turns are done."""
+    @property
+    def progress(self) -> float:
+        """The share of the turns that is done."""
+        return 1.0 if not self._turns else self._turned / (self._turns * math.tau)
+
+    def execute(self, context: Context) -> Action | None:
+        """Turn left until the turns are done, from where it was."""
+        if not context.is_resumed:
+            self._yaw = None  # what the body did meanwhile was not for this task
         self._acting = True
         return None if self._turned >= self._turns * math.tau else {**STAND, "base.wz": SPEED}

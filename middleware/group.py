@@ -27,10 +27,11 @@ Enter = Callable[[Callable[[tuple[Report, ...]], None]], "Bidding"]
 
 
 class Group:
-    """One participant's place in the group of ``task_id``; ``quietly`` takes what may fail without anybody waiting.
+    """One participant's place in the group of ``task_id``.
 
-    With ``enter`` bids go to the task's council as well (``dissemination``), which announces those that decide; the
-    records stay as what people see, and as who is present.
+    ``quietly`` takes what may fail without anybody waiting, ``ordered`` all records there are, for an operator's orders
+    among them.  With ``enter`` bids go to the task's council as well (``dissemination``), which announces those that
+    decide; the records stay as what people see, and as who is present.
     """
 
     def __init__(
@@ -39,11 +40,13 @@ class Group:
         entangled: EntangledNode,
         heard: Heard,
         quietly: Callable[[Deferred[Stored]], None],
+        ordered: Callable[[list[Record]], None] = lambda records: None,
         enter: Enter | None = None,
     ) -> None:
         self._key = group_key(task_id)
         self._entangled = entangled
         self._heard = heard
+        self._ordered = ordered
         self._quietly = quietly
         # Imported by the first who takes part: a plain node has no group.
         from middleware.dissemination.roll import Roll
@@ -85,6 +88,7 @@ class Group:
         if self._bidding is not None:
             self._bidding.expect(len(self._roll))
         self._heard(self._roll.members(), self._outcome)
+        self._ordered(records)
 
     def _announced(self, reports: tuple[Report, ...]) -> None:
         self._roll.announced(reports)

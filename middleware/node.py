@@ -32,7 +32,7 @@ from middleware.entangled.replication.watch import Changed, Watch
 from middleware.group import Group, Heard
 from middleware.presence import DEVICES, Device, Presence, devices_of
 from middleware.streams import Streams
-from middleware.tasks import MAX_LEASE_TTL, RESULT, TASKS, Result, Task, group_key
+from middleware.tasks import MAX_LEASE_TTL, ORDER, RESULT, TASKS, Result, Task, group_key
 from middleware.value import bounded
 
 if TYPE_CHECKING:
@@ -209,22 +209,22 @@ class SwarmNode(Service):
         """Follow the reports and the outcome of one task; ``keep`` leaves them in the store as well."""
         return self.entangled.watch(group_key(task_id), changed, keep)
 
-    def group(self, task_id: str, heard: Heard, task: Task | None = None) -> Group:
-        """Take part in a task: a place among its participants; with ``task`` bids go to its council, too."""
-        if task is None or not task.council:
-            return Group(task_id, self.entangled, heard, self._quietly)
-        generation = getattr(task, "generation", 0)
-        enter = partial(self.bidding, task, generation)
-        return Group(task_id, self.entangled, heard, self._quietly, enter)
+    def group(self, task: Task, heard: Heard, ordered: Changed = lambda records: None) -> Group:
+        """Take part in a task: a place among its participants.  Where it has a council, bids go there, too."""
+        enter = partial(self.bidding, task, task.generation) if task.council else None
+        return Group(task.task_id, self.entangled, heard, self._quietly, ordered, enter)
 
     def bidding(self, task: Task, epoch: int, on_summary: OnSummary) -> Bidding:
         """Bid for ``task`` in ``epoch``: ``on_summary`` is told which bids the task's council announces."""
         from middleware.dissemination.auction import MAX_WAITING, Auction
 
-        exclusive = getattr(task, "exclusive", True)
         waiting = min(float(task.waiting_period), MAX_WAITING)
-        auction = Auction(task.task_id, epoch, task.council, task.strategy, waiting, exclusive)
+        auction = Auction(task.task_id, epoch, task.council, task.strategy, waiting, task.exclusive)
         return self.dissemination.enter(auction, on_summary)
+
+    def order(self, task_id: str, order: bytes) -> Deferred[Stored]:
+        """Record what an operator wants of a task that is under way (``middleware.order``, packed)."""
+        return self.entangled.put(group_key(task_id), ORDER, order, "team")
 
     def conclude(self, task_id: str, result: Result) -> Deferred[Stored]:
         """Record how a task ended, as somebody who takes no part in it."""

@@ -8,7 +8,8 @@ written back.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import MISSING, asdict, dataclass, field, fields, replace
+from typing import Any
 
 import msgpack
 
@@ -24,6 +25,8 @@ OUTCOMES = (COMPLETED, FAILED, CANCELLED)
 MAX_LEASE_TTL = 60.0
 MEMBER = "member"
 RESULT = "result"
+ORDER = "order"
+MAX_PRIORITY = 1000
 
 
 def group_key(task_id: str) -> bytes:
@@ -38,7 +41,14 @@ class Task:
     ``requirements`` maps capability names to properties that a device must at least have; ``waiting_period`` is how
     long the agents wait for each other's reports after the first one, in seconds; ``lease_ttl`` how long the right to
     act outlives a silent holder; ``hysteresis`` by which share a late report must be better to take the task over;
-    ``council`` are the nodes whose majority grants that right, pinned when the task is made.
+    ``council`` are the nodes whose majority grants that right, pinned when the task is made; ``configuration`` counts
+    its changes.
+
+    Of several tasks the one with the highest ``priority`` has an agent's body, then the oldest; ``preemptible`` ones
+    are put aside for it and resumed.  ``deadline`` is in seconds after its creation, and ``stall_limit`` in seconds
+    without progress until the right to act is given back (0: none).  ``stop_time`` is how long the robot needs to
+    stand still, ``value`` what the task is worth, ``generation`` rises when an operator makes it anew, and ``group``
+    names the tasks that are divided together.
     """
 
     task_id: str
@@ -52,11 +62,22 @@ class Task:
     hysteresis: float = 0.1
     created: float = 0.0
     council: tuple[Contact, ...] = ()
+    priority: int = 0
+    deadline: float = 0.0
+    stop_time: float = 0.0
+    value: float = 1.0
+    generation: int = 0
+    group: str = ""
+    preemptible: bool = False
+    exclusive: bool = True
+    configuration: int = 1
+    stall_limit: float = 0.0
 
     def packed(self) -> bytes:
-        """The value of the task's record."""
-        content = {f.name: getattr(self, f.name) for f in fields(self)}
-        content["council"] = [contact.packed() for contact in self.council]
+        """The value of the task's record; what is as usual is left out."""
+        content = _unusual(self)
+        if self.council:
+            content["council"] = [contact.packed() for contact in self.council]
         return bounded(bytes(msgpack.packb(content)))
 
 
@@ -66,6 +87,13 @@ class Member:
 
     ``cost`` is the measured distance in metres, or None while it has nothing to report; ``assigned`` the uuid of the
     agent that it computed as the consensus point; ``digest`` of the reports that it computed it from.
+
+    ``epoch`` is the round of the task that the report and the decision belong to, and ``serial`` the place of the
+    report in it: what is older than something known already is ignored.  A report counts for ``valid_for`` seconds
+    (0: as long as its writer is present), of which ``age`` had passed when it was written.  ``available`` says whether
+    the body is free for this task, ``load`` how many tasks the participant has, ``state`` where exactly it stands
+    (``agents.state``), ``progress`` the share that is done, 0 to 1.  ``angle`` is the direction in which it stands as
+    seen from the target, and ``post`` the one it goes to, in radians by the compass.
     """
 
     uuid: str
@@ -76,25 +104,44 @@ class Member:
     digest: str = ""
     token: int = 0
     why: str = ""
+    epoch: int = 0
+    serial: int = 0
+    state: str = ""
+    available: bool = True
+    load: int = 0
+    age: float = 0.0
+    valid_for: float = 0.0
+    progress: float | None = None
+    angle: float | None = None
+    post: float | None = None
 
     def packed(self) -> bytes:
-        """The value of the member's record."""
-        return bounded(bytes(msgpack.packb(asdict(self))))
+        """The value of the member's record; what is as usual is left out."""
+        return bounded(bytes(msgpack.packb(_unusual(self))))
 
 
 @dataclass(frozen=True)
 class Result:
-    """How a task ended, one of ``OUTCOMES``; ``bids`` are the reports that decided it, (name, metres) each."""
+    """How a task ended, one of ``OUTCOMES``, and ``why`` where that needs a word.
+
+    ``bids`` are the reports that decided it, (name, metres) each.
+    """
 
     outcome: str
     by: str
     took: float = 0.0
     token: int = 0
     bids: tuple[tuple[str, float], ...] = ()
+    why: str = ""
 
     def packed(self) -> bytes:
         """The value of the result's record."""
         return bounded(bytes(msgpack.packb(asdict(self))))
+
+    @property
+    def rank(self) -> tuple[int, str, str]:
+        """Of several results the one with the highest rank holds: a total order, so that all agree."""
+        return self.token, self.outcome, self.by
 
 
 def refusals(capabilities: Capabilities, requirements: Capabilities) -> list[str]:
@@ -128,11 +175,16 @@ def task_of(record: Record) -> Task | None:
         task = Task(**content)
     except TypeError:
         return None
-    numbers = (task.waiting_period, task.lease_ttl, task.hysteresis, task.created)
+    times = (task.waiting_period, task.lease_ttl, task.created, task.deadline, task.stop_time, task.stall_limit)
     lawful = (
         len(task.council) == len(council)
-        and all(isinstance(text, str) for text in (task.task_id, task.kind, task.title, task.strategy))
-        and all(is_number(n) and n >= 0 for n in numbers)
+        and all(isinstance(text, str) for text in (task.task_id, task.kind, task.title, task.strategy, task.group))
+        and all(is_number(n) and n >= 0 for n in (*times, task.hysteresis, task.value))
+        and all(is_whole(n) for n in (task.generation, task.configuration))
+        and type(task.priority) is int
+        and abs(task.priority) <= MAX_PRIORITY
+        and isinstance(task.preemptible, bool)
+        and isinstance(task.exclusive, bool)
         and 0 < task.lease_ttl <= MAX_LEASE_TTL
         and are_capabilities(task.requirements)
         and are_properties(task.parameters)
@@ -141,7 +193,10 @@ def task_of(record: Record) -> Task | None:
 
 
 def member_of(record: Record) -> Member | None:
-    """The member report in a record, or None; a cost that is no finite distance counts as "nothing to report"."""
+    """The member report in a record, or None.
+
+    A cost that is no finite distance, or is older than it is valid for, counts as "nothing to report".
+    """
     content = mapping_of(record)
     if record.name != MEMBER or content is None:
         return None
@@ -149,13 +204,29 @@ def member_of(record: Record) -> Member | None:
         member = Member(**{f.name: content[f.name] for f in fields(Member) if f.name in content})
     except TypeError:
         return None
-    texts = (member.uuid, member.name, member.status, member.assigned, member.digest, member.why)
-    if not all(isinstance(text, str) for text in texts) or not is_whole(member.token):
-        return None
-    if node_id(record.owner).hex() != member.uuid:
+    texts = (member.uuid, member.name, member.status, member.assigned, member.digest, member.why, member.state)
+    counts = (member.token, member.epoch, member.serial, member.load)
+    places = (member.progress, member.angle, member.post)
+    lawful = (
+        all(isinstance(text, str) for text in texts)
+        and all(is_whole(count) for count in counts)
+        and all(is_number(number) and number >= 0 for number in (member.age, member.valid_for))
+        and all(place is None or is_number(place) for place in places)
+        and isinstance(member.available, bool)
+    )
+    if not lawful or node_id(record.owner).hex() != member.uuid:
         return None  # nobody reports for another
-    sound = is_number(member.cost) and member.cost is not None and member.cost >= 0
-    return member if sound else replace(member, cost=None)
+    return member if is_bid(member.cost) and not is_stale(member, 0.0) else replace(member, cost=None)
+
+
+def is_bid(cost: object) -> bool:
+    """Whether ``cost`` is one that can win: finite, not negative, and no larger than people can be shown."""
+    return is_number(cost) and cost >= 0  # type: ignore[operator]
+
+
+def is_stale(member: Member, since: float) -> bool:
+    """Whether a report that came ``since`` seconds ago is older than it is valid for."""
+    return 0.0 < member.valid_for < member.age + since
 
 
 def result_of(record: Record) -> Result | None:
@@ -174,6 +245,7 @@ def result_of(record: Record) -> Result | None:
         and isinstance(result.by, str)
         and is_number(result.took)
         and is_whole(result.token)
+        and isinstance(result.why, str)
         and all(isinstance(name, str) and is_number(cost) for name, cost in result.bids)
     )
     return result if lawful else None
@@ -182,4 +254,9 @@ def result_of(record: Record) -> Result | None:
 def outcome_of(records: list[Record]) -> Result | None:
     """How the task of a group ended, or None while it is open; of several results the highest token holds."""
     results = [result for record in records if (result := result_of(record)) is not None]
-    return max(results, key=lambda result: (result.token, result.outcome, result.by), default=None)
+    return max(results, key=lambda result: result.rank, default=None)
+
+
+def _unusual(one: Task | Member) -> dict[str, Any]:
+    """The fields that are not at their default; records are small, and there are many fields."""
+    return {f.name: value for f in fields(one) if (value := getattr(one, f.name)) != f.default or f.default is MISSING}

@@ -1,7 +1,7 @@
 """Sensor: what one dog feels, from the world alone: rangers, accelerometer, odometry, power.
 
 Geometry and ranges are those of the ERS-7 in the stance of its stock walk (body 0.105 m above the floor, neck drawn
-back so that the nose stays inside the footprint).
+back so that the nose stays inside the footprint).  The compass is no part of an ERS-7: it rides on the back.
 """
 
 from __future__ import annotations
@@ -40,6 +40,8 @@ class Sensors:
         self._stride_error = 1.0 + rng.gauss(0.0, 0.01)
         self._turn_error = 1.0 + rng.gauss(0.0, 0.01)
         self._power = 1.0
+        # Iron in the legs turns the needle, each dog's a little and always alike.
+        self._deviation = Random(f"compass of {dog.name}").gauss(0.0, math.radians(2.0))
 
     def sample(self) -> None:
         """Take one sample of everything, 8 ms after the one before."""
@@ -74,6 +76,7 @@ class Sensors:
             "odom.x": x,
             "odom.y": y,
             "odom.yaw": math.remainder(yaw, math.tau),
+            "compass.heading": math.remainder(self._dog.heading + self._deviation, math.tau),
             **newest,
             "power.level": self._power,
         }

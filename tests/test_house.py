@@ -30,7 +30,15 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
 # Plain objects: bytes and ``now`` in, decisions out.
 PURE = (
     "agents.behaviour",
+    "agents.circle",
+    "agents.circling",
+    "agents.conference",
     "agents.decision",
+    "agents.docket",
+    "agents.epoch",
+    "agents.execution",
+    "agents.formation",
+    "agents.state",
     "drivers.errors",
     "drivers.gate",
     "drivers.reading",
@@ -71,6 +79,7 @@ PURE = (
     "middleware.entangled.wire.noise",
     "middleware.entangled.wire.session",
     "middleware.errors",
+    "middleware.order",
     "middleware.presence",
     "middleware.settings",
     "middleware.tasks",

@@ -127,11 +127,11 @@ def _serve_tasks(app: Flask, read: Callable[[], State], desk: Desk, on_reactor: 
         answer = on_reactor(desk.assign, name)
         return jsonify(answer if isinstance(answer, dict) else {"id": answer}), 202
 
-    @app.post("/api/tasks/<task_id>/cancel")
-    def cancel(task_id: str) -> tuple[Response, int]:
+    @app.post("/api/tasks/<task_id>/<any(cancel, pause, resume):wish>")
+    def order(task_id: str, wish: str) -> tuple[Response, int]:
         if task_id not in [task["id"] for task in read()["tasks"]]:
             raise Refusal("task", "there is no such task", "choose one of /api/tasks", 404)
-        on_reactor(desk.cancel, task_id)
+        on_reactor({"cancel": desk.cancel, "pause": desk.pause, "resume": desk.resume}[wish], task_id)
         return jsonify({"id": task_id}), 202
 
 

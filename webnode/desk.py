@@ -28,6 +28,12 @@ class Desk(Protocol):
     def cancel(self, task_id: str) -> Any:
         """End a task; its devices stop."""
 
+    def pause(self, task_id: str) -> Any:
+        """Let a task rest; its devices stop, and are free for others."""
+
+    def resume(self, task_id: str) -> Any:
+        """Let a task that rests go on, from where it was."""
+
     def message(self, uuid: str, text: str) -> Any:
         """Send ``text`` to one device, or to all where ``uuid`` is empty."""
 
@@ -73,6 +79,14 @@ class MemoryDesk:
     def cancel(self, task_id: str) -> None:
         """Write it down."""
         self._noted("cancel", task_id)
+
+    def pause(self, task_id: str) -> None:
+        """Write it down."""
+        self._noted("pause", task_id)
+
+    def resume(self, task_id: str) -> None:
+        """Write it down."""
+        self._noted("resume", task_id)
 
     def message(self, uuid: str, text: str) -> None:
         """Write it down."""

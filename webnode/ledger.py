@@ -11,6 +11,7 @@ from dataclasses import asdict
 from typing import Any
 
 from middleware.entangled.record import Record
+from middleware.order import PAUSE, order_of
 from middleware.presence import DEVICES, Device, devices_of
 from middleware.tasks import TASKS, Task, group_key, member_of, outcome_of, refusals, task_of
 from webnode.state import Departed, State, state_of
@@ -46,15 +47,19 @@ def _device_row(device: Device) -> dict[str, Any]:
 def _task_row(task: Task, records: list[Record], devices: list[Device]) -> dict[str, Any]:
     outcome = outcome_of(records)
     members = [m for r in records if (m := member_of(r)) is not None]
-    note = ""
+    order = order_of(records)
+    is_paused = outcome is None and order is not None and order.word == PAUSE
+    note = f"paused by {order.by}" if is_paused and order is not None else ""
     if outcome is not None:
         status = outcome.outcome
-        if outcome.bids:
-            note = "reports: " + ", ".join(f"{name} {cost:.2f}" for name, cost in outcome.bids)
+        reports = "reports: " + ", ".join(f"{name} {cost:.2f}" for name, cost in outcome.bids) if outcome.bids else ""
+        note = "; ".join(filter(None, (outcome.why, reports)))
     elif any(m.status == "EXECUTING" for m in members):
         status = "EXECUTING"
     elif members:
         status = "ASSIGNED"
+        if not (is_paused or any(m.available for m in members)):
+            note = "nobody is free for it: " + "; ".join(f"{m.name} {m.why}" for m in members)
     else:
         status = "OPEN"
         refused = refused_by(task, devices)
@@ -73,5 +78,8 @@ def _task_row(task: Task, records: list[Record], devices: list[Device]) -> dict[
         "council": [str(contact.address) for contact in task.council],
         "status": status,
         "note": note,
+        "paused": is_paused,
+        "priority": task.priority,
+        "deadline": task.deadline,
         "result": None if outcome is None else {"by": outcome.by, "took": outcome.took},
     }

@@ -7,6 +7,7 @@ came in.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -90,6 +91,9 @@ def task_view(fields: Fields) -> State:
         "strategy": text(fields.get("strategy")),
         "created": number(fields.get("created")),
         "council": texts(fields.get("council")),
+        "paused": fields.get("paused") is True,
+        "priority": count(fields.get("priority")),
+        "deadline": number(fields.get("deadline")),
         "status": _status(fields.get("status"), TASK_STATUSES),
         "note": "\n".join(texts(note.split("\n"))) if isinstance(note, str) else "",
         "result": _result(result) if isinstance(result, Mapping) else None,
@@ -159,6 +163,11 @@ def _member_view(fields: Fields) -> State:
         "assigned": text(fields.get("assigned"), limit=64),
         "token": count(fields.get("token")),
         "why": text(fields.get("why"), limit=600),
+        "state": text(fields.get("state"), limit=32),
+        "epoch": count(fields.get("epoch")),
+        "available": fields.get("available") is not False,
+        "progress": distance(fields.get("progress")),
+        "post": None if fields.get("post") is None else round(math.degrees(number(fields.get("post")))),
     }
 
 

@@ -13,6 +13,7 @@ from middleware.entangled.errors import EntangledError
 from middleware.entangled.record import Record
 from middleware.entangled.replication.watch import Watch
 from middleware.node import CAMERA, SwarmNode
+from middleware.order import PAUSE, RESUME, Order
 from middleware.presence import DEVICES, devices_of
 from middleware.tasks import CANCELLED, TASKS, Result, Task, group_key, outcome_of, task_of
 from webnode.errors import Refusal
@@ -112,6 +113,14 @@ class TeamDesk:
         """Record that the task is cancelled; whoever is at it stops."""
         self._quietly(self._node.conclude(task_id, Result(CANCELLED, self._node.presence.device.name)))
 
+    def pause(self, task_id: str) -> None:
+        """Record that the task is to rest; whoever is at it stops, and is free for others."""
+        self._order(task_id, PAUSE)
+
+    def resume(self, task_id: str) -> None:
+        """Record that the task is to go on."""
+        self._order(task_id, RESUME)
+
     def message(self, uuid: str, text: str) -> None:
         """Send a text to one device, or to all."""
         for device, record in devices_of(self._devices.records):
@@ -139,6 +148,10 @@ class TeamDesk:
             task = task_of(record)
             if task is not None and task.task_id not in self._groups:
                 self._groups[task.task_id] = self._node.watch_group(task.task_id, lambda records: None, keep=True)
+
+    def _order(self, task_id: str, word: str) -> None:
+        order = Order(word, self._node.presence.device.name, self._node.wall())
+        self._quietly(self._node.order(task_id, order.packed()))
 
     def _open_tasks(self) -> list[Task]:
         tasks = filter(None, map(task_of, self._tasks.records))

@@ -57,6 +57,7 @@ def described(options: Options) -> Description:
     capabilities: dict[str, Mapping[str, float | str]] = {
         "base2d": {},
         "odometry": {},
+        "compass": {},
         "ranger": {"max": 1.5},
         "imu": {},
         "power": {},

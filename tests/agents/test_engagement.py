@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 from twisted.trial.unittest import SynchronousTestCase
 
-from agents.behaviour import STAND
+from agents.behaviour import STAND, Context
 from agents.engagement import SEARCH_TTL, Deed, Engagement
+from agents.state import State
 from drivers.reading import Action, Observation
 from middleware.consensus.lease import Lease
 from middleware.consensus.nearest import Nearest
+from middleware.consensus.strategy import Consensus, Report
 from middleware.entangled.clock import HeapClock
 from middleware.entangled.identity import Identity
+from middleware.order import PAUSE, RESUME, Order
 from middleware.presence import ASSIGNED, DONE, EXECUTING, SEARCHING, WAITING
-from middleware.tasks import CANCELLED, COMPLETED, Member, Result, Task
+from middleware.tasks import CANCELLED, COMPLETED, FAILED, Member, Result, Task
 
 TASK = Task("t1", "find-target", "Find it", waiting_period=2.0)
 LOOK, GO, HOLD = {"base.wz": 1.0}, {"base.vx": 0.1}, {"base.wz": 0.0}
@@ -26,6 +32,10 @@ class Dog:
         self.cost: float | None = None
         self.steps = 10**6
         self.executed = 0
+        self.is_safe = True
+        self.progress: float | None = None
+        self.valid_for = 0.0
+        self.contexts: list[Context] = []
 
     def look(self, seen: Observation, now: float) -> None:
         """Take the cost from the observation."""
@@ -40,9 +50,10 @@ class Dog:
         """Stand."""
         return HOLD
 
-    def execute(self, now: float) -> Action | None:
+    def execute(self, context: Context) -> Action | None:
         """Go on, from where it was."""
         self.executed += 1
+        self.contexts.append(context)
         return None if self.executed > self.steps else GO
 
 
@@ -292,3 +303,171 @@ class EngagementTests(SynchronousTestCase):
             self.clock.advance(0.05)
             self.step()
         self.assertEqual(len(self.told), before)
+
+    def test_same_token_resumes_and_a_new_one_is_told(self) -> None:
+        """After the lease was lost and won anew the behaviour goes on, and knows that others may have acted."""
+        self.acting(5)
+        self.clock.advance(2.0)
+        self.step()
+        self.assertEqual(self.engagement.course.state, State.FENCED)
+        self.step()
+        self.council.grant(7)
+        self.step()
+        self.step()
+        self.assertEqual([(c.token, c.is_resumed) for c in self.dog.contexts], [(5, False), (7, False), (7, True)])
+
+    def test_task_changes_hands_at_safe_points_only(self) -> None:
+        """A better report waits until the body may be stopped; a lost body, a cancellation and a pause do not."""
+        self.acting()
+        self.dog.is_safe = False
+        self.hear(self.report(2, 0.5))
+        self.assertEqual(self.step().action, GO)
+        self.dog.is_safe = True
+        self.assertEqual(self.step().action, HOLD)
+        self.assertEqual(self.events, ["halted", "released"])
+
+    def test_unsafe_body_that_is_lost_gives_way(self) -> None:
+        """Who lost its robot gives the task back whether or not the point is safe."""
+        self.acting()
+        self.dog.is_safe = False
+        self.engagement.lose_body()
+        self.step()
+        self.assertEqual(self.events, ["halted", "released"])
+
+    def test_pause_and_resume(self) -> None:
+        """A paused task stops the body, gives the lease back and reports no body; resumed it goes on where it was."""
+        self.acting()
+        self.engagement.ordered(Order(PAUSE, "vaio", 1.0))
+        self.assertIsNone(self.engagement.step())
+        self.assertEqual(self.events, ["halted", "released"])
+        self.assertEqual((self.engagement.me.cost, self.engagement.me.available), (None, False))
+        self.see(0.9)
+        self.assertIsNone(self.engagement.me.cost)
+        self.engagement.ordered(Order(RESUME, "vaio", 2.0))
+        self.see(0.9)
+        self.hear(self.report(2, 2.0))
+        self.step()
+        self.council.grant(6)
+        self.assertEqual(self.step().action, GO)
+        self.assertEqual(self.said[-3:], ["resumed by vaio", "reports 0.90 m", "goes: dog1, 0.90, best of 2"])
+
+    def test_put_aside_for_another_task(self) -> None:
+        """Without its body the agent claims nothing, says so, and keeps nobody waiting."""
+        self.acting()
+        self.engagement.put_aside("busy with T")
+        self.assertEqual(self.events, ["halted", "released"])
+        self.assertIsNone(self.engagement.step())
+        me = self.engagement.me
+        self.assertEqual((me.status, me.state, me.why, me.available), (ASSIGNED, "IDLE", "busy with T", False))
+
+    def test_lease_is_kept_while_the_outcome_is_on_its_way(self) -> None:
+        """A pause or another task that comes between the deed and its record does not give the lease to another."""
+        self.dog.steps = 1
+        self.acting()
+        self.step()
+        self.assertFalse(self.engagement.may_be_put_aside)
+        self.engagement.put_aside("busy with T")
+        self.assertEqual(self.events, ["halted"])
+        self.end(COMPLETED, "dog1")
+        self.engagement.abandon()
+        self.assertEqual(self.events, ["halted", "released"])
+
+    def test_deadline_fails_the_task_once(self) -> None:
+        """Past its deadline the task fails by whoever acts, or by the first of those present, and by nobody else."""
+        self.engagement.task = replace(TASK, deadline=5.0)
+        self.acting()
+        self.clock.advance(5.1)
+        self.council.grant(5)
+        self.assertIsNone(self.engagement.step())
+        self.assertIsNone(self.engagement.step())
+        self.assertEqual([(r.outcome, r.why) for r in self.results], [(FAILED, "past its deadline of 5 s")])
+
+    def test_deadline_falls_to_one(self) -> None:
+        """Who does not act leaves it to whoever does, or to the participant with the lowest uuid."""
+        self.engagement.task = replace(TASK, deadline=5.0)
+        self.clock.advance(5.1)
+        lowest = min([ME, *self.others.values()], key=lambda one: one.node_id.hex())
+        self.hear(self.report(2, 1.0, EXECUTING))
+        self.step()
+        self.assertEqual(self.results, [])
+        self.hear(self.report(2, 1.0), self.report(3, 1.0))
+        self.engagement.step()
+        self.assertEqual(len(self.results), int(lowest is ME))
+
+    def test_no_progress_gives_the_task_to_another(self) -> None:
+        """Who comes no further within the stall limit gives the lease back and does not bid for as long."""
+        self.engagement._execution._stall_limit = 1.0
+        self.dog.progress = 0.5
+        self.acting()
+        for _ in range(22):
+            self.clock.advance(0.05)
+            self.council.grant(5)
+            self.step()
+        self.assertEqual(self.events[:2], ["halted", "released"])
+        self.assertIn("makes no progress", self.said)
+        self.see(0.5)
+        self.assertIsNone(self.engagement.me.cost)
+        self.clock.advance(1.2)
+        self.see(0.5)
+        self.assertEqual(self.engagement.me.cost, 0.5)
+
+    def test_behaviour_that_bids_nonsense_bids_nothing(self) -> None:
+        """NaN, infinite, negative and enormous costs are never reported, whatever the behaviour says."""
+        for cost in (float("nan"), float("inf"), -1.0, 1e300):
+            self.see(cost)
+            self.assertIsNone(self.engagement.me.cost)
+
+    def test_validity_is_renewed(self) -> None:
+        """A bid that counts for a while only is told again before it is void, with a new serial number."""
+        self.dog.valid_for = 2.0
+        self.see(1.0)
+        self.clock.advance(1.1)
+        self.see(1.0)
+        self.assertEqual([(m.cost, m.serial, m.valid_for) for m in self.told], [(1.0, 1, 2.0), (1.0, 2, 2.0)])
+
+    def test_failing_strategy_falls_back_to_nearest(self) -> None:
+        """A strategy that raises is said once, and the nearest is assigned."""
+
+        class Broken(Nearest):
+            name = "broken"
+
+            def find(self, contacts: Sequence[Report]) -> Consensus:
+                """Fail."""
+                raise ZeroDivisionError("no luck")
+
+        self.engagement._conference.strategy = Broken()
+        self.hear(self.report(2, 0.5))
+        self.see(1.0)
+        self.step()
+        self.step()
+        faults = [line for line in self.said if "broken" in line and not line.startswith("stands")]
+        self.assertEqual(faults, ["strategy broken failed (no luck), nearest decides"])
+        self.assertEqual(self.engagement.me.assigned, self.others[2].node_id.hex())
+
+    def test_outcome_absorbs_what_follows(self) -> None:
+        """After the end nothing begins again; of two outcomes the one that holds everywhere is kept."""
+        self.end(CANCELLED, "vaio")
+        self.hear(self.report(2, 2.0))
+        self.see(1.0)
+        self.assertIsNone(self.engagement.step())
+        self.assertTrue(self.engagement.is_over)
+        self.engagement.heard([], Result(COMPLETED, "dog2", 1.0, 9))
+        self.assertEqual(self.engagement.result, Result(COMPLETED, "dog2", 1.0, 9))
+        self.engagement.heard([], Result(CANCELLED, "vaio"))
+        self.assertEqual(self.engagement.result, Result(COMPLETED, "dog2", 1.0, 9))
+
+    def test_older_life_is_counted_on(self) -> None:
+        """After a restart the agent counts its reports on from where the others know it, so that they are heard."""
+        self.hear(Member(ME.node_id.hex(), "dog1", WAITING, 9.0, epoch=4, serial=3))
+        self.see(1.0)
+        self.assertGreater((self.told[-1].epoch, self.told[-1].serial), (4, 3))
+
+    def test_decisions_name_their_round(self) -> None:
+        """A member that leaves after a decision opens a round, which the report of the new decision names."""
+        self.hear(self.report(2, 0.5, EXECUTING), self.report(3, 3.0))
+        self.see(1.0)
+        self.step()
+        before = self.engagement.me.epoch
+        self.hear(self.report(3, 3.0))
+        self.step()
+        self.assertEqual(self.engagement.me.epoch, before + 1)

@@ -64,10 +64,10 @@ class LoopTests(SynchronousTestCase):
         driver.act = watched
         driver.enable = lambda: deferLater(self.team.clock, 1.5, enable)  # a robot that is slow to wake up
         self.team.clock.advance(1.3)
-        self.assertIsNot(self.agent_of("dog3")._engagement, None)
-        self.assertFalse(self.agent_of("dog3")._is_awake)
+        self.assertIsNot(self.agent_of("dog3").engagement, None)
+        self.assertFalse(self.agent_of("dog3")._body.is_awake)
         self.team.clock.advance(2.0)
-        self.assertTrue(self.agent_of("dog3")._is_awake)
+        self.assertTrue(self.agent_of("dog3")._body.is_awake)
         self.assertEqual(refused, [])
 
     def test_motors_are_asked_for_until_they_are_on(self) -> None:
@@ -82,8 +82,8 @@ class LoopTests(SynchronousTestCase):
         self.team.clock.advance(3.0)
         self.team.desk.assign("turn-around")
         self.team.clock.advance(1.0)
-        self.assertTrue(self.agent_of("dog3")._is_awake)
-        self.assertIsNot(self.agent_of("dog3")._engagement, None)
+        self.assertTrue(self.agent_of("dog3")._body.is_awake)
+        self.assertIsNot(self.agent_of("dog3").engagement, None)
 
     def test_every_motion_of_the_task_is_under_a_lease(self) -> None:
         """While a dog turns for its task each command carries token and deadline of a lease that is valid then."""
@@ -91,13 +91,13 @@ class LoopTests(SynchronousTestCase):
         count = 0
         for name in ("dog1", "dog2"):
             agent = self.agent_of(name)
-            driver: Any = agent._driver
+            driver: Any = agent._body.driver
 
             def watched(action: Action, permit: Permit, agent: Agent = agent, act: Any = driver.act) -> Action:
                 nonlocal count
                 if any(action.values()):
                     count += 1
-                    engagement = agent._engagement
+                    engagement = agent.engagement
                     lease = None if engagement is None or engagement.lessee is None else engagement.lessee.lease
                     if lease != Lease("t1", permit.token, permit.deadline):
                         bad.append((action, permit, lease))
@@ -161,7 +161,7 @@ class LoopTests(SynchronousTestCase):
         self.team.add("dog3")
         self.team.clock.advance(3.0)
         self.assertEqual(self.device("dog3")["status"], "IDLE")
-        self.assertEqual(self.agent_of("dog3")._open, {})
+        self.assertEqual(self.agent_of("dog3")._docket.open, set())
 
     def test_task_is_taken_up_when_nobody_could_tell_at_first(self) -> None:
         """A task whose group nobody answers for is asked about again, without any other event."""
@@ -181,7 +181,7 @@ class LoopTests(SynchronousTestCase):
         self.submit()
         self.team.clock.advance(2.0)
         self.assertGreaterEqual(len(tries), 3)
-        self.assertIsNot(agent._engagement, None)
+        self.assertIsNot(agent.engagement, None)
 
     def test_robot_that_the_yard_does_not_have_is_said(self) -> None:
         """A device whose robot does not exist says so, and the others do the task without it."""

@@ -8,6 +8,7 @@ from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
+from agents.behaviour import Context
 from agents.search import MEMORY, STOP_AT, SearchAndApproach
 from drivers.reading import Action, Frame, Observation
 from sim.camera import Camera
@@ -34,6 +35,10 @@ class Walk:
         self.frames = 0
         self.turned_off: set[str] = set()
         self.replaced: dict[str, float] = {}
+
+    def execute(self, now: float) -> Action | None:
+        """Act as under a lease."""
+        return self.behaviour.execute(Context(now))
 
     def live(self, act: Any = None) -> Action | None:
         """One tick: sense, look, act (``search`` where nothing else is said)."""
@@ -122,7 +127,7 @@ class RangerTests(SynchronousTestCase):
 class ApproachTests(SynchronousTestCase):
     def reach(self, walk: Walk, limit: float = 60.0) -> None:
         """Walk up to the target until the behaviour says that it is done."""
-        while walk.live(walk.behaviour.execute) is not None:
+        while walk.live(walk.execute) is not None:
             self.assertLess(walk.now, limit, "never done")
         walk.world.halt("dog1")
 
@@ -142,7 +147,7 @@ class ApproachTests(SynchronousTestCase):
         walk.world.place_target(1.8, 1.2)
         walk.find()
         for _ in range(40):
-            walk.live(walk.behaviour.execute)
+            walk.live(walk.execute)
         walk.world.place_target(1.3, 1.9)
         self.reach(walk)
         self.assertLessEqual(walk.gap(), STOP_AT + 0.03)
@@ -154,7 +159,7 @@ class ApproachTests(SynchronousTestCase):
         walk.find()
         walk.world.clear_target()
         while walk.now < 25.0:
-            self.assertIsNotNone(walk.live(walk.behaviour.execute))
+            self.assertIsNotNone(walk.live(walk.execute))
         self.assertIsNone(walk.behaviour.cost)
 
     def test_dog_in_the_way_is_not_pushed(self) -> None:
@@ -164,7 +169,7 @@ class ApproachTests(SynchronousTestCase):
         walk.find()
         walk.world.move_dog("dog2", 1.1, 1.24, math.pi / 2)
         before = walk.world.dogs["dog2"].x
-        while walk.now < 20.0 and walk.live(walk.behaviour.execute) is not None:
+        while walk.now < 20.0 and walk.live(walk.execute) is not None:
             pass
         self.assertLess(abs(walk.world.dogs["dog2"].x - before), 0.05)
 

@@ -7,7 +7,7 @@ import random
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from agents.behaviour import STAND
+from agents.behaviour import STAND, Context
 from agents.turn import TurnAround
 from drivers.reading import Observation, Value
 
@@ -35,7 +35,7 @@ class TurnTests(SynchronousTestCase):
             yaw += 0.3
             turn.look(seen(odom_yaw=math.remainder(yaw, math.tau)), 0.0)
         start = yaw
-        while (action := turn.execute(0.0)) is not None:
+        while (action := turn.execute(Context(0.0, is_resumed=True))) is not None:
             self.assertGreater(action["base.wz"], 0.0)
             yaw += 0.05
             turn.look(seen(odom_yaw=math.remainder(yaw, math.tau)), 0.0)
@@ -44,10 +44,10 @@ class TurnTests(SynchronousTestCase):
     def test_turns_can_be_chosen(self) -> None:
         """The task says how many turns; half a turn is done after half a circle, and unlawful numbers are refused."""
         turn = TurnAround({"turns": 0.5}, random.Random(1))
-        turn.execute(0.0)
+        turn.execute(Context(0.0, is_resumed=True))
         for step in range(33):
             turn.look(seen(odom_yaw=step * 0.1), 0.0)
-        self.assertIsNone(turn.execute(0.0))
+        self.assertIsNone(turn.execute(Context(0.0, is_resumed=True)))
         for wrong in (-1.0, math.inf, math.nan, 1e9, "often"):
             self.assertRaises(ValueError, TurnAround, {"turns": wrong}, random.Random(1))
 

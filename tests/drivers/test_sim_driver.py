@@ -77,7 +77,8 @@ class SimDriverTests(DriverContract, SynchronousTestCase):
         self.assertEqual(
             set(seen.values),
             {"base.vx", "base.vy", "base.wz", "base.moving", "odom.x", "odom.y", "odom.yaw", "range.near", "range.far"}
-            | {"range.chest", "imu.ax", "imu.ay", "imu.az", "power.level", "estop.engaged"},
+            | {"range.chest", "imu.ax", "imu.ay", "imu.az", "power.level", "estop.engaged"}
+            | {"compass.heading"},
         )
         self.assertEqual({len(row) for row in seen.samples.values()}, {4})
         self.assertEqual(len(seen.samples), 6)

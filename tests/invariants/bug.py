@@ -8,6 +8,10 @@ from typing import Any
 
 from twisted.internet.defer import Deferred, succeed
 
+from agents import circle
+from agents.docket import Docket
+from middleware.consensus.nearest import Nearest
+from middleware.consensus.strategy import Consensus, digest_of
 from middleware.entangled.data import schema
 from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.data.sqlite import SqliteStore
@@ -103,6 +107,15 @@ def _safe_already(self: Writer) -> Deferred[None]:
     return succeed(None)
 
 
+def _buried_and_forgotten(self: Docket, task_id: str, now: float) -> None:
+    self._open.pop(task_id, None)
+
+
+def _first_come(self: Nearest, contacts: Any) -> Consensus:
+    order = [report.agent for report in sorted(contacts, key=lambda report: report.cost)]
+    return Consensus(order[0], tuple(order[1:]), digest_of(contacts)) if order else Consensus(None)
+
+
 BUGS: dict[str, list[tuple[Any, str, Any]]] = {
     "tombstone dropped too early": [(owner, "TOMBSTONE_TTL", 3.0)],
     "acknowledged by a minority": [(Overlay, "voters", lambda self, key, targets: [targets[0].node_id])],
@@ -138,6 +151,11 @@ BUGS: dict[str, list[tuple[Any, str, Any]]] = {
     "acknowledged before it is written": [(Writer, "written", _safe_already)],
     "checksums are not looked at": [(schema, "record_of", lambda row: schema._unchecked(row))],
     "a full disk takes records": [(SqliteStore, "put", MemoryStore.put)],
+    # Tasks.
+    "the end of a task is forgotten": [(Docket, "bury", _buried_and_forgotten)],
+    "equal bids have no order": [(Nearest, "find", _first_come)],
+    "a little better is enough": [(Nearest, "improves", lambda self, held, offer, _: offer.cost < held.cost)],
+    "old rounds count": [(circle, "is_older", lambda told, known: False)],
 }
 
 FINDERS: dict[str, tuple[str, ...]] = {
@@ -153,6 +171,10 @@ FINDERS: dict[str, tuple[str, ...]] = {
     "acknowledged before it is written": ("records", "stores"),
     "checksums are not looked at": ("records", "stores"),
     "a full disk takes records": ("records", "stores"),
+    "the end of a task is forgotten": ("tasks",),
+    "equal bids have no order": ("tasks",),
+    "a little better is enough": ("tasks",),
+    "old rounds count": ("tasks",),
 }
 """The workloads that look for a bug, where these are not the records."""
 

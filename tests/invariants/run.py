@@ -15,6 +15,7 @@ from tests.invariants.disk import DiskFleet
 from tests.invariants.records import Records
 from tests.invariants.schedule import Schedule, Workload
 from tests.invariants.stores import Stores
+from tests.invariants.tasks import Tasks
 from tests.invariants.tuples import Tuples
 from tests.invariants.wire import Wire
 
@@ -25,8 +26,11 @@ WORKLOADS: dict[str, Callable[[Schedule], Workload]] = {
     "wire": Wire,
 }
 """Each may be asked for by name; the order is the one in which they act."""
+ALONE = {"tasks": Tasks}
+"""Those that need no fleet: a world of their own beside it, with faults of its own."""
 SHARES = {"records": 1.0, "tuples": 0.06, "stores": 0.06, "wire": 0.06}
 """The share of schedules in which each takes part, unless it is asked for."""
+ALONE_SHARE = 0.25
 
 
 @dataclass(frozen=True)
@@ -42,18 +46,23 @@ class Outcome:
 def drawn(seed: int) -> list[str]:
     """The workloads of a seed."""
     dice = random.Random(f"workloads/{seed}")
-    return [name for name, share in SHARES.items() if dice.random() < share]
+    names = [name for name, share in SHARES.items() if dice.random() < share]
+    return names + [name for name in ALONE if random.Random(f"{name} alone/{seed}").random() < ALONE_SHARE]
 
 
 def run(seed: int, only: tuple[str, ...] = (), bug: str | None = None) -> Outcome:
     """Run the schedule of ``seed``, with the workloads of ``only`` instead of those drawn, and with a bug put in."""
     names = only or drawn(seed)
     with seeded(bug):
+        alone = [ALONE[name](seed) for name in ALONE if name in names]
+        found_alone = [line for world in alone for line in world.run()]
+        if alone and len(names) == len(alone):
+            return Outcome(seed, "; ".join(map(str, alone)), found_alone, alone[0].digest)
         schedule = Schedule(seed, DiskFleet if "stores" in names else Fleet)
         found = schedule.run([WORKLOADS[name](schedule) for name in WORKLOADS if name in names])
     faults = "; ".join(map(str, schedule.faults))
     title = f"n={schedule.n} {'+'.join(names)} {schedule.weather} faults: {faults}"
-    return Outcome(seed, title, found, schedule.fleet.board.digest())
+    return Outcome(seed, title, found_alone + found, schedule.fleet.board.digest())
 
 
 def run_all(seeds: range, jobs: int, only: tuple[str, ...] = (), bug: str | None = None) -> Iterator[Outcome]:

@@ -39,6 +39,10 @@ BITING_ELSEWHERE = {
     "acknowledged before it is written": (6, "S-a"),
     "checksums are not looked at": (1, "S-b"),
     "a full disk takes records": (1, "S-c"),
+    "the end of a task is forgotten": (1, "E4"),
+    "equal bids have no order": (1, "E7"),
+    "a little better is enough": (5, "E6"),
+    "old rounds count": (2, "E7"),
 }
 """The same of the quickest bugs that other workloads look for."""
 ALL = tuple(WORKLOADS)
@@ -77,6 +81,13 @@ class InvariantTests(SynchronousTestCase):
     def test_all_workloads(self) -> None:
         """Tuples, hostile datagrams and failing disks beside the records break no invariant either."""
         self.assertEqual({seed: found for seed in (7, 12) if (found := run(seed, ALL).found)}, {})
+
+    def test_whole_agents(self) -> None:
+        """Forty schedules of agents that come, go, fail, pause and cancel break none of E4 to E7, and none repeats."""
+        outcomes = [run(seed, ("tasks",)) for seed in range(7001, 7041)]
+        self.assertEqual({outcome.seed: outcome.found for outcome in outcomes if outcome.found}, {})
+        self.assertGreater(len({outcome.digest for outcome in outcomes}), 35)
+        self.assertEqual(outcomes[0], run(7001, ("tasks",)))
 
     def test_the_others_bite(self) -> None:
         """Bugs of tuples, wire and stores are found by the workloads that look for them."""

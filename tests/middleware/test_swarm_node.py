@@ -102,8 +102,8 @@ class SwarmNodeTests(FleetCase):
         group: list[list[Record]] = []
         fleet.nodes[3].watch_group("t1", group.append, keep=True)
         heard: list[tuple[list[str], Result | None]] = []
-        places = [node.group("t1", lambda *news: None) for node in fleet.nodes[1:3]]
-        places.append(fleet.nodes[3].group("t1", lambda members, end: heard.append(([m.name for m in members], end))))
+        places = [node.group(task, lambda *news: None) for node in fleet.nodes[1:3]]
+        places.append(fleet.nodes[3].group(task, lambda members, end: heard.append(([m.name for m in members], end))))
         for node, place in zip(fleet.nodes[1:3], places, strict=False):
             place.report(Member(node.uuid, node.presence.device.name, "WAITING", 1.0))
         fleet.run(1.0)

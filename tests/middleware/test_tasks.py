@@ -96,6 +96,16 @@ class DecoderTests(SynchronousTestCase):
             "lease_ttl": [0, -1, 61.0, float("nan"), "1"],
             "hysteresis": [-0.1, None],
             "created": [float("inf"), 1e300, "now"],
+            "priority": [1.0, 1001, None, "high"],
+            "deadline": [-1.0, float("nan"), None],
+            "stop_time": [-1.0, "1"],
+            "stall_limit": [-1.0, []],
+            "value": [-1.0, float("inf")],
+            "generation": [-1, 0.5],
+            "configuration": [-1, None],
+            "group": [5, None],
+            "preemptible": [1, None],
+            "exclusive": [0, "no"],
             "council": [5, None, [5], [[b"x", "10.0.0.1", 7000]], [COUNCIL[0].packed(), 5], {"a": 1}],
         }
         for name, values in bad.items():
@@ -115,6 +125,16 @@ class DecoderTests(SynchronousTestCase):
             ("why", 5),
             ("token", 1.0),
             ("token", 2**60),
+            ("epoch", -1),
+            ("serial", 0.5),
+            ("state", None),
+            ("available", 1),
+            ("load", -1),
+            ("age", -1.0),
+            ("valid_for", float("nan")),
+            ("progress", "half"),
+            ("angle", float("inf")),
+            ("post", [1.0]),
             ("uuid", 5),
         ]:
             self.assertIsNone(member_of(record(MEMBER, changed(REPORT.packed(), **{name: value}))), (name, value))
@@ -124,12 +144,29 @@ class DecoderTests(SynchronousTestCase):
         for nothing in (None, b"", {}, {"uuid": UUID}, DEPTH):
             self.assertIsNone(member_of(record(MEMBER, nothing)), nothing)
 
+    def test_report_that_is_stale_when_it_comes(self) -> None:
+        """A report older than it is valid for has nothing to report; one that says nothing of that counts."""
+        for age, valid_for, cost in ((2.0, 1.0, None), (1.0, 2.0, 1.5), (9.0, 0.0, 1.5)):
+            report = member_of(record(MEMBER, changed(REPORT.packed(), age=age, valid_for=valid_for)))
+            self.assertEqual(report and report.cost, cost, (age, valid_for))
+
+    def test_usual_fields_take_no_room(self) -> None:
+        """What is as usual is left out of a record, and comes out as usual."""
+        plain = Task("t1", "search", "Find it")
+        self.assertEqual(
+            sorted(msgpack.unpackb(plain.packed())), ["kind", "parameters", "requirements", "task_id", "title"]
+        )
+        self.assertEqual(task_of(record("t1", plain.packed())), plain)
+        full = replace(TASK, priority=5, deadline=9.0, preemptible=True, exclusive=False, group="g", configuration=2)
+        self.assertEqual(task_of(record("t1", full.packed())), full)
+
     def test_crafted_results(self) -> None:
         """A result with a wrong type, number or outcome is none."""
         for name, value in [
             ("outcome", "WON"),
             ("outcome", []),
             ("by", 5),
+            ("why", 5),
             ("took", "5"),
             ("took", float("nan")),
             ("token", float("inf")),

@@ -7,9 +7,12 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
+from agents.catalogue import task_named
 from drivers.sim.link import MemoryLink
+from middleware.tasks import Task
 from sim.demo.experiment import TOUCH_M
 from sim.demo.trials import trial
 from sim.scene import FOOTPRINT
@@ -48,6 +51,10 @@ class TeamTests(SynchronousTestCase):
     def statuses(self, team: VirtualTeam) -> dict[str, str]:
         """The status of each device."""
         return {row["name"]: row["status"] for row in team.state()["devices"]}
+
+    def lines(self, team: VirtualTeam, name: str) -> list[str]:
+        """The messages of a device."""
+        return [text for _, text in self.device(team, name)["messages"]]
 
     def executing(self, team: VirtualTeam) -> list[str]:
         """Who executes the newest task."""
@@ -128,6 +135,56 @@ class TaskTests(TeamTests):
         team.desk.assign("turn-around")
         self.until(team, lambda: [t["status"] for t in team.state()["tasks"]] == ["COMPLETED", "COMPLETED"])
 
+    def test_urgent_task_has_the_bodies_first(self) -> None:
+        """A task of a higher priority puts a preemptible one aside, which is resumed and done after."""
+        team = self.team()
+        node = team.services["vaio"].assembly.node
+        turn = Task("slow", "turn-around", "Slow", parameters={"turns": 3.0}, waiting_period=1.0, preemptible=True)
+        Deferred.fromCoroutine(node.submit(turn))
+        self.until(team, lambda: bool(self.executing(team)))
+        team.clock.advance(2.0)
+        urgent = Task("fast", "turn-around", "Fast", waiting_period=1.0, priority=5, created=1.0)
+        Deferred.fromCoroutine(node.submit(urgent))
+        shown: list[dict[str, str]] = []
+
+        def is_done(name: str) -> bool:
+            rows = {row["id"]: row["status"] for row in team.state()["tasks"]}
+            shown.append(rows)
+            return rows.get(name) == "COMPLETED"
+
+        self.until(team, lambda: is_done("fast"))
+        self.assertNotIn("COMPLETED", [rows["slow"] for rows in shown])
+        self.assertIn("ASSIGNED", [rows["slow"] for rows in shown])
+        self.until(team, lambda: is_done("slow"))
+
+    def test_paused_task_rests_until_it_is_resumed(self) -> None:
+        """Paused, no dog moves and the page says who paused it; resumed, it is completed."""
+        team = self.team()
+        team.run_demo()
+        self.until(team, lambda: bool(self.executing(team)))
+        task_id = self.task(team)["id"]
+        team.desk.pause(task_id)
+        team.clock.advance(1.0)
+        self.assertEqual([dog.name for dog in team.yard.world.dogs.values() if dog.is_moving], [])
+        task = self.task(team)
+        self.assertEqual((task["status"], task["paused"]), ("ASSIGNED", True))
+        self.assertIn("paused by vaio", {*self.lines(team, "dog1")})
+        team.clock.advance(5.0)
+        self.assertEqual(self.task(team)["status"], "ASSIGNED")
+        team.desk.resume(task_id)
+        self.until(team, lambda: self.task(team)["status"] == "COMPLETED")
+
+    def test_deadline_fails_the_task_and_says_so(self) -> None:
+        """A task that nobody finishes in time fails once, for all, with the reason on the page."""
+        team = self.team()
+        node = team.services["vaio"].assembly.node
+        task = Task("late", "find-target", "Late", created=team.clock.seconds(), deadline=4.0)
+        Deferred.fromCoroutine(node.submit(task))
+        self.until(team, lambda: self.task(team)["status"] == "FAILED", 6.0)
+        self.assertIn("past its deadline of 4 s", self.task(team)["note"])
+        team.clock.advance(0.5)
+        self.assertEqual(set(self.statuses(team).values()) - {"DONE"}, {"IDLE"})
+
     def test_cancel_stops_the_robot(self) -> None:
         """A cancelled task ends for everybody within half a second: no dog moves, no dog has a task."""
         team = self.team()
@@ -177,6 +234,52 @@ class MembershipTests(TeamTests):
 
         self.until(team, all_agree)
         self.until(team, lambda: self.task(team)["status"] == "COMPLETED")
+
+    def test_others_spread_when_one_leaves(self) -> None:
+        """When the dog on its way is lost, the one that stands by moves around the target, as far from it as before."""
+        team = self.team()
+        team.scatter(3)
+        team.run_demo()
+        self.until(team, lambda: bool(self.executing(team)))
+        first = self.executing(team)[0]
+        team.clock.advance(0.5)
+        team.kill(first)
+        rest = [name for name in team.DOGS if name != first]
+        world, bumps = team.yard.world, team.yard.world.collisions
+        target = world.target
+        assert target is not None
+
+        def seen_from_target() -> float:
+            one, other = (math.atan2(world.dogs[n].y - target.y, world.dogs[n].x - target.x) for n in rest)
+            return abs(math.remainder(one - other, math.tau))
+
+        before = seen_from_target()
+        posts: set[object] = set()
+
+        def is_done() -> bool:
+            posts.update(member["post"] for member in team.state()["groups"][0]["members"])
+            return bool(self.task(team)["status"] == "COMPLETED")
+
+        self.until(team, is_done)
+        self.assertGreater(seen_from_target(), before + math.radians(15))
+        self.assertEqual(world.collisions, bumps)
+        self.assertTrue(posts - {None})
+        self.assertNotEqual(self.task(team)["result"]["by"], first)
+
+    def test_newcomer_takes_over_only_if_it_is_clearly_better(self) -> None:
+        """A dog that joins mid-task is drawn in, and takes over where it stands far nearer to the target."""
+        for place, takes_over in (((1.5, 0.75), True), ((2.8, 2.2), False)):
+            team = self.team(6, dogs=("dog1",))
+            world = team.yard.world
+            world.move_dog("dog2", 2.8, 0.2, 0.0)
+            world.move_dog("dog1", 0.3, 0.3, 0.0)
+            world.move_dog("dog3", *place, math.pi / 2)
+            Deferred.fromCoroutine(team.services["vaio"].assembly.node.submit(task_named("find-red-target", "t", 0.0)))
+            world.place_target(1.5, 1.3)
+            self.until(team, lambda team=team: self.executing(team) == ["dog1"])  # type: ignore[misc]
+            team.add("dog3")
+            self.until(team, lambda team=team: self.task(team)["status"] == "COMPLETED")  # type: ignore[misc]
+            self.assertEqual(self.task(team)["result"]["by"], "dog3" if takes_over else "dog1")
 
     def test_dog_alone_finishes(self) -> None:
         """One dog that is all there is does the task by itself."""
@@ -240,7 +343,7 @@ class MembershipTests(TeamTests):
             team.clock.advance(0.02)
             leases = []
             for name, service in team.services.items():
-                engagement = getattr(service.assembly.agent, "_engagement", None)
+                engagement = getattr(service.assembly.agent, "engagement", None)
                 if engagement is not None and engagement.lessee is not None and engagement.lessee.lease is not None:
                     leases.append(name)
             self.assertLessEqual(len(leases), 1, leases)

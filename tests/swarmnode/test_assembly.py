@@ -32,7 +32,9 @@ class AssemblyTests(SynchronousTestCase):
         device = made.node.presence.device
         self.assertEqual(device.kind, "aibo-ers7")
         self.assertEqual(device.capabilities["base2d"], {"max": 1})
-        self.assertEqual(set(device.capabilities), {"base2d", "horn", "odometry", "ranger", "imu", "power", "camera"})
+        self.assertEqual(
+            set(device.capabilities), {"base2d", "horn", "odometry", "compass", "ranger", "imu", "power"} | {"camera"}
+        )
         self.assertIsNotNone(made.agent)
 
     def test_node_without_body_has_no_agent(self) -> None:

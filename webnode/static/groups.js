@@ -25,8 +25,10 @@ function update(article, group) {
     attribute(item, "data-winner", member.uuid === group.assigned_uuid);
     words(name, member.name);
     bar.firstChild.style.width = `${100 * (member.share ?? 0)}%`;
-    words(cost, member.cost === null ? "no bid" : `${member.cost.toFixed(2)} m`);
-    words(choice, `${member.choice ? `names ${member.choice}` : "undecided"}${member.token ? `, token ${member.token}` : ""}${member.why ? ` – ${member.why}` : ""}`);
+    words(cost, member.cost === null ? (member.available ? "no bid" : "not free") : `${member.cost.toFixed(2)} m`);
+    const detail = [member.state.toLowerCase(), member.post === null ? "" : `goes to ${member.post}°`,
+      member.progress === null ? "" : `${Math.round(100 * member.progress)} % done`].filter(Boolean).join(", ");
+    words(choice, `${member.choice ? `names ${member.choice}` : "undecided"}${member.token ? `, token ${member.token}` : ""}${member.why ? ` – ${member.why}` : ""}${detail ? ` (${detail})` : ""}`);
   });
 }
 

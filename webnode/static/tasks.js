@@ -12,16 +12,23 @@ export function showTasks(tasks) {
     state(item.querySelector(".badge"), task.status);
     const result = task.result ? `Done by ${task.result.by} in ${task.result.took.toFixed(1)} s. ` : "";
     words(item.querySelector(".note"), result + task.note);
-    const button = item.querySelector("button");
-    button.hidden = ENDED.includes(task.status);
+    const [button, rest] = item.querySelectorAll("button");
+    button.hidden = rest.hidden = ENDED.includes(task.status);
     button.setAttribute("aria-label", `Cancel ${task.title}`);
+    words(rest, task.paused ? "Resume" : "Pause");
+    rest.setAttribute("aria-label", `${rest.textContent} ${task.title}`);
   });
 }
 
 function row(task) {
   const button = element("button", {}, "Cancel");
   button.addEventListener("click", () => wish(`Cancelling ${task.title}`, `/api/tasks/${encodeURIComponent(task.id)}/cancel`));
-  return element("li", {}, element("b"), badge(), element("span", { class: "note" }), button);
+  const rest = element("button", {}, "Pause");
+  rest.addEventListener("click", () => {
+    const isPaused = rest.textContent === "Resume";
+    wish(`${isPaused ? "Resuming" : "Pausing"} ${task.title}`, `/api/tasks/${encodeURIComponent(task.id)}/${isPaused ? "resume" : "pause"}`);
+  });
+  return element("li", {}, element("b"), badge(), element("span", { class: "note" }), button, rest);
 }
 
 function outcome({ able = [], refused = {} }) {

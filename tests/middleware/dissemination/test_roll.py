@@ -58,7 +58,7 @@ class GroupTests(FleetCase):
         task = Task("job", "find", "Find it", waiting_period=0.5)
         task = self.done(fleet, Deferred.fromCoroutine(fleet.nodes[0].submit(task)))
         self.assertEqual(len(task.council), 3)
-        groups = [fleet.nodes[place].group("job", self.hearing(place), task) for place in range(3)]
+        groups = [fleet.nodes[place].group(task, self.hearing(place)) for place in range(3)]
         for place, group in enumerate(groups):
             group.report(member(fleet.nodes[place].uuid, None))
         fleet.run(1.0)

@@ -1,0 +1,96 @@
+"""Body: an agent's robot behind its driver: woken, watched for whether it answers, and moved under a permit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from twisted.internet.defer import Deferred
+from twisted.internet.interfaces import IReactorTime
+from twisted.internet.task import deferLater
+from twisted.logger import Logger
+
+from agents.engagement import Deed
+from drivers.driver import Driver
+from drivers.errors import DriverError, LinkError, StaleCommand, UsageError
+from drivers.reading import Observation
+
+WAKE_AGAIN = 0.5
+PATIENCE = 0.5
+"""Seconds for which a robot may fall silent before its agent takes its report back."""
+
+
+class Body:
+    """One robot; ``seen`` is called with what it senses, ``missing`` with why there is none."""
+
+    _log = Logger()
+
+    def __init__(
+        self,
+        driver: Driver,
+        clock: IReactorTime,
+        seen: Callable[[Observation], None],
+        missing: Callable[[str], None],
+    ) -> None:
+        self.driver = driver
+        self.is_awake = False
+        self._clock = clock
+        self._seen = seen
+        self._missing = missing
+        self._is_running = False
+        self._answered_at = clock.seconds()
+        self._unsubscribe: Callable[[], None] | None = None
+
+    def start(self) -> None:
+        """Connect, and have the motors on."""
+        self._is_running = True
+        self._unsubscribe = self.driver.subscribe(self._seen)
+        Deferred.fromCoroutine(self._wake()).addErrback(self._no_body)
+
+    def stop(self) -> None:
+        """Stand still, and tell nothing any more."""
+        self._is_running = False
+        self.driver.stop()
+        if self._unsubscribe is not None:
+            self._unsubscribe()
+
+    @property
+    def answers(self) -> bool:
+        """Whether the robot answers with its motors on, or did so a moment ago."""
+        seen = self.driver.observe()
+        has_motors = seen is None or seen.values.get("estop.engaged") is not True
+        now = self._clock.seconds()
+        if self.is_awake and has_motors and self.driver.state == "ready":
+            self._answered_at = now
+        return self.is_awake and has_motors and now - self._answered_at <= PATIENCE
+
+    def do(self, deed: Deed) -> bool:
+        """Do it; False where the robot has obeyed a newer token, which means that another may act."""
+        if self.driver.state != "ready":
+            return True
+        try:
+            self.driver.act(deed.action, deed.permit)
+        except UsageError as error:
+            self.driver.stop()
+            self._log.debug("the body refused: {error}", error=error)
+            return not isinstance(error, StaleCommand)
+        except DriverError as error:
+            self._log.info("the body does not answer: {error}", error=error)
+        return True
+
+    async def _wake(self) -> None:
+        """Have the body connected and its motors on; a link that goes away in between is tried again."""
+        await self.driver.connect()
+        while self._is_running and not self.is_awake:
+            try:
+                self.is_awake = await self.driver.enable()
+            except LinkError as error:
+                self._log.info("motors not on yet: {error}", error=error)
+                await deferLater(self._clock, WAKE_AGAIN)
+
+    def _no_body(self, failure: Any) -> None:
+        failure.trap(DriverError)
+        if self._is_running:
+            reason = failure.getErrorMessage()
+            self._log.warn("no robot: {reason}", reason=reason)
+            self._missing(reason)

@@ -1,0 +1,64 @@
+"""Execution: one agent's doing of one task, which outlives interruptions; pure.
+
+A behaviour is told under which token it acts.  The same token means "go on"; a new one means that others may have
+acted in between, and the behaviour decides what that means to it.  Whether the doing comes forward is watched here.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from agents.behaviour import Behaviour, Context
+from drivers.reading import Action
+
+SHARE = 0.01
+"""Less progress than this is none."""
+TOLD = 0.25
+"""The others are told of each quarter."""
+
+
+@dataclass(frozen=True)
+class Turn:
+    """What is to be done next (None: it is done), and the share that is done, where the behaviour can tell."""
+
+    action: Action | None
+    progress: float | None
+
+
+class Execution:
+    """The doing of one ``behaviour``; ``stall_limit`` in seconds without progress (0: any time)."""
+
+    def __init__(self, behaviour: Behaviour, stall_limit: float) -> None:
+        self._behaviour = behaviour
+        self._stall_limit = stall_limit
+        self._token = 0
+        self._began = 0.0
+        self._best = -math.inf
+        self._best_at = 0.0
+        self._stalled_at = -math.inf
+
+    def go_on(self, now: float, token: int, deadline: float) -> Turn:
+        """Do the next bit under the lease of ``token``."""
+        is_resumed = token == self._token
+        if not is_resumed:
+            self._token, self._began, self._best, self._best_at = token, now, -math.inf, now
+        action = self._behaviour.execute(Context(now, token, deadline, self._began, is_resumed))
+        progress = getattr(self._behaviour, "progress", None)
+        if not isinstance(progress, int | float) or not math.isfinite(progress):
+            return Turn(action, None)
+        progress = min(1.0, max(0.0, progress))
+        if progress >= self._best + SHARE:
+            self._best, self._best_at = progress, now
+        elif 0.0 < self._stall_limit < now - self._best_at:
+            self._stalled_at, self._best_at = now, now
+        return Turn(action, math.floor(max(progress, self._best) / TOLD + 1e-9) * TOLD)
+
+    def has_stalled(self, now: float) -> bool:
+        """Whether it came to nothing lately: another is to try, for as long as this one tried in vain."""
+        return now - self._stalled_at < self._stall_limit
+
+    @property
+    def is_safe(self) -> bool:
+        """Whether the task may change hands now; a behaviour that does not say is always at a safe point."""
+        return bool(getattr(self._behaviour, "is_safe", True))

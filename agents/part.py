@@ -1,0 +1,79 @@
+"""Part: one agent's engagement in one task, with its place in the group of the task; reports go out through it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from twisted.internet.interfaces import IReactorTime
+
+from agents.behaviour import Behaviour
+from agents.engagement import Engagement
+from middleware.consensus.strategy import ConsensusAlgorithm
+from middleware.entangled.errors import EntangledError
+from middleware.entangled.record import Record
+from middleware.node import SwarmNode
+from middleware.order import order_of
+from middleware.presence import IDLE
+from middleware.tasks import Member, Result, Task
+
+AGAIN = 0.5
+"""Seconds until an outcome that no majority could be told is told again."""
+
+
+class Part:
+    """The agent of ``node`` at ``task``; ``told`` is called with each report that goes out."""
+
+    def __init__(
+        self,
+        task: Task,
+        node: SwarmNode,
+        behaviour: Behaviour,
+        strategy: ConsensusAlgorithm,
+        clock: IReactorTime,
+        token: int,
+        told: Callable[[Part, Member], None],
+        halt: Callable[[], object],
+    ) -> None:
+        self.is_left = False
+        self._node = node
+        self._clock = clock
+        self._told = told
+        me = Member(node.uuid, node.presence.device.name, IDLE)
+        age = max(0.0, node.wall() - task.created)
+        self.engagement = Engagement(
+            task, me, behaviour, strategy, clock, token, self._tell, self._conclude, self._say, halt, age
+        )
+        self._group = node.group(task, self.engagement.heard, self._ordered)
+
+    def report(self) -> None:
+        """Tell the others how things stand."""
+        self._group.report(self.engagement.me)
+
+    def leave(self, is_running: bool) -> None:
+        """Give back what is held and hear no more of it; who goes on running takes its report back."""
+        self.is_left = True
+        self.engagement.abandon()
+        self._group.leave()
+        if is_running:
+            self._group.withdraw()
+
+    def _ordered(self, records: list[Record]) -> None:
+        self.engagement.ordered(order_of(records))
+
+    def _tell(self, member: Member) -> None:
+        self._group.report(member)
+        self._told(self, member)
+
+    def _conclude(self, result: Result) -> None:
+        if not self.is_left:
+            self._group.conclude(result).addErrback(self._not_concluded, result)
+
+    def _not_concluded(self, failure: Any, result: Result) -> None:
+        """No majority could be told: try again for as long as the task is ours to conclude."""
+        failure.trap(EntangledError)
+        if not self.is_left and not self.engagement.is_over:
+            self._clock.callLater(AGAIN, self._conclude, result)
+
+    def _say(self, text: str) -> None:
+        self._node.presence.say(self._node.wall(), text)

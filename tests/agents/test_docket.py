@@ -1,0 +1,55 @@
+"""Tests of ``agents.docket``: which task has the body, and which never starts again."""
+
+from __future__ import annotations
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from agents.docket import KEPT, MOST, Docket, next_task
+from middleware.entangled.record import TOLERATED_ABSENCE
+from middleware.tasks import MAX_LEASE_TTL, Task
+
+
+def task(name: str, created: float = 0.0, priority: int = 0) -> Task:
+    """A task."""
+    return Task(name, "walk", name, created=created, priority=priority)
+
+
+OLD, NEW, URGENT = task("old", 1.0), task("new", 2.0), task("urgent", 3.0, 5)
+
+
+class DocketTests(SynchronousTestCase):
+    def test_order(self) -> None:
+        """The most urgent task is first, then the oldest; only so many are followed."""
+        docket = Docket()
+        for one in (NEW, URGENT, OLD):
+            docket.add(one)
+        self.assertEqual(docket.followed(), [URGENT, OLD, NEW])
+        for number in range(2 * MOST):
+            docket.add(task(f"t{number}", 9.0))
+        self.assertEqual(len(docket.followed()), MOST)
+
+    def test_ended_task_never_starts_again(self) -> None:
+        """A task that is over is not taken in again, for longer than any lease lives and any node may be away."""
+        docket = Docket()
+        docket.add(OLD)
+        docket.bury("old", 0.0)
+        self.assertFalse(docket.is_new("old"))
+        self.assertFalse(docket.add(OLD))
+        docket.forget([], TOLERATED_ABSENCE + MAX_LEASE_TTL)
+        self.assertFalse(docket.add(OLD))
+        docket.forget(["old"], 2 * KEPT)
+        self.assertFalse(docket.add(OLD))
+        docket.forget([], 2 * KEPT)
+        self.assertTrue(docket.is_new("old"))
+
+
+class NextTaskTests(SynchronousTestCase):
+    def test_who_gets_the_body(self) -> None:
+        """The first in order, unless another has it and cannot be put aside, or is as urgent and acts already."""
+        every = [NEW, OLD, URGENT]
+        self.assertIs(next_task(every, None, True), URGENT)
+        self.assertIs(next_task(every, OLD, True), URGENT)
+        self.assertIs(next_task(every, OLD, False), OLD)
+        self.assertIs(next_task([OLD, NEW], NEW, True), OLD)
+        self.assertIs(next_task([OLD, NEW], NEW, False), NEW)
+        self.assertIsNone(next_task([], None, True))

@@ -1,0 +1,67 @@
+"""Tests of ``agents.execution``: going on under one token, progress, and a limit to a stall."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from agents.behaviour import STAND, Context
+from agents.execution import Execution
+
+
+class Digger:
+    """A behaviour that notes under which right it acts, and says how far it has come."""
+
+    def __init__(self, progress: object = 0.0) -> None:
+        self.progress = progress
+        self.contexts: list[Context] = []
+
+    def execute(self, context: Context) -> Any:
+        """Note it."""
+        self.contexts.append(context)
+        return STAND
+
+
+class ExecutionTests(SynchronousTestCase):
+    def execution(self, digger: Digger, limit: float = 0.0) -> Execution:
+        """The doing of it."""
+        return Execution(digger, limit)  # type: ignore[arg-type]
+
+    def test_same_token_goes_on(self) -> None:
+        """Under the same token the behaviour is told to go on, under a new one that others may have acted."""
+        digger = Digger()
+        execution = self.execution(digger)
+        for now, token in ((1.0, 5), (2.0, 5), (3.0, 6), (4.0, 6)):
+            execution.go_on(now, token, now + 1.0)
+        told = [(c.now, c.token, c.deadline, c.began, c.is_resumed) for c in digger.contexts]
+        self.assertEqual(told[0], (1.0, 5, 2.0, 1.0, False))
+        self.assertEqual(told[1], (2.0, 5, 3.0, 1.0, True))
+        self.assertEqual([row[3:] for row in told[2:]], [(3.0, False), (3.0, True)])
+
+    def test_progress_is_told_in_quarters(self) -> None:
+        """What a behaviour says of its progress is told in steps; what is none is not."""
+        for said, told in ((0.0, 0.0), (0.3, 0.25), (0.75, 0.75), (7.0, 1.0), (-1, 0.0), ("much", None)):
+            self.assertEqual(self.execution(Digger(said)).go_on(0.0, 1, 1.0).progress, told, said)
+        self.assertIsNone(self.execution(Digger(float("nan"))).go_on(0.0, 1, 1.0).progress)
+
+    def test_stall(self) -> None:
+        """Without progress for longer than the limit it has stalled, for as long as it tried; with progress never."""
+        digger = Digger()
+        execution = self.execution(digger, 2.0)
+        for tenth in range(30):
+            digger.progress = tenth / 30
+            execution.go_on(tenth / 10, 1, 9.0)
+            self.assertFalse(execution.has_stalled(tenth / 10))
+        for tenth in range(30, 53):
+            execution.go_on(tenth / 10, 1, 9.0)
+        self.assertTrue(execution.has_stalled(5.2))
+        self.assertFalse(execution.has_stalled(7.2))
+
+    def test_no_limit(self) -> None:
+        """A task without a limit never stalls, and a behaviour that does not tell is always at a safe point."""
+        execution = self.execution(Digger())
+        for now in range(100):
+            execution.go_on(float(now), 1, 999.0)
+        self.assertFalse(execution.has_stalled(99.0))
+        self.assertTrue(execution.is_safe)

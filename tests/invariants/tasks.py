@@ -1,0 +1,271 @@
+"""The workload of tasks: whole agents over an ether in memory, and E4, E5, E6 and E7 over all that they decided.
+
+It needs no fleet of nodes: ``python -m tests.invariants --only tasks`` runs it alone, a few milliseconds a schedule.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import random
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from importlib import import_module
+from typing import Any
+
+from agents.behaviour import KINDS
+from agents.decision import Decision
+from agents.loop import Agent
+from agents.state import State
+from middleware.consensus.strategy import ConsensusAlgorithm
+from middleware.entangled.clock import HeapClock
+from middleware.order import PAUSE, RESUME, Order
+from middleware.tasks import CANCELLED, Member, Result, Task
+from tests.invariants.ether import OPERATOR, Ether, Lessee, Node, Weather
+from tests.invariants.walk import Robot, restarted
+
+STEP = 0.25
+FAULTS_S = 20.0
+SETTLE_S = 40.0
+HEARD = 3.0
+"""Seconds in calm after which everybody has heard."""
+
+
+class Tasks:
+    """One schedule: agents, tasks and faults from ``seed``."""
+
+    def __init__(self, seed: int) -> None:
+        self.rng = random.Random(f"tasks/{seed}")
+        self.clock = HeapClock()
+        self.n = self.rng.choice([2, 3, 3, 4, 5])
+        self.ether = Ether(self.clock, random.Random(f"ether/{seed}"), self.n)
+        self.robots = {place: Robot(self.clock, self.rng.uniform(-3.0, 3.0)) for place in range(1, self.n + 1)}
+        self.agents: dict[int, Agent] = {}
+        self.tasks: dict[str, Task] = {}
+        self.found: dict[str, None] = {}
+        self.is_calm = self.rng.random() < 0.3
+        self.trace: list[str] = []
+        self._decided: dict[tuple[object, ...], str] = {}
+        self._used: dict[tuple[str, str], tuple[float, dict[str, tuple[int, int]]]] = {}
+        self._over: dict[str, float] = {}
+        self._acting: dict[str, tuple[int, int]] = {}
+        self._faulty_until = 0.0
+        for place in range(1, self.n + 1):
+            self.birth(place)
+
+    def run(self) -> list[str]:
+        """Everything; the violations."""
+        with self._recorded():
+            if not self.is_calm:
+                self.ether.weather = Weather(
+                    self.rng.choice([0.005, 0.05, 0.15]), self.rng.choice([0.0, 0.1, 0.3]), self.rng.choice([0.0, 0.2])
+                )
+            while self.clock.seconds() < FAULTS_S:
+                self.step()
+                self.live(STEP)
+            self.heal()
+            settled = self.clock.seconds() + SETTLE_S
+            while self.clock.seconds() < settled and not self.is_settled():
+                self.live(1.0)
+            self.live(1.0)
+            self.late()
+            self.live(2.0)
+        self.verdict()
+        return list(self.found)
+
+    def __str__(self) -> str:
+        """What kind of schedule it is."""
+        return f"{self.n} agents, {len(self.tasks)} tasks, {self.ether.weather}{', calm' if self.is_calm else ''}"
+
+    @property
+    def digest(self) -> str:
+        """A hash of who acted when."""
+        return hashlib.blake2s("".join(self.trace).encode(), digest_size=8).hexdigest()
+
+    # -- what happens -----------------------------------------------------------------------------------------------
+
+    def birth(self, place: int) -> None:
+        """Start an agent."""
+        self._used = {key: used for key, used in self._used.items() if key[0] != f"{place:040x}"}
+        self.robots[place] = restarted(self.robots[place], self.clock)
+        node: Any = Node(self.ether, place)
+        self.ether.nodes[place] = node
+        driver: Any = self.robots[place]
+        agent = self.agents[place] = Agent(node, driver, self.clock, random.Random(place))
+        agent.startService()
+
+    def death(self, place: int) -> None:
+        """End it without a word."""
+        del self.ether.nodes[place]
+        self.agents.pop(place).stopService()
+
+    def step(self) -> None:
+        """Something at random."""
+        dice = self.rng.random
+        if dice() < 0.12 and len(self.tasks) < 4:
+            self.submit()
+        open_ = [name for name in self.tasks if name not in self.ether.acknowledged]
+        if open_ and dice() < 0.03:
+            self.ether.conclude(OPERATOR, self.rng.choice(open_), Result(CANCELLED, "operator")).addErrback(lambda _: 0)
+        if open_ and dice() < 0.05:
+            order = Order(self.rng.choice([PAUSE, RESUME]), "operator", self.clock.seconds())
+            self.ether.order(self.rng.choice(open_), order)
+        if open_ and dice() < 0.03:
+            name = self.rng.choice(open_)
+            self.tasks[name] = faded(self.tasks[name], priority=self.rng.choice([0, 5]))
+            self.ether.submit(self.tasks[name])
+        if dice() < 0.2:
+            self.robots[self.rng.randint(1, self.n)].drift = self.rng.choice([0.0, 0.0, 1.0, 2.0])
+        if not self.is_calm:
+            self.fault()
+
+    def fault(self) -> None:
+        """A member that goes, one that comes back, or a cut."""
+        dice = self.rng.random()
+        place = self.rng.randint(1, self.n)
+        if dice < 0.06:
+            if place in self.agents:
+                self.death(place)
+            else:
+                self.birth(place)
+        elif dice < 0.09:
+            self.ether.side = {place: 1} if not self.ether.side else {}
+        if dice < 0.09:
+            self._faulty_until = self.clock.seconds() + HEARD
+
+    def submit(self) -> None:
+        """A task of any kind of task."""
+        rng = self.rng
+        name = f"t{len(self.tasks)}"
+        self.tasks[name] = Task(
+            name,
+            "walk",
+            name,
+            parameters={"target": rng.choice([-4.0, 0.0, 4.0])},
+            waiting_period=1.0,
+            created=self.clock.seconds(),
+            priority=rng.choice([0, 0, 5]),
+            preemptible=rng.random() < 0.5,
+            deadline=rng.choice([0.0, 0.0, 0.0, 6.0]),
+        )
+        self.ether.submit(self.tasks[name])
+
+    def heal(self) -> None:
+        """The end of all faults; whoever is away comes back."""
+        self.ether.weather, self.ether.side = Weather(), {}
+        for place in range(1, self.n + 1):
+            if place not in self.agents:
+                self.birth(place)
+            self.robots[place].drift = 0.0
+        for name in self.tasks:
+            self.ether.order(name, Order(RESUME, "operator", self.clock.seconds()))
+
+    def is_settled(self) -> bool:
+        """Whether every agent knows the end of every task."""
+        dockets = [agent._docket for agent in self.agents.values()]
+        return not any(docket.open or any(map(docket.is_new, self.tasks)) for docket in dockets)
+
+    def late(self) -> None:
+        """Long after the end the outcome's record has run out, and the task is still listed by who was away."""
+        for name in self.tasks:
+            if self.ether.outcome(OPERATOR, name) is not None:
+                self._over.setdefault(name, self.clock.seconds())
+                self.ether.forget(name)
+
+    def live(self, seconds: float) -> None:
+        """Let time pass, and look on."""
+        until = self.clock.seconds() + seconds
+        while self.clock.seconds() < until - 1e-9:
+            self.clock.advance(0.1)
+            self.watch()
+
+    # -- what must hold ---------------------------------------------------------------------------------------------
+
+    def watch(self) -> None:
+        """Look at every agent."""
+        now = self.clock.seconds()
+        for place, agent in sorted(self.agents.items()):
+            for name, part in agent._parts.items():
+                if part.engagement.course.state is not State.EXECUTING:
+                    continue
+                if name in self._over:
+                    self.say(f"E4: {name} is over and is begun again")
+                known = self.ether.acknowledged.get(name)
+                if known is not None and now > max(known[1], self._faulty_until) + HEARD + Lessee.TTL and self.is_calm:
+                    self.say(f"E5: {name} is executed although it ended {known[0].outcome}")
+                token = part.engagement.me.token
+                before = self._acting.get(name)
+                if before is None or before[1] < token:
+                    self._acting[name] = place, token
+                    self.trace.append(f"{now:.2f} {name} dog{place} {token}")
+
+    @contextmanager
+    def _recorded(self) -> Iterator[None]:
+        """Each decision of each agent goes through here."""
+        place: Any = import_module("agents.conference")
+        genuine = place.decide
+
+        def decide(
+            members: Iterable[Member],
+            strategy: ConsensusAlgorithm,
+            hysteresis: float,
+            period: float,
+            since: float | None,
+        ) -> Decision:
+            listed = list(members)
+            decision: Decision = genuine(listed, strategy, hysteresis, period, since)
+            self.check(listed, decision, hysteresis)
+            return decision
+
+        place.decide = decide
+        KINDS["walk"] = "tests.invariants.walk:Walk"
+        try:
+            yield
+        finally:
+            place.decide = genuine
+            del KINDS["walk"]
+
+    def check(self, members: list[Member], decision: Decision, hysteresis: float) -> None:
+        """Of the same reports the same, never by an older report, and nothing changes hands for little."""
+        me, others = members[0], members[1:]
+        group = ",".join(sorted(name for name, one in self.tasks.items() if one.title == self._title(me)))
+        now = self.clock.seconds()
+        at, used = self._used.get((me.uuid, group), (now, {}))
+        self._used[me.uuid, group] = now, {m.uuid: (m.epoch, m.serial) for m in others}
+        for other in others:
+            if now - at < 1.0 and (other.epoch, other.serial) < used.get(other.uuid, (0, 0)):
+                self.say(f"E7: {me.name} decides by a report of {other.name} that is older than one it had used")
+        if decision.assigned is None:
+            return
+        agreed = self._decided.setdefault(decision.basis, decision.assigned)
+        if agreed != decision.assigned:
+            self.say(f"E7: of the same reports {me.name} names another than the others")
+        bids = {m.uuid: m.cost for m in members if m.cost is not None}
+        holders = decision.basis[2]
+        if isinstance(holders, tuple) and holders:
+            holder = holders[0][1]
+            if decision.assigned != holder and not bids[decision.assigned] < bids[holder] * (1.0 - hysteresis):
+                self.say(f"E6: {bids[holder]} gives way to {bids[decision.assigned]}")
+
+    def _title(self, me: Member) -> str:
+        agent = self.agents[int(me.uuid, 16)]
+        return next(name for name, part in agent._parts.items() if part.engagement.me is me)
+
+    def verdict(self) -> None:
+        """E4: every task has an outcome, and the same everywhere."""
+        for name in self.tasks:
+            if name not in self._over:
+                states = {p: str(a._parts[name].engagement.course) for p, a in self.agents.items() if name in a._parts}
+                self.say(f"E4: {name} has no outcome: {states}")
+        for place, agent in self.agents.items():
+            for name in agent._docket.open:
+                self.say(f"E4: dog{place} does not know that {name} is over")
+
+    def say(self, line: str) -> None:
+        """Note a violation, once."""
+        self.found.setdefault(line)
+
+
+def faded(task: Task, **changes: Any) -> Task:
+    """The task with an edit of an operator's."""
+    return replace(task, generation=task.generation + 1, **changes)

@@ -1,0 +1,116 @@
+"""Walk: the behaviour of the workload of tasks, and a robot on a line that it moves."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable, Mapping
+from types import SimpleNamespace
+
+from twisted.internet.defer import Deferred, succeed
+
+from agents.behaviour import STAND, Context
+from drivers.driver import Permit
+from drivers.gate import Gate
+from drivers.reading import Action, Observation
+from middleware.entangled.clock import HeapClock
+
+
+class Walk:
+    """Walk along a line to a target; distances are told in quarters, so that many are equal."""
+
+    def __init__(self, parameters: Mapping[str, float | str], rng: random.Random) -> None:
+        self._target = float(parameters["target"])
+        self._place: float | None = None
+        self._drift = 0.0
+        self._start = 1.0
+
+    def look(self, seen: Observation, now: float) -> None:
+        """Take in where the body is, and how far the target seems to have drifted."""
+        self._place, self._drift = float(seen.values["place"]), float(seen.values["drift"])
+
+    @property
+    def cost(self) -> float | None:
+        """The distance in whole quarters."""
+        return None if self._place is None else round(4.0 * abs(self._target - self._place) + self._drift) / 4.0
+
+    @property
+    def is_safe(self) -> bool:
+        """Now and then the body must not be stopped."""
+        return self._place is None or round(5.0 * self._place) % 5 != 0
+
+    def search(self, now: float) -> Action:
+        """Stand."""
+        return STAND
+
+    def hold(self, now: float) -> Action:
+        """Stand."""
+        return STAND
+
+    def execute(self, context: Context) -> Action | None:
+        """Walk."""
+        assert self._place is not None
+        way = self._target - self._place
+        return None if abs(way) < 0.1 else {**STAND, "base.vx": 0.8 if way > 0 else -0.8}
+
+
+class Robot:
+    """A driver whose robot walks on a line."""
+
+    def __init__(self, clock: HeapClock, place: float) -> None:
+        self.description = SimpleNamespace(capabilities={})
+        self.state = "ready"
+        self.place = place
+        self.drift = 0.0
+        self._clock = clock
+        self._gate = Gate()
+        self._speed = 0.0
+        self._seen: Callable[[Observation], None] = lambda seen: None
+        self._is_on = False
+
+    def connect(self) -> Deferred[None]:
+        """Begin to sense."""
+        self._is_on = True
+        self._clock.callLater(0.1, self._live)
+        return succeed(None)
+
+    def enable(self) -> Deferred[bool]:
+        """Motors on."""
+        return succeed(True)
+
+    def disconnect(self) -> Deferred[None]:
+        """End."""
+        self._is_on = False
+        return succeed(None)
+
+    def subscribe(self, seen: Callable[[Observation], None]) -> Callable[[], None]:
+        """Tell what is sensed."""
+        self._seen = seen
+        return lambda: None
+
+    def observe(self) -> None:
+        """Nothing beside what is told."""
+
+    def stop(self) -> None:
+        """Stand."""
+        self._speed = 0.0
+
+    def act(self, action: Action, permit: Permit) -> None:
+        """Walk until the permit ends."""
+        self._gate.admit(permit, self._clock.seconds())
+        self._speed = action["base.vx"]
+
+    def _live(self) -> None:
+        if self._is_on:
+            self._clock.callLater(0.1, self._live)
+            if self._gate.is_over(self._clock.seconds()):
+                self._speed = 0.0
+            self.place += 0.1 * self._speed
+            now = self._clock.seconds()
+            self._seen(Observation(now, now, {"place": self.place, "drift": self.drift}))
+
+
+def restarted(robot: Robot, clock: HeapClock) -> Robot:
+    """The same robot under a new life of its node: its gate has not forgotten."""
+    again = Robot(clock, robot.place)
+    again._gate = robot._gate
+    return again
