@@ -7,7 +7,6 @@ The others are compared by the time to get there, the battery that is left and t
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 from middleware.consensus.nearest import KEPT
 from middleware.consensus.strategy import Consensus, Report, digest_of, refusal, standing
@@ -38,7 +37,7 @@ class CapabilityCost:
             first.epoch,
             (first.agent,),
             strategy=self.name,
-            reason=f"{first.cost:.1f} s away, battery {first.battery:.0%}, {first.load:g} other tasks: {weighed(first):.1f}",
+            reason=f"{first.cost:.1f} s away, battery {first.battery:.0%}, {first.load:g} other tasks",
         )
 
     def improves(self, current: Report, offer: Report, hysteresis: float) -> bool:
@@ -53,23 +52,10 @@ class CapabilityCost:
 
     def _best(self, contacts: Sequence[Report]) -> list[Report]:
         """The lightest reports, one of each agent, of the newest epoch and the first task."""
-        best: dict[str, Report] = {}
-        lawful = [r for r in contacts if not refusal(r)]
-        epoch = max((r.epoch for r in lawful), default=0)
-        task = min((r.task for r in lawful if r.epoch == epoch), default="")
-        for report in lawful:
-            if report.epoch == epoch and report.task == task:
-                known = best.get(report.agent)
-                if known is None or _order(report) < _order(known):
-                    best[report.agent] = report
-        return sorted(best.values(), key=_order)[:KEPT]
+        counted = standing(contacts, weighed)
+        return sorted((r for r in counted if r.task == counted[0].task), key=lambda r: (weighed(r), r.agent))[:KEPT]
 
 
 def weighed(report: Report) -> float:
     """What a report weighs, in seconds: it rises with way and load, and falls with the battery."""
     return report.cost + BATTERY_S * (1.0 - report.battery) + LOAD_S * report.load
-
-
-def _order(report: Report) -> tuple[object, ...]:
-    known = replace(report, unmet=())
-    return (weighed(report), report.agent, *(getattr(known, name) for name in sorted(Report.__slots__)))

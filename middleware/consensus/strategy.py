@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import importlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
@@ -23,6 +23,8 @@ BUILT_IN = {
     "group_optimal": "middleware.consensus.group_optimal:GroupOptimal",
     "nearest": "middleware.consensus.nearest:Nearest",
     "rendezvous": "middleware.consensus.rendezvous:Rendezvous",
+    "rendezvous_centre": "middleware.consensus.rendezvous:Centre",
+    "rendezvous_median": "middleware.consensus.rendezvous:Median",
     "sequential": "middleware.consensus.sequential:Sequential",
     "weighted_vote": "middleware.consensus.weighted_vote:WeightedVote",
 }
@@ -41,8 +43,9 @@ class Report:
     requirements that the device does not meet.  ``age`` is how many seconds ago it was measured and ``valid_for`` how
     many it holds (0: as long as the agent is there), both durations, since no two clocks agree.  ``value`` is a number
     or a place, in metres (``average``, ``rendezvous``; for ``sequential`` where the agent stands), ``choice`` a vote
-    and ``sequence`` its number, ``weight`` counts for both, ``capacity`` is how many tasks the agent would take,
-    ``battery`` the share that is left and ``load`` how many tasks it has already.
+    and ``sequence`` its number, ``weight`` counts for both and ``electorate`` is the weight of all that may vote,
+    ``capacity`` is how many tasks the agent would take, ``battery`` the share that is left and ``load`` how many tasks
+    it has already.
     """
 
     agent: str
@@ -53,6 +56,7 @@ class Report:
     value: tuple[float, ...] = ()
     choice: str = ""
     weight: float = 1.0
+    electorate: float = 0.0
     capacity: int = 1
     battery: float = 1.0
     load: float = 0.0
@@ -108,16 +112,14 @@ def refusal(report: Report) -> str:
     """Why a report counts for nothing, or "" where it is lawful."""
     if not isinstance(report.agent, str) or not 0 < len(report.agent) <= MAX_NAME:
         return "the agent has no name"
-    for label, number in (("cost", report.cost), ("weight", report.weight), ("load", report.load), ("age", report.age)):
-        if why := _unlawful(number):
+    for label in ("cost", "weight", "electorate", "load", "age", "valid_for"):
+        if why := _unlawful(getattr(report, label)):
             return f"{label} {why}"
     if not isinstance(report.value, tuple) or len(report.value) > 8:
         return "value is no place"
     for number in report.value:
         if why := _unlawful(number, lowest=-MAX_NUMBER):
             return f"value {why}"
-    if why := _unlawful(report.valid_for):
-        return f"valid_for {why}"
     if _unlawful(report.battery, highest=1.0):
         return f"battery {report.battery!r:.40} is no share"
     for label, whole in (("epoch", report.epoch), ("sequence", report.sequence), ("capacity", report.capacity)):
@@ -137,19 +139,24 @@ def refused(contacts: Iterable[Report]) -> tuple[Refused, ...]:
     return tuple(sorted(Refused(str(r.agent)[:MAX_NAME], why) for r in contacts if (why := refusal(r))))
 
 
-def standing(contacts: Iterable[Report], newest: bool = False) -> tuple[Report, ...]:
+def cost_of(report: Report) -> float:
+    """What most strategies rank by."""
+    return report.cost
+
+
+def standing(contacts: Iterable[Report], rank: Callable[[Report], float] = cost_of) -> tuple[Report, ...]:
     """The reports that count: lawful, of the newest epoch, one of each agent and task, by task and agent.
 
-    Within an epoch a bid only ever improves, so of several the lowest cost stands; with ``newest``, as for a vote, the
-    one of the highest sequence.  Both are joins, so it makes no difference who merged what first.
+    Within an epoch a bid only ever improves, so of several of one agent that of the lowest ``rank`` stands.  This is a
+    join: it makes no difference who merged what first, or twice.
     """
     lawful = [r for r in contacts if not refusal(r)]
     epoch = max((r.epoch for r in lawful), default=0)
     best: dict[tuple[str, str], Report] = {}
     for report in lawful:
         if report.epoch == epoch:
-            known = best.get((report.task, report.agent))
-            if known is None or _order(report, newest) < _order(known, newest):
+            known = best.setdefault((report.task, report.agent), report)
+            if known is not report and _order(report, rank) < _order(known, rank):
                 best[report.task, report.agent] = report
     return tuple(best[key] for key in sorted(best))
 
@@ -204,11 +211,11 @@ def _unlawful(number: float, lowest: float = 0.0, highest: float = MAX_NUMBER) -
     return f"{number:.3g} is negative" if lowest == 0.0 and number < 0.0 else f"{number:.3g} is enormous"
 
 
-def _order(report: Report, newest: bool) -> tuple[object, ...]:
-    return (-report.sequence if newest else 0, report.cost, -report.sequence, _rest(report))
+def _order(report: Report, rank: Callable[[Report], float]) -> tuple[object, ...]:
+    return (rank(report), report.cost, _rest(report), report.age, report.valid_for)
 
 
 def _rest(report: Report) -> str:
     given = (report.task, report.epoch, report.sequence, report.value, report.choice, report.weight, report.capacity)
-    more = (report.battery, report.load)
-    return "" if (given, more) == (("", 0, 0, (), "", 1.0, 1), (1.0, 0.0)) else f"{given!r}{more!r};"
+    more = (report.battery, report.load, report.electorate)
+    return "" if (given, more) == (("", 0, 0, (), "", 1.0, 1), (1.0, 0.0, 0.0)) else f"{given!r}{more!r};"
