@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 
 from middleware.consensus.nearest import Nearest
-from middleware.consensus.strategy import Consensus, Report, digest_of, standing
+from middleware.consensus.strategy import Consensus, Report, digest_of, refusal, standing
 
 Point = tuple[float, ...]
 
@@ -40,13 +40,10 @@ class Average(Nearest):
 
     def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
         """Everybody's newest value, about the first task by name; the fewest numbers that anybody gave say how many."""
-        counted = standing((*a, *b), lambda report: -report.sequence)
-        valued = [r for r in counted if r.value and r.weight > 0.0]
-        if not valued:
-            return ()
-        task = valued[0].task
-        size = min(len(r.value) for r in valued if r.task == task)
-        return tuple(r for r in valued if r.task == task and len(r.value) == size)
+        valued = [r for r in (*a, *b) if not refusal(r) and r.value and r.weight > 0.0]
+        first = min(((-r.epoch, r.task, len(r.value)) for r in valued), default=None)
+        alike = (r for r in valued if (-r.epoch, r.task, len(r.value)) == first)
+        return standing(alike, lambda report: -report.sequence)
 
     def point(self, points: Sequence[Point], weights: Sequence[float]) -> Point:
         """What is agreed on, for points in any order."""
