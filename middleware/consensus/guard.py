@@ -14,29 +14,26 @@ from twisted.logger import Logger
 
 from middleware.consensus.nearest import Nearest
 from middleware.consensus.strategy import (
-    BUILT_IN,
     MAX_NAME,
     MAX_NUMBER,
     Consensus,
     ConsensusAlgorithm,
     Report,
-    place_of,
     refusal,
-    strategy_for,
 )
 from middleware.errors import SwarmError
 
 REMEMBERED = 64
 STRIKES = 3
-"""So often a strategy may not answer in time; then it is asked no more, since each time costs the whole deadline."""
+"""So often a strategy may be lost; then it is asked no more, since each time costs up to the deadline."""
 
 
 class NoOpinion(SwarmError):
     """What a strategy answered cannot be used; the text says why."""
 
 
-class Late(NoOpinion):
-    """A strategy did not answer in time."""
+class Lost(NoOpinion):
+    """A strategy gave no answer, and what it ran in had to be ended: it was late, said too much, or died."""
 
 
 class Guard:
@@ -112,11 +109,11 @@ class Guard:
 
     def _may_be_asked(self) -> None:
         if self._strikes >= STRIKES:
-            raise NoOpinion(f"it was late {STRIKES} times and is asked no more")
+            raise NoOpinion(f"it gave no answer {STRIKES} times and is asked no more")
 
     def _failed(self, error: Exception) -> str:
         """Count and log it; gives it in one line.  The same again is not logged again."""
-        if isinstance(error, Late):
+        if isinstance(error, Lost):
             self._strikes += 1
         text = str(error) if isinstance(error, NoOpinion) else f"{type(error).__name__}: {error}"
         why = (text.strip().splitlines() or ["it says nothing"])[-1][:MAX_NAME]  # of a trace, what was raised
@@ -124,19 +121,6 @@ class Guard:
             self.why_not = why
             self.log.failure("strategy {name} has no opinion: {why}", name=self.name, why=why)
         return why
-
-
-def guarded(name: str, dotted: bool = False) -> Guard:
-    """The strategy of that name: built-in ones run here, all others in a process of their own with a deadline.
-
-    Raises ``UnknownStrategy`` where there is none of that name.
-    """
-    place = place_of(name, dotted)
-    if place in BUILT_IN.values():
-        return Guard(strategy_for(name, dotted))
-    from middleware.consensus.worker import Worker  # most nodes never come here
-
-    return Guard(Worker(name, place), twice=True)
 
 
 def checked(found: Consensus, contacts: Sequence[Report]) -> Consensus:

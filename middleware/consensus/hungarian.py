@@ -1,7 +1,8 @@
-"""Hungarian: the cheapest assignment of rows to columns, exactly, by shortest augmenting paths (Jonker, Volgenant 1987).
+"""Hungarian: the cheapest assignment of rows to columns, exactly, by shortest augmenting paths.
 
-Costs are whole numbers, so that sums are exact and every machine finds the same: of several optima the one whose
-columns, read row by row, come first.  SciPy solves it where it is installed; the result is the same.
+Jonker, Volgenant, Computing 38, 1987.  Costs are whole numbers, so that sums are exact and every machine finds the
+same: of several optima the one whose columns, read row by row, come first.  SciPy solves it where it is installed; the
+result is the same.
 """
 
 from __future__ import annotations

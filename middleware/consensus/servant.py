@@ -32,7 +32,8 @@ def served(strategy: Any, method: str, arguments: list[Any]) -> Any:
 
 
 def _report(fields: list[Any]) -> Report:
-    return Report(*(tuple(field) if isinstance(field, list) else field for field in fields))
+    values: list[Any] = [tuple(field) if isinstance(field, list) else field for field in fields]
+    return Report(*values)
 
 
 def _say(out: BinaryIO, is_well: bool, content: Any) -> None:

@@ -18,7 +18,7 @@ from typing import Any
 
 import msgpack
 
-from middleware.consensus.guard import Late, NoOpinion
+from middleware.consensus.guard import Lost, NoOpinion
 from middleware.consensus.strategy import Consensus, Report
 
 DEADLINE_S = 0.2
@@ -51,7 +51,7 @@ class Worker:
         """What the strategy finds."""
         answer = self._asked("find", [astuple(r) for r in contacts])
         try:
-            return Consensus(*(tuple(field) if isinstance(field, list) else field for field in answer))
+            return Consensus(*_fields(answer))
         except TypeError as error:
             raise NoOpinion(f"find answers {answer!r:.60}") from error
 
@@ -103,11 +103,11 @@ class Worker:
                 self._is_ready = True
             self._write(bytes(msgpack.packb([method, arguments])), end)
             return self._heard(self._read(end))
-        except Late:
+        except TimeoutError:
             if not self._is_ready and time.monotonic() - self._began < START_S:
                 raise NoOpinion("it is still being loaded") from None
             self.stop()
-            raise
+            raise Lost(f"it did not answer within {self._deadline:g} s") from None
         except (OSError, ValueError, NoOpinion) as error:
             if not self._is_ready and isinstance(error, Raised):
                 self._broken = str(error)
@@ -119,7 +119,7 @@ class Worker:
         try:
             is_well, content = msgpack.unpackb(answer)
         except Exception as error:  # msgpack raises many things
-            raise NoOpinion("its answer cannot be read") from error
+            raise Lost("its answer cannot be read") from error
         if not is_well:
             raise Raised(str(content))
         return content
@@ -136,7 +136,7 @@ class Worker:
     def _read(self, end: float) -> bytes:
         (size,) = LENGTH.unpack(self._bytes(LENGTH.size, end))
         if size > MAX_ANSWER:
-            raise NoOpinion(f"its answer has {size} bytes, more than {MAX_ANSWER}")
+            raise Lost(f"its answer has {size} bytes, more than {MAX_ANSWER}")
         return self._bytes(size, end)
 
     def _bytes(self, size: int, end: float) -> bytes:
@@ -146,7 +146,7 @@ class Worker:
             _wait(self._process.stdout.fileno(), select.POLLIN, end)
             more = os.read(self._process.stdout.fileno(), size - len(found))
             if not more:
-                raise NoOpinion("its process has died")
+                raise Lost("its process has died")
             found += more
         return found
 
@@ -157,11 +157,15 @@ class Raised(NoOpinion):
 
 def report_of(fields: Sequence[Any]) -> Report:
     """A report out of what ``astuple`` made of it and a pipe carried."""
-    return Report(*(tuple(field) if isinstance(field, list) else field for field in fields))
+    return Report(*_fields(fields))
+
+
+def _fields(values: Sequence[Any]) -> list[Any]:
+    return [tuple(value) if isinstance(value, list) else value for value in values]
 
 
 def _wait(pipe: int, event: int, end: float) -> None:
     poll = select.poll()
     poll.register(pipe, event)
     if not poll.poll(max(0.0, end - time.monotonic()) * 1000.0):
-        raise Late("it did not answer in time")
+        raise TimeoutError
