@@ -113,6 +113,8 @@ class Worker:
                 self._broken = str(error)
             if not self._is_ready or not isinstance(error, Raised):
                 self.stop()
+            if isinstance(error, OSError):
+                raise Lost("its process has died") from error
             raise
 
     def _heard(self, answer: bytes) -> Any:

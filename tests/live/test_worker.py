@@ -37,7 +37,7 @@ class Giant(Nearest):
     name = "giant"
 
     def find(self, contacts: Sequence[Report]) -> Consensus:
-        return Consensus("b", reason="x" * 50_000_000)
+        return Consensus("b", reason="x" * 1_000_000)
 
 
 class Hungry(Nearest):
