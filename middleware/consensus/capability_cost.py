@@ -44,18 +44,17 @@ class CapabilityCost:
         """Whether ``offer`` weighs less by more than the share ``hysteresis``; who cannot do it never does."""
         if refusal(offer):
             return False
-        return bool(refusal(current)) or weighed(offer) < weighed(current) * (1.0 - hysteresis)
+        return bool(refusal(current)) or self.weigh(offer) < self.weigh(current) * (1.0 - hysteresis)
 
     def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
         """The best of both."""
         return tuple(self._best((*a, *b)))
 
+    def weigh(self, report: Report) -> float:
+        """What a report weighs, in seconds: it rises with way and load, and falls with the battery."""
+        return report.cost + BATTERY_S * (1.0 - report.battery) + LOAD_S * report.load
+
     def _best(self, contacts: Sequence[Report]) -> list[Report]:
         """The lightest reports, one of each agent, of the newest epoch and the first task."""
-        counted = standing(contacts, weighed)
-        return sorted((r for r in counted if r.task == counted[0].task), key=lambda r: (weighed(r), r.agent))[:KEPT]
-
-
-def weighed(report: Report) -> float:
-    """What a report weighs, in seconds: it rises with way and load, and falls with the battery."""
-    return report.cost + BATTERY_S * (1.0 - report.battery) + LOAD_S * report.load
+        counted = standing(contacts, self.weigh)
+        return sorted((r for r in counted if r.task == counted[0].task), key=lambda r: (self.weigh(r), r.agent))[:KEPT]
