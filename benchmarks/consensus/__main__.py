@@ -35,7 +35,9 @@ def main() -> int:
     """Measure what the arguments say, print it, and write it."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.consensus", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="up to 100 agents and two seeds; ends within 20 s")
-    parser.add_argument("--sizes", default="", help=f"numbers of agents, with commas (default {','.join(map(str, SIZES))})")
+    parser.add_argument(
+        "--sizes", default="", help=f"numbers of agents, with commas (default {','.join(map(str, SIZES))})"
+    )
     parser.add_argument("--seeds", type=int, default=0, help="missions of each size (default 5, quick 2)")
     parser.add_argument("--out", type=Path, help="write everything as JSON")
     parser.add_argument("--plot", type=Path, help="draw the costs as SVG")
@@ -61,7 +63,9 @@ def main() -> int:
         print(f"    {key:12s} {ratio:.3f}")
     print(f"\nTargets (optimum by {rows[0]['by']}):")
     for target in found:
-        print(f"    {'yes' if target['is_met'] else 'NO ':3s}  {target['what']:58s} {target['is']:9.3f} (at most {target['most']:g})")
+        print(
+            f"    {'yes' if target['is_met'] else 'NO ':3s}  {target['what']:58s} {target['is']:9.3f} (at most {target['most']:g})"
+        )
     if wanted.out:
         wanted.out.write_text(json.dumps({"rows": rows, "ways": ways, "targets": found}, indent=1), encoding="utf-8")
     if wanted.plot:

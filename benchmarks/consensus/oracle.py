@@ -60,7 +60,9 @@ def _annealed(mission: Mission, ways: dict[str, list[str]], steps: int) -> float
         task = dice.choice(tasks)
         here = owner[task]
         # Somebody near it, or anybody.
-        there = here if dice.random() < 0.3 else owner[dice.choice(tasks)] if dice.random() < 0.7 else dice.choice(agents)
+        there = (
+            here if dice.random() < 0.3 else owner[dice.choice(tasks)] if dice.random() < 0.7 else dice.choice(agents)
+        )
         rest = [t for t in now[here] if t != task]
         target = rest if there == here else now[there]
         if len(target) >= mission.capacity:

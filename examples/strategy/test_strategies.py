@@ -11,10 +11,14 @@ from middleware.consensus.strategy import Report
 
 
 class FarthestTests(Conformance, SynchronousTestCase):
+    """The template conforms."""
+
     make = Farthest
 
 
 class SpareTests(Conformance, SynchronousTestCase):
+    """The example conforms, and does what it says."""
+
     make = Spare
 
     def test_battery_decides(self) -> None:

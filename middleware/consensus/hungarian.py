@@ -10,7 +10,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-Costs = Sequence[Sequence[int]]
+Costs = Sequence[Sequence[float]]
+"""Whole numbers, as ``int`` or, while they are small, as ``float``, which reckons as exactly and faster."""
 BEYOND = 2**52
 """Sums from here on are not exact in the floating point that SciPy reckons in."""
 
@@ -19,23 +20,25 @@ def assigned(costs: Costs, with_scipy: bool = True) -> list[int]:
     """The column of each row; there are at least as many columns as rows, and all rows are equally long."""
     if not costs:
         return []
+    if max(map(max, costs)) * len(costs) < BEYOND:
+        costs = [list(map(float, row)) for row in costs]
     found = _by_scipy(costs) if with_scipy else None
     columns, prices = found or solved(costs)
     return first_of_equals(costs, columns, prices)
 
 
-def total(costs: Costs, columns: Sequence[int]) -> int:
+def total(costs: Costs, columns: Sequence[int]) -> float:
     """What an assignment costs."""
     return sum(row[column] for row, column in zip(costs, columns, strict=True))
 
 
-def solved(costs: Costs) -> tuple[list[int], list[int]]:
+def solved(costs: Costs) -> tuple[list[int], list[float]]:
     """One cheapest assignment, and the price of each column: none above 0, and 0 where nobody has it.
 
     Each row has a column that is cheapest for it, its price taken off; that proves the assignment.
     """
     wide = len(costs[0])
-    prices = [0] * wide
+    prices: list[float] = [0 * costs[0][0]] * wide  # of the same kind as the costs, or sums were not exact
     owner = [-1] * wide
     free = list(range(len(costs)))
     for _ in range(2):
@@ -49,7 +52,7 @@ def solved(costs: Costs) -> tuple[list[int], list[int]]:
     return columns, prices
 
 
-def _bid(costs: Costs, prices: list[int], owner: list[int], free: list[int]) -> list[int]:
+def _bid(costs: Costs, prices: list[float], owner: list[int], free: list[int]) -> list[int]:
     """Let each free row outbid others for the column it likes best; gives the rows that are free afterwards."""
     lost: list[int] = []
     patience = 4 * len(free)
@@ -59,7 +62,7 @@ def _bid(costs: Costs, prices: list[int], owner: list[int], free: list[int]) -> 
         net = [cost - price for cost, price in zip(costs[row], prices, strict=True)]
         least = min(net)
         best = net.index(least)
-        net[best] = least + 2**80
+        net[best] = float("inf")
         second = min(net)
         if second == least and owner[best] >= 0:
             best = net.index(second)
@@ -75,7 +78,7 @@ def _bid(costs: Costs, prices: list[int], owner: list[int], free: list[int]) -> 
     return lost
 
 
-def _augment(costs: Costs, prices: list[int], owner: list[int], row: int) -> None:
+def _augment(costs: Costs, prices: list[float], owner: list[int], row: int) -> None:
     """Give ``row`` a column along the cheapest chain of changes, and mend the prices."""
     length = [cost - price for cost, price in zip(costs[row], prices, strict=True)]
     before = [row] * len(length)
@@ -107,7 +110,7 @@ def _augment(costs: Costs, prices: list[int], owner: list[int], row: int) -> Non
         reached = where[through]
 
 
-def first_of_equals(costs: Costs, columns: Sequence[int], prices: Sequence[int]) -> list[int]:
+def first_of_equals(costs: Costs, columns: Sequence[int], prices: Sequence[float]) -> list[int]:
     """Of all assignments that cost as little, the first: row by row the lowest column that the others leave open."""
     rows = len(columns)
     columns = [*columns, *sorted(set(range(len(prices))) - set(columns))]
@@ -146,7 +149,7 @@ def _changed_hands(row: int, wanted: int, columns: list[int], owner: dict[int, i
     return False
 
 
-def _by_scipy(costs: Costs) -> tuple[list[int], list[int]] | None:
+def _by_scipy(costs: Costs) -> tuple[list[int], list[float]] | None:
     """The same by SciPy, with prices that prove it; None where it is not installed, or cannot be exact."""
     try:
         import numpy

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from middleware.consensus.strategy import Consensus, ConsensusAlgorithm, Report, digest_of, standing
+from middleware.consensus.strategy import Consensus, ConsensusAlgorithm, Report, digest_of
 
 QUANTUM = 1_000_000
 """Costs are compared as whole millionths, so that sums are exact and equal everywhere."""
@@ -52,21 +52,24 @@ def capacities(contacts: Iterable[Report]) -> dict[str, int]:
 
 
 def shared_out(
-    name: str, contacts: Sequence[Report], items: Sequence[Item], owners: Mapping[str, Sequence[str]]
+    name: str, counted: Sequence[Report], items: Sequence[Item], owners: Mapping[str, Sequence[str]]
 ) -> tuple[Consensus, ...]:
-    """The consensus points of an assignment: who has each task, and who else bid for it, the cheapest first."""
-    counted = standing(contacts)
+    """The consensus points of an assignment: who has each task, and who else bid for it, the cheapest first.
+
+    ``counted`` are the reports that stand.
+    """
     epoch = counted[0].epoch if counted else 0
     digest = digest_of(counted) if counted else ""
     bids: dict[str, list[Report]] = {}
     for report in counted:
         bids.setdefault(report.task, []).append(report)
     points = []
+    agents = len({r.agent for r in counted})
     for item in listed(items):
         chosen = tuple(owners.get(item.task, ()))
         order = sorted(bids.get(item.task, []), key=lambda r: (r.cost, r.agent))
         standby = tuple(r.agent for r in order if r.agent not in chosen)[:15]
-        reason = f"with {len(items) - 1} others among {len(set(r.agent for r in counted))}"
+        reason = f"with {len(items) - 1} others among {agents}"
         if not chosen:
             reason = "nobody bid for it" if not order else "everybody who bid for it has enough to do"
         points.append(

@@ -29,11 +29,12 @@ class PushSum:
         self._count = 0
         self._given: dict[int, tuple[str, Share]] = {}
         self._taken: dict[str, set[int]] = {}
+        self._below: dict[str, int] = {}
 
     @property
     def value(self) -> tuple[float, ...]:
-        """The average as far as it is known here."""
-        return tuple(m / self.weight for m in self.mass)
+        """The average as far as it is known here; () once everything was given away."""
+        return tuple(m / self.weight for m in self.mass) if self.weight > 0.0 else ()
 
     def give(self, taker: str, whole: bool = False) -> Share:
         """Half of what there is, for ``taker`` (who leaves gives the ``whole``)."""
@@ -48,11 +49,20 @@ class PushSum:
     def take(self, share: Share) -> int:
         """Take a share, once; gives the number to acknowledge."""
         taken = self._taken.setdefault(share.giver, set())
-        if share.number not in taken and len(share.mass) == len(self.mass):
+        if not self.has_taken(share) and len(share.mass) == len(self.mass):
+            below = self._below.get(share.giver, 0)
             taken.add(share.number)
+            while below + 1 in taken:
+                below += 1
+                taken.remove(below)
+            self._below[share.giver] = below
             self.mass = tuple(m + s for m, s in zip(self.mass, share.mass, strict=True))
             self.weight += share.weight
         return share.number
+
+    def has_taken(self, share: Share) -> bool:
+        """Whether a share has arrived here."""
+        return share.number <= self._below.get(share.giver, 0) or share.number in self._taken.get(share.giver, ())
 
     def acknowledged(self, number: int) -> None:
         """A share has arrived."""

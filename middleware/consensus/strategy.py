@@ -33,6 +33,7 @@ MAX_NUMBER = 1e9
 """What is beyond it is no cost, place or weight of anything on this planet, and adds up without loss."""
 MAX_WHOLE = 2**53
 MAX_NAME = 200
+LABELS = ("cost", "weight", "electorate", "load", "age", "valid_for")
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,22 +112,25 @@ class ConsensusAlgorithm(Protocol):
 def refusal(report: Report) -> str:
     """Why a report counts for nothing, or "" where it is lawful."""
     if not isinstance(report.agent, str) or not 0 < len(report.agent) <= MAX_NAME:
-        return "the agent has no name"
-    for label in ("cost", "weight", "electorate", "load", "age", "valid_for"):
-        if why := _unlawful(getattr(report, label)):
-            return f"{label} {why}"
+        return "the agent has no name, or too long a one"
+    numbers = (report.cost, report.weight, report.electorate, report.load, report.age, report.valid_for)
+    if not all((type(n) is float or type(n) is int) and 0.0 <= n <= MAX_NUMBER for n in numbers):
+        for label, number in zip(LABELS, numbers, strict=True):
+            if why := _unlawful(number):
+                return f"{label} {why}"
     if not isinstance(report.value, tuple) or len(report.value) > 8:
         return "value is no place"
     for number in report.value:
         if why := _unlawful(number, lowest=-MAX_NUMBER):
             return f"value {why}"
-    if _unlawful(report.battery, highest=1.0):
+    if type(report.battery) not in (float, int) or not 0.0 <= report.battery <= 1.0:
         return f"battery {report.battery!r:.40} is no share"
-    for label, whole in (("epoch", report.epoch), ("sequence", report.sequence), ("capacity", report.capacity)):
+    for whole in (report.epoch, report.sequence, report.capacity):
         if type(whole) is not int or not 0 <= whole < MAX_WHOLE:
-            return f"{label} {whole!r:.40} is no number of anything"
-    if not all(isinstance(text, str) and len(text) <= MAX_NAME for text in (report.task, report.choice)):
-        return "task or choice is no text"
+            return f"{whole!r:.40} is no epoch, sequence or capacity"
+    for text in (report.task, report.choice):
+        if not isinstance(text, str) or len(text) > MAX_NAME:
+            return "task or choice is no text, or too long"
     if report.unmet:
         return "cannot do it: " + ", ".join(map(str, report.unmet))[:MAX_NAME]
     if 0.0 < report.valid_for < report.age:
@@ -199,10 +203,10 @@ def place_of(name: str, dotted: bool = False) -> str:
     return target
 
 
-def _unlawful(number: float, lowest: float = 0.0, highest: float = MAX_NUMBER) -> str:
+def _unlawful(number: float, lowest: float = 0.0) -> str:
     if type(number) is not float and type(number) is not int:
         return "is no number"
-    if lowest <= number <= highest:
+    if lowest <= number <= MAX_NUMBER:
         return ""
     if number != number:
         return "is not a number"

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 from twisted.internet.defer import Deferred, succeed
 
+from middleware.consensus import bidder, nearest
+from middleware.consensus.strategy import Report
 from middleware.entangled.data import schema
 from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.data.sqlite import SqliteStore
@@ -103,6 +106,22 @@ def _safe_already(self: Writer) -> Deferred[None]:
     return succeed(None)
 
 
+def _first_come(contacts: Any) -> list[Report]:
+    return sorted(contacts, key=lambda report: report.cost)
+
+
+def _numbered_in_a_byte(contacts: Any) -> list[Report]:
+    order = _BEST_OF(contacts)
+    names = sorted({report.agent for report in contacts})
+    return [replace(r, agent=names[(names.index(r.agent) + 128) % 256 - 128]) for r in order]
+
+
+def _not_a_number_first(contacts: Any) -> list[Report]:
+    return sorted(contacts, key=lambda r: (r.cost >= 0, r.cost, r.agent))
+
+
+_BEST_OF = nearest.best_of
+
 BUGS: dict[str, list[tuple[Any, str, Any]]] = {
     "tombstone dropped too early": [(owner, "TOMBSTONE_TTL", 3.0)],
     "acknowledged by a minority": [(Overlay, "voters", lambda self, key, targets: [targets[0].node_id])],
@@ -138,6 +157,11 @@ BUGS: dict[str, list[tuple[Any, str, Any]]] = {
     "acknowledged before it is written": [(Writer, "written", _safe_already)],
     "checksums are not looked at": [(schema, "record_of", lambda row: schema._unchecked(row))],
     "a full disk takes records": [(SqliteStore, "put", MemoryStore.put)],
+    # Strategies.
+    "no tie-break": [(nearest, "best_of", _first_come)],
+    "agents are numbered in a byte": [(nearest, "best_of", _numbered_in_a_byte)],
+    "a cost that is not a number wins": [(nearest, "best_of", _not_a_number_first)],
+    "bidders stop after one quiet round": [(bidder, "is_over", lambda rounds, quiet, tasks, members: quiet >= 1)],
 }
 
 FINDERS: dict[str, tuple[str, ...]] = {
@@ -153,6 +177,10 @@ FINDERS: dict[str, tuple[str, ...]] = {
     "acknowledged before it is written": ("records", "stores"),
     "checksums are not looked at": ("records", "stores"),
     "a full disk takes records": ("records", "stores"),
+    "no tie-break": ("deciders",),
+    "agents are numbered in a byte": ("deciders",),
+    "a cost that is not a number wins": ("deciders",),
+    "bidders stop after one quiet round": ("deciders",),
 }
 """The workloads that look for a bug, where these are not the records."""
 

@@ -38,6 +38,10 @@ BITING_ELSEWHERE = {
     "acknowledged before it is written": (6, "S-a"),
     "checksums are not looked at": (1, "S-b"),
     "a full disk takes records": (1, "S-c"),
+    "no tie-break": (1, "C1"),
+    "agents are numbered in a byte": (1, "C3"),
+    "a cost that is not a number wins": (1, "C2"),
+    "bidders stop after one quiet round": (1, "C4"),
 }
 """The same of the quickest bugs that other workloads look for."""
 ALL = tuple(WORKLOADS)
