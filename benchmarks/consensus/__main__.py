@@ -63,9 +63,8 @@ def main() -> int:
         print(f"    {key:12s} {ratio:.3f}")
     print(f"\nTargets (optimum by {rows[0]['by']}):")
     for target in found:
-        print(
-            f"    {'yes' if target['is_met'] else 'NO ':3s}  {target['what']:58s} {target['is']:9.3f} (at most {target['most']:g})"
-        )
+        word = "yes" if target["is_met"] else "NO"
+        print(f"    {word:3s}  {target['what']:58s} {target['is']:9.3f} (at most {target['most']:g})")
     if wanted.out:
         wanted.out.write_text(json.dumps({"rows": rows, "ways": ways, "targets": found}, indent=1), encoding="utf-8")
     if wanted.plot:

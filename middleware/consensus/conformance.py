@@ -28,6 +28,7 @@ HOSTILE = (
     {"cost": -math.inf},
     {"cost": -1.0},
     {"cost": 1e300},
+    {"cost": 10**400},
     {"cost": True},
     {"cost": "1"},
     {"cost": None},
@@ -37,7 +38,7 @@ HOSTILE = (
     {"value": (1e300, 0.0)},
     {"value": [0.0]},
     {"epoch": -1},
-    {"epoch": 2**70},
+    {"epoch": 10**400},
     {"capacity": 0.5},
     {"battery": 2.0},
     {"load": math.nan},
@@ -194,7 +195,7 @@ def check_many(make: Make) -> None:
     """With 300 agents everything is as with three."""
     dice = random.Random("many")
     one = team(dice)[0]
-    contacts = [replace(one, agent=f"agent-{number:03d}", cost=1.0 + number) for number in range(300)]
+    contacts = [replace(one, agent=f"agent-{number:03d}", cost=1000.0 * (1 + number)) for number in range(300)]
     strategy = make()
     found = strategy.find(contacts)
     _demand(found.assigned_agent in {r.agent for r in contacts}, "nobody is found among 300")

@@ -124,10 +124,10 @@ def refusal(report: Report) -> str:
         if why := _unlawful(number, lowest=-MAX_NUMBER):
             return f"value {why}"
     if type(report.battery) not in (float, int) or not 0.0 <= report.battery <= 1.0:
-        return f"battery {report.battery!r:.40} is no share"
+        return f"battery {_told(report.battery)} is no share"
     for whole in (report.epoch, report.sequence, report.capacity):
         if type(whole) is not int or not 0 <= whole < MAX_WHOLE:
-            return f"{whole!r:.40} is no epoch, sequence or capacity"
+            return f"{_told(whole)} is no epoch, sequence or capacity"
     for text in (report.task, report.choice):
         if not isinstance(text, str) or len(text) > MAX_NAME:
             return "task or choice is no text, or too long"
@@ -212,7 +212,14 @@ def _unlawful(number: float, lowest: float = 0.0) -> str:
         return "is not a number"
     if number in (float("inf"), float("-inf")):
         return "is infinite"
-    return f"{number:.3g} is negative" if lowest == 0.0 and number < 0.0 else f"{number:.3g} is enormous"
+    return f"{_told(number)} is negative" if lowest == 0.0 and number < 0.0 else f"{_told(number)} is enormous"
+
+
+def _told(number: object) -> str:
+    try:
+        return f"{number:.3g}" if isinstance(number, float) else repr(number)[:40]
+    except ValueError:  # a whole number of thousands of digits
+        return "a number of thousands of digits"
 
 
 def _order(report: Report, rank: Callable[[Report], float]) -> tuple[object, ...]:

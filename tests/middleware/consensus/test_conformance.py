@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import runpy
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -229,6 +230,13 @@ class ConformanceTests(SynchronousTestCase):
         self.assertEqual(list(broken(Unnamed)), ["name"])
         self.assertEqual(list(broken(Nervous)), ["improves"])
         self.assertEqual(list(broken(Concatenates)), ["merge"])
+
+    def test_examples_conform(self) -> None:
+        """The template and the example of one's own pass as they are."""
+        for name in ("spare:Spare", "template:Farthest"):
+            module, _, attribute = name.partition(":")
+            found = runpy.run_path(str(ROOT / "examples" / "strategy" / f"{module}.py"))
+            self.assertEqual(broken(found[attribute]), {}, name)
 
     def test_same_in_every_process(self) -> None:
         """Every strategy finds the same, digest included, however the process hashes its strings."""
