@@ -61,6 +61,7 @@ def with_all_bids() -> GroupOptimal:
 DECIDERS: dict[str, Decider] = {
     "nearest, in order": in_order,
     "cbba": bundled,
+    "cbba, then meetings": bundled,
     "cbba + exchange": shared(Cbba()),
     "sequential": shared(Sequential()),
     "group_optimal, 20 bids": shared(GroupOptimal()),

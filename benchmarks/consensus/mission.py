@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import random
+from collections.abc import Collection
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -58,11 +59,12 @@ class Mission:
         """The way from each agent to each task, in whole millionths of a metre."""
         return {a: {t: exact(math.dist(s, p)) for t, p in self.places.items()} for a, s in self.starts.items()}
 
-    def reports(self, agents: list[str], bids: int) -> list[Report]:
-        """The bids of some agents, each for as many tasks as there may be ``bids``, the nearest first."""
+    def reports(self, agents: list[str], bids: int, also: Collection[str] = ()) -> list[Report]:
+        """The bids of some agents, each for as many tasks as there may be ``bids``, the nearest first, and ``also``."""
         found = []
         for agent in agents:
             start = self.starts[agent]
-            ways = sorted((math.dist(start, place), task) for task, place in self.places.items())[:bids]
+            ways = sorted((math.dist(start, place), task) for task, place in self.places.items())
+            ways = ways[:bids] + [(way, task) for way, task in ways[bids:] if task in also]
             found += [Report(agent, way, task=t, value=start, capacity=self.capacity) for way, t in ways]
         return found

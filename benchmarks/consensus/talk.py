@@ -10,6 +10,7 @@ import msgpack
 
 from benchmarks.consensus.mission import SIDE, Mission
 from middleware.consensus.bidder import Bidder, Score, Statement
+from middleware.consensus.exchange import met, partners
 
 PAUSE = 5
 """Rounds between two messages of an agent: what it learns meanwhile goes in one."""
@@ -27,6 +28,32 @@ class Talked:
     messages: float
     octets: float
     cpu_s: float
+
+
+def after_meetings(mission: Mission, owners: dict[str, str]) -> tuple[dict[str, str], float]:
+    """Who has each task after agents have met two by two until no meeting helps, and the messages of each agent.
+
+    A meeting is a message there and one back; who has met without success meets the same again only after a change.
+    """
+    room = dict.fromkeys(mission.alive, mission.capacity)
+    owners = dict(owners)
+    messages = 0
+    seen: set[tuple[object, ...]] = set()
+    is_changed = True
+    while is_changed:
+        is_changed = False
+        for agent in mission.alive:
+            for other in partners(agent, owners, mission.costs[agent]):
+                held = tuple(sorted((task, a) for task, a in owners.items() if a in (agent, other)))
+                if held in seen:
+                    continue
+                seen.add(held)
+                messages += 2
+                now = met(agent, other, owners, mission.costs, room)
+                if any(owners[task] != a for task, a in now.items()):
+                    owners.update(now)
+                    is_changed = True
+    return owners, messages / len(mission.alive)
 
 
 def neighbours(names: list[str], seed: int) -> dict[str, list[str]]:

@@ -25,6 +25,25 @@ def exchanged(
     return owner
 
 
+def partners(agent: str, owners: Mapping[str, str], costs: Mapping[str, int], most: int = 16) -> list[str]:
+    """Whom an agent should meet, to swap with: those who have the tasks that cost it least, the nearest first."""
+    near = sorted((cost, task) for task, cost in costs.items() if task in owners)
+    return list(dict.fromkeys(owners[task] for _, task in near if owners[task] != agent))[:most]
+
+
+def met(
+    one: str,
+    other: str,
+    owners: Mapping[str, str],
+    costs: Mapping[str, Mapping[str, int]],
+    capacities: Mapping[str, int],
+) -> dict[str, str]:
+    """Who of two agents has each of their tasks after they met: each told the other what those tasks cost it."""
+    both = {task: agent for task, agent in owners.items() if agent in (one, other)}
+    rows = {agent: {task: costs[agent][task] for task in both if task in costs[agent]} for agent in (one, other)}
+    return exchanged(both, rows, capacities)
+
+
 def _moved(
     task: str,
     owner: dict[str, str],
