@@ -55,7 +55,7 @@ def solved(costs: Costs) -> tuple[list[int], list[float]]:
 def _bid(costs: Costs, prices: list[float], owner: list[int], free: list[int]) -> list[int]:
     """Let each free row outbid others for the column it likes best; gives the rows that are free afterwards."""
     lost: list[int] = []
-    patience = 4 * len(free)
+    patience = len(free)
     free = free[::-1]
     while free:
         row = free.pop()
@@ -95,8 +95,7 @@ def _augment(costs: Costs, prices: list[float], owner: list[int], row: int) -> N
         line = costs[through]
         base = so_far - line[reached] + prices[reached]
         for column in todo:
-            there = base + line[column] - prices[column]
-            if there < length[column]:
+            if (there := base + line[column] - prices[column]) < length[column]:
                 length[column] = there
                 before[column] = through
     for column in done:
