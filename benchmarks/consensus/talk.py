@@ -36,22 +36,29 @@ def after_meetings(mission: Mission, owners: dict[str, str]) -> tuple[dict[str, 
     A meeting is a message there and one back; who has met without success meets the same again only after a change.
     """
     room = dict.fromkeys(mission.alive, mission.capacity)
+    near = {agent: sorted(row, key=lambda task: (row[task], task)) for agent, row in mission.costs.items()}
     owners = dict(owners)
+    held: dict[str, dict[str, str]] = {agent: {} for agent in mission.alive}
+    for task, agent in owners.items():
+        held[agent][task] = agent
     messages = 0
     seen: set[tuple[object, ...]] = set()
     is_changed = True
     while is_changed:
         is_changed = False
         for agent in mission.alive:
-            for other in partners(agent, owners, mission.costs[agent]):
-                held = tuple(sorted((task, a) for task, a in owners.items() if a in (agent, other)))
-                if held in seen:
+            for other in partners(agent, owners, near[agent]):
+                both = held[agent] | held[other]
+                state = tuple(sorted(both.items()))
+                if state in seen:
                     continue
-                seen.add(held)
+                seen.add(state)
                 messages += 2
-                now = met(agent, other, owners, mission.costs, room)
-                if any(owners[task] != a for task, a in now.items()):
+                now = met(agent, other, both, mission.costs, room)
+                if now != both:
                     owners.update(now)
+                    for one in (agent, other):
+                        held[one] = {task: owner for task, owner in now.items() if owner == one}
                     is_changed = True
     return owners, messages / len(mission.alive)
 

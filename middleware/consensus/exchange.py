@@ -6,7 +6,7 @@ agents on what the two of them hold; either way it never costs more than before.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 SWEEPS = 50
 
@@ -25,10 +25,16 @@ def exchanged(
     return owner
 
 
-def partners(agent: str, owners: Mapping[str, str], costs: Mapping[str, int], most: int = 16) -> list[str]:
-    """Whom an agent should meet, to swap with: those who have the tasks that cost it least, the nearest first."""
-    near = sorted((cost, task) for task, cost in costs.items() if task in owners)
-    return list(dict.fromkeys(owners[task] for _, task in near if owners[task] != agent))[:most]
+def partners(agent: str, owners: Mapping[str, str], near: Iterable[str], most: int = 16) -> list[str]:
+    """Whom an agent should meet, to swap with: who has the tasks that it would have liked best, ``near`` in order."""
+    found: dict[str, None] = {}
+    for task in near:
+        owner = owners.get(task, agent)
+        if owner != agent:
+            found[owner] = None
+            if len(found) >= most:
+                break
+    return list(found)
 
 
 def met(
