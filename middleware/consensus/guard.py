@@ -7,11 +7,12 @@ the answer says so.  None of this is needed for safety, which rests on leases; i
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from twisted.logger import Logger
 
+from middleware.consensus.item import Item, capacities, listed
 from middleware.consensus.nearest import Nearest
 from middleware.consensus.strategy import (
     MAX_NAME,
@@ -20,6 +21,7 @@ from middleware.consensus.strategy import (
     ConsensusAlgorithm,
     Report,
     refusal,
+    standing,
 )
 from middleware.errors import SwarmError
 
@@ -73,6 +75,22 @@ class Guard:
             said = f"{self.name} has no opinion ({why}); {self._fallback.name}: {instead.reason}"
             return replace(instead, strategy=self._fallback.name, reason=said)
         return replace(found, strategy=self.name)
+
+    def find_group(self, contacts: Sequence[Report], items: Sequence[Item]) -> tuple[Consensus, ...]:
+        """One consensus point for each item; of a strategy for one task, or of the fallback, one after the other."""
+        lawful = tuple(sorted((r for r in contacts if not refusal(r)), key=_order))
+        whole = getattr(self.strategy, "find_group", None)
+        if whole is None:
+            return one_by_one(self.find, lawful, items)
+        try:
+            self._may_be_asked()
+            return checked_group(whole(lawful, items), lawful, items)
+        except NotImplementedError:
+            return one_by_one(self.find, lawful, items)
+        except Exception as error:  # the strategy is foreign code
+            said = f"{self.name} has no opinion ({self._failed(error)}); {self._fallback.name}: "
+            found = one_by_one(self._fallback.find, lawful, items)
+            return tuple(replace(p, strategy=self._fallback.name, reason=said + p.reason) for p in found)
 
     def improves(self, current: Report, offer: Report, hysteresis: float) -> bool:
         """Whether ``offer`` should take over; the fallback says so where the strategy has no opinion."""
@@ -143,6 +161,41 @@ def checked(found: Consensus, contacts: Sequence[Report]) -> Consensus:
     if not all(type(n) in (int, float) and -MAX_NUMBER <= n <= MAX_NUMBER for n in found.value):
         raise NoOpinion("its value is no place")
     return found
+
+
+def checked_group(
+    found: Sequence[Consensus], contacts: Sequence[Report], items: Sequence[Item]
+) -> tuple[Consensus, ...]:
+    """``found`` if it has one possible point for each item and gives nobody too much; raises ``NoOpinion`` else."""
+    if not isinstance(found, tuple) or not all(isinstance(point, Consensus) for point in found):
+        raise NoOpinion("find_group answers no tuple of Consensus")
+    if [point.task for point in found] != [item.task for item in listed(items)]:
+        raise NoOpinion("it does not give one answer for each task")
+    wanted = {"", *(item.task for item in items)}
+    room = capacities(report for report in standing(contacts) if report.task in wanted)
+    for point in found:
+        checked(point, [report for report in contacts if report.task in (point.task, "")])
+        for agent in {*point.assigned, *filter(None, (point.assigned_agent,))}:
+            room[agent] = room.get(agent, 0) - 1
+    if tired := sorted(agent for agent, left in room.items() if left < 0):
+        raise NoOpinion(f"it gives {tired[0]!r:.60} more than it takes")
+    return found
+
+
+def one_by_one(
+    find: Callable[[Sequence[Report]], Consensus], contacts: Sequence[Report], items: Sequence[Item]
+) -> tuple[Consensus, ...]:
+    """The tasks by name, each decided by itself; who has enough to do is left out."""
+    counted = standing(contacts)
+    room = capacities(counted)
+    points = []
+    for item in listed(items):
+        free = [replace(r, task=item.task) for r in counted if r.task in (item.task, "") and room[r.agent] > 0]
+        point = replace(find(free), task=item.task, epoch=counted[0].epoch if counted else 0)
+        if point.assigned_agent is not None:
+            room[point.assigned_agent] -= 1
+        points.append(point)
+    return tuple(points)
 
 
 def _order(report: Report) -> tuple[object, ...]:

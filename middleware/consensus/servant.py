@@ -14,6 +14,7 @@ from typing import Any, BinaryIO
 
 import msgpack
 
+from middleware.consensus.item import Item
 from middleware.consensus.strategy import Report
 
 LENGTH = struct.Struct("!I")
@@ -27,6 +28,11 @@ def served(strategy: Any, method: str, arguments: list[Any]) -> Any:
         return astuple(strategy.find([_report(r) for r in arguments]))
     if method == "improves":
         return strategy.improves(_report(arguments[0]), _report(arguments[1]), arguments[2])
+    if method == "find_group":
+        if not hasattr(strategy, "find_group"):
+            return None
+        items = [Item(task, tuple(position), slots) for task, position, slots in arguments[1]]
+        return [astuple(point) for point in strategy.find_group([_report(r) for r in arguments[0]], items)]
     a, b = ([_report(r) for r in part] for part in arguments)
     return [astuple(r) for r in strategy.merge(a, b)]
 

@@ -19,6 +19,7 @@ from typing import Any
 import msgpack
 
 from middleware.consensus.guard import Lost, NoOpinion
+from middleware.consensus.item import Item
 from middleware.consensus.strategy import Consensus, Report
 
 DEADLINE_S = 0.2
@@ -49,11 +50,16 @@ class Worker:
 
     def find(self, contacts: Sequence[Report]) -> Consensus:
         """What the strategy finds."""
-        answer = self._asked("find", [astuple(r) for r in contacts])
-        try:
-            return Consensus(*_fields(answer))
-        except TypeError as error:
-            raise NoOpinion(f"find answers {answer!r:.60}") from error
+        return _consensus(self._asked("find", [astuple(r) for r in contacts]))
+
+    def find_group(self, contacts: Sequence[Report], items: Sequence[Item]) -> tuple[Consensus, ...]:
+        """What the strategy finds, if it is one for several tasks; raises ``NotImplementedError`` otherwise."""
+        answer = self._asked("find_group", [[astuple(r) for r in contacts], [astuple(i) for i in items]])
+        if answer is None:
+            raise NotImplementedError
+        if not isinstance(answer, list):
+            raise NoOpinion(f"find_group answers {answer!r:.60}")
+        return tuple(_consensus(point) for point in answer)
 
     def improves(self, current: Report, offer: Report, hysteresis: float) -> bool:
         """What the strategy says."""
@@ -160,6 +166,13 @@ class Raised(NoOpinion):
 def report_of(fields: Sequence[Any]) -> Report:
     """A report out of what ``astuple`` made of it and a pipe carried."""
     return Report(*_fields(fields))
+
+
+def _consensus(answer: Any) -> Consensus:
+    try:
+        return Consensus(*_fields(answer))
+    except TypeError as error:
+        raise NoOpinion(f"it answers {answer!r:.60}, not Consensus") from error
 
 
 def _fields(values: Sequence[Any]) -> list[Any]:

@@ -10,7 +10,9 @@ from pathlib import Path
 
 from twisted.trial.unittest import SynchronousTestCase
 
+from middleware.consensus.cbba import Cbba
 from middleware.consensus.guard import STRIKES, Guard
+from middleware.consensus.item import Item
 from middleware.consensus.nearest import Nearest
 from middleware.consensus.selection import guarded
 from middleware.consensus.strategy import Consensus, Report
@@ -23,6 +25,10 @@ PATIENCE = 20.0
 
 class Good(Nearest):
     name = "good"
+
+
+class Many(Cbba):
+    name = "many"
 
 
 class Looping(Nearest):
@@ -94,6 +100,14 @@ class WorkerTests(SynchronousTestCase):
         self.assertEqual(guard.find(TEAM).strategy, "Good")
         self.assertTrue(guard.improves(TEAM[0], TEAM[1], 0.1))
         self.assertEqual(guard.merge(TEAM, TEAM), Nearest().merge(TEAM, ()))
+        self.assertEqual(self.flushLoggedErrors(), [])
+
+    def test_group(self) -> None:
+        """A strategy for several tasks answers so from its own process; one for one task is asked for each."""
+        items = [Item("s", (1.0, 2.0)), Item("t")]
+        bids = [Report(a, c, task=t) for a, c in (("a", 1.0), ("b", 2.0)) for t in "st"]
+        self.assertEqual(self.guard("Many").find_group(bids, items), Cbba().find_group(bids, items))
+        self.assertEqual([p.assigned_agent for p in self.guard("Good").find_group(bids, items)], ["a", "b"])
         self.assertEqual(self.flushLoggedErrors(), [])
 
     def test_looping(self) -> None:

@@ -8,7 +8,9 @@ from dataclasses import replace
 
 from twisted.trial.unittest import SynchronousTestCase
 
+from middleware.consensus.cbba import Cbba
 from middleware.consensus.guard import STRIKES, Guard, Lost
+from middleware.consensus.item import Item
 from middleware.consensus.nearest import Nearest
 from middleware.consensus.selection import guarded
 from middleware.consensus.strategy import Consensus, Report
@@ -175,6 +177,35 @@ class GuardTests(SynchronousTestCase):
         self.assertEqual(guard.merge(TEAM, ()), Nearest().merge(TEAM, ()))
         self.assertTrue(guard.improves(TEAM[0], TEAM[1], 0.1))
         self.assertEqual(len(self.flushLoggedErrors()), 2)
+
+    def test_group(self) -> None:
+        """Of several tasks too: a good answer stays; one that leaves a task out or gives too much falls back."""
+        items = [Item("s"), Item("t")]
+        bids = [Report(a, c, task=t) for a, c in (("a", 1.0), ("b", 2.0)) for t in "st"]
+        good = Cbba().find_group(bids, items)
+        self.assertEqual(Guard(Cbba()).find_group(bids, items), good)
+        self.assertEqual([p.assigned_agent for p in Guard(Nearest()).find_group(bids, items)], ["a", "b"])
+
+        class Bad(Cbba):
+            answer: object = ()
+
+            def find_group(self, contacts: Sequence[Report], items: Sequence[Item]) -> tuple[Consensus, ...]:
+                return self.answer  # type: ignore[return-value]
+
+        for answer, why in (
+            (good[:1], "one answer for each task"),
+            (good[::-1], "one answer for each task"),
+            ((good[0], replace(good[0], task="t")), "gives 'a' more than it takes"),
+            ((good[0], replace(good[1], assigned_agent="zorro")), "who did not report"),
+            (("s", "t"), "no tuple of Consensus"),
+            (None, "no tuple of Consensus"),
+        ):
+            bad = Bad()
+            bad.answer = answer
+            found = Guard(bad).find_group(bids, items)
+            self.assertEqual([p.assigned_agent for p in found], ["a", "b"])
+            self.assertIn(why, found[0].reason)
+            self.flushLoggedErrors()
 
     def test_unlawful_reports_never_reach_it(self) -> None:
         """A strategy behind a guard sees lawful reports only, so what it believes does no harm."""
