@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 from middleware.consensus.strategy import Consensus, Report, better, digest_of, standing
 
-KEPT = 16
-"""How many of the best a summary keeps: one to act, the others to stand by; so it fits into one datagram."""
+KEPT = 4
+"""How many of the best a summary keeps: one to act, the others to stand by; signed, that many fill a datagram."""
 
 
 class Nearest:

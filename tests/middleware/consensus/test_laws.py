@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.consensus.conformance import team
+from middleware.consensus.nearest import KEPT
 from middleware.consensus.strategy import BUILT_IN, Report, strategy_for
 
 reports = st.builds(
@@ -61,7 +62,7 @@ class LawTests(SynchronousTestCase):
                 summary: tuple[Report, ...] = ()
                 for start in range(0, len(contacts), 7):
                     summary = strategy.merge(strategy.merge((), contacts[start : start + 7]), summary)
-                self.assertLessEqual(len(summary), 16)
+                self.assertLessEqual(len(summary), KEPT)
                 self.assertEqual(strategy.find(summary), strategy.find(contacts))
 
 
