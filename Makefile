@@ -12,6 +12,7 @@ WEB_PORT ?=
 NODES  ?= 8,32
 SECONDS ?= 5
 PEERS  ?=
+QUICK  ?=
 
 # Wheels only: nothing is ever compiled here.  Our own tree is installed without a build sandbox,
 # so that a second run needs no network.
@@ -22,7 +23,8 @@ DEV     := $(VENV)/.stamp-dev
 BROWSER := $(VENV)/.stamp-browser
 BENCH   := $(VENV)/.stamp-bench
 
-.PHONY: help demo test trials check format cov live schedules browser bench-demo bench-dht bench-takeover api dist clean
+.PHONY: help demo test trials check format cov live schedules browser \
+    bench-demo bench-dht bench-consensus bench-takeover api dist clean
 
 help:
 	@echo 'make demo [HEADLESS=1] [SEED=1]       three dogs, a red target and the page; HEADLESS: both experiments, then exit'
@@ -38,6 +40,7 @@ help:
 	@echo 'make bench-demo                       what the demonstration costs: memory, datagrams, seconds'
 	@echo 'make bench-dht [NODES=8,32] [SECONDS=5] [PEERS=..]   the peer-to-peer library beside others of its kind'
 	@echo 'make bench-takeover [N=200] [REAL=20]   seconds to take over, for each way to lose who acts'
+	@echo 'make bench-consensus [QUICK=1]        every strategy over the same missions: cost, messages, time to agree'
 	@echo 'make api                              the reference of every class, from the docstrings, in build/api'
 	@echo 'make dist                             sdist and wheel, installed into a fresh environment and asked for help'
 	@echo 'make clean                            remove what the above left behind, the environment included'
@@ -88,6 +91,11 @@ bench-dht: $(BENCH)
 
 bench-takeover: $(RUNTIME)
 	$(PY) -m benchmarks.takeover --count $(if $(filter file,$(origin N)),200,$(N)) --real $(REAL) --seed $(SEED)
+
+bench-consensus: $(BENCH)
+	@mkdir -p build
+	$(PY) -m benchmarks.consensus $(if $(filter-out 0,$(QUICK)),--quick) \
+	    --out build/bench-consensus.json --plot build/bench-consensus.svg
 
 api: $(DEV)
 	$(PIP) 'pydoctor>=25.10,<26'

@@ -2,34 +2,47 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
-from middleware.consensus.strategy import Consensus, Report, digest_of
+from middleware.consensus.strategy import Consensus, Report, better, digest_of, standing
+
+KEPT = 4
+"""How many of the best a summary keeps: one to act, the others to stand by; signed, that many fill a datagram."""
 
 
 class Nearest:
     """The lowest cost wins; equal costs are decided by the agent's id, so that there is never none and never two."""
 
     name = "nearest"
+    version = "2"
 
     def find(self, contacts: Sequence[Report]) -> Consensus:
-        """The consensus point; None is assigned where nobody reports a finite, non-negative cost."""
-        best: dict[str, Report] = {}
-        for report in contacts:
-            if _is_lawful(report):
-                known = best.get(report.agent)
-                if known is None or report.cost < known.cost:
-                    best[report.agent] = report
-        order = [r.agent for r in sorted(best.values(), key=lambda r: (r.cost, r.agent))]
+        """The consensus point; None is assigned where no report counts (``strategy.refused`` says why)."""
+        order = best_of(contacts)
         if not order:
-            return Consensus(None)
-        return Consensus(order[0], tuple(order[1:]), digest_of(list(best.values())))
+            return Consensus(None, strategy=self.name, reason="no report counts")
+        first = order[0]
+        return Consensus(
+            first.agent,
+            tuple(r.agent for r in order[1:]),
+            digest_of(order),
+            first.task,
+            first.epoch,
+            (first.agent,),
+            strategy=self.name,
+            reason=f"{first.cost:.2f}, least of {len(order)}",
+        )
 
     def improves(self, current: Report, offer: Report, hysteresis: float) -> bool:
         """Whether ``offer`` is nearer by more than the share ``hysteresis``; what is no distance never is."""
-        return _is_lawful(offer) and offer.cost < current.cost * (1.0 - hysteresis)
+        return better(current, offer, hysteresis)
+
+    def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
+        """The best of both."""
+        return tuple(best_of((*a, *b)))
 
 
-def _is_lawful(report: Report) -> bool:
-    return math.isfinite(report.cost) and report.cost >= 0
+def best_of(contacts: Sequence[Report]) -> list[Report]:
+    """The lowest costs, one of each agent, the lowest first; of several tasks only the first by name is looked at."""
+    counted = standing(contacts)
+    return sorted((r for r in counted if r.task == counted[0].task), key=lambda r: (r.cost, r.agent))[:KEPT]

@@ -10,6 +10,7 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field, fields, replace
 from functools import cached_property
+from typing import Any
 
 import msgpack
 
@@ -89,7 +90,7 @@ def report_of(content: object, agent: str) -> Report | None:
     """The report of ``agent`` in what ``packed_report`` made, or None; a cost that is no finite distance is none."""
     if not isinstance(content, Mapping) or not is_cost(content.get("cost")):
         return None
-    others = {name: _as_sent(value) for name, value in content.items() if name != "cost"}
+    others: dict[str, Any] = {name: _as_sent(value) for name, value in content.items() if name != "cost"}
     for name, value in others.items():
         usual = _DEFAULTS.get(name, MISSING)
         if usual is MISSING or not _is_like(value, usual):

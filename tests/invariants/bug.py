@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 from twisted.internet.defer import Deferred, succeed
 
 from agents import circle
 from agents.docket import Docket
+from middleware.consensus import bidder, nearest
 from middleware.consensus.nearest import Nearest
-from middleware.consensus.strategy import Consensus, digest_of
+from middleware.consensus.strategy import Report
 from middleware.entangled.data import schema
 from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.data.sqlite import SqliteStore
@@ -111,10 +113,21 @@ def _buried_and_forgotten(self: Docket, task_id: str, now: float) -> None:
     self._open.pop(task_id, None)
 
 
-def _first_come(self: Nearest, contacts: Any) -> Consensus:
-    order = [report.agent for report in sorted(contacts, key=lambda report: report.cost)]
-    return Consensus(order[0], tuple(order[1:]), digest_of(contacts)) if order else Consensus(None)
+def _first_come(contacts: Any) -> list[Report]:
+    return sorted(contacts, key=lambda report: report.cost)
 
+
+def _numbered_in_a_byte(contacts: Any) -> list[Report]:
+    order = _BEST_OF(contacts)
+    names = sorted({report.agent for report in contacts})
+    return [replace(r, agent=names[(names.index(r.agent) + 128) % 256 - 128]) for r in order]
+
+
+def _not_a_number_first(contacts: Any) -> list[Report]:
+    return sorted(contacts, key=lambda r: (r.cost >= 0, r.cost, r.agent))
+
+
+_BEST_OF = nearest.best_of
 
 BUGS: dict[str, list[tuple[Any, str, Any]]] = {
     "tombstone dropped too early": [(owner, "TOMBSTONE_TTL", 3.0)],
@@ -153,9 +166,14 @@ BUGS: dict[str, list[tuple[Any, str, Any]]] = {
     "a full disk takes records": [(SqliteStore, "put", MemoryStore.put)],
     # Tasks.
     "the end of a task is forgotten": [(Docket, "bury", _buried_and_forgotten)],
-    "equal bids have no order": [(Nearest, "find", _first_come)],
+    "equal bids have no order": [(nearest, "best_of", _first_come)],
     "a little better is enough": [(Nearest, "improves", lambda self, held, offer, _: offer.cost < held.cost)],
     "old rounds count": [(circle, "is_older", lambda told, known: False)],
+    # Strategies.
+    "no tie-break": [(nearest, "best_of", _first_come)],
+    "agents are numbered in a byte": [(nearest, "best_of", _numbered_in_a_byte)],
+    "a cost that is not a number wins": [(nearest, "best_of", _not_a_number_first)],
+    "bidders stop after one quiet round": [(bidder, "is_over", lambda rounds, quiet, tasks, members: quiet >= 1)],
 }
 
 FINDERS: dict[str, tuple[str, ...]] = {
@@ -175,6 +193,10 @@ FINDERS: dict[str, tuple[str, ...]] = {
     "equal bids have no order": ("tasks",),
     "a little better is enough": ("tasks",),
     "old rounds count": ("tasks",),
+    "no tie-break": ("deciders",),
+    "agents are numbered in a byte": ("deciders",),
+    "a cost that is not a number wins": ("deciders",),
+    "bidders stop after one quiet round": ("deciders",),
 }
 """The workloads that look for a bug, where these are not the records."""
 

@@ -287,8 +287,9 @@ class Node:
         self.on_tasks = changed
         self.ether.listed(self.place)
 
-    def group(self, task_id: str, heard: Any, ordered: Any) -> Any:
+    def group(self, task: Task, heard: Any, ordered: Any) -> Any:
         """A place among those at a task."""
+        task_id = task.task_id
         followers = self.groups.setdefault(task_id, [])
         followers.append((heard, ordered))
         place, ether = self.place, self.ether

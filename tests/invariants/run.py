@@ -11,6 +11,7 @@ from functools import partial
 
 from tests.fleet import Fleet
 from tests.invariants.bug import seeded
+from tests.invariants.deciders import Deciders
 from tests.invariants.disk import DiskFleet
 from tests.invariants.records import Records
 from tests.invariants.schedule import Schedule, Workload
@@ -24,11 +25,12 @@ WORKLOADS: dict[str, Callable[[Schedule], Workload]] = {
     "tuples": Tuples,
     "stores": Stores,
     "wire": Wire,
+    "deciders": Deciders,
 }
 """Each may be asked for by name; the order is the one in which they act."""
 ALONE = {"tasks": Tasks}
 """Those that need no fleet: a world of their own beside it, with faults of its own."""
-SHARES = {"records": 1.0, "tuples": 0.06, "stores": 0.06, "wire": 0.06}
+SHARES = {"records": 1.0, "tuples": 0.06, "stores": 0.06, "wire": 0.06, "deciders": 0.06}
 """The share of schedules in which each takes part, unless it is asked for."""
 ALONE_SHARE = 0.25
 

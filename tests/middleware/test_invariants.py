@@ -43,6 +43,10 @@ BITING_ELSEWHERE = {
     "equal bids have no order": (1, "E7"),
     "a little better is enough": (5, "E6"),
     "old rounds count": (2, "E7"),
+    "no tie-break": (1, "C1"),
+    "agents are numbered in a byte": (1, "C3"),
+    "a cost that is not a number wins": (1, "C2"),
+    "bidders stop after one quiet round": (1, "C4"),
 }
 """The same of the quickest bugs that other workloads look for."""
 ALL = tuple(WORKLOADS)

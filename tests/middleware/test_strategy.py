@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import sys
+from dataclasses import replace
 
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.consensus.nearest import Nearest
-from middleware.consensus.strategy import Report, digest_of, strategy_for
+from middleware.consensus.strategy import BUILT_IN, Report, better, digest_of, refusal, refused, standing, strategy_for
 from middleware.errors import UnknownStrategy
 
 
@@ -41,6 +43,54 @@ class StrategyTests(SynchronousTestCase):
         broken = f"{__name__}:Broken"
         for name in ("no.such:X", "middleware.consensus.nearest:No", ":X", ".x:Y", "math:", broken, "math:pi"):
             self.assertRaises(UnknownStrategy, strategy_for, name, dotted=True)
+
+    def test_every_built_in_loads(self) -> None:
+        """Whatever is in the box can be made, and says the name by which it was asked for."""
+        for name in BUILT_IN:
+            self.assertEqual(strategy_for(name).name, name)
+
+    def test_refused_by_name(self) -> None:
+        """Each report that counts for nothing is named, with what is wrong with it."""
+        rows = [
+            ({"cost": math.nan}, "cost is not a number"),
+            ({"cost": math.inf}, "cost is infinite"),
+            ({"cost": -math.inf}, "cost is infinite"),
+            ({"cost": -2.0}, "cost -2 is negative"),
+            ({"cost": 1e12}, "cost 1e+12 is enormous"),
+            ({"cost": True}, "cost is no number"),
+            ({"cost": "1"}, "cost is no number"),
+            ({"cost": None}, "cost is no number"),
+            ({"cost": 10**5000}, "cost a number of thousands of digits is enormous"),
+            ({"weight": -1.0}, "weight -1 is negative"),
+            ({"electorate": math.inf}, "electorate is infinite"),
+            ({"value": (0.0, math.nan)}, "value is not a number"),
+            ({"value": (1e300,)}, "value 1e+300 is enormous"),
+            ({"value": [1.0]}, "value is no place"),
+            ({"battery": 1.5}, "battery 1.5 is no share"),
+            ({"epoch": -1}, "-1 is no epoch, sequence or capacity"),
+            ({"capacity": 2.0}, "2 is no epoch, sequence or capacity"),
+            ({"choice": "x" * 999}, "task or choice is no text, or too long"),
+            ({"agent": ""}, "the agent has no name, or too long a one"),
+            ({"unmet": ("has no camera", "has no gripper")}, "cannot do it: has no camera, has no gripper"),
+            ({"age": 6.5, "valid_for": 5.0}, "stale: 6.5 s old, valid for 5 s"),
+        ]
+        for change, why in rows:
+            bad = replace(Report("dog", 1.0), **change)  # type: ignore[arg-type]
+            self.assertEqual(refusal(bad), why)
+            self.assertEqual(refused([bad, Report("cat", 1.0)]), ((bad.agent, why),))
+        self.assertEqual(refused([Report("dog", 0.0, age=4.0, valid_for=5.0), Report("cat", 1, value=(-9.0,))]), ())
+
+    def test_newest_epoch_stands(self) -> None:
+        """Bids of an epoch that is over count no more, however low; within one the lowest of an agent stands."""
+        old, first, later = Report("a", 0.0), Report("a", 5.0, epoch=2), Report("a", 4.0, epoch=2)
+        other = Report("b", 9.0, epoch=2)
+        self.assertEqual(standing([old, other, first, later]), (later, other))
+
+    def test_better(self) -> None:
+        """Better is lawful, and lower by more than the share."""
+        self.assertTrue(better(Report("a", 10.0), Report("b", 8.9), 0.1))
+        for cost in (9.0, 10.0, math.nan, -1.0):
+            self.assertFalse(better(Report("a", 10.0), Report("b", cost), 0.1))
 
     def test_digest(self) -> None:
         """Equal reports have one digest in any order, duplicates included, and another cost has another."""

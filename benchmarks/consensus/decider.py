@@ -1,0 +1,69 @@
+"""Decider: the strategies, each as a function from bids to who has each task, and what it takes to agree on that."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+from benchmarks.consensus.mission import Mission
+from middleware.consensus.cbba import Cbba, greedy
+from middleware.consensus.group_optimal import GroupOptimal
+from middleware.consensus.item import GroupAlgorithm, capacities, exact
+from middleware.consensus.nearest import Nearest
+from middleware.consensus.sequential import Sequential
+from middleware.consensus.strategy import Consensus, Report
+
+Owners = dict[str, str]
+Decider = Callable[[Mission, list[Report]], Owners]
+
+
+def in_order(mission: Mission, reports: list[Report]) -> Owners:
+    """The rule of the thesis, one task after the other as they come; who has enough does not bid."""
+    left = capacities(reports)
+    owners: Owners = {}
+    bids: dict[str, list[Report]] = {}
+    for report in reports:
+        bids.setdefault(report.task, []).append(replace(report, capacity=1))
+    for task in mission.places:
+        free = [r for r in bids.get(task, ()) if left[r.agent] > 0]
+        chosen = Nearest().find(free).assigned_agent
+        if chosen is not None:
+            owners[task] = chosen
+            left[chosen] -= 1
+    return owners
+
+
+def bundled(mission: Mission, reports: list[Report]) -> Owners:
+    """CBBA without exchange, which ends at the greedy assignment."""
+    costs: dict[str, dict[str, float]] = {}
+    for report in reports:
+        costs.setdefault(report.agent, {})[report.task] = exact(report.cost)
+    return greedy(costs, capacities(reports))
+
+
+def shared(strategy: GroupAlgorithm) -> Decider:
+    """A strategy for several tasks."""
+
+    def decide(mission: Mission, reports: list[Report]) -> Owners:
+        points: tuple[Consensus, ...] = strategy.find_group(reports, mission.items)
+        return {point.task: point.assigned_agent for point in points if point.assigned_agent is not None}
+
+    return decide
+
+
+def with_all_bids() -> GroupOptimal:
+    """The optimum of every bid, instead of 20 of each."""
+    strategy = GroupOptimal()
+    strategy.bids = 10**6
+    return strategy
+
+
+DECIDERS: dict[str, Decider] = {
+    "nearest, in order": in_order,
+    "cbba": bundled,
+    "cbba, then meetings": bundled,
+    "cbba + exchange": shared(Cbba()),
+    "sequential": shared(Sequential()),
+    "group_optimal, 20 bids": shared(GroupOptimal()),
+    "group_optimal": shared(with_all_bids()),
+}

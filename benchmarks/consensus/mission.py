@@ -1,0 +1,70 @@
+"""Mission: agents and tasks in a square of one kilometre, some of the agents failing; equal for equal seeds."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Collection
+from dataclasses import dataclass
+from functools import cached_property
+
+from middleware.consensus.item import Item, exact
+from middleware.consensus.strategy import Report
+
+SIDE = 1000.0
+Place = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Mission:
+    """``agents`` and ``tasks`` by seed; ``failed`` of 100 agents fall silent after they have bid."""
+
+    agents: int
+    tasks: int
+    seed: int
+    failed: int = 0
+    spare: int = 0
+
+    @property
+    def capacity(self) -> int:
+        """How many tasks an agent takes, as few as suffice for those that are left, and ``spare`` more."""
+        return math.ceil(self.tasks / max(1, len(self.alive))) + self.spare
+
+    @cached_property
+    def starts(self) -> dict[str, Place]:
+        """Where each agent stands."""
+        dice = random.Random(f"agents/{self.agents}/{self.tasks}/{self.seed}")
+        return {f"a{n:04d}": (dice.uniform(0, SIDE), dice.uniform(0, SIDE)) for n in range(self.agents)}
+
+    @cached_property
+    def places(self) -> dict[str, Place]:
+        """Where each task is."""
+        dice = random.Random(f"tasks/{self.agents}/{self.tasks}/{self.seed}")
+        return {f"t{n:04d}": (dice.uniform(0, SIDE), dice.uniform(0, SIDE)) for n in range(self.tasks)}
+
+    @cached_property
+    def alive(self) -> list[str]:
+        """Who does not fail."""
+        dice = random.Random(f"failed/{self.agents}/{self.seed}")
+        gone = set(dice.sample(range(self.agents), self.agents * self.failed // 100))
+        return [agent for number, agent in enumerate(sorted(self.starts)) if number not in gone]
+
+    @cached_property
+    def items(self) -> list[Item]:
+        """The tasks as strategies see them."""
+        return [Item(task, place) for task, place in self.places.items()]
+
+    @cached_property
+    def costs(self) -> dict[str, dict[str, int]]:
+        """The way from each agent to each task, in whole millionths of a metre."""
+        return {a: {t: exact(math.dist(s, p)) for t, p in self.places.items()} for a, s in self.starts.items()}
+
+    def reports(self, agents: list[str], bids: int, also: Collection[str] = ()) -> list[Report]:
+        """The bids of some agents, each for as many tasks as there may be ``bids``, the nearest first, and ``also``."""
+        found = []
+        for agent in agents:
+            start = self.starts[agent]
+            ways = sorted((math.dist(start, place), task) for task, place in self.places.items())
+            ways = ways[:bids] + [(way, task) for way, task in ways[bids:] if task in also]
+            found += [Report(agent, way, task=t, value=start, capacity=self.capacity) for way, t in ways]
+        return found

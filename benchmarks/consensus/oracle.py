@@ -1,0 +1,99 @@
+"""Oracle: what a mission costs at least, by SciPy and OR-Tools where they are installed, else by our own means."""
+
+from __future__ import annotations
+
+import math
+import random
+from typing import Any
+
+from benchmarks.consensus.mission import Mission
+from middleware.consensus import hungarian
+from middleware.consensus.sequential import insertion, length
+
+STEPS_S = 60_000
+"""Steps of our own search for short ways in place of each second that OR-Tools would get."""
+
+
+def least_star(mission: Mission) -> tuple[float, str]:
+    """The least sum of ways there, if each task is a way of its own, and who says so; exact in either case."""
+    columns = [agent for agent in mission.alive for _ in range(mission.capacity)]
+    costs = [[mission.costs[agent][task] for agent in columns] for task in mission.places]
+    try:
+        import numpy
+        from scipy.optimize import linear_sum_assignment
+    except ImportError:
+        return float(hungarian.total(costs, hungarian.solved(costs)[0])), "own Hungarian"
+    table: Any = numpy.array(costs, dtype=float)
+    rows, chosen = linear_sum_assignment(table)
+    return float(table[rows, chosen].sum()), "SciPy"
+
+
+def least_way(mission: Mission, ways: dict[str, list[str]], seconds: float) -> tuple[float, str]:
+    """The shortest sum of ways through all tasks that is known; ``ways`` is one to begin with."""
+    own = _annealed(mission, ways, round(STEPS_S * seconds))
+    try:
+        return min(own, _by_ortools(mission, seconds)), "OR-Tools"
+    except ImportError:
+        return own, "own search"
+
+
+def travelled(mission: Mission, ways: dict[str, list[str]]) -> float:
+    """The sum of the ways through all tasks, in metres."""
+    return sum(length(mission.starts[a], [mission.places[t] for t in way]) for a, way in ways.items())
+
+
+def _annealed(mission: Mission, ways: dict[str, list[str]], steps: int) -> float:
+    """Move single tasks about, at first also for the worse, and less and less so."""
+    dice = random.Random(mission.seed)
+    now = {agent: list(ways.get(agent, ())) for agent in mission.alive}
+    agents = list(now)
+    best = cost = travelled(mission, now)
+    heat = cost / max(1, len(mission.places)) * 0.3
+
+    def long(agent: str, way: list[str]) -> float:
+        return length(mission.starts[agent], [mission.places[t] for t in way])
+
+    owner = {task: agent for agent, way in now.items() for task in way}
+    tasks = sorted(owner)
+    for step in range(steps):
+        warmth = heat * (1.0 - step / steps) ** 2 + 1e-9
+        task = dice.choice(tasks)
+        here = owner[task]
+        # Somebody near it, or anybody.
+        there = (
+            here if dice.random() < 0.3 else owner[dice.choice(tasks)] if dice.random() < 0.7 else dice.choice(agents)
+        )
+        rest = [t for t in now[here] if t != task]
+        target = rest if there == here else now[there]
+        if len(target) >= mission.capacity:
+            continue
+        spared = long(here, now[here]) - long(here, rest)
+        more, where = insertion(mission.starts[there], [mission.places[t] for t in target], mission.places[task])
+        if more - spared <= 0.0 or dice.random() < math.exp((spared - more) / warmth):
+            now[here] = rest
+            now[there] = [*target[:where], task, *target[where:]]
+            owner[task] = there
+            cost += more - spared
+            best = min(best, cost)
+    return best
+
+
+def _by_ortools(mission: Mission, seconds: float) -> float:
+    from ortools.constraint_solver import pywrapcp, routing_enums_pb2
+
+    agents, tasks = mission.alive, list(mission.places)
+    points = [mission.starts[a] for a in agents] + [mission.places[t] for t in tasks]
+    end = len(points)  # a place that costs nothing to reach: ways are open
+    far = [[round(1000.0 * math.dist(p, q)) for q in points] + [0] for p in points] + [[0] * (end + 1)]
+    index = pywrapcp.RoutingIndexManager(end + 1, len(agents), list(range(len(agents))), [end] * len(agents))
+    model = pywrapcp.RoutingModel(index)
+    way = model.RegisterTransitCallback(lambda i, j: far[index.IndexToNode(i)][index.IndexToNode(j)])
+    model.SetArcCostEvaluatorOfAllVehicles(way)
+    load = model.RegisterUnaryTransitCallback(lambda i: int(len(agents) <= index.IndexToNode(i) < end))
+    model.AddDimensionWithVehicleCapacity(load, 0, [mission.capacity] * len(agents), True, "load")
+    search = pywrapcp.DefaultRoutingSearchParameters()
+    search.first_solution_strategy = routing_enums_pb2.FirstSolutionStrategy.PARALLEL_CHEAPEST_INSERTION
+    search.local_search_metaheuristic = routing_enums_pb2.LocalSearchMetaheuristic.GUIDED_LOCAL_SEARCH
+    search.time_limit.FromMilliseconds(round(1000.0 * seconds))
+    found = model.SolveWithParameters(search)
+    return found.ObjectiveValue() / 1000.0 if found else math.inf

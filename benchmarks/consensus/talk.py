@@ -1,0 +1,130 @@
+"""Talk: the bidders of CBBA among themselves, in rounds, over a graph in which each has four neighbours."""
+
+from __future__ import annotations
+
+import random
+import time
+from dataclasses import dataclass
+
+import msgpack
+
+from benchmarks.consensus.mission import SIDE, Mission
+from middleware.consensus.bidder import Bidder, Score, Statement
+from middleware.consensus.exchange import met, partners
+
+PAUSE = 5
+"""Rounds between two messages of an agent: what it learns meanwhile goes in one."""
+FAR = 3.0 * SIDE
+ROUND_S = 0.030
+"""A round is one way through the network: 20 ms and 10 ms more on average."""
+
+
+@dataclass(frozen=True)
+class Talked:
+    """What came of it: who has each task (or two), and what it took, per agent, in rounds, and of the processor."""
+
+    owners: dict[str, list[str]]
+    rounds: int
+    messages: float
+    octets: float
+    cpu_s: float
+
+
+def after_meetings(mission: Mission, owners: dict[str, str]) -> tuple[dict[str, str], float]:
+    """Who has each task after agents have met two by two until no meeting helps, and the messages of each agent.
+
+    A meeting is a message there and one back; who has met without success meets the same again only after a change.
+    """
+    room = dict.fromkeys(mission.alive, mission.capacity)
+    near = {agent: sorted(row, key=lambda task: (row[task], task)) for agent, row in mission.costs.items()}
+    owners = dict(owners)
+    held: dict[str, dict[str, str]] = {agent: {} for agent in mission.alive}
+    for task, agent in owners.items():
+        held[agent][task] = agent
+    messages = 0
+    seen: set[tuple[object, ...]] = set()
+    is_changed = True
+    while is_changed:
+        is_changed = False
+        for agent in mission.alive:
+            for other in partners(agent, owners, near[agent]):
+                both = held[agent] | held[other]
+                state = tuple(sorted(both.items()))
+                if state in seen:
+                    continue
+                seen.add(state)
+                messages += 2
+                now = met(agent, other, both, mission.costs, room)
+                if now != both:
+                    owners.update(now)
+                    for one in (agent, other):
+                        held[one] = {task: owner for task, owner in now.items() if owner == one}
+                    is_changed = True
+    return owners, messages / len(mission.alive)
+
+
+def neighbours(names: list[str], seed: int) -> dict[str, list[str]]:
+    """Four of each, or all where there are fewer: two rings through all in random order, so all are connected."""
+    dice = random.Random(f"graph/{seed}")
+    found: dict[str, set[str]] = {name: set() for name in names}
+    for _ in range(2):
+        ring = dice.sample(names, len(names))
+        for one, other in zip(ring, ring[1:] + ring[:1], strict=True):
+            if one != other:
+                found[one].add(other)
+                found[other].add(one)
+    return {name: sorted(others) for name, others in found.items()}
+
+
+def score_of(costs: dict[str, int]) -> Score:
+    """Nearer is worth more, and what is in the bundle already makes no difference."""
+    worth = {task: FAR - cost * 1e-6 for task, cost in costs.items()}
+    return lambda bundle, task: worth[task]
+
+
+def talked(mission: Mission, pause: int = PAUSE, loss: float = 0.0, quiet: int | None = None) -> Talked:
+    """Let the bidders of a mission talk until nobody has anything to say, or has had nothing for ``quiet`` rounds.
+
+    A message that is lost is sent again in the next round, since it is not acknowledged.
+    """
+    graph = neighbours(mission.alive, mission.seed)
+    dice = random.Random(f"loss/{mission.seed}")
+    began = time.process_time()
+    bidders = {
+        name: Bidder(name, mission.places, score_of(mission.costs[name]), mission.capacity, graph[name])
+        for name in mission.alive
+    }
+    measured = 0.0
+    messages = octets = rounds = silent = 0
+    last = 0
+    on_the_way: list[tuple[str, str, tuple[Statement, ...]]] = []
+    while quiet is None or silent < quiet:
+        rounds += 1
+        arriving, on_the_way = on_the_way, []
+        for sender, taker, said in arriving:
+            if loss and dice.random() < loss:
+                on_the_way.append((sender, taker, said))
+            elif corrections := bidders[taker].hear(sender, said):
+                on_the_way.append((taker, sender, tuple(corrections)))
+        for number, (name, bidder) in enumerate(bidders.items()):
+            if (rounds + number) % pause == 0:
+                on_the_way += [(name, other, news) for other, news in bidder.drain().items()]
+        silent = 0 if on_the_way else silent + 1
+        last = rounds if on_the_way else last
+        counted = time.process_time()
+        messages += len(on_the_way)
+        octets += sum(len(packed(said)) for _, _, said in on_the_way)
+        measured += time.process_time() - counted
+        if quiet is None and not on_the_way and all(bidder.is_quiet for bidder in bidders.values()):
+            break
+    owners: dict[str, list[str]] = {}
+    for name, bidder in bidders.items():
+        for task in bidder.bundle:
+            owners.setdefault(task, []).append(name)
+    each = len(bidders)
+    return Talked(owners, last, messages / each, octets / each, time.process_time() - began - measured)
+
+
+def packed(said: tuple[Statement, ...]) -> bytes:
+    """A message as it would travel: tasks and agents by their number in the epoch."""
+    return bytes(msgpack.packb([(int(s.task[1:]), int(s.agent[1:]), s.version, s.bid) for s in said]))

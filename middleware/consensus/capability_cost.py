@@ -1,0 +1,60 @@
+"""Capability and cost: among devices of different kinds, the one that can do it and to which it costs least.
+
+Who does not meet a requirement has it in ``Report.unmet`` and never wins (Assumption 5 of the thesis; Algorithm 4.4).
+The others are compared by the time to get there, the battery that is left and the tasks that they have already.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from middleware.consensus.nearest import KEPT
+from middleware.consensus.strategy import Consensus, Report, digest_of, refusal, standing
+
+BATTERY_S = 30.0
+"""An empty battery weighs as much as so many seconds of way."""
+LOAD_S = 20.0
+"""Each task that an agent has already weighs as much as so many seconds of way."""
+
+
+class CapabilityCost:
+    """``cost`` in seconds, plus what a low battery and other tasks weigh; the least wins, ties go by the id."""
+
+    name = "capability_cost"
+    version = "1"
+
+    def find(self, contacts: Sequence[Report]) -> Consensus:
+        """The consensus point; None is assigned where nobody can, and ``strategy.refused`` says why for each."""
+        order = self._best(contacts)
+        if not order:
+            return Consensus(None, strategy=self.name, reason="no device can do it")
+        first = order[0]
+        return Consensus(
+            first.agent,
+            tuple(r.agent for r in order[1:]),
+            digest_of(order),
+            first.task,
+            first.epoch,
+            (first.agent,),
+            strategy=self.name,
+            reason=f"{first.cost:.1f} s away, battery {first.battery:.0%}, {first.load:g} other tasks",
+        )
+
+    def improves(self, current: Report, offer: Report, hysteresis: float) -> bool:
+        """Whether ``offer`` weighs less by more than the share ``hysteresis``; who cannot do it never does."""
+        if refusal(offer):
+            return False
+        return bool(refusal(current)) or self.weigh(offer) < self.weigh(current) * (1.0 - hysteresis)
+
+    def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
+        """The best of both."""
+        return tuple(self._best((*a, *b)))
+
+    def weigh(self, report: Report) -> float:
+        """What a report weighs, in seconds: it rises with way and load, and falls with the battery."""
+        return report.cost + BATTERY_S * (1.0 - report.battery) + LOAD_S * report.load
+
+    def _best(self, contacts: Sequence[Report]) -> list[Report]:
+        """The lightest reports, one of each agent, of the newest epoch and the first task."""
+        counted = standing(contacts, self.weigh)
+        return sorted((r for r in counted if r.task == counted[0].task), key=lambda r: (self.weigh(r), r.agent))[:KEPT]

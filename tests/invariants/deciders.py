@@ -1,0 +1,82 @@
+"""Deciders: whatever each agent hears, and in which order, all decide the same, and on what is lawful.
+
+C1  agents that heard the same reports in any order assign the same one      (E7, S3)
+C2  a report of nonsense is never assigned, and makes no difference          (S4)
+C3  among 300 agents the cheapest is found, as among three
+C4  when bidders stop by the rule that there is for it, no task has two owners
+"""
+
+from __future__ import annotations
+
+import math
+import random
+
+from benchmarks.consensus.mission import Mission
+from middleware.consensus import bidder
+from middleware.consensus.nearest import Nearest
+from middleware.consensus.strategy import Report
+from tests.invariants.schedule import Schedule
+
+LINE = 12
+
+
+class Deciders:
+    """Reports of random teams, and bidders on a line, beside the schedule of ``schedule.seed``."""
+
+    def __init__(self, schedule: Schedule) -> None:
+        self._dice = random.Random(f"deciders/{schedule.seed}")
+        self._found: list[str] = []
+
+    def step(self) -> None:
+        """One small team decides."""
+        contacts = [Report(f"agent-{n:03d}", self._dice.choice([1.0, 1.0, 2.0])) for n in range(4)]
+        views = [self._dice.sample(contacts, len(contacts)) for _ in contacts]
+        assigned = sorted({str(Nearest().find(view).assigned_agent) for view in views})
+        if len(assigned) > 1:
+            self._found.append(f"C1: {' and '.join(assigned)} are assigned by equal reports")
+        bad = Report("agent-bad", self._dice.choice([math.nan, math.inf, -math.inf, -1.0]))
+        view = self._dice.sample([*contacts, bad], len(contacts) + 1)
+        if str(Nearest().find(view).assigned_agent) not in assigned:
+            self._found.append(f"C2: a cost of {bad.cost} makes {Nearest().find(view).assigned_agent} win")
+
+    def settled(self) -> None:
+        """A large team decides once, and a line of bidders talks until it is over."""
+        far = [Report(f"agent-{n:03d}", 300.0 - n) for n in range(300)]
+        found = Nearest().find(far).assigned_agent
+        if found != "agent-299":
+            self._found.append(f"C3: of 300 agents {found} is assigned, not agent-299")
+        mission = Mission(LINE, LINE, self._dice.randrange(10**6))
+        self._found += [f"C4: {' and '.join(o)} own {t}" for t, o in stopped(mission).items() if len(o) > 1]
+
+    def verdict(self) -> list[str]:
+        """Every violation so far."""
+        return self._found
+
+
+def stopped(mission: Mission) -> dict[str, list[str]]:
+    """Who believes to own each task, of bidders on a line of which each stops by itself."""
+    names = mission.alive
+    near = {a: [names[m] for m in (n - 1, n + 1) if 0 <= m < len(names)] for n, a in enumerate(names)}
+    bidders = {}
+    for name in names:
+        worth = {task: 5000.0 - cost * 1e-6 for task, cost in mission.costs[name].items()}
+        score: bidder.Score = lambda bundle, task, worth=worth: worth[task]  # type: ignore[misc]  # noqa: E731
+        bidders[name] = bidder.Bidder(name, mission.places, score, 1, near[name])
+    quiet = dict.fromkeys(names, 0)
+    talking, rounds = list(names), 0
+    while talking:
+        rounds += 1
+        said = [(a, to, news) for a in talking for to, news in bidders[a].drain().items()]
+        for name in talking:
+            before = bidders[name].bundle
+            for a, to, news in said:
+                if to == name:
+                    bidders[name].hear(a, news)
+            is_same = bidders[name].is_quiet and bidders[name].bundle == before
+            quiet[name] = quiet[name] + 1 if is_same else 0
+        talking = [n for n in talking if not bidder.is_over(rounds, quiet[n], len(mission.places), len(names))]
+    owners: dict[str, list[str]] = {}
+    for name, one in bidders.items():
+        for task in one.bundle:
+            owners.setdefault(task, []).append(name)
+    return owners

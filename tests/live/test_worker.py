@@ -1,0 +1,148 @@
+"""Tests of strategies of somebody else, in real processes."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.consensus.cbba import Cbba
+from middleware.consensus.guard import STRIKES, Guard
+from middleware.consensus.item import Item
+from middleware.consensus.nearest import Nearest
+from middleware.consensus.selection import guarded
+from middleware.consensus.strategy import Consensus, Report
+from middleware.consensus.worker import Worker
+
+ROOT = str(Path(__file__).resolve().parents[2])
+TEAM = [Report("a", 3.0, value=(1.0, 2.0)), Report("b", 1.0), Report("c", 2.0)]
+PATIENCE = 20.0
+
+
+class Good(Nearest):
+    name = "good"
+
+
+class Many(Cbba):
+    name = "many"
+
+
+class Looping(Nearest):
+    name = "looping"
+
+    def find(self, contacts: Sequence[Report]) -> Consensus:
+        while True:
+            pass
+
+
+class Giant(Nearest):
+    name = "giant"
+
+    def find(self, contacts: Sequence[Report]) -> Consensus:
+        return Consensus("b", reason="x" * 1_000_000)
+
+
+class Hungry(Nearest):
+    name = "hungry"
+
+    def find(self, contacts: Sequence[Report]) -> Consensus:
+        return Consensus("b", reason=str(len([0] * 10**10)))
+
+
+class Quitting(Nearest):
+    name = "quitting"
+
+    def find(self, contacts: Sequence[Report]) -> Consensus:
+        os._exit(0)
+
+
+class Chatty(Nearest):
+    name = "chatty"
+
+    def find(self, contacts: Sequence[Report]) -> Consensus:
+        sys.stdout.write("\x00\x00 nearly an answer\n")
+        sys.stdout.flush()
+        return super().find(contacts)
+
+
+class Raising(Nearest):
+    name = "raising"
+
+    def find(self, contacts: Sequence[Report]) -> Consensus:
+        raise ZeroDivisionError("I divide")
+
+
+class WorkerTests(SynchronousTestCase):
+    def guard(self, name: str) -> Guard:
+        """A class of this module in a process of its own, loaded, behind a guard."""
+        worker = Worker(name, f"{__name__}:{name}", path=(ROOT,))
+        self.addCleanup(worker.stop)
+        guard = Guard(worker, twice=True)
+        self.loaded(guard)
+        return guard
+
+    def loaded(self, guard: Guard) -> Consensus:
+        """What it finds as soon as its process has begun."""
+        end = time.monotonic() + PATIENCE
+        while "still being loaded" in (found := guard.find(TEAM)).reason and time.monotonic() < end:
+            pass
+        self.flushLoggedErrors()
+        return found
+
+    def test_good_one(self) -> None:
+        """A good strategy answers from its own process as it would here."""
+        guard = self.guard("Good")
+        self.assertEqual(guard.find(TEAM), Nearest().find(TEAM))
+        self.assertEqual(guard.find(TEAM).strategy, "Good")
+        self.assertTrue(guard.improves(TEAM[0], TEAM[1], 0.1))
+        self.assertEqual(guard.merge(TEAM, TEAM), Nearest().merge(TEAM, ()))
+        self.assertEqual(self.flushLoggedErrors(), [])
+
+    def test_group(self) -> None:
+        """A strategy for several tasks answers so from its own process; one for one task is asked for each."""
+        items = [Item("s", (1.0, 2.0)), Item("t")]
+        bids = [Report(a, c, task=t) for a, c in (("a", 1.0), ("b", 2.0)) for t in "st"]
+        self.assertEqual(self.guard("Many").find_group(bids, items), Cbba().find_group(bids, items))
+        self.assertEqual([p.assigned_agent for p in self.guard("Good").find_group(bids, items)], ["a", "b"])
+        self.assertEqual(self.flushLoggedErrors(), [])
+
+    def test_looping(self) -> None:
+        """One that never answers costs its deadline three times; then it is asked no more, and no process is left."""
+        guard = self.guard("Looping")
+        worst = 0.0
+        end = time.monotonic() + PATIENCE
+        while "asked no more" not in guard.find(TEAM).reason and time.monotonic() < end:
+            began = time.monotonic()
+            self.assertEqual(guard.find(TEAM).assigned_agent, "b")
+            worst = max(worst, time.monotonic() - began)
+        self.assertIn(f"no answer {STRIKES} times", guard.find(TEAM).reason)
+        self.assertLess(worst, 2.0)
+        self.assertIsNone(guard.strategy._process)  # type: ignore[attr-defined]
+        self.flushLoggedErrors()
+
+    def test_others(self) -> None:
+        """What answers far too much, eats memory, ends its process or raises has no opinion, and says why."""
+        for name, why in (
+            ("Giant", "bytes, more than"),
+            ("Hungry", "MemoryError"),
+            ("Quitting", "its process has died"),
+            ("Raising", "ZeroDivisionError: I divide"),
+            ("Absent", "has no attribute 'Absent'"),
+        ):
+            found = self.loaded(self.guard(name))
+            self.assertEqual((found.assigned_agent, found.strategy), ("b", "nearest"), name)
+            self.assertIn(why, found.reason)
+
+    def test_chatty(self) -> None:
+        """What a strategy prints is not taken for its answer."""
+        self.assertEqual(self.guard("Chatty").find(TEAM), Nearest().find(TEAM))
+
+    def test_foreign_by_name(self) -> None:
+        """A strategy that is not built in gets a process of its own; what is named by a dotted name is not."""
+        guard = guarded(f"{__name__}:Good", dotted=True)
+        self.addCleanup(guard.stop)
+        self.assertIsInstance(guard.strategy, Worker)

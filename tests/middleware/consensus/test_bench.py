@@ -1,0 +1,56 @@
+"""The bench of the strategies, at its smallest."""
+
+from __future__ import annotations
+
+import json
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from benchmarks.consensus.decider import DECIDERS
+from benchmarks.consensus.mission import Mission
+from benchmarks.consensus.oracle import least_star, least_way, travelled
+from benchmarks.consensus.plot import drawn
+from benchmarks.consensus.talk import talked
+from middleware.consensus.sequential import ways_of
+
+
+class BenchConsensusTests(SynchronousTestCase):
+    def test_missions_are_seeded(self) -> None:
+        """Equal seeds give equal missions, and those who fail are there in both."""
+        one, again, other = Mission(20, 20, 1), Mission(20, 20, 1), Mission(20, 20, 2)
+        self.assertEqual((one.costs, one.items), (again.costs, again.items))
+        self.assertNotEqual(one.costs, other.costs)
+        after = Mission(20, 20, 1, 10)
+        self.assertEqual((after.starts, len(after.alive)), (one.starts, 18))
+        self.assertEqual(after.capacity, 2)
+
+    def test_nobody_beats_the_oracle(self) -> None:
+        """No strategy costs less than the optimum, each serves every task, and the optimum's own costs just that."""
+        mission = Mission(8, 8, 3)
+        least = least_star(mission)[0]
+        for name, decide in DECIDERS.items():
+            owners = decide(mission, mission.reports(mission.alive, 8))
+            self.assertEqual(set(owners), set(mission.places), name)
+            cost = sum(mission.costs[agent][task] for task, agent in owners.items())
+            self.assertGreaterEqual(cost, least, name)
+            if name == "group_optimal":
+                self.assertEqual(cost, least)
+
+    def test_ways(self) -> None:
+        """The best known way is no longer than the one that it began with."""
+        mission = Mission(3, 6, 1, spare=1)
+        ways = ways_of(mission.reports(mission.alive, 6), mission.items) or {}
+        self.assertLessEqual(least_way(mission, ways, 0.02)[0], travelled(mission, ways))
+
+    def test_talk(self) -> None:
+        """Among themselves the bidders end with one owner each, also where messages are lost."""
+        for loss in (0.0, 0.3):
+            found = talked(Mission(12, 12, 1), loss=loss)
+            self.assertEqual(sorted(map(len, found.owners.values())), [1] * 12)
+            self.assertGreater(found.messages, 1.0)
+
+    def test_plot(self) -> None:
+        """The picture is drawn from rows as they are written."""
+        row = {"agents": 3, "strategy": "a < b", "ratio": 1.0, "ratio_failed": 1.25}
+        picture = drawn(json.loads(json.dumps([row])))
+        self.assertIn("a &lt; b", picture)

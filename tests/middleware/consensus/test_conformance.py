@@ -1,0 +1,256 @@
+"""Every built-in strategy conforms, and the kit sees what does not."""
+
+from __future__ import annotations
+
+import math
+import os
+import runpy
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.consensus.average import Average
+from middleware.consensus.capability_cost import CapabilityCost
+from middleware.consensus.cbba import Cbba
+from middleware.consensus.conformance import CHECKS, Conformance, broken
+from middleware.consensus.group_optimal import GroupOptimal
+from middleware.consensus.guard import Guard
+from middleware.consensus.item import Item
+from middleware.consensus.nearest import Nearest
+from middleware.consensus.rendezvous import Centre, Median, Rendezvous
+from middleware.consensus.sequential import Sequential
+from middleware.consensus.strategy import BUILT_IN, Consensus, Report, digest_of, strategy_for
+from middleware.consensus.weighted_vote import WeightedVote
+
+ROOT = Path(__file__).resolve().parents[3]
+
+
+class AverageTests(Conformance, SynchronousTestCase):
+    make = Average
+
+
+class CapabilityCostTests(Conformance, SynchronousTestCase):
+    make = CapabilityCost
+
+
+class CbbaTests(Conformance, SynchronousTestCase):
+    make = Cbba
+
+
+class CentreTests(Conformance, SynchronousTestCase):
+    make = Centre
+
+
+class GroupOptimalTests(Conformance, SynchronousTestCase):
+    make = GroupOptimal
+
+
+class MedianTests(Conformance, SynchronousTestCase):
+    make = Median
+
+
+class NearestTests(Conformance, SynchronousTestCase):
+    make = Nearest
+
+
+class RendezvousTests(Conformance, SynchronousTestCase):
+    make = Rendezvous
+
+
+class SequentialTests(Conformance, SynchronousTestCase):
+    make = Sequential
+
+
+class WeightedVoteTests(Conformance, SynchronousTestCase):
+    make = WeightedVote
+
+
+class GuardedTests(Conformance, SynchronousTestCase):
+    """A guard around a good strategy is a good strategy."""
+
+    @staticmethod
+    def make() -> Guard:
+        return Guard(Nearest())
+
+
+def point(order: Sequence[Report]) -> Consensus:
+    """A consensus point out of reports in the order of their rank."""
+    if not order:
+        return Consensus(None)
+    names = list(dict.fromkeys(r.agent for r in order))
+    return Consensus(names[0], tuple(names[1:]), digest_of(order))
+
+
+class Unnamed(Nearest):
+    name = ""
+
+
+class Remembers(Nearest):
+    """Whoever won before is not to win again."""
+
+    def __init__(self) -> None:
+        self.last: str | None = None
+
+    def find(self, contacts: Sequence[Report]) -> Consensus:
+        found = super().find([r for r in contacts if r.agent != self.last] or contacts)
+        self.last = found.assigned_agent
+        return found
+
+
+class Sorts(Nearest):
+    """Sorts what it was given in its place."""
+
+    def find(self, contacts: Sequence[Report]) -> Consensus:
+        contacts.sort(key=lambda r: r.agent, reverse=True)  # type: ignore[attr-defined]
+        return super().find(contacts)
+
+
+class FirstCome(Nearest):
+    """No tie-break: the first of the nearest."""
+
+    def find(self, contacts: Sequence[Report]) -> Consensus:
+        found = super().find(contacts)
+        first = [r for r in contacts if r.cost == min((c.cost for c in contacts), default=0.0)]
+        return replace(found, assigned_agent=first[0].agent) if found.assigned_agent and first else found
+
+
+class Trusting(Nearest):
+    """Believes every number, as ``min`` does with NaN."""
+
+    def find(self, contacts: Sequence[Report]) -> Consensus:
+        return point(sorted(contacts, key=lambda r: (not math.isnan(float(r.cost)), r.cost, r.agent)))
+
+
+class Concatenates(Nearest):
+    def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
+        return (*a, *b)
+
+
+class Forgets(Nearest):
+    def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
+        return super().merge(a, b)[-1:]
+
+
+class NamesNobody(Nearest):
+    def find(self, contacts: Sequence[Report]) -> Consensus:
+        return replace(super().find(contacts), assigned_agent="agent-999")
+
+
+class Nervous(Nearest):
+    def improves(self, current: Report, offer: Report, hysteresis: float) -> bool:
+        return offer.agent != current.agent
+
+
+class ByHash(Nearest):
+    """Ties by whatever a set gives first."""
+
+    def find(self, contacts: Sequence[Report]) -> Consensus:
+        found = super().find(contacts)
+        least = {r.agent for r in contacts if found.assigned_agent and r.cost <= 5.0}
+        return replace(found, assigned_agent=next(iter(least))) if least else found
+
+
+class SmallIds(Nearest):
+    """Keeps the number of an agent in one signed byte."""
+
+    def find(self, contacts: Sequence[Report]) -> Consensus:
+        found = super().find(contacts)
+        if found.assigned_agent is None:
+            return found
+        names = sorted({r.agent for r in contacts})
+        number = (names.index(found.assigned_agent) + 128) % 256 - 128
+        return replace(found, assigned_agent=names[number])
+
+
+class Raises(Nearest):
+    def find(self, contacts: Sequence[Report]) -> Consensus:
+        raise ZeroDivisionError("I divide")
+
+
+class Greedy(Cbba):
+    """Gives everything to whoever is nearest."""
+
+    def find_group(self, contacts: Sequence[Report], items: Sequence[Item]) -> tuple[Consensus, ...]:
+        return super().find_group([replace(r, capacity=99) for r in contacts], items)
+
+
+class Lazy(Cbba):
+    """Leaves out the last task."""
+
+    def find_group(self, contacts: Sequence[Report], items: Sequence[Item]) -> tuple[Consensus, ...]:
+        return super().find_group(contacts, items)[: len(items) - 1]
+
+
+BREACHES: dict[str, tuple[Callable[[], Any], ...]] = {
+    "name": (Unnamed,),
+    "purity": (Remembers, Sorts),
+    "order": (FirstCome,),
+    "merge": (Concatenates, Forgets),
+    "ties": (FirstCome,),
+    "winners": (NamesNobody,),
+    "hostile": (Trusting,),
+    "improves": (Nervous,),
+    "hashing": (ByHash,),
+    "many": (Raises, SmallIds),
+    "group": (Greedy, Lazy),
+}
+"""Strategies that break each rule."""
+
+
+class ConformanceTests(SynchronousTestCase):
+    def test_every_built_in_is_tested(self) -> None:
+        """No strategy is in the box without its conformance being tested above."""
+        cases = [case for case in globals().values() if isinstance(case, type) and issubclass(case, Conformance)]
+        tested = {getattr(case, "make", None) for case in cases}
+        self.assertEqual({type(strategy_for(name)) for name in BUILT_IN} - tested, set())
+        self.assertEqual({name: strategy_for(name).name for name in BUILT_IN}, {name: name for name in BUILT_IN})
+
+    def test_mixin_has_every_check(self) -> None:
+        """What ``broken`` looks at is what the mixin tests."""
+        self.assertEqual({f"test_{name}" for name in CHECKS}, {n for n in dir(Conformance) if n.startswith("test_")})
+
+    def test_each_breach_is_seen(self) -> None:
+        """A strategy that breaks a rule fails the check of this very rule."""
+        self.assertEqual(set(BREACHES), set(CHECKS))
+        unseen = [
+            (rule, strategy)
+            for rule, strategies in BREACHES.items()
+            for strategy in strategies
+            if rule not in broken(strategy)
+        ]
+        self.assertEqual(unseen, [])
+
+    def test_only_what_is_broken(self) -> None:
+        """A breach of one rule is not told as one of all."""
+        self.assertEqual(list(broken(Unnamed)), ["name"])
+        self.assertEqual(list(broken(Nervous)), ["improves"])
+        self.assertEqual(list(broken(Concatenates)), ["merge"])
+
+    def test_examples_conform(self) -> None:
+        """The template and the example of one's own pass as they are."""
+        for name in ("spare:Spare", "template:Farthest"):
+            module, _, attribute = name.partition(":")
+            found = runpy.run_path(str(ROOT / "examples" / "strategy" / f"{module}.py"))
+            self.assertEqual(broken(found[attribute]), {}, name)
+
+    def test_same_in_every_process(self) -> None:
+        """Every strategy finds the same, digest included, however the process hashes its strings."""
+        program = (
+            "import random; from middleware.consensus.conformance import team\n"
+            "from middleware.consensus.strategy import BUILT_IN, strategy_for\n"
+            "for n in sorted(BUILT_IN): print(strategy_for(n).find(team(random.Random(3), 90)))\n"
+        )
+        told = set()
+        for seed in ("1", "2"):
+            child = subprocess.run(
+                [sys.executable, "-c", program],
+                cwd=ROOT, env={**os.environ, "PYTHONHASHSEED": seed}, capture_output=True, text=True, timeout=60,
+            )  # fmt: skip
+            self.assertEqual((child.returncode, child.stderr), (0, ""))
+            told.add(child.stdout)
+        self.assertEqual(len(told), 1)

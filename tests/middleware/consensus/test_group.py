@@ -1,0 +1,188 @@
+"""Tests of the strategies that share out several tasks: what they promise of safety and of quality."""
+
+from __future__ import annotations
+
+import math
+import random
+from itertools import product
+from statistics import fmean
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.consensus.cbba import Cbba, greedy
+from middleware.consensus.exchange import exchanged
+from middleware.consensus.group_optimal import GroupOptimal
+from middleware.consensus.item import Item, exact
+from middleware.consensus.sequential import Sequential, length, ways_of
+from middleware.consensus.strategy import Consensus, Report
+
+Place = tuple[float, float]
+
+
+def square(agents: int, tasks: int, seed: int, capacity: int = 0) -> tuple[list[Report], list[Item]]:
+    """A mission in the unit square: every bid, and the items."""
+    dice = random.Random(f"square/{agents}/{tasks}/{seed}")
+    starts = {f"a{n:03d}": (dice.random(), dice.random()) for n in range(agents)}
+    items = [Item(f"t{n:03d}", (dice.random(), dice.random())) for n in range(tasks)]
+    room = capacity or math.ceil(tasks / agents)
+    return [
+        Report(agent, math.dist(start, item.position), task=item.task, value=start, capacity=room)
+        for agent, start in starts.items()
+        for item in items
+    ], items
+
+
+def cost(points: tuple[Consensus, ...], reports: list[Report]) -> float:
+    """What an assignment costs."""
+    known = {(r.agent, r.task): r.cost for r in reports}
+    return sum(known[agent, point.task] for point in points for agent in point.assigned)
+
+
+class GroupOptimalTests(SynchronousTestCase):
+    def test_optimum(self) -> None:
+        """With all bids nothing is cheaper: compared with every assignment there is."""
+        for seed in range(30):
+            reports, items = square(3, 4, seed)
+            known = {(r.agent, r.task): r.cost for r in reports}
+            agents = sorted({r.agent for r in reports})
+            best = min(
+                sum(known[agent, item.task] for agent, item in zip(chosen, items, strict=True))
+                for chosen in product(agents, repeat=4)
+                if all(chosen.count(agent) <= 2 for agent in chosen)
+            )
+            self.assertAlmostEqual(cost(GroupOptimal().find_group(reports, items), reports), best, 5)
+
+    def test_twenty_bids(self) -> None:
+        """With 20 bids of each the cost is within 2 % of the optimum, and every task has somebody."""
+        ratios = []
+        for seed in range(4):
+            reports, items = square(60, 60, seed)
+            best = GroupOptimal()
+            best.bids = 1000
+            few = GroupOptimal().find_group(reports, items)
+            self.assertNotIn(None, [point.assigned_agent for point in few])
+            ratios.append(cost(few, reports) / cost(best.find_group(reports, items), reports))
+        self.assertLessEqual(fmean(ratios), 1.02)
+
+    def test_second_pass(self) -> None:
+        """A task for which nobody's best bids were is found somebody among all bids."""
+        reports = [Report("a", float(n), task=f"t{n:02d}", capacity=30) for n in range(30)]
+        found = GroupOptimal().find_group(reports, [Item(f"t{n:02d}") for n in range(30)])
+        self.assertEqual({point.assigned_agent for point in found}, {"a"})
+
+    def test_slots(self) -> None:
+        """A task for two has two agents, never one of them twice, and one owner for each place."""
+        reports = [Report(a, c, task=t, capacity=2) for a, c in (("a", 1.0), ("b", 5.0)) for t in ("s", "t")]
+        found = GroupOptimal().find_group(reports, [Item("s", slots=2), Item("t", slots=2)])
+        self.assertEqual([point.assigned for point in found], [("a", "b"), ("a", "b")])
+
+    def test_holes_say_why(self) -> None:
+        """What nobody can take is said to be so, and nobody gets more than it can take."""
+        reports = [Report("a", 1.0, task="s"), Report("a", 2.0, task="t")]
+        found = GroupOptimal().find_group(reports, [Item("s"), Item("t"), Item("u")])
+        self.assertEqual([point.assigned_agent for point in found], ["a", None, None])
+        self.assertEqual(found[1].reason, "everybody who bid for it has enough to do")
+        self.assertEqual(found[2].reason, "nobody bid for it")
+
+    def test_equal_optima(self) -> None:
+        """Among equal optima it is always the same one."""
+        reports = [Report(a, 1.0, task=t) for a in "abc" for t in "xyz"]
+        found = GroupOptimal().find_group(reports, [Item(t) for t in "xyz"])
+        self.assertEqual([point.assigned_agent for point in found], ["a", "b", "c"])
+
+
+class CbbaTests(SynchronousTestCase):
+    def test_exchange_never_costs(self) -> None:
+        """Exchanges never raise the cost, respect capacity, and bring the mean to within 5 % of the optimum."""
+        ratios = []
+        for seed in range(12):
+            agents = random.Random(seed).choice([5, 20, 40])
+            reports, items = square(agents, 40, seed)
+            costs: dict[str, dict[str, int]] = {}
+            for report in reports:
+                costs.setdefault(report.agent, {})[report.task] = exact(report.cost)
+            room = {agent: math.ceil(40 / agents) for agent in costs}
+            before = greedy(costs, room)
+            after = exchanged(before, costs, room)
+            sums = [sum(costs[a][t] for t, a in owner.items()) for owner in (before, after)]
+            self.assertLessEqual(sums[1], sums[0])
+            self.assertEqual(set(after), set(before))
+            self.assertTrue(all(list(after.values()).count(agent) <= room[agent] for agent in room))
+            best = GroupOptimal()
+            best.bids = 1000
+            ratios.append(
+                cost(Cbba().find_group(reports, items), reports) / cost(best.find_group(reports, items), reports)
+            )
+        self.assertLessEqual(fmean(ratios), 1.05)
+
+    def test_half_of_the_score(self) -> None:
+        """The greedy assignment has at least half of the best score, worst case or not."""
+        for seed in range(200):
+            dice = random.Random(seed)
+            score = {a: {t: dice.choice([1, 2, 10, 100]) for t in "xyz"} for a in "abc"}
+            found = greedy({a: {t: -s for t, s in row.items()} for a, row in score.items()}, dict.fromkeys("abc", 1))
+            got = sum(score[a][t] for t, a in found.items())
+            best = max(
+                sum(score[a][t] for a, t in zip(chosen, "xyz", strict=True))
+                for chosen in product("abc", repeat=3)
+                if len(set(chosen)) == 3
+            )
+            self.assertGreaterEqual(2 * got, best)
+
+
+class SequentialTests(SynchronousTestCase):
+    def test_each_task_once(self) -> None:
+        """Each task is on one way, no way has more than the capacity, and the points say the same."""
+        for seed in range(10):
+            reports, items = square(4, 10, seed, capacity=3)
+            ways = ways_of(reports, items) or {}
+            self.assertEqual(sorted(t for way in ways.values() for t in way), [item.task for item in items])
+            self.assertLessEqual(max(map(len, ways.values())), 3)
+            found = Sequential().find_group(reports, items)
+            self.assertEqual({p.task: p.assigned_agent for p in found}, {t: a for a, w in ways.items() for t in w})
+
+    def test_twice_the_best_at_most(self) -> None:
+        """The sum of ways is at most twice the shortest there is, on average at most 1.15 of it."""
+        ratios = []
+        for seed in range(25):
+            reports, items = square(2, 5, seed, capacity=5)
+            starts = {r.agent: r.value for r in reports}
+            places = {item.task: item.position for item in items}
+            ways = ways_of(reports, items) or {}
+            mine = sum(length(starts[a], [places[t] for t in way]) for a, way in ways.items())
+            ratios.append(mine / self.best(list(starts.values()), list(places.values())))
+        self.assertLessEqual(max(ratios), 2.0)
+        self.assertLessEqual(fmean(ratios), 1.15)
+
+    def best(self, starts: list[tuple[float, ...]], places: list[tuple[float, ...]]) -> float:
+        """The shortest sum of ways of two agents, by trying all."""
+        shortest: dict[tuple[int, int], float] = {}
+        for which, start in enumerate(starts):
+            ends: dict[tuple[int, int], float] = {(1 << n, n): math.dist(start, p) for n, p in enumerate(places)}
+            for mask in range(1, 1 << len(places)):
+                for last in range(len(places)):
+                    if (mask, last) in ends:
+                        for n, p in enumerate(places):
+                            if not mask >> n & 1:
+                                way = ends[mask, last] + math.dist(places[last], p)
+                                key = (mask | 1 << n, n)
+                                ends[key] = min(way, ends.get(key, math.inf))
+            for mask in range(1, 1 << len(places)):
+                shortest[which, mask] = min(way for (m, _), way in ends.items() if m == mask)
+            shortest[which, 0] = 0.0
+        whole = (1 << len(places)) - 1
+        return min(shortest[0, mask] + shortest[1, whole - mask] for mask in range(whole + 1))
+
+    def test_without_places(self) -> None:
+        """Where positions are missing, or of different kinds, the bids alone decide."""
+        reports = [Report("a", 2.0, task="t"), Report("b", 1.0, task="t", value=(1.0,))]
+        for items in ([Item("t")], [Item("t", (1.0, 2.0))]):
+            self.assertEqual([p.assigned_agent for p in Sequential().find_group(reports, items)], ["b"])
+
+    def test_only_what_it_bid_for(self) -> None:
+        """An agent that bids by name goes nowhere else; one that names no task goes anywhere."""
+        items = [Item("s", (0.0, 0.0)), Item("t", (1.0, 0.0))]
+        near = Report("near", 0.0, task="s", value=(0.5, 0.0), capacity=2)
+        self.assertEqual(ways_of([near], items), {"near": ["s"]})
+        far = Report("far", 0.0, value=(9.0, 0.0), capacity=2)
+        self.assertEqual(Sequential().find_group([near, far], items)[1].assigned_agent, "far")

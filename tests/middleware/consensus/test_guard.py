@@ -1,0 +1,237 @@
+"""Tests of what a bad strategy can do, which is little."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.consensus.cbba import Cbba
+from middleware.consensus.guard import STRIKES, Guard, Lost
+from middleware.consensus.item import Item
+from middleware.consensus.nearest import Nearest
+from middleware.consensus.selection import guarded
+from middleware.consensus.strategy import Consensus, Report
+from middleware.errors import UnknownStrategy
+
+TEAM = [Report("a", 3.0), Report("b", 1.0), Report("c", 2.0)]
+
+
+class Raising(Nearest):
+    """Raises whenever it is asked anything."""
+
+    name = "raising"
+
+    def find(self, contacts: Sequence[Report]) -> Consensus:
+        raise ZeroDivisionError("I divide")
+
+    def improves(self, current: Report, offer: Report, hysteresis: float) -> bool:
+        raise KeyError("nothing")
+
+    def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
+        raise RecursionError("deep")
+
+
+class Lying(Nearest):
+    """Answers whatever it is told to."""
+
+    name = "lying"
+
+    def __init__(self, answer: object) -> None:
+        self.answer = answer
+
+    def find(self, contacts: Sequence[Report]) -> Consensus:
+        return self.answer  # type: ignore[return-value]
+
+
+class Moody(Nearest):
+    """The nearest, and the next time the farthest."""
+
+    name = "moody"
+    asked = 0
+
+    def find(self, contacts: Sequence[Report]) -> Consensus:
+        found = super().find(contacts)
+        self.asked += 1
+        if self.asked % 2 or not found.standby:
+            return found
+        return Consensus(found.standby[-1], (), found.digest)
+
+
+class OrderBound(Nearest):
+    """Whoever comes first."""
+
+    name = "order_bound"
+
+    def find(self, contacts: Sequence[Report]) -> Consensus:
+        return Consensus(contacts[0].agent)
+
+
+class Slow(Nearest):
+    """Never answers in time."""
+
+    name = "slow"
+    asked = 0
+
+    def find(self, contacts: Sequence[Report]) -> Consensus:
+        self.asked += 1
+        raise Lost("it did not answer in time")
+
+
+class Inventing(Nearest):
+    """Adds a report to each summary, and says perhaps."""
+
+    name = "inventing"
+
+    def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
+        return (Report("nobody", 0.0),)
+
+    def improves(self, current: Report, offer: Report, hysteresis: float) -> bool:
+        return "perhaps"  # type: ignore[return-value]
+
+
+class GuardTests(SynchronousTestCase):
+    def assert_falls_back(self, guard: Guard, why: str) -> None:
+        """The nearest acts, the reason says so and why, and the log has the trace once."""
+        found = guard.find(TEAM)
+        self.assertEqual((found.assigned_agent, found.standby), ("b", ("c", "a")))
+        self.assertEqual(found.strategy, "nearest")
+        self.assertIn(f"{guard.name} has no opinion (", found.reason)
+        self.assertIn(why, found.reason)
+        guard.find(TEAM)
+        self.assertTrue(self.flushLoggedErrors())
+
+    def test_good_one(self) -> None:
+        """A good strategy is not changed by its guard, and nothing is logged."""
+        guard = Guard(Nearest(), twice=True)
+        self.assertEqual(guard.find(TEAM), Nearest().find(TEAM))
+        self.assertEqual((guard.name, guard.version), ("nearest", "2"))
+        self.assertTrue(guard.improves(TEAM[0], TEAM[1], 0.1))
+        self.assertEqual(guard.merge(TEAM[:2], TEAM[2:]), Nearest().merge(TEAM, ()))
+
+    def test_raising(self) -> None:
+        """One that raises has no opinion; its exception is named, and the trace is logged once for the same."""
+        guard = Guard(Raising())
+        found = guard.find(TEAM)
+        self.assertEqual(found.assigned_agent, "b")
+        self.assertEqual(
+            found.reason, "raising has no opinion (ZeroDivisionError: I divide); nearest: 1.00, least of 3"
+        )
+        guard.find(TEAM)
+        logged = self.flushLoggedErrors(ZeroDivisionError)
+        self.assertEqual(len(logged), 1)
+        self.assertIn("in find", logged[0].getTraceback())
+
+    def test_raising_elsewhere(self) -> None:
+        """Also what is better, and summaries, are then as the nearest has it."""
+        guard = Guard(Raising())
+        self.assertTrue(guard.improves(TEAM[0], TEAM[1], 0.1))
+        self.assertFalse(guard.improves(TEAM[1], TEAM[0], 0.1))
+        self.assertEqual(guard.merge(TEAM, TEAM), Nearest().merge(TEAM, ()))
+        self.assertEqual(len(self.flushLoggedErrors()), 2)
+
+    def test_lying(self) -> None:
+        """One that names who did not report, somebody twice, crowds, novels, or no consensus at all, has no opinion."""
+        for lie, why in (
+            (Consensus("zorro"), "who did not report"),
+            (Consensus("b", ("zorro",)), "who did not report"),
+            (Consensus("b", assigned=("zorro",)), "who did not report"),
+            (Consensus("b", ("b",)), "twice"),
+            (Consensus("b", ("a",) * 1_000_000), "more than there are"),
+            (Consensus("b", reason="x" * 10_000_000), "too long"),
+            (Consensus("b", value=(math.nan,)), "no place"),
+            (Consensus(["b"]), "TypeError"),  # type: ignore[arg-type]
+            ("b", "str"),
+            (None, "NoneType"),
+        ):
+            self.assert_falls_back(Guard(Lying(lie)), why)
+
+    def test_mutable_state(self) -> None:
+        """One that answers equal reports in two ways is caught, at once or when it is asked again."""
+        self.assert_falls_back(Guard(Moody(), twice=True), "two answers")
+        later = Guard(Moody())
+        self.assertEqual(later.find(TEAM).assigned_agent, "b")
+        self.assertIn("two answers", later.find(TEAM).reason)
+        self.flushLoggedErrors()
+
+    def test_order(self) -> None:
+        """One that goes by the order of reports is caught, or gets them in one order."""
+        self.assert_falls_back(Guard(OrderBound(), twice=True), "two answers")
+        self.assertEqual(Guard(OrderBound()).find(TEAM), Guard(OrderBound()).find(TEAM[::-1]))
+
+    def test_late(self) -> None:
+        """One that does not answer in time costs its deadline a few times, and then no more."""
+        slow = Slow()
+        guard = Guard(slow)
+        for _ in range(10):
+            self.assertEqual(guard.find(TEAM).assigned_agent, "b")
+        self.assertEqual(slow.asked, STRIKES)
+        self.assertIn("asked no more", guard.find(TEAM).reason)
+        self.flushLoggedErrors()
+
+    def test_inventing(self) -> None:
+        """A summary may not hold what nobody reported, and "perhaps" is no answer."""
+        guard = Guard(Inventing())
+        self.assertEqual(guard.merge(TEAM, ()), Nearest().merge(TEAM, ()))
+        self.assertTrue(guard.improves(TEAM[0], TEAM[1], 0.1))
+        self.assertEqual(len(self.flushLoggedErrors()), 2)
+
+    def test_group(self) -> None:
+        """Of several tasks too: a good answer stays; one that leaves a task out or gives too much falls back."""
+        items = [Item("s"), Item("t")]
+        bids = [Report(a, c, task=t) for a, c in (("a", 1.0), ("b", 2.0)) for t in "st"]
+        good = Cbba().find_group(bids, items)
+        self.assertEqual(Guard(Cbba()).find_group(bids, items), good)
+        self.assertEqual([p.assigned_agent for p in Guard(Nearest()).find_group(bids, items)], ["a", "b"])
+
+        class Bad(Cbba):
+            answer: object = ()
+
+            def find_group(self, contacts: Sequence[Report], items: Sequence[Item]) -> tuple[Consensus, ...]:
+                return self.answer  # type: ignore[return-value]
+
+        for answer, why in (
+            (good[:1], "one answer for each task"),
+            (good[::-1], "one answer for each task"),
+            ((good[0], replace(good[0], task="t")), "gives 'a' more than it takes"),
+            ((good[0], replace(good[1], assigned_agent="zorro")), "who did not report"),
+            (("s", "t"), "no tuple of Consensus"),
+            (None, "no tuple of Consensus"),
+        ):
+            bad = Bad()
+            bad.answer = answer
+            found = Guard(bad).find_group(bids, items)
+            self.assertEqual([p.assigned_agent for p in found], ["a", "b"])
+            self.assertIn(why, found[0].reason)
+            self.flushLoggedErrors()
+
+    def test_unlawful_reports_never_reach_it(self) -> None:
+        """A strategy behind a guard sees lawful reports only, so what it believes does no harm."""
+        bad = [Report("x", cost) for cost in (math.nan, math.inf, -1.0, 1e300)]
+        bad += [Report("x", 0.0, age=3.0, valid_for=2.0), Report("x", 0.0, unmet=("has no camera",))]
+        guard = Guard(Nearest())
+        self.assertEqual(guard.find([*bad, *TEAM]), guard.find(TEAM))
+        for offer in bad:
+            self.assertFalse(Guard(Lying(None)).improves(TEAM[0], offer, 0.0))
+
+    def test_by_name(self) -> None:
+        """Built-in strategies come behind a guard by name; a name that nobody has is an error."""
+        self.assertIsInstance(guarded("nearest").strategy, Nearest)
+        error = self.assertRaises(UnknownStrategy, guarded, "farthest")
+        self.assertIn("nearest", str(error))
+        self.assertRaises(UnknownStrategy, guarded, "this:s")
+
+    def test_fallback_of_choice(self) -> None:
+        """Another strategy than the nearest can be what decides then, and is named."""
+
+        class Farthest(Nearest):
+            name = "farthest"
+
+            def find(self, contacts: Sequence[Report]) -> Consensus:
+                return replace(super().find(contacts), assigned_agent="a", standby=())
+
+        found = Guard(Raising(), Farthest()).find(TEAM)
+        self.assertEqual((found.assigned_agent, found.strategy), ("a", "farthest"))
+        self.flushLoggedErrors()
