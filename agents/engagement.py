@@ -16,7 +16,7 @@ from agents.behaviour import STAND, Behaviour
 from agents.decision import Decision, decide
 from drivers.driver import Permit
 from drivers.reading import Action, Observation
-from middleware.consensus.lease import Lessee
+from middleware.commitment.lessee import Lessee
 from middleware.consensus.strategy import ConsensusAlgorithm
 from middleware.presence import ASSIGNED, DONE, EXECUTING, SEARCHING, WAITING
 from middleware.tasks import COMPLETED, Member, Result, Task

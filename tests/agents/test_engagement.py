@@ -7,7 +7,7 @@ from twisted.trial.unittest import SynchronousTestCase
 from agents.behaviour import STAND
 from agents.engagement import SEARCH_TTL, Deed, Engagement
 from drivers.reading import Action, Observation
-from middleware.consensus.lease import Lease
+from middleware.commitment.lessee import Lease
 from middleware.consensus.nearest import Nearest
 from middleware.entangled.clock import HeapClock
 from middleware.entangled.identity import Identity

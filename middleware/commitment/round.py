@@ -1,0 +1,118 @@
+"""Round: one question to every member of a council, tried again where no answer comes, and what came of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from twisted.internet.defer import Deferred
+from twisted.internet.interfaces import IDelayedCall, IReactorTime
+
+from middleware.commitment.ballot import Reply, quorum, reply_of
+from middleware.entangled.kademlia.contact import Contact
+
+TRIES = 3
+PAUSE = 0.1
+"""Seconds between two tries with a member that has not answered (consensus rule 6)."""
+
+Ask = Callable[[Contact, str, tuple[Any, ...]], Deferred[Any]]
+"""Ask a council member: (member, method, arguments)."""
+
+
+class Round:
+    """``outcome`` fires with the round as soon as it is decided whether a majority answers with one of ``kinds``.
+
+    It also fires, undecided, when everybody answered or ``patience`` seconds have passed.  Who has not answered then is
+    asked on, three times in all, until the round is closed.
+    """
+
+    def __init__(
+        self,
+        members: Sequence[Contact],
+        ask: Ask,
+        clock: IReactorTime,
+        method: str,
+        arguments: tuple[Any, ...],
+        kinds: tuple[str, ...],
+        patience: float,
+    ) -> None:
+        self.began = clock.seconds()
+        self.replies: dict[int, Reply] = {}
+        self.outcome: Deferred[Round] = Deferred()
+        self._members = members
+        self._ask = ask
+        self._clock = clock
+        self._question = (method, arguments)
+        self._kinds = kinds
+        self._needed = quorum(len(members))
+        self._sent: dict[int, float] = {}
+        self._tries = 0
+        self._is_closed = False
+        self._timer: IDelayedCall | None = None
+        self._end: IDelayedCall | None = clock.callLater(patience, self._ended)
+        self._try()
+
+    @property
+    def is_open(self) -> bool:
+        """Whether it still waits for what decides it."""
+        return not self.outcome.called and not self._is_closed
+
+    @property
+    def is_won(self) -> bool:
+        """Whether a majority has said yes."""
+        return len(self.yes) >= self._needed > 0
+
+    @property
+    def yes(self) -> list[int]:
+        """The places of those that said yes."""
+        return [place for place, reply in self.replies.items() if reply.kind in self._kinds]
+
+    @property
+    def sent_at(self) -> float:
+        """The moment from which a majority counts its grants at the earliest: the question was sent by then."""
+        moments = sorted((self._sent[place] for place in self.yes), reverse=True)
+        return moments[self._needed - 1]
+
+    def close(self) -> None:
+        """Ask nobody any more and wait for nothing."""
+        self._is_closed = True
+        for timer in (self._timer, self._end):
+            if timer is not None and timer.active():
+                timer.cancel()
+
+    def free_in(self) -> float:
+        """Seconds until a majority may be free to say yes, as far as its members told."""
+        waits = sorted(self.replies[n].remaining if n in self.replies else 0.0 for n in range(len(self._members)))
+        return waits[self._needed - 1] if waits else 0.0
+
+    def _try(self) -> None:
+        self._tries += 1
+        method, arguments = self._question
+        if self._tries < TRIES:
+            self._timer = self._clock.callLater(PAUSE, self._try)
+        for place, member in enumerate(self._members):
+            if place not in self.replies and not self._is_closed:
+                asked = self._ask(member, method, arguments)
+                asked.addBoth(self._answered, place, self._clock.seconds())
+        if not self._members:
+            self._ended()
+
+    def _answered(self, answer: object, place: int, sent: float) -> None:
+        """Take in the answer of one member; its silence (a Failure) and what is no answer count for nothing."""
+        reply = reply_of(answer)
+        if self._is_closed or reply is None or place in self.replies:
+            return
+        self.replies[place], self._sent[place] = reply, sent
+        if len(self.replies) == len(self._members):
+            self.close()
+        no = len(self.replies) - len(self.yes)
+        if self.is_won or len(self._members) - no < self._needed or self._is_closed:
+            self._decided()
+
+    def _ended(self) -> None:
+        self.close()
+        self._decided()
+
+    def _decided(self) -> None:
+        if not self.outcome.called:
+            self.outcome.callback(self)
