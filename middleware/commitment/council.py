@@ -13,6 +13,7 @@ from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorTime
 
 from middleware.commitment.ballot import (
+    BEHIND,
     FIRST,
     GRANTED,
     HELD,
@@ -80,6 +81,11 @@ class Council:
         newest = max(round_.replies.values(), key=lambda reply: reply.configuration, default=None)
         if newest is not None and newest.kind == MOVED and newest.members:
             self._adopt(newest.configuration, newest.members)
+            return
+        # Who was away when this council was chosen is told by whoever meets it.
+        for place, reply in round_.replies.items():
+            if reply.kind == BEHIND and newest is not None and newest.configuration == self.configuration:
+                self._install(self.members[place])
 
     def let_go(self, ballot: Ballot) -> None:
         """Give back whatever was promised or granted under ``ballot``."""
@@ -160,15 +166,22 @@ class Council:
         installed = await told.outcome
         if not installed.is_won:
             raise NoMajority("the new council is chosen, but too few of its members know; ask for the change again")
-        for member in self.members:
-            # So that those who leave can tell where the council is now.
-            if member not in members:
-                self._ask(member, "lease.install", question).addErrback(lambda _: None)
+        leaving = [member for member in self.members if member not in members]
         self._adopt(following, members)
+        for member in leaving:
+            # So that it can tell where the council is now.
+            self._install(member)
 
     async def _decision(self, ballot: Ballot, packed: list[list[object]]) -> Round:
         """A majority of the *old* council decides: so no lease of it can be open, nor another change be chosen."""
         return await self.round("lease.change", ballot.counter, packed, self.token).outcome
+
+    def _install(self, member: Contact) -> None:
+        """Tell ``member`` of the present council, which was chosen by the one before."""
+        packed = [one.packed() for one in self.members]
+        self._ask(member, "lease.install", (self.task_id, self.configuration, packed, self.token)).addErrback(
+            lambda _: None
+        )
 
     def _adopt(self, configuration: int, members: tuple[Contact, ...]) -> None:
         if configuration > self.configuration:

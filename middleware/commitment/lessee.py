@@ -9,6 +9,7 @@ and the time in which the robot comes to rest, so it ends before any member woul
 
 from __future__ import annotations
 
+import math
 import random
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -68,6 +69,7 @@ class Lessee:
         self._changed = changed
         self._stop_time = stop_time
         self._deadline = 0.0
+        self._rests_at = -math.inf
         self._ballot = NONE
         self._claimed = NONE
         self._rank = 0
@@ -127,17 +129,14 @@ class Lessee:
 
         Where the robot takes a time to come to rest, the council is told when that has passed.
         """
-        was_held = self.lease is not None
+        if self.lease is not None:
+            self._rests_at = self._clock.seconds() + self._stop_time
         self._is_wanted = False
         self._cancel()
         ballots = [ballot for ballot in {self._ballot: None, self._claimed: None} if ballot != NONE]
         self.token, self._deadline, self._ballot, self._claimed = 0, 0.0, NONE, NONE
-        rest = self._rest(was_held)
         for ballot in ballots:
-            if rest > 0.0:
-                self._clock.callLater(rest, self._let_go, ballot)
-            else:
-                self._let_go(ballot)
+            self._let_go(ballot)
 
     # -- claiming ---------------------------------------------------------------------------------------------------
 
@@ -187,6 +186,7 @@ class Lessee:
         if deadline <= self._clock.seconds():
             return self._failed(asked)
         self._ballot, self.token, self._deadline = ballot, token, deadline
+        self._rests_at = deadline + self._stop_time
         self._again(max(0.0, asked.began + self.council.ttl / RENEWALS - self._clock.seconds()))
         self._changed()
 
@@ -258,12 +258,17 @@ class Lessee:
         if self._is_wanted and not self._is_asking:
             self._again(self._rng.uniform(*BACK_OFF))
 
-    def _rest(self, was_held: bool) -> float:
-        """How long the robot may still move after it was told to stop."""
-        return self._stop_time if was_held else 0.0
-
     def _let_go(self, ballot: Ballot) -> None:
-        self.council.let_go(ballot)
+        """Tell the council, as soon as the robot stands still (it was told to stop at the deadline at the latest)."""
+        rest = self._rest()
+        if rest > 0.0:
+            self._clock.callLater(rest, self.council.let_go, ballot)
+        else:
+            self.council.let_go(ballot)
+
+    def _rest(self) -> float:
+        """Seconds for which the robot may still move."""
+        return self._rests_at - self._clock.seconds()
 
     def _let_go_of_minority(self) -> None:
         """What a minority granted must not keep a healthier claimant waiting."""

@@ -22,7 +22,8 @@ Ask = Callable[[Contact, str, tuple[Any, ...]], Deferred[Any]]
 class Round:
     """``outcome`` fires with the round as soon as it is decided whether a majority answers with one of ``kinds``.
 
-    It also fires, undecided, when everybody answered or ``patience`` seconds have passed.  Who has not answered then is
+    It also fires, undecided, when everybody answered or ``patience`` seconds have passed, and soon after a majority has
+    answered.  Who has not answered then is
     asked on, three times in all, until the round is closed.
     """
 
@@ -45,6 +46,7 @@ class Round:
         self._question = (method, arguments)
         self._kinds = kinds
         self._needed = quorum(len(members))
+        self._patience = patience
         self._sent: dict[int, float] = {}
         self._tries = 0
         self._is_closed = False
@@ -108,6 +110,11 @@ class Round:
         no = len(self.replies) - len(self.yes)
         if self.is_won or len(self._members) - no < self._needed or self._is_closed:
             self._decided()
+        elif len(self.replies) == self._needed and not self.outcome.called:
+            # The rest decides it; whoever is down must not hold up a claimant whom another one was faster than.
+            if self._end is not None and self._end.active():
+                self._end.cancel()
+            self._end = self._clock.callLater(min(PAUSE, self._patience), self._ended)
 
     def _ended(self) -> None:
         self.close()
