@@ -133,10 +133,10 @@ class Lessee:
             self._rests_at = self._clock.seconds() + self._stop_time
         self._is_wanted = False
         self._cancel()
-        ballots = [ballot for ballot in {self._ballot: None, self._claimed: None} if ballot != NONE]
+        if self._ballot != NONE:
+            self._let_go(self._ballot)
+        self._let_go_of_minority()
         self.token, self._deadline, self._ballot, self._claimed = 0, 0.0, NONE, NONE
-        for ballot in ballots:
-            self._let_go(ballot)
 
     # -- claiming ---------------------------------------------------------------------------------------------------
 
@@ -205,6 +205,7 @@ class Lessee:
         was_held = self.token != 0
         self._let_go_of_minority()
         if was_held:
+            self._let_go(self._ballot)
             self._lose()
         self._wait(asked)
 
@@ -237,7 +238,7 @@ class Lessee:
 
     def _lose(self) -> None:
         """It is over before it was given back."""
-        self.token, self._deadline = 0, 0.0
+        self.token, self._deadline, self._ballot = 0, 0.0, NONE
         self._changed()
 
     def _has_ended(self, asked: Round) -> bool:
@@ -272,7 +273,8 @@ class Lessee:
 
     def _let_go_of_minority(self) -> None:
         """What a minority granted must not keep a healthier claimant waiting."""
-        self._let_go(self._claimed)
+        if self._claimed not in (self._ballot, NONE):
+            self._let_go(self._claimed)
 
     def _cancel(self) -> None:
         """What a round under way still brings is not used any more."""

@@ -64,7 +64,7 @@ class Bidder:
                 self._ask,
                 self.machine,
                 configuration,
-                self.world.gates[task_id].token or 0,
+                self.world.floor(self.place, task_id),
             )
             council.moved = lambda: self.world.moved(task_id, council)
             changed = lambda: self.world.on_change(self, task_id)  # noqa: E731

@@ -8,6 +8,14 @@ from typing import Any
 
 from twisted.internet.defer import Deferred, succeed
 
+from drivers.errors import StaleCommand
+from drivers.gate import Gate
+from middleware.commitment import ledger, lessee
+from middleware.commitment.acceptor import Acceptor
+from middleware.commitment.ballot import GRANTED, members_of
+from middleware.commitment.council import Council
+from middleware.commitment.lessee import Lessee
+from middleware.commitment.round import Round
 from middleware.entangled.data import schema
 from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.data.sqlite import SqliteStore
@@ -29,6 +37,8 @@ from middleware.entangled.wire import greeting
 from middleware.entangled.wire.greeting import Cookies, Greeter
 from middleware.entangled.wire.method import Ledger
 from middleware.entangled.wire.session import Session
+from tests.invariants.leases import Leases
+from tests.invariants.machine import Machine
 
 
 async def _nothing(*_: object) -> None:
@@ -60,7 +70,14 @@ def _any_answer(answers: dict[bytes, Any], voters: frozenset[bytes]) -> int:
 
 _GENUINE = {
     (place, name): getattr(place, name)
-    for place, name in [(Tally, "outcome"), (Vote, "claim"), (Greeter, "on_who"), (Session, "open"), (Seat, "_load")]
+    for place, name in [
+        (Tally, "outcome"),
+        (Vote, "claim"),
+        (Greeter, "on_who"),
+        (Session, "open"),
+        (Seat, "_load"),
+        (ledger.Ledger, "keep"),
+    ]
 }
 
 
@@ -103,6 +120,42 @@ def _safe_already(self: Writer) -> Deferred[None]:
     return succeed(None)
 
 
+def _deadline_from_the_answer(self: Lessee, won: Round) -> float:
+    return self._clock.seconds() + self.council.ttl * (1.0 - lessee.CLOCK_MARGIN) - self._stop_time
+
+
+def _deadline_without_the_stop(self: Lessee, won: Round) -> float:
+    return won.sent_at + self.council.ttl * (1.0 - lessee.CLOCK_MARGIN)
+
+
+def _only_listens(self: Lessee, asked: Round) -> None:
+    return None
+
+
+def _closest_now(self: Leases, place: int, task_id: str) -> Any:
+    near = [n for n in range(self.n) if not {(place, n), (n, place)} & self.ether.cut and self._is_up(n)]
+    return tuple(self.contacts[n] for n in near[:3]), 1
+
+
+def _forgets_tokens(self: ledger.Ledger, task_id: str) -> None:
+    entry = self._entries[task_id]
+    token, entry.token = entry.token, 0
+    _GENUINE[ledger.Ledger, "keep"](self, task_id)
+    entry.token = token
+
+
+def _admits_lower_tokens(self: Gate, permit: Any, now: float) -> None:
+    if permit.deadline <= now:
+        raise StaleCommand("late")
+    self._token, self._deadline = permit.token, permit.deadline
+
+
+async def _decided_by_the_new(self: Council, ballot: Any, packed: Any) -> Round:
+    members = members_of(packed) or ()
+    question = (self.task_id, self.configuration, ballot.counter, packed, self.token)
+    return await Round(members, self._ask, self._clock, "lease.change", question, (GRANTED,), self.ttl / 3).outcome
+
+
 BUGS: dict[str, list[tuple[Any, str, Any]]] = {
     "tombstone dropped too early": [(owner, "TOMBSTONE_TTL", 3.0)],
     "acknowledged by a minority": [(Overlay, "voters", lambda self, key, targets: [targets[0].node_id])],
@@ -138,7 +191,21 @@ BUGS: dict[str, list[tuple[Any, str, Any]]] = {
     "acknowledged before it is written": [(Writer, "written", _safe_already)],
     "checksums are not looked at": [(schema, "record_of", lambda row: schema._unchecked(row))],
     "a full disk takes records": [(SqliteStore, "put", MemoryStore.put)],
+    # Leases.
+    "deadline from the time of the answer": [(Lessee, "_deadline_of", _deadline_from_the_answer)],
+    "no clock margin": [(lessee, "CLOCK_MARGIN", 0.0)],
+    "a clock that stands still while suspended": [(Machine, "COUNTS_SUSPENSION", False)],
+    "the council is whoever is closest now": [(Leases, "council_for", _closest_now)],
+    "a stand-by does not ask": [(Lessee, "_wait", _only_listens)],
+    "minority grants are kept": [(Lessee, "_let_go_of_minority", _idle)],
+    "the token is not stored": [(ledger.Ledger, "keep", _forgets_tokens)],
+    "the time to stop is ignored": [(Lessee, "_deadline_of", _deadline_without_the_stop)],
+    "released before it stands still": [(Lessee, "_rest", lambda self: 0.0)],
+    "the device takes lower tokens": [(Gate, "admit", _admits_lower_tokens)],
+    "a restarted member grants at once": [(Acceptor, "_silence", lambda self, ttl: 0.0)],
+    "the new council decides the change": [(Council, "_decision", _decided_by_the_new)],
 }
+LEASE_BUGS = tuple(list(BUGS)[-12:])
 
 FINDERS: dict[str, tuple[str, ...]] = {
     "one promise is a majority": ("tuples",),
@@ -153,6 +220,7 @@ FINDERS: dict[str, tuple[str, ...]] = {
     "acknowledged before it is written": ("records", "stores"),
     "checksums are not looked at": ("records", "stores"),
     "a full disk takes records": ("records", "stores"),
+    **dict.fromkeys(LEASE_BUGS, ("leases",)),
 }
 """The workloads that look for a bug, where these are not the records."""
 

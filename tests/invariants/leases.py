@@ -37,7 +37,7 @@ ROUGH = 0.06
 """E1: by this share of the ttl a device's count of a duration may differ from a clock that is 5 % off."""
 KINDS = (
     "cut", "cut", "one way", "swizzle", "kill", "kill", "wipe", "freeze", "freeze", "suspend", "change", "change",
-    "leave", "air", "step",
+    "change", "leave", "air", "step", "blackout",
 )  # fmt: skip
 
 
@@ -226,6 +226,10 @@ class Leases:
         accepted.append((now, permit.token, bidder.place))
         self._rest_at[task_id, bidder.place] = deadline + self.stop_time
 
+    def floor(self, place: int, task_id: str) -> int:
+        """The highest token that the robot of a place has obeyed, and tells its agent."""
+        return max((token for _, token, one in self._accepted[task_id] if one == place), default=0)
+
     def stop(self, place: int, task_id: str) -> None:
         """The agent stops its robot, which comes to rest; on the wire a stop does not overtake a command."""
         self.clock.callLater(WIRE, self._stop, place, task_id)
@@ -399,6 +403,8 @@ class Leases:
             places = tuple(self._dice.sample(range(self.n), min(count, self.n - 1)))
             if self._dice.random() < 0.4:
                 places = (self._dice.choice(self.agents), *places[1:])
+            if kind == "blackout":
+                kind, places = "kill", tuple(range(self.n))
             if kind == "wipe" and self.has_stores:
                 kind = "kill"
             troubles.append(Trouble(at, at + seconds, kind, places))
@@ -461,7 +467,7 @@ class Leases:
         for task_id in self._councils:
             if self._dice.random() < 0.7:
                 for agent in self.agents:
-                    if self._is_up(agent) and self._dice.random() < 0.8:
+                    if self._is_up(agent) and self._dice.random() < 0.9:
                         self.bidders[agent].leave(task_id)
             members = [self.contacts[n] for n in sorted(self._dice.sample(range(self.n), 3))]
             self.clock.callLater(0.5 + self.stop_time, self._change_now, place, task_id, members)

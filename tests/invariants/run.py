@@ -12,6 +12,7 @@ from functools import partial
 from tests.fleet import Fleet
 from tests.invariants.bug import seeded
 from tests.invariants.disk import DiskFleet
+from tests.invariants.leases import Leases
 from tests.invariants.records import Records
 from tests.invariants.schedule import Schedule, Workload
 from tests.invariants.stores import Stores
@@ -25,6 +26,8 @@ WORKLOADS: dict[str, Callable[[Schedule], Workload]] = {
     "wire": Wire,
 }
 """Each may be asked for by name; the order is the one in which they act."""
+LEASES = "leases"
+"""The workload that has a world of its own and takes part in every schedule: it runs beside the others."""
 SHARES = {"records": 1.0, "tuples": 0.06, "stores": 0.06, "wire": 0.06}
 """The share of schedules in which each takes part, unless it is asked for."""
 
@@ -47,8 +50,12 @@ def drawn(seed: int) -> list[str]:
 
 def run(seed: int, only: tuple[str, ...] = (), bug: str | None = None) -> Outcome:
     """Run the schedule of ``seed``, with the workloads of ``only`` instead of those drawn, and with a bug put in."""
-    names = only or drawn(seed)
+    names = only or (*drawn(seed), LEASES)
     with seeded(bug):
+        leases = Leases(seed) if LEASES in names else None
+        found = leases.run() if leases is not None else []
+        if leases is not None and (found or set(names) == {LEASES}):
+            return Outcome(seed, f"leases {leases.title}", found, leases.ether.digest())
         schedule = Schedule(seed, DiskFleet if "stores" in names else Fleet)
         found = schedule.run([WORKLOADS[name](schedule) for name in WORKLOADS if name in names])
     faults = "; ".join(map(str, schedule.faults))
