@@ -20,13 +20,14 @@ def main() -> int:
     parser.add_argument("--schedules", type=int, help="how many to run (default 200; of each bug at most 400)")
     parser.add_argument("--seed", type=int, default=1, help="the seed of the first; the others follow (default 1)")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes (default: one for each core)")
-    parser.add_argument("--only", default="", help=f"workloads in all of them, with commas: {', '.join((*WORKLOADS, LEASES))}")
+    names = ", ".join((*WORKLOADS, LEASES))
+    parser.add_argument("--only", default="", help=f"workloads in all of them, with commas: {names}")
     parser.add_argument("--bug", choices=sorted(BUGS), help="run with a bug put in, until it shows")
     parser.add_argument("--bugs", action="store_true", help="run with each bug in turn, and say when it showed")
     wanted = parser.parse_args()
     only = tuple(name for name in wanted.only.split(",") if name)
     if unknown := [name for name in only if name not in (*WORKLOADS, LEASES)]:
-        parser.error(f"--only: no workload {unknown[0]}; there are {', '.join((*WORKLOADS, LEASES))}")
+        parser.error(f"--only: no workload {unknown[0]}; there are {names}")
     began, failed = time.monotonic(), 0
     count = wanted.schedules or (BOUND if wanted.bugs or wanted.bug else 200)
     seeds = range(wanted.seed, wanted.seed + count)

@@ -64,17 +64,17 @@ class Bidder:
                 self._ask,
                 self.machine,
                 configuration,
-                self.world.floor(self.place, task_id),
+                self.world.referee.floor(self.place, task_id),
             )
             council.moved = lambda: self.world.moved(task_id, council)
-            changed = lambda: self.world.on_change(self, task_id)  # noqa: E731
+            changed = lambda: self.world.referee.on_change(self, task_id)  # noqa: E731
             self.lessees[task_id] = Lessee(council, self.machine, self._rng, changed, self.world.stop_time)
             self._gates[task_id] = Gate()
         return self.lessees[task_id]
 
     def leave(self, task_id: str) -> None:
         """Stop the robot, then give the lease back."""
-        self.world.stop(self.place, task_id)
+        self.world.referee.stop(self.place, task_id)
         lessee = self.lessees.get(task_id)
         if lessee is not None:
             lessee.release()
@@ -99,8 +99,8 @@ class Bidder:
             return
         if lessee.lease is None and not lessee.token:
             return  # it was given back meanwhile
-        self.world.on_issue(self, task_id, permit)
-        self.world.clock.callLater(WIRE, self.world.on_command, self, task_id, permit, told, remaining)
+        self.world.referee.on_issue(self, task_id, permit)
+        self.world.clock.callLater(WIRE, self.world.referee.on_command, self, task_id, permit, told, remaining)
 
     # -- the wire ---------------------------------------------------------------------------------------------------
 

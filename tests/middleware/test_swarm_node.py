@@ -191,7 +191,7 @@ class SwarmNodeTests(FleetCase):
         self.assertEqual(self.flushLoggedErrors(), [])
 
     def test_claims_from_the_wire(self) -> None:
-        """Claims with a wrong name, configuration, ballot, token or duration are refused, and so are crafted councils."""
+        """Claims with a wrong name, configuration, ballot, token or duration are refused, and crafted councils."""
         fleet = self.swarm(2)
         good = ["t", 1, 1, 1.0]
         for place, bad in ((0, "t" * 65), (0, 5), (1, 0), (2, 0), (2, 2**62), (2, True), (3, 0.0), (3, 61.0), (3, "1")):
