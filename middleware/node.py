@@ -223,7 +223,7 @@ class SwarmNode(Service):
             return self._desk.ask(self.entangled.contact, member, method, arguments, ttl / 3)
 
         configuration = getattr(task, "configuration", FIRST)
-        council = Council(task.task_id, self.uuid, ttl, task.council, ask, self.clock, configuration, floor)
+        council = Council(task.task_id, self.uuid, ttl, task.council, ask, self.clock, self.rng, configuration, floor)
         lessee = Lessee(council, self.clock, self.rng, changed, getattr(task, "stop_time", 0.0))
         self._desk.enter(lessee)
         return lessee

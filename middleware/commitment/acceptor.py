@@ -44,13 +44,13 @@ class Acceptor:
     def prepare(self, task_id: str, configuration: int, ballot: Ballot, ttl: float, now: float) -> Reply:
         """Promise to accept nothing under a lower ballot, or say what stands against it.
 
-        While another holds the lease nothing changes but that the asker is told when it is given back: to ask is to
-        poll, and never shortens a lease.
+        While another holds the lease (a former life of the same agent is another) nothing changes but that the asker
+        is told when it is given back: to ask is to poll, and never shortens a lease.
         """
         entry = self._entry(task_id, configuration, ttl, now)
         if isinstance(entry, Reply):
             return entry
-        if entry.until > now and entry.ballot.agent != ballot.agent:
+        if entry.until > now and not entry.ballot.is_kin(ballot):
             self._listen(entry, ballot.agent, now + ttl)
             return self._reply(HELD, entry, now)
         if ballot < entry.promised:
@@ -70,7 +70,7 @@ class Acceptor:
             return entry
         if entry.sealed != NONE:
             return self._reply(SEALED, entry, now)._replace(ballot=entry.sealed)
-        is_lower = token < entry.token or (token == entry.token and ballot.agent != entry.ballot.agent)
+        is_lower = token < entry.token or (token == entry.token and not ballot.is_kin(entry.ballot))
         if ballot < entry.promised or ballot <= entry.spent or is_lower:
             return self._reply(OUTBID, entry, now)
         is_new = (entry.promised, entry.ballot, entry.token, entry.ttl) != (ballot, ballot, token, ttl)
@@ -110,7 +110,8 @@ class Acceptor:
             entry.is_over, entry.touched_at = True, now
             self._ledger.keep(task_id)
         reply = self._reply(OVER, entry, now)
-        return reply._replace(remaining=0.0) if entry.ballot.agent == agent else reply
+        is_done = entry.ballot.agent == agent and entry.token == token
+        return reply._replace(remaining=0.0) if is_done else reply
 
     def change(
         self, task_id: str, configuration: int, ballot: Ballot, members: tuple[Contact, ...], token: int, now: float

@@ -34,11 +34,19 @@ OVER = "over"
 KINDS = (GRANTED, HELD, OUTBID, QUIET, BEHIND, SEALED, MOVED, OVER)
 
 
+LIFE = 2**20
+"""The lowest digits of a counter are dice, thrown anew in each life of an agent."""
+
+
 class Ballot(NamedTuple):
     """The number of one attempt; the agent's id makes it unique and breaks ties."""
 
     counter: int
     agent: str
+
+    def is_kin(self, other: Ballot) -> bool:
+        """Whether both are of the same life of an agent: a former life's robot may still move, as far as this knows."""
+        return self.agent == other.agent and self.counter % LIFE == other.counter % LIFE
 
 
 NONE = Ballot(0, "")

@@ -6,6 +6,7 @@ of the old council and by nobody else, never while a claim is open (consensus ru
 
 from __future__ import annotations
 
+import random
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -17,6 +18,7 @@ from middleware.commitment.ballot import (
     FIRST,
     GRANTED,
     HELD,
+    LIFE,
     MAX_COUNCIL,
     MOVED,
     OUTBID,
@@ -48,6 +50,7 @@ class Council:
         members: Sequence[Contact],
         ask: Ask,
         clock: IReactorTime,
+        rng: random.Random,
         configuration: int = FIRST,
         token: int = 0,
         moved: Callable[[], None] = lambda: None,
@@ -61,12 +64,13 @@ class Council:
         self.moved = moved
         self._ask = ask
         self._clock = clock
-        self._counter = 0
+        self._rounds = 0
+        self._life = rng.randrange(LIFE)
 
     def next_ballot(self) -> Ballot:
         """A ballot above all that were seen."""
-        self._counter += 1
-        return Ballot(self._counter, self.agent)
+        self._rounds += 1
+        return Ballot(self._rounds * LIFE + self._life, self.agent)
 
     def round(self, method: str, *arguments: Any, kinds: tuple[str, ...] = (GRANTED,)) -> Round:
         """Ask every member; tell ``hear`` what came of it."""
@@ -76,7 +80,7 @@ class Council:
     def hear(self, round_: Round) -> None:
         """Learn from answers which numbers are taken, and whether the council is another one now."""
         for reply in round_.replies.values():
-            self._counter = max(self._counter, reply.ballot.counter)
+            self._rounds = max(self._rounds, reply.ballot.counter // LIFE)
             self.token = max(self.token, reply.token)
         newest = max(round_.replies.values(), key=lambda reply: reply.configuration, default=None)
         if newest is not None and newest.kind == MOVED and newest.members:
@@ -87,11 +91,12 @@ class Council:
             if reply.kind == BEHIND and newest is not None and newest.configuration == self.configuration:
                 self._install(self.members[place])
 
-    def let_go(self, ballot: Ballot) -> None:
-        """Give back whatever was promised or granted under ``ballot``."""
+    def let_go(self, ballot: Ballot, heirs: Sequence[Contact] = ()) -> None:
+        """Give back whatever was promised or granted under ``ballot``, and tell ``heirs``."""
         for member in self.members:
-            asked = self._ask(member, "lease.release", (self.task_id, ballot.counter))
-            asked.addErrback(lambda _: None)
+            self._ask(member, "lease.release", (self.task_id, ballot.counter)).addErrback(lambda _: None)
+        for heir in heirs:
+            self._ask(heir, "lease.freed", (self.task_id, self.token)).addErrback(lambda _: None)
 
     def close(self, token: int = 0) -> Deferred[None]:
         """Have no more leases granted on the task, which has ended; fires when nobody can act on it any more.
@@ -148,29 +153,31 @@ class Council:
             await self.finish(ballot, prepared)
         else:
             await self._decide(ballot, wanted)
-        if set(self.members) != set(wanted):
+        if self.configuration == before + 1 and set(self.members) != set(wanted):
             raise Superseded("another change of the council was under way and is complete now; look at it again")
 
     async def _decide(self, ballot: Ballot, members: tuple[Contact, ...]) -> None:
         """Let a majority of the old council accept ``members``, then tell these; a majority of them must know."""
+        # The council of this object may become another one while answers are awaited; this decision is of this one.
+        old, following = self.members, self.configuration + 1
         packed = [member.packed() for member in members]
         accepted = await self._decision(ballot, packed)
         accepted.close()
-        self.hear(accepted)
         if not accepted.is_won:
+            self.hear(accepted)
             self.let_go(ballot)
             _raise(accepted, "the council stays as it is")
-        following = self.configuration + 1
-        question = (self.task_id, following, packed, self.token)
-        told = Round(members, self._ask, self._clock, "lease.install", question, (GRANTED,), self.ttl / 3)
+        token = max(self.token, *(reply.token for reply in accepted.replies.values()))
+        question = (self.task_id, following, packed, token)
+        told = Round(members, self._ask, self._clock, "lease.install", question, (GRANTED, MOVED), self.ttl / 3)
         installed = await told.outcome
         if not installed.is_won:
             raise NoMajority("the new council is chosen, but too few of its members know; ask for the change again")
-        leaving = [member for member in self.members if member not in members]
         self._adopt(following, members)
-        for member in leaving:
-            # So that it can tell where the council is now.
-            self._install(member)
+        for member in old:
+            # So that who leaves can tell where the council is now.
+            if member not in members:
+                self._ask(member, "lease.install", question).addErrback(lambda _: None)
 
     async def _decision(self, ballot: Ballot, packed: list[list[object]]) -> Round:
         """A majority of the *old* council decides: so no lease of it can be open, nor another change be chosen."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from twisted.internet.defer import Deferred
@@ -21,13 +21,14 @@ from middleware.commitment.ballot import GRANTED, NONE, OUTBID, OVER, SEALED, Ba
 from middleware.commitment.council import Council
 from middleware.commitment.round import Round
 from middleware.entangled.errors import EntangledError
+from middleware.entangled.kademlia.contact import Contact
 
 CLOCK_MARGIN = 0.02
 """Share by which the clocks of two correct nodes may drift apart: 2 rho, with rho = 1 %."""
 RENEWALS = 3
 """How often a lease is renewed, and a stand-by asks, in each ttl."""
 RETRY = 0.1
-JITTER = (0.005, 0.03)
+JITTER = (0.0, 0.02)
 BACK_OFF = (0.02, 0.08)
 """Seconds after which a claim is tried again that another one was faster than."""
 STAGGER = 0.1
@@ -124,17 +125,18 @@ class Lessee:
             self._lose()
             self._claim()
 
-    def release(self) -> None:
+    def release(self, heirs: Sequence[Contact] = ()) -> None:
         """Give the lease back (stop the device first), or stop claiming it.
 
-        Where the robot takes a time to come to rest, the council is told when that has passed.
+        Where the robot takes a time to come to rest, the council is told when that has passed.  Its members tell those
+        that stand by; ``heirs`` are told from here, and so half a round trip earlier.
         """
         if self.lease is not None:
             self._rests_at = self._clock.seconds() + self._stop_time
         self._is_wanted = False
         self._cancel()
         if self._ballot != NONE:
-            self._let_go(self._ballot)
+            self._let_go(self._ballot, heirs)
         self._let_go_of_minority()
         self.token, self._deadline, self._ballot, self._claimed = 0, 0.0, NONE, NONE
 
@@ -185,9 +187,12 @@ class Lessee:
         deadline = self._deadline_of(asked) if asked.is_won else 0.0
         if deadline <= self._clock.seconds():
             return self._failed(asked)
+        if ballot == self._ballot:
+            # A majority is enough to renew: who has not answered is asked in the next round.
+            asked.close()
         self._ballot, self.token, self._deadline = ballot, token, deadline
         self._rests_at = deadline + self._stop_time
-        self._again(max(0.0, asked.began + self.council.ttl / RENEWALS - self._clock.seconds()))
+        self._again(self._poll_period())
         self._changed()
 
     def _deadline_of(self, won: Round) -> float:
@@ -259,13 +264,13 @@ class Lessee:
         if self._is_wanted and not self._is_asking:
             self._again(self._rng.uniform(*BACK_OFF))
 
-    def _let_go(self, ballot: Ballot) -> None:
+    def _let_go(self, ballot: Ballot, heirs: Sequence[Contact] = ()) -> None:
         """Tell the council, as soon as the robot stands still (it was told to stop at the deadline at the latest)."""
         rest = self._rest()
         if rest > 0.0:
-            self._clock.callLater(rest, self.council.let_go, ballot)
+            self._clock.callLater(rest, self.council.let_go, ballot, heirs)
         else:
-            self.council.let_go(ballot)
+            self.council.let_go(ballot, heirs)
 
     def _rest(self) -> float:
         """Seconds for which the robot may still move."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -37,7 +38,6 @@ class Round:
         kinds: tuple[str, ...],
         patience: float,
     ) -> None:
-        self.began = clock.seconds()
         self.replies: dict[int, Reply] = {}
         self.outcome: Deferred[Round] = Deferred()
         self._members = members
@@ -48,6 +48,7 @@ class Round:
         self._needed = quorum(len(members))
         self._patience = patience
         self._sent: dict[int, float] = {}
+        self._free_at: dict[int, float] = {}
         self._tries = 0
         self._is_closed = False
         self._timer: IDelayedCall | None = None
@@ -84,8 +85,8 @@ class Round:
 
     def free_in(self) -> float:
         """Seconds until a majority may be free to say yes, as far as its members told."""
-        waits = sorted(self.replies[n].remaining if n in self.replies else 0.0 for n in range(len(self._members)))
-        return waits[self._needed - 1] if waits else 0.0
+        waits = sorted(self._free_at.get(place, -math.inf) for place in range(len(self._members)))
+        return max(0.0, waits[self._needed - 1] - self._clock.seconds()) if waits else 0.0
 
     def _try(self) -> None:
         self._tries += 1
@@ -105,6 +106,8 @@ class Round:
         if self._is_closed or reply is None or place in self.replies:
             return
         self.replies[place], self._sent[place] = reply, sent
+        # The member counted somewhere between question and answer; to come too early harms nobody.
+        self._free_at[place] = (sent + self._clock.seconds()) / 2 + reply.remaining
         if len(self.replies) == len(self._members):
             self.close()
         no = len(self.replies) - len(self.yes)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from twisted.internet.defer import Deferred
@@ -21,7 +21,7 @@ from middleware.entangled.kademlia.contact import Contact
 from tests.invariants.machine import Machine
 
 if TYPE_CHECKING:
-    from tests.invariants.leases import Leases
+    from tests.invariants.team import Team
 
 TICK = 0.1
 ACT = 0.002
@@ -32,7 +32,7 @@ WIRE = 0.001
 class Bidder:
     """One life of a place: its acceptor, its claims, its robot."""
 
-    def __init__(self, world: Leases, place: int, machine: Machine, store: Store, rng: random.Random) -> None:
+    def __init__(self, world: Team, place: int, machine: Machine, store: Store, rng: random.Random) -> None:
         self.world = world
         self.place = place
         self.machine = machine
@@ -47,8 +47,9 @@ class Bidder:
             "lease.close": self._close,
             "lease.change": self._change,
             "lease.install": self._install,
+            "lease.freed": self.freed,
         }
-        machine.callLater(rng.random() * TICK, self._tick)
+        machine.callLater(rng.random() * world.tick, self._tick)
 
     # -- the agent --------------------------------------------------------------------------------------------------
 
@@ -63,6 +64,7 @@ class Bidder:
                 members,
                 self._ask,
                 self.machine,
+                self._rng,
                 configuration,
                 self.world.referee.floor(self.place, task_id),
             )
@@ -72,12 +74,18 @@ class Bidder:
             self._gates[task_id] = Gate()
         return self.lessees[task_id]
 
-    def leave(self, task_id: str) -> None:
+    def leave(self, task_id: str, heirs: Sequence[int] = ()) -> None:
         """Stop the robot, then give the lease back."""
         self.world.referee.stop(self.place, task_id)
         lessee = self.lessees.get(task_id)
         if lessee is not None:
-            lessee.release()
+            lessee.release([self.world.contacts[heir] for heir in heirs])
+
+    def freed(self, agent: str, task_id: str, token: int) -> None:
+        """Hear that the lease was given back."""
+        lessee = self.lessees.get(task_id)
+        if lessee is not None:
+            lessee.freed(token)
 
     def _tick(self) -> None:
         for task_id, lessee in self.lessees.items():
@@ -88,7 +96,7 @@ class Bidder:
                 # As a driver does: the device's time as it was told lately, and how long the lease lasts from then on.
                 told = self.world.clock.seconds() - self._rng.random() * 0.02
                 self.machine.callLater(ACT, self._act, task_id, permit, told, lease.deadline - now)
-        self.machine.callLater(TICK, self._tick)
+        self.machine.callLater(self.world.tick, self._tick)
 
     def _act(self, task_id: str, permit: Permit, told: float, remaining: float) -> None:
         lessee = self.lessees[task_id]

@@ -133,7 +133,7 @@ def _only_listens(self: Lessee, asked: Round) -> None:
 
 
 def _closest_now(self: Leases, place: int, task_id: str) -> Any:
-    near = [n for n in range(self.n) if not {(place, n), (n, place)} & self.ether.cut and self._is_up(n)]
+    near = [n for n in range(self.n) if not {(place, n), (n, place)} & self.ether.cut and self.is_up(n)]
     return tuple(self.contacts[n] for n in near[:3]), 1
 
 

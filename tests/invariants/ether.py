@@ -32,13 +32,28 @@ class Ether:
     """Carries calls between places; ``cut`` holds the directed pairs that do not hear each other."""
 
     def __init__(self, clock: HeapClock, rng: random.Random, air: Air = CALM) -> None:
-        self.air = air
+        self._air = self._slowest = air
         self.cut: set[tuple[int, int]] = set()
         self.sent = 0
         self._clock = clock
         self._rng = rng
         self._bad: dict[tuple[int, int], bool] = {}
         self._hash = hashlib.blake2b(digest_size=8)
+
+    @property
+    def air(self) -> Air:
+        """How datagrams fare now."""
+        return self._air
+
+    @air.setter
+    def air(self, air: Air) -> None:
+        self._air = air
+        self._slowest = max(self._slowest, air, key=lambda one: one.delay + 10 * one.jitter)
+
+    @property
+    def longest_way(self) -> float:
+        """Seconds within which a datagram arrives, but for one in twenty thousand."""
+        return self._slowest.delay + 10 * self._slowest.jitter
 
     def send(self, source: int, to: int, deliver: Callable[..., object], *arguments: Any) -> None:
         """Have ``deliver`` called at the other end, perhaps."""

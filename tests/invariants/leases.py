@@ -7,23 +7,15 @@ machines and a simulated link.  What agents select is left to dice: commitment m
 from __future__ import annotations
 
 import random
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 from twisted.internet.defer import Deferred
 from twisted.python.failure import Failure
 
-from middleware.commitment.ballot import FIRST
-from middleware.commitment.council import Council
-from middleware.entangled.clock import HeapClock
-from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.kademlia.contact import Contact
-from middleware.entangled.network.network import Address
-from tests.invariants.bidder import Bidder
-from tests.invariants.ether import CALM, Air, Ether
-from tests.invariants.machine import Machine
-from tests.invariants.referee import Referee
+from tests.invariants.ether import CALM, Air
+from tests.invariants.team import Team
 from tests.invariants.trouble import Trouble, drawn
 
 TTL = 1.5
@@ -33,21 +25,20 @@ LEAVE = 0.2
 """Seconds within which a stand-by holds what was given back, beside the time to stop."""
 
 
-class Leases:
+class Leases(Team):
     """The run of ``seed``: everything follows from it."""
 
     def __init__(self, seed: int, ttl: float = TTL) -> None:
-        self.seed = seed
-        self.ttl = ttl
-        self.clock = HeapClock()
-        self.referee = Referee(self)
         dice = self._dice = random.Random(f"leases/{seed}")
-        self.n = dice.choice([4, 5, 5, 6, 7])
-        self.agents = list(range(dice.choice([2, 3, 3, 4])))
-        self.stop_time = dice.choice([0.0, 0.0, 0.3])
-        self.drift = dice.choice([0.0, 0.01, 0.01, 0.01, 0.05])
+        n = dice.choice([4, 5, 5, 6, 7])
+        agents = dice.choice([2, 3, 3, 4])
+        stop_time = dice.choice([0.0, 0.0, 0.3])
+        drift = dice.choice([0.0, 0.01, 0.01, 0.01, 0.05])
+        # The worst that is allowed must come up often: a slow holder, fast members.
+        rates = [1.0 + dice.choice([-1, 1]) * drift for _ in range(n)]
         # Without stores a restarted member has forgotten everything: then councils stay, and tokens may fall back.
-        self.has_stores = dice.random() < 0.7
+        has_stores = dice.random() < 0.7
+        super().__init__(f"leases/{seed}", rates, agents, ttl, stop_time, drift, has_stores)
         self.air = Air(
             dice.choice([0.001, 0.005, 0.02, 0.05, 0.2]),
             dice.choice([0.0, 0.01, 0.05]),
@@ -55,72 +46,11 @@ class Leases:
             dice.choice([0.0, 0.1, 0.3]),
             dice.choice([1.0, 1.0, 5.0]),
         )
-        self.ether = Ether(self.clock, random.Random(f"leases/{seed}/ether"))
-        self.contacts = [
-            Contact(random.Random(f"leases/{seed}/{n}").randbytes(32), Address("10.0.0.1", 7000 + n))
-            for n in range(self.n)
-        ]
-        self.troubles = drawn(dice, self.n, self.agents, self.has_stores)
-        self._places = {contact.public: n for n, contact in enumerate(self.contacts)}
-        self._by_id = {contact.node_id.hex(): n for n, contact in enumerate(self.contacts)}
-        self._rates = [1.0 + dice.uniform(-1, 1) * self.drift for _ in range(self.n)]
-        if self.drift:
-            # The worst that is allowed must come up often: a slow holder, fast members.
-            self._rates = [1.0 + dice.choice([-1, 1]) * self.drift for _ in range(self.n)]
-        self._stores = [MemoryStore() for _ in range(self.n)]
-        self._lives = 0
-        self.councils: dict[str, tuple[tuple[Contact, ...], int]] = {}
+        self.troubles = drawn(dice, n, self.agents, has_stores)
         self._is_well = False
-        self.bidders = [self._born(place) for place in range(self.n)]
         for task_id in ["t0", "t1"][: dice.choice([1, 1, 2])]:
-            size = 5 if self.n >= 5 and dice.random() < 0.25 else 3
-            members = tuple(self.contacts[place] for place in sorted(dice.sample(range(self.n), size)))
-            self.councils[task_id] = members, FIRST
-            self.referee.add(task_id)
-
-    # -- what bidders need ------------------------------------------------------------------------------------------
-
-    def place_of(self, contact: Contact) -> int:
-        """Where a contact is."""
-        return self._places[contact.public]
-
-    def council_for(self, place: int, task_id: str) -> tuple[tuple[Contact, ...], int]:
-        """The council as the task's record names it."""
-        return self.councils[task_id]
-
-    def moved(self, task_id: str, council: Council) -> None:
-        """Let the record name a newer council."""
-        if council.configuration > self.councils[task_id][1]:
-            self.councils[task_id] = council.members, council.configuration
-            self.referee.look_at_cuts()
-
-    def ask(
-        self, me: Bidder, to: int, method: str, arguments: tuple[Any, ...], answered: Callable[[object], object]
-    ) -> None:
-        """Carry a question and its answer."""
-
-        def arrive() -> None:
-            peer = self.bidders[to]
-
-            def run() -> None:
-                answer = peer.answer(me.place, method, arguments)
-                if answer is not None:
-                    self.ether.send(to, me.place, me.machine.take, answered, answer)
-
-            peer.machine.take(run)
-
-        self.ether.send(me.place, to, arrive)
-
-    def tell_freed(self, source: int, agent: str, task_id: str) -> None:
-        """Carry the news that a lease was given back."""
-        to = self._by_id[agent]
-
-        def hear() -> None:
-            lessee = self.bidders[to].lessees.get(task_id)
-            if lessee is not None:
-                lessee.freed(0)
-
-        self.ether.send(source, to, lambda: self.bidders[to].machine.take(hear))
+            size = 5 if n >= 5 and dice.random() < 0.25 else 3
+            self.add_task(task_id, sorted(dice.sample(range(n), size)))
 
     # -- the run ----------------------------------------------------------------------------------------------------
 
@@ -178,7 +108,7 @@ class Leases:
             if bidder.machine.is_still:
                 bidder.machine.thaw()
             if not bidder.machine.is_alive:
-                self.bidders[place] = self._born(place)
+                self.bidders[place] = self.born(place)
 
     def _verify_health(self, task_id: str) -> None:
         """E3, the graceful leave and E5, when everything is well and one after the other goes."""
@@ -285,7 +215,7 @@ class Leases:
                     self.clock.callLater(0.2 * number, self._clog, place)
             case "kill" | "wipe":
                 for place in trouble.places:
-                    self._kill(place)
+                    self.kill(place)
             case "freeze" | "suspend":
                 for place in trouble.places:
                     if self.bidders[place].machine.is_alive and not self.bidders[place].machine.is_still:
@@ -294,7 +224,7 @@ class Leases:
                 self._change(trouble.places[0])
             case "leave":
                 for task_id in self.councils:
-                    if self._is_up(trouble.places[0]):
+                    if self.is_up(trouble.places[0]):
                         self.bidders[trouble.places[0]].leave(task_id)
             case "air":
                 self.ether.air = Air(self.air.delay, self.air.jitter, 0.5, 0.3, 5.0)
@@ -307,7 +237,7 @@ class Leases:
             case "kill" | "wipe":
                 for place in trouble.places:
                     if not self.bidders[place].machine.is_alive:
-                        self.bidders[place] = self._born(place)
+                        self.bidders[place] = self.born(place)
             case "freeze" | "suspend":
                 for place in trouble.places:
                     if self.bidders[place].machine.is_still:
@@ -324,34 +254,17 @@ class Leases:
 
     def _change(self, place: int) -> None:
         """Somebody has another council chosen, at a moment when the task may be free."""
-        if not self._is_up(place) or not self.has_stores:
+        if not self.is_up(place) or not self.has_stores:
             return
         for task_id in self.councils:
             if self._dice.random() < 0.7:
                 for agent in self.agents:
-                    if self._is_up(agent) and self._dice.random() < 0.9:
+                    if self.is_up(agent) and self._dice.random() < 0.9:
                         self.bidders[agent].leave(task_id)
             members = [self.contacts[n] for n in sorted(self._dice.sample(range(self.n), 3))]
             self.clock.callLater(0.5 + self.stop_time, self._change_now, place, task_id, members)
 
     def _change_now(self, place: int, task_id: str, members: Sequence[Contact]) -> None:
-        if self._is_up(place):
+        if self.is_up(place):
             changing: Deferred[None] = self.bidders[place].lessee(task_id).council.change(members)
             changing.addErrback(lambda failure: failure.trap(EntangledError))
-
-    def _is_up(self, place: int) -> bool:
-        return self.bidders[place].machine.is_alive and not self.bidders[place].machine.is_still
-
-    def _kill(self, place: int) -> None:
-        self.bidders[place].machine.die()
-        if not self.has_stores:
-            self._stores[place] = MemoryStore()
-            self.referee.is_amnesiac = True
-
-    def _born(self, place: int) -> Bidder:
-        """The next life at a place."""
-        self._lives += 1
-        rng = random.Random(f"leases/{self.seed}/{place}/{self._lives}")
-        return Bidder(
-            self, place, Machine(self.clock, self._rates[place], rng.uniform(0.0, 1e4)), self._stores[place], rng
-        )

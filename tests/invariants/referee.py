@@ -11,7 +11,7 @@ from middleware.commitment.ballot import quorum
 from tests.invariants.bidder import WIRE, Bidder
 
 if TYPE_CHECKING:
-    from tests.invariants.leases import Leases
+    from tests.invariants.team import Team
 
 ROUGH = 0.06
 """E1: by this share of the ttl a device's count of a duration may differ from a clock that is 5 % off."""
@@ -20,7 +20,7 @@ ROUGH = 0.06
 class Referee:
     """What is known of each task: its device's gate, what that accepted, who won, whose robot still moves."""
 
-    def __init__(self, world: Leases) -> None:
+    def __init__(self, world: Team) -> None:
         self.found: list[str] = []
         self.gates: dict[str, Gate] = {}
         self.accepted: dict[str, list[tuple[float, int, int]]] = {}
@@ -67,10 +67,7 @@ class Referee:
             self.say("E1", f"token {lease.token} of {task_id} is granted to {bidder.place} after {highest}")
         self._highest[task_id] = max(highest, lease.token)
         since = self._unreachable_since.get((task_id, bidder.place))
-        if (
-            since is not None
-            and now > since + self._world.ttl / 3 + self._world.air.delay + 10 * self._world.air.jitter + 0.1
-        ):
+        if since is not None and now > since + self._world.ttl / 3 + self._world.ether.longest_way + 0.1:
             self.say("E9", f"{bidder.place} wins {task_id} at {now:.2f}, cut from the majority since {since:.2f}")
 
     def _check_alone(self, bidder: Bidder, task_id: str, now: float) -> None:
@@ -116,10 +113,7 @@ class Referee:
         if over_at is not None:
             self.say("E5", f"the device of {task_id} obeys {bidder.place} at {now:.2f}, it ended at {over_at:.2f}")
         since = self._unreachable_since.get((task_id, bidder.place))
-        if (
-            since is not None
-            and now > since + self._world.ttl * 1.1 + self._world.air.delay + 10 * self._world.air.jitter
-        ):
+        if since is not None and now > since + self._world.ttl * 1.1 + self._world.ether.longest_way:
             self.say("E9", f"{bidder.place} acts on {task_id} at {now:.2f}, cut from the majority since {since:.2f}")
         accepted.append((now, permit.token, bidder.place))
         self._rest_at[task_id, bidder.place] = deadline + self._world.stop_time
@@ -141,10 +135,6 @@ class Referee:
         line = f"{invariant}: {text}"
         if line not in self.found and len(self.found) < 20:
             self.found.append(line)
-
-    def _longest_way(self) -> float:
-        """Seconds within which a datagram arrives that was sent before a cut."""
-        return self._world.air.delay + 10 * self._world.air.jitter
 
     def look_at_cuts(self) -> None:
         """Note who cannot reach a majority of the council, both ways, and since when."""
