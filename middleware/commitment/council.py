@@ -204,6 +204,6 @@ def _raise(round_: Round, what: str) -> None:
         raise OpenClaim(f"{what}: a claim is open and runs out in {max(held):.2f} s unless it is renewed")
     if any(reply.kind == OUTBID for reply in replies):
         raise NoMajority(f"{what}: another claimant was faster; try again")
-    if any(reply.kind == OVER for reply in replies):
+    if any(reply.kind == OVER for reply in replies) and OVER not in round_.kinds:
         raise Refused(f"{what}: the task has ended")
     raise NoMajority(f"{what}: {len(replies)} members answered, too few of them with yes; try again")

@@ -187,9 +187,6 @@ class Lessee:
         deadline = self._deadline_of(asked) if asked.is_won else 0.0
         if deadline <= self._clock.seconds():
             return self._failed(asked)
-        if ballot == self._ballot:
-            # A majority is enough to renew: who has not answered is asked in the next round.
-            asked.close()
         self._ballot, self.token, self._deadline = ballot, token, deadline
         self._rests_at = deadline + self._stop_time
         self._again(self._poll_period())

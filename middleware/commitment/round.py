@@ -13,6 +13,7 @@ from middleware.commitment.ballot import Reply, quorum, reply_of
 from middleware.entangled.kademlia.contact import Contact
 
 TRIES = 3
+"""How often a member is asked at least: a majority is enough, but who missed a renewal may promise to another."""
 PAUSE = 0.1
 """Seconds between two tries with a member that has not answered (consensus rule 6)."""
 
@@ -24,8 +25,7 @@ class Round:
     """``outcome`` fires with the round as soon as it is decided whether a majority answers with one of ``kinds``.
 
     It also fires, undecided, when everybody answered or ``patience`` seconds have passed, and soon after a majority has
-    answered.  Who has not answered then is
-    asked on, three times in all, until the round is closed.
+    answered.  Who has not answered is asked every 100 ms until it is decided, and at least three times in all.
     """
 
     def __init__(
@@ -44,7 +44,7 @@ class Round:
         self._ask = ask
         self._clock = clock
         self._question = (method, arguments)
-        self._kinds = kinds
+        self.kinds = kinds
         self._needed = quorum(len(members))
         self._patience = patience
         self._sent: dict[int, float] = {}
@@ -68,7 +68,7 @@ class Round:
     @property
     def yes(self) -> list[int]:
         """The places of those that said yes."""
-        return [place for place, reply in self.replies.items() if reply.kind in self._kinds]
+        return [place for place, reply in self.replies.items() if reply.kind in self.kinds]
 
     @property
     def sent_at(self) -> float:
@@ -91,7 +91,7 @@ class Round:
     def _try(self) -> None:
         self._tries += 1
         method, arguments = self._question
-        if self._tries < TRIES:
+        if self._tries < TRIES or not self.outcome.called:
             self._timer = self._clock.callLater(PAUSE, self._try)
         for place, member in enumerate(self._members):
             if place not in self.replies and not self._is_closed:

@@ -148,7 +148,7 @@ class Leases(Team):
         how = dice.choice(["kill", "freeze", "suspend", "cut"])
         self._begin(Trouble(0, 0, how, (holder, *also)))
         others = [place for place in self.agents if place != holder]
-        if len(others) > 1 and dice.random() < 0.5:
+        if len(others) > 1 and dice.random() < 0.75:
             # Selection names one agent when the lease ends, and thinks better of it.
             fickle = dice.choice(others)
             self.bidders[fickle].leave(task_id)
@@ -156,7 +156,7 @@ class Leases(Team):
             self.bidders[fickle].lessee(task_id).want()
             while self.clock.seconds() < gone_at + 1.1 * self.ttl and self.referee.accepted[task_id][-1][1] <= token:
                 self.clock.advance(dice.choice([0.004, 0.011, 0.017]))
-                if dice.random() < 0.1:
+                if dice.random() < 0.2:
                     break
             self.bidders[fickle].leave(task_id)
         won_at = self._wait_for_command(task_id, token, 3 * self.ttl + SLACK)
