@@ -45,7 +45,8 @@ class Acceptor:
         """Promise to accept nothing under a lower ballot, or say what stands against it.
 
         While another holds the lease (a former life of the same agent is another) nothing changes but that the asker
-        is told when it is given back: to ask is to poll, and never shortens a lease.
+        is told when it is given back.  A ballot of counter 0 only looks, and is promised nothing: a member whose grant
+        has run out, because it missed a renewal, is not to be lost to its healthy holder.
         """
         entry = self._entry(task_id, configuration, ttl, now)
         if isinstance(entry, Reply):
@@ -53,10 +54,10 @@ class Acceptor:
         if entry.until > now and not entry.ballot.is_kin(ballot):
             self._listen(entry, ballot.agent, now + ttl)
             return self._reply(HELD, entry, now)
-        if ballot < entry.promised:
+        if ballot.counter > 0 and ballot < entry.promised:
             return self._reply(OUTBID, entry, now)
         entry.touched_at = now
-        if ballot != entry.promised:
+        if ballot > entry.promised:
             entry.promised = ballot
             self._ledger.keep(task_id)
         if entry.sealed != NONE:

@@ -63,7 +63,7 @@ class Desk:
     # -- what peers ask ---------------------------------------------------------------------------------------------
 
     def _prepare(self, peer: Contact, task_id: str, configuration: int, counter: int, ttl: float) -> Answer:
-        _check(task_id, configuration, counter, ttl=ttl)
+        _check(task_id, configuration, counter + 1, ttl=ttl)
         agent = self._known(peer)
         ballot = Ballot(counter, agent)
         return self._kept(self._acceptor.prepare(task_id, configuration, ballot, float(ttl), self._clock.seconds()))

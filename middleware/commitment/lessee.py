@@ -31,6 +31,8 @@ RETRY = 0.1
 JITTER = (0.0, 0.02)
 BACK_OFF = (0.02, 0.08)
 """Seconds after which a claim is tried again that another one was faster than."""
+SOON = 1.5
+"""Periods of asking within which a lease that runs out is claimed rather than looked at once more."""
 STAGGER = 0.1
 """Seconds by which each rank of those that stand by waits longer than the one before it."""
 TICK = 0.05
@@ -76,6 +78,7 @@ class Lessee:
         self._rank = 0
         self._is_wanted = False
         self._is_freed = False
+        self._only_looks = False
         self._must_prepare = False
         self._round: Round | None = None
         self._timer: IDelayedCall | None = None
@@ -102,13 +105,13 @@ class Lessee:
         """
         self._rank = max(1, rank)
         if not self._is_wanted and not self.is_over:
-            self._is_wanted = True
+            self._is_wanted = self._only_looks = True
             self._again(self._rank * self.council.ttl / RENEWALS)
 
     def suspect(self) -> None:
         """The holder may be gone: ask now how long its lease runs, and be ready when it ends.  It shortens no lease."""
         if self._is_wanted and not self._is_asking and self.lease is None:
-            self._claim()
+            self._look()
 
     def freed(self, token: int) -> None:
         """A member says that the lease with that token was given back."""
@@ -212,11 +215,29 @@ class Lessee:
         self._wait(asked)
 
     def _wait(self, asked: Round) -> None:
-        """Ask again when the lease may be free, and at any rate a third of a ttl later: a push may be lost."""
+        """Claim when the lease may be free; look again in a third of a ttl at any rate, for a push may be lost."""
         free_in = 0.0 if self._is_freed else asked.free_in()
         is_outbid = any(reply.kind == OUTBID for reply in asked.replies.values())
-        pause = self._rng.uniform(*(BACK_OFF if is_outbid else JITTER))
-        self._again(min(free_in + self._stagger(), self._poll_period()) + pause)
+        wait, pause = free_in + self._stagger(), self._rng.uniform(*(BACK_OFF if is_outbid else JITTER))
+        # A healthy holder renews well before: what runs out that soon is claimed in time, without a look before.
+        self._only_looks = wait > SOON * self._poll_period()
+        self._again((self._poll_period() if self._only_looks else wait) + pause)
+
+    def _look(self) -> None:
+        """Ask whether the lease is free, and be promised nothing."""
+        self._cancel()
+        self._round = asked = self.council.round("lease.prepare", 0, self.council.ttl)
+        asked.outcome.addCallback(self._looked)
+
+    def _looked(self, asked: Round) -> None:
+        self.council.hear(asked)
+        if self._round is not asked or self._has_ended(asked):
+            return
+        asked.close()
+        if asked.is_won:
+            self._claim()
+        else:
+            self._wait(asked)
 
     def _poll_period(self) -> float:
         return self.council.ttl / RENEWALS
@@ -236,7 +257,10 @@ class Lessee:
             return
         if self.token and self.lease is None:
             self._lose()
-        self._claim()
+        if self._only_looks and not self._is_freed and self.lease is None:
+            self._look()
+        else:
+            self._claim()
 
     def _lose(self) -> None:
         """It is over before it was given back."""

@@ -85,7 +85,9 @@ class Round:
 
     def free_in(self) -> float:
         """Seconds until a majority may be free to say yes, as far as its members told."""
-        waits = sorted(self._free_at.get(place, -math.inf) for place in range(len(self._members)))
+        # Of who did not answer nothing is known; where nobody answered, nothing is known against asking at once.
+        unknown = math.inf if self.replies else -math.inf
+        waits = sorted(self._free_at.get(place, unknown) for place in range(len(self._members)))
         return max(0.0, waits[self._needed - 1] - self._clock.seconds()) if waits else 0.0
 
     def _try(self) -> None:

@@ -194,7 +194,17 @@ class SwarmNodeTests(FleetCase):
         """Claims with a wrong name, configuration, ballot, token or duration are refused, and crafted councils."""
         fleet = self.swarm(2)
         good = ["t", 1, 1, 1.0]
-        for place, bad in ((0, "t" * 65), (0, 5), (1, 0), (2, 0), (2, 2**62), (2, True), (3, 0.0), (3, 61.0), (3, "1")):
+        for place, bad in (
+            (0, "t" * 65),
+            (0, 5),
+            (1, 0),
+            (2, -1),
+            (2, 2**62),
+            (2, True),
+            (3, 0.0),
+            (3, 61.0),
+            (3, "1"),
+        ):
             question = [*good[:place], bad, *good[place + 1 :]]
             asked = self.asked(fleet, "lease.prepare", *question)
             fleet.run(0.1)

@@ -67,8 +67,8 @@ class ReplyTests(SynchronousTestCase):
             (6, 0),
         ):
             self.assertIsNone(reply_of([*good[:place], bad, *good[place + 1 :]]), (place, bad))
-        for bad in (None, 5, [], good[:-1], [*good, 0], {}):
-            self.assertIsNone(reply_of(bad))
+        for other in (None, 5, [], good[:-1], [*good, 0], {}):
+            self.assertIsNone(reply_of(other))
 
     def test_councils(self) -> None:
         """A council has contacts, not too many, and none twice."""
