@@ -9,6 +9,7 @@ from __future__ import annotations
 import random
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 from twisted.application.service import Service
@@ -16,8 +17,6 @@ from twisted.internet.defer import Deferred, maybeDeferred
 from twisted.internet.interfaces import IReactorTime
 from twisted.logger import Logger
 
-from middleware.commitment.ballot import FIRST
-from middleware.commitment.desk import Desk
 from middleware.entangled.background import Background
 from middleware.entangled.data.store import Store
 from middleware.entangled.errors import EntangledError, NotRunning, Refused, WeatherError
@@ -36,10 +35,12 @@ from middleware.tasks import RESULT, TASKS, Result, Task, group_key
 from middleware.value import bounded
 
 if TYPE_CHECKING:
+    from middleware.commitment.desk import Desk
     from middleware.commitment.lessee import Lessee
 
 COUNCIL = 3
 CAMERA = "camera"
+LEASE_VERBS = ("prepare", "propose", "release", "close", "change", "install", "freed")
 LOOK_AGAIN = 0.3
 """Seconds after which a newcomer looks whether others took the same place in the order of joining."""
 LOOKS = 10
@@ -80,10 +81,13 @@ class SwarmNode(Service):
         self.joined: Deferred[None] = Deferred()
         self._known = list(known_nodes)
         self._network = network
-        self._desk = Desk(self.entangled.endpoint, store, clock)
+        self._born_at = clock.seconds()
         self._on_message: Callable[[str], None] = lambda text: None
         self._on_disconnect: Callable[[float], None] = lambda seconds: None
         expose = self.entangled.endpoint.expose
+        for verb in LEASE_VERBS:
+            # To repeat what a council member is asked does no harm; nothing need be kept of the first time.
+            expose(f"lease.{verb}", partial(self._answer_lease, f"lease.{verb}"), changes=True, idempotent=True)
         expose("device.message", self._answer_message, changes=True)
         expose("device.disconnect", self._answer_disconnect, changes=True)
 
@@ -214,6 +218,7 @@ class SwarmNode(Service):
         ``floor`` is the highest token that the node's own device has obeyed, so that a new token is always higher.
         """
         # Imported by the first who has something to claim: a node without a robot is spared their memory.
+        from middleware.commitment.ballot import FIRST
         from middleware.commitment.council import Council
         from middleware.commitment.lessee import Lessee
 
@@ -228,7 +233,18 @@ class SwarmNode(Service):
         self._desk.enter(lessee)
         return lessee
 
+    @cached_property
+    def _desk(self) -> Desk:
+        """Where this node sits in the councils of tasks."""
+        # Imported by the first who calls it to one: a node that is in none is spared the memory.
+        from middleware.commitment.desk import Desk
+
+        return Desk(self.entangled.endpoint, self.store, self.clock, self._born_at)
+
     # -- what peers ask ---------------------------------------------------------------------------------------------
+
+    def _answer_lease(self, method: str, peer: Contact, *arguments: Any) -> object:
+        return self._desk.answer(method, peer, arguments)
 
     def _answer_message(self, peer: Contact, text: str) -> str:
         if not 0 < len(text) <= 200:

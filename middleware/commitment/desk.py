@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 from weakref import WeakValueDictionary
 
@@ -17,6 +16,7 @@ from middleware.entangled.errors import Refused
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.record import MAX_NAME
 from middleware.entangled.wire.endpoint import Endpoint
+from middleware.entangled.wire.method import Method
 
 if TYPE_CHECKING:
     from middleware.commitment.lessee import Lessee
@@ -27,26 +27,34 @@ Answer = list[object] | Deferred[list[object]]
 
 
 class Desk:
-    """The acceptor of one node, and the lessees that wait for news from others' acceptors."""
+    """The acceptor of one node, and the lessees that wait for news from others' acceptors.
 
-    def __init__(self, endpoint: Endpoint, store: Store, clock: IReactorTime) -> None:
+    It may be made when the first peer asks: ``born_at`` is when the node began, for silence counts from then.
+    """
+
+    def __init__(self, endpoint: Endpoint, store: Store, clock: IReactorTime, born_at: float) -> None:
         self._endpoint = endpoint
         self._store = store
         self._clock = clock
-        self._acceptor = Acceptor(Ledger(store, clock.seconds()), clock.seconds())
+        self._acceptor = Acceptor(Ledger(store, born_at), born_at)
         self._lessees: WeakValueDictionary[str, Lessee] = WeakValueDictionary()
         self._contacts: dict[str, Contact] = {}
-        self._methods: dict[str, Callable[..., object]] = {
-            "lease.prepare": self._prepare,
-            "lease.propose": self._propose,
-            "lease.release": self._release,
-            "lease.close": self._close,
-            "lease.change": self._change,
-            "lease.install": self._install,
-            "lease.freed": self._freed,
+        self._methods = {
+            name: Method(name, answer)
+            for name, answer in (
+                ("lease.prepare", self._prepare),
+                ("lease.propose", self._propose),
+                ("lease.release", self._release),
+                ("lease.close", self._close),
+                ("lease.change", self._change),
+                ("lease.install", self._install),
+                ("lease.freed", self._freed),
+            )
         }
-        for name, answer in self._methods.items():
-            endpoint.expose(name, answer, changes=True, idempotent=True)
+
+    def answer(self, method: str, peer: Contact, arguments: tuple[Any, ...]) -> object:
+        """What a peer is told; raises ``Refused`` where its arguments do not fit."""
+        return self._methods[method].run(peer, arguments)
 
     def enter(self, lessee: Lessee) -> None:
         """Let ``lessee`` hear when the lease of its task is given back."""
@@ -57,7 +65,7 @@ class Desk:
     ) -> Deferred[Any]:
         """Ask a member, which may be this node itself."""
         if member.node_id == own.node_id:
-            return maybeDeferred(self._methods[method], own, *arguments)
+            return maybeDeferred(self.answer, method, own, arguments)
         return self._endpoint.ask(member, method, *arguments, changes=True, timeout=patience)
 
     # -- what peers ask ---------------------------------------------------------------------------------------------

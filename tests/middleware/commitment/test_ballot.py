@@ -67,7 +67,8 @@ class ReplyTests(SynchronousTestCase):
             (6, 0),
         ):
             self.assertIsNone(reply_of([*good[:place], bad, *good[place + 1 :]]), (place, bad))
-        for other in (None, 5, [], good[:-1], [*good, 0], {}):
+        others: tuple[object, ...] = (None, 5, [], good[:-1], [*good, 0], {})
+        for other in others:
             self.assertIsNone(reply_of(other))
 
     def test_councils(self) -> None:

@@ -11,7 +11,8 @@ from middleware.commitment.ballot import NoMajority, OpenClaim
 from middleware.commitment.lessee import CLOCK_MARGIN, RENEWALS
 from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.kademlia.distance import closest
-from middleware.tasks import COMPLETED, Result, Task, group_key, outcome_of
+from middleware.entangled.record import Record
+from middleware.tasks import COMPLETED, RESULT, Result, Task, group_key, outcome_of
 from tests.fleet import FleetCase
 from tests.invariants.machine import Machine
 from tests.middleware.commitment.room import TTL, RoomCase, T
@@ -199,9 +200,13 @@ class RuleTests(RoomCase):
         self.assertEqual(self.holders(), [1])
         self.assertIsNone(self.outcome(self.lessee(1).council.close(2)))
         self.assertEqual(self.holders(), [])
-        self.assertIsNone(outcome_of([]))
-        results = [Result(COMPLETED, "dog0", 1.0, 1), Result(COMPLETED, "dog1", 1.0, 2)]
-        self.assertEqual(max(results, key=lambda result: result.token).by, "dog1")
+        results = [Result(COMPLETED, "dog1", 1.0, 2), Result(COMPLETED, "dog0", 1.0, 1)]
+        records = [
+            Record(group_key(T), RESULT, bytes([n]) * 32, 1, "team", 0.0, result.packed(), bytes(64))
+            for n, result in enumerate(results)
+        ]
+        for told in (records, records[::-1]):
+            self.assertEqual(outcome_of(told), results[0])
 
     def test_rule_10_graceful_leave(self) -> None:
         """Stopped, given back, and in a fifth of a second the first that stands by acts, after the time to stop."""
