@@ -12,7 +12,7 @@ from drivers.errors import StaleCommand
 from drivers.gate import Gate
 from middleware.commitment import ledger, lessee
 from middleware.commitment.acceptor import Acceptor
-from middleware.commitment.ballot import GRANTED, Ballot, members_of
+from middleware.commitment.ballot import GRANTED, members_of
 from middleware.commitment.council import Council
 from middleware.commitment.lessee import Lessee
 from middleware.commitment.round import Round
@@ -203,10 +203,9 @@ BUGS: dict[str, list[tuple[Any, str, Any]]] = {
     "released before it stands still": [(Lessee, "_rest", lambda self: 0.0)],
     "the device takes lower tokens": [(Gate, "admit", _admits_lower_tokens)],
     "a restarted member grants at once": [(Acceptor, "_silence", lambda self, ttl: 0.0)],
-    "a former life holds on for the next": [(Ballot, "is_kin", lambda self, other: self.agent == other.agent)],
     "the new council decides the change": [(Council, "_decision", _decided_by_the_new)],
 }
-LEASE_BUGS = tuple(list(BUGS)[-13:])
+LEASE_BUGS = tuple(list(BUGS)[-12:])
 
 FINDERS: dict[str, tuple[str, ...]] = {
     "one promise is a majority": ("tuples",),
