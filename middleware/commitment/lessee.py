@@ -33,6 +33,8 @@ BACK_OFF = (0.02, 0.08)
 """Seconds after which a claim is tried again that another one was faster than."""
 SOON = 1.5
 """Periods of asking within which a lease that runs out is claimed rather than looked at once more."""
+FRESH = 0.3
+"""Seconds for which the news of a release is believed against members that have not heard it."""
 STAGGER = 0.1
 """Seconds by which each rank of those that stand by waits longer than the one before it."""
 TICK = 0.05
@@ -77,7 +79,7 @@ class Lessee:
         self._claimed = NONE
         self._rank = 0
         self._is_wanted = False
-        self._is_freed = False
+        self._freed_at = -math.inf
         self._only_looks = False
         self._must_prepare = False
         self._round: Round | None = None
@@ -117,7 +119,7 @@ class Lessee:
         """A member says that the lease with that token was given back."""
         self.council.token = max(self.council.token, token)
         if self._is_wanted and self.lease is None:
-            self._is_freed = True
+            self._freed_at = self._clock.seconds()
             if not self._is_asking:
                 self._again(self._stagger())
 
@@ -148,7 +150,6 @@ class Lessee:
     def _claim(self) -> None:
         """Ask for promises; while a lease is held it stays in force meanwhile."""
         self._cancel()
-        self._is_freed = False
         self._claimed = ballot = self.council.next_ballot()
         kinds = (GRANTED, SEALED)
         self._round = asked = self.council.round("lease.prepare", ballot.counter, self.council.ttl, kinds=kinds)
@@ -276,6 +277,11 @@ class Lessee:
         return self.is_over
 
     # -- inside -----------------------------------------------------------------------------------------------------
+
+    @property
+    def _is_freed(self) -> bool:
+        """Whether the lease was given back just now: the news may be here before it is at every member."""
+        return self._clock.seconds() - self._freed_at < FRESH
 
     @property
     def _is_asking(self) -> bool:
