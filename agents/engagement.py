@@ -22,7 +22,7 @@ from agents.report import Reporter
 from agents.state import Course, State
 from drivers.driver import Permit
 from drivers.reading import Action, Observation
-from middleware.consensus.lease import Lease, Lessee
+from middleware.commitment.lessee import Lease, Lessee
 from middleware.consensus.strategy import ConsensusAlgorithm
 from middleware.order import PAUSE, Order
 from middleware.tasks import COMPLETED, FAILED, Member, Result, Task

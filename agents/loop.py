@@ -200,6 +200,10 @@ class Agent(Service):
         has_body = self._body.answers
         if not has_body:
             engagement.lose_body()
+        # A robot may have obeyed an agent before this one: nothing older than that does it obey now.
+        engagement.token = max(engagement.token, self._body.driver.token)
+        if engagement.lessee is not None:
+            engagement.lessee.outrank(engagement.token)
         deed = engagement.step()
         self._token = max(self._token, engagement.token)
         if deed is not None and has_body and not self._body.do(deed):

@@ -37,6 +37,10 @@ class Driver(Protocol):
     def state(self) -> str:
         """Where the link stands."""
 
+    @property
+    def token(self) -> int:
+        """The highest token that the robot has obeyed, as far as it told: a new claim has to lie above it."""
+
     def connect(self) -> Deferred[Description]:
         """Open the link; fires when the first observation has arrived.  Lost links are opened again with back-off."""
 
@@ -65,4 +69,7 @@ class Driver(Protocol):
         """Call ``seen`` at each observation; call what is returned to end that."""
 
     def diagnostics(self) -> dict[str, float]:
-        """Counters: frames, bad frames, bytes, reconnects, age of the newest observation in seconds."""
+        """Counters: frames, bad frames, bytes, reconnects, age of the newest observation in seconds.
+
+        Also the commands ``accepted`` here, and those refused as ``lower token`` or ``late``.
+        """

@@ -17,7 +17,6 @@ from twisted.internet.defer import Deferred, maybeDeferred
 from twisted.internet.interfaces import IReactorTime
 from twisted.logger import Logger
 
-from middleware.consensus.lease import Acceptor, Lessee
 from middleware.entangled.background import Background
 from middleware.entangled.data.store import Store
 from middleware.entangled.errors import EntangledError, NotRunning, Refused, WeatherError
@@ -26,22 +25,25 @@ from middleware.entangled.kademlia.contact import Contact, unpacked
 from middleware.entangled.kademlia.distance import closest
 from middleware.entangled.network.network import Address, Network
 from middleware.entangled.node import EntangledNode
-from middleware.entangled.record import MAX_NAME, Record
+from middleware.entangled.record import Record
 from middleware.entangled.replication.owner import Stored
 from middleware.entangled.replication.watch import Changed, Watch
 from middleware.group import Group, Heard
 from middleware.presence import DEVICES, Device, Presence, devices_of
 from middleware.streams import Streams
-from middleware.tasks import MAX_LEASE_TTL, ORDER, RESULT, TASKS, Result, Task, group_key
+from middleware.tasks import ORDER, RESULT, TASKS, Result, Task, group_key
 from middleware.value import bounded
 
 if TYPE_CHECKING:
+    from middleware.commitment.desk import Desk
+    from middleware.commitment.lessee import Lessee
     from middleware.dissemination.bidding import Bidding
     from middleware.dissemination.dissemination import Dissemination
     from middleware.dissemination.party import OnSummary
 
 COUNCIL = 3
 CAMERA = "camera"
+LEASE_VERBS = ("prepare", "propose", "release", "close", "change", "install", "freed")
 LOOK_AGAIN = 0.3
 """Seconds after which a newcomer looks whether others took the same place in the order of joining."""
 LOOKS = 10
@@ -82,12 +84,13 @@ class SwarmNode(Service):
         self.joined: Deferred[None] = Deferred()
         self._known = list(known_nodes)
         self._network = network
-        self._acceptor = Acceptor(clock.seconds())
+        self._born_at = clock.seconds()
         self._on_message: Callable[[str], None] = lambda text: None
         self._on_disconnect: Callable[[float], None] = lambda seconds: None
         expose = self.entangled.endpoint.expose
-        expose("lease.claim", self._answer_claim, changes=True)
-        expose("lease.release", self._answer_release, changes=True)
+        for verb in LEASE_VERBS:
+            # To repeat what a council member is asked does no harm; nothing need be kept of the first time.
+            expose(f"lease.{verb}", partial(self._answer_lease, f"lease.{verb}"), changes=True, idempotent=True)
         expose("bid.offer", self._answer_offer, changes=True, idempotent=True)
         expose("bid.announce", self._answer_announcement, changes=True, idempotent=True)
         expose("bid.cry", self._take_cry, changes=True)
@@ -231,17 +234,32 @@ class SwarmNode(Service):
         return self.entangled.put(group_key(task_id), RESULT, result.packed(), "team")
 
     def lessee(self, task: Task, changed: Callable[[], None], floor: int) -> Lessee:
-        """The claimant of the right to act on ``task``, in this node's name."""
+        """The claimant of the right to act on ``task``, in this node's name.
 
-        def ask(member: int, method: str, arguments: tuple[Any, ...]) -> Deferred[Any]:
-            contact = task.council[member]
-            if contact.node_id == self.entangled.identity.node_id:
-                answer = self._answer_claim if method == "lease.claim" else self._answer_release
-                return maybeDeferred(answer, contact, *arguments)
-            return self.entangled.endpoint.ask(contact, method, *arguments, changes=True, timeout=task.lease_ttl / 3)
+        ``floor`` is the highest token that the node's own device has obeyed, so that a new token is always higher.
+        """
+        # Imported by the first who has something to claim: a node without a robot is spared their memory.
+        from middleware.commitment.council import Council
+        from middleware.commitment.lessee import Lessee
 
         ttl = float(task.lease_ttl)
-        return Lessee(task.task_id, self.uuid, ttl, len(task.council), ask, self.clock, self.rng, changed, floor)
+
+        def ask(member: Contact, method: str, arguments: tuple[Any, ...]) -> Deferred[Any]:
+            return self._desk.ask(self.entangled.contact, member, method, arguments, ttl / 3)
+
+        made, now = task.council, self.clock
+        council = Council(task.task_id, self.uuid, ttl, made, ask, now, self.rng, task.configuration, floor)
+        lessee = Lessee(council, self.clock, self.rng, changed, task.stop_time)
+        self._desk.enter(lessee)
+        return lessee
+
+    @cached_property
+    def _desk(self) -> Desk:
+        """Where this node sits in the councils of tasks."""
+        # Imported by the first who calls it to one: a node that is in none is spared the memory.
+        from middleware.commitment.desk import Desk
+
+        return Desk(self.entangled.endpoint, self.store, self.clock, self._born_at)
 
     @cached_property
     def dissemination(self) -> Dissemination:
@@ -261,6 +279,9 @@ class SwarmNode(Service):
 
     # -- what peers ask ---------------------------------------------------------------------------------------------
 
+    def _answer_lease(self, method: str, peer: Contact, *arguments: Any) -> object:
+        return self._desk.answer(method, peer, arguments)
+
     def _answer_offer(
         self, peer: Contact, auction: list[object], bids: list[object], age_ms: int, is_shared: bool
     ) -> list[object] | None:
@@ -271,17 +292,6 @@ class SwarmNode(Service):
 
     def _take_cry(self, peer: Contact, auction: list[object], bids: list[object]) -> None:
         self.dissemination.take_cry(peer, auction, bids)
-
-    def _answer_claim(self, peer: Contact, task_id: str, token: int, ttl: float) -> list[object]:
-        if len(task_id) > MAX_NAME or not 0 < token < 2**62:
-            raise Refused("lease.claim takes a task id, a positive token and a duration")
-        if not 0.0 < ttl <= MAX_LEASE_TTL:
-            raise Refused(f"a lease lasts more than 0 and at most {MAX_LEASE_TTL:g} seconds")
-        grant = self._acceptor.claim(task_id, peer.node_id.hex(), token, ttl, self.clock.seconds())
-        return [grant.granted, grant.token, grant.remaining]
-
-    def _answer_release(self, peer: Contact, task_id: str, token: int) -> None:
-        self._acceptor.release(task_id, peer.node_id.hex(), token, self.clock.seconds())
 
     def _answer_message(self, peer: Contact, text: str) -> str:
         if not 0 < len(text) <= 200:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from functools import partial
 from random import Random
 from typing import Any, TextIO
 
@@ -40,8 +41,11 @@ def main(arguments: list[str] | None = None, output: TextIO = sys.stdout, errors
         scene = loaded(chosen.scene)
     except SceneError as error:
         return _refused(errors, str(error))
-    # Twisted's timers run on the wall clock by default: a step of that clock would freeze the yard, or race it.
-    ReactorBase.seconds = staticmethod(time.monotonic)
+    # Twisted's timers run on the wall clock by default: a step of that clock would freeze the yard, or race it.  What
+    # was ordered before the machine was suspended must be over when it wakes.
+    ReactorBase.seconds = staticmethod(
+        partial(time.clock_gettime, time.CLOCK_BOOTTIME) if hasattr(time, "CLOCK_BOOTTIME") else time.monotonic
+    )
     from twisted.internet import reactor as running
 
     reactor: Any = running

@@ -4,23 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from drivers.gate import Gate
 from drivers.sim.codec import FrameReader, Message, encoded
 from drivers.sim.link import Link
 
 
 class Session:
-    """A driver that holds ``robot``, or an operator, or somebody who has not said yet; a ``Receiver`` of the link.
-
-    Each session has a gate of its own: a new driver of the same robot starts with fresh tokens, and the yard lets only
-    one driver hold a robot at a time.
-    """
+    """A driver that holds ``robot``, or an operator, or somebody who has not said yet; a ``Receiver`` of the link."""
 
     def __init__(
         self, link: Link, on_message: Callable[[Session, Message], None], on_down: Callable[[Session], None], now: float
     ) -> None:
         self.link = link
-        self.gate = Gate()
         self.robot: str | None = None
         self.has_motors = False
         self.is_operator = False

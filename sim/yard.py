@@ -1,7 +1,8 @@
 """Yard: the world, its sensors and cameras tied to connections, paced by the clock it is given.
 
-Each dog obeys one driver, through a gate of its own: a command runs out after its time to live, whatever became of
-the driver, and the dog stops when the connection closes.
+Each dog obeys one driver at a time, through a gate of its own: a command runs out after its time to live, whatever
+became of the driver, and the dog stops when the connection closes.  The gate outlives its drivers: what is older than
+what the dog has obeyed is refused, also over a new connection, and the dog tells the next driver how far it is.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from twisted.logger import Logger
 
 from drivers.driver import Permit
 from drivers.errors import StaleCommand
+from drivers.gate import Gate
 from drivers.sim.codec import (
     VERSION,
     Done,
@@ -64,6 +66,7 @@ class Yard:
         self._senses = {
             name: Senses(Random(rng.getrandbits(64)), self.world, dog) for name, dog in self.world.dogs.items()
         }
+        self._gates = {name: Gate() for name in self.world.dogs}
         self._sessions: list[Session] = []
         self._holders: dict[str, Session] = {}
         self._orders: dict[str, tuple[Callable[..., None], tuple[type, ...]]] = {
@@ -81,6 +84,14 @@ class Yard:
     def holders(self) -> list[str]:
         """The dogs that a driver holds now."""
         return [name for name in self.world.dogs if name in self._holders]
+
+    def truth(self) -> dict[str, object]:
+        """The whole yard as seen from above, and of each dog what its gate has let through and refused."""
+        snapshot = self.world.snapshot()
+        gates = self._gates.values()
+        counts = [{"token": g.token or 0, "accepted": g.accepted, "refused": sum(g.refused.values())} for g in gates]
+        dogs: Any = snapshot["dogs"]
+        return {**snapshot, "dogs": [{**dog, **count} for dog, count in zip(dogs, counts, strict=True)]}
 
     def start(self) -> None:
         """Let time run from now on."""
@@ -119,9 +130,11 @@ class Yard:
     def _turn(self) -> None:
         late = self._now() - (self._ticks + 1) * TICK_S
         if late > MAX_LATE_S:
-            # After a suspended machine nobody wants the lost minutes back at once.
+            # After a suspended machine nobody wants the lost minutes back at once, nor what was ordered before them.
             self._origin += late
             late = 0.0
+            for name in self._gates:
+                self._halt(name)
         due = 1 + max(0, math.floor(late / TICK_S + 1e-6))
         for left in range(due - 1, -1, -1):
             # A late yard drops pictures, never physics.
@@ -130,9 +143,9 @@ class Yard:
 
     def _tick(self, with_pictures: bool) -> None:
         for _ in range(SUBSTEPS):
-            for name, session in self._holders.items():
-                if session.gate.is_over(self.world.t):
-                    self._halt(name, session)
+            for name, gate in self._gates.items():
+                if gate.is_over(self.world.t):
+                    self._halt(name)
             self.world.step()
             for senses in self._senses.values():
                 senses.sample()
@@ -158,10 +171,11 @@ class Yard:
                 session.seq += 1
                 data = self._camera.jpeg(self.world.dogs[name])
                 session.send(Picture(session.seq, t, WIDTH, HEIGHT, data))
-            session.send(Sensors(t, {**values, "estop.engaged": not session.has_motors}, samples))
+            felt = {**values, "estop.engaged": not session.has_motors}
+            session.send(Sensors(t, felt, samples, self._gates[name].token or 0))
         watchers = [one for one in self._sessions if one.is_operator and one.truths.is_due(t) and not one.link.is_busy]
         if watchers:
-            truth = Truth(self.world.snapshot())
+            truth = Truth(self.truth())
             for session in watchers:
                 session.send(truth)
 
@@ -203,22 +217,22 @@ class Yard:
             case Motors():
                 session.has_motors = message.on
                 if not message.on:
-                    self._halt(name, session)
+                    self._halt(name)
             case Halt():
-                self._halt(name, session)
+                self._halt(name)
             case Drive() if session.has_motors:
                 now = self._now()
                 # A command that was held up has used up its time on the way; a stamp ahead of ours gains nothing.
                 deadline = min(message.sent, now) + min(message.ttl, MAX_TTL_S)
                 try:
-                    session.gate.admit(Permit(message.token, deadline), now)
+                    self._gates[name].admit(Permit(message.token, deadline), now)
                 except StaleCommand as error:
                     self.log.debug("{robot}: {error}", robot=name, error=error)
                     return
                 self.world.drive(name, message.vx, message.vy, message.wz)
 
-    def _halt(self, name: str, session: Session) -> None:
-        session.gate.close()
+    def _halt(self, name: str) -> None:
+        self._gates[name].close()
         self.world.halt(name)
 
     def _on_down(self, session: Session) -> None:
@@ -226,7 +240,7 @@ class Yard:
             self._sessions.remove(session)
         if session.robot is not None and self._holders.get(session.robot) is session:
             del self._holders[session.robot]
-            self._halt(session.robot, session)
+            self._halt(session.robot)
 
     def _carried_out(self, order: Order) -> str:
         """Do what the operator orders; the problem in words, or an empty text."""

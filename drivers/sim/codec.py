@@ -17,7 +17,7 @@ import msgpack
 from drivers.errors import BadFrame
 from drivers.reading import Value
 
-VERSION = 1
+VERSION = 2
 MARKER = b"\xa9Y"
 HEADER = len(MARKER) + 4
 MAX_PAYLOAD = 256 * 1024
@@ -86,11 +86,12 @@ class Order:
 
 @dataclass(frozen=True)
 class Sensors:
-    """From the yard: what the robot feels at ``t`` of the yard's time."""
+    """From the yard: what the robot feels at ``t`` of the yard's time, and the highest token that it has obeyed."""
 
     t: float
     values: Mapping[str, Value]
     samples: Mapping[str, tuple[float, ...]]
+    token: int = 0
 
 
 @dataclass(frozen=True)
@@ -201,7 +202,7 @@ _TABLE: dict[str, tuple[type[Message], tuple[Check, ...]]] = {
     "halt": (Halt, ()),
     "alive": (Alive, ()),
     "order": (Order, (_is_count, _is_text, _is_arguments)),
-    "sensors": (Sensors, (_is_number, _is_values, _is_samples)),
+    "sensors": (Sensors, (_is_number, _is_values, _is_samples, _is_count)),
     "picture": (Picture, (_is_count, _is_number, _is_count, _is_count, _is_bytes)),
     "truth": (Truth, (_is_snapshot,)),
     "done": (Done, (_is_count, _is_text)),

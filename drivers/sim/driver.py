@@ -91,6 +91,11 @@ class SimDriver:
             return "stale"
         return "stopped" if self._is_disabled else "ready"
 
+    @property
+    def token(self) -> int:
+        """The highest token that the robot has obeyed, as far as it told, whoever commanded it then."""
+        return self._gate.token or 0
+
     def connect(self) -> Deferred[Description]:
         """Open the link; fires when the first observation has arrived.  Lost links are opened again with back-off.
 
@@ -173,8 +178,11 @@ class SimDriver:
         return end
 
     def diagnostics(self) -> dict[str, float]:
-        """Counters: frames, bad frames, pictures, bytes, links, reconnects, refused; ``age`` of the newest in s."""
-        counts: dict[str, float] = dict(self._counts)
+        """Counters: frames, bad frames, pictures, bytes, links, reconnects, refused; ``age`` of the newest in s.
+
+        Also the commands ``accepted`` here, and those refused as ``lower token`` or ``late``.
+        """
+        counts: dict[str, float] = {**self._counts, "accepted": self._gate.accepted, **self._gate.refused}
         counts["reconnects"] = max(0, self._counts["links"] - 1)
         counts["age"] = math.inf if self._newest is None else self._clock.seconds() - self._newest.t_host
         return counts
@@ -225,6 +233,7 @@ class SimDriver:
     def _on_sensors(self, message: Sensors) -> None:
         observation = Observation(self._clock.seconds(), float(message.t), message.values, message.samples, self._frame)
         self._newest = observation
+        self._gate.learn(message.token)
         self._is_heard = True
         self._has_problem = False
         self._settle_switching(observation.values.get("estop.engaged"))

@@ -11,6 +11,7 @@ import heapq
 import itertools
 import time
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 
 from twisted.internet.base import ReactorBase
 from twisted.internet.error import AlreadyCalled, AlreadyCancelled
@@ -20,14 +21,28 @@ from zope.interface import implementer
 _COMPACT_FROM = 64
 
 
+def boot_time() -> Callable[[], float]:
+    """The clock that no one sets: seconds since the machine started, those in which it was suspended included.
+
+    Where the system has no such clock (CLOCK_BOOTTIME) it is ``time.monotonic``, which may stand still meanwhile.
+    """
+    if hasattr(time, "CLOCK_BOOTTIME"):
+        return partial(time.clock_gettime, time.CLOCK_BOOTTIME)
+    return time.monotonic
+
+
 def use_monotonic_time() -> None:
-    """Make every Twisted reactor of this process keep its timers on ``time.monotonic``.
+    """Make every Twisted reactor of this process keep its timers on ``boot_time``.
 
     Twisted measures with ``time.time``: when the wall clock is set back a minute (NTP, a robot that gets GPS time),
     every timer stands still for that minute; when it is set forward, every pending time-out is due at once and a whole
-    team suspects everybody.  Call this before timers are made; calling it again changes nothing.
+    team suspects everybody.  ``time.monotonic`` stands still while the machine is suspended: who wakes up would take
+    a lease for its own that has long gone to another.  On this clock whatever came due meanwhile is due at once, as
+    after any long pause; a timer that is late says that there was one.
+
+    Call this before timers are made; calling it again changes nothing.
     """
-    ReactorBase.seconds = staticmethod(time.monotonic)
+    ReactorBase.seconds = staticmethod(boot_time())
 
 
 @implementer(IDelayedCall)
@@ -136,6 +151,10 @@ class HeapClock:
     def advance(self, seconds: float) -> None:
         """Move time on by ``seconds``."""
         self.run_until(self._now + seconds)
+
+    def leap(self, seconds: float) -> None:
+        """Be suspended for ``seconds``: time passes and nothing is done; what came due is done late."""
+        self._now += seconds
 
     def pump(self, steps: Iterable[float]) -> None:
         """Move time on by each of ``steps`` seconds in turn."""

@@ -11,7 +11,7 @@ from agents.behaviour import STAND, Context
 from agents.engagement import SEARCH_TTL, Deed, Engagement
 from agents.state import State
 from drivers.reading import Action, Observation
-from middleware.consensus.lease import Lease
+from middleware.commitment.lessee import Lease
 from middleware.consensus.nearest import Nearest
 from middleware.consensus.strategy import Consensus, Report
 from middleware.entangled.clock import HeapClock

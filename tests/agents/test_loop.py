@@ -12,7 +12,7 @@ from agents.loop import Agent
 from drivers.driver import Permit
 from drivers.errors import NotEnabled
 from drivers.reading import Action
-from middleware.consensus.lease import Lease
+from middleware.commitment.lessee import Lease
 from middleware.tasks import Task
 from swarmnode.rehearsal import VirtualTeam
 

@@ -8,7 +8,7 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from drivers.driver import Permit
 from drivers.errors import StaleCommand
-from drivers.gate import Gate
+from drivers.gate import LATE, LOWER, Gate
 
 
 class GateTests(SynchronousTestCase):
@@ -51,3 +51,20 @@ class GateTests(SynchronousTestCase):
         gate.close()
         self.assertFalse(gate.is_over(3.0))
         self.assertRaises(StaleCommand, gate.admit, Permit(3, 9.0), 3.0)
+
+    def test_learns_from_a_gate_further_down(self) -> None:
+        """What the robot has obeyed under another holder of the link bars lower tokens here; a lower one does not."""
+        gate = Gate()
+        for token, known in ((0, None), (7, 7), (5, 7)):
+            gate.learn(token)
+            self.assertEqual(gate.token, known)
+        self.assertRaises(StaleCommand, gate.admit, Permit(6, 2.0), 1.0)
+        gate.admit(Permit(7, 2.0), now=1.0)
+
+    def test_counts_by_name(self) -> None:
+        """Commands let through and refused are counted, the refused by their reason."""
+        gate = Gate()
+        gate.admit(Permit(4, 2.0), now=1.0)
+        for token, deadline in ((3, 2.0), (2, 2.0), (9, 0.5)):
+            self.assertRaises(StaleCommand, gate.admit, Permit(token, deadline), 1.0)
+        self.assertEqual((gate.accepted, gate.refused), (1, {LOWER: 2, LATE: 1}))

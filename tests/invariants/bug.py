@@ -11,6 +11,14 @@ from twisted.internet.defer import Deferred, succeed
 
 from agents import circle
 from agents.docket import Docket
+from drivers.errors import StaleCommand
+from drivers.gate import Gate
+from middleware.commitment import ledger, lessee
+from middleware.commitment.acceptor import Acceptor
+from middleware.commitment.ballot import GRANTED, members_of
+from middleware.commitment.council import Council
+from middleware.commitment.lessee import Lessee
+from middleware.commitment.round import Round
 from middleware.consensus import bidder, nearest
 from middleware.consensus.nearest import Nearest
 from middleware.consensus.strategy import Report
@@ -35,6 +43,8 @@ from middleware.entangled.wire import greeting
 from middleware.entangled.wire.greeting import Cookies, Greeter
 from middleware.entangled.wire.method import Ledger
 from middleware.entangled.wire.session import Session
+from tests.invariants.leases import Leases
+from tests.invariants.machine import Machine
 
 
 async def _nothing(*_: object) -> None:
@@ -66,7 +76,14 @@ def _any_answer(answers: dict[bytes, Any], voters: frozenset[bytes]) -> int:
 
 _GENUINE = {
     (place, name): getattr(place, name)
-    for place, name in [(Tally, "outcome"), (Vote, "claim"), (Greeter, "on_who"), (Session, "open"), (Seat, "_load")]
+    for place, name in [
+        (Tally, "outcome"),
+        (Vote, "claim"),
+        (Greeter, "on_who"),
+        (Session, "open"),
+        (Seat, "_load"),
+        (ledger.Ledger, "keep"),
+    ]
 }
 
 
@@ -129,6 +146,43 @@ def _not_a_number_first(contacts: Any) -> list[Report]:
 
 _BEST_OF = nearest.best_of
 
+
+def _deadline_from_the_answer(self: Lessee, won: Round) -> float:
+    return self._clock.seconds() + self.council.ttl * (1.0 - lessee.CLOCK_MARGIN) - self._stop_time
+
+
+def _deadline_without_the_stop(self: Lessee, won: Round) -> float:
+    return won.sent_at + self.council.ttl * (1.0 - lessee.CLOCK_MARGIN)
+
+
+def _only_listens(self: Lessee, asked: Round) -> None:
+    return None
+
+
+def _closest_now(self: Leases, place: int, task_id: str) -> Any:
+    near = [n for n in range(self.n) if not {(place, n), (n, place)} & self.radio.cut and self.is_up(n)]
+    return tuple(self.contacts[n] for n in near[:3]), 1
+
+
+def _forgets_tokens(self: ledger.Ledger, task_id: str) -> None:
+    entry = self._entries[task_id]
+    token, entry.token = entry.token, 0
+    _GENUINE[ledger.Ledger, "keep"](self, task_id)
+    entry.token = token
+
+
+def _admits_lower_tokens(self: Gate, permit: Any, now: float) -> None:
+    if permit.deadline <= now:
+        raise StaleCommand("late")
+    self._token, self._deadline = permit.token, permit.deadline
+
+
+async def _decided_by_the_new(self: Council, ballot: Any, packed: Any) -> Round:
+    members = members_of(packed) or ()
+    question = (self.task_id, self.configuration, ballot.counter, packed, self.token)
+    return await Round(members, self._ask, self._clock, "lease.change", question, (GRANTED,), self.ttl / 3).outcome
+
+
 BUGS: dict[str, list[tuple[Any, str, Any]]] = {
     "tombstone dropped too early": [(owner, "TOMBSTONE_TTL", 3.0)],
     "acknowledged by a minority": [(Overlay, "voters", lambda self, key, targets: [targets[0].node_id])],
@@ -174,7 +228,21 @@ BUGS: dict[str, list[tuple[Any, str, Any]]] = {
     "agents are numbered in a byte": [(nearest, "best_of", _numbered_in_a_byte)],
     "a cost that is not a number wins": [(nearest, "best_of", _not_a_number_first)],
     "bidders stop after one quiet round": [(bidder, "is_over", lambda rounds, quiet, tasks, members: quiet >= 1)],
+    # Leases.
+    "deadline from the time of the answer": [(Lessee, "_deadline_of", _deadline_from_the_answer)],
+    "no clock margin": [(lessee, "CLOCK_MARGIN", 0.0)],
+    "a clock that stands still while suspended": [(Machine, "COUNTS_SUSPENSION", False)],
+    "the council is whoever is closest now": [(Leases, "council_for", _closest_now)],
+    "a stand-by does not ask": [(Lessee, "_wait", _only_listens)],
+    "minority grants are kept": [(Lessee, "_let_go_of_minority", _idle)],
+    "the token is not stored": [(ledger.Ledger, "keep", _forgets_tokens)],
+    "the time to stop is ignored": [(Lessee, "_deadline_of", _deadline_without_the_stop)],
+    "released before it stands still": [(Lessee, "_rest", lambda self: 0.0)],
+    "the device takes lower tokens": [(Gate, "admit", _admits_lower_tokens)],
+    "a restarted member grants at once": [(Acceptor, "_silence", lambda self, ttl: 0.0)],
+    "the new council decides the change": [(Council, "_decision", _decided_by_the_new)],
 }
+LEASE_BUGS = tuple(list(BUGS)[-12:])
 
 FINDERS: dict[str, tuple[str, ...]] = {
     "one promise is a majority": ("tuples",),
@@ -197,6 +265,7 @@ FINDERS: dict[str, tuple[str, ...]] = {
     "agents are numbered in a byte": ("deciders",),
     "a cost that is not a number wins": ("deciders",),
     "bidders stop after one quiet round": ("deciders",),
+    **dict.fromkeys(LEASE_BUGS, ("leases",)),
 }
 """The workloads that look for a bug, where these are not the records."""
 

@@ -14,7 +14,7 @@ from typing import Any
 
 from twisted.internet.defer import Deferred, fail, succeed
 
-from middleware.consensus.lease import Lease
+from middleware.commitment.lessee import Lease
 from middleware.entangled.clock import HeapClock
 from middleware.entangled.errors import Unavailable
 from middleware.entangled.record import Record
@@ -225,6 +225,10 @@ class Lessee:
         """The lease if it is held now."""
         is_held = self.token and self._ether.clock.seconds() < self._deadline
         return Lease(self._task_id, self.token, self._deadline) if is_held else None
+
+    def outrank(self, token: int) -> None:
+        """Take higher tokens than this one from now on."""
+        self._floor = max(self._floor, token)
 
     def want(self) -> None:
         """Claim, and renew."""

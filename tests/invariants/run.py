@@ -8,17 +8,31 @@ import random
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
+from typing import Protocol
 
 from tests.fleet import Fleet
 from tests.invariants.bug import seeded
 from tests.invariants.deciders import Deciders
 from tests.invariants.disk import DiskFleet
+from tests.invariants.leases import Leases
 from tests.invariants.records import Records
 from tests.invariants.schedule import Schedule, Workload
 from tests.invariants.stores import Stores
 from tests.invariants.tasks import Tasks
 from tests.invariants.tuples import Tuples
 from tests.invariants.wire import Wire
+
+
+class Alone(Protocol):
+    """A workload with a world and faults of its own."""
+
+    @property
+    def digest(self) -> str:
+        """A hash of what happened."""
+
+    def run(self) -> list[str]:
+        """Every violation, a line each."""
+
 
 WORKLOADS: dict[str, Callable[[Schedule], Workload]] = {
     "records": Records,
@@ -28,11 +42,10 @@ WORKLOADS: dict[str, Callable[[Schedule], Workload]] = {
     "deciders": Deciders,
 }
 """Each may be asked for by name; the order is the one in which they act."""
-ALONE = {"tasks": Tasks}
-"""Those that need no fleet: a world of their own beside it, with faults of its own."""
+ALONE: dict[str, Callable[[int], Alone]] = {"tasks": Tasks, "leases": Leases}
+"""Those that need no fleet: a world of their own beside it, with faults of its own, in every schedule."""
 SHARES = {"records": 1.0, "tuples": 0.06, "stores": 0.06, "wire": 0.06, "deciders": 0.06}
 """The share of schedules in which each takes part, unless it is asked for."""
-ALONE_SHARE = 0.25
 
 
 @dataclass(frozen=True)
@@ -48,8 +61,7 @@ class Outcome:
 def drawn(seed: int) -> list[str]:
     """The workloads of a seed."""
     dice = random.Random(f"workloads/{seed}")
-    names = [name for name, share in SHARES.items() if dice.random() < share]
-    return names + [name for name in ALONE if random.Random(f"{name} alone/{seed}").random() < ALONE_SHARE]
+    return [*(name for name, share in SHARES.items() if dice.random() < share), *ALONE]
 
 
 def run(seed: int, only: tuple[str, ...] = (), bug: str | None = None) -> Outcome:
@@ -59,7 +71,7 @@ def run(seed: int, only: tuple[str, ...] = (), bug: str | None = None) -> Outcom
         alone = [ALONE[name](seed) for name in ALONE if name in names]
         found_alone = [line for world in alone for line in world.run()]
         if alone and len(names) == len(alone):
-            return Outcome(seed, "; ".join(map(str, alone)), found_alone, alone[0].digest)
+            return Outcome(seed, "; ".join(map(str, alone)), found_alone, " ".join(world.digest for world in alone))
         schedule = Schedule(seed, DiskFleet if "stores" in names else Fleet)
         found = schedule.run([WORKLOADS[name](schedule) for name in WORKLOADS if name in names])
     faults = "; ".join(map(str, schedule.faults))

@@ -67,6 +67,11 @@ class Robot:
         self._seen: Callable[[Observation], None] = lambda seen: None
         self._is_on = False
 
+    @property
+    def token(self) -> int:
+        """The highest token that it has obeyed."""
+        return self._gate.token or 0
+
     def connect(self) -> Deferred[None]:
         """Begin to sense."""
         self._is_on = True

@@ -7,7 +7,7 @@ from typing import Any
 
 from twisted.internet.defer import Deferred
 
-from middleware.consensus.lease import Lessee
+from middleware.commitment.lessee import Lessee
 from middleware.entangled.errors import NoAnswer, Refused
 from middleware.entangled.network.switchboard import Weather
 from middleware.entangled.record import Record
@@ -191,20 +191,34 @@ class SwarmNodeTests(FleetCase):
         self.assertEqual(self.flushLoggedErrors(), [])
 
     def test_claims_from_the_wire(self) -> None:
-        """Claims with a wrong token, name or duration are refused."""
+        """Claims with a wrong name, configuration, ballot, token or duration are refused, and crafted councils."""
         fleet = self.swarm(2)
-        for bad in (
-            ("t", 0, 1.0),
-            ("t", 2**62, 1.0),
-            ("t", 1, 0.0),
-            ("t", 1, 61.0),
-            ("t", 1, float("nan")),
-            ("t" * 65, 1, 1.0),
-            (5, 1, 1.0),
-            ("t", True, 1.0),
-            ("t", 1, "1"),
+        good = ["t", 1, 1, 1.0]
+        for place, bad in (
+            (0, "t" * 65),
+            (0, 5),
+            (1, 0),
+            (2, -1),
+            (2, 2**62),
+            (2, True),
+            (3, 0.0),
+            (3, 61.0),
+            (3, "1"),
         ):
-            asked = self.asked(fleet, "lease.claim", *bad)
+            question = [*good[:place], bad, *good[place + 1 :]]
+            asked = self.asked(fleet, "lease.prepare", *question)
+            fleet.run(0.1)
+            self.failureResultOf(asked, Refused)
+        for method, *question in (
+            ("lease.prepare", "t", 1, 1, float("nan")),
+            ("lease.propose", "t", 1, 1, 0, 1.0),
+            ("lease.release", "t", -1),
+            ("lease.close", "t", -1),
+            ("lease.change", "t", 1, 1, [], 0),
+            ("lease.change", "t", 1, 1, [[b"k", "h", 0]], 0),
+            ("lease.install", "t", 2, [b"?"], 0),
+        ):
+            asked = self.asked(fleet, method, *question)
             fleet.run(0.1)
             self.failureResultOf(asked, Refused)
 

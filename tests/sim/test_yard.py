@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from random import Random
+from typing import Any
 
 from twisted.internet.task import Clock
 from twisted.trial.unittest import SynchronousTestCase
@@ -167,7 +168,7 @@ class YardTests(SynchronousTestCase):
         self.assertFalse(self.is_moving())
 
     def test_stops_the_dog_of_a_lost_driver(self) -> None:
-        """When the connection closes, the dog stops and is free, with fresh tokens, for another driver."""
+        """When the connection closes, the dog stops and is free for another driver, who learns its token."""
         self.drive(token=9, ttl=5.0)
         self.ticks(5)
         self.client.close()
@@ -175,9 +176,32 @@ class YardTests(SynchronousTestCase):
         self.assertFalse(self.is_moving())
         self.client = Client(self.yard)
         self.client.say(Hello(VERSION, "dog1", 0.0), Motors(True))
-        self.drive(token=1, ttl=5.0)
+        self.ticks(1)
+        self.assertEqual([m.token for m in self.client.of(Sensors) if isinstance(m, Sensors)], [9])
+        self.drive(token=8, ttl=5.0)
+        self.ticks(5)
+        self.assertFalse(self.is_moving())
+        self.drive(token=9, ttl=5.0)
         self.ticks(5)
         self.assertTrue(self.is_moving())
+
+    def test_stops_after_a_suspension(self) -> None:
+        """What was ordered before the machine was suspended is over when it wakes."""
+        self.drive(ttl=5.0)
+        self.ticks(5)
+        self.clock.advance(60.0)
+        self.ticks(5)
+        self.assertFalse(self.is_moving())
+
+    def test_tells_what_the_gates_did(self) -> None:
+        """The truth says of each dog its highest token, and how many commands were obeyed and refused."""
+        self.drive(token=7)
+        self.drive(token=7)
+        self.drive(token=6)
+        self.drive(token=8, ttl=0.0)
+        dogs: Any = self.yard.truth()["dogs"]
+        told = [(dog["name"], dog["token"], dog["accepted"], dog["refused"]) for dog in dogs]
+        self.assertEqual(told, [("dog1", 7, 2, 2), ("dog2", 0, 0, 0), ("dog3", 0, 0, 0)])
 
     def test_gives_up_a_silent_client(self) -> None:
         """A frozen driver is hung up on after some seconds, and so is a stranger who never says hello."""

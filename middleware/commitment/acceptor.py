@@ -1,0 +1,178 @@
+"""Acceptor: one member of a task's council; it promises, grants, and counts down what it granted.
+
+The moment is an argument.  Safety is that of Paxos: a lease is proposed under a ballot that a majority has promised,
+after none of them had another's lease in force; two majorities share a member (PaxosLease, arXiv 1209.4187).
+"""
+
+from __future__ import annotations
+
+import math
+
+from middleware.commitment.ballot import (
+    BEHIND,
+    FIRST,
+    GRANTED,
+    HELD,
+    MOVED,
+    NONE,
+    OUTBID,
+    OVER,
+    QUIET,
+    SEALED,
+    Ballot,
+    Reply,
+)
+from middleware.commitment.ledger import Entry, Ledger
+from middleware.entangled.kademlia.contact import Contact
+
+MAX_LISTENERS = 16
+ROOM = 1.0
+"""Seconds after which a claimant may ask again where there was no room for its task."""
+
+
+class Acceptor:
+    """A council member since ``born_at``.
+
+    It does not know whether a task exists: a lease on nothing hurts nobody and runs out.  What its ``ledger`` may have
+    forgotten it keeps silent about for the longest ttl.
+    """
+
+    def __init__(self, ledger: Ledger, born_at: float = -math.inf) -> None:
+        self._ledger = ledger
+        self._born_at = born_at
+
+    def prepare(self, task_id: str, configuration: int, ballot: Ballot, ttl: float, now: float) -> Reply:
+        """Promise to accept nothing under a lower ballot, or say what stands against it.
+
+        While another holds the lease (a former life of the same agent is another) nothing changes but that the asker
+        is told when it is given back.  A ballot of counter 0 only looks, and is promised nothing: a member whose grant
+        has run out, because it missed a renewal, is not to be lost to its healthy holder.
+        """
+        entry = self._entry(task_id, configuration, ttl, now)
+        if isinstance(entry, Reply):
+            return entry
+        if entry.until > now and not entry.ballot.is_kin(ballot):
+            self._listen(entry, ballot.agent, now + ttl)
+            return self._reply(HELD, entry, now)
+        if ballot.counter > 0 and ballot < entry.promised:
+            return self._reply(OUTBID, entry, now)
+        entry.touched_at = now
+        if ballot > entry.promised:
+            entry.promised = ballot
+            self._ledger.keep(task_id)
+        if entry.sealed != NONE:
+            return self._reply(SEALED, entry, now)._replace(ballot=entry.sealed)
+        return self._reply(GRANTED, entry, now)
+
+    def propose(self, task_id: str, configuration: int, ballot: Ballot, token: int, ttl: float, now: float) -> Reply:
+        """Grant the lease for ``ttl`` seconds from now, or renew it, unless a higher ballot or token was seen."""
+        entry = self._entry(task_id, configuration, ttl, now)
+        if isinstance(entry, Reply):
+            return entry
+        if entry.sealed != NONE:
+            return self._reply(SEALED, entry, now)._replace(ballot=entry.sealed)
+        is_lower = token < entry.token or (token == entry.token and not ballot.is_kin(entry.ballot))
+        if ballot < entry.promised or ballot <= entry.spent or is_lower:
+            return self._reply(OUTBID, entry, now)
+        is_new = (entry.promised, entry.ballot, entry.token, entry.ttl) != (ballot, ballot, token, ttl)
+        entry.promised = entry.ballot = ballot
+        entry.token, entry.ttl = token, ttl
+        entry.until, entry.touched_at = now + ttl, now
+        if is_new:
+            self._ledger.keep(task_id)
+        return self._reply(GRANTED, entry, now)
+
+    def release(self, task_id: str, ballot: Ballot, now: float) -> list[str]:
+        """End what was granted under ``ballot``, for good, and name those that are to be told."""
+        entry = self._ledger.get(task_id)
+        if entry is None or ballot not in (entry.ballot, entry.promised) or ballot <= entry.spent:
+            return []
+        # A proposal of that ballot may still be on its way: it comes too late.
+        entry.spent = ballot
+        if entry.ballot == ballot:
+            entry.ballot, entry.until = NONE, now
+        self._ledger.keep(task_id)
+        if entry.until > now:
+            return []
+        listeners, entry.listeners = entry.listeners, {}
+        return [agent for agent, until in listeners.items() if until > now and agent != ballot.agent]
+
+    def close(self, task_id: str, agent: str, token: int, now: float) -> Reply:
+        """Grant no more leases on a task that has ended; ``remaining`` is how long another may still act on it.
+
+        Who concludes names its token, and is refused where a higher one was granted; token 0 is an operator's.
+        """
+        entry = self._ledger.get(task_id) or self._ledger.add(task_id, FIRST, now)
+        if entry is None:
+            return Reply(QUIET, remaining=ROOM)
+        if 0 < token < entry.token:
+            return self._reply(OUTBID, entry, now)
+        if not entry.is_over:
+            entry.is_over, entry.touched_at = True, now
+            self._ledger.keep(task_id)
+        reply = self._reply(OVER, entry, now)
+        is_done = entry.ballot.agent == agent and entry.token == token
+        return reply._replace(remaining=0.0) if is_done else reply
+
+    def change(
+        self, task_id: str, configuration: int, ballot: Ballot, members: tuple[Contact, ...], token: int, now: float
+    ) -> Reply:
+        """Accept ``members`` as the next council: from then on no lease of the present one, unless one is open."""
+        entry = self._entry(task_id, configuration, 0.0, now)
+        if isinstance(entry, Reply):
+            return entry
+        if entry.until > now:
+            return self._reply(HELD, entry, now)
+        if ballot < entry.promised or ballot <= entry.spent:
+            return self._reply(OUTBID, entry, now)
+        entry.promised = entry.sealed = ballot
+        entry.members, entry.token, entry.touched_at = members, max(entry.token, token), now
+        self._ledger.keep(task_id)
+        return self._reply(GRANTED, entry, now)
+
+    def install(self, task_id: str, configuration: int, members: tuple[Contact, ...], token: int, now: float) -> Reply:
+        """Learn that a majority of the council before has chosen ``members``, and above which token they go on."""
+        entry = self._ledger.get(task_id) or self._ledger.add(task_id, FIRST, now)
+        if entry is None:
+            return Reply(QUIET, remaining=ROOM)
+        if configuration > entry.configuration:
+            entry.configuration, entry.members, entry.sealed = configuration, members, NONE
+            entry.ballot, entry.until = NONE, now
+            entry.token, entry.touched_at = max(entry.token, token), now
+            self._ledger.keep(task_id)
+        return self._reply(GRANTED if configuration == entry.configuration else MOVED, entry, now)
+
+    # -- inside -----------------------------------------------------------------------------------------------------
+
+    def _entry(self, task_id: str, configuration: int, ttl: float, now: float) -> Entry | Reply:
+        """The entry of a task, or what stands against whatever is asked."""
+        quiet = self._silence(ttl) - now
+        if quiet > 0.0:
+            return Reply(QUIET, remaining=quiet)
+        entry = self._ledger.get(task_id)
+        if entry is None and configuration == FIRST:
+            entry = self._ledger.add(task_id, configuration, now)
+            if entry is None:
+                return Reply(QUIET, remaining=ROOM)
+        if entry is None or configuration > entry.configuration:
+            return Reply(BEHIND, configuration=0 if entry is None else entry.configuration)
+        if entry.is_over:
+            return self._reply(OVER, entry, now)
+        if configuration < entry.configuration:
+            return self._reply(MOVED, entry, now)
+        return entry
+
+    def _silence(self, ttl: float) -> float:
+        """Until when it grants nothing, because it may have granted something that it has forgotten."""
+        return -math.inf if self._ledger.is_whole else self._born_at + max(ttl, self._ledger.longest)
+
+    def _listen(self, entry: Entry, agent: str, until: float) -> None:
+        entry.listeners.pop(agent, None)
+        if len(entry.listeners) >= MAX_LISTENERS:
+            del entry.listeners[next(iter(entry.listeners))]
+        entry.listeners[agent] = until
+
+    def _reply(self, kind: str, entry: Entry, now: float) -> Reply:
+        members = entry.members if kind in (MOVED, SEALED) else ()
+        remaining = max(0.0, entry.until - now)
+        return Reply(kind, entry.promised, entry.token, remaining, entry.configuration, members)

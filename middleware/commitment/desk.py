@@ -1,0 +1,144 @@
+"""Desk: where peers reach this node's acceptor; it checks what they send; answers wait until they are kept."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+from weakref import WeakValueDictionary
+
+from twisted.internet.defer import Deferred, maybeDeferred
+from twisted.internet.interfaces import IReactorTime
+
+from middleware.commitment.acceptor import Acceptor
+from middleware.commitment.ballot import MAX_NUMBER, Ballot, Reply, members_of
+from middleware.commitment.ledger import Ledger
+from middleware.entangled.data.store import Store
+from middleware.entangled.errors import Refused
+from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.record import MAX_NAME
+from middleware.entangled.wire.endpoint import Endpoint
+from middleware.entangled.wire.method import Method
+
+if TYPE_CHECKING:
+    from middleware.commitment.lessee import Lessee
+
+MAX_TTL = 60.0
+
+Answer = list[object] | Deferred[list[object]]
+
+
+class Desk:
+    """The acceptor of one node, and the lessees that wait for news from others' acceptors.
+
+    It may be made when the first peer asks: ``born_at`` is when the node began, for silence counts from then.
+    """
+
+    def __init__(self, endpoint: Endpoint, store: Store, clock: IReactorTime, born_at: float) -> None:
+        self._endpoint = endpoint
+        self._store = store
+        self._clock = clock
+        self._acceptor = Acceptor(Ledger(store, born_at), born_at)
+        self._lessees: WeakValueDictionary[str, Lessee] = WeakValueDictionary()
+        self._contacts: dict[str, Contact] = {}
+        self._methods = {
+            name: Method(name, answer)
+            for name, answer in (
+                ("lease.prepare", self._prepare),
+                ("lease.propose", self._propose),
+                ("lease.release", self._release),
+                ("lease.close", self._close),
+                ("lease.change", self._change),
+                ("lease.install", self._install),
+                ("lease.freed", self._freed),
+            )
+        }
+
+    def answer(self, method: str, peer: Contact, arguments: tuple[Any, ...]) -> object:
+        """What a peer is told; raises ``Refused`` where its arguments do not fit."""
+        return self._methods[method].run(peer, arguments)
+
+    def enter(self, lessee: Lessee) -> None:
+        """Let ``lessee`` hear when the lease of its task is given back."""
+        self._lessees[lessee.task_id] = lessee
+
+    def ask(
+        self, own: Contact, member: Contact, method: str, arguments: tuple[Any, ...], patience: float
+    ) -> Deferred[Any]:
+        """Ask a member, which may be this node itself."""
+        if member.node_id == own.node_id:
+            return maybeDeferred(self.answer, method, own, arguments)
+        return self._endpoint.ask(member, method, *arguments, changes=True, timeout=patience)
+
+    # -- what peers ask ---------------------------------------------------------------------------------------------
+
+    def _prepare(self, peer: Contact, task_id: str, configuration: int, counter: int, ttl: float) -> Answer:
+        _check(task_id, configuration, counter + 1, ttl=ttl)
+        agent = self._known(peer)
+        ballot = Ballot(counter, agent)
+        return self._kept(self._acceptor.prepare(task_id, configuration, ballot, float(ttl), self._clock.seconds()))
+
+    def _propose(self, peer: Contact, task_id: str, configuration: int, counter: int, token: int, ttl: float) -> Answer:
+        _check(task_id, configuration, counter, token, ttl=ttl)
+        ballot, now = Ballot(counter, peer.node_id.hex()), self._clock.seconds()
+        return self._kept(self._acceptor.propose(task_id, configuration, ballot, token, float(ttl), now))
+
+    def _release(self, peer: Contact, task_id: str, counter: int) -> None:
+        _check(task_id, counter)
+        ballot = Ballot(counter, peer.node_id.hex())
+        for agent in self._acceptor.release(task_id, ballot, self._clock.seconds()):
+            contact = self._contacts.get(agent)
+            if contact is not None:
+                self._endpoint.tell(contact, "lease.freed", task_id, 0)
+
+    def _close(self, peer: Contact, task_id: str, token: int) -> Answer:
+        _check(task_id, token + 1)
+        return self._kept(self._acceptor.close(task_id, peer.node_id.hex(), token, self._clock.seconds()))
+
+    def _change(
+        self, peer: Contact, task_id: str, configuration: int, counter: int, packed: list[object], token: int
+    ) -> Answer:
+        _check(task_id, configuration, counter, token + 1)
+        members = _checked(packed)
+        ballot, now = Ballot(counter, peer.node_id.hex()), self._clock.seconds()
+        return self._kept(self._acceptor.change(task_id, configuration, ballot, members, token, now))
+
+    def _install(self, peer: Contact, task_id: str, configuration: int, packed: list[object], token: int) -> Answer:
+        _check(task_id, configuration, token + 1)
+        members, now = _checked(packed), self._clock.seconds()
+        return self._kept(self._acceptor.install(task_id, configuration, members, token, now))
+
+    def _freed(self, peer: Contact, task_id: str, token: int) -> None:
+        _check(task_id, token + 1)
+        lessee = self._lessees.get(task_id)
+        if lessee is not None:
+            lessee.freed(token)
+
+    # -- inside -----------------------------------------------------------------------------------------------------
+
+    def _known(self, peer: Contact) -> str:
+        """The id of an agent, to which its address is remembered for a push."""
+        agent = peer.node_id.hex()
+        self._contacts.pop(agent, None)
+        if len(self._contacts) >= 256:
+            del self._contacts[next(iter(self._contacts))]
+        self._contacts[agent] = peer
+        return agent
+
+    def _kept(self, reply: Reply) -> Answer:
+        """The answer, once everything that it promises survives the end of the process."""
+        packed = reply.packed()
+        written = self._store.written()
+        return packed if written.called and written.result is None else written.addCallback(lambda _: packed)
+
+
+def _check(task_id: str, *numbers: int, ttl: float = 1.0) -> None:
+    if len(task_id) > MAX_NAME or not all(0 < number < MAX_NUMBER for number in numbers):
+        raise Refused("a lease is asked for with a task id and positive numbers below 2^62")
+    if not 0.0 < ttl <= MAX_TTL:
+        raise Refused(f"a lease lasts more than 0 and at most {MAX_TTL:g} seconds")
+
+
+def _checked(packed: list[object]) -> tuple[Contact, ...]:
+    members = members_of(packed)
+    if not members:
+        raise Refused("a council has one to seven members, each [public key, host, port]")
+    return members

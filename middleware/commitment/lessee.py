@@ -1,0 +1,324 @@
+"""Lessee: one agent's lease on one task: claim it, keep it, give it back; and stand by for it.
+
+A claim has two phases: a majority promises (and tells the highest token), a majority grants.  A renewal needs the
+second one only.  The deadline is counted from when the granted question was *sent*, less a margin for clocks that drift
+and the time in which the robot comes to rest, so it ends before any member would grant another (consensus rule 5).
+
+``clock`` has to go on while the machine is suspended, where there is such a clock (rule 7).
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from twisted.internet.defer import Deferred
+from twisted.internet.interfaces import IDelayedCall, IReactorTime
+
+from middleware.commitment.ballot import GRANTED, NONE, OUTBID, OVER, SEALED, Ballot
+from middleware.commitment.council import Council
+from middleware.commitment.round import Round
+from middleware.entangled.errors import EntangledError
+from middleware.entangled.kademlia.contact import Contact
+
+CLOCK_MARGIN = 0.02
+"""Share by which the clocks of two correct nodes may drift apart: 2 rho, with rho = 1 %."""
+RENEWALS = 3
+"""How often a lease is renewed, and a stand-by asks, in each ttl."""
+RETRY = 0.1
+JITTER = (0.0, 0.02)
+BACK_OFF = (0.02, 0.08)
+"""Seconds after which a claim is tried again that another one was faster than."""
+SOON = 1.5
+"""Periods of asking within which a lease that runs out is claimed rather than looked at once more."""
+FRESH = 0.3
+"""Seconds for which the news of a release is believed against members that have not heard it."""
+STAGGER = 0.1
+"""Seconds by which each rank of those that stand by waits longer than the one before it."""
+TICK = 0.05
+"""A timer that fires later than this counts as a possible pause."""
+
+
+@dataclass(frozen=True)
+class Lease:
+    """The right to act on a task until ``deadline`` (seconds of the lessee's own clock)."""
+
+    task_id: str
+    token: int
+    deadline: float
+
+
+class Lessee:
+    """One agent's claim on the task of ``council``; ``changed`` is called when the lease is won, renewed or lost.
+
+    ``stop_time`` is how long the robot takes to come to rest, in seconds.
+    """
+
+    def __init__(
+        self,
+        council: Council,
+        clock: IReactorTime,
+        rng: random.Random,
+        changed: Callable[[], None],
+        stop_time: float = 0.0,
+    ) -> None:
+        self.task_id = council.task_id
+        self.council = council
+        self.token = 0
+        self.is_over = False
+        self.pauses = 0
+        self._clock = clock
+        self._rng = rng
+        self._changed = changed
+        self._stop_time = stop_time
+        self._deadline = 0.0
+        self._rests_at = -math.inf
+        self._ballot = NONE
+        self._claimed = NONE
+        self._rank = 0
+        self._is_wanted = False
+        self._freed_at = -math.inf
+        self._only_looks = False
+        self._must_prepare = False
+        self._round: Round | None = None
+        self._timer: IDelayedCall | None = None
+        self._due_at = 0.0
+
+    @property
+    def lease(self) -> Lease | None:
+        """The lease if it is held now."""
+        if self.token and self._clock.seconds() < self._deadline:
+            return Lease(self.task_id, self.token, self._deadline)
+        return None
+
+    def want(self) -> None:
+        """Claim the lease and keep it, trying again until it is won."""
+        self._rank = 0
+        if not self._is_wanted and not self.is_over:
+            self._is_wanted = True
+            self._claim()
+
+    def stand_by(self, rank: int = 1) -> None:
+        """Claim the lease when it is given back or has run out, the lower ranks first; until then listen and ask.
+
+        Who holds the lease or wants it already only takes the rank.
+        """
+        self._rank = max(1, rank)
+        if not self._is_wanted and not self.is_over:
+            self._is_wanted = self._only_looks = True
+            self._again(self._rank * self.council.ttl / RENEWALS)
+
+    def suspect(self) -> None:
+        """The holder may be gone: ask now how long its lease runs, and be ready when it ends.  It shortens no lease."""
+        if self._is_wanted and not self._is_asking and self.lease is None:
+            self._look()
+
+    def freed(self, token: int) -> None:
+        """A member says that the lease with that token was given back."""
+        self.council.token = max(self.council.token, token)
+        if self._is_wanted and self.lease is None:
+            self._freed_at = self._clock.seconds()
+            if not self._is_asking:
+                self._again(self._stagger())
+
+    def outrank(self, token: int) -> None:
+        """A device has obeyed ``token``: from now on nothing is claimed that is not higher, and nothing lower used."""
+        self.council.token = max(self.council.token, token)
+        if 0 < self.token < token:
+            self._lose()
+            self._claim()
+
+    def release(self, heirs: Sequence[Contact] = ()) -> None:
+        """Give the lease back (stop the device first), or stop claiming it.
+
+        Where the robot takes a time to come to rest, the council is told when that has passed.  Its members tell those
+        that stand by; ``heirs`` are told from here, and so half a round trip earlier.
+        """
+        if self.lease is not None:
+            self._rests_at = self._clock.seconds() + self._stop_time
+        self._is_wanted = False
+        self._cancel()
+        if self._ballot != NONE:
+            self._let_go(self._ballot, heirs)
+        self._let_go_of_minority()
+        self.token, self._deadline, self._ballot, self._claimed = 0, 0.0, NONE, NONE
+
+    # -- claiming ---------------------------------------------------------------------------------------------------
+
+    def _claim(self) -> None:
+        """Ask for promises; while a lease is held it stays in force meanwhile."""
+        self._cancel()
+        self._claimed = ballot = self.council.next_ballot()
+        kinds = (GRANTED, SEALED)
+        self._round = asked = self.council.round("lease.prepare", ballot.counter, self.council.ttl, kinds=kinds)
+        asked.outcome.addCallback(self._promised, ballot, self.council.configuration)
+
+    def _promised(self, asked: Round, ballot: Ballot, configuration: int) -> None:
+        self.council.hear(asked)
+        if self._round is not asked or self._has_ended(asked):
+            return
+        if self.council.configuration != configuration:
+            return self._claim()
+        if not asked.is_won:
+            return self._failed(asked)
+        asked.close()
+        if any(reply.kind == SEALED for reply in asked.replies.values()):
+            self._round = None
+            finishing = Deferred.fromCoroutine(self.council.finish(ballot, asked))
+            finishing.addErrback(lambda failure: failure.trap(EntangledError))
+            finishing.addBoth(lambda _: self._go_on())
+            return
+        self._propose(ballot, self._next_token())
+
+    def _next_token(self) -> int:
+        """The token to claim: the one that is held while nobody was granted a higher one, else above all seen."""
+        if self.lease is not None and self.token >= self.council.token:
+            return self.token
+        self.council.token += 1
+        return self.council.token
+
+    def _propose(self, ballot: Ballot, token: int) -> None:
+        self._round = asked = self.council.round("lease.propose", ballot.counter, token, self.council.ttl)
+        asked.outcome.addCallback(self._granted, ballot, token)
+
+    def _granted(self, asked: Round, ballot: Ballot, token: int) -> None:
+        self.council.hear(asked)
+        if self._round is not asked or self._has_ended(asked):
+            return
+        self._must_prepare = any(reply.kind != GRANTED for reply in asked.replies.values())
+        deadline = self._deadline_of(asked) if asked.is_won else 0.0
+        if deadline <= self._clock.seconds():
+            return self._failed(asked)
+        self._ballot, self.token, self._deadline = ballot, token, deadline
+        self._rests_at = deadline + self._stop_time
+        self._again(self._poll_period())
+        self._changed()
+
+    def _deadline_of(self, won: Round) -> float:
+        """Until when the robot must stand still again, on our clock."""
+        return won.sent_at + self.council.ttl * (1.0 - CLOCK_MARGIN) - self._stop_time
+
+    def _failed(self, asked: Round) -> None:
+        asked.close()
+        self._round = None
+        if self.lease is not None:
+            # There is time for another renewal before the deadline; a member that has promised a higher ballot
+            # meanwhile needs a new one.
+            self._must_prepare = any(reply.kind == OUTBID for reply in asked.replies.values())
+            return self._again(min(RETRY, self._deadline - self._clock.seconds()))
+        was_held = self.token != 0
+        self._let_go_of_minority()
+        if was_held:
+            self._let_go(self._ballot)
+            self._lose()
+        self._wait(asked)
+
+    def _wait(self, asked: Round) -> None:
+        """Claim when the lease may be free; look again in a third of a ttl at any rate, for a push may be lost."""
+        free_in = 0.0 if self._is_freed else asked.free_in()
+        is_outbid = any(reply.kind == OUTBID for reply in asked.replies.values())
+        wait, pause = free_in + self._stagger(), self._rng.uniform(*(BACK_OFF if is_outbid else JITTER))
+        # A healthy holder renews well before: what runs out that soon is claimed in time, without a look before.
+        self._only_looks = wait > SOON * self._poll_period()
+        self._again((self._poll_period() if self._only_looks else wait) + pause)
+
+    def _look(self) -> None:
+        """Ask whether the lease is free, and be promised nothing."""
+        self._cancel()
+        self._round = asked = self.council.round("lease.prepare", 0, self.council.ttl)
+        asked.outcome.addCallback(self._looked)
+
+    def _looked(self, asked: Round) -> None:
+        self.council.hear(asked)
+        if self._round is not asked or self._has_ended(asked):
+            return
+        asked.close()
+        if asked.is_won:
+            self._claim()
+        else:
+            self._wait(asked)
+
+    def _poll_period(self) -> float:
+        return self.council.ttl / RENEWALS
+
+    def _stagger(self) -> float:
+        return STAGGER * max(0, self._rank - 1)
+
+    # -- keeping ----------------------------------------------------------------------------------------------------
+
+    def _due(self) -> None:
+        """Renew, or ask again; a timer that is late may mean that this process or machine stood still."""
+        self._timer = None
+        self.pauses += self._clock.seconds() - self._due_at > TICK
+        if self.lease is not None and not self._must_prepare:
+            self._cancel()
+            self._propose(self._ballot, self.token)
+            return
+        if self.token and self.lease is None:
+            self._lose()
+        if self._only_looks and not self._is_freed and self.lease is None:
+            self._look()
+        else:
+            self._claim()
+
+    def _lose(self) -> None:
+        """It is over before it was given back."""
+        self.token, self._deadline, self._ballot = 0, 0.0, NONE
+        self._changed()
+
+    def _has_ended(self, asked: Round) -> bool:
+        """Whether a member says that the task has ended: then nobody may act, not even whoever could for a while."""
+        if any(reply.kind == OVER for reply in asked.replies.values()):
+            self.is_over, self._is_wanted = True, False
+            self._cancel()
+            self._lose()
+        return self.is_over
+
+    # -- inside -----------------------------------------------------------------------------------------------------
+
+    @property
+    def _is_freed(self) -> bool:
+        """Whether the lease was given back just now: the news may be here before it is at every member."""
+        return self._clock.seconds() - self._freed_at < FRESH
+
+    @property
+    def _is_asking(self) -> bool:
+        return self._round is not None and self._round.is_open
+
+    def _go_on(self) -> None:
+        if self._is_wanted and not self._is_asking:
+            self._again(self._rng.uniform(*BACK_OFF))
+
+    def _let_go(self, ballot: Ballot, heirs: Sequence[Contact] = ()) -> None:
+        """Tell the council, as soon as the robot stands still (it was told to stop at the deadline at the latest)."""
+        rest = self._rest()
+        if rest > 0.0:
+            self._clock.callLater(rest, self.council.let_go, ballot, heirs)
+        else:
+            self.council.let_go(ballot, heirs)
+
+    def _rest(self) -> float:
+        """Seconds for which the robot may still move."""
+        return self._rests_at - self._clock.seconds()
+
+    def _let_go_of_minority(self) -> None:
+        """What a minority granted must not keep a healthier claimant waiting."""
+        if self._claimed not in (self._ballot, NONE):
+            self._let_go(self._claimed)
+
+    def _cancel(self) -> None:
+        """What a round under way still brings is not used any more."""
+        if self._round is not None:
+            self._round.close()
+            self._round = None
+        if self._timer is not None and self._timer.active():
+            self._timer.cancel()
+        self._timer = None
+
+    def _again(self, delay: float) -> None:
+        if self._timer is not None and self._timer.active():
+            self._timer.cancel()
+        self._due_at = self._clock.seconds() + delay
+        self._timer = self._clock.callLater(delay, self._due)

@@ -1,0 +1,274 @@
+"""The workload of leases: agents claim, keep, lose and give back tasks under every fault, with E1 to E3, E5, E8, E9.
+
+It is a world of its own, light enough for a thousand schedules in two minutes: the protocol's classes, simulated
+machines and a simulated link.  What agents select is left to dice: commitment must hold whatever selection says.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Sequence
+
+from twisted.internet.defer import Deferred
+from twisted.python.failure import Failure
+
+from middleware.entangled.errors import EntangledError
+from middleware.entangled.kademlia.contact import Contact
+from tests.invariants.radio import CALM, Air
+from tests.invariants.team import Team
+from tests.invariants.trouble import Trouble, drawn
+
+TTL = 1.5
+SLACK = 0.8
+"""E3: seconds beyond the ttl within which another executes when the executor is gone and the rest is well."""
+LEAVE = 0.2
+"""Seconds within which a stand-by holds what was given back, beside the time to stop."""
+
+
+class Leases(Team):
+    """The run of ``seed``: everything follows from it."""
+
+    def __init__(self, seed: int, ttl: float = TTL) -> None:
+        dice = self._dice = random.Random(f"leases/{seed}")
+        n = dice.choice([4, 5, 5, 6, 7])
+        agents = dice.choice([2, 3, 3, 4])
+        stop_time = dice.choice([0.0, 0.0, 0.3])
+        drift = dice.choice([0.0, 0.01, 0.01, 0.01, 0.05])
+        # The worst that is allowed must come up often: a slow holder, fast members.
+        rates = [1.0 + dice.choice([-1, 1]) * drift for _ in range(n)]
+        # Without stores a restarted member has forgotten everything: then councils stay, and tokens may fall back.
+        has_stores = dice.random() < 0.7
+        super().__init__(f"leases/{seed}", rates, agents, ttl, stop_time, drift, has_stores)
+        self.air = Air(
+            dice.choice([0.001, 0.005, 0.02, 0.05, 0.2]),
+            dice.choice([0.0, 0.01, 0.05]),
+            dice.choice([0.0, 0.05, 0.1, 0.2, 0.3, 0.5]),
+            dice.choice([0.0, 0.1, 0.3]),
+            dice.choice([1.0, 1.0, 5.0]),
+        )
+        self.troubles = drawn(dice, n, self.agents, has_stores)
+        self._is_well = False
+        for task_id in ["t0", "t1"][: dice.choice([1, 1, 2])]:
+            size = 5 if n >= 5 and dice.random() < 0.25 else 3
+            self.add_task(task_id, sorted(dice.sample(range(n), size)))
+
+    # -- the run ----------------------------------------------------------------------------------------------------
+
+    @property
+    def digest(self) -> str:
+        """The hash of every message, and of who won when."""
+        return self.radio.digest()
+
+    def __str__(self) -> str:
+        """What the schedule was."""
+        stores = "stores" if self.has_stores else "no stores"
+        return f"n={self.n} agents={len(self.agents)} drift={self.drift} stop={self.stop_time} {stores} {self.air} " + (
+            "; ".join(map(str, self.troubles))
+        )
+
+    def run(self) -> list[str]:
+        """Troubles, then health; the violations, a line each."""
+        self.clock.advance(self.ttl + 0.1)
+        self.radio.air = self.air
+        ahead = sorted(
+            [(t.at, 0, n) for n, t in enumerate(self.troubles)] + [(t.until, 1, n) for n, t in enumerate(self.troubles)]
+        )
+        end = self._dice.choice([8.0, 12.0, 16.0])
+        began = self.clock.seconds()
+        while self.clock.seconds() - began < end:
+            while ahead and ahead[0][0] <= self.clock.seconds() - began:
+                _, is_end, number = ahead.pop(0)
+                (self._end if is_end else self._begin)(self.troubles[number])
+            self._choose()
+            self.clock.advance(0.25)
+        self._heal()
+        for task_id in self.councils:
+            self._verify_health(task_id)
+        return self.referee.found
+
+    def _choose(self) -> None:
+        """Selection, as dice: now and then another agent is to act, or nobody."""
+        for task_id in self.councils:
+            for place in self.agents:
+                bidder = self.bidders[place]
+                if bidder.machine.is_still or not bidder.machine.is_alive or self._dice.random() > 0.25:
+                    continue
+                fate = self._dice.random()
+                if fate < 0.35:
+                    bidder.lessee(task_id).want()
+                elif fate < 0.75:
+                    bidder.lessee(task_id).stand_by(self._dice.choice([1, 1, 2, 3]))
+                elif fate < 0.85:
+                    bidder.leave(task_id)
+                elif fate < 0.9:
+                    bidder.lessee(task_id).suspect()
+
+    def _heal(self) -> None:
+        self._is_well = True
+        self.radio.cut.clear()
+        self.referee.look_at_cuts()
+        self.radio.air = CALM
+        for place, bidder in enumerate(self.bidders):
+            if bidder.machine.is_still:
+                bidder.machine.thaw()
+            if not bidder.machine.is_alive:
+                self.bidders[place] = self.born(place)
+
+    def _verify_health(self, task_id: str) -> None:
+        """E3, the graceful leave and E5, when everything is well and one after the other goes."""
+        for rank, place in enumerate(self._dice.sample(self.agents, len(self.agents))):
+            lessee = self.bidders[place].lessee(task_id)
+            if rank:
+                lessee.stand_by(rank)
+            else:
+                lessee.want()
+        # A restarted member keeps silent for a ttl; a device may have to tell its token first.
+        first = self._wait_for_command(task_id, 0, 2 * self.ttl + SLACK + 1.0)
+        if first is None:
+            return self.referee.say("E3", f"nobody executes {task_id} though all is well")
+        self.clock.advance(self._dice.uniform(0.7, 1.3) * self.ttl)
+        _, token, holder = self.referee.accepted[task_id][-1]
+        self._depart_politely(task_id, token, holder)
+        self.clock.advance(self._dice.uniform(0.7, 1.3) * self.ttl)
+        _, token, holder = self.referee.accepted[task_id][-1]
+        self._depart_suddenly(task_id, token, holder)
+        self._conclude(task_id)
+
+    def _depart_politely(self, task_id: str, token: int, holder: int) -> None:
+        left_at = self.clock.seconds()
+        self.bidders[holder].leave(task_id)
+        won_at = self._wait_for_command(task_id, token, 2 * self.ttl + SLACK)
+        if won_at is None or won_at - left_at > self.stop_time + LEAVE + 0.1 + 0.1 * len(self.agents):
+            late = "never" if won_at is None else f"{won_at - left_at:.2f} s later"
+            self.referee.say("E3", f"{holder} gives {task_id} back, another acts {late}")
+        self.bidders[holder].lessee(task_id).stand_by(len(self.agents))
+
+    def _depart_suddenly(self, task_id: str, token: int, holder: int) -> None:
+        """The executor is killed, frozen or cut off; one member of the council goes with it."""
+        gone_at, dice = self.clock.seconds(), self._dice
+        members = [self.place_of(member) for member in self.councils[task_id][0]]
+        spare = [place for place in members if place not in self.agents]
+        also = [dice.choice(spare)] if spare and holder not in members else []
+        how = dice.choice(["kill", "freeze", "suspend", "cut"])
+        self._begin(Trouble(0, 0, how, (holder, *also)))
+        others = [place for place in self.agents if place != holder]
+        if len(others) > 1 and dice.random() < 0.75:
+            # Selection names one agent when the lease ends, and thinks better of it.
+            fickle = dice.choice(others)
+            self.bidders[fickle].leave(task_id)
+            self.clock.advance(dice.uniform(0.8, 1.0) * self.ttl)
+            self.bidders[fickle].lessee(task_id).want()
+            while self.clock.seconds() < gone_at + 1.1 * self.ttl and self.referee.accepted[task_id][-1][1] <= token:
+                self.clock.advance(dice.choice([0.004, 0.011, 0.017]))
+                if dice.random() < 0.2:
+                    break
+            self.bidders[fickle].leave(task_id)
+        won_at = self._wait_for_command(task_id, token, 3 * self.ttl + SLACK)
+        if won_at is None or won_at - gone_at > self.ttl / (1.0 - self.drift) + SLACK:
+            late = "never" if won_at is None else f"{won_at - gone_at:.2f} s later"
+            self.referee.say("E3", f"{holder} is gone ({how}); another acts on {task_id} {late}")
+        self._heal()
+
+    def _conclude(self, task_id: str) -> None:
+        """The executor is done, or an operator cancels: from the acknowledgement on nothing moves."""
+        _, token, holder = self.referee.accepted[task_id][-1]
+        place = self._dice.choice([holder, self.n - 1])
+        if place == holder:
+            self.referee.stop(holder, task_id)
+        closing = self.bidders[place].lessee(task_id).council.close(token if place == holder else 0)
+        if place == holder:
+            self.bidders[holder].lessee(task_id).release()
+
+        def closed(_: object) -> None:
+            self.referee.ended(task_id)
+
+        def failed(failure: Failure) -> None:
+            failure.trap(EntangledError)
+            self.referee.say("E5", f"the end of {task_id} is not recorded: {failure.value}")
+
+        closing.addCallbacks(closed, failed)
+        self.clock.advance(2 * self.ttl)
+        for agent in self.agents:
+            self.bidders[agent].lessee(task_id).want()
+        self.clock.advance(2 * self.ttl)
+        if not self.referee.is_over(task_id) and not self.referee.found:
+            self.referee.say("E5", f"the end of {task_id} is never acknowledged")
+
+    def _wait_for_command(self, task_id: str, above: int, most: float) -> float | None:
+        """When a command with a token higher than ``above`` is accepted, if that is within ``most`` seconds."""
+        began = self.clock.seconds()
+        accepted = self.referee.accepted[task_id]
+        while self.clock.seconds() - began < most:
+            if accepted and accepted[-1][1] > above and accepted[-1][0] >= began:
+                return accepted[-1][0]
+            self.clock.advance(0.02)
+        return None
+
+    # -- troubles ---------------------------------------------------------------------------------------------------
+
+    def _begin(self, trouble: Trouble) -> None:
+        rest = [place for place in range(self.n) if place not in trouble.places]
+        match trouble.kind:
+            case "cut":
+                self.radio.cut |= {pair for a in trouble.places for b in rest for pair in ((a, b), (b, a))}
+            case "one way":
+                self.radio.cut |= {(a, b) for a in trouble.places for b in rest}
+            case "swizzle":
+                order = self._dice.sample(range(self.n), self.n // 2)
+                for number, place in enumerate(order):
+                    self.clock.callLater(0.2 * number, self._clog, place)
+            case "kill" | "wipe":
+                for place in trouble.places:
+                    self.kill(place)
+            case "freeze" | "suspend":
+                for place in trouble.places:
+                    if self.bidders[place].machine.is_alive and not self.bidders[place].machine.is_still:
+                        self.bidders[place].machine.freeze(trouble.kind == "suspend")
+            case "change":
+                self._change(trouble.places[0])
+            case "leave":
+                for task_id in self.councils:
+                    if self.is_up(trouble.places[0]):
+                        self.bidders[trouble.places[0]].leave(task_id)
+            case "air":
+                self.radio.air = Air(self.air.delay, self.air.jitter, 0.5, 0.3, 5.0)
+        self.referee.look_at_cuts()
+
+    def _end(self, trouble: Trouble) -> None:
+        match trouble.kind:
+            case "cut" | "one way" | "swizzle":
+                self.radio.cut.clear()
+            case "kill" | "wipe":
+                for place in trouble.places:
+                    if not self.bidders[place].machine.is_alive:
+                        self.bidders[place] = self.born(place)
+            case "freeze" | "suspend":
+                for place in trouble.places:
+                    if self.bidders[place].machine.is_still:
+                        self.bidders[place].machine.thaw()
+            case "air":
+                self.radio.air = self.air
+        self.referee.look_at_cuts()
+
+    def _clog(self, place: int) -> None:
+        if self._is_well:
+            return
+        self.radio.cut |= {pair for b in range(self.n) if b != place for pair in ((place, b), (b, place))}
+        self.referee.look_at_cuts()
+
+    def _change(self, place: int) -> None:
+        """Somebody has another council chosen, at a moment when the task may be free."""
+        if not self.is_up(place) or not self.has_stores:
+            return
+        for task_id in self.councils:
+            if self._dice.random() < 0.7:
+                for agent in self.agents:
+                    if self.is_up(agent) and self._dice.random() < 0.9:
+                        self.bidders[agent].leave(task_id)
+            members = [self.contacts[n] for n in sorted(self._dice.sample(range(self.n), 3))]
+            self.clock.callLater(0.5 + self.stop_time, self._change_now, place, task_id, members)
+
+    def _change_now(self, place: int, task_id: str, members: Sequence[Contact]) -> None:
+        if self.is_up(place):
+            changing: Deferred[None] = self.bidders[place].lessee(task_id).council.change(members)
+            changing.addErrback(lambda failure: failure.trap(EntangledError))

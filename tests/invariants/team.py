@@ -1,0 +1,121 @@
+"""Team: places with machines, acceptors and agents on a simulated link, for schedules and trials of leases."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from middleware.commitment.ballot import FIRST
+from middleware.commitment.council import Council
+from middleware.entangled.clock import HeapClock
+from middleware.entangled.data.memory import MemoryStore
+from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.network.network import Address
+from tests.invariants.bidder import TICK, Bidder
+from tests.invariants.machine import Machine
+from tests.invariants.radio import Radio
+from tests.invariants.referee import Referee
+
+
+class Team:
+    """Places whose clocks run at ``rates``; the first ``agents`` of them have agents.  ``seed`` names its dice.
+
+    ``stop_time`` is how long a robot takes to come to rest, ``drift`` the largest error of a clock.
+    """
+
+    def __init__(
+        self,
+        seed: str,
+        rates: Sequence[float],
+        agents: int,
+        ttl: float,
+        stop_time: float = 0.0,
+        drift: float = 0.01,
+        has_stores: bool = True,
+        tick: float = TICK,
+    ) -> None:
+        self.ttl = ttl
+        self.stop_time = stop_time
+        self.drift = drift
+        self.tick = tick
+        self.n = len(rates)
+        self.agents = list(range(agents))
+        self.has_stores = has_stores
+        self.clock = HeapClock()
+        self.referee = Referee(self)
+        self.radio = Radio(self.clock, random.Random(f"{seed}/radio"))
+        keys = random.Random(f"{seed}/keys")
+        self.contacts = [Contact(keys.randbytes(32), Address("10.0.0.1", 7000 + n)) for n in range(self.n)]
+        self.councils: dict[str, tuple[tuple[Contact, ...], int]] = {}
+        self._seed = seed
+        self._rates = rates
+        self._places = {contact.public: n for n, contact in enumerate(self.contacts)}
+        self._by_id = {contact.node_id.hex(): n for n, contact in enumerate(self.contacts)}
+        self._stores = [MemoryStore() for _ in range(self.n)]
+        self._lives = 0
+        self.bidders = [self.born(place) for place in range(self.n)]
+
+    def add_task(self, task_id: str, council: Sequence[int]) -> None:
+        """One more task, with its council pinned."""
+        self.councils[task_id] = tuple(self.contacts[place] for place in council), FIRST
+        self.referee.add(task_id)
+
+    # -- what bidders need ------------------------------------------------------------------------------------------
+
+    def place_of(self, contact: Contact) -> int:
+        """Where a contact is."""
+        return self._places[contact.public]
+
+    def council_for(self, place: int, task_id: str) -> tuple[tuple[Contact, ...], int]:
+        """The council as the task's record names it."""
+        return self.councils[task_id]
+
+    def moved(self, task_id: str, council: Council) -> None:
+        """Let the record name a newer council."""
+        if council.configuration > self.councils[task_id][1]:
+            self.councils[task_id] = council.members, council.configuration
+            self.referee.look_at_cuts()
+
+    def ask(
+        self, me: Bidder, to: int, method: str, arguments: tuple[Any, ...], answered: Callable[[object], object]
+    ) -> None:
+        """Carry a question and its answer."""
+
+        def arrive() -> None:
+            peer = self.bidders[to]
+
+            def run() -> None:
+                answer = peer.answer(me.place, method, arguments)
+                if answer is not None:
+                    self.radio.send(to, me.place, me.machine.take, answered, answer)
+
+            peer.machine.take(run)
+
+        self.radio.send(me.place, to, arrive)
+
+    def tell_freed(self, source: int, agent: str, task_id: str) -> None:
+        """Carry the news that a lease was given back."""
+        to = self._by_id[agent]
+
+        self.radio.send(source, to, lambda: self.bidders[to].machine.take(self.bidders[to].freed, agent, task_id, 0))
+
+    # -- lives ------------------------------------------------------------------------------------------------------
+
+    def is_up(self, place: int) -> bool:
+        """Whether a machine runs."""
+        return self.bidders[place].machine.is_alive and not self.bidders[place].machine.is_still
+
+    def kill(self, place: int) -> None:
+        """End a machine as a loss of power does; what it has in a store stays."""
+        self.bidders[place].machine.die()
+        if not self.has_stores:
+            self._stores[place] = MemoryStore()
+            self.referee.is_amnesiac = True
+
+    def born(self, place: int) -> Bidder:
+        """The next life at a place."""
+        self._lives += 1
+        rng = random.Random(f"{self._seed}/{place}/{self._lives}")
+        machine = Machine(self.clock, self._rates[place], rng.uniform(0.0, 1e4))
+        return Bidder(self, place, machine, self._stores[place], rng)

@@ -1,0 +1,225 @@
+"""Tests of ``middleware.commitment.acceptor``."""
+
+from __future__ import annotations
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.commitment import ledger
+from middleware.commitment.acceptor import MAX_LISTENERS, Acceptor
+from middleware.commitment.ballot import (
+    BEHIND,
+    GRANTED,
+    HELD,
+    LIFE,
+    MOVED,
+    OUTBID,
+    OVER,
+    QUIET,
+    SEALED,
+    Ballot,
+    Reply,
+)
+from middleware.commitment.ledger import Ledger
+from tests.middleware.commitment.test_ballot import MEMBERS
+
+TTL = 2.0
+
+
+def ballot(number: int, agent: str) -> Ballot:
+    """A ballot of the agent's only life."""
+    return Ballot(number * LIFE, agent)
+
+
+class AcceptorTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.acceptor = Acceptor(Ledger())
+
+    def prepare(self, number: int, agent: str, now: float, configuration: int = 1) -> Reply:
+        """Ask for a promise."""
+        return self.acceptor.prepare("t", configuration, ballot(number, agent), TTL, now)
+
+    def propose(self, number: int, agent: str, token: int, now: float, configuration: int = 1) -> Reply:
+        """Ask for a lease."""
+        return self.acceptor.propose("t", configuration, ballot(number, agent), token, TTL, now)
+
+    def test_promise_and_grant(self) -> None:
+        """A ballot is promised, the lease granted for a ttl, and the next one told its token and how long it runs."""
+        self.assertEqual(self.prepare(1, "a", 0.0).kind, GRANTED)
+        self.assertEqual(self.propose(1, "a", 1, 0.5)[0:4], (GRANTED, ballot(1, "a"), 1, TTL))
+        refused = self.prepare(2, "b", 1.0)
+        self.assertEqual((refused.kind, refused.token, refused.remaining), (HELD, 1, 1.5))
+        self.assertEqual(self.prepare(2, "b", 2.5).kind, GRANTED)
+
+    def test_to_ask_changes_nothing_while_a_lease_runs(self) -> None:
+        """However high the ballot that asks, the holder renews as before."""
+        self.prepare(1, "a", 0.0)
+        self.propose(1, "a", 1, 0.0)
+        for number in range(2, 9):
+            self.assertEqual(self.prepare(number, "b", 1.0).kind, HELD)
+        self.assertEqual(self.propose(1, "a", 1, 1.5).kind, GRANTED)
+
+    def test_promise_bars_lower_ballots(self) -> None:
+        """What is proposed under a lower ballot than one promised is refused, and told which."""
+        self.prepare(1, "a", 0.0)
+        self.prepare(2, "b", 0.0)
+        refused = self.propose(1, "a", 1, 0.0)
+        self.assertEqual((refused.kind, refused.ballot), (OUTBID, ballot(2, "b")))
+        self.assertEqual(self.prepare(1, "c", 0.0).kind, OUTBID)
+
+    def test_token_never_falls_and_belongs_to_one(self) -> None:
+        """A token at most as high as one granted to another is refused, under whatever ballot."""
+        self.prepare(1, "a", 0.0)
+        self.propose(1, "a", 5, 0.0)
+        self.prepare(2, "b", 3.0)
+        for token in (1, 4, 5):
+            self.assertEqual(self.propose(2, "b", token, 3.0)[::2], (OUTBID, 5, 1))
+        self.assertEqual(self.propose(2, "b", 6, 3.0).kind, GRANTED)
+
+    def test_holder_takes_a_higher_ballot_and_keeps_its_token(self) -> None:
+        """A holder that another one's promise stands against asks for a new one while its lease runs, and goes on."""
+        self.prepare(1, "a", 0.0)
+        self.propose(1, "a", 1, 0.0)
+        self.assertEqual(self.prepare(7, "a", 0.5).kind, GRANTED)
+        self.assertEqual(self.propose(7, "a", 1, 0.5).kind, GRANTED)
+
+    def test_former_life_is_another(self) -> None:
+        """A restarted agent waits like everybody until what its former life held has run out: its robot may move."""
+        self.prepare(1, "a", 0.0)
+        self.propose(1, "a", 1, 0.0)
+        self.assertEqual(self.acceptor.prepare("t", 1, Ballot(9 * LIFE + 5, "a"), TTL, 1.0).kind, HELD)
+
+    def test_release(self) -> None:
+        """What is given back is free at once, is told to those that asked, and no late proposal brings it back."""
+        self.prepare(1, "a", 0.0)
+        self.propose(1, "a", 1, 0.0)
+        self.prepare(2, "b", 0.5)
+        self.prepare(2, "c", 0.5)
+        self.assertEqual(self.acceptor.release("t", ballot(1, "a"), 1.0), ["b", "c"])
+        self.assertEqual(self.acceptor.release("t", ballot(1, "a"), 1.0), [])
+        self.assertEqual(self.propose(1, "a", 1, 1.0).kind, OUTBID)
+        self.assertEqual(self.prepare(2, "b", 1.0).kind, GRANTED)
+
+    def test_release_that_overtakes_its_proposal(self) -> None:
+        """A proposal that arrives after its own release grants nothing."""
+        self.prepare(1, "a", 0.0)
+        self.acceptor.release("t", ballot(1, "a"), 0.1)
+        self.assertEqual(self.propose(1, "a", 1, 0.2).kind, OUTBID)
+        self.assertEqual(self.prepare(2, "a", 0.3).kind, GRANTED)
+
+    def test_release_of_others(self) -> None:
+        """Nobody ends what another holds, nor something unknown."""
+        self.prepare(1, "a", 0.0)
+        self.propose(1, "a", 1, 0.0)
+        self.acceptor.release("t", ballot(1, "b"), 0.5)
+        self.acceptor.release("u", ballot(1, "b"), 0.5)
+        self.assertEqual(self.prepare(2, "b", 0.5).kind, HELD)
+
+    def test_listeners_are_bounded(self) -> None:
+        """However many ask, those that asked last are told."""
+        self.prepare(1, "a", 0.0)
+        self.propose(1, "a", 1, 0.0)
+        for number in range(3 * MAX_LISTENERS):
+            self.prepare(2, f"b{number:03d}", 0.5)
+        told = self.acceptor.release("t", ballot(1, "a"), 1.0)
+        self.assertEqual((len(told), told[-1]), (MAX_LISTENERS, f"b{3 * MAX_LISTENERS - 1:03d}"))
+
+    def test_no_room(self) -> None:
+        """A member that can remember no more tasks says so, and grants nothing that it would forget."""
+        self.patch(ledger, "MAX_TASKS", 1)
+        self.prepare(1, "a", 0.0)
+        for reply in (
+            self.acceptor.prepare("u", 1, ballot(1, "a"), TTL, 0.0),
+            self.acceptor.propose("u", 1, ballot(1, "a"), 1, TTL, 0.0),
+            self.acceptor.close("u", "a", 0, 0.0),
+            self.acceptor.install("u", 2, MEMBERS[:3], 0, 0.0),
+        ):
+            self.assertEqual(reply.kind, QUIET)
+            self.assertGreater(reply.remaining, 0.0)
+
+    def test_close(self) -> None:
+        """After the end nothing is granted or renewed; who ends it learns how long another may still act."""
+        self.prepare(1, "a", 0.0)
+        self.propose(1, "a", 3, 0.0)
+        self.assertEqual(self.acceptor.close("t", "b", 2, 0.5).kind, OUTBID)
+        closed = self.acceptor.close("t", "b", 0, 0.5)
+        self.assertEqual((closed.kind, closed.remaining), (OVER, 1.5))
+        self.assertEqual(self.acceptor.close("t", "a", 3, 0.5).remaining, 0.0)
+        self.assertEqual(self.propose(1, "a", 3, 0.6).kind, OVER)
+        self.assertEqual(self.prepare(9, "b", 99.0).kind, OVER)
+
+    def test_change(self) -> None:
+        """An accepted change seals the council; whoever asks is told of it, and once it is chosen where to go."""
+        self.prepare(1, "a", 0.0)
+        changed = self.acceptor.change("t", 1, ballot(1, "a"), MEMBERS[:3], 4, 0.0)
+        self.assertEqual(changed.kind, GRANTED)
+        self.assertEqual(self.propose(1, "a", 5, 0.1).kind, SEALED)
+        asked = self.prepare(2, "b", 0.1)
+        self.assertEqual(
+            (asked.kind, asked.ballot, asked.members, asked.token), (SEALED, ballot(1, "a"), MEMBERS[:3], 4)
+        )
+        self.assertEqual(self.acceptor.change("t", 1, ballot(1, "a"), MEMBERS[:2], 4, 0.2).kind, OUTBID)
+        self.assertEqual(self.acceptor.install("t", 2, MEMBERS[:3], 4, 0.3).kind, GRANTED)
+        told = self.prepare(3, "b", 0.4)
+        self.assertEqual((told.kind, told.configuration, told.members), (MOVED, 2, MEMBERS[:3]))
+        self.assertEqual(self.prepare(3, "b", 0.4, configuration=2).kind, GRANTED)
+        self.assertEqual(self.propose(3, "b", 4, 0.4, configuration=2).kind, OUTBID)
+        self.assertEqual(self.propose(3, "b", 5, 0.4, configuration=2).kind, GRANTED)
+
+    def test_change_under_a_lease(self) -> None:
+        """While a lease runs, the asker's own included, no change is accepted."""
+        self.prepare(1, "a", 0.0)
+        self.propose(1, "a", 1, 0.0)
+        self.prepare(2, "a", 0.1)
+        self.assertEqual(self.acceptor.change("t", 1, ballot(2, "a"), MEMBERS[:3], 1, 0.1).kind, HELD)
+
+    def test_late_installs(self) -> None:
+        """What is installed twice, or after something newer, changes nothing."""
+        self.acceptor.install("t", 3, MEMBERS[:3], 9, 0.0)
+        self.prepare(1, "a", 0.0, configuration=3)
+        self.propose(1, "a", 10, 0.0, configuration=3)
+        self.assertEqual(self.acceptor.install("t", 3, MEMBERS[:3], 9, 0.1).kind, GRANTED)
+        self.assertEqual(self.acceptor.install("t", 2, MEMBERS[1:4], 5, 0.1).kind, MOVED)
+        self.assertEqual(self.prepare(2, "b", 0.2, configuration=3).kind, HELD)
+
+    def test_behind(self) -> None:
+        """A member that was never told of a later council grants nothing in its name."""
+        self.assertEqual(self.prepare(1, "a", 0.0, configuration=2).kind, BEHIND)
+        self.assertEqual(self.propose(1, "a", 1, 0.0, configuration=2).kind, BEHIND)
+        self.assertEqual(self.acceptor.change("t", 2, ballot(1, "a"), MEMBERS[:3], 1, 0.0).kind, BEHIND)
+
+    def test_silence_after_a_restart(self) -> None:
+        """Who may have forgotten grants nothing for the longest ttl, and says how long that is."""
+        acceptor = Acceptor(Ledger(), born_at=10.0)
+        self.assertEqual(acceptor.prepare("t", 1, ballot(1, "a"), TTL, 11.0), Reply(QUIET, remaining=1.0))
+        self.assertEqual(acceptor.propose("t", 1, ballot(1, "a"), 1, TTL, 11.0).kind, QUIET)
+        self.assertEqual(acceptor.prepare("t", 1, ballot(1, "a"), TTL, 12.0).kind, GRANTED)
+
+    @settings(max_examples=150, deadline=None, derandomize=True, database=None)
+    @given(
+        st.lists(
+            st.tuples(
+                st.sampled_from("ppqr"), st.sampled_from("abc"), st.integers(1, 5), st.integers(1, 4), st.floats(0, 1)
+            ),
+            max_size=30,
+        )
+    )
+    def test_never_two_and_never_lower(self, events: list[tuple[str, str, int, int, float]]) -> None:
+        """Whatever comes, the promised ballot and the token never fall, and no lease of a lower ballot replaces one."""
+        acceptor, now, highest, best = Acceptor(Ledger()), 0.0, 0, ballot(0, "")
+        for kind, agent, number, token, pause in events:
+            now += pause
+            one = ballot(number, agent)
+            if kind == "r":
+                acceptor.release("t", one, now)
+                continue
+            if kind == "p":
+                reply = acceptor.prepare("t", 1, one, TTL, now)
+            else:
+                reply = acceptor.propose("t", 1, one, token, TTL, now)
+            if reply.kind == GRANTED:
+                self.assertGreaterEqual(one, best)
+                best = one
+            self.assertGreaterEqual(reply.token, highest)
+            highest = reply.token

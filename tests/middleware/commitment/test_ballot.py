@@ -1,0 +1,87 @@
+"""Tests of ``middleware.commitment.ballot``."""
+
+from __future__ import annotations
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.commitment.ballot import GRANTED, KINDS, LIFE, MAX_COUNCIL, Ballot, Reply, members_of, quorum, reply_of
+from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.network.network import Address
+
+MEMBERS = tuple(Contact(bytes([n]) * 32, Address("10.0.0.1", 7000 + n)) for n in range(MAX_COUNCIL + 1))
+ANYTHING = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8) | st.binary(max_size=40),
+    lambda inner: st.lists(inner, max_size=8) | st.dictionaries(st.text(max_size=3), inner, max_size=3),
+    max_leaves=12,
+)
+
+
+class BallotTests(SynchronousTestCase):
+    def test_order(self) -> None:
+        """Ballots are ordered by counter, and among equals by agent, so that no two are the same."""
+        ballots = [Ballot(1, "b"), Ballot(2, "a"), Ballot(1, "a")]
+        self.assertEqual(sorted(ballots), [Ballot(1, "a"), Ballot(1, "b"), Ballot(2, "a")])
+
+    def test_lives(self) -> None:
+        """Ballots of one life of an agent are kin; those of another agent or another life are not."""
+        one = Ballot(3 * LIFE + 7, "a")
+        self.assertTrue(one.is_kin(Ballot(9 * LIFE + 7, "a")))
+        self.assertFalse(one.is_kin(Ballot(3 * LIFE + 7, "b")))
+        self.assertFalse(one.is_kin(Ballot(3 * LIFE + 8, "a")))
+
+    def test_quorum(self) -> None:
+        """Two quorums of one council always share a member."""
+        for size in range(1, MAX_COUNCIL + 1):
+            self.assertGreater(2 * quorum(size), size)
+
+
+class ReplyTests(SynchronousTestCase):
+    def test_there_and_back(self) -> None:
+        """What is packed is read as it was, of every kind."""
+        for kind in KINDS:
+            reply = Reply(kind, Ballot(5, "a"), 3, 1.25, 2, MEMBERS[:3])
+            self.assertEqual(reply_of(reply.packed()), reply)
+
+    def test_strange_durations(self) -> None:
+        """What cannot be a duration counts as none."""
+        for strange in (-1.0, float("nan")):
+            read = reply_of([GRANTED, 1, "a", 1, strange, 1, []])
+            assert read is not None
+            self.assertEqual(read.remaining, 0.0)
+
+    def test_unlawful(self) -> None:
+        """Anything else is no reply."""
+        good = Reply(GRANTED, Ballot(5, "a"), 3, 1.25, 2).packed()
+        for place, bad in (
+            (0, "yes"),
+            (0, 1),
+            (1, -1),
+            (1, True),
+            (1, 2**62),
+            (2, 5),
+            (3, 1.0),
+            (4, 1),
+            (5, "1"),
+            (6, 0),
+        ):
+            self.assertIsNone(reply_of([*good[:place], bad, *good[place + 1 :]]), (place, bad))
+        others: tuple[object, ...] = (None, 5, [], good[:-1], [*good, 0], {})
+        for other in others:
+            self.assertIsNone(reply_of(other))
+
+    def test_councils(self) -> None:
+        """A council has contacts, not too many, and none twice."""
+        packed = [member.packed() for member in MEMBERS]
+        self.assertEqual(members_of(packed[:MAX_COUNCIL]), MEMBERS[:MAX_COUNCIL])
+        for bad in (packed, [packed[0], packed[0]], [[b"k", "h", 1]], [1], None, b"x"):
+            self.assertIsNone(members_of(bad))
+
+    @settings(max_examples=300, deadline=None, derandomize=True, database=None)
+    @given(ANYTHING)
+    def test_total(self, answer: object) -> None:
+        """Whatever a peer answers is read as a reply or as none, and never an accident."""
+        read = reply_of(answer)
+        self.assertTrue(read is None or read.remaining >= 0.0)
+        members_of(answer)

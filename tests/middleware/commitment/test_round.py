@@ -1,0 +1,139 @@
+"""Tests of ``middleware.commitment.round``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from twisted.internet.defer import Deferred, fail, succeed
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.commitment.ballot import GRANTED, HELD, Reply
+from middleware.commitment.round import PAUSE, TRIES, Round
+from middleware.entangled.clock import HeapClock
+from middleware.entangled.errors import NoAnswer
+from middleware.entangled.kademlia.contact import Contact
+from tests.middleware.commitment.test_ballot import MEMBERS
+
+YES, NO = Reply(GRANTED), Reply(HELD, remaining=1.0)
+
+
+class RoundTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.clock = HeapClock()
+        self.asked: list[tuple[float, int, Deferred[Any]]] = []
+
+    def ask(self, member: Contact, method: str, arguments: tuple[Any, ...]) -> Deferred[Any]:
+        """Note that a member is asked."""
+        self.asked.append((self.clock.seconds(), MEMBERS.index(member), Deferred()))
+        return self.asked[-1][2]
+
+    def round(self, size: int = 3) -> Round:
+        """A question to the first members."""
+        return Round(MEMBERS[:size], self.ask, self.clock, "lease.prepare", ("t",), (GRANTED,), 0.5)
+
+    def answer(self, number: int, reply: Reply) -> None:
+        """Answer the question of that number."""
+        self.asked[number][2].callback(reply.packed())
+
+    def test_decided_by_a_majority(self) -> None:
+        """The outcome is there with the second yes of three, and not before."""
+        asked = self.round()
+        self.answer(0, YES)
+        self.assertNoResult(asked.outcome)
+        self.answer(2, YES)
+        self.assertTrue(self.successResultOf(asked.outcome).is_won)
+
+    def test_lost_as_soon_as_no_majority_can_be(self) -> None:
+        """The second no of three decides it."""
+        asked = self.round()
+        self.answer(0, NO)
+        self.assertNoResult(asked.outcome)
+        self.answer(1, NO)
+        self.assertFalse(self.successResultOf(asked.outcome).is_won)
+
+    def test_silent_members_are_asked_again(self) -> None:
+        """Who has not answered is asked each 100 ms until it is decided, and three times at least; who has, once."""
+        self.round()
+        self.answer(1, YES)
+        self.answer(2, YES)
+        self.clock.advance(1.0)
+        moments = [round(moment, 6) for moment, member, _ in self.asked if member == 0]
+        self.assertEqual(moments, [number * PAUSE for number in range(TRIES)])
+        self.assertEqual([member for _, member, _ in self.asked].count(1), 1)
+        del self.asked[:]
+        self.round()
+        self.clock.advance(0.45)
+        self.assertEqual([member for _, member, _ in self.asked], [0, 1, 2] * 5)
+
+    def test_patience(self) -> None:
+        """Where nobody answers it is over in time, and nothing is left on the clock."""
+        asked = self.round()
+        self.clock.advance(0.49)
+        self.assertNoResult(asked.outcome)
+        self.clock.advance(0.02)
+        self.assertFalse(self.successResultOf(asked.outcome).is_won)
+        self.assertEqual(self.clock.getDelayedCalls(), [])
+
+    def test_a_member_that_is_down_holds_nobody_up(self) -> None:
+        """Where a majority has answered and is divided, the last one is not waited for as long as that."""
+        asked = self.round()
+        self.answer(0, YES)
+        self.answer(1, NO)
+        self.clock.advance(PAUSE + 0.01)
+        self.assertFalse(self.successResultOf(asked.outcome).is_won)
+
+    def test_sent_at_counts_the_latest_majority(self) -> None:
+        """A majority's grants count from when the question was sent that its last needed member answered."""
+        asked = self.round()
+        self.answer(0, YES)
+        self.clock.advance(0.25)
+        self.answer(len(self.asked) - 1, YES)
+        self.assertEqual(self.successResultOf(asked.outcome).sent_at, 0.0)
+        later = self.round()
+        first = len(self.asked) - 3
+        self.clock.advance(0.25)
+        self.answer(len(self.asked) - 1, YES)
+        self.answer(len(self.asked) - 2, YES)
+        self.assertAlmostEqual(self.successResultOf(later.outcome).sent_at, 0.25 + 2 * PAUSE)
+        self.assertFalse(self.asked[first][2].called)
+
+    def test_double_and_strange_answers(self) -> None:
+        """A second answer of a member, silence and nonsense count for nothing."""
+        asked = self.round()
+        self.answer(0, YES)
+        self.clock.advance(PAUSE)
+        self.asked[1][2].errback(NoAnswer("late"))
+        self.asked[2][2].callback(["?"])
+        self.assertNoResult(asked.outcome)
+        self.assertEqual(len(asked.replies), 1)
+        asked.close()
+
+    def test_closed(self) -> None:
+        """After the end nobody is asked any more, and late answers change nothing."""
+        asked = self.round()
+        asked.close()
+        self.answer(0, YES)
+        self.assertEqual((self.clock.getDelayedCalls(), asked.replies), ([], {}))
+
+    def test_council_of_nobody(self) -> None:
+        """A council without members says no."""
+        self.assertFalse(self.successResultOf(self.round(0).outcome).is_won)
+
+    def test_answers_at_once(self) -> None:
+        """Members on this very node may answer before the question returns, or fail at once."""
+        for answer, is_won in ((lambda: succeed(YES.packed()), True), (lambda: fail(NoAnswer("x")), False)):
+            asked = Round(MEMBERS[:3], lambda *_: answer(), self.clock, "m", (), (GRANTED,), 0.5)  # noqa: B023
+            self.clock.advance(1.0)
+            self.assertEqual(self.successResultOf(asked.outcome).is_won, is_won)
+
+    def test_free_in(self) -> None:
+        """A majority may be free when the second shortest lease has run out, as counted on the members' clocks."""
+        asked = self.round()
+        self.clock.advance(0.04)
+        self.answer(0, Reply(HELD, remaining=0.2))
+        self.answer(1, Reply(HELD, remaining=0.9))
+        # Of the third nothing is known; the second is needed; it counted half way from 0.00 to 0.04.
+        self.assertAlmostEqual(asked.free_in(), 0.88)
+        unheard = self.round()
+        self.clock.advance(0.6)
+        self.assertEqual(unheard.free_in(), 0.0)

@@ -1,0 +1,40 @@
+"""The workload of leases in short: some schedules, their replay, and a seeded bug that each kind of check shows."""
+
+from __future__ import annotations
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from tests.invariants.bug import LEASE_BUGS
+from tests.invariants.leases import Leases
+from tests.invariants.run import run
+
+
+class ScheduleTests(SynchronousTestCase):
+    def test_no_violation(self) -> None:
+        """Twenty schedules of faults pass, in which leases were won many times and councils have changed."""
+        wins = changes = 0
+        for seed in range(1, 21):
+            schedule = Leases(seed)
+            self.assertEqual(schedule.run(), [], seed)
+            wins += schedule.referee.wins
+            changes += sum(configuration - 1 for _, configuration in schedule.councils.values())
+        self.assertGreater(wins, 100)
+        self.assertGreater(changes, 0)
+
+    def test_replay(self) -> None:
+        """The same seed gives the same datagrams, another one others."""
+        digests = [run(seed, ("leases",)).digest for seed in (3, 3, 4)]
+        self.assertEqual(digests[0], digests[1])
+        self.assertNotEqual(digests[0], digests[2])
+
+    def test_bugs_show(self) -> None:
+        """Seeded bugs of safety, liveness and the device are each found within few schedules."""
+        for bug in (
+            "a clock that stands still while suspended",
+            "the council is whoever is closest now",
+            "a stand-by does not ask",
+            "the time to stop is ignored",
+            "released before it stands still",
+        ):
+            self.assertIn(bug, LEASE_BUGS)
+            self.assertTrue(any(run(seed, ("leases",), bug).found for seed in range(1, 30)), bug)
