@@ -17,15 +17,19 @@ from agents.decision import Decision, decide
 from drivers.driver import Permit
 from drivers.reading import Action, Observation
 from middleware.consensus.lease import Lessee
-from middleware.consensus.strategy import ConsensusAlgorithm
+from middleware.consensus.strategy import ConsensusAlgorithm, Report
 from middleware.presence import ASSIGNED, DONE, EXECUTING, SEARCHING, WAITING
 from middleware.tasks import COMPLETED, Member, Result, Task
+from middleware.verdict import Verdict, verdict_from
 
 FARTHER, NEARER, STEP = 1.15, 0.85, 0.05
 """A report is renewed when the distance grew by 15 % and 5 cm (the target was moved), or shrank so much while the body
 does not act."""
 SEARCH_TTL = 0.5
 """Seconds for which a motion that needs no lease (to look around) is allowed at a time."""
+
+JUSTIFY = 1.0
+"""Seconds between two accounts of a decision of which nothing changed but the reports."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +45,7 @@ class Engagement:
 
     ``tell`` publishes this agent's report; ``conclude`` records the outcome; ``say`` writes a line for people; ``halt``
     stops the body now; ``token`` is the highest token that the body has obeyed so far.  ``lessee`` is to be set before
-    the first step.
+    the first step; ``justify`` is told why, at each decision.
     """
 
     def __init__(
@@ -62,6 +66,7 @@ class Engagement:
         self.result: Result | None = None
         self.token = token
         self.lessee: Lessee | None = None
+        self.justify: Callable[[Verdict], None] = lambda verdict: None
         self._behaviour = behaviour
         self._strategy = strategy
         self._clock = clock
@@ -74,6 +79,9 @@ class Engagement:
         self._began = clock.seconds()
         self._acting = False
         self._concluding = False
+        self._seen_token = 0
+        self._judged: tuple[object, ...] = ()
+        self._justified_at = 0.0
 
     @property
     def is_over(self) -> bool:
@@ -160,6 +168,24 @@ class Engagement:
         if assigned and assigned != self.me.assigned and assigned != self.me.uuid:
             self._say(f"stands by: {decision.why}")
         self._publish(status=status, assigned=assigned, digest=decision.digest, token=token, why=decision.why)
+        self._account(decision, token)
+
+    def _account(self, decision: Decision, token: int) -> None:
+        """Say why, at each new decision; where only the reports moved, once in ``JUSTIFY`` seconds."""
+        members = [self.me, *self._others.values()]
+        tokens = [m.token for m in members if m.status == EXECUTING]
+        self._seen_token = max(self._seen_token, *(m.token for m in members))
+        # The epoch is the token under which the task is done, or is to be done next.
+        epoch = max(tokens, default=self._seen_token + 1)
+        now, judged = self._clock.seconds(), (epoch, decision.assigned, token, len(members), decision.digest)
+        is_new, is_due = judged[:-1] != self._judged[:-1], now - self._justified_at >= JUSTIFY
+        if judged == self._judged or not (is_new or is_due) or not (decision.assigned or self._judged):
+            return
+        self._judged, self._justified_at = judged, now
+        consensus = self._strategy.find([Report(m.uuid, m.cost) for m in members if m.cost is not None])
+        version = str(getattr(self._strategy, "version", ""))
+        given = (self.task.task_id, epoch, self.me, self._others.values(), self.task.strategy, version)
+        self.justify(verdict_from(*given, consensus, decision.assigned, self.task.hysteresis, token))
 
     def _publish(self, **changes: object) -> None:
         told = replace(self.me, **changes)  # type: ignore[arg-type]

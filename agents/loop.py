@@ -159,6 +159,7 @@ class Agent(Service):
             self._say,
             self._driver.stop,
         )
+        engagement.justify = self._node.justify
         engagement.lessee = self._node.lessee(task, self._turn_now, self._token)
         self._engagement = engagement
         self._group = self._node.group(task.task_id, engagement.heard)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import random
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from twisted.application.service import Service
 from twisted.internet.defer import Deferred, maybeDeferred
@@ -33,6 +33,9 @@ from middleware.presence import DEVICES, Device, Presence, devices_of
 from middleware.streams import Streams
 from middleware.tasks import MAX_LEASE_TTL, RESULT, TASKS, Result, Task, group_key
 from middleware.value import bounded
+
+if TYPE_CHECKING:
+    from middleware.verdict import Verdict
 
 COUNCIL = 3
 CAMERA = "camera"
@@ -205,6 +208,11 @@ class SwarmNode(Service):
     def conclude(self, task_id: str, result: Result) -> Deferred[Stored]:
         """Record how a task ended, as somebody who takes no part in it."""
         return self.entangled.put(group_key(task_id), RESULT, result.packed(), "team")
+
+    def justify(self, verdict: Verdict) -> None:
+        """Record why this node's agent decided so; stays when this node goes."""
+        put = maybeDeferred(self.entangled.put, group_key(verdict.task), verdict.slot, verdict.packed(), "team")
+        self._quietly(put)
 
     def lessee(self, task: Task, changed: Callable[[], None], floor: int) -> Lessee:
         """The claimant of the right to act on ``task``, in this node's name."""

@@ -13,6 +13,7 @@ from typing import Any
 from middleware.entangled.record import Record
 from middleware.presence import DEVICES, Device, devices_of
 from middleware.tasks import TASKS, Task, group_key, member_of, outcome_of, refusals, task_of
+from middleware.verdict import explained, verdict_of
 from webnode.state import Departed, State, state_of
 
 Read = Callable[[bytes], list[Record]]
@@ -74,4 +75,5 @@ def _task_row(task: Task, records: list[Record], devices: list[Device]) -> dict[
         "status": status,
         "note": note,
         "result": None if outcome is None else {"by": outcome.by, "took": outcome.took},
+        "why": asdict(explained(v for v in map(verdict_of, records) if v is not None and v.task == task.task_id)),
     }

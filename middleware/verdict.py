@@ -1,0 +1,375 @@
+"""Verdict: one agent's signed account of one decision, and what all of them together explain; pure.
+
+Each agent that takes part in a task writes whom it named, by which rule and from which reports, into slots of its own
+under the task's group key.  The record's signature is the agent's; nobody can testify for another.  The accounts are
+team records: why somebody went can be asked after it is gone.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import msgpack
+
+from middleware.consensus.strategy import Consensus
+from middleware.entangled.identity import ID_BYTES, node_id
+from middleware.entangled.record import Record
+from middleware.presence import EXECUTING
+from middleware.tasks import Member
+from middleware.value import is_number, is_whole, mapping_of
+
+SLOT = "verdict"
+KEPT = 4
+"""Epochs of one task that an agent keeps: the newest takes the slot of the one that was ``KEPT`` before it."""
+MANY, BEST = 30, 8
+"""Of more than ``MANY`` reports the ``BEST`` are written down, with the count of all; as many of the silent."""
+STANDBY = 3
+MAX_VERDICT = 3300
+"""Bytes of a verdict at most: three datagrams, and one for a team of ten."""
+NAME, WORDS = 40, 160
+TOLD = 3
+"""Reports in which two agents differ that are named one by one."""
+
+
+@dataclass(frozen=True)
+class Reported:
+    """What one participant had reported when it was decided: its uuid, its name, and the cost."""
+
+    agent: str
+    name: str
+    cost: float
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whom ``agent`` (a uuid) named as the one to do ``task`` in ``epoch``, and why.
+
+    ``winner`` and ``standby`` are uuids, ``winner`` empty where nobody was fit.  ``rule`` and ``version`` are those of
+    the strategy, ``hysteresis`` tells in words what became of whoever acted before.  ``reports`` are the best first;
+    ``reported`` counts all there were, ``silent`` names participants without a report, ``participants`` counts both.
+    ``digest`` is of the reports as this agent computed it; ``token`` is not 0 where it holds the right to act.
+    """
+
+    agent: str
+    name: str
+    task: str
+    epoch: int
+    rule: str
+    version: str
+    winner: str
+    standby: tuple[str, ...]
+    hysteresis: str
+    digest: str
+    token: int
+    participants: int
+    reported: int
+    reports: tuple[Reported, ...]
+    silent: tuple[str, ...]
+
+    @property
+    def slot(self) -> str:
+        """The name of the slot under the task's group key."""
+        return slot_of(self.epoch)
+
+    def packed(self) -> bytes:
+        """The value of the verdict's record, at most ``MAX_VERDICT`` bytes whatever the texts."""
+        content = {
+            "name": self.name[:NAME],
+            "task": self.task[:64],
+            "epoch": self.epoch,
+            "rule": self.rule[:64],
+            "version": self.version[:NAME],
+            "winner": bytes.fromhex(self.winner),
+            "standby": [bytes.fromhex(uuid) for uuid in self.standby[:STANDBY]],
+            "hysteresis": self.hysteresis[:WORDS],
+            "digest": self.digest[:64],
+            "token": self.token,
+            "participants": self.participants,
+            "reported": self.reported,
+            "reports": [[bytes.fromhex(r.agent), r.name[:NAME], r.cost] for r in self.reports[:MANY]],
+            "silent": [name[:NAME] for name in self.silent[:BEST]],
+        }
+        return bytes(msgpack.packb(content))
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Who differs from the others, and in what."""
+
+    name: str
+    what: str
+
+
+@dataclass(frozen=True)
+class Ruling:
+    """What one epoch came to: the agents' verdicts side by side.
+
+    ``winner`` is the uuid named by most (the lowest where two are), ``chosen`` its name; ``agree`` names those that
+    named it, ``of`` counts the participants.  ``differ`` has whoever named another, used another rule or knew other
+    reports than most of those that agree; the rest is what these wrote.  ``token`` is the winner's, 0 where it told of
+    none.
+    """
+
+    epoch: int
+    winner: str
+    chosen: str
+    agree: tuple[str, ...]
+    of: int
+    differ: tuple[Difference, ...]
+    rule: str
+    version: str
+    hysteresis: str
+    standby: tuple[str, ...]
+    digest: str
+    token: int
+    reported: int
+    reports: tuple[Reported, ...]
+    silent: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """Why who went: the rulings of a task, the newest epoch first."""
+
+    task: str
+    epochs: tuple[Ruling, ...] = ()
+
+
+def slot_of(epoch: int) -> str:
+    """The slot of an epoch's verdict."""
+    return f"{SLOT}/{epoch % KEPT}"
+
+
+def verdict_from(
+    task: str,
+    epoch: int,
+    me: Member,
+    others: Iterable[Member],
+    rule: str,
+    version: str,
+    consensus: Consensus,
+    assigned: str | None,
+    hysteresis: float,
+    token: int = 0,
+) -> Verdict:
+    """The account of one decision that ``me`` took.
+
+    ``consensus`` is what the strategy found among the reports, ``assigned`` who was decided for after the
+    ``hysteresis`` (a share), ``token`` that of the lease which this agent holds, or 0.
+    """
+    members = {m.uuid: m for m in (*others, me)}
+    fit = [m for m in members.values() if m.cost is not None]
+    reports = sorted((Reported(m.uuid, m.name, float(m.cost or 0.0)) for m in fit), key=lambda r: (r.cost, r.agent))
+    best = reports if len(reports) <= MANY else reports[:BEST]
+    silent = sorted(m.name for m in members.values() if m.cost is None)
+    acting = sorted((m for m in fit if m.status == EXECUTING), key=lambda m: (m.cost, m.uuid))
+    return Verdict(
+        me.uuid,
+        me.name,
+        task,
+        epoch,
+        rule,
+        version,
+        assigned or "",
+        tuple(uuid for uuid in (*_first(consensus.assigned_agent), *consensus.standby) if uuid != assigned)[:STANDBY],
+        _outcome(members, acting[0] if acting else None, consensus.assigned_agent, assigned, hysteresis),
+        consensus.digest,
+        token,
+        len(members),
+        len(reports),
+        tuple(best),
+        tuple(silent[:BEST]),
+    )
+
+
+def verdict_of(record: Record) -> Verdict | None:
+    """The verdict in a record, or None where it holds none, or one in another's name; never raises."""
+    content = mapping_of(record, MAX_VERDICT)
+    if content is None or not record.name.startswith(f"{SLOT}/"):
+        return None
+    texts = [content.get(name) for name in ("name", "task", "rule", "version", "hysteresis", "digest")]
+    wholes = [content.get(name) for name in ("epoch", "token", "participants", "reported")]
+    winner, standby = content.get("winner"), _uuids(content.get("standby"))
+    reports, silent = _reports(content.get("reports")), content.get("silent")
+    if not all(isinstance(text, str) for text in texts) or not all(is_whole(number) for number in wholes):
+        return None
+    if not isinstance(winner, bytes) or len(winner) not in (0, ID_BYTES) or standby is None or reports is None:
+        return None
+    if not isinstance(silent, list) or not all(isinstance(name, str) for name in silent):
+        return None
+    name, task, rule, version, hysteresis, digest = (str(text) for text in texts)
+    epoch, token, participants, reported = (int(number or 0) for number in wholes)
+    if record.name != slot_of(epoch) or reported < len(reports) or participants < reported:
+        return None
+    agent = node_id(record.owner).hex()
+    return Verdict(
+        agent,
+        name,
+        task,
+        epoch,
+        rule,
+        version,
+        winner.hex(),
+        standby,
+        hysteresis,
+        digest,
+        token,
+        participants,
+        reported,
+        reports,
+        tuple(silent),
+    )
+
+
+def explained(verdicts: Iterable[Verdict]) -> Explanation:
+    """What ``verdicts`` of one task explain together; their order does not matter."""
+    epochs: dict[int, dict[str, Verdict]] = {}
+    task = ""
+    for verdict in sorted(verdicts, key=lambda v: (v.epoch, v.agent, v.packed())):
+        task = verdict.task
+        epochs.setdefault(verdict.epoch, {})[verdict.agent] = verdict
+    rulings = [_ruling(epoch, list(epochs[epoch].values())) for epoch in sorted(epochs, reverse=True)]
+    return Explanation(task, tuple(rulings))
+
+
+def as_text(explanation: Explanation) -> str:
+    """The explanation for a person, the newest epoch first; empty where nothing was decided yet."""
+    return "".join(_paragraph(ruling) for ruling in explanation.epochs)
+
+
+# -- inside -------------------------------------------------------------------------------------------------------
+
+
+def _outcome(
+    members: Mapping[str, Member], acting: Member | None, best: str | None, assigned: str | None, hysteresis: float
+) -> str:
+    """What became of whoever acted, in words."""
+    if not assigned:
+        return "no report counts"
+    if acting is None:
+        return "nobody acted before"
+    name = members[best].name if best is not None and best in members else "nobody"
+    if assigned == acting.uuid:
+        if best == assigned:
+            return f"{acting.name} acts already, and nobody is better"
+        return f"{name} is the best, but not better by {hysteresis:.0%} than {acting.name}, who acts"
+    return f"{name} is better by more than {hysteresis:.0%} than {acting.name}, who acted"
+
+
+def _ruling(epoch: int, verdicts: Sequence[Verdict]) -> Ruling:
+    votes = Counter(v.winner for v in verdicts)
+    winner = min(votes, key=lambda uuid: (-votes[uuid], not uuid, uuid))
+    agreeing = [v for v in verdicts if v.winner == winner]
+    grounds = Counter(_grounds(v) for v in agreeing)
+    most = min(grounds, key=lambda ground: (-grounds[ground], ground))
+    reference = next(v for v in agreeing if _grounds(v) == most)
+    names = {r.agent: r.name for v in verdicts for r in v.reports} | {v.agent: v.name for v in verdicts}
+    differ = [Difference(v.name, what) for v in verdicts if (what := _differences(v, reference, names))]
+    spoke = {v.agent for v in verdicts}
+    mute = [r.name for r in reference.reports if r.agent not in spoke]
+    differ += [Difference(name, "has told no decision") for name in mute]
+    return Ruling(
+        epoch,
+        winner,
+        _name(winner, names),
+        tuple(sorted(v.name for v in agreeing)),
+        max(len(verdicts), reference.participants),
+        tuple(sorted(differ, key=lambda each: (each.name, each.what))),
+        reference.rule,
+        reference.version,
+        reference.hysteresis,
+        tuple(_name(uuid, names) for uuid in reference.standby),
+        reference.digest,
+        max((v.token for v in agreeing if v.agent == winner), default=0),
+        reference.reported,
+        reference.reports,
+        reference.silent,
+    )
+
+
+def _grounds(verdict: Verdict) -> tuple[str, str, str]:
+    return (verdict.rule, verdict.version, verdict.digest)
+
+
+def _differences(verdict: Verdict, reference: Verdict, names: Mapping[str, str]) -> str:
+    """In what a verdict differs from that of the majority; empty where it does not."""
+    told = []
+    if verdict.winner != reference.winner:
+        told.append(f"names {_name(verdict.winner, names)}")
+    if (verdict.rule, verdict.version) != (reference.rule, reference.version):
+        told.append(f"decided by {_rule(verdict)}, not {_rule(reference)}")
+    if verdict.digest != reference.digest:
+        told.append(_other_reports(verdict, reference))
+    return "; ".join(told)
+
+
+def _other_reports(verdict: Verdict, reference: Verdict) -> str:
+    are_whole = all(len(v.reports) == v.reported for v in (verdict, reference))
+    knew, known = ({r.agent: r for r in v.reports} for v in (verdict, reference))
+    told = []
+    for agent in sorted({**knew, **known}, key=lambda agent: ({**known, **knew}[agent].name, agent)):
+        if agent not in knew:
+            told.append(f"no report of {known[agent].name}")
+        elif agent not in known:
+            told.append(f"a report of {knew[agent].name}")
+        elif knew[agent].cost != known[agent].cost:
+            told.append(f"{knew[agent].name} at {knew[agent].cost:.2f}, not {known[agent].cost:.2f}")
+    if not are_whole or not told:
+        return "knew other reports"
+    more = [f"{len(told) - TOLD} more"] if len(told) > TOLD else []
+    return f"knew {', '.join([*told[:TOLD], *more])}"
+
+
+def _paragraph(ruling: Ruling) -> str:
+    """One ruling as lines."""
+    token = f", token {ruling.token}" if ruling.token else ""
+    lines = [f"epoch {ruling.epoch}: {ruling.chosen}, {len(ruling.agree)} of {ruling.of} agree{token}"]
+    lines.append(
+        f"  by {ruling.rule} {ruling.version}".rstrip() + f" from reports {ruling.digest}: {ruling.hysteresis}"
+    )
+    width = max((len(name) for name in (*(r.name for r in ruling.reports), *ruling.silent)), default=0)
+    for report in ruling.reports:
+        lines.append(f"  {report.name:{width}}  {report.cost:8.2f}{'  *' if report.agent == ruling.winner else ''}")
+    if ruling.reported > len(ruling.reports):
+        lines.append(f"  the best {len(ruling.reports)} of {ruling.reported} reports")
+    lines += [f"  {name:{width}}  no report" for name in ruling.silent]
+    if ruling.standby:
+        lines.append(f"  stand by: {', '.join(ruling.standby)}")
+    lines += [f"  {each.name} differs: {each.what}" for each in ruling.differ]
+    return "".join(f"{line}\n" for line in lines)
+
+
+def _rule(verdict: Verdict) -> str:
+    return f"{verdict.rule} {verdict.version}".rstrip()
+
+
+def _name(uuid: str, names: Mapping[str, str]) -> str:
+    return names.get(uuid, uuid[:8]) or "nobody"
+
+
+def _first(uuid: str | None) -> tuple[str, ...]:
+    return () if uuid is None else (uuid,)
+
+
+def _uuids(value: object) -> tuple[str, ...] | None:
+    if not isinstance(value, list) or len(value) > STANDBY:
+        return None
+    lawful = all(isinstance(uuid, bytes) and len(uuid) == ID_BYTES for uuid in value)
+    return tuple(uuid.hex() for uuid in value) if lawful else None
+
+
+def _reports(value: object) -> tuple[Reported, ...] | None:
+    if not isinstance(value, list) or len(value) > MANY:
+        return None
+    reports = []
+    for entry in value:
+        if not isinstance(entry, list) or len(entry) != 3:
+            return None
+        agent, name, cost = entry
+        is_lawful = isinstance(agent, bytes) and len(agent) == ID_BYTES and isinstance(name, str)
+        if not is_lawful or not is_number(cost) or cost < 0:
+            return None
+        reports.append(Reported(agent.hex(), name, float(cost)))
+    return tuple(reports)
