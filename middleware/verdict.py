@@ -193,11 +193,11 @@ def verdict_of(record: Record) -> Verdict | None:
     wholes = [content.get(name) for name in ("epoch", "token", "participants", "reported")]
     winner, standby = content.get("winner"), _uuids(content.get("standby"))
     reports, silent = _reports(content.get("reports")), content.get("silent")
-    if not all(isinstance(text, str) for text in texts) or not all(is_whole(number) for number in wholes):
+    if not all(_is_line(text) for text in texts) or not all(is_whole(number) for number in wholes):
         return None
     if not isinstance(winner, bytes) or len(winner) not in (0, ID_BYTES) or standby is None or reports is None:
         return None
-    if not isinstance(silent, list) or not all(isinstance(name, str) for name in silent):
+    if not isinstance(silent, list) or not all(_is_line(name) for name in silent):
         return None
     name, task, rule, version, hysteresis, digest = (str(text) for text in texts)
     epoch, token, participants, reported = (int(number or 0) for number in wholes)
@@ -353,6 +353,11 @@ def _first(uuid: str | None) -> tuple[str, ...]:
     return () if uuid is None else (uuid,)
 
 
+def _is_line(value: object) -> bool:
+    """Whether ``value`` is text that a terminal can be shown."""
+    return isinstance(value, str) and value.isprintable()
+
+
 def _uuids(value: object) -> tuple[str, ...] | None:
     if not isinstance(value, list) or len(value) > STANDBY:
         return None
@@ -368,7 +373,7 @@ def _reports(value: object) -> tuple[Reported, ...] | None:
         if not isinstance(entry, list) or len(entry) != 3:
             return None
         agent, name, cost = entry
-        is_lawful = isinstance(agent, bytes) and len(agent) == ID_BYTES and isinstance(name, str)
+        is_lawful = isinstance(agent, bytes) and len(agent) == ID_BYTES and _is_line(name)
         if not is_lawful or not is_number(cost) or cost < 0:
             return None
         reports.append(Reported(agent.hex(), name, float(cost)))

@@ -51,7 +51,9 @@ def main(words: Sequence[str] | None = None, out: TextIO | None = None, ask: Ask
         out.write(json.dumps({**told, "outcome": ended, "epochs": asdict(explanation)["epochs"]}) + "\n")
         return 0 if explanation.epochs else FAILED
     ended_by = "" if outcome is None else f", {outcome.outcome.lower()} by {outcome.by}"
-    out.write(f"task {task.task_id}: {task.title}{ended_by}\n{as_text(explanation)}")
+    # Both are somebody's words: no control character of theirs reaches the terminal.
+    head = "".join(c if c.isprintable() else " " for c in f"task {task.task_id}: {task.title}{ended_by}")
+    out.write(f"{head}\n{as_text(explanation)}")
     if not explanation.epochs:
         out.write("nobody has decided anything yet\n")
     return 0 if explanation.epochs else FAILED

@@ -179,7 +179,7 @@ def _ruling_view(fields: Fields) -> State:
     for name in (*fields["silent"], *differ):
         rows.setdefault(name, {"name": text(name, limit=64), "cost": None, "note": ""})
     for name, what in differ.items():
-        rows[name]["note"] = "; ".join(filter(None, (rows[name]["note"], text(what, limit=200))))
+        rows[name]["note"] = f"differs: {text(what, limit=200)}"
     return {
         "epoch": count(fields["epoch"]),
         "chosen": text(fields["chosen"], limit=64),
