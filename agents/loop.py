@@ -139,8 +139,8 @@ class Agent(Service):
         self._disengage()
         task = min(self._open.values(), key=lambda t: (t.created, t.task_id))
         try:
-            behaviour = behaviour_for(task, self._rng)
-            strategy = strategy_for(task.strategy)
+            behaviour = behaviour_for(task, self._rng, self._node.deployed)
+            strategy = strategy_for(task.strategy, deployed=self._node.deployed)
         except SwarmError as error:
             self._ended.add(task.task_id)
             del self._open[task.task_id]

@@ -7,7 +7,7 @@ ask the council for a lease, send a camera's frames, and call a peer by name.
 from __future__ import annotations
 
 import random
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -49,7 +49,9 @@ COUNTING = 2.0
 class SwarmNode(Service):
     """One node of a team.
 
-    ``device`` is what the node says of itself; ``wall`` gives seconds of the wall clock, for people only.
+    ``device`` is what the node says of itself; ``wall`` gives seconds of the wall clock, for people only.  ``deployed``
+    is what operators pushed and its owner allowed: (kind, name) to what makes it.  ``later(seconds, call, ...)`` is a
+    timer that ends with the node.
     """
 
     _log = Logger()
@@ -74,6 +76,8 @@ class SwarmNode(Service):
         self.entangled = EntangledNode(identity, team_key, network, store, clock, rng, lease, wall)
         self.uuid = identity.node_id.hex()
         self._chores = Background(clock)
+        self.later = self._chores.later
+        self.deployed: Mapping[tuple[str, str], Callable[..., Any]] = {}
         self.presence = Presence(device, self._announce, self._chores.later)
         self.streams = Streams(self.entangled.endpoint, clock)
         self.joined: Deferred[None] = Deferred()

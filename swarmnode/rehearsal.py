@@ -6,6 +6,7 @@ It wires what the front door wires, with the twins in memory of clock, wire and 
 from __future__ import annotations
 
 import random
+from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
@@ -62,8 +63,11 @@ class VirtualTeam:
         self._departed = Departed()
         self.clock.advance(self.JOINING)
 
-    def add(self, name: str) -> None:
-        """Start the node ``name``, the laptop or one of the dogs."""
+    def add(self, name: str, tables: Mapping[str, Mapping[str, Any]] | None = None, shelf: Any = None) -> None:
+        """Start the node ``name``, the laptop or one of the dogs, with further ``tables`` of settings.
+
+        ``shelf`` is where it keeps deployed modules.
+        """
         place = (self.BOOTSTRAP, *self.DOGS).index(name)
         port = 7000 + place
         mapping: dict[str, Any] = {"node": {"name": name, "port": port, "team_key": str(self._seed)}}
@@ -71,6 +75,7 @@ class VirtualTeam:
             mapping["node"]["known_nodes"] = ["127.0.0.1:7000"]
             mapping["agent"] = {"module": "search"}
             mapping["driver"] = {"kind": "sim", "options": {"robot": name, "camera_fps": self._fps}}
+        mapping.update(tables or {})
         seams = Seams(
             self.clock,
             partial(self.board.network, "127.0.0.1", port),
@@ -78,6 +83,7 @@ class VirtualTeam:
             random.Random(f"{self._seed}/{name}"),
             self.clock.seconds,
             self.yard.connector(),
+            shelf,
         )
         self.services[name] = NodeService(Settings.from_mapping(mapping, f"seed {self._seed}"), seams)
         self.services[name].startService()

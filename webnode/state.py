@@ -59,7 +59,8 @@ def state_of(
 
 def device_view(fields: Fields) -> State:
     """One device as the page shows it; fields that are missing or no lawful values become empty ones."""
-    network = fields.get("network")
+    network, deployed = fields.get("network"), fields.get("deployed")
+    deployed = deployed if isinstance(deployed, Mapping) else {}
     return {
         "uuid": text(fields.get("uuid"), limit=64),
         "name": text(fields.get("name"), "unnamed", 64),
@@ -74,6 +75,7 @@ def device_view(fields: Fields) -> State:
         "status": _status(fields.get("status"), DEVICE_STATUSES),
         "messages": _messages(fields.get("messages")),
         "network": {text(key): number(value) for key, value in network.items()} if isinstance(network, Mapping) else {},
+        "deployed": {text(key): text(value, limit=64) for key, value in deployed.items()},
         "gone": None,
     }
 

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import hashlib
 import importlib
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 from middleware.errors import UnknownStrategy
 
@@ -54,12 +54,18 @@ def digest_of(contacts: Sequence[Report]) -> str:
     return hashlib.blake2s("".join(texts).encode(), digest_size=4).hexdigest()
 
 
-def strategy_for(name: str, dotted: bool = False) -> ConsensusAlgorithm:
+def strategy_for(
+    name: str, dotted: bool = False, deployed: Mapping[tuple[str, str], Callable[..., Any]] | None = None
+) -> ConsensusAlgorithm:
     """The strategy called ``name``: a built-in one, or an entry point of ``swarm_node.strategies``.
+
+    ``deployed:x`` is the module ``x`` that an operator pushed, among those in ``deployed``.
 
     With ``dotted`` also ``module:Class``, for names out of this machine's own settings: what a peer sends must never
     say what is imported here.  Raises ``UnknownStrategy``, which names those that there are.
     """
+    if name.startswith("deployed:"):
+        return _deployed(name, deployed or {})
     target = name if dotted and ":" in name else BUILT_IN.get(name)
     if target is None:
         from importlib.metadata import entry_points  # heavy, and most nodes never come here
@@ -73,4 +79,16 @@ def strategy_for(name: str, dotted: bool = False) -> ConsensusAlgorithm:
         strategy: ConsensusAlgorithm = getattr(importlib.import_module(module), attribute)()
     except Exception as error:  # a module of somebody else may fail in any way
         raise UnknownStrategy(f"strategy {name!r} cannot be loaded: {error}") from error
+    return strategy
+
+
+def _deployed(name: str, deployed: Mapping[tuple[str, str], Callable[..., Any]]) -> ConsensusAlgorithm:
+    make = deployed.get(("strategy", name.removeprefix("deployed:")))
+    if make is None:
+        known = ", ".join(sorted(f"deployed:{each}" for kind, each in deployed if kind == "strategy")) or "none"
+        raise UnknownStrategy(f"no strategy {name!r} here ([deployment] of this node); there are {known}")
+    try:
+        strategy: ConsensusAlgorithm = make()
+    except Exception as error:  # a module of somebody else may fail in any way
+        raise UnknownStrategy(f"strategy {name!r} cannot be made: {error}") from error
     return strategy
