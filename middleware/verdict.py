@@ -76,20 +76,20 @@ class Verdict:
     def packed(self) -> bytes:
         """The value of the verdict's record, at most ``MAX_VERDICT`` bytes whatever the texts."""
         content = {
-            "name": self.name[:NAME],
-            "task": self.task[:64],
+            "name": _cut(self.name, NAME),
+            "task": _cut(self.task, 64),
             "epoch": self.epoch,
-            "rule": self.rule[:64],
-            "version": self.version[:NAME],
+            "rule": _cut(self.rule, 64),
+            "version": _cut(self.version, NAME),
             "winner": bytes.fromhex(self.winner),
             "standby": [bytes.fromhex(uuid) for uuid in self.standby[:STANDBY]],
-            "hysteresis": self.hysteresis[:WORDS],
-            "digest": self.digest[:64],
+            "hysteresis": _cut(self.hysteresis, WORDS),
+            "digest": _cut(self.digest, 64),
             "token": self.token,
             "participants": self.participants,
             "reported": self.reported,
-            "reports": [[bytes.fromhex(r.agent), r.name[:NAME], r.cost] for r in self.reports[:MANY]],
-            "silent": [name[:NAME] for name in self.silent[:BEST]],
+            "reports": [[bytes.fromhex(r.agent), _cut(r.name, NAME), r.cost] for r in self.reports[:MANY]],
+            "silent": [_cut(name, NAME) for name in self.silent[:BEST]],
         }
         return bytes(msgpack.packb(content))
 
@@ -351,6 +351,12 @@ def _name(uuid: str, names: Mapping[str, str]) -> str:
 
 def _first(uuid: str | None) -> tuple[str, ...]:
     return () if uuid is None else (uuid,)
+
+
+def _cut(text: str, most: int) -> str:
+    """At most ``most`` bytes of a text, without what no terminal should be shown: other members chose their names."""
+    printable = "".join(c if c.isprintable() else "?" for c in text)
+    return printable.encode(errors="replace")[:most].decode(errors="ignore")
 
 
 def _is_line(value: object) -> bool:

@@ -75,7 +75,11 @@ def compiled(source: bytes, name: str) -> Any:
 
 
 def within(steps: int, call: Callable[..., T], *arguments: object) -> T:
-    """What ``call`` returns if it takes at most ``steps`` instructions of Python."""
+    """What ``call`` returns if it takes at most ``steps`` instructions of Python; else raises.
+
+    It ends loops that somebody wrote by mistake.  Code that catches everything and goes on evades it, and so does one
+    long call into C.
+    """
     left = steps
 
     def count(frame: FrameType, event: str, argument: object) -> Any:
