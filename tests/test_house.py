@@ -36,6 +36,7 @@ PURE = (
     "drivers.reading",
     "middleware.consensus.nearest",
     "middleware.consensus.strategy",
+    "middleware.deployment.manifest",
     "middleware.entangled.replication.cache",
     "middleware.entangled.errors",
     "middleware.entangled.identity",
@@ -56,6 +57,7 @@ PURE = (
     "middleware.presence",
     "middleware.settings",
     "middleware.tasks",
+    "middleware.verdict",
     "sim.demo.configuration",
     "sim.demo.experiment",
     "sim.demo.story",
@@ -74,6 +76,7 @@ EDGES = (
 WORLD = ("time", "socket", "threading", "asyncio", "selectors", "subprocess", "secrets", "twisted.internet.reactor")
 GUARDED = ("middleware", "agents", "drivers")
 
+ON_DEMAND = ("middleware.deployment", "middleware.verdict")
 HEAVY = ("flask", "jinja2", "cv2", "numpy", "pymunk", "serial", "playwright")
 
 
@@ -231,6 +234,13 @@ class PurityTests(SynchronousTestCase):
         )
         child = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=60)
         self.assertEqual((child.returncode, child.stdout.strip()), (0, ""), child.stderr)
+
+    def test_plain_node_loads_what_it_needs(self) -> None:
+        """A node without agent, page and deployment loads neither the verdicts nor what runs foreign modules."""
+        program = "import sys, swarmnode.plugin; print(*[n for n in sys.modules if n.startswith(('middleware.',))])"
+        child = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=60)
+        unwanted = [name for name in child.stdout.split() if _within(name, *ON_DEMAND)]
+        self.assertEqual((child.returncode, unwanted), (0, []), child.stderr)
 
 
 class PackagingTests(SynchronousTestCase):

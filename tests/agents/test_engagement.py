@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from twisted.trial.unittest import SynchronousTestCase
 
 from agents.behaviour import STAND
@@ -13,6 +15,7 @@ from middleware.entangled.clock import HeapClock
 from middleware.entangled.identity import Identity
 from middleware.presence import ASSIGNED, DONE, EXECUTING, SEARCHING, WAITING
 from middleware.tasks import CANCELLED, COMPLETED, Member, Result, Task
+from middleware.verdict import Verdict
 
 TASK = Task("t1", "find-target", "Find it", waiting_period=2.0)
 LOOK, GO, HOLD = {"base.wz": 1.0}, {"base.vx": 0.1}, {"base.wz": 0.0}
@@ -292,3 +295,39 @@ class EngagementTests(SynchronousTestCase):
             self.clock.advance(0.05)
             self.step()
         self.assertEqual(len(self.told), before)
+
+    def test_each_decision_is_accounted_for_once(self) -> None:
+        """A new decision is told why at once, moved reports at most once a second, and an unchanged one never again."""
+        accounts: list[Verdict] = []
+        self.engagement.justify = accounts.append
+        self.step()
+        self.assertEqual(accounts, [])
+        self.hear(self.report(2, 2.0))
+        self.see(1.0)
+        self.step()
+        self.assertEqual([(v.winner, v.epoch, v.token) for v in accounts], [(ME.node_id.hex(), 1, 0)])
+        self.assertEqual([(r.name, r.cost) for r in accounts[0].reports], [("dog1", 1.0), ("dog2", 2.0)])
+        for cost in (2.1, 2.2, 2.3, 2.4):
+            self.hear(self.report(2, cost))
+            self.clock.advance(0.1)
+            self.step()
+        self.assertEqual(len(accounts), 1)
+        self.clock.advance(1.0)
+        self.step()
+        self.assertEqual(accounts[1].reports[1].cost, 2.4)
+        self.clock.advance(5.0)
+        self.step()
+        self.assertEqual(len(accounts), 2)
+
+    def test_epoch_follows_the_token(self) -> None:
+        """The epoch is the token under which somebody acts; when that agent is gone, the next one."""
+        accounts: list[Verdict] = []
+        self.engagement.justify = accounts.append
+        self.see(2.0)
+        self.hear(replace(self.report(2, 1.0, EXECUTING), token=3))
+        self.step()
+        self.hear()
+        self.step()
+        self.council.grant(4)
+        self.step()
+        self.assertEqual([(v.epoch, v.token) for v in accounts], [(3, 0), (4, 0), (4, 4)])

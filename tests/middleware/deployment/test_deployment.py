@@ -203,8 +203,8 @@ class DeploymentTests(FleetCase):
         manifest, source = self.version(1)
         self.push(manifest, source)
         sys.modules.pop(CANARY)
-        for struck in ({"operators": ()}, {"modules": ()}):
-            made = self.allow(node=self.stranger, **struck)
+        for struck in ("operators", "modules"):
+            made = self.allow(None, self.stranger, **{struck: ()})
             self.assertEqual((dict(made.held), made.modules), ({}, {}))
             self.assertNotIn(CANARY, sys.modules)
 
