@@ -124,7 +124,7 @@ class Deployment:
         if record.name not in self._allowed.modules:
             return "is not among this node's modules"
         if record.owner.hex() not in self._allowed.operators:
-            return f"comes from {record.owner.hex()[:8]}, who is none of this node's operators"
+            return f"comes from {record.owner.hex()[:8]}, no operator of this node"
         if not record.is_genuine():
             return "is not signed by its operator"
         if manifest is None:
