@@ -63,6 +63,7 @@ class GuardedTests(SynchronousTestCase):
         """A task of the kind ``deployed:x`` gets the deployed behaviour; others are refused with those there are."""
         deployed = {("behaviour", "spin"): Spin, ("strategy", "best"): Spin}
         made = behaviour_for(Task("t", "deployed:spin", ""), random.Random(1), deployed)
+        self.assertIsInstance(made, Guarded)
         self.assertEqual(made.cost, 1.5)
         for kind in ("deployed:best", "deployed:other"):
             error = self.assertRaises(UnknownTask, behaviour_for, Task("t", kind, ""), random.Random(1), deployed)

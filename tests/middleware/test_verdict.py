@@ -182,6 +182,14 @@ class ExplanationTests(SynchronousTestCase):
             rng.shuffle(verdicts)
             self.assertEqual(explained(verdicts), expected)
 
+    def test_most_decide_whoever_dissents(self) -> None:
+        """Two that agree outvote the third, whichever of the three it is."""
+        for lone in (1, 2, 3):
+            verdicts = [decided(n, THREE, assigned=1 if n == lone else None) for n in (1, 2, 3)]
+            (ruling,) = explained(verdicts).epochs
+            self.assertEqual((ruling.chosen, len(ruling.agree)), ("dog2", 2))
+            self.assertEqual([(d.name, d.what) for d in ruling.differ], [(f"dog{lone}", "names dog1")])
+
     def test_even_votes_give_the_lowest(self) -> None:
         """Two agents that name each other: the lower uuid counts as the winner, and the other as differing."""
         first, second = decided(1, THREE, assigned=1), decided(2, THREE, assigned=2)

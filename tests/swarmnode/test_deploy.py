@@ -9,6 +9,7 @@ import tempfile
 from dataclasses import replace
 from pathlib import Path
 
+from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
 from agents.catalogue import DEMO, TASKS
@@ -100,14 +101,12 @@ class DeployTests(SynchronousTestCase):
         """What the dogs decide about a task, and by which rule."""
         task = replace(TASKS[DEMO], task_id=f"t{self.team.clock.seconds():.0f}", strategy=strategy, waiting_period=30.0)
         task = replace(task, created=self.team.clock.seconds())
-        submitted: list[object] = []
-        from twisted.internet.defer import Deferred
-
-        Deferred.fromCoroutine(self.laptop.submit(task)).addCallback(submitted.append)
+        submitted = Deferred.fromCoroutine(self.laptop.submit(task))
         self.team.yard.world.scatter(3)
         self.team.clock.advance(3.0)
         self.team.desk.move_target(1.5, 1.2)
         self.team.clock.advance(seconds)
+        self.assertEqual(self.successResultOf(submitted).task_id, task.task_id)
         records = self.team.desk.read(group_key(task.task_id))
         return [verdict for each in records if (verdict := verdict_of(each)) is not None]
 
@@ -132,6 +131,7 @@ class DeployTests(SynchronousTestCase):
         self.let_in("farthest", refusing="dog3")
         self.push()
         self.assertEqual(self.deployed()["dog3"], "")
+        self.assertNotIn("farthest", self.messages("dog3"))
         self.assertIn("dog3  -", self.swarm("status"))
         self.verdicts("deployed:farthest", 2.0)
         self.assertIn("no strategy 'deployed:farthest' here", self.messages("dog3"))
