@@ -185,7 +185,9 @@ class Engagement:
         consensus = self._strategy.find([Report(m.uuid, m.cost) for m in members if m.cost is not None])
         version = str(getattr(self._strategy, "version", ""))
         given = (self.task.task_id, epoch, self.me, self._others.values(), self.task.strategy, version)
-        self.justify(verdict_from(*given, consensus, decision.assigned, self.task.hysteresis, token))
+        verdict = verdict_from(*given, consensus, decision.assigned, self.task.hysteresis, token)
+        if verdict.is_witness:
+            self.justify(verdict)
 
     def _publish(self, **changes: object) -> None:
         told = replace(self.me, **changes)  # type: ignore[arg-type]

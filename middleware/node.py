@@ -215,7 +215,7 @@ class SwarmNode(Service):
 
     def justify(self, verdict: Verdict) -> None:
         """Record why this node's agent decided so; stays when this node goes."""
-        put = maybeDeferred(self.entangled.put, group_key(verdict.task), verdict.slot, verdict.packed(), "team")
+        put = maybeDeferred(self.entangled.put, verdict.key, verdict.slot, verdict.packed(), "team")
         self._quietly(put)
 
     def lessee(self, task: Task, changed: Callable[[], None], floor: int) -> Lessee:

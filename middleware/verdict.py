@@ -1,8 +1,9 @@
 """Verdict: one agent's signed account of one decision, and what all of them together explain; pure.
 
 Each agent that takes part in a task writes whom it named, by which rule and from which reports, into slots of its own
-under the task's group key.  The record's signature is the agent's; nobody can testify for another.  The accounts are
-team records: why somebody went can be asked after it is gone.
+under a key beside the task's group: who asks why reads it, and those at work are not told.  The record's signature is
+the agent's; nobody can testify for another.  The accounts are team records: why somebody went can be asked after it is
+gone.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import msgpack
 
 from middleware.consensus.strategy import Consensus
 from middleware.entangled.identity import ID_BYTES, node_id
-from middleware.entangled.record import Record
+from middleware.entangled.record import Record, hashed_key
 from middleware.presence import EXECUTING
 from middleware.tasks import Member
 from middleware.value import is_number, is_whole, mapping_of
@@ -69,8 +70,18 @@ class Verdict:
     silent: tuple[str, ...]
 
     @property
+    def key(self) -> bytes:
+        """The key under which it is written."""
+        return verdicts_key(self.task)
+
+    @property
+    def is_witness(self) -> bool:
+        """Whether its agent is to write it: in a group of more than ``MANY``, those with the best reports do."""
+        return self.participants <= MANY or self.agent in [report.agent for report in self.reports[:BEST]]
+
+    @property
     def slot(self) -> str:
-        """The name of the slot under the task's group key."""
+        """The name of the slot under ``key``."""
         return slot_of(self.epoch)
 
     def packed(self) -> bytes:
@@ -107,9 +118,9 @@ class Ruling:
     """What one epoch came to: the agents' verdicts side by side.
 
     ``winner`` is the uuid named by most (the lowest where two are), ``chosen`` its name; ``agree`` names those that
-    named it, ``of`` counts the participants.  ``differ`` has whoever named another, used another rule or knew other
-    reports than most of those that agree; the rest is what these wrote.  ``token`` is the winner's, 0 where it told of
-    none.
+    named it, ``of`` counts the participants, or those who are to tell where there are many.  ``differ`` has whoever
+    named another, used another rule or knew other reports than most of those that agree; the rest is what these wrote.
+    ``token`` is the winner's, 0 where it told of none.
     """
 
     epoch: int
@@ -135,6 +146,16 @@ class Explanation:
 
     task: str
     epochs: tuple[Ruling, ...] = ()
+
+
+def verdicts_key(task: str) -> bytes:
+    """The key under which the verdicts on a task lie."""
+    return hashed_key(verdicts_text(task))
+
+
+def verdicts_text(task: str) -> str:
+    """The text of that key, as a shell names it."""
+    return f"task/{task}/why"
 
 
 def slot_of(epoch: int) -> str:
@@ -275,7 +296,7 @@ def _ruling(epoch: int, verdicts: Sequence[Verdict]) -> Ruling:
         winner,
         _name(winner, names),
         tuple(sorted(v.name for v in agreeing)),
-        max(len(verdicts), reference.participants),
+        max(len(verdicts), reference.participants if reference.participants <= MANY else len(reference.reports)),
         tuple(sorted(differ, key=lambda each: (each.name, each.what))),
         reference.rule,
         reference.version,

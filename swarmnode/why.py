@@ -1,6 +1,6 @@
 """Why: ``swarm why TASK``, the decisions of a task explained from the agents' signed verdicts.
 
-Whatever it tells it reads under two keys, through the control socket of a node of this machine.
+Whatever it tells it reads under three keys, through the control socket of a node of this machine.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import TextIO
 from middleware.entangled.control.command import FAILED, WRONG, Ask, asked
 from middleware.entangled.control.place import NoControl
 from middleware.tasks import Task, outcome_of, task_of
-from middleware.verdict import as_text, explained, verdict_of
+from middleware.verdict import as_text, explained, verdict_of, verdicts_text
 from swarmnode.asker import Asker, Refusal
 
 LAST = "last"
@@ -38,13 +38,13 @@ def main(words: Sequence[str] | None = None, out: TextIO | None = None, ask: Ask
     try:
         asker = Asker(wishes.node, ask)
         task = chosen(wishes.task, [task for each in asker.records("tasks") if (task := task_of(each)) is not None])
-        records = asker.records(f"task/{task.task_id}")
+        outcome = outcome_of(asker.records(f"task/{task.task_id}"))
+        records = asker.records(verdicts_text(task.task_id))
     except (Refusal, NoControl) as problem:
         sys.stderr.write(f"swarm why: {problem}\n")
         return FAILED if isinstance(problem, Refusal) else WRONG
     verdicts = [verdict for each in records if (verdict := verdict_of(each)) is not None]
     explanation = explained(verdict for verdict in verdicts if verdict.task == task.task_id)
-    outcome = outcome_of(records)
     if wishes.json:
         told = {"task": task.task_id, "title": task.title, "strategy": task.strategy}
         ended = None if outcome is None else {"outcome": outcome.outcome, "by": outcome.by, "took": outcome.took}

@@ -13,7 +13,7 @@ from middleware.consensus.strategy import Consensus, Report
 from middleware.entangled.identity import Identity
 from middleware.entangled.record import MAX_NAME, Record
 from middleware.presence import EXECUTING, WAITING
-from middleware.tasks import Member, group_key
+from middleware.tasks import Member
 from middleware.verdict import (
     BEST,
     KEPT,
@@ -25,6 +25,7 @@ from middleware.verdict import (
     slot_of,
     verdict_from,
     verdict_of,
+    verdicts_key,
 )
 
 
@@ -51,7 +52,7 @@ def record_of(number: int, verdict: Verdict, value: bytes | None = None, name: s
     """The record that dog ``number`` publishes."""
     content = verdict.packed() if value is None else value
     slot = name or verdict.slot
-    return Record(group_key("t1"), slot, identity(number).public, 1, "team", 60.0, content).signed(identity(number))
+    return Record(verdicts_key("t1"), slot, identity(number).public, 1, "team", 60.0, content).signed(identity(number))
 
 
 THREE = [member(1, 1.5), member(2, 0.5), member(3, 1.0)]
@@ -132,6 +133,15 @@ class VerdictTests(SynchronousTestCase):
         verdict = verdict_of(record_of(1, decided(1, [hostile, member(1, 1.0)])))
         self.assertIsNotNone(verdict)
         self.assertEqual(verdict and verdict.reports[0].name, "a?[2J?")
+
+    def test_of_many_the_best_tell(self) -> None:
+        """In a group of up to thirty all write; in a larger one the eight best, and these are what agreement is of."""
+        members = [member(i, float(i)) for i in range(1, MANY + 2)]
+        self.assertTrue(all(decided(n, members[:MANY]).is_witness for n in range(1, MANY + 1)))
+        told = [verdict for n in range(1, MANY + 2) if (verdict := decided(n, members)).is_witness]
+        self.assertEqual([verdict.name for verdict in told], [f"dog{n}" for n in range(1, BEST + 1)])
+        (ruling,) = explained(told).epochs
+        self.assertEqual((len(ruling.agree), ruling.of, ruling.differ), (BEST, BEST, ()))
 
     def test_slots_are_few(self) -> None:
         """However many epochs a task has, an agent fills few slots under it."""

@@ -16,8 +16,7 @@ from agents.catalogue import DEMO, TASKS
 from middleware.deployment.shelf import MemoryShelf
 from middleware.entangled.control.place import made
 from middleware.entangled.identity import node_id
-from middleware.tasks import group_key
-from middleware.verdict import Verdict, verdict_of
+from middleware.verdict import Verdict, verdict_of, verdicts_key
 from swarmnode.deploy import main
 from swarmnode.rehearsal import VirtualTeam
 from tests.swarmnode.shell import Shell
@@ -107,7 +106,7 @@ class DeployTests(SynchronousTestCase):
         self.team.desk.move_target(1.5, 1.2)
         self.team.clock.advance(seconds)
         self.assertEqual(self.successResultOf(submitted).task_id, task.task_id)
-        records = self.team.desk.read(group_key(task.task_id))
+        records = self.team.desk.read(verdicts_key(task.task_id))
         return [verdict for each in records if (verdict := verdict_of(each)) is not None]
 
     def test_team_runs_what_is_pushed(self) -> None:
