@@ -14,8 +14,9 @@ from typing import TextIO
 
 from middleware.entangled.control.command import FAILED, WRONG, Ask, asked
 from middleware.entangled.control.place import NoControl
+from middleware.explanation import as_text, explained
 from middleware.tasks import Task, outcome_of, task_of
-from middleware.verdict import as_text, explained, verdict_of, verdicts_text
+from middleware.verdict import verdict_of, verdicts_text
 from swarmnode.asker import Asker, Refusal
 
 LAST = "last"

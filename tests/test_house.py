@@ -54,6 +54,7 @@ PURE = (
     "middleware.entangled.wire.noise",
     "middleware.entangled.wire.session",
     "middleware.errors",
+    "middleware.explanation",
     "middleware.presence",
     "middleware.settings",
     "middleware.tasks",
@@ -76,7 +77,7 @@ EDGES = (
 WORLD = ("time", "socket", "threading", "asyncio", "selectors", "subprocess", "secrets", "twisted.internet.reactor")
 GUARDED = ("middleware", "agents", "drivers")
 
-ON_DEMAND = ("middleware.deployment", "middleware.verdict")
+ON_DEMAND = ("middleware.deployment", "middleware.explanation", "middleware.verdict")
 HEAVY = ("flask", "jinja2", "cv2", "numpy", "pymunk", "serial", "playwright")
 
 

@@ -11,9 +11,10 @@ from dataclasses import asdict
 from typing import Any
 
 from middleware.entangled.record import Record
+from middleware.explanation import explained
 from middleware.presence import DEVICES, Device, devices_of
 from middleware.tasks import TASKS, Task, group_key, member_of, outcome_of, refusals, task_of
-from middleware.verdict import explained, verdict_of, verdicts_key
+from middleware.verdict import verdict_of, verdicts_key
 from webnode.state import Departed, State, state_of
 
 Read = Callable[[bytes], list[Record]]

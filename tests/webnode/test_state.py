@@ -9,7 +9,8 @@ from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.verdict import Difference, Explanation, Reported, Ruling
+from middleware.explanation import Difference, Explanation, Ruling
+from middleware.verdict import Reported
 from webnode.state import Departed, group_view, state_of
 
 
