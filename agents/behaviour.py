@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import importlib
 import random
-from dataclasses import dataclass
-from typing import Protocol
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
 
+from agents.context import Context
 from drivers.reading import Action, Observation
 from middleware.errors import MissingExtra, UnknownTask
 from middleware.tasks import Task
@@ -22,21 +23,6 @@ KINDS = {
 ENTRY_POINTS = "swarm_node.behaviours"
 VISION = ("cv2", "numpy")
 STAND = {"base.vx": 0.0, "base.vy": 0.0, "base.wz": 0.0}
-
-
-@dataclass(frozen=True)
-class Context:
-    """Under which right a body acts ``now``: the lease's ``token``, and its ``deadline`` on the same clock.
-
-    ``is_resumed`` says that the token is the one of the call before, so that nobody acted in between: go on.  With a
-    new token, held since ``began``, another may have acted: what was done so far is still remembered, and may be void.
-    """
-
-    now: float
-    token: int = 0
-    deadline: float = 0.0
-    began: float = 0.0
-    is_resumed: bool = False
 
 
 class Behaviour(Protocol):
@@ -64,13 +50,19 @@ class Behaviour(Protocol):
         """What to do next to get it done; None when it is done."""
 
 
-def behaviour_for(task: Task, rng: random.Random) -> Behaviour:
+def behaviour_for(
+    task: Task, rng: random.Random, deployed: Mapping[tuple[str, str], Callable[..., Any]] | None = None
+) -> Behaviour:
     """The behaviour for ``task.kind``: a built-in one, or an entry point of ``swarm_node.behaviours``.
+
+    ``deployed:x`` is the module ``x`` that an operator pushed, among those in ``deployed``.
 
     A task comes from the wire, so its kind is looked up among what is installed here and never imported as it stands.
     Raises ``UnknownTask``, which names those there are or says what is wrong with the task's parameters, and
     ``MissingExtra`` where the behaviour's libraries are not installed.
     """
+    if task.kind.startswith("deployed:"):
+        return _deployed(task, rng, deployed or {})
     target = KINDS.get(task.kind)
     if target is None:
         from importlib.metadata import entry_points  # heavy, and most nodes never come here
@@ -92,3 +84,16 @@ def behaviour_for(task: Task, rng: random.Random) -> Behaviour:
     except (TypeError, ValueError, AttributeError, LookupError) as error:
         raise UnknownTask(f"a task of kind {task.kind!r} cannot have these parameters: {error}") from error
     return made
+
+
+def _deployed(task: Task, rng: random.Random, deployed: Mapping[tuple[str, str], Callable[..., Any]]) -> Behaviour:
+    from agents.guarded import Guarded  # most nodes never come here
+
+    make = deployed.get(("behaviour", task.kind.removeprefix("deployed:")))
+    if make is None:
+        known = ", ".join(sorted(f"deployed:{each}" for kind, each in deployed if kind == "behaviour")) or "none"
+        raise UnknownTask(f"no behaviour {task.kind!r} here ([deployment] of this node); there are {known}")
+    try:
+        return Guarded(make(task.parameters, rng), STAND)
+    except Exception as error:  # a module of somebody else may fail in any way
+        raise UnknownTask(f"a task of kind {task.kind!r} cannot have these parameters: {error}") from error

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from agents.epoch import is_older
+from middleware.presence import IDLE
 from middleware.tasks import Member, is_bid, is_stale
 
 LINGERING = 3.0
@@ -25,6 +26,7 @@ class Circle:
         self._known: dict[str, Member] = {}
         self._came: dict[str, float] = {}
         self._left: dict[str, tuple[Member, float]] = {}
+        self._dismissed: dict[str, Member] = {}
         self.echo: Member | None = None
         """The newest report of this participant itself that came back: after a restart it is an older life's."""
 
@@ -49,6 +51,12 @@ class Circle:
             came[told.uuid] = now if is_news else self._came[told.uuid]
         self._left.update((uuid, (member, now)) for uuid, member in self._known.items() if uuid not in known)
         self._known, self._came = known, came
+        self._dismissed = {uuid: was for uuid, was in self._dismissed.items() if known.get(uuid) == was}
+
+    def dismiss(self, uuid: str) -> None:
+        """Count what ``uuid`` said for nothing until it says something new: it gave up what it had."""
+        if uuid in self._known:
+            self._dismissed[uuid] = self._known[uuid]
 
     def members(self, now: float) -> list[Member]:
         """The others with what counts now, in the order of their uuids: a bid that is none or stale is left out."""
@@ -60,6 +68,8 @@ class Circle:
         return max((member.epoch for member in self._known.values()), default=0)
 
     def _sound(self, member: Member, now: float) -> Member:
+        if member.uuid in self._dismissed:
+            return replace(member, cost=None, available=False, status=IDLE)
         since = now - self._came[member.uuid]
         is_sound = is_bid(member.cost) and not is_stale(member, since) and math.isfinite(since)
         return member if member.cost is None or is_sound else replace(member, cost=None)

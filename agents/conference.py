@@ -50,6 +50,10 @@ class Conference:
         self._epoch.hear(echo.epoch)
         return replace(me, epoch=echo.epoch, serial=echo.serial)
 
+    def dismiss(self, uuid: str) -> None:
+        """Count what ``uuid`` said for nothing until it says something new."""
+        self._circle.dismiss(uuid)
+
     def decide(self, task: Task, me: Member, now: float) -> Decision:
         """Who should act, of all that have reported (``me`` included)."""
         others = self.others(now)

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from middleware.consensus.nearest import Nearest
 from middleware.consensus.strategy import Consensus, ConsensusAlgorithm, Report
 from middleware.presence import EXECUTING
 from middleware.tasks import Member, is_bid
@@ -21,7 +20,7 @@ class Decision:
 
     ``order`` are all who could act, the assigned one first and then those that stand by; ``basis`` is everything that
     the decision was computed from, so that an equal basis gives an equal decision; ``fault`` says how the strategy
-    failed where it did, and the nearest was taken instead.
+    failed where it did, and the nearest was taken instead; ``consensus`` is what was found before the hysteresis.
     """
 
     assigned: str | None
@@ -30,6 +29,7 @@ class Decision:
     order: tuple[str, ...] = ()
     basis: tuple[object, ...] = ()
     fault: str = ""
+    consensus: Consensus | None = None
 
 
 def decide(
@@ -39,7 +39,7 @@ def decide(
     waiting_period: float,
     since_first: float | None,
 ) -> Decision:
-    """The consensus point of ``members``.
+    """The consensus point of ``members``, as ``strategy`` finds it (a foreign one from behind its guard).
 
     ``since_first`` is the seconds since the first report was seen, None when there is none.  Within the waiting period
     nobody is assigned, unless everybody has reported (or has no body free to do so), or somebody acts already; whoever
@@ -59,34 +59,23 @@ def decide(
     if missing and since_first < waiting_period and not acting:
         return Decision(None, "", f"waiting for {', '.join(missing)}", basis=basis)
     holder = reports[acting[0].uuid] if acting else None
-    consensus, best, fault = _chosen(list(reports.values()), holder, strategy, hysteresis)
+    consensus, best = _chosen(list(reports.values()), holder, strategy, hysteresis)
+    fault = consensus.reason if consensus.strategy not in ("", strategy.name) else ""
     if best is None:
-        return Decision(None, consensus.digest, "no report counts", basis=basis, fault=fault)
+        return Decision(None, consensus.digest, "no report counts", basis=basis, fault=fault, consensus=consensus)
     name, cost = present[best].name, reports[best].cost
     why = f"{name}, {cost:.2f}, best of {len(reports)}"
     rest = (agent for agent in (consensus.assigned_agent, *consensus.standby) if agent is not None)
     order = tuple(dict.fromkeys((best, *rest)))
-    return Decision(best, consensus.digest, f"{why}; {fault}" if fault else why, order, basis, fault)
+    return Decision(best, consensus.digest, f"{why}; {fault}" if fault else why, order, basis, fault, consensus)
 
 
 def _chosen(
     reports: Sequence[Report], holder: Report | None, strategy: ConsensusAlgorithm, hysteresis: float
-) -> tuple[Consensus, str | None, str]:
-    """What the strategy finds, and who should act; where it fails the nearest should, and the fault is told."""
-    try:
-        return *_asked(reports, holder, strategy, hysteresis), ""
-    except Exception as error:  # a strategy is somebody else's
-        fault = f"strategy {strategy.name} failed ({error or type(error).__name__}), nearest decides"
-        return *_asked(reports, holder, Nearest(), hysteresis), fault[:120]
-
-
-def _asked(
-    reports: Sequence[Report], holder: Report | None, strategy: ConsensusAlgorithm, hysteresis: float
 ) -> tuple[Consensus, str | None]:
+    """What the strategy finds, and who should act: whoever does already, unless another is clearly better."""
     consensus = strategy.find(list(reports))
     best = next((r for r in reports if r.agent == consensus.assigned_agent), None)
-    if best is None and consensus.assigned_agent is not None:
-        raise LookupError(f"it names {consensus.assigned_agent}, who reported nothing")
     if holder is not None and (best is None or not strategy.improves(holder, best, hysteresis)):
         best = holder
     return consensus, None if best is None else best.agent

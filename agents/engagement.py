@@ -13,6 +13,7 @@ from typing import Any
 
 from twisted.internet.interfaces import IReactorTime
 
+from agents.account import Account
 from agents.behaviour import STAND, Behaviour
 from agents.conference import Conference
 from agents.decision import Decision
@@ -26,7 +27,10 @@ from middleware.commitment.lessee import Lease, Lessee
 from middleware.consensus.strategy import ConsensusAlgorithm
 from middleware.order import PAUSE, Order
 from middleware.tasks import COMPLETED, FAILED, Member, Result, Task
+from middleware.verdict import Verdict
 
+HEIRS = 2
+"""So many of those that wait are ready to take over at once: each asks the council now and then."""
 SEARCH_TTL = 0.5
 """Seconds for which a motion that needs no lease (to look around) is allowed at a time."""
 
@@ -45,6 +49,7 @@ class Engagement:
     ``tell`` publishes this agent's report; ``conclude`` records the outcome; ``say`` writes a line for people; ``halt``
     stops the body now; ``token`` is the highest token that the body has obeyed so far; ``age`` is how old the task was
     when the agent took it up.  With a ``lessee`` the agent has its body for this task, without one it only listens.
+    ``justify`` is told why, at each decision.
     """
 
     def __init__(
@@ -68,6 +73,7 @@ class Engagement:
         self.order: Order | None = None
         self.token = token
         self.lessee: Lessee | None = None
+        self.justify: Callable[[Verdict], None] = lambda verdict: None
         self._reporter = Reporter(behaviour, clock)
         self._behaviour = behaviour
         self._execution = Execution(behaviour, task.stall_limit)
@@ -77,6 +83,7 @@ class Engagement:
         self._say = say
         self._halt = halt
         self._conference = Conference(me.uuid, strategy)
+        self._account = Account(task, strategy)
         self._formation = Formation(me.uuid, behaviour)
         self._began = clock.seconds()
         self._age = age
@@ -164,8 +171,9 @@ class Engagement:
         decision = self._decision(now)
         if decision.assigned == self.me.uuid or self._must_go_on(decision):
             return self._act(decision, now)
-        self._give_back()
+        self._yield()
         self._place(decision)
+        self._line_up()
         return self._stand_by(decision, now)
 
     def fence(self) -> None:
@@ -184,14 +192,26 @@ class Engagement:
         self.lessee = None
 
     def abandon(self) -> None:
-        """Leave the task: the lease is given back (the caller has stopped the body)."""
-        if self.lessee is not None:
+        """Leave the task (the caller has stopped the body): give the lease back, for good where the task is done."""
+        if self.lessee is None:
+            return
+        if self._concluding and self.result is not None:
+            self.lessee.end()
+        else:
             self.lessee.release()
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
     def _decision(self, now: float) -> Decision:
         decision = self._conference.decide(self.task, self.me, now)
+        for _ in range(len(self._conference)):
+            if self.lessee is None or self.lessee.lease is None or self.course.state is not State.WAITING:
+                break
+            # It stood by and the lease is its own: who was to act has given up, and the news of that is on its way.
+            if decision.assigned in (None, self.me.uuid):
+                break
+            self._conference.dismiss(str(decision.assigned))
+            decision = self._conference.decide(self.task, self.me, now)
         if decision.fault and decision.fault != self._fault:
             self._say(decision.fault)
         self._fault = decision.fault
@@ -252,6 +272,10 @@ class Engagement:
             self._say(f"stands by: {decision.why}")
         told: dict[str, Any] = {"assigned": assigned, "digest": decision.digest, "why": decision.why}
         self._publish(token=token, progress=progress, post=post, **told)
+        now = self._clock.seconds()
+        verdict = self._account.of(decision, self.me, self._conference.others(now), token, now)
+        if verdict is not None:
+            self.justify(verdict)
 
     def _publish(self, again: bool = False, **changes: object) -> None:
         status, state = self.course.state.status, str(self.course)
@@ -259,6 +283,23 @@ class Engagement:
         if again or told != replace(self.me, epoch=told.epoch):  # a round alone is told with the next report
             self.me = replace(told, load=self.load, serial=self.me.serial + 1 if told.epoch == self.me.epoch else 0)
             self._tell(self.me)
+
+    def _yield(self) -> None:
+        """Let another act: stop the body, and only then give the lease back."""
+        was_claiming = self.course.state is State.CLAIMING
+        was_acting = self._stop(State.RELEASING)
+        if was_acting:
+            self._say("gives the task back")
+        if self.lessee is not None and (was_acting or was_claiming or self.lessee.lease is not None):
+            self.lessee.release()
+
+    def _line_up(self) -> None:
+        """Be ready to take over at once, where few are before this agent."""
+        assert self.lessee is not None
+        if self.course.state is State.WAITING and 0 < self.course.rank <= HEIRS:
+            self.lessee.stand_by(self.course.rank)
+        else:
+            self.lessee.release()
 
     def _give_back(self) -> None:
         """Stop the body where it acts, and only then give the lease back."""

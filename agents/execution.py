@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from agents.behaviour import Behaviour, Context
+from agents.behaviour import Behaviour
+from agents.context import Context
 from drivers.reading import Action
 
 SHARE = 0.01

@@ -16,7 +16,7 @@ from agents.engagement import Engagement
 from agents.part import Part
 from drivers.driver import Driver
 from drivers.reading import Observation
-from middleware.consensus.strategy import strategy_for
+from middleware.consensus.selection import guarded
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.record import Record
 from middleware.errors import SwarmError
@@ -145,7 +145,9 @@ class Agent(Service):
 
     def _engage(self, task: Task) -> None:
         try:
-            behaviour, strategy = behaviour_for(task, self._rng), strategy_for(task.strategy)
+            deployed = self._node.deployed
+            behaviour = behaviour_for(task, self._rng, deployed)
+            strategy = guarded(task.strategy, deployed=deployed)
         except SwarmError as error:
             self._docket.bury(task.task_id, self._clock.seconds())
             return self._say(str(error))

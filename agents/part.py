@@ -44,6 +44,7 @@ class Part:
         self.engagement = Engagement(
             task, me, behaviour, strategy, clock, token, self._tell, self._conclude, self._say, halt, age
         )
+        self.engagement.justify = node.justify
         self._group = node.group(task, self.engagement.heard, self._ordered)
 
     def report(self) -> None:

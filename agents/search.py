@@ -10,8 +10,9 @@ import math
 import random
 from collections.abc import Mapping
 
-from agents.behaviour import STAND, Context
+from agents.behaviour import STAND
 from agents.circling import Circling
+from agents.context import Context
 from agents.exploration import TURN_GAIN, TURN_SPEED, WALK, Exploration, Pose, clipped
 from agents.formation import Post
 from agents.vision import Sighting, Size, find_target

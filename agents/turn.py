@@ -6,7 +6,8 @@ import math
 import random
 from collections.abc import Mapping
 
-from agents.behaviour import STAND, Context
+from agents.behaviour import STAND
+from agents.context import Context
 from drivers.reading import Action, Observation
 
 SPEED = 1.2

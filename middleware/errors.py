@@ -8,6 +8,7 @@
       UnknownTask        ask for a kind of task, or a behaviour, that exists
       UnknownStrategy    ask for a consensus strategy that exists
       UnknownAgent       ask for an agent that exists
+      Undeployable       mend the module, and push it again as a higher version
 """
 
 from __future__ import annotations
@@ -53,3 +54,15 @@ class UnknownStrategy(SwarmError):
 
 class UnknownAgent(SwarmError):
     """No agent has this name, or it cannot be loaded."""
+
+
+class Undeployable(SwarmError):
+    """A module that was pushed to the team cannot run: its name, and what is wrong with it."""
+
+    def __init__(self, name: str, problem: str) -> None:
+        super().__init__(name, problem)
+        self.name = name
+        self.problem = problem
+
+    def __str__(self) -> str:
+        return " ".join(f"the module {self.name} cannot run: {self.problem}".split())

@@ -7,7 +7,7 @@ ask the council for a lease, send a camera's frames, and call a peer by name.
 from __future__ import annotations
 
 import random
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from middleware.dissemination.bidding import Bidding
     from middleware.dissemination.dissemination import Dissemination
     from middleware.dissemination.party import OnSummary
+    from middleware.verdict import Verdict
 
 COUNCIL = 3
 CAMERA = "camera"
@@ -54,7 +55,9 @@ COUNTING = 2.0
 class SwarmNode(Service):
     """One node of a team.
 
-    ``device`` is what the node says of itself; ``wall`` gives seconds of the wall clock, for people only.
+    ``device`` is what the node says of itself; ``wall`` gives seconds of the wall clock, for people only.  ``deployed``
+    is what operators pushed and its owner allowed: (kind, name) to what makes it.  ``later(seconds, call, ...)`` is a
+    timer that ends with the node.
     """
 
     _log = Logger()
@@ -79,6 +82,8 @@ class SwarmNode(Service):
         self.entangled = EntangledNode(identity, team_key, network, store, clock, rng, lease, wall)
         self.uuid = identity.node_id.hex()
         self._chores = Background(clock)
+        self.later = self._chores.later
+        self.deployed: Mapping[tuple[str, str], Callable[..., Any]] = {}
         self.presence = Presence(device, self._announce, self._chores.later)
         self.streams = Streams(self.entangled.endpoint, clock)
         self.joined: Deferred[None] = Deferred()
@@ -232,6 +237,11 @@ class SwarmNode(Service):
     def conclude(self, task_id: str, result: Result) -> Deferred[Stored]:
         """Record how a task ended, as somebody who takes no part in it."""
         return self.entangled.put(group_key(task_id), RESULT, result.packed(), "team")
+
+    def justify(self, verdict: Verdict) -> None:
+        """Record why this node's agent decided so; stays when this node goes."""
+        put = maybeDeferred(self.entangled.put, verdict.key, verdict.slot, verdict.packed(), "team")
+        self._quietly(put)
 
     def lessee(self, task: Task, changed: Callable[[], None], floor: int) -> Lessee:
         """The claimant of the right to act on ``task``, in this node's name.

@@ -31,7 +31,8 @@ class Device:
     """What a device says of itself (thesis, Algorithm 4.3).
 
     ``uuid`` is its node id in hex; ``joined`` its place in the order of joining; ``since`` seconds of the wall clock,
-    for people; ``messages`` are its newest (time, text) lines.
+    for people; ``messages`` are its newest (time, text) lines; ``deployed`` maps each module that was pushed to
+    the version and digest that it runs, or says that it was refused.
     """
 
     uuid: str
@@ -47,6 +48,7 @@ class Device:
     status: str = IDLE
     messages: tuple[tuple[float, str], ...] = ()
     network: Mapping[str, int] = field(default_factory=dict)
+    deployed: Mapping[str, str] = field(default_factory=dict)
 
     def with_message(self, now: float, text: str) -> Device:
         """This device with one more line; the oldest goes when there are more than ``MESSAGES_KEPT``."""
@@ -54,14 +56,18 @@ class Device:
         return replace(self, messages=(*self.messages, line)[-MESSAGES_KEPT:])
 
     def packed(self) -> bytes:
-        """The value of its record; the oldest messages and the description give way where it would be too large."""
+        """The value of its record; where it is too large, messages give way, then description, then ``deployed``."""
         device = self
         while True:
             value = bytes(msgpack.packb(asdict(device)))
-            if len(value) <= MAX_VALUE or not (device.messages or device.description):
+            if len(value) <= MAX_VALUE or not (device.messages or device.description or device.deployed):
                 return value
-            shorter = {"messages": device.messages[1:]} if device.messages else {"description": ""}
-            device = replace(device, **shorter)
+            if device.messages:
+                device = replace(device, messages=device.messages[1:])
+            elif device.description:
+                device = replace(device, description="")
+            else:
+                device = replace(device, deployed={})
 
 
 def device_of(record: Record) -> Device | None:
@@ -84,6 +90,8 @@ def device_of(record: Record) -> Device | None:
         and all(is_number(n) for n in (device.since, *(t for t, _ in device.messages)))
         and are_capabilities(device.capabilities)
         and isinstance(device.network, dict)
+        and isinstance(device.deployed, dict)
+        and all(isinstance(name, str) and isinstance(label, str) for name, label in device.deployed.items())
         and all(isinstance(name, str) and is_number(n) for name, n in device.network.items())
     )
     return device if lawful else None

@@ -69,6 +69,33 @@ def secret(most: int) -> Rule:
     return _rule(check)
 
 
+def truth() -> Rule:
+    """A rule for true or false."""
+
+    def check(value: object) -> bool:
+        if type(value) is not bool:
+            raise Wrong(f"must be true or false, is {shown(value)}", "write true or false, without quotes")
+        return value
+
+    return _rule(check, lambda word: {"true": True, "false": False}.get(word, word))
+
+
+def patterns(expression: str, most: int, example: str) -> Rule:
+    """A rule for a list of at most ``most`` texts that match ``expression`` from end to end."""
+    remedy = f"write a list such as [{example}]"
+
+    def check(value: object) -> tuple[str, ...]:
+        listed = _listed(value, remedy)
+        for item in listed:
+            if not isinstance(item, str) or not re.fullmatch(expression, item, re.ASCII):
+                raise Wrong(f"{shown(item)} does not match {expression}", remedy)
+        if len(listed) > most:
+            raise Wrong(f"has {len(listed)} entries, more than {most}", "leave some out")
+        return tuple(dict.fromkeys(str(item) for item in listed))
+
+    return _rule(check, _comma_separated)
+
+
 def port() -> Rule:
     """A rule for a port number."""
 

@@ -1,7 +1,7 @@
 """Settings: a node's TOML file, checked and frozen; every knob with its unit and what more and less of it do.
 
-Tables: ``[node]``, ``[agent]``, ``[driver]`` and ``[web]``, one dataclass each.  Whatever is wrong is one
-``BadSetting``, which says where, what, and what to write instead.
+Tables: ``[node]``, ``[agent]``, ``[driver]``, ``[web]`` and ``[deployment]``, one dataclass each.  Whatever is wrong
+is one ``BadSetting``, which says where, what, and what to write instead.
 """
 
 from __future__ import annotations
@@ -120,11 +120,31 @@ class WebSettings:
     """Where the simulated yard takes its operator's commands, as ``"host:port"``; none where empty."""
 
 
+@dataclass(frozen=True)
+class DeploymentSettings:
+    """``[deployment]``: whether code that operators push into the running team may run on this node."""
+
+    allow: bool = field(default=False, metadata=setting.truth())
+    """**Whoever may push can do on this machine whatever the node can.**  The signature says from whom a module comes,
+    not that it is harmless; there is no cage.  False: nothing is ever fetched, loaded or run."""
+
+    operators: tuple[str, ...] = field(
+        default=(), metadata=setting.patterns(r"[0-9a-f]{64}", 8, '"5f0c...", as `swarm deploy keys` shows them')
+    )
+    """Public keys of the nodes whose operators may push, each 64 hexadecimal digits.  Empty: nobody may."""
+
+    modules: tuple[str, ...] = field(
+        default=(), metadata=setting.patterns(r"[a-z][a-z0-9_-]{0,31}", 8, '"nearest-left"')
+    )
+    """Names of the modules that may run here, at most 8.  Any other is refused, whoever pushes it."""
+
+
 TABLES: dict[str, type[Any]] = {
     "node": NodeSettings,
     "agent": AgentSettings,
     "driver": DriverSettings,
     "web": WebSettings,
+    "deployment": DeploymentSettings,
 }
 
 
@@ -136,6 +156,7 @@ class Settings:
     agent: AgentSettings = AgentSettings()
     driver: DriverSettings = DriverSettings()
     web: WebSettings = WebSettings()
+    deployment: DeploymentSettings = DeploymentSettings()
     origin: str = ""
 
     @classmethod

@@ -18,9 +18,9 @@ LARGEST = 2**53
 """No number of ours is larger: up to here every reader of the page's JSON keeps them exact."""
 
 
-def mapping_of(record: Record) -> dict[str, Any] | None:
-    """The mapping in a record's value, or None where there is none or it is too large; never raises."""
-    if record.value is None or len(record.value) > MAX_VALUE:
+def mapping_of(record: Record, most: int = MAX_VALUE) -> dict[str, Any] | None:
+    """The mapping in a record's value, or None where there is none or it has over ``most`` bytes; never raises."""
+    if record.value is None or len(record.value) > most:
         return None
     try:
         content = msgpack.unpackb(record.value, strict_map_key=True)

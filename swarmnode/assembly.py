@@ -36,7 +36,8 @@ class Seams:
     """Where a node touches the world; everything else is logic.
 
     ``network`` makes the node's port each time that it enters the network; ``connector`` opens links to robots and
-    yards (None: TCP); ``wall`` is unix time, for people.
+    yards (None: TCP); ``wall`` is unix time, for people; ``shelf`` is where deployed modules are kept (None: they are
+    forgotten when the node ends).
     """
 
     clock: IReactorTime
@@ -45,6 +46,7 @@ class Seams:
     rng: random.Random
     wall: Callable[[], float]
     connector: Any = None
+    shelf: Any = None
 
 
 @dataclass
@@ -102,7 +104,26 @@ def assembled(settings: Settings, seams: Seams) -> Assembly:
         seams.wall,
         node_settings.presence_lease,
     )
+    if settings.deployment.allow:
+        _deployable(node, settings, seams)
     agent = None
     if settings.agent.module and driver is not None:
         agent = agent_named(settings.agent.module)(node, driver, seams.clock, seams.rng)
     return Assembly(node, agent, driver)
+
+
+def _deployable(node: SwarmNode, settings: Settings, seams: Seams) -> None:
+    """Let the node run what its operators push; a node that does not allow it loads none of this."""
+    from middleware.deployment.deployment import Deployment
+    from middleware.deployment.shelf import MemoryShelf
+
+    shelf = MemoryShelf() if seams.shelf is None else seams.shelf
+    deployment = Deployment(node.entangled, node.presence, node.wall, node.later, settings.deployment, shelf)
+    node.deployed = deployment.modules
+    deployment.open()
+
+    def follow(_: None) -> None:
+        if node.running:
+            deployment.follow()
+
+    node.joined.addCallback(follow)

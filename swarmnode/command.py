@@ -13,6 +13,8 @@ WORKS: dict[str, tuple[str, str]] = {
     "demo": ("sim.demo.demonstration", "three robots, a yard and the page, on this machine"),
     "yard": ("sim.server", "the yard alone"),
     "trials": ("swarmnode.rehearsal", "both experiments, many times"),
+    "deploy": ("swarmnode.deploy", "push a strategy or a behaviour to the team, see who runs it, go back"),
+    "why": ("swarmnode.why", "who was chosen for a task, and why"),
 }
 GROUPS = {
     "dht": "get, put, find, watch, remove: the distributed hash table",

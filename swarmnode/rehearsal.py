@@ -6,6 +6,7 @@ It wires what the front door wires, with the twins in memory of clock, wire and 
 from __future__ import annotations
 
 import random
+from collections.abc import Mapping
 from typing import Any
 
 from agents.catalogue import DEMO, TASKS
@@ -69,8 +70,11 @@ class VirtualTeam:
         self._departed = Departed()
         self.clock.advance(self.JOINING)
 
-    def add(self, name: str) -> None:
-        """Start the node ``name``, the laptop, one of the dogs or of the others."""
+    def add(self, name: str, tables: Mapping[str, Mapping[str, Any]] | None = None, shelf: Any = None) -> None:
+        """Start the node ``name``, the laptop, one of the dogs or of the others, with further ``tables`` of settings.
+
+        ``shelf`` is where it keeps deployed modules.
+        """
         port = self.address(name).port
         mapping: dict[str, Any] = {"node": {"name": name, "port": port, "team_key": str(self._seed)}}
         if name != self.BOOTSTRAP:
@@ -78,6 +82,7 @@ class VirtualTeam:
         if name in self.DOGS:
             mapping["agent"] = {"module": "search"}
             mapping["driver"] = {"kind": "sim", "options": {"robot": name, "camera_fps": self._fps}}
+        mapping.update(tables or {})
         frost = self.frosts[name] = Frost(self.clock)
         connector = self.connectors[name] = self.yard.connector()
         seams = Seams(
@@ -87,6 +92,7 @@ class VirtualTeam:
             random.Random(f"{self._seed}/{name}"),
             self.clock.seconds,
             frost.connector(connector),
+            shelf,
         )
         self.services[name] = NodeService(Settings.from_mapping(mapping, f"seed {self._seed}"), seams)
         self.services[name].startService()

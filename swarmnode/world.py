@@ -40,7 +40,12 @@ def real_seams(settings: Settings, reactor: Any) -> Seams:
         deliver, durable = reactor.callFromThread, settings.node.durable
         store = SqliteStore.open(Path(path), reactor.seconds(), *quota, deliver=deliver, durable=durable)
     network = partial(UdpNetwork, reactor, settings.node.host, settings.node.port)
-    return Seams(reactor, network, store, rng, time.time)
+    shelf = None
+    if settings.deployment.allow and path != IN_MEMORY:
+        from middleware.deployment.shelf import FileShelf
+
+        shelf = FileShelf(Path(f"{path}.deployed"))
+    return Seams(reactor, network, store, rng, time.time, shelf=shelf)
 
 
 LookUp = Callable[..., Sequence[tuple[Any, ...]]]

@@ -75,6 +75,7 @@ PURE = (
     "middleware.dissemination.teller",
     "middleware.dissemination.tree",
     "middleware.consensus.weighted_vote",
+    "middleware.deployment.manifest",
     "middleware.entangled.replication.cache",
     "middleware.entangled.errors",
     "middleware.entangled.identity",
@@ -93,9 +94,11 @@ PURE = (
     "middleware.entangled.wire.session",
     "middleware.errors",
     "middleware.order",
+    "middleware.explanation",
     "middleware.presence",
     "middleware.settings",
     "middleware.tasks",
+    "middleware.verdict",
     "sim.demo.configuration",
     "sim.demo.experiment",
     "sim.demo.story",
@@ -115,6 +118,7 @@ EDGES = (
 WORLD = ("time", "socket", "threading", "asyncio", "selectors", "subprocess", "secrets", "twisted.internet.reactor")
 GUARDED = ("middleware", "agents", "drivers")
 
+ON_DEMAND = ("middleware.deployment", "middleware.explanation", "middleware.verdict")
 HEAVY = ("flask", "jinja2", "cv2", "numpy", "pymunk", "serial", "playwright")
 
 
@@ -272,6 +276,13 @@ class PurityTests(SynchronousTestCase):
         )
         child = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=60)
         self.assertEqual((child.returncode, child.stdout.strip()), (0, ""), child.stderr)
+
+    def test_plain_node_loads_what_it_needs(self) -> None:
+        """A node without agent, page and deployment loads neither the verdicts nor what runs foreign modules."""
+        program = "import sys, swarmnode.plugin; print(*[n for n in sys.modules if n.startswith(('middleware.',))])"
+        child = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=60)
+        unwanted = [name for name in child.stdout.split() if _within(name, *ON_DEMAND)]
+        self.assertEqual((child.returncode, unwanted), (0, []), child.stderr)
 
 
 class PackagingTests(SynchronousTestCase):

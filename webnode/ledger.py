@@ -11,9 +11,11 @@ from dataclasses import asdict
 from typing import Any
 
 from middleware.entangled.record import Record
+from middleware.explanation import explained
 from middleware.order import PAUSE, order_of
 from middleware.presence import DEVICES, Device, devices_of
 from middleware.tasks import TASKS, Task, group_key, member_of, outcome_of, refusals, task_of
+from middleware.verdict import verdict_of, verdicts_key
 from webnode.state import Departed, State, state_of
 
 Read = Callable[[bytes], list[Record]]
@@ -29,7 +31,7 @@ def state_from(read: Read, departed: Departed, node: str, now: float) -> State:
         records = read(group_key(task.task_id))
         members = [m for r in records if (m := member_of(r)) is not None]
         groups[task.task_id] = [asdict(member) for member in members]
-        rows.append(_task_row(task, records, devices))
+        rows.append({**_task_row(task, records, devices), "why": _why(task, read(verdicts_key(task.task_id)))})
     views = [_device_row(device) for device in devices]
     return state_of(views, rows, groups, departed=departed.of(views, now), node=node)
 
@@ -83,3 +85,8 @@ def _task_row(task: Task, records: list[Record], devices: list[Device]) -> dict[
         "deadline": task.deadline,
         "result": None if outcome is None else {"by": outcome.by, "took": outcome.took},
     }
+
+
+def _why(task: Task, records: list[Record]) -> dict[str, Any]:
+    verdicts = [verdict for record in records if (verdict := verdict_of(record)) is not None]
+    return asdict(explained(verdict for verdict in verdicts if verdict.task == task.task_id))

@@ -60,7 +60,8 @@ def state_of(
 
 def device_view(fields: Fields) -> State:
     """One device as the page shows it; fields that are missing or no lawful values become empty ones."""
-    network = fields.get("network")
+    network, deployed = fields.get("network"), fields.get("deployed")
+    deployed = deployed if isinstance(deployed, Mapping) else {}
     return {
         "uuid": text(fields.get("uuid"), limit=64),
         "name": text(fields.get("name"), "unnamed", 64),
@@ -75,13 +76,14 @@ def device_view(fields: Fields) -> State:
         "status": _status(fields.get("status"), DEVICE_STATUSES),
         "messages": _messages(fields.get("messages")),
         "network": {text(key): number(value) for key, value in network.items()} if isinstance(network, Mapping) else {},
+        "deployed": {text(key): text(value, limit=64) for key, value in deployed.items()},
         "gone": None,
     }
 
 
 def task_view(fields: Fields) -> State:
     """One task as the page shows it."""
-    note, result = fields.get("note"), fields.get("result")
+    note, result, why = fields.get("note"), fields.get("result"), fields.get("why")
     return {
         "id": text(fields.get("id"), limit=64),
         "kind": text(fields.get("kind"), limit=64),
@@ -97,6 +99,7 @@ def task_view(fields: Fields) -> State:
         "status": _status(fields.get("status"), TASK_STATUSES),
         "note": "\n".join(texts(note.split("\n"))) if isinstance(note, str) else "",
         "result": _result(result) if isinstance(result, Mapping) else None,
+        "why": [_ruling_view(epoch) for epoch in why.get("epochs", ())] if isinstance(why, Mapping) else [],
     }
 
 
@@ -173,6 +176,34 @@ def _member_view(fields: Fields) -> State:
 
 def _result(fields: Fields) -> State:
     return {"by": text(fields.get("by")), "took": number(fields.get("took"))}
+
+
+def _ruling_view(fields: Fields) -> State:
+    """One epoch of ``middleware.explanation.Explanation``: a row for each who reported, and for each who differs."""
+    standby, winner = list(fields["standby"]), fields["winner"]
+    differ = {each["name"]: each["what"] for each in fields["differ"]}
+    rows: dict[str, State] = {}
+    for report in fields["reports"]:
+        name = report["name"]
+        note = "goes" if report["agent"] == winner else "stands by" if name in standby else ""
+        rows[name] = {"name": text(name, limit=64), "cost": number(report["cost"]), "note": note}
+    for name in (*fields["silent"], *differ):
+        rows.setdefault(name, {"name": text(name, limit=64), "cost": None, "note": ""})
+    for name, what in differ.items():
+        rows[name]["note"] = f"differs: {text(what, limit=200)}"
+    return {
+        "epoch": count(fields["epoch"]),
+        "chosen": text(fields["chosen"], limit=64),
+        "agree": len(fields["agree"]),
+        "of": count(fields["of"]),
+        "differ": texts(list(differ)),
+        "rule": text(f"{fields['rule']} {fields['version']}".strip(), limit=100),
+        "hysteresis": text(fields["hysteresis"], limit=200),
+        "digest": text(fields["digest"], limit=64),
+        "token": count(fields["token"]),
+        "reported": count(fields["reported"]),
+        "rows": list(rows.values()),
+    }
 
 
 def _status(value: object, lawful: Sequence[str]) -> str:

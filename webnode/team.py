@@ -16,6 +16,7 @@ from middleware.node import CAMERA, SwarmNode
 from middleware.order import PAUSE, RESUME, Order
 from middleware.presence import DEVICES, devices_of
 from middleware.tasks import CANCELLED, TASKS, Result, Task, group_key, outcome_of, task_of
+from middleware.verdict import verdicts_key
 from webnode.errors import Refusal
 from webnode.ledger import refused_by
 
@@ -53,6 +54,7 @@ class TeamDesk:
         self._demo = demo
         self._yard = yard
         self._groups: dict[str, Watch] = {}
+        self._reasons: dict[str, Watch] = {}
         self._devices = node.watch_devices(lambda records: None, keep=True)
         self._tasks = node.watch_tasks(self._follow, keep=True)
 
@@ -64,7 +66,8 @@ class TeamDesk:
             return self._devices.records
         if key == TASKS:
             return self._tasks.records
-        return next((watch.records for watch in self._groups.values() if watch.key == key), [])
+        watches = (*self._groups.values(), *self._reasons.values())
+        return next((watch.records for watch in watches if watch.key == key), [])
 
     def watch(self, uuid: str, on_frame: Callable[[int, bytes], None]) -> Callable[[], None]:
         """Look through the camera of the device ``uuid`` until what is returned is called."""
@@ -148,6 +151,9 @@ class TeamDesk:
             task = task_of(record)
             if task is not None and task.task_id not in self._groups:
                 self._groups[task.task_id] = self._node.watch_group(task.task_id, lambda records: None, keep=True)
+                self._reasons[task.task_id] = self._node.entangled.watch(
+                    verdicts_key(task.task_id), lambda records: None, keep=True
+                )
 
     def _order(self, task_id: str, word: str) -> None:
         order = Order(word, self._node.presence.device.name, self._node.wall())

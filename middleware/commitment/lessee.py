@@ -145,6 +145,12 @@ class Lessee:
         self._let_go_of_minority()
         self.token, self._deadline, self._ballot, self._claimed = 0, 0.0, NONE, NONE
 
+    def end(self) -> None:
+        """Give the lease back (stop the device first) and have none granted any more: the task has ended."""
+        closed = self.council.close(self.token)
+        closed.addErrback(lambda failure: failure.trap(EntangledError))
+        closed.addCallback(lambda _: self.release())
+
     # -- claiming ---------------------------------------------------------------------------------------------------
 
     def _claim(self) -> None:

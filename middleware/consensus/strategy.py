@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import hashlib
 import importlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from middleware.errors import UnknownStrategy
 
@@ -176,12 +176,18 @@ def digest_of(contacts: Iterable[Report]) -> str:
     return hashlib.blake2s("".join(texts).encode(errors="replace"), digest_size=4).hexdigest()
 
 
-def strategy_for(name: str, dotted: bool = False) -> ConsensusAlgorithm:
+def strategy_for(
+    name: str, dotted: bool = False, deployed: Mapping[tuple[str, str], Callable[..., Any]] | None = None
+) -> ConsensusAlgorithm:
     """The strategy called ``name``: a built-in one, or an entry point of ``swarm_node.strategies``.
+
+    ``deployed:x`` is the module ``x`` that an operator pushed, among those in ``deployed``.
 
     With ``dotted`` also ``module:Class``, for names out of this machine's own settings: what a peer sends must never
     say what is imported here.  Raises ``UnknownStrategy``, which names those that there are.
     """
+    if name.startswith("deployed:"):
+        return _deployed(name, deployed or {})
     module, _, attribute = place_of(name, dotted).partition(":")
     try:
         strategy: ConsensusAlgorithm = getattr(importlib.import_module(module), attribute)()
@@ -230,3 +236,15 @@ def _rest(report: Report) -> str:
     given = (report.task, report.epoch, report.sequence, report.value, report.choice, report.weight, report.capacity)
     more = (report.battery, report.load, report.electorate)
     return "" if (given, more) == (("", 0, 0, (), "", 1.0, 1), (1.0, 0.0, 0.0)) else f"{given!r}{more!r};"
+
+
+def _deployed(name: str, deployed: Mapping[tuple[str, str], Callable[..., Any]]) -> ConsensusAlgorithm:
+    make = deployed.get(("strategy", name.removeprefix("deployed:")))
+    if make is None:
+        known = ", ".join(sorted(f"deployed:{each}" for kind, each in deployed if kind == "strategy")) or "none"
+        raise UnknownStrategy(f"no strategy {name!r} here ([deployment] of this node); there are {known}")
+    try:
+        strategy: ConsensusAlgorithm = make()
+    except Exception as error:  # a module of somebody else may fail in any way
+        raise UnknownStrategy(f"strategy {name!r} cannot be made: {error}") from error
+    return strategy

@@ -7,11 +7,13 @@ from dataclasses import replace
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from agents.behaviour import STAND, Context
+from agents.behaviour import STAND
+from agents.context import Context
 from agents.engagement import SEARCH_TTL, Deed, Engagement
 from agents.state import State
 from drivers.reading import Action, Observation
 from middleware.commitment.lessee import Lease
+from middleware.consensus.guard import Guard
 from middleware.consensus.nearest import Nearest
 from middleware.consensus.strategy import Consensus, Report
 from middleware.entangled.clock import HeapClock
@@ -19,6 +21,7 @@ from middleware.entangled.identity import Identity
 from middleware.order import PAUSE, RESUME, Order
 from middleware.presence import ASSIGNED, DONE, EXECUTING, SEARCHING, WAITING
 from middleware.tasks import CANCELLED, COMPLETED, FAILED, Member, Result, Task
+from middleware.verdict import Verdict
 
 TASK = Task("t1", "find-target", "Find it", waiting_period=2.0)
 LOOK, GO, HOLD = {"base.wz": 1.0}, {"base.vx": 0.1}, {"base.wz": 0.0}
@@ -62,6 +65,7 @@ class Council:
 
     def __init__(self, clock: HeapClock, events: list[str]) -> None:
         self.is_wanted = False
+        self.rank = 0
         self.token = 0
         self.deadline = 0.0
         self._clock = clock
@@ -76,6 +80,15 @@ class Council:
     def want(self) -> None:
         """Note the wish."""
         self.is_wanted = True
+
+    def end(self) -> None:
+        """Give it back for good."""
+        self._events.append("ended")
+        self.is_wanted, self.token = False, 0
+
+    def stand_by(self, rank: int = 1) -> None:
+        """Note the place in the row."""
+        self.rank = rank
 
     def release(self) -> None:
         """Give it back."""
@@ -273,7 +286,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.events, ["halted"])
         self.end(COMPLETED, "dog1")
         self.engagement.abandon()
-        self.assertEqual(self.events[-1], "released")
+        self.assertEqual(self.events[-1], "ended")
 
     def test_outcome_of_another_ends_it_at_once(self) -> None:
         """A task that was cancelled or done by another is over: the body stops and no step follows."""
@@ -370,7 +383,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.events, ["halted"])
         self.end(COMPLETED, "dog1")
         self.engagement.abandon()
-        self.assertEqual(self.events, ["halted", "released"])
+        self.assertEqual(self.events, ["halted", "ended"])
 
     def test_deadline_fails_the_task_once(self) -> None:
         """Past its deadline the task fails by whoever acts, or by the first of those present, and by nobody else."""
@@ -435,14 +448,15 @@ class EngagementTests(SynchronousTestCase):
                 """Fail."""
                 raise ZeroDivisionError("no luck")
 
-        self.engagement._conference.strategy = Broken()
+        self.engagement._conference.strategy = Guard(Broken())
         self.hear(self.report(2, 0.5))
         self.see(1.0)
         self.step()
         self.step()
         faults = [line for line in self.said if "broken" in line and not line.startswith("stands")]
-        self.assertEqual(faults, ["strategy broken failed (no luck), nearest decides"])
+        self.assertEqual(faults, ["broken has no opinion (ZeroDivisionError: no luck); nearest: 0.50, least of 2"])
         self.assertEqual(self.engagement.me.assigned, self.others[2].node_id.hex())
+        self.assertEqual(len(self.flushLoggedErrors(ZeroDivisionError)), 1)
 
     def test_outcome_absorbs_what_follows(self) -> None:
         """After the end nothing begins again; of two outcomes the one that holds everywhere is kept."""
@@ -471,3 +485,39 @@ class EngagementTests(SynchronousTestCase):
         self.hear(self.report(3, 3.0))
         self.step()
         self.assertEqual(self.engagement.me.epoch, before + 1)
+
+    def test_each_decision_is_accounted_for_once(self) -> None:
+        """A new decision is told why at once, moved reports at most once a second, and an unchanged one never again."""
+        accounts: list[Verdict] = []
+        self.engagement.justify = accounts.append
+        self.step()
+        self.assertEqual(accounts, [])
+        self.hear(self.report(2, 2.0))
+        self.see(1.0)
+        self.step()
+        self.assertEqual([(v.winner, v.epoch, v.token) for v in accounts], [(ME.node_id.hex(), 1, 0)])
+        self.assertEqual([(r.name, r.cost) for r in accounts[0].reports], [("dog1", 1.0), ("dog2", 2.0)])
+        for cost in (2.1, 2.2, 2.3, 2.4):
+            self.hear(self.report(2, cost))
+            self.clock.advance(0.1)
+            self.step()
+        self.assertEqual(len(accounts), 1)
+        self.clock.advance(1.0)
+        self.step()
+        self.assertEqual(accounts[1].reports[1].cost, 2.4)
+        self.clock.advance(5.0)
+        self.step()
+        self.assertEqual(len(accounts), 2)
+
+    def test_epoch_follows_the_token(self) -> None:
+        """The epoch is the token under which somebody acts; when that agent is gone, the next one."""
+        accounts: list[Verdict] = []
+        self.engagement.justify = accounts.append
+        self.see(2.0)
+        self.hear(replace(self.report(2, 1.0, EXECUTING), token=3))
+        self.step()
+        self.hear()
+        self.step()
+        self.council.grant(4)
+        self.step()
+        self.assertEqual([(v.epoch, v.token) for v in accounts], [(3, 0), (4, 0), (4, 4)])

@@ -6,7 +6,8 @@ from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from agents.behaviour import STAND, Context
+from agents.behaviour import STAND
+from agents.context import Context
 from agents.execution import Execution
 
 

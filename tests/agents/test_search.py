@@ -8,7 +8,7 @@ from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from agents.behaviour import Context
+from agents.context import Context
 from agents.search import MEMORY, STOP_AT, SearchAndApproach
 from drivers.reading import Action, Frame, Observation
 from sim.camera import Camera

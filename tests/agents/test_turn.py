@@ -7,7 +7,8 @@ import random
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from agents.behaviour import STAND, Context
+from agents.behaviour import STAND
+from agents.context import Context
 from agents.turn import TurnAround
 from drivers.reading import Observation, Value
 

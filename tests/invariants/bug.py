@@ -220,7 +220,6 @@ BUGS: dict[str, list[tuple[Any, str, Any]]] = {
     "a full disk takes records": [(SqliteStore, "put", MemoryStore.put)],
     # Tasks.
     "the end of a task is forgotten": [(Docket, "bury", _buried_and_forgotten)],
-    "equal bids have no order": [(nearest, "best_of", _first_come)],
     "a little better is enough": [(Nearest, "improves", lambda self, held, offer, _: offer.cost < held.cost)],
     "old rounds count": [(circle, "is_older", lambda told, known: False)],
     # Strategies.
@@ -258,7 +257,6 @@ FINDERS: dict[str, tuple[str, ...]] = {
     "checksums are not looked at": ("records", "stores"),
     "a full disk takes records": ("records", "stores"),
     "the end of a task is forgotten": ("tasks",),
-    "equal bids have no order": ("tasks",),
     "a little better is enough": ("tasks",),
     "old rounds count": ("tasks",),
     "no tie-break": ("deciders",),

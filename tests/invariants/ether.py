@@ -236,6 +236,13 @@ class Lessee:
             self._wanted = True
             self._ether.clock.callLater(0.02, self._claim, self._life)
 
+    def end(self) -> None:
+        """Give back, as the task has ended."""
+        self.release()
+
+    def stand_by(self, rank: int = 1) -> None:
+        """Nobody is told here when a lease is free: only who wants it asks."""
+
     def release(self) -> None:
         """Give back."""
         self._wanted, self._deadline = False, 0.0
@@ -282,9 +289,13 @@ class Node:
             device=SimpleNamespace(name=f"dog{place}"), say=lambda *_: None, change=lambda **_: None
         )
         self.entangled = SimpleNamespace(get=self._get)
+        self.deployed: dict[tuple[str, str], Callable[..., Any]] = {}
         self.groups: dict[str, list[tuple[Any, Any]]] = {}
         self.reports: dict[str, Member] = {}
         self.on_tasks: Callable[[list[Record]], None] | None = None
+
+    def justify(self, verdict: object) -> None:
+        """Why somebody goes is asked by nobody here."""
 
     def watch_tasks(self, changed: Callable[[list[Record]], None]) -> None:
         """Follow the tasks."""

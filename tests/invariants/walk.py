@@ -8,7 +8,8 @@ from types import SimpleNamespace
 
 from twisted.internet.defer import Deferred, succeed
 
-from agents.behaviour import STAND, Context
+from agents.behaviour import STAND
+from agents.context import Context
 from drivers.driver import Permit
 from drivers.gate import Gate
 from drivers.reading import Action, Observation

@@ -49,6 +49,43 @@ def dog(number: int, status: str, task: str, started: float) -> dict[str, Any]:
     }
 
 
+def why() -> dict[str, Any]:
+    """Two decisions: dog3's was overtaken when dog2 came near, and dog3 knew nothing of it."""
+    costs = {"dog2": 0.62, "dog1": 1.04, "dog3": 1.37}
+    reports = [{"agent": f"0{name[-1]}" * 16, "name": name, "cost": cost} for name, cost in costs.items()]
+    first = {
+        "epoch": 1,
+        "winner": "03" * 16,
+        "chosen": "dog3",
+        "agree": ["dog1", "dog3"],
+        "of": 2,
+        "differ": [],
+        "rule": "nearest",
+        "version": "1",
+        "hysteresis": "nobody acted before",
+        "standby": ["dog1"],
+        "digest": "1a2b3c4d",
+        "token": 1,
+        "reported": 2,
+        "reports": [{**reports[2], "cost": 1.4}, {**reports[1], "cost": 1.6}],
+        "silent": [],
+    }
+    second = {
+        "epoch": 2,
+        "winner": "02" * 16,
+        "chosen": "dog2",
+        "agree": ["dog1", "dog2"],
+        "of": 3,
+        "differ": [{"name": "dog3", "what": "names dog3; knew no report of dog2"}],
+        "hysteresis": "dog2 is better by more than 10% than dog3, who acted",
+        "standby": ["dog1", "dog3"],
+        "token": 2,
+        "reported": 3,
+        "reports": reports,
+    }
+    return {"task": "t1", "epochs": [{**first, **second}, first]}
+
+
 class Team:
     """What the front door would hand in: the records, and pictures from nowhere."""
 
@@ -66,6 +103,7 @@ class Team:
                 "created": now,
                 "status": "EXECUTING",
                 "note": "",
+                "why": why(),
             },
             {
                 "id": "t0",

@@ -25,10 +25,11 @@ class ControlTests(SynchronousTestCase):
         inherited = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
         self.environment = {**inherited, "XDG_RUNTIME_DIR": str(self.runtime), "PYTHONPATH": str(ROOT)}
 
-    def start(self) -> subprocess.Popen[bytes]:
+    def start(self, *flags: str) -> subprocess.Popen[bytes]:
         """A node that has joined."""
         twistd = str(Path(sys.executable).parent / "twistd")
-        command = [sys.executable, twistd, "-n", "--pidfile=", "swarm-node", "--name", "a", "--store", "a.sqlite"]
+        flags = flags or ("--name", "a", "--store", "a.sqlite")
+        command = [sys.executable, twistd, "-n", "--pidfile=", "swarm-node", *flags]
         child = subprocess.Popen(
             command, cwd=self.runtime, env=self.environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
         )
@@ -81,3 +82,33 @@ class ControlTests(SynchronousTestCase):
         while self.swarm("dht", "get", "colour").returncode and time.monotonic() < deadline:
             time.sleep(0.2)
         self.assertIn("red", self.said("dht", "get", "colour"))
+
+    def test_operator_pushes_to_a_running_node(self) -> None:
+        """A node that trusts its own operator runs what is pushed, shows it, goes back, and has it after a SIGKILL."""
+        child = self.start("--name", "a", "--store", "a.sqlite")
+        key = json.loads(self.said("deploy", "keys", "--json"))["a"]
+        child.kill()
+        child.wait()
+        settings = self.runtime / "a.toml"
+        table = f'[deployment]\nallow = true\noperators = ["{key}"]\nmodules = ["mine"]\n'
+        settings.write_text(f'[node]\nname = "a"\nstore = "a.sqlite"\n{table}')
+        child = self.start("--config", str(settings))
+        module = self.runtime / "mine.py"
+        for number in (1, 2):
+            module.write_text(f"from middleware.consensus.nearest import Nearest as Strategy\nVERSION = {number}\n")
+            self.said("deploy", "push", str(module), "--name", "mine", "--kind", "strategy")
+            self.until(f"  a  {number} ")
+        self.assertIn("went back", self.said("deploy", "rollback", "mine"))
+        self.until("  a  1 ")
+        child.kill()
+        child.wait()
+        self.start("--config", str(settings))
+        self.until("  a  1 ")
+        self.assertIn("the team has no task", self.swarm("why", "last").stderr)
+
+    def until(self, words: str) -> None:
+        """Wait until ``swarm deploy status`` says so."""
+        deadline = time.monotonic() + PATIENCE_S
+        while words not in (told := self.swarm("deploy", "status").stdout):
+            self.assertLess(time.monotonic(), deadline, told)
+            time.sleep(0.2)

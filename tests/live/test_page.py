@@ -118,6 +118,30 @@ class PageTests(SynchronousTestCase):
                 self.assertEqual(self.faults, [])
         self.assertEqual([url for url in self.asked if not url.startswith(self.team.url)], [])
 
+    def test_tell_why(self) -> None:
+        """A task says who agrees and who differs; opened, it tells each decision's rule and reports, and stays open."""
+        from axe_playwright_python.sync_playwright import Axe
+
+        for screen in (PHONE, DESK):
+            page = self.opened(screen)
+            why = page.locator("#tasks details").first
+            self.assertEqual(why.locator("summary").inner_text(), "dog2 \N{EN DASH} 2 of 3 agree, dog3 differs")
+            self.assertFalse(why.locator("table").first.is_visible())
+            why.locator("summary").click()
+            self.assertIn("by nearest 1: dog2 is better by more than 10%", why.locator("p").first.inner_text())
+            rows = why.locator("table").first.locator("tr").all_inner_texts()
+            self.assertEqual(
+                [row.split("\t")[:2] for row in rows], [["dog2", "0.62"], ["dog1", "1.04"], ["dog3", "1.37"]]
+            )
+            self.assertIn("differs: names dog3; knew no report of dog2", rows[2])
+            self.team.order("status dog1 SEARCHING")
+            page.locator(".device .badge[data-state=SEARCHING]").nth(1).wait_for()
+            self.assertTrue(why.locator("table").first.is_visible())
+            self.assertEqual(Axe().run(page).response["violations"], [])
+            self.assertLessEqual(page.evaluate("document.documentElement.scrollWidth - innerWidth"), 0)
+            self.assertEqual(page.locator("#tasks details:visible").count(), 1)
+            self.team.order("status dog1 WAITING")
+
     def test_show_cameras(self) -> None:
         """On a desk all three cameras live; one that is scrolled away or whose device is gone is not asked for."""
         page = self.opened(DESK)

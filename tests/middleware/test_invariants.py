@@ -40,7 +40,6 @@ BITING_ELSEWHERE = {
     "checksums are not looked at": (1, "S-b"),
     "a full disk takes records": (1, "S-c"),
     "the end of a task is forgotten": (1, "E4"),
-    "equal bids have no order": (1, "E7"),
     "a little better is enough": (5, "E6"),
     "old rounds count": (2, "E7"),
     "no tie-break": (1, "C1"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import msgpack
@@ -135,6 +136,9 @@ class DeviceTests(SynchronousTestCase):
         huge = Device(DEVICE.uuid, "dog", description="d" * 1200, messages=((1.0, "m"),))
         said = device_of(record(huge.packed()))
         self.assertEqual(said and (said.description, said.messages), ("", ()))
+        crowded = Device(DEVICE.uuid, "dog", deployed={f"{n}" * 32: "1 1a2b3c4d, 2 refused" for n in range(8)})
+        said = device_of(record(replace(crowded, capabilities={"c" * 300: {"p" * 200: 1.0}}).packed()))
+        self.assertEqual(said and said.deployed, {})
 
 
 class PresenceTests(SynchronousTestCase):

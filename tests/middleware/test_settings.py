@@ -146,10 +146,24 @@ class SettingsTest(SynchronousTestCase):
             ("web", "host"): ["page.local"],
             ("web", "port"): ["8080"],
             ("web", "yard"): ["127.0.0.1", 7400, None],
+            ("deployment", "allow"): [1, "true", None],
+            ("deployment", "operators"): ["ab" * 32, ["ab"], ["AB" * 32], [7], [f"{n:064x}" for n in range(9)]],
+            ("deployment", "modules"): ["best", ["../best"], ["Best"], [""], [f"m{n}" for n in range(9)]],
         }
         for (table, key), values in wrong.items():
             for value in values:
                 self.refusal(table, key, value)
+
+    def test_deployment_is_off_by_default(self) -> None:
+        """Nothing may be deployed on a node whose owner has not said so; what he says arrives, in files and flags."""
+        off = settings().deployment
+        self.assertEqual((off.allow, off.operators, off.modules), (False, (), ()))
+        table = {"allow": True, "operators": ["ab" * 32], "modules": ["best", "spin"]}
+        on = Settings.from_mapping({"node": {"name": "a"}, "deployment": table}, "a.toml").deployment
+        self.assertEqual((on.allow, on.operators, on.modules), (True, ("ab" * 32,), ("best", "spin")))
+        flags = settings().with_flags(deployment_allow="true", deployment_modules="best, spin").deployment
+        self.assertEqual((flags.allow, flags.modules), (True, ("best", "spin")))
+        self.assertRaises(BadSetting, settings().with_flags, deployment_allow="yes")
 
     def test_capability_property_names_itself(self) -> None:
         """An error in a capability names the property."""

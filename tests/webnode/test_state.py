@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import json
 import random
+from dataclasses import asdict
 from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
+from middleware.explanation import Difference, Explanation, Ruling
+from middleware.verdict import Reported
 from webnode.state import Departed, group_view, state_of
 
 
@@ -93,6 +96,35 @@ class GroupTests(SynchronousTestCase):
         view = group_view("t", "T", [member(1, 0.0, None)])
         self.assertEqual((view["assigned"], view["agree"]), ("", 0))
         self.assertEqual(view["members"][0]["share"], 0.0)
+
+
+class WhyTests(SynchronousTestCase):
+    def test_rows_of_a_decision(self) -> None:
+        """A task's decision has a row for each who reported, stands silent, or differs, and says what each is."""
+        reports = [Reported("02" * 20, "dog2", 0.5), Reported("01" * 20, "dog1", 1.5)]
+        differ = (Difference("dog1", "names dog1"), Difference("dog4", "names dog1"))
+        head = (2, "02" * 20, "dog2", ("dog2", "dog3"), 4, differ, "nearest", "1", "nobody acted before")
+        ruling = Ruling(*head, ("dog1",), "1a2b", 3, 2, tuple(reports), ("dog3",))
+        (view,) = state_of([], [{"id": "t", "why": asdict(Explanation("t", (ruling,)))}], {})["tasks"]
+        (why,) = view["why"]
+        self.assertEqual((why["chosen"], why["agree"], why["of"], why["rule"]), ("dog2", 2, 4, "nearest 1"))
+        self.assertEqual(
+            [(row["name"], row["cost"], row["note"]) for row in why["rows"]],
+            [
+                ("dog2", 0.5, "goes"),
+                ("dog1", 1.5, "differs: names dog1"),
+                ("dog3", None, ""),
+                ("dog4", None, "differs: names dog1"),
+            ],
+        )
+        self.assertEqual(why["differ"], ["dog1", "dog4"])
+        json.dumps(view, allow_nan=False)
+        self.assertEqual(state_of([], [{"id": "t", "why": 7}], {})["tasks"][0]["why"], [])
+
+    def test_deployed(self) -> None:
+        """A device tells what was deployed on it."""
+        (view,) = state_of([device(1, deployed={"best": "1 ab"})], [], {})["devices"]
+        self.assertEqual(view["deployed"], {"best": "1 ab"})
 
 
 class DepartedTests(SynchronousTestCase):

@@ -76,7 +76,8 @@ function fill() {
   facts(at("d-capabilities"), Object.entries(device.capabilities).map(([name, entries]) => [name, properties(entries)]));
   facts(at("d-network"), [
     ["address", device.address], ["roles", device.roles.join(", ")], ["joined", device.joined ? `as number ${device.joined}` : ""],
-    ...Object.entries(device.network), ["uuid", device.uuid]]);
+    ...Object.entries(device.network), ...Object.entries(device.deployed).map(([name, label]) => [`deployed ${name}`, label]),
+    ["uuid", device.uuid]]);
   const told = device.messages.map(([moment, text]) => [new Date(moment * 1000).toLocaleTimeString(), text]);
   keyed(at("d-messages"), told.length ? told : [["", "No messages."]], (entry) => entry.join(), () => element("li"),
     (item, entry) => words(item, entry.join(" ").trim()));

@@ -1,5 +1,5 @@
 // Tasks: choosing a predefined one, seeing what became of each, and taking it back.
-import { at, badge, element, keyed, state, words } from "./element.js";
+import { at, attribute, badge, element, keyed, state, words } from "./element.js";
 import { ask, say, wish } from "./desk.js";
 
 const ENDED = ["COMPLETED", "FAILED", "CANCELLED"];
@@ -12,6 +12,7 @@ export function showTasks(tasks) {
     state(item.querySelector(".badge"), task.status);
     const result = task.result ? `Done by ${task.result.by} in ${task.result.took.toFixed(1)} s. ` : "";
     words(item.querySelector(".note"), result + task.note);
+    why(item.querySelector("details"), task.why);
     const [button, rest] = item.querySelectorAll("button");
     button.hidden = rest.hidden = ENDED.includes(task.status);
     button.setAttribute("aria-label", `Cancel ${task.title}`);
@@ -28,7 +29,23 @@ function row(task) {
     const isPaused = rest.textContent === "Resume";
     wish(`${isPaused ? "Resuming" : "Pausing"} ${task.title}`, `/api/tasks/${encodeURIComponent(task.id)}/${isPaused ? "resume" : "pause"}`);
   });
-  return element("li", {}, element("b"), badge(), element("span", { class: "note" }), button, rest);
+  return element("li", {}, element("b"), badge(), element("span", { class: "note" }),
+    element("details", {}, element("summary"), element("div")), button, rest);
+}
+
+// Why: the newest decision in one line; opened, each with its rule and who reported what.
+function why(box, epochs) {
+  box.hidden = !epochs.length;
+  const told = JSON.stringify(epochs);
+  if (box.hidden || box.dataset.told === told) return;
+  box.dataset.told = told;
+  words(box.firstChild, `${epochs[0].chosen} – ${epochs[0].agree} of ${epochs[0].of} agree${epochs[0].differ.map((name) => `, ${name} differs`).join("")}`);
+  attribute(box, "data-agree", epochs[0].agree === epochs[0].of && !epochs[0].differ.length);
+  box.lastChild.replaceChildren(...epochs.flatMap((each) => [
+    element("p", {}, element("b", {}, `${each.epoch}. ${each.chosen}`), ` by ${each.rule}: ${each.hysteresis}`),
+    element("table", {}, ...each.rows.map((row) => element("tr", {}, element("th", { scope: "row" }, row.name),
+      element("td", {}, row.cost?.toFixed(2) ?? "no report"), element("td", {}, row.note)))),
+    ...(each.reported > each.rows.length ? [`of ${each.reported} reports`] : [])]));
 }
 
 function outcome({ able = [], refused = {} }) {

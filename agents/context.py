@@ -1,0 +1,20 @@
+"""Context: under which right a body acts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Context:
+    """Under which right a body acts ``now``: the lease's ``token``, and its ``deadline`` on the same clock.
+
+    ``is_resumed`` says that the token is the one of the call before, so that nobody acted in between: go on.  With a
+    new token, held since ``began``, another may have acted: what was done so far is still remembered, and may be void.
+    """
+
+    now: float
+    token: int = 0
+    deadline: float = 0.0
+    began: float = 0.0
+    is_resumed: bool = False

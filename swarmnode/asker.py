@@ -1,0 +1,54 @@
+"""Asker: what a command reads and writes of the network, through the control socket of a node of this machine."""
+
+from __future__ import annotations
+
+import base64
+from pathlib import Path
+from typing import Any
+
+from middleware.entangled.control import word
+from middleware.entangled.control.command import Ask
+from middleware.entangled.control.place import found
+from middleware.entangled.record import MAX_TTL, Record, hashed_key
+
+
+class Refusal(Exception):
+    """The node, or what it knows, says no; ``str()`` is one line for a person."""
+
+
+class Asker:
+    """One node of this machine, asked through its control socket; raises ``NoControl`` where there is none."""
+
+    def __init__(self, node: str | None, ask: Ask) -> None:
+        self._path: Path = found(node)
+        self._ask = ask
+
+    def records(self, key: str) -> list[Record]:
+        """What the network holds under the key of a text.
+
+        The node has checked the signatures; they do not come through the socket.  Raises ``Refusal``.
+        """
+        answer = self._answer("dht get", key=key, concern="majority")
+        if not isinstance(answer, list):
+            raise Refusal(f"the node's answer to a read of {key!r} is no list of records")
+        return [_record(hashed_key(key), each) for each in answer]
+
+    def put(self, key: str, name: str, value: bytes) -> int:
+        """Store ``value`` in the node's own slot; returns how many replicas have it.  Raises ``Refusal``."""
+        given = {"base64": base64.b64encode(value).decode()}
+        return int(self._answer("dht put", key=key, name=name, value=given)["replicas"])
+
+    def _answer(self, verb: str, **given: Any) -> Any:
+        for line in self._ask(self._path, {"verb": verb, "with": given}):
+            if "error" in line:
+                raise Refusal(str(line.get("text", line["error"])))
+            if "answer" in line:
+                return line["answer"]
+        raise Refusal("the node closed the connection without an answer")
+
+
+def _record(key: bytes, told: dict[str, Any]) -> Record:
+    value = word.value(told["value"])
+    content = value.encode() if isinstance(value, str) else bytes(value)
+    owner = bytes.fromhex(told["owner"])
+    return Record(key, told["name"], owner, told["sequence"], told["lifetime"], MAX_TTL, content)

@@ -1,0 +1,244 @@
+"""Tests of ``middleware.deployment.deployment``: one node's acceptance, on a fleet in memory."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import msgpack
+
+from middleware.consensus.strategy import strategy_for
+from middleware.deployment.deployment import RETRY, Deployment
+from middleware.deployment.manifest import (
+    BEHAVIOUR,
+    MAX_SOURCE,
+    STRATEGY,
+    Manifest,
+    manifests_key,
+    pushed,
+    rolled_back,
+    source_key,
+)
+from middleware.deployment.shelf import FileShelf, MemoryShelf, Shelf
+from middleware.entangled.record import Record, hashed_key
+from middleware.errors import UnknownStrategy
+from middleware.node import SwarmNode
+from middleware.settings import DeploymentSettings
+from tests.fleet import FleetCase
+
+SOURCE = b"""
+import sys
+from middleware.consensus.nearest import Nearest
+sys.modules["swarm_canary"] = sys
+
+class Strategy(Nearest):
+    pass
+"""
+CANARY = "swarm_canary"
+
+
+class DeploymentTests(FleetCase):
+    def setUp(self) -> None:
+        super().setUp()
+        before = set(sys.modules)
+        self.addCleanup(lambda: [sys.modules.pop(name) for name in sorted(set(sys.modules) - before)])
+        self.world = self.swarm(3)
+        self.operator, self.stranger, self.dog = self.world.nodes
+        self.shelf = MemoryShelf()
+        self.deployment = self.allow()
+
+    def allow(self, shelf: Shelf | None = None, node: SwarmNode | None = None, **more: object) -> Deployment:
+        """Let the dog (or ``node``) run "best" as the operator pushes it."""
+        node = self.dog if node is None else node
+        key = self.operator.entangled.identity.public.hex()
+        allowed = replace(DeploymentSettings(True, (key,), ("best",)), **more)  # type: ignore[arg-type]
+        shelf = self.shelf if shelf is None else shelf
+        made = Deployment(node.entangled, node.presence, node.wall, node.later, allowed, shelf)
+        made.open()
+        made.follow()
+        return made
+
+    def push(self, manifest: Manifest, source: bytes | None = SOURCE, by: SwarmNode | None = None) -> None:
+        """Publish a manifest, and a source under the key that it names."""
+        node = self.operator if by is None else by
+        if source is not None:
+            self.done(self.world, node.entangled.put(hashed_key(source_key(manifest.digest)), "source", source), 1.0)
+        self.done(self.world, node.entangled.put(manifests_key(), manifest.name, manifest.packed()), 1.0)
+        self.world.run(1.0)
+
+    def version(self, number: int, held: Manifest | None = None, name: str = "best") -> tuple[Manifest, bytes]:
+        """A version of a good strategy."""
+        source = SOURCE + b"# %d\n" % number
+        return pushed(name, STRATEGY, source, held, number), source
+
+    @property
+    def running(self) -> int:
+        """Which version runs, 0 for none."""
+        held = self.deployment.held.get("best")
+        return 0 if held is None else held.version
+
+    def assert_refused(self, words: str, runs: int = 0) -> None:
+        """The dog's messages say so, its code never ran, and what ran before still runs."""
+        said = " | ".join(text for _, text in self.dog.presence.device.messages)
+        self.assertIn(words, said)
+        self.assertEqual(self.running, runs)
+        if not runs:
+            self.assertNotIn(CANARY, sys.modules)
+
+    def test_accepts_and_reports(self) -> None:
+        """A listed module of a listed operator runs, by its name, and the device says its version and digest."""
+        manifest, source = self.version(1)
+        self.push(manifest, source)
+        self.assertEqual(self.running, 1)
+        self.assertIn(CANARY, sys.modules)
+        strategy = strategy_for("deployed:best", deployed=self.deployment.modules)
+        self.assertEqual(strategy.name, "deployed:best")
+        self.assertEqual(self.dog.presence.device.deployed, {"best": f"1 {manifest.digest[:8]}"})
+        error = self.assertRaises(UnknownStrategy, strategy_for, "deployed:other", deployed=self.deployment.modules)
+        self.assertIn("there are deployed:best", str(error))
+        self.assertRaises(UnknownStrategy, strategy_for, "deployed:best")
+
+    def test_stranger_is_refused_by_key(self) -> None:
+        """A module of somebody who is no operator here is refused with the beginning of that key."""
+        manifest, source = self.version(1)
+        self.push(manifest, source, self.stranger)
+        self.assert_refused(f"comes from {self.stranger.entangled.identity.public.hex()[:8]}")
+
+    def test_unlisted_name_is_refused(self) -> None:
+        """A module that is not listed is refused by its name."""
+        manifest, source = self.version(1, name="worst")
+        self.push(manifest, source)
+        self.assert_refused("refuses worst 1: is not among this node's modules")
+        self.assertEqual(self.dog.presence.device.deployed, {})
+
+    def test_bad_signature_is_refused(self) -> None:
+        """A record in the operator's name that the operator did not sign is refused, though a watcher is shown it."""
+        manifest, source = self.version(1)
+        self.done(self.world, self.operator.entangled.put(hashed_key(source_key(manifest.digest)), "source", source))
+        owner = self.operator.entangled.identity.public
+        forged = Record(manifests_key(), "best", owner, 5, "team", 60.0, manifest.packed())
+        self.deployment._pushed([forged.signed(self.stranger.entangled.identity)])
+        self.world.run(1.0)
+        self.assert_refused("is not signed by its operator")
+
+    def test_wrong_kind_is_refused(self) -> None:
+        """A strategy pushed as a behaviour is refused, and a name keeps the kind that it had."""
+        source = SOURCE + b"#"
+        self.push(pushed("best", BEHAVIOUR, source, None, 1), source)
+        said = " ".join(text for _, text in self.dog.presence.device.messages)
+        self.assertIn("a behaviour has to define Behaviour", said)
+        manifest, source = self.version(2)
+        self.push(manifest, source)
+        self.push(replace(pushed("best", BEHAVIOUR, source, manifest, 3), before=()), source)
+        self.assert_refused("is a strategy here, not a behaviour", runs=2)
+
+    def test_lower_version_and_other_content_are_refused(self) -> None:
+        """Neither an older version, nor the same version with other content, takes the place of what is held."""
+        second, source = self.version(2)
+        self.push(second, source)
+        first, source = self.version(1)
+        self.push(first, source)
+        self.assert_refused("version 1 is older than the 2 held", runs=2)
+        other = SOURCE + b"# other\n"
+        self.push(pushed("best", STRATEGY, other, None, 2), other)
+        self.assert_refused("version 2 is held with other content", runs=2)
+        self.assertEqual(self.deployment.held["best"], second)
+
+    def test_going_back_and_old_word_again(self) -> None:
+        """Going back holds also against the version taken back, should its word come again."""
+        first, source = self.version(1)
+        self.push(first, source)
+        second, source = self.version(2, first)
+        self.push(second, source)
+        back = rolled_back(second)
+        assert back is not None
+        self.push(back, None)
+        self.assertEqual(self.running, 1)
+        self.push(second, None)
+        self.assert_refused("version 2 is older than the 1 held (2 was taken back)", runs=1)
+
+    def test_too_large_is_refused_unread(self) -> None:
+        """A manifest that announces more than a module may have is refused before its source is asked for."""
+        manifest, source = self.version(1)
+        self.push(replace(manifest, size=MAX_SOURCE + 1), source)
+        self.assert_refused(f"has {MAX_SOURCE + 1} bytes, more than {MAX_SOURCE}")
+
+    def test_source_may_come_late(self) -> None:
+        """A source that is not there yet, or is another than was signed, is asked for again until it comes."""
+        manifest, source = self.version(1)
+        wrong = source[:-2] + b"2\n"
+        key = hashed_key(source_key(manifest.digest))
+        self.done(self.world, self.stranger.entangled.put(key, "source", wrong))
+        self.push(manifest, None)
+        self.world.run(RETRY)
+        self.assertEqual(self.running, 0)
+        self.assertNotIn(CANARY, sys.modules)
+        self.done(self.world, self.operator.entangled.put(key, "source", source))
+        self.world.run(2 * RETRY)
+        self.assertEqual(self.running, 1)
+
+    def test_nonsense_under_the_key(self) -> None:
+        """Values that are no manifests are refused once each, and nothing else happens."""
+        for value in (b"", b"\xc1", msgpack.packb({"name": "best"}), bytes(5000)):
+            self.done(self.world, self.operator.entangled.put(manifests_key(), "best", value), 1.0)
+            self.done(self.world, self.stranger.entangled.put(manifests_key(), "x\x1b", value), 1.0)
+        self.assert_refused("refuses best: has a manifest that cannot be read")
+        self.assertNotIn("\x1b", "".join(text for _, text in self.dog.presence.device.messages))
+
+    def test_restart_loads_from_the_shelf(self) -> None:
+        """The next life runs what was accepted before it hears of anybody; two editions are on the shelf."""
+        held = None
+        for number in (1, 2, 3):
+            held, source = self.version(number, held)
+            self.push(held, source)
+        self.assertEqual(len(self.shelf.contents), 2)
+        for node in (self.operator, self.stranger):
+            node.vanish()
+        self.deployment = self.allow()
+        self.assertEqual(self.running, 3)
+
+    def test_restart_checks_again(self) -> None:
+        """What was accepted does not run in the next life if the owner has struck the operator, or the name."""
+        manifest, source = self.version(1)
+        self.push(manifest, source)
+        sys.modules.pop(CANARY)
+        for struck in ("operators", "modules"):
+            made = self.allow(None, self.stranger, **{struck: ()})
+            self.assertEqual((dict(made.held), made.modules), ({}, {}))
+            self.assertNotIn(CANARY, sys.modules)
+
+    def test_damaged_files_never_run(self) -> None:
+        """A file that was cut, or changed anywhere, is left out and named; the edition before it runs."""
+        folder = Path(self.mktemp())
+        self.deployment = self.allow(FileShelf(folder))
+        first, source = self.version(1)
+        self.push(first, source)
+        second, source = self.version(2, first)
+        self.push(second, source)
+        path = folder / f"best-{second.digest[:16]}.module"
+        whole = path.read_bytes()
+        sys.modules.pop(CANARY)
+        for damaged in (b"", whole[:40], whole[: len(whole) // 2], whole.replace(b"Strategy", b"Strategx")):
+            path.write_bytes(damaged)
+            for node in (self.operator, self.stranger):
+                if node.running:
+                    node.vanish()
+            self.deployment = self.allow(FileShelf(folder))
+            self.assertEqual(self.running, 1)
+        middle = len(whole) // 8
+        path.write_bytes(whole[:middle] + bytes([whole[middle] ^ 1]) + whole[middle + 1 :])
+        self.deployment = self.allow(FileShelf(folder))
+        self.assertEqual(self.running, 1)
+
+    def test_full_disk_is_told(self) -> None:
+        """A module that cannot be put on file runs all the same, and the device says so."""
+
+        def full(source: Path, target: Path) -> None:
+            raise OSError(28, "No space left on device")
+
+        folder = Path(self.mktemp())
+        self.deployment = self.allow(FileShelf(folder, full))
+        manifest, source = self.version(1)
+        self.push(manifest, source)
+        self.assert_refused("best 1 is not on file: No space left on device", runs=1)

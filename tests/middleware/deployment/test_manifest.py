@@ -1,0 +1,112 @@
+"""Tests of ``middleware.deployment.manifest``: which word of an operator holds."""
+
+from __future__ import annotations
+
+import itertools
+import random
+from dataclasses import replace
+
+import msgpack
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.deployment.manifest import (
+    KEPT,
+    MAX_VERSION,
+    STRATEGY,
+    Edition,
+    Manifest,
+    manifest_of,
+    manifests_key,
+    newest,
+    pushed,
+    rolled_back,
+)
+from middleware.entangled.identity import Identity
+from middleware.entangled.record import Record
+from middleware.value import MAX_VALUE
+
+OPERATOR = Identity(bytes([9]) * 32)
+
+
+def record_of(manifest: Manifest, value: bytes | None = None, name: str | None = None) -> Record:
+    """The operator's record."""
+    content = manifest.packed() if value is None else value
+    slot = manifest.name if name is None else name
+    return Record(manifests_key(), slot, OPERATOR.public, 1, "team", 60.0, content).signed(OPERATOR)
+
+
+def versions(n: int) -> list[Manifest]:
+    """``n`` versions, each pushed after the other."""
+    told: list[Manifest] = []
+    for number in range(n):
+        told.append(pushed("best", STRATEGY, b"x = %d" % number, told[-1] if told else None))
+    return told
+
+
+class ManifestTests(SynchronousTestCase):
+    def test_survives_the_wire(self) -> None:
+        """What is packed is read back, with its history, in fewer bytes than every device holds."""
+        for manifest in (*versions(9), rolled_back(versions(9)[-1])):
+            assert manifest is not None
+            self.assertEqual(manifest_of(record_of(manifest)), manifest)
+            self.assertLessEqual(len(manifest.packed()), MAX_VALUE)
+        self.assertEqual([e.version for e in versions(9)[-1].before], [8, 7, 6, 5])
+        self.assertEqual(len(versions(9)[-1].before), KEPT)
+
+    def test_newest_word_holds_in_any_order(self) -> None:
+        """Push, push, back, push, back, back: whichever of these words come again in whatever order, the last holds."""
+        first = pushed("best", STRATEGY, b"1", None)
+        second = pushed("best", STRATEGY, b"2", first)
+        back = rolled_back(second)
+        assert back is not None
+        third = pushed("best", STRATEGY, b"3", back)
+        again = rolled_back(third)
+        assert again is not None
+        self.assertEqual((back.version, third.version, again.version), (1, 3, 1))
+        words = [first, second, back, third, again]
+        self.assertEqual(sorted(words, key=lambda m: m.rank), words)
+        for order in itertools.permutations(words):
+            self.assertEqual(newest(order), again)
+
+    def test_going_back_twice(self) -> None:
+        """Going back goes one version each time, until there is none before."""
+        manifest: Manifest | None = versions(3)[-1]
+        seen = []
+        while manifest is not None:
+            seen.append((manifest.version, manifest.rank))
+            manifest = rolled_back(manifest)
+        self.assertEqual([version for version, _ in seen], [3, 2, 1])
+        self.assertEqual([rank for _, rank in seen], sorted(rank for _, rank in seen))
+        self.assertIsNone(newest([]))
+
+    def test_decoder_is_total(self) -> None:
+        """No value of a record, however crafted, raises; what is no manifest is None."""
+        good = versions(2)[-1]
+        content = msgpack.unpackb(good.packed())
+        bad: dict[str, list[object]] = {
+            "name": ["Best", "../x", "", 7, "other", "b" * 40],
+            "kind": ["module", None, 3],
+            "version": [0, -1, 1.0, "2", True, MAX_VERSION + 1],
+            "digest": ["ab" * 32, b"", b"a" * 31],
+            "size": [-1, None, 2.5],
+            "before": [None, [1], [[1, b"x", 3]], [[2, bytes(32), 3]], "x"],
+            "withdrawn": [-1, None, MAX_VERSION + 1, True],
+        }
+        for field, values in bad.items():
+            for value in values:
+                packed = msgpack.packb({**content, field: value})
+                self.assertIsNone(manifest_of(record_of(good, packed)), f"{field} {value!r}")
+        self.assertIsNone(manifest_of(record_of(good, name="other")))
+        self.assertIsNone(manifest_of(replace(record_of(good), value=None)))
+        rng = random.Random(3)
+        for _ in range(300):
+            crafted = bytearray(good.packed())
+            crafted[rng.randrange(len(crafted))] = rng.randrange(256)
+            manifest_of(record_of(good, bytes(crafted)))
+
+    def test_given_version(self) -> None:
+        """A version may be named; the edition before is remembered by its digest."""
+        first = pushed("best", STRATEGY, b"1", None, 4)
+        second = pushed("best", STRATEGY, b"2", first, 9)
+        self.assertEqual((first.version, second.version), (4, 9))
+        self.assertEqual(second.before, (Edition(4, first.digest, 1),))

@@ -1,0 +1,115 @@
+"""Tests of ``middleware.deployment.module``: foreign source in, something that can be called out, or why not."""
+
+from __future__ import annotations
+
+import sys
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.consensus.strategy import Report
+from middleware.deployment.manifest import BEHAVIOUR, STRATEGY, pushed
+from middleware.deployment.module import loaded
+from middleware.errors import Undeployable
+
+GOOD = """
+from __future__ import annotations
+from dataclasses import dataclass
+from middleware.consensus.nearest import Nearest
+
+@dataclass
+class Weight:
+    share: float = 0.5
+
+class Strategy(Nearest):
+    name = "mine"
+    weight = Weight()
+"""
+SPIN = """
+class Behaviour:
+    def __init__(self, parameters, rng): self.cost = float(parameters["cost"])
+    cost = None
+    def look(self, seen, now): pass
+    def search(self, now): return {}
+    def hold(self, now): return {}
+    def execute(self, now): raise RuntimeError("dizzy")
+"""
+BASE = "from middleware.consensus.nearest import Nearest\nfrom middleware.consensus.strategy import Consensus\n"
+
+
+class ModuleTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        before = set(sys.modules)
+        self.addCleanup(lambda: [sys.modules.pop(name) for name in sorted(set(sys.modules) - before)])
+
+    def refusal(self, source: str | bytes, kind: str = STRATEGY) -> str:
+        """Why a source is refused; nothing of it stays."""
+        data = source.encode() if isinstance(source, str) else source
+        before = set(sys.modules)
+        error = self.assertRaises(Undeployable, loaded, pushed("best", kind, data, None), data)
+        self.assertEqual([name for name in set(sys.modules) - before if "deployed" in name], [])
+        self.assertEqual(len(str(error).splitlines()), 1)
+        return str(error.problem)
+
+    def test_strategy_decides_under_its_name_and_version(self) -> None:
+        """A strategy is made anew each time, works, and says under which name and version it was deployed."""
+        source = GOOD.encode()
+        manifest = pushed("best", STRATEGY, source, None)
+        strategy = loaded(manifest, source)()
+        self.assertEqual(strategy.find([Report("a", 2.0), Report("b", 1.0)]).assigned_agent, "b")
+        self.assertEqual((strategy.name, strategy.version), ("deployed:best", f"1 {manifest.digest[:8]}"))
+        self.assertIsNot(loaded(manifest, source)(), strategy)
+
+    def test_behaviour_takes_parameters(self) -> None:
+        """A behaviour is made of a task's parameters."""
+        source = SPIN.encode()
+        made = loaded(pushed("spin", BEHAVIOUR, source, None), source)({"cost": 2}, None)
+        self.assertEqual(made.cost, 2.0)
+
+    def test_what_cannot_run_is_refused(self) -> None:
+        """What does not parse, raises whatever, never ends or is of another kind is refused with its reason."""
+        for source, reason in (
+            ("def f(:\n", "line 1: "),
+            (b"\xff\xfe", ""),
+            ("x = 1\0", ""),
+            ("(" * 100_000, ""),
+            ("1 / 0", "raises ZeroDivisionError"),
+            ("raise SystemExit(3)", "raises SystemExit"),
+            ("raise KeyboardInterrupt", "raises KeyboardInterrupt"),
+            ("import nothing_of_that_name", "raises ModuleNotFoundError"),
+            ("while True: pass", "takes more than"),
+            ("try:\n  while 1: pass\nexcept Exception: pass", "takes more than"),
+            ("x = 1", "a strategy has to define Strategy"),
+            ("Strategy = 7", "a strategy has to define Strategy"),
+            (SPIN, "a strategy has to define Strategy"),
+            ("class Strategy: pass", "a strategy has find"),
+        ):
+            self.assertIn(reason, self.refusal(source), source[:40])
+        self.assertIn("a behaviour has to define Behaviour", self.refusal(GOOD, BEHAVIOUR))
+        self.assertIn("a behaviour has look", self.refusal("class Behaviour: pass", BEHAVIOUR))
+
+    def test_what_is_no_strategy_is_refused(self) -> None:
+        """A strategy that loops, names a stranger, depends on the order or prefers a report to itself is refused."""
+        for body, reason in (
+            ("def find(self, c):\n  while True: pass", "takes more than"),
+            ("def find(self, c): return Consensus('x' * 40 if c else None)", "did not report"),
+            ("def find(self, c): return Consensus('x' * 40)", "where nobody reported"),
+            ("def find(self, c): return Consensus(c[0].agent if c else None)", "depends on the order"),
+            ("def find(self, c): return None", "raises AttributeError"),
+            ("def improves(self, a, b, h): return True", "better than itself"),
+        ):
+            indented = "".join(f"  {line}\n" for line in body.splitlines())
+            self.assertIn(reason, self.refusal(f"{BASE}class Strategy(Nearest):\n{indented}"))
+
+    def test_other_source_than_signed_never_runs(self) -> None:
+        """A source of another digest or size than the manifest's is refused before any of it runs."""
+        source = b"import sys; sys.modules['swarm_canary'] = sys"
+        manifest = pushed("best", STRATEGY, b"x" * len(source), None)
+        error = self.assertRaises(Undeployable, loaded, manifest, source)
+        self.assertIn("not what was signed", str(error))
+        self.assertNotIn("swarm_canary", sys.modules)
+
+    def test_tracer_of_others_is_put_back(self) -> None:
+        """Whoever watches the program's steps (coverage, a debugger) goes on doing so."""
+        before = sys.gettrace()
+        self.refusal("while True: pass")
+        self.assertIs(sys.gettrace(), before)

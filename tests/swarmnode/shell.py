@@ -1,0 +1,48 @@
+"""A shell beside a node of a virtual team: the ``swarm`` command asks the real verbs, on a turned clock."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import random
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from middleware.entangled.control.verb import Verbs
+from middleware.entangled.node import EntangledNode
+from swarmnode.rehearsal import VirtualTeam
+
+Main = Callable[..., int]
+PATIENCE = 5.0
+
+
+class Shell:
+    """What a person types beside ``node`` and reads; each answer may take ``PATIENCE`` seconds of the team's time."""
+
+    def __init__(self, team: VirtualTeam, node: EntangledNode) -> None:
+        self._team = team
+        self._verbs = Verbs.of(node, team.clock, random.Random(1))
+        self.said = ""
+
+    def ask(self, path: Path, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
+        """Answer as the control socket does."""
+        answers: list[dict[str, Any]] = []
+        work = self._verbs.run(request["verb"], request["with"], lambda event: None)
+        work.addCallbacks(
+            lambda answer: answers.append({"answer": answer}),
+            lambda failure: answers.append({"error": failure.type.__name__, "text": failure.getErrorMessage()}),
+        )
+        waited = 0.0
+        while not answers and waited < PATIENCE:
+            self._team.clock.advance(0.05)
+            waited += 0.05
+        yield from answers
+
+    def run(self, main: Main, words: Sequence[str]) -> tuple[int, str]:
+        """Exit code and output; what is complained of is in ``said``."""
+        output, complaint = io.StringIO(), io.StringIO()
+        with contextlib.redirect_stderr(complaint):
+            code = main(list(words), output, self.ask)
+        self.said = complaint.getvalue()
+        return code, output.getvalue()

@@ -1,0 +1,222 @@
+"""Tests of ``swarmnode.deploy`` and of deployment on a whole team: three dogs in a yard, and a shell at the laptop."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+from twisted.internet.defer import Deferred
+from twisted.trial.unittest import SynchronousTestCase
+
+from agents.catalogue import DEMO, TASKS
+from middleware.deployment.shelf import MemoryShelf
+from middleware.entangled.control.place import made
+from middleware.entangled.identity import node_id
+from middleware.verdict import Verdict, verdict_of, verdicts_key
+from swarmnode.deploy import main
+from swarmnode.rehearsal import VirtualTeam
+from tests.swarmnode.shell import Shell
+
+FARTHEST = '''
+"""The agent with the longest way goes: nobody wants that, so nobody takes it for the default."""
+from middleware.consensus.strategy import Consensus, digest_of
+
+RAN = True
+
+
+class Strategy:
+    name = "farthest"
+
+    def find(self, contacts):
+        order = sorted({r.agent: r for r in contacts}.values(), key=lambda r: (-r.cost, r.agent))
+        names = [r.agent for r in order]
+        return Consensus(names[0], tuple(names[1:]), digest_of(order)) if names else Consensus(None)
+
+    def improves(self, current, offer, hysteresis):
+        return False
+'''
+
+
+class DeployTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        # Trial's own folders are deeper than the path of a socket may be.
+        self.folder = Path(tempfile.mkdtemp())
+        self.addCleanup(shutil.rmtree, self.folder)
+        self.patch(os, "environ", {**os.environ, "XDG_RUNTIME_DIR": str(self.folder)})
+        made("vaio").touch()
+        self.team = VirtualTeam(11, dogs=())
+        self.addCleanup(self.team.stop)
+        self.laptop = self.team.services["vaio"].assembly.node
+        self.shell = Shell(self.team, self.laptop.entangled)
+        self.shelves = {name: MemoryShelf() for name in self.team.DOGS}
+
+    def let_in(self, *modules: str, refusing: str = "") -> None:
+        """Start the dogs, each with a shelf of its own; all but ``refusing`` allow the laptop to push ``modules``."""
+        allowed = {"allow": True, "operators": [self.laptop.entangled.identity.public.hex()], "modules": list(modules)}
+        for name in self.team.DOGS:
+            tables = {} if name == refusing else {"deployment": allowed}
+            self.team.add(name, tables, self.shelves[name])
+            self.team.clock.advance(0.5)
+
+    def swarm(self, line: str) -> str:
+        """What ``swarm deploy LINE`` prints, without trouble."""
+        code, output = self.shell.run(main, line.split())
+        self.assertEqual((code, self.shell.said), (0, ""))
+        return output
+
+    def refused(self, line: str) -> str:
+        """What ``swarm deploy LINE`` complains of."""
+        code, _ = self.shell.run(main, line.split())
+        self.assertTrue(code in (1, 2))
+        return self.shell.said
+
+    def file(self, text: str) -> str:
+        """A file with a module."""
+        path = self.folder / "module.py"
+        path.write_text(text)
+        return str(path)
+
+    def push(self, text: str = FARTHEST, name: str = "farthest", more: str = "") -> str:
+        """Push a strategy, and let the team hear of it."""
+        told = self.swarm(f"push {self.file(text)} --name {name} --kind strategy {more}")
+        self.team.clock.advance(2.0)
+        return told
+
+    def messages(self, name: str) -> str:
+        """The last lines of a device."""
+        device = self.team.services[name].assembly.node.presence.device
+        return " | ".join(text for _, text in device.messages)
+
+    def deployed(self) -> dict[str, str]:
+        """What the devices say that they run, as the page shows it."""
+        devices = self.team.state()["devices"]
+        return {d["name"]: d["deployed"].get("farthest", "") for d in devices if d["name"] != "vaio"}
+
+    def verdicts(self, strategy: str, seconds: float) -> list[Verdict]:
+        """What the dogs decide about a task, and by which rule."""
+        task = replace(TASKS[DEMO], task_id=f"t{self.team.clock.seconds():.0f}", strategy=strategy, waiting_period=30.0)
+        task = replace(task, created=self.team.clock.seconds())
+        submitted = Deferred.fromCoroutine(self.laptop.submit(task))
+        self.team.yard.world.scatter(3)
+        self.team.clock.advance(3.0)
+        self.team.desk.move_target(1.5, 1.2)
+        self.team.clock.advance(seconds)
+        self.assertEqual(self.successResultOf(submitted).task_id, task.task_id)
+        records = self.team.desk.read(verdicts_key(task.task_id))
+        return [verdict for each in records if (verdict := verdict_of(each)) is not None]
+
+    def test_team_runs_what_is_pushed(self) -> None:
+        """A strategy pushed to a running team is loaded by all three dogs, shown, and decides the next task."""
+        self.let_in("farthest")
+        told = self.push()
+        self.assertIn("pushed strategy farthest 1 ", told)
+        self.assertEqual({label[:2] for label in self.deployed().values()}, {"1 "})
+        status = self.swarm("status")
+        self.assertIn("farthest  strategy  1 ", status)
+        self.assertEqual(status.count("dog"), 3)
+        verdicts = self.verdicts("deployed:farthest", 30.0)
+        self.assertEqual({v.rule for v in verdicts}, {"deployed:farthest"})
+        self.assertEqual({v.version[:2] for v in verdicts}, {"1 "})
+        first = min(verdicts, key=lambda v: v.epoch)
+        costs = {report.agent: report.cost for report in first.reports}
+        self.assertEqual(first.winner, max(costs, key=lambda agent: costs[agent]))
+
+    def test_node_with_deployment_off_refuses_by_name(self) -> None:
+        """A dog that allows nothing has loaded nothing, and says by name that it cannot do a task decided so."""
+        self.let_in("farthest", refusing="dog3")
+        self.push()
+        self.assertEqual(self.deployed()["dog3"], "")
+        self.assertNotIn("farthest", self.messages("dog3"))
+        self.assertIn("dog3  -", self.swarm("status"))
+        self.verdicts("deployed:farthest", 2.0)
+        self.assertIn("no strategy 'deployed:farthest' here", self.messages("dog3"))
+        self.assertNotIn("no strategy", self.messages("dog1"))
+
+    def test_unlisted_name_is_refused_by_name(self) -> None:
+        """A module that is on nobody's list is refused by name in the messages of each dog, and never runs."""
+        self.let_in("nearest-left")
+        self.push("raise SystemExit('this ran')")
+        for name in self.team.DOGS:
+            self.assertIn("refuses farthest 1: is not among this node's modules", self.messages(name))
+        self.assertEqual(set(self.deployed().values()), {""})
+
+    def test_rollback_and_next_version(self) -> None:
+        """The operator's word takes version 2 back; an older word changes nothing; version 3 comes after both."""
+        self.let_in("farthest")
+        self.push()
+        first = self.deployed()
+        self.push(FARTHEST + "# two\n")
+        self.assertEqual({label[:2] for label in self.deployed().values()}, {"2 "})
+        self.assertIn("went back from version 2: strategy farthest 1 ", self.swarm("rollback farthest"))
+        self.team.clock.advance(2.0)
+        self.assertEqual(self.deployed(), first)
+        self.assertIn("2 was taken back", self.swarm("status"))
+        self.assertIn("nothing before version 1", self.refused("rollback farthest"))
+        self.assertIn(
+            "not above 2", self.refused(f"push {self.file(FARTHEST)} --name farthest --kind strategy --version 2")
+        )
+        self.push(FARTHEST + "# three\n")
+        self.assertEqual({label[:2] for label in self.deployed().values()}, {"3 "})
+
+    def test_module_that_raises_is_refused_and_the_one_before_runs_on(self) -> None:
+        """Version 2 that raises at import, loops, or depends on the order of reports is refused; version 1 runs on."""
+        self.let_in("farthest")
+        self.push()
+        for text, reason in (
+            (FARTHEST + "1 / 0\n", "raises ZeroDivisionError"),
+            (FARTHEST + "while True: pass\n", "takes more than"),
+            (FARTHEST.replace("sorted(", "list("), "depends on the order"),
+            ("x = 1\n", "has to define Strategy"),
+        ):
+            if "list(" in text:
+                text = text.replace(", key=lambda r: (-r.cost, r.agent))", ")")
+            self.push(text)
+            self.assertIn(reason, self.messages("dog1"))
+            self.assertEqual({label[:2] for label in self.deployed().values()}, {"1 "})
+            self.assertIn("refused", self.deployed()["dog2"])
+
+    def test_restart_loads_what_was_accepted(self) -> None:
+        """A dog that leaves and comes back runs the module before it hears of anybody, from its own shelf."""
+        self.let_in("farthest")
+        self.push()
+        before = self.deployed()["dog2"]
+        service = self.team.services["dog2"]
+        service.leave(2.0)
+        self.team.kill("vaio")
+        for other in ("dog1", "dog3"):
+            self.team.kill(other)
+        self.team.clock.advance(2.5)
+        node = service.assembly.node
+        self.assertEqual(node.presence.device.deployed["farthest"], before)
+        self.assertEqual(list(node.deployed), [("strategy", "farthest")])
+
+    def test_wrong_commands(self) -> None:
+        """What the command can see is wrong is refused before anything is sent, with the line of the module."""
+        self.let_in("farthest")
+        path = self.file("def f(:\n")
+        self.assertIn("line 1", self.refused(f"push {path} --name farthest --kind strategy"))
+        self.assertIn("cannot be read", self.refused("push /nowhere --name farthest --kind strategy"))
+        self.assertIn("--name must match", self.refused(f"push {path} --name Far/thest --kind strategy"))
+        self.assertIn("nothing called 'farthest'", self.refused("rollback farthest"))
+        big = self.file("#" * 300_000)
+        self.assertIn("bytes", self.refused(f"push {big} --name farthest --kind strategy"))
+        self.push()
+        again = f"push {self.file(FARTHEST)} --name farthest --kind behaviour"
+        self.assertIn("is a strategy", self.refused(again))
+        self.assertEqual(self.swarm("status").count("farthest"), 1)
+
+    def test_keys_and_json(self) -> None:
+        """``keys`` tells each device's public key, of which its uuid is the hash; ``--json`` is one line of JSON."""
+        self.let_in("farthest")
+        keys = json.loads(self.swarm("keys --json"))
+        devices = {d["name"]: d["uuid"] for d in self.team.state()["devices"]}
+        self.assertEqual({name: node_id(bytes.fromhex(key)).hex() for name, key in keys.items()}, devices)
+        self.push()
+        (row,) = json.loads(self.swarm("status --json"))
+        self.assertEqual((row["name"], row["version"], row["by"]), ("farthest", 1, "vaio"))
+        self.assertEqual(sorted(row["devices"]), ["dog1", "dog2", "dog3", "vaio"])
+        self.assertEqual(json.loads(self.swarm(f"push {self.file('1')} --name o --kind strategy --json"))["version"], 1)

@@ -1,0 +1,93 @@
+"""Tests of ``swarmnode.why``: what a person reads who asks why a dog went, and why another took over."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tempfile
+from pathlib import Path
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.entangled.control.place import made
+from middleware.tasks import Task
+from swarmnode.asker import Refusal
+from swarmnode.rehearsal import VirtualTeam
+from swarmnode.why import chosen, main
+from tests.swarmnode.shell import Shell
+
+
+class WhyTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        # Trial's own folders are deeper than the path of a socket may be.
+        self.folder = Path(tempfile.mkdtemp())
+        self.addCleanup(shutil.rmtree, self.folder)
+        self.patch(os, "environ", {**os.environ, "XDG_RUNTIME_DIR": str(self.folder)})
+        made("vaio").touch()
+        self.team = VirtualTeam(4)
+        self.addCleanup(self.team.stop)
+        self.shell = Shell(self.team, self.team.services["vaio"].assembly.node.entangled)
+
+    def why(self, line: str) -> str:
+        """What ``swarm why LINE`` prints, without trouble."""
+        code, output = self.shell.run(main, line.split())
+        self.assertEqual((code, self.shell.said), (0, ""))
+        return output
+
+    def until(self, status: str) -> str:
+        """Let the team go on until a dog has ``status``; returns its name."""
+        for _ in range(400):
+            self.team.clock.advance(0.2)
+            for device in self.team.state()["devices"]:
+                if device["status"] == status:
+                    return str(device["name"])
+        self.fail(f"nobody was ever {status}")
+
+    def test_takeover_is_explained(self) -> None:
+        """Two epochs: who went first and who took over when it was gone, all agreeing, from the reports they name."""
+        task = self.team.run_demo()
+        first = self.until("EXECUTING")
+        self.team.clock.advance(1.5)
+        told = self.why(task[:5])
+        self.assertIn(f"task {task}: Find the red target\n", told)
+        self.assertIn(f"epoch 1: {first}, 3 of 3 agree, token 1\n", told)
+        self.assertIn("by nearest from reports ", told)
+        self.team.kill(first)
+        self.team.clock.advance(1.5)
+        second = self.until("EXECUTING")
+        self.team.clock.advance(1.5)
+        told = self.why("last")
+        self.assertIn(f"epoch 2: {second}, 2 of 2 agree, token 2\n", told)
+        self.assertLess(told.index("epoch 2"), told.index("epoch 1"))
+        self.assertIn(f"epoch 1: {first}, 3 of 3 agree", told)
+        self.until("DONE")
+        self.team.clock.advance(1.0)
+        self.assertIn(f", completed by {second}\n", self.why(task))
+        (newest, *_) = json.loads(self.why(f"{task} --json"))["epochs"]
+        self.assertEqual((newest["chosen"], newest["of"], newest["rule"]), (second, 2, "nearest"))
+        card = next(each for each in self.team.state()["tasks"] if each["id"] == task)
+        self.assertEqual([(each["chosen"], each["agree"]) for each in card["why"]], [(second, 2), (first, 3)])
+
+    def test_errors_by_name(self) -> None:
+        """No task, no decision, an unknown id and a missing node are one line each, which names what there is."""
+        self.assertEqual(self.shell.run(main, ["last"]), (1, ""))
+        self.assertEqual(self.shell.said, "swarm why: the team has no task\n")
+        task = self.team.run_demo()
+        self.team.clock.advance(1.0)
+        code, output = self.shell.run(main, ["last"])
+        self.assertEqual((code, output.splitlines()[-1]), (1, "nobody has decided anything yet"))
+        self.assertEqual(self.shell.run(main, ["zz"])[0], 1)
+        self.assertEqual(self.shell.said, f"swarm why: no task begins with 'zz'; the newest are {task}\n")
+        self.assertEqual(self.shell.run(main, ["last", "--node", "nobody"])[0], 2)
+        self.assertIn("no node 'nobody' runs", self.shell.said)
+
+    def test_prefix(self) -> None:
+        """A beginning that fits several is refused with their names; a whole id is meant, also where others go on."""
+        tasks = [Task(name, "k", name, created=float(n)) for n, name in enumerate(("ab", "abc", "b"))]
+        self.assertEqual(chosen("last", tasks).task_id, "b")
+        self.assertEqual(chosen("ab", tasks).task_id, "ab")
+        self.assertEqual(chosen("abc", tasks).task_id, "abc")
+        error = self.assertRaises(Refusal, chosen, "a", tasks)
+        self.assertEqual(str(error), "2 tasks begin with 'a': abc, ab; say more of the id")
+        self.assertRaises(Refusal, chosen, "", tasks)
