@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
+from twisted.internet.defer import Deferred, succeed
 from twisted.internet.interfaces import IReactorTime
 
 from agents.account import Account
@@ -191,14 +192,14 @@ class Engagement:
         self._rest_aside(why)
         self.lessee = None
 
-    def abandon(self) -> None:
-        """Leave the task (the caller has stopped the body): give the lease back, for good where the task is done."""
+    def abandon(self) -> Deferred[object]:
+        """Leave the task (the caller has stopped the body): give the lease back, for good where the task is done.
+
+        Fires when the council knows.
+        """
         if self.lessee is None:
-            return
-        if self._concluding and self.result is not None:
-            self.lessee.end()
-        else:
-            self.lessee.release()
+            return succeed(None)
+        return self.lessee.end() if self._concluding and self.result is not None else self.lessee.release()
 
     # -- inside -----------------------------------------------------------------------------------------------------
 

@@ -6,7 +6,7 @@ import random
 from typing import Any
 
 from twisted.application.service import Service
-from twisted.internet.defer import Deferred
+from twisted.internet.defer import Deferred, DeferredList
 from twisted.internet.interfaces import IDelayedCall, IReactorTime
 
 from agents.behaviour import behaviour_for
@@ -59,15 +59,14 @@ class Agent(Service):
         self._node.joined.addCallback(self._follow)
         self._tick = self._clock.callLater(TICK, self._turn)
 
-    def stopService(self) -> Deferred[None]:
-        """Stop the body first, then give back what is held."""
+    def stopService(self) -> Deferred[Any]:
+        """Stop the body first, then give back what is held; fires when those who lent it know."""
         super().stopService()
         self._body.stop()
         if self._tick is not None and self._tick.active():
             self._tick.cancel()
-        for task_id in list(self._parts):
-            self._leave(task_id)
-        return self._body.driver.disconnect()
+        told: list[Deferred[Any]] = [self._leave(task_id) for task_id in list(self._parts)]
+        return DeferredList([*told, self._body.driver.disconnect()], consumeErrors=True)
 
     # -- observe ----------------------------------------------------------------------------------------------------
 
@@ -173,11 +172,11 @@ class Agent(Service):
         engagement.lessee = self._node.lessee(engagement.task, self._turn_now, self._token)
         self._node.presence.change(task=engagement.task.task_id, status=engagement.me.status)
 
-    def _leave(self, task_id: str) -> None:
+    def _leave(self, task_id: str) -> Deferred[object]:
         part = self._parts.pop(task_id)
-        part.leave(bool(self.running))
         if part is self._holder:
             self._holder = None
+        return part.leave(bool(self.running))
 
     # -- act --------------------------------------------------------------------------------------------------------
 

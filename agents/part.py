@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorTime
 
 from agents.behaviour import Behaviour
@@ -51,13 +52,17 @@ class Part:
         """Tell the others how things stand."""
         self._group.report(self.engagement.me)
 
-    def leave(self, is_running: bool) -> None:
-        """Give back what is held and hear no more of it; who goes on running takes its report back."""
+    def leave(self, is_running: bool) -> Deferred[object]:
+        """Give back what is held and hear no more of it; who goes on running takes its report back.
+
+        Fires when those who lend it know.
+        """
         self.is_left = True
-        self.engagement.abandon()
+        told = self.engagement.abandon()
         self._group.leave()
         if is_running:
             self._group.withdraw()
+        return told
 
     def _ordered(self, records: list[Record]) -> None:
         self.engagement.ordered(order_of(records))

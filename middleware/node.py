@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
@@ -17,6 +18,7 @@ from twisted.internet.defer import Deferred, maybeDeferred
 from twisted.internet.interfaces import IReactorTime
 from twisted.logger import Logger
 
+from middleware.consensus.strategy import place_of
 from middleware.entangled.background import Background
 from middleware.entangled.data.store import Store
 from middleware.entangled.errors import EntangledError, NotRunning, Refused, WeatherError
@@ -35,6 +37,7 @@ from middleware.tasks import ORDER, RESULT, TASKS, Result, Task, group_key
 from middleware.value import bounded
 
 if TYPE_CHECKING:
+    from middleware.commitment.council import Council
     from middleware.commitment.desk import Desk
     from middleware.commitment.lessee import Lessee
     from middleware.dissemination.bidding import Bidding
@@ -42,7 +45,8 @@ if TYPE_CHECKING:
     from middleware.dissemination.party import OnSummary
     from middleware.verdict import Verdict
 
-COUNCIL = 3
+LARGE = 50
+"""Members from which on a council has five instead of three."""
 CAMERA = "camera"
 LEASE_VERBS = ("prepare", "propose", "release", "close", "change", "install", "freed")
 LOOK_AGAIN = 0.3
@@ -201,10 +205,16 @@ class SwarmNode(Service):
     # -- tasks ------------------------------------------------------------------------------------------------------
 
     async def submit(self, task: Task) -> Task:
-        """Publish ``task`` with the council pinned: the nodes closest to its key now (consensus rule 1)."""
+        """Publish ``task`` with the council pinned: the nodes closest to its key now (consensus rule 1).
+
+        Raises ``UnknownStrategy`` where there is no strategy of the name that it gives.
+        """
+        if not task.strategy.startswith("deployed:"):  # those are the business of the nodes that have them
+            place_of(task.strategy)
         key = group_key(task.task_id)
         nearest = await self.entangled.find_node(key)
-        council = closest([*nearest, self.entangled.contact], key, COUNCIL)
+        tolerates = max(task.tolerates, 2 if len(self.entangled.overlay.contacts()) >= LARGE else 1)
+        council = closest([*nearest, self.entangled.contact], key, 2 * tolerates + 1)
         task = replace(task, council=tuple(council))
         await self.entangled.put(TASKS, task.task_id, task.packed(), "team")
         return task
@@ -243,25 +253,38 @@ class SwarmNode(Service):
         put = maybeDeferred(self.entangled.put, verdict.key, verdict.slot, verdict.packed(), "team")
         self._quietly(put)
 
+    async def cancel(self, task: Task, result: Result) -> Stored:
+        """Record that ``task`` was cancelled, and have its council grant nothing more; done when nobody can act on it.
+
+        Where the council cannot be reached the record alone has to do, and who acts stops when it hears of it.
+        """
+        written = self.conclude(task.task_id, result)
+        with suppress(EntangledError):
+            await self._council(task).close()
+        return await written
+
     def lessee(self, task: Task, changed: Callable[[], None], floor: int) -> Lessee:
         """The claimant of the right to act on ``task``, in this node's name.
 
         ``floor`` is the highest token that the node's own device has obeyed, so that a new token is always higher.
         """
-        # Imported by the first who has something to claim: a node without a robot is spared their memory.
-        from middleware.commitment.council import Council
+        # Imported by the first who has something to claim: a node without a robot is spared the memory.
         from middleware.commitment.lessee import Lessee
+
+        lessee = Lessee(self._council(task, floor), self.clock, self.rng, changed, task.stop_time)
+        self._desk.enter(lessee)
+        return lessee
+
+    def _council(self, task: Task, floor: int = 0) -> Council:
+        from middleware.commitment.council import Council
 
         ttl = float(task.lease_ttl)
 
         def ask(member: Contact, method: str, arguments: tuple[Any, ...]) -> Deferred[Any]:
             return self._desk.ask(self.entangled.contact, member, method, arguments, ttl / 3)
 
-        made, now = task.council, self.clock
-        council = Council(task.task_id, self.uuid, ttl, made, ask, now, self.rng, task.configuration, floor)
-        lessee = Lessee(council, self.clock, self.rng, changed, task.stop_time)
-        self._desk.enter(lessee)
-        return lessee
+        pinned = task.task_id, self.uuid, ttl, task.council
+        return Council(*pinned, ask, self.clock, self.rng, task.configuration, floor)
 
     @cached_property
     def _desk(self) -> Desk:

@@ -23,6 +23,7 @@ TASKS = hashed_key("tasks")
 COMPLETED, FAILED, CANCELLED = "COMPLETED", "FAILED", "CANCELLED"
 OUTCOMES = (COMPLETED, FAILED, CANCELLED)
 MAX_LEASE_TTL = 60.0
+MAX_TOLERATED = 3
 MEMBER = "member"
 RESULT = "result"
 ORDER = "order"
@@ -41,7 +42,8 @@ class Task:
     ``requirements`` maps capability names to properties that a device must at least have; ``waiting_period`` is how
     long the agents wait for each other's reports after the first one, in seconds; ``lease_ttl`` how long the right to
     act outlives a silent holder; ``hysteresis`` by which share a late report must be better to take the task over;
-    ``council`` are the nodes whose majority grants that right, pinned when the task is made; ``configuration`` counts
+    ``council`` are the nodes whose majority grants that right, pinned when the task is made: so many that ``tolerates``
+    of them may be lost at once, where the team has as many; ``configuration`` counts
     its changes.
 
     Of several tasks the one with the highest ``priority`` has an agent's body, then the oldest; ``preemptible`` ones
@@ -62,6 +64,7 @@ class Task:
     hysteresis: float = 0.1
     created: float = 0.0
     council: tuple[Contact, ...] = ()
+    tolerates: int = 1
     priority: int = 0
     deadline: float = 0.0
     stop_time: float = 0.0
@@ -178,6 +181,8 @@ def task_of(record: Record) -> Task | None:
     times = (task.waiting_period, task.lease_ttl, task.created, task.deadline, task.stop_time, task.stall_limit)
     lawful = (
         len(task.council) == len(council)
+        and type(task.tolerates) is int
+        and 1 <= task.tolerates <= MAX_TOLERATED
         and all(isinstance(text, str) for text in (task.task_id, task.kind, task.title, task.strategy, task.group))
         and all(is_number(n) and n >= 0 for n in (*times, task.hysteresis, task.value))
         and all(is_whole(n) for n in (task.generation, task.configuration))

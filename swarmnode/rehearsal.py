@@ -42,6 +42,7 @@ class VirtualTeam:
     BOOTSTRAP = "vaio"
     DOGS = ("dog1", "dog2", "dog3")
     JOINING = 0.3
+    GOING = 1.0
 
     def __init__(
         self,
@@ -140,6 +141,7 @@ class VirtualTeam:
         for service in self.services.values():
             if service.running:
                 service.stopService()
+        self.clock.advance(self.GOING)
         self._operator.disconnect()
         self.yard.stop()
 

@@ -46,8 +46,8 @@ class NodeService(Service):
         super().stopService()
         if self._coming is not None and self._coming.active():
             self._coming.cancel()
-        ended = self._end_agent()
-        self.assembly.node.stopService()
+        # What the agent held is given back while the node still speaks: so another goes on at once.
+        ended = self._end_agent().addBoth(lambda _: self.assembly.node.stopService())
         down = gatherResults([ended, self._end_fronts()])
         return down.addBoth(lambda _: self._seams.store.close())
 

@@ -123,8 +123,10 @@ def _serve_tasks(app: Flask, read: Callable[[], State], desk: Desk, on_reactor: 
 
     @app.post("/api/tasks")
     def assign() -> tuple[Response, int]:
-        name = _words("name", 64)
-        answer = on_reactor(desk.assign, name)
+        name, tolerates = _words("name", 64), _number("tolerates", 1.0)
+        if tolerates not in (1.0, 2.0, 3.0):
+            raise Refusal("tolerates", f"{tolerates:g} is out of range", "give 1, 2 or 3")
+        answer = on_reactor(desk.assign, name, int(tolerates))
         return jsonify(answer if isinstance(answer, dict) else {"id": answer}), 202
 
     @app.post("/api/tasks/<task_id>/<any(cancel, pause, resume):wish>")

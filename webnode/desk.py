@@ -19,8 +19,11 @@ class Desk(Protocol):
     def run_demo(self) -> Any:
         """Assign the demonstration's task; returns its id."""
 
-    def assign(self, name: str) -> Any:
-        """Assign a predefined task; returns its id, or ``{"id", "able": [names], "refused": {name: [reasons]}}``."""
+    def assign(self, name: str, tolerates: int = 1) -> Any:
+        """Assign a predefined task; ``tolerates`` members of its council may be lost at once.
+
+        Returns its id, or ``{"id", "able": [names], "refused": {name: [reasons]}}``.
+        """
 
     def catalogue(self) -> Sequence[Mapping[str, Any]]:
         """The predefined tasks: ``{"name", "title", "requirements"}`` each."""
@@ -66,7 +69,7 @@ class MemoryDesk:
         """Return ``demo-N``."""
         return self._noted("demo")
 
-    def assign(self, name: str) -> dict[str, Any]:
+    def assign(self, name: str, tolerates: int = 1) -> dict[str, Any]:
         """Return ``assign-N``; nobody is able, nobody is refused."""
         if name not in [task["name"] for task in self.tasks]:
             raise Refusal("name", f"there is no task {name!r}", "choose one of /api/catalogue", 404)

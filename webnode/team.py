@@ -99,14 +99,14 @@ class TeamDesk:
             self._node.clock.callLater(PLACING, self._place)
         return str(self.assign(self._demo)["id"])
 
-    def assign(self, name: str) -> dict[str, Any]:
+    def assign(self, name: str, tolerates: int = 1) -> dict[str, Any]:
         """Publish a predefined task; the devices that can do it take it up by themselves."""
         template = self._predefined.get(name)
         if template is None:
             known = ", ".join(sorted(self._predefined))
             raise Refusal("name", f"there is no predefined task {name!r}", f"choose one of {known}", 404)
         task_id = self._node.rng.randbytes(6).hex()
-        task = replace(template, task_id=task_id, created=self._node.wall())
+        task = replace(template, task_id=task_id, created=self._node.wall(), tolerates=tolerates)
         devices = [device for device, _ in devices_of(self._devices.records)]
         refused = refused_by(task, devices)
         self._quietly(Deferred.fromCoroutine(self._node.submit(task)))
@@ -114,7 +114,13 @@ class TeamDesk:
 
     def cancel(self, task_id: str) -> None:
         """Record that the task is cancelled; whoever is at it stops."""
-        self._quietly(self._node.conclude(task_id, Result(CANCELLED, self._node.presence.device.name)))
+        result = Result(CANCELLED, self._node.presence.device.name)
+        task = next(
+            (task for record in self._tasks.records if (task := task_of(record)) and task.task_id == task_id), None
+        )
+        if task is None:
+            return self._quietly(self._node.conclude(task_id, result))
+        self._quietly(Deferred.fromCoroutine(self._node.cancel(task, result)))
 
     def pause(self, task_id: str) -> None:
         """Record that the task is to rest; whoever is at it stops, and is free for others."""

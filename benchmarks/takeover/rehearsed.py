@@ -33,6 +33,8 @@ def trial(cause: Cause, seed: int, loss: float = 0.1) -> Trial:
     asker = WEB if others else VirtualTeam.BOOTSTRAP
     node = team.services[asker].assembly.node
     task = replace(task_named("turn-around", f"turn{seed}", 0.0), waiting_period=1.0)
+    if cause is Cause.TRIPLE_KILL:
+        task = replace(task, tolerates=3)
     Deferred.fromCoroutine(node.submit(task))
     team.board.weather = replace(WEATHER, loss=loss)
     watcher = team.services[WITNESSES[0] if others else asker].assembly.node

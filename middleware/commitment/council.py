@@ -10,7 +10,7 @@ import random
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from twisted.internet.defer import Deferred
+from twisted.internet.defer import Deferred, DeferredList
 from twisted.internet.interfaces import IReactorTime
 
 from middleware.commitment.ballot import (
@@ -91,12 +91,14 @@ class Council:
             if reply.kind == BEHIND and newest is not None and newest.configuration == self.configuration:
                 self._install(self.members[place])
 
-    def let_go(self, ballot: Ballot, heirs: Sequence[Contact] = ()) -> None:
-        """Give back whatever was promised or granted under ``ballot``, and tell ``heirs``."""
-        for member in self.members:
-            self._ask(member, "lease.release", (self.task_id, ballot.counter)).addErrback(lambda _: None)
-        for heir in heirs:
-            self._ask(heir, "lease.freed", (self.task_id, self.token)).addErrback(lambda _: None)
+    def let_go(self, ballot: Ballot, heirs: Sequence[Contact] = ()) -> Deferred[Any]:
+        """Give back whatever was promised or granted under ``ballot``, and tell ``heirs``.
+
+        Fires when every member has been told, or does not answer.
+        """
+        told = [self._ask(member, "lease.release", (self.task_id, ballot.counter)) for member in self.members]
+        told += [self._ask(heir, "lease.freed", (self.task_id, self.token)) for heir in heirs]
+        return DeferredList(told, consumeErrors=True)
 
     def close(self, token: int = 0) -> Deferred[None]:
         """Have no more leases granted on the task, which has ended; fires when nobody can act on it any more.

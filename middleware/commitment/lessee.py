@@ -14,8 +14,9 @@ import random
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from twisted.internet.defer import Deferred
+from twisted.internet.defer import Deferred, succeed
 from twisted.internet.interfaces import IDelayedCall, IReactorTime
+from twisted.internet.task import deferLater
 
 from middleware.commitment.ballot import GRANTED, NONE, OUTBID, OVER, SEALED, Ballot
 from middleware.commitment.council import Council
@@ -130,26 +131,29 @@ class Lessee:
             self._lose()
             self._claim()
 
-    def release(self, heirs: Sequence[Contact] = ()) -> None:
-        """Give the lease back (stop the device first), or stop claiming it.
+    def release(self, heirs: Sequence[Contact] = ()) -> Deferred[object]:
+        """Give the lease back (stop the device first), or stop claiming it; fires when the council knows.
 
         Where the robot takes a time to come to rest, the council is told when that has passed.  Its members tell those
         that stand by; ``heirs`` are told from here, and so half a round trip earlier.
         """
+        told: Deferred[object] = succeed(None)
         if self.lease is not None:
             self._rests_at = self._clock.seconds() + self._stop_time
         self._is_wanted = False
         self._cancel()
         if self._ballot != NONE:
-            self._let_go(self._ballot, heirs)
+            told = self._let_go(self._ballot, heirs)
         self._let_go_of_minority()
         self.token, self._deadline, self._ballot, self._claimed = 0, 0.0, NONE, NONE
+        return told
 
-    def end(self) -> None:
+    def end(self) -> Deferred[object]:
         """Give the lease back (stop the device first) and have none granted any more: the task has ended."""
-        closed = self.council.close(self.token)
-        closed.addErrback(lambda failure: failure.trap(EntangledError))
-        closed.addCallback(lambda _: self.release())
+        closed: Deferred[object] = self.council.close(self.token).addErrback(
+            lambda failure: failure.trap(EntangledError)
+        )
+        return closed.addCallback(lambda _: self.release())
 
     # -- claiming ---------------------------------------------------------------------------------------------------
 
@@ -297,13 +301,12 @@ class Lessee:
         if self._is_wanted and not self._is_asking:
             self._again(self._rng.uniform(*BACK_OFF))
 
-    def _let_go(self, ballot: Ballot, heirs: Sequence[Contact] = ()) -> None:
+    def _let_go(self, ballot: Ballot, heirs: Sequence[Contact] = ()) -> Deferred[object]:
         """Tell the council, as soon as the robot stands still (it was told to stop at the deadline at the latest)."""
         rest = self._rest()
         if rest > 0.0:
-            self._clock.callLater(rest, self.council.let_go, ballot, heirs)
-        else:
-            self.council.let_go(ballot, heirs)
+            return deferLater(self._clock, rest, self.council.let_go, ballot, heirs)
+        return self.council.let_go(ballot, heirs)
 
     def _rest(self) -> float:
         """Seconds for which the robot may still move."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+from twisted.internet.defer import Deferred, succeed
 from twisted.trial.unittest import SynchronousTestCase
 
 from agents.behaviour import STAND
@@ -81,20 +82,22 @@ class Council:
         """Note the wish."""
         self.is_wanted = True
 
-    def end(self) -> None:
+    def end(self) -> Deferred[object]:
         """Give it back for good."""
         self._events.append("ended")
         self.is_wanted, self.token = False, 0
+        return succeed(None)
 
     def stand_by(self, rank: int = 1) -> None:
         """Note the place in the row."""
         self.rank = rank
 
-    def release(self) -> None:
+    def release(self) -> Deferred[object]:
         """Give it back."""
         if self.token:
             self._events.append("released")
         self.is_wanted, self.token = False, 0
+        return succeed(None)
 
     def grant(self, token: int, ttl: float = 1.5) -> None:
         """Let the agent have it."""

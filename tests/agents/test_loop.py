@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 from twisted.internet.defer import Deferred
@@ -13,7 +14,8 @@ from drivers.driver import Permit
 from drivers.errors import NotEnabled
 from drivers.reading import Action
 from middleware.commitment.lessee import Lease
-from middleware.tasks import Task
+from middleware.errors import UnknownStrategy
+from middleware.tasks import TASKS, Task
 from swarmnode.rehearsal import VirtualTeam
 
 
@@ -140,11 +142,14 @@ class LoopTests(SynchronousTestCase):
         self.assertEqual(self.team.state()["tasks"][0]["status"], "COMPLETED")
 
     def test_strategy_is_never_imported_from_a_task(self) -> None:
-        """A task that brings a strategy as a module's path is left, with a line that says why."""
-        self.submit(strategy="os:system")
-        self.assertIn("no strategy is called 'os:system'", self.lines("dog1")[-1])
-        self.submit(task_id="t2", created=1.0, strategy="loudest")
-        self.assertIn("no strategy is called 'loudest'", self.lines("dog1")[-1])
+        """A strategy as a module's path is refused where a task is submitted, and where a peer wrote it all the same."""
+        node = self.team.services["vaio"].assembly.node
+        task = Task("t0", "turn-around", "Odd", strategy="os:system")
+        self.failureResultOf(Deferred.fromCoroutine(node.submit(task)), UnknownStrategy)
+        for task in (replace(task, task_id="t1"), replace(task, task_id="t2", created=1.0, strategy="loudest")):
+            node.entangled.put(TASKS, task.task_id, task.packed(), "team")
+            self.team.clock.advance(1.0)
+            self.assertIn(f"no strategy is called {task.strategy!r}", self.lines("dog1")[-1])
 
     def test_odd_parameters_do_not_stop_the_agent(self) -> None:
         """Parameters from the wire that no behaviour can have cost the task and nothing else."""
@@ -200,6 +205,7 @@ class LoopTests(SynchronousTestCase):
         self.team.clock.advance(1.0)
         moving = [dog.name for dog in self.team.yard.world.dogs.values() if dog.is_moving]
         self.assertEqual(len(moving), 1)
-        self.successResultOf(self.agent_of(moving[0]).stopService())
+        stopped = self.agent_of(moving[0]).stopService()
         self.team.clock.advance(0.3)
         self.assertFalse(self.team.yard.world.dogs[moving[0]].is_moving)
+        self.successResultOf(stopped)

@@ -236,14 +236,14 @@ class Lessee:
             self._wanted = True
             self._ether.clock.callLater(0.02, self._claim, self._life)
 
-    def end(self) -> None:
+    def end(self) -> Deferred[object]:
         """Give back, as the task has ended."""
-        self.release()
+        return self.release()
 
     def stand_by(self, rank: int = 1) -> None:
         """Nobody is told here when a lease is free: only who wants it asks."""
 
-    def release(self) -> None:
+    def release(self) -> Deferred[object]:
         """Give back."""
         self._wanted, self._deadline = False, 0.0
         self._life += 1
@@ -251,6 +251,7 @@ class Lessee:
         if self.token and holder is not None and holder[1] == self.token and self._reached():
             del self._ether.holders[self._task_id]
         self.token = 0
+        return succeed(None)
 
     def _reached(self) -> bool:
         ether = self._ether

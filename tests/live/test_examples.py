@@ -78,13 +78,14 @@ class ExamplesTests(TestCase):
 
     def test_workqueue(self) -> None:
         """All jobs are done though a worker dies over its first one."""
-        first = free_port()
-        boss = self.start("workqueue", "--port", first, "boss", 4)
-        self.assertEqual(self.line(boss), "jobs are put: 4")
+        first, jobs = free_port(), 12
+        boss = self.start("workqueue", "--port", first, "boss", jobs)
+        self.assertEqual(self.line(boss), f"jobs are put: {jobs}")
         known = ("--known", f"127.0.0.1:{first}")
+        self.start("workqueue", "--port", free_port(), *known, "worker", "ann")
+        lines = [self.line(boss)]
         mortal = self.start("workqueue", "--port", free_port(), *known, "worker", "bob", "--dies", "1.0")
         self.assertTrue(self.line(mortal).startswith("bob dies over"))
-        self.start("workqueue", "--port", free_port(), *known, "worker", "ann")
-        lines = [self.line(boss) for _ in range(4)]
-        for number in range(4):
+        lines += [self.line(boss) for _ in range(jobs - 1)]
+        for number in range(jobs):
             self.assertTrue(any(line.startswith(f"{number} squared is {number**2}, says ann") for line in lines), lines)

@@ -16,7 +16,7 @@ from middleware.consensus.item import Item
 from middleware.consensus.nearest import Nearest
 from middleware.consensus.selection import guarded
 from middleware.consensus.strategy import Consensus, Report
-from middleware.consensus.worker import Worker
+from middleware.consensus.worker import DEADLINE_S, Worker
 
 ROOT = str(Path(__file__).resolve().parents[2])
 TEAM = [Report("a", 3.0, value=(1.0, 2.0)), Report("b", 1.0), Report("c", 2.0)]
@@ -77,9 +77,9 @@ class Raising(Nearest):
 
 
 class WorkerTests(SynchronousTestCase):
-    def guard(self, name: str) -> Guard:
+    def guard(self, name: str, deadline: float = DEADLINE_S) -> Guard:
         """A class of this module in a process of its own, loaded, behind a guard."""
-        worker = Worker(name, f"{__name__}:{name}", path=(ROOT,))
+        worker = Worker(name, f"{__name__}:{name}", deadline, path=(ROOT,))
         self.addCleanup(worker.stop)
         guard = Guard(worker, twice=True)
         self.loaded(guard)
@@ -133,7 +133,7 @@ class WorkerTests(SynchronousTestCase):
             ("Raising", "ZeroDivisionError: I divide"),
             ("Absent", "has no attribute 'Absent'"),
         ):
-            found = self.loaded(self.guard(name))
+            found = self.loaded(self.guard(name, 10.0))
             self.assertEqual((found.assigned_agent, found.strategy), ("b", "nearest"), name)
             self.assertIn(why, found.reason)
 

@@ -52,7 +52,7 @@ class WhyTests(SynchronousTestCase):
         told = self.why(task[:5])
         self.assertIn(f"task {task}: Find the red target\n", told)
         self.assertIn(f"epoch 1: {first}, 3 of 3 agree, token 1\n", told)
-        self.assertIn("by nearest from reports ", told)
+        self.assertIn("by nearest 2 from reports ", told)
         self.team.kill(first)
         self.team.clock.advance(1.5)
         second = self.until("EXECUTING")
@@ -65,7 +65,7 @@ class WhyTests(SynchronousTestCase):
         self.team.clock.advance(1.0)
         self.assertIn(f", completed by {second}\n", self.why(task))
         (newest, *_) = json.loads(self.why(f"{task} --json"))["epochs"]
-        self.assertEqual((newest["chosen"], newest["of"], newest["rule"]), (second, 2, "nearest"))
+        self.assertEqual((newest["chosen"], newest["of"], newest["rule"]), (second, 2, "nearest 2"))
         card = next(each for each in self.team.state()["tasks"] if each["id"] == task)
         self.assertEqual([(each["chosen"], each["agree"]) for each in card["why"]], [(second, 2), (first, 3)])
 

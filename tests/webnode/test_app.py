@@ -90,9 +90,12 @@ class AppTests(SynchronousTestCase):
 
     def test_tell_who_can(self) -> None:
         """Assigning answers the id, who is able, and who was refused and why."""
-        self.desk.assign = lambda name: {"id": "t2", "able": ["dog1"], "refused": {"dog2": ["no camera"]}}  # type: ignore[method-assign]
+        answer = {"id": "t2", "able": ["dog1"], "refused": {"dog2": ["no camera"]}}
+        self.desk.assign = lambda name, tolerates=1: {**answer, "for": tolerates}  # type: ignore[method-assign]
         told = self.client.post("/api/tasks", json={"name": "search"}).get_json()
-        self.assertEqual(told, {"id": "t2", "able": ["dog1"], "refused": {"dog2": ["no camera"]}})
+        self.assertEqual(told, {**answer, "for": 1})
+        told = self.client.post("/api/tasks", json={"name": "search", "tolerates": 3}).get_json()
+        self.assertEqual(told["for"], 3)
 
     def test_refuse(self) -> None:
         """Every unlawful wish gets its code and an error with field, problem and remedy, and reaches nobody."""
