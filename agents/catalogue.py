@@ -8,6 +8,8 @@ from middleware.errors import UnknownTask
 from middleware.tasks import Task
 
 DEMO = "find-red-target"
+STOP = 0.1
+"""Seconds in which a dog that turns at 1.2 rad/s, or walks, stands still."""
 
 TASKS = {
     DEMO: Task(
@@ -17,6 +19,7 @@ TASKS = {
         requirements={"base2d": {}, "camera": {"width": 104}, "ranger": {"max": 0.5}},
         parameters={"target_radius": 0.08, "target_height": 0.22},
         waiting_period=15.0,
+        stop_time=STOP,
     ),
     "turn-around": Task(
         task_id="",
@@ -24,6 +27,7 @@ TASKS = {
         title="Turn around once",
         requirements={"base2d": {}, "odometry": {}, "power": {}},
         waiting_period=1.0,
+        stop_time=STOP,
     ),
     "fetch-the-ball": Task(
         task_id="",

@@ -12,7 +12,6 @@ from benchmarks.takeover.cause import WEB, WITNESSES, Cause, Trial
 from middleware.entangled.network.switchboard import Weather
 from middleware.entangled.record import Record
 from middleware.tasks import COMPLETED, outcome_of
-from sim.dog import REST
 from swarmnode.rehearsal import VirtualTeam
 
 WEATHER = Weather(delay_s=0.03, jitter_s=0.01)
@@ -71,7 +70,7 @@ def trial(cause: Cause, seed: int, loss: float = 0.1) -> Trial:
 
 
 def _moving(team: VirtualTeam) -> list[str]:
-    return [name for name, dog in team.yard.world.dogs.items() if dog.command != REST]
+    return [name for name, dog in team.yard.world.dogs.items() if dog.is_moving]
 
 
 def _until_one_moves(team: VirtualTeam) -> str | None:

@@ -142,14 +142,14 @@ class LoopTests(SynchronousTestCase):
         self.assertEqual(self.team.state()["tasks"][0]["status"], "COMPLETED")
 
     def test_strategy_is_never_imported_from_a_task(self) -> None:
-        """A strategy as a module's path is refused where a task is submitted, and where a peer wrote it all the same."""
+        """A strategy as a module's path is refused where a task is submitted, and where a peer wrote it anyway."""
         node = self.team.services["vaio"].assembly.node
         task = Task("t0", "turn-around", "Odd", strategy="os:system")
         self.failureResultOf(Deferred.fromCoroutine(node.submit(task)), UnknownStrategy)
-        for task in (replace(task, task_id="t1"), replace(task, task_id="t2", created=1.0, strategy="loudest")):
-            node.entangled.put(TASKS, task.task_id, task.packed(), "team")
+        for odd in (task, replace(task, task_id="t2", created=1.0, strategy="loudest")):
+            node.entangled.put(TASKS, odd.task_id, odd.packed(), "team")
             self.team.clock.advance(1.0)
-            self.assertIn(f"no strategy is called {task.strategy!r}", self.lines("dog1")[-1])
+            self.assertIn(f"no strategy is called {odd.strategy!r}", self.lines("dog1")[-1])
 
     def test_odd_parameters_do_not_stop_the_agent(self) -> None:
         """Parameters from the wire that no behaviour can have cost the task and nothing else."""

@@ -65,7 +65,7 @@ class WhyTests(SynchronousTestCase):
         self.team.clock.advance(1.0)
         self.assertIn(f", completed by {second}\n", self.why(task))
         (newest, *_) = json.loads(self.why(f"{task} --json"))["epochs"]
-        self.assertEqual((newest["chosen"], newest["of"], newest["rule"]), (second, 2, "nearest 2"))
+        self.assertEqual((newest["chosen"], newest["of"], newest["rule"]), (second, 2, "nearest"))
         card = next(each for each in self.team.state()["tasks"] if each["id"] == task)
         self.assertEqual([(each["chosen"], each["agree"]) for each in card["why"]], [(second, 2), (first, 3)])
 
