@@ -74,7 +74,7 @@ class DeskTests(FleetCase):
         fleet.run(0.3)
         lessees[3].stand_by(3)
         lessees[1].release([fleet.nodes[3].entangled.contact])
-        fleet.run(0.3)
+        fleet.run(0.7)
         self.assertEqual(self.holders(lessees), [3])
         self.end(fleet, lessees)
 
