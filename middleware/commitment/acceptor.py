@@ -97,10 +97,11 @@ class Acceptor:
         listeners, entry.listeners = entry.listeners, {}
         return [agent for agent, until in listeners.items() if until > now and agent != ballot.agent]
 
-    def close(self, task_id: str, agent: str, token: int, now: float) -> Reply:
+    def close(self, task_id: str, agent: str, configuration: int, token: int, now: float) -> Reply:
         """Grant no more leases on a task that has ended; ``remaining`` is how long another may still act on it.
 
-        Who concludes names its token, and is refused where a higher one was granted; token 0 is an operator's.
+        Who concludes names its token, and is refused where a higher one was granted; token 0 is an operator's.  Where
+        the council is another one by now, or may be, that one has to be asked as well.
         """
         entry = self._ledger.get(task_id) or self._ledger.add(task_id, FIRST, now)
         if entry is None:
@@ -110,7 +111,8 @@ class Acceptor:
         if not entry.is_over:
             entry.is_over, entry.touched_at = True, now
             self._ledger.keep(task_id)
-        reply = self._reply(OVER, entry, now)
+        has_moved = configuration < entry.configuration
+        reply = self._reply(MOVED if has_moved else OVER if entry.sealed == NONE else SEALED, entry, now)
         is_done = entry.ballot.agent == agent and entry.token == token
         return reply._replace(remaining=0.0) if is_done else reply
 

@@ -127,14 +127,26 @@ class Council:
     # -- inside -----------------------------------------------------------------------------------------------------
 
     async def _close(self, token: int) -> None:
-        asked = Round(self.members, self._ask, self._clock, "lease.close", (self.task_id, token), (OVER,), self.ttl / 3)
-        done = await asked.outcome
-        self.hear(done)
-        if not done.is_won:
-            done.close()
-            _raise(done, "the end of the task is not recorded")
-        # Among any majority that closed is a member that granted whatever lease is still in force.
-        rest = max(done.replies[place].remaining for place in done.yes)
+        over_at = 0.0
+        while True:
+            configuration = self.configuration
+            done = await self.round("lease.close", token, kinds=(OVER, SEALED)).outcome
+            self.hear(done)
+            if not done.is_won:
+                done.close()
+                if self.configuration == configuration:
+                    _raise(done, "the end of the task is not recorded")
+                continue  # there is another council by now
+            # Among any majority that closed is a member that granted whatever lease is still in force.
+            rest = max(done.replies[place].remaining for place in done.yes)
+            over_at = max(over_at, self._clock.seconds() + rest)
+            sealed = [reply for reply in done.replies.values() if reply.kind == SEALED]
+            if self.configuration == configuration and not sealed:
+                break
+            if sealed and self.configuration == configuration:
+                # A change was accepted by some: it may be decided, so the council to come has to know as well.
+                self._adopt(configuration + 1, max(sealed, key=lambda reply: reply.ballot).members)
+        rest = over_at - self._clock.seconds()
         if rest > 0.0:
             waited: Deferred[None] = Deferred()
             self._clock.callLater(rest, waited.callback, None)

@@ -89,9 +89,10 @@ class Desk:
             if contact is not None:
                 self._endpoint.tell(contact, "lease.freed", task_id, 0)
 
-    def _close(self, peer: Contact, task_id: str, token: int) -> Answer:
-        _check(task_id, token + 1)
-        return self._kept(self._acceptor.close(task_id, peer.node_id.hex(), token, self._clock.seconds()))
+    def _close(self, peer: Contact, task_id: str, configuration: int, token: int) -> Answer:
+        _check(task_id, configuration, token + 1)
+        agent, now = peer.node_id.hex(), self._clock.seconds()
+        return self._kept(self._acceptor.close(task_id, agent, configuration, token, now))
 
     def _change(
         self, peer: Contact, task_id: str, configuration: int, counter: int, packed: list[object], token: int

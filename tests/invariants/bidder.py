@@ -148,8 +148,8 @@ class Bidder:
         for listener in self.acceptor.release(task_id, Ballot(counter, agent), self.machine.seconds()):
             self.world.tell_freed(self.place, listener, task_id)
 
-    def _close(self, agent: str, task_id: str, token: int) -> Reply:
-        return self.acceptor.close(task_id, agent, token, self.machine.seconds())
+    def _close(self, agent: str, task_id: str, configuration: int, token: int) -> Reply:
+        return self.acceptor.close(task_id, agent, configuration, token, self.machine.seconds())
 
     def _change(
         self, agent: str, task_id: str, configuration: int, counter: int, packed: list[object], token: int

@@ -213,7 +213,7 @@ class SwarmNodeTests(FleetCase):
             ("lease.prepare", "t", 1, 1, float("nan")),
             ("lease.propose", "t", 1, 1, 0, 1.0),
             ("lease.release", "t", -1),
-            ("lease.close", "t", -1),
+            ("lease.close", "t", 1, -1),
             ("lease.change", "t", 1, 1, [], 0),
             ("lease.change", "t", 1, 1, [[b"k", "h", 0]], 0),
             ("lease.install", "t", 2, [b"?"], 0),

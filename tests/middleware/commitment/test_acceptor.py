@@ -132,7 +132,7 @@ class AcceptorTests(SynchronousTestCase):
         for reply in (
             self.acceptor.prepare("u", 1, ballot(1, "a"), TTL, 0.0),
             self.acceptor.propose("u", 1, ballot(1, "a"), 1, TTL, 0.0),
-            self.acceptor.close("u", "a", 0, 0.0),
+            self.acceptor.close("u", "a", 1, 0, 0.0),
             self.acceptor.install("u", 2, MEMBERS[:3], 0, 0.0),
         ):
             self.assertEqual(reply.kind, QUIET)
@@ -142,10 +142,10 @@ class AcceptorTests(SynchronousTestCase):
         """After the end nothing is granted or renewed; who ends it learns how long another may still act."""
         self.prepare(1, "a", 0.0)
         self.propose(1, "a", 3, 0.0)
-        self.assertEqual(self.acceptor.close("t", "b", 2, 0.5).kind, OUTBID)
-        closed = self.acceptor.close("t", "b", 0, 0.5)
+        self.assertEqual(self.acceptor.close("t", "b", 1, 2, 0.5).kind, OUTBID)
+        closed = self.acceptor.close("t", "b", 1, 0, 0.5)
         self.assertEqual((closed.kind, closed.remaining), (OVER, 1.5))
-        self.assertEqual(self.acceptor.close("t", "a", 3, 0.5).remaining, 0.0)
+        self.assertEqual(self.acceptor.close("t", "a", 1, 3, 0.5).remaining, 0.0)
         self.assertEqual(self.propose(1, "a", 3, 0.6).kind, OVER)
         self.assertEqual(self.prepare(9, "b", 99.0).kind, OVER)
 

@@ -133,6 +133,20 @@ class CouncilTests(RoomCase):
         self.wanting(1, 1.0)
         self.assertEqual((self.holders(), self.lessee(1).is_over), ([], True))
 
+    def test_close_by_who_missed_a_change(self) -> None:
+        """Whoever knows an older council is sent on to the newer one, and waits for the lease that this one granted."""
+        stale = self.lessee(0)
+        self.assertIsNone(self.change(1, 3, 6, 2))
+        self.wanting(1)
+        self.assertEqual(self.holders(), [1])
+        self.cut(0, 3)
+        closing = stale.council.close()
+        self.run_for(TTL - 0.3)
+        self.assertNoResult(closing)
+        self.run_for(0.5)
+        self.assertIsNone(self.successResultOf(closing))
+        self.assertEqual((self.holders(), self.lessee(1).is_over), ([], True))
+
     def test_close_without_a_majority(self) -> None:
         """An end that only a minority knows is not acknowledged."""
         self.cut(0, 3, 4)
