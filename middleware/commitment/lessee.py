@@ -36,7 +36,7 @@ SOON = 1.5
 """Periods of asking within which a lease that runs out is claimed rather than looked at once more."""
 FRESH = 0.3
 """Seconds for which the news of a release is believed against members that have not heard it."""
-STAGGER = 0.15
+STAGGER = 0.1
 """Seconds by which each rank of those that stand by waits longer than the one before it."""
 TICK = 0.05
 """A timer that fires later than this counts as a possible pause."""
