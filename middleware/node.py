@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from middleware.commitment.council import Council
     from middleware.commitment.desk import Desk
     from middleware.commitment.lessee import Lessee
+    from middleware.consensus.strategy import ConsensusAlgorithm
     from middleware.dissemination.bidding import Bidding
     from middleware.dissemination.dissemination import Dissemination
     from middleware.dissemination.party import OnSummary
@@ -298,16 +299,19 @@ class SwarmNode(Service):
     def dissemination(self) -> Dissemination:
         """How the bids for tasks travel through this node."""
         # Imported by the first bid: a node that never carries one is spared the memory.
-        from middleware.consensus.strategy import strategy_for
+        from middleware.consensus.selection import guarded
         from middleware.dissemination.dissemination import Dissemination, Surroundings
         from middleware.dissemination.scale import team_size
 
         entangled = self.entangled
 
+        def strategy(name: str) -> ConsensusAlgorithm:
+            return guarded(name, deployed=self.deployed)
+
         def size() -> int:
             return team_size(entangled.identity.node_id, entangled.overlay.contacts())
 
-        around = Surroundings(lambda: entangled.contact, entangled.overlay.contacts, size, strategy_for)
+        around = Surroundings(lambda: entangled.contact, entangled.overlay.contacts, size, strategy)
         return Dissemination(entangled.identity, entangled.endpoint, around, self.clock, self.rng)
 
     # -- what peers ask ---------------------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ def guarded(
 ) -> Guard:
     """The strategy of that name: built-in ones run here, all others in a process of their own with a deadline.
 
-    What an operator deployed was looked at before, and counts its steps by itself: it runs here, and is asked twice.
+    What an operator deployed was checked when it came: it runs here, unbounded from then on, and is asked twice.
     Raises ``UnknownStrategy`` where there is none of that name.
     """
     if name.startswith("deployed:"):
