@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from twisted.internet.defer import Deferred
 from twisted.python.failure import Failure
 
+from middleware.commitment.lessee import STAGGER
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.kademlia.contact import Contact
 from tests.invariants.radio import CALM, Air
@@ -164,7 +165,8 @@ class Leases(Team):
                     break
             self.bidders[fickle].leave(task_id)
         won_at = self._wait_for_command(task_id, token, 3 * self.ttl + SLACK)
-        if won_at is None or won_at - gone_at > self.ttl / (1.0 - self.drift) + SLACK:
+        in_line = STAGGER * (len(self.agents) - 1)
+        if won_at is None or won_at - gone_at > self.ttl / (1.0 - self.drift) + SLACK + in_line:
             late = "never" if won_at is None else f"{won_at - gone_at:.2f} s later"
             self.referee.say("E3", f"{holder} is gone ({how}); another acts on {task_id} {late}")
         self._heal()
