@@ -11,6 +11,7 @@ WEB_HOST ?= 127.0.0.1
 WEB_PORT ?=
 NODES  ?= 8,32
 SECONDS ?= 5
+JOBS   ?= $(shell nproc 2>/dev/null || echo 1)
 PEERS  ?=
 QUICK  ?=
 
@@ -49,8 +50,9 @@ demo: $(RUNTIME)
 	@exec $(PY) -m sim.demo --seed $(SEED) $(if $(filter-out 0,$(HEADLESS)),--headless) \
 	    --web-host $(WEB_HOST) $(if $(WEB_PORT),--web-port $(WEB_PORT))
 
+# One worker for each processor.
 test: $(DEV)
-	$(PY) -m twisted.trial tests
+	$(PY) -m twisted.trial -j$(JOBS) tests
 
 trials: $(RUNTIME)
 	$(VENV)/bin/swarm trials --count $(N) --seed $(SEED) --real $(REAL)

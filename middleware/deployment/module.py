@@ -125,7 +125,7 @@ def _faults(kind: str, make: Callable[..., Any]) -> Sequence[str]:
         lacking = [name for name in ("look", "cost", "search", "hold", "execute") if not hasattr(make, name)]
         return [f"a behaviour has {name}" for name in lacking]
     strategy = make()
-    lacking = [name for name in ("find", "improves") if not callable(getattr(strategy, name, None))]
+    lacking = [name for name in ("find", "improves", "merge") if not callable(getattr(strategy, name, None))]
     if lacking:
         return [f"a strategy has {name}" for name in lacking]
     faults = []
@@ -138,6 +138,9 @@ def _faults(kind: str, make: Callable[..., Any]) -> Sequence[str]:
         if strategy.find(list(order)).assigned_agent != found.assigned_agent:
             faults.append("find depends on the order of the reports, or on how often it hears them")
             break
+    halves = strategy.merge(strategy.merge(REPORTS[:2], ()), strategy.merge(REPORTS[2:], REPORTS[:2]))
+    if strategy.find(list(halves)).assigned_agent != found.assigned_agent:
+        faults.append("find of what merge keeps is not find of all reports")
     if strategy.improves(REPORTS[1], REPORTS[1], 0.1):
         faults.append("improves says that a report is better than itself")
     return faults

@@ -23,7 +23,7 @@ from tests.swarmnode.shell import Shell
 
 FARTHEST = '''
 """The agent with the longest way goes: nobody wants that, so nobody takes it for the default."""
-from middleware.consensus.strategy import Consensus, digest_of
+from middleware.consensus.strategy import Consensus, digest_of, standing
 
 RAN = True
 
@@ -38,6 +38,9 @@ class Strategy:
 
     def improves(self, current, offer, hysteresis):
         return False
+
+    def merge(self, a, b):
+        return standing((*a, *b))
 '''
 
 

@@ -96,6 +96,7 @@ class ModuleTests(SynchronousTestCase):
             ("def find(self, c): return Consensus(c[0].agent if c else None)", "depends on the order"),
             ("def find(self, c): return None", "raises AttributeError"),
             ("def improves(self, a, b, h): return True", "better than itself"),
+            ("def merge(self, a, b): return tuple(r for r in (*a, *b) if r.cost > 2)", "what merge keeps"),
         ):
             indented = "".join(f"  {line}\n" for line in body.splitlines())
             self.assertIn(reason, self.refusal(f"{BASE}class Strategy(Nearest):\n{indented}"))
