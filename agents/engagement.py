@@ -7,7 +7,7 @@ given back after.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -26,6 +26,7 @@ from drivers.driver import Permit
 from drivers.reading import Action, Observation
 from middleware.commitment.lessee import Lease, Lessee
 from middleware.consensus.strategy import ConsensusAlgorithm
+from middleware.entangled.kademlia.contact import Contact
 from middleware.order import PAUSE, Order
 from middleware.tasks import COMPLETED, FAILED, Member, Result, Task
 from middleware.verdict import Verdict
@@ -50,7 +51,7 @@ class Engagement:
     ``tell`` publishes this agent's report; ``conclude`` records the outcome; ``say`` writes a line for people; ``halt``
     stops the body now; ``token`` is the highest token that the body has obeyed so far; ``age`` is how old the task was
     when the agent took it up.  With a ``lessee`` the agent has its body for this task, without one it only listens.
-    ``justify`` is told why, at each decision.
+    ``justify`` is told why, at each decision; ``reached`` knows how the agents of some uuids are reached.
     """
 
     def __init__(
@@ -75,6 +76,8 @@ class Engagement:
         self.token = token
         self.lessee: Lessee | None = None
         self.justify: Callable[[Verdict], None] = lambda verdict: None
+        self.reached: Callable[[Sequence[str]], Sequence[Contact]] = lambda uuids: ()
+        self._heirs: tuple[str, ...] = ()
         self._reporter = Reporter(behaviour, clock)
         self._behaviour = behaviour
         self._execution = Execution(behaviour, task.stall_limit)
@@ -199,7 +202,9 @@ class Engagement:
         """
         if self.lessee is None:
             return succeed(None)
-        return self.lessee.end() if self._concluding and self.result is not None else self.lessee.release()
+        if self._concluding and self.result is not None:
+            return self.lessee.end()
+        return self.lessee.release(self.reached(self._heirs))
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
@@ -273,6 +278,7 @@ class Engagement:
             self._say(f"stands by: {decision.why}")
         told: dict[str, Any] = {"assigned": assigned, "digest": decision.digest, "why": decision.why}
         self._publish(token=token, progress=progress, post=post, **told)
+        self._heirs = tuple(uuid for uuid in decision.order if uuid != self.me.uuid)[:HEIRS]
         now = self._clock.seconds()
         verdict = self._account.of(decision, self.me, self._conference.others(now), token, now)
         if verdict is not None:

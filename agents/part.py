@@ -46,6 +46,7 @@ class Part:
             task, me, behaviour, strategy, clock, token, self._tell, self._conclude, self._say, halt, age
         )
         self.engagement.justify = node.justify
+        self.engagement.reached = node.reached
         self._group = node.group(task, self.engagement.heard, self._ordered)
 
     def report(self) -> None:

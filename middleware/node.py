@@ -195,6 +195,10 @@ class SwarmNode(Service):
         host, _, port = pair[0].address.rpartition(":")
         return unpacked([record.owner, host, int(port)]) if port.isascii() and port.isdigit() else None
 
+    def reached(self, uuids: Sequence[str]) -> list[Contact]:
+        """How to reach those of the devices that this node has met."""
+        return [contact for contact in self.entangled.overlay.contacts() if contact.node_id.hex() in uuids]
+
     def on_message(self, receive: Callable[[str], None]) -> None:
         """Call ``receive`` with each text that an operator sends to this device."""
         self._on_message = receive

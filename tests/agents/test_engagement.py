@@ -19,6 +19,8 @@ from middleware.consensus.nearest import Nearest
 from middleware.consensus.strategy import Consensus, Report
 from middleware.entangled.clock import HeapClock
 from middleware.entangled.identity import Identity
+from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.network.network import Address
 from middleware.order import PAUSE, RESUME, Order
 from middleware.presence import ASSIGNED, DONE, EXECUTING, SEARCHING, WAITING
 from middleware.tasks import CANCELLED, COMPLETED, FAILED, Member, Result, Task
@@ -66,6 +68,7 @@ class Council:
 
     def __init__(self, clock: HeapClock, events: list[str]) -> None:
         self.is_wanted = False
+        self.heirs: Sequence[Contact] = ()
         self.rank = 0
         self.token = 0
         self.deadline = 0.0
@@ -92,8 +95,9 @@ class Council:
         """Note the place in the row."""
         self.rank = rank
 
-    def release(self) -> Deferred[object]:
+    def release(self, heirs: Sequence[Contact] = ()) -> Deferred[object]:
         """Give it back."""
+        self.heirs = heirs
         if self.token:
             self._events.append("released")
         self.is_wanted, self.token = False, 0
@@ -488,6 +492,19 @@ class EngagementTests(SynchronousTestCase):
         self.hear(self.report(3, 3.0))
         self.step()
         self.assertEqual(self.engagement.me.epoch, before + 1)
+
+    def test_heirs_hear_of_a_leave_from_the_one_that_leaves(self) -> None:
+        """Who leaves the task names those that stand by, the next one first, and never itself."""
+        contacts = {n: Contact(each.public, Address("10.0.0.1", n)) for n, each in self.others.items()}
+        known = {contact.node_id.hex(): contact for contact in contacts.values()}
+        self.engagement.reached = lambda uuids: [known[uuid] for uuid in uuids]
+        self.hear(self.report(2, 3.0), self.report(3, 2.0))
+        self.see(1.0)
+        self.step()
+        self.council.grant(1)
+        self.step()
+        self.engagement.abandon()
+        self.assertEqual(self.council.heirs, [contacts[3], contacts[2]])
 
     def test_each_decision_is_accounted_for_once(self) -> None:
         """A new decision is told why at once, moved reports at most once a second, and an unchanged one never again."""

@@ -243,7 +243,7 @@ class Lessee:
     def stand_by(self, rank: int = 1) -> None:
         """Nobody is told here when a lease is free: only who wants it asks."""
 
-    def release(self) -> Deferred[object]:
+    def release(self, heirs: object = ()) -> Deferred[object]:
         """Give back."""
         self._wanted, self._deadline = False, 0.0
         self._life += 1
@@ -290,6 +290,7 @@ class Node:
             device=SimpleNamespace(name=f"dog{place}"), say=lambda *_: None, change=lambda **_: None
         )
         self.entangled = SimpleNamespace(get=self._get)
+        self.reached = lambda uuids: ()
         self.deployed: dict[tuple[str, str], Callable[..., Any]] = {}
         self.groups: dict[str, list[tuple[Any, Any]]] = {}
         self.reports: dict[str, Member] = {}

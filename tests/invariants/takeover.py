@@ -1,8 +1,15 @@
-"""Takeover: trials of one executor and its stand-bys on a link of one-way 20 ms + Exp(10 ms), clocks off by 1 %."""
+"""Takeover: trials of one executor and its stand-bys on a link of one-way 20 ms + Exp(10 ms), clocks off by 1 %.
+
+``python -m tests.invariants.takeover [--trials 500] [--hours 24]`` prints what leases alone promise; what whole teams
+make of it prints ``make bench-takeover``.
+"""
 
 from __future__ import annotations
 
+import argparse
+import math
 import random
+import sys
 
 from tests.invariants.radio import Air
 from tests.invariants.team import Team
@@ -68,3 +75,40 @@ def upkeep(ttl: float = 1.5) -> float:
     sent = team.radio.sent
     team.clock.advance(60.0)
     return (team.radio.sent - sent) / 60.0
+
+
+CASES = (
+    ("executor dies, ttl 1.5, loss 10 %", 0.1, 1.5, False, (1.5, 2.0)),
+    ("executor dies, ttl 1.5, loss 30 %", 0.3, 1.5, False, (math.inf, math.inf)),
+    ("executor dies, ttl 0.9, loss 10 %", 0.1, 0.9, False, (math.inf, 1.2)),
+    ("executor leaves, no loss", 0.0, 1.5, True, (0.2, 0.2)),
+    ("executor leaves, loss 10 %", 0.1, 1.5, True, (0.2, math.inf)),
+)
+"""What is tried: loss, ttl, whether it leaves in order, and the targets of p50 and p99 in seconds."""
+MOST_MESSAGES = 12.0
+
+
+def main(arguments: list[str]) -> int:
+    """Print the table; 1 where a target is missed."""
+    parser = argparse.ArgumentParser(prog="python -m tests.invariants.takeover")
+    parser.add_argument("--trials", type=int, default=500, help="of each case (default %(default)s)")
+    parser.add_argument("--hours", type=int, default=24, help="of a healthy executor, virtual (default %(default)s)")
+    given = parser.parse_args(arguments)
+    missed = 0
+    for case, loss, ttl, is_polite, (most50, most99) in CASES:
+        took = sorted(takeover(seed, loss, ttl, is_polite) for seed in range(1, given.trials + 1))
+        p50, p95, p99 = (took[max(0, math.ceil(share * len(took)) - 1)] for share in (0.5, 0.95, 0.99))
+        reached = p50 <= most50 and p99 <= most99
+        missed += not reached
+        limits = ", ".join(f"{name} {most:g}" for name, most in (("p50", most50), ("p99", most99)) if most < math.inf)
+        wanted = f"{limits}: {'yes' if reached else 'no'}" if limits else "no target"
+        sys.stdout.write(f"{case:36}{p50:7.3f}{p95:7.3f}{p99:7.3f}{took[-1]:7.3f} s  {wanted}\n")
+    false = sum(false_takeovers(seed, 1.0, 0.2)[0] for seed in range(1, given.hours + 1))
+    messages = upkeep()
+    sys.stdout.write(f"false takeovers in {given.hours} h at 20 % loss: {false}\n")
+    sys.stdout.write(f"upkeep of a lease: {messages:.1f} datagrams a second, at most {MOST_MESSAGES:g}\n")
+    return int(bool(missed or false or messages > MOST_MESSAGES))
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
