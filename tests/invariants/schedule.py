@@ -198,7 +198,10 @@ class Schedule:
     def _begin(self, fault: Fault) -> None:
         board = self.fleet.board
         if fault.kind == "join":
-            self._join(fault.places[0], fault.places[1:])
+            place, *known = fault.places
+            if self.dead.issuperset(known):
+                known = self.alive()[:1]  # who knows nobody but the dead never gets in
+            self._join(place, known)
         elif fault.kind == "cut":
             board.partition(self.addresses(fault.places))
         elif fault.kind == "one way":
