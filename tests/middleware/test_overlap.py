@@ -138,7 +138,7 @@ class JoinTests(FleetCase):
             key = hashed_key(f"new {number}")
             stored: Any = fleet.enter(newcomer, [fleet.address(0)])
             stored.addCallback(lambda _, newcomer=newcomer, key=key: newcomer.put(key, "state", b"new"))
-            fleet.run(0.01)
+            fleet.run(1.0)
             self.assertGreaterEqual(self.successResultOf(stored), 5)
             read = fleet.nodes[number].get(key)
             self.assertEqual([record.value for record in self.done(fleet, read, 0.5)], [b"new"])

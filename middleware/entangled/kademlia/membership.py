@@ -175,7 +175,7 @@ class Membership:
             answer = await self._overlay.ask(contact, "members", after)
             if answer is None:
                 self._large_until = self._clock.seconds() + LARGE_FOR
-                self._overlay.is_whole = False
+                self._overlay.is_whole, self._overlay.is_large = False, True
                 return
             found = contacts_of(answer)
             strangers += [c for c in found if self._is_worth_a_try(c)]
@@ -190,6 +190,7 @@ class Membership:
         if not self._overlay.is_whole and not self._overlay.roster.is_settled:
             await self._count_absent()
         self._overlay.is_whole = self._clock.seconds() > self._large_until
+        self._overlay.is_large = not self._overlay.is_whole
 
     async def _count_absent(self) -> None:
         """Count as absent whom others know and this newcomer cannot reach, or it would take its side of a cut for all.

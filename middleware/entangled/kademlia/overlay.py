@@ -40,6 +40,8 @@ MAX_FOUND = 512
 """Keys whose closest nodes, as the last lookup found them, are remembered."""
 
 PLACING, PLACING_STEP = 15, 0.1
+MEETING, MEETING_STEP = 75, 0.02
+"""Steps for which what needs a majority waits until the members are known, and seconds of each."""
 NOBODY = b""
 """Stands for members that must be there, though none is known yet."""
 
@@ -49,7 +51,8 @@ OnContact = Callable[[Contact], None]
 class Overlay:
     """Who a node knows; ``on_newcomer`` and ``on_lost`` are told of contacts that come and go.
 
-    ``is_whole`` says whether all members of the team are known, ``is_placed`` whether this node has looked around at
+    ``is_whole`` says whether all members of the team are known, ``is_large`` that there are too many for that,
+    ``is_placed`` whether this node has looked around at
     all, so that where it knows few there are few; whoever asks around sets them.
     """
 
@@ -64,6 +67,7 @@ class Overlay:
         self.table = RoutingTable(self.own_id, K)
         self.roster = Roster(self.own_id)
         self.is_whole = False
+        self.is_large = False
         self.is_placed = False
         self.on_newcomer: OnContact = lambda contact: None
         self.on_lost: OnContact = lambda contact: None
@@ -125,6 +129,13 @@ class Overlay:
         self.note_found(key, found)
         return _closest([*found, self.me()], key) if len(found) >= K else self.responsible(key)
 
+    async def met(self) -> None:
+        """Give a node that is still joining a moment to learn who is there."""
+        for _ in range(MEETING):
+            if self.is_whole or self.is_large:
+                return
+            await self._chores.sleep(MEETING_STEP)
+
     def note_found(self, key: bytes, found: list[Contact]) -> None:
         """Keep in mind what a lookup found."""
         self._found[key] = found
@@ -137,8 +148,8 @@ class Overlay:
 
         In a team small enough for a roster the absent ones count too; in a larger network, who was found.
         """
-        if not (self.is_whole or len(self.roster)):
-            # It has not found its team yet: whoever is alone by mistake shall not take itself for a majority.
+        if not (self.is_whole or self.is_large):
+            # It has not met its team yet: whoever knows a few of them shall not take those for all.
             return [self.own_id, NOBODY]
         absent = [] if self.roster.is_full else self.roster.absent()
         return [contact.node_id for contact in (_closest([*targets, *absent], key) if absent else targets)]

@@ -149,6 +149,8 @@ class Owner:
 
         Raises ``NotAcknowledged`` where too few took it and nothing stood against it.
         """
+        if concern != "one":
+            await self._overlay.met()
         targets = await self._overlay.holders(record.key)
         voters = frozenset(self._overlay.voters(record.key, targets))
         needed = {"one": 1, "majority": len(voters) // 2 + 1, "all": len(voters)}[concern]
