@@ -19,6 +19,18 @@ class OverlayTests(FleetCase):
         fleet = self.fleet(5)
         self.assertEqual([len(node.overlay.table) for node in fleet.nodes], [4] * 5)
 
+    def test_who_has_not_met_its_team_has_no_majority(self) -> None:
+        """Of the few that a newcomer knows at first no majority is made, though all of them were to agree."""
+        node = self.fleet(5).nodes[4]
+        key, few = hashed_key("a"), [node.contact, node.overlay.roster.live()[0]]
+        self.assertEqual(len(node.overlay.voters(key, few)), 2)
+        node.overlay.is_whole = False
+        voters = node.overlay.voters(key, few)
+        named = {contact.node_id for contact in few}
+        self.assertLess(sum(voter in named for voter in voters), len(voters) // 2 + 1)
+        node.overlay.is_large = True
+        self.assertEqual(len(node.overlay.voters(key, few)), 2)
+
     def test_holders_are_the_closest_of_all(self) -> None:
         """In a large network every node finds the same k holders of a key, the truly closest, in order."""
         for n in (9, 20):
