@@ -238,7 +238,7 @@ class MembershipTests(TeamTests):
     def test_others_spread_when_one_leaves(self) -> None:
         """When the dog on its way is lost, the one that stands by moves around the target, as far from it as before."""
         team = self.team()
-        team.scatter(3)
+        team.scatter(2)
         team.run_demo()
         self.until(team, lambda: bool(self.executing(team)))
         first = self.executing(team)[0]
