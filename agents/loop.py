@@ -16,7 +16,6 @@ from agents.engagement import Engagement
 from agents.part import Part
 from drivers.driver import Driver
 from drivers.reading import Observation
-from middleware.consensus.selection import guarded
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.record import Record
 from middleware.errors import SwarmError
@@ -144,9 +143,8 @@ class Agent(Service):
 
     def _engage(self, task: Task) -> None:
         try:
-            deployed = self._node.deployed
-            behaviour = behaviour_for(task, self._rng, deployed)
-            strategy = guarded(task.strategy, deployed=deployed)
+            behaviour = behaviour_for(task, self._rng, self._node.deployed)
+            strategy = self._node.strategy(task.strategy)
         except SwarmError as error:
             self._docket.bury(task.task_id, self._clock.seconds())
             return self._say(str(error))

@@ -40,7 +40,8 @@ if TYPE_CHECKING:
     from middleware.commitment.council import Council
     from middleware.commitment.desk import Desk
     from middleware.commitment.lessee import Lessee
-    from middleware.consensus.strategy import ConsensusAlgorithm
+    from middleware.consensus.guard import Guard
+    from middleware.consensus.selection import Strategies
     from middleware.dissemination.bidding import Bidding
     from middleware.dissemination.dissemination import Dissemination
     from middleware.dissemination.party import OnSummary
@@ -129,6 +130,8 @@ class SwarmNode(Service):
         if "dissemination" in self.__dict__:
             self.dissemination.stop()
         leave()
+        if "_strategies" in self.__dict__:
+            self._strategies.stop()
         super().stopService()
 
     async def _join(self) -> None:
@@ -268,6 +271,13 @@ class SwarmNode(Service):
             await self._council(task).close()
         return await written
 
+    def strategy(self, name: str) -> Guard:
+        """The strategy of that name behind its guard, for as long as this node is here.
+
+        Raises ``UnknownStrategy`` where there is none.
+        """
+        return self._strategies.named(name, self.deployed)
+
     def lessee(self, task: Task, changed: Callable[[], None], floor: int) -> Lessee:
         """The claimant of the right to act on ``task``, in this node's name.
 
@@ -300,22 +310,26 @@ class SwarmNode(Service):
         return Desk(self.entangled.endpoint, self.store, self.clock, self._born_at)
 
     @cached_property
+    def _strategies(self) -> Strategies:
+        """What decides on this node who should act."""
+        # Imported by the first who decides, or carries a bid: a node that does neither is spared the memory.
+        from middleware.consensus.selection import Strategies
+
+        return Strategies()
+
+    @cached_property
     def dissemination(self) -> Dissemination:
         """How the bids for tasks travel through this node."""
         # Imported by the first bid: a node that never carries one is spared the memory.
-        from middleware.consensus.selection import guarded
         from middleware.dissemination.dissemination import Dissemination, Surroundings
         from middleware.dissemination.scale import team_size
 
         entangled = self.entangled
 
-        def strategy(name: str) -> ConsensusAlgorithm:
-            return guarded(name, deployed=self.deployed)
-
         def size() -> int:
             return team_size(entangled.identity.node_id, entangled.overlay.contacts())
 
-        around = Surroundings(lambda: entangled.contact, entangled.overlay.contacts, size, strategy)
+        around = Surroundings(lambda: entangled.contact, entangled.overlay.contacts, size, self.strategy)
         return Dissemination(entangled.identity, entangled.endpoint, around, self.clock, self.rng)
 
     # -- what peers ask ---------------------------------------------------------------------------------------------

@@ -120,7 +120,7 @@ class Guard:
         return merged
 
     def stop(self) -> None:
-        """Let go of what the strategy runs in, if anything."""
+        """Let go of what the strategy runs in, if anything; one that ran in something has no opinion from then on."""
         stop = getattr(self.strategy, "stop", None)
         if stop is not None:
             stop()

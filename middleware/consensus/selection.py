@@ -7,6 +7,41 @@ from typing import Any
 
 from middleware.consensus.guard import Guard
 from middleware.consensus.strategy import BUILT_IN, place_of, strategy_for
+from middleware.errors import UnknownStrategy
+
+
+class Strategies:
+    """The strategies of one node, by name.
+
+    One of somebody else is made once and shared by all tasks and auctions, since it has a process; ``stop`` ends it.
+    So what it lost in one task counts in the next: each time the whole node stands still, whichever task it is.  Who
+    is asked no more is out for as long as the node is here, and the next life of the node asks it again.
+    """
+
+    def __init__(self) -> None:
+        self._foreign: dict[str, Guard] = {}
+        self._is_stopped = False
+
+    def named(self, name: str, deployed: Mapping[tuple[str, str], Callable[..., Any]]) -> Guard:
+        """The strategy of that name; ``deployed`` are those that an operator pushed, of which the newest is taken.
+
+        Raises ``UnknownStrategy`` where there is none, and for one of somebody else once the node has left.
+        """
+        known = self._foreign.get(name)
+        if known is not None:
+            return known
+        if _runs_here(name):
+            return guarded(name, deployed=deployed)
+        if self._is_stopped:
+            raise UnknownStrategy(f"strategy {name!r} is asked for after its node has left")
+        self._foreign[name] = guarded(name)
+        return self._foreign[name]
+
+    def stop(self) -> None:
+        """End what strategies of others run in; whoever still asks them hears the fallback."""
+        self._is_stopped = True
+        for guard in self._foreign.values():
+            guard.stop()
 
 
 def guarded(
@@ -15,13 +50,15 @@ def guarded(
     """The strategy of that name: built-in ones run here, all others in a process of their own with a deadline.
 
     What an operator deployed was checked when it came: it runs here, unbounded from then on, and is asked twice.
-    Raises ``UnknownStrategy`` where there is none of that name.
+    Whoever gets one with a process has to ``stop`` it.  Raises ``UnknownStrategy`` where there is none of that name.
     """
-    if name.startswith("deployed:"):
-        return Guard(strategy_for(name, deployed=deployed), twice=True)
-    place = place_of(name, dotted)
-    if place in BUILT_IN.values():
-        return Guard(strategy_for(name, dotted))
+    if _runs_here(name, dotted):
+        return Guard(strategy_for(name, dotted, deployed), twice=name.startswith("deployed:"))
     from middleware.consensus.worker import Worker  # most nodes never come here
 
-    return Guard(Worker(name, place), twice=True)
+    return Guard(Worker(name, place_of(name, dotted)), twice=True)
+
+
+def _runs_here(name: str, dotted: bool = False) -> bool:
+    """Whether a strategy needs no process of its own; raises ``UnknownStrategy``."""
+    return name.startswith("deployed:") or place_of(name, dotted) in BUILT_IN.values()

@@ -46,6 +46,7 @@ class Worker:
         self._is_ready = False
         self._began = 0.0
         self._broken = ""
+        self._is_stopped = False
         self._start()
 
     def find(self, contacts: Sequence[Report]) -> Consensus:
@@ -75,14 +76,9 @@ class Worker:
             raise NoOpinion("merge answers no reports") from error
 
     def stop(self) -> None:
-        """End the process."""
-        process, self._process = self._process, None
-        if process is not None:
-            process.kill()
-            for pipe in (process.stdin, process.stdout):
-                if pipe is not None:
-                    pipe.close()
-            process.wait()
+        """End the process for good: whoever still asks gets no answer, and no new process."""
+        self._is_stopped = True
+        self._end()
 
     def _start(self) -> None:
         # Sets come out in the same order on every machine.
@@ -97,10 +93,21 @@ class Worker:
         )
         self._is_ready, self._began = False, time.monotonic()
 
+    def _end(self) -> None:
+        process, self._process = self._process, None
+        if process is not None:
+            process.kill()
+            for pipe in (process.stdin, process.stdout):
+                if pipe is not None:
+                    pipe.close()
+            process.wait()
+
     def _asked(self, method: str, arguments: list[Any]) -> Any:
         end = time.monotonic() + self._deadline
         if self._broken:
             raise Raised(self._broken)
+        if self._is_stopped:
+            raise NoOpinion("it was stopped")
         if self._process is None:
             self._start()
         try:
@@ -112,13 +119,13 @@ class Worker:
         except TimeoutError:
             if not self._is_ready and time.monotonic() - self._began < START_S:
                 raise NoOpinion("it is still being loaded") from None
-            self.stop()
+            self._end()
             raise Lost(f"it did not answer within {self._deadline:g} s") from None
         except (OSError, ValueError, NoOpinion) as error:
             if not self._is_ready and isinstance(error, Raised):
                 self._broken = str(error)
             if not self._is_ready or not isinstance(error, Raised):
-                self.stop()
+                self._end()
             if isinstance(error, OSError):
                 raise Lost("its process has died") from error
             raise

@@ -15,6 +15,8 @@ from typing import Any
 from twisted.internet.defer import Deferred, fail, succeed
 
 from middleware.commitment.lessee import Lease
+from middleware.consensus.guard import Guard
+from middleware.consensus.selection import Strategies
 from middleware.entangled.clock import HeapClock
 from middleware.entangled.errors import Unavailable
 from middleware.entangled.record import Record
@@ -292,12 +294,17 @@ class Node:
         self.entangled = SimpleNamespace(get=self._get)
         self.reached = lambda uuids: ()
         self.deployed: dict[tuple[str, str], Callable[..., Any]] = {}
+        self.strategies = Strategies()
         self.groups: dict[str, list[tuple[Any, Any]]] = {}
         self.reports: dict[str, Member] = {}
         self.on_tasks: Callable[[list[Record]], None] | None = None
 
     def justify(self, verdict: object) -> None:
         """Why somebody goes is asked by nobody here."""
+
+    def strategy(self, name: str) -> Guard:
+        """The strategy of that name."""
+        return self.strategies.named(name, self.deployed)
 
     def watch_tasks(self, changed: Callable[[list[Record]], None]) -> None:
         """Follow the tasks."""

@@ -141,6 +141,23 @@ class WorkerTests(SynchronousTestCase):
         """What a strategy prints is not taken for its answer."""
         self.assertEqual(self.guard("Chatty").find(TEAM), Nearest().find(TEAM))
 
+    def test_stopped(self) -> None:
+        """One that was stopped has no opinion and begins no new process; one that was lost does when it is asked."""
+        guard = self.guard("Good")
+        worker = guard.strategy
+        assert isinstance(worker, Worker) and worker._process is not None
+        lost = worker._process
+        lost.kill()
+        lost.wait()
+        self.assertIn("its process has died", guard.find(TEAM).reason)
+        self.assertEqual(self.loaded(guard).strategy, "Good")
+        guard.stop()
+        found = guard.find(TEAM)
+        self.assertEqual((found.assigned_agent, found.strategy), ("b", "nearest"))
+        self.assertIn("it was stopped", found.reason)
+        self.assertIsNone(worker._process)
+        self.flushLoggedErrors()
+
     def test_foreign_by_name(self) -> None:
         """A strategy that is not built in gets a process of its own; what is named by a dotted name is not."""
         guard = guarded(f"{__name__}:Good", dotted=True)
