@@ -27,7 +27,9 @@ from middleware.errors import SwarmError
 
 REMEMBERED = 64
 STRIKES = 3
-"""So often a strategy may be lost; then it is asked no more, since each time costs up to the deadline."""
+"""A strategy that is lost so often within ``SPAN`` questions is asked no more, since each costs up to the deadline."""
+SPAN = 10_000
+"""Questions after which a loss is forgotten: about four minutes of a task.  A busy machine is late now and then."""
 
 
 class NoOpinion(SwarmError):
@@ -55,7 +57,8 @@ class Guard:
         self.why_not = ""
         self._fallback = fallback or Nearest()
         self._twice = twice
-        self._strikes = 0
+        self._asked = 0
+        self._losses: list[int] = []
         self._answers: OrderedDict[tuple[Report, ...], Consensus] = OrderedDict()
 
     def find(self, contacts: Sequence[Report]) -> Consensus:
@@ -126,13 +129,14 @@ class Guard:
             stop()
 
     def _may_be_asked(self) -> None:
-        if self._strikes >= STRIKES:
+        if len(self._losses) >= STRIKES:
             raise NoOpinion(f"it gave no answer {STRIKES} times and is asked no more")
+        self._asked += 1
 
     def _failed(self, error: Exception) -> str:
         """Count and log it; gives it in one line.  The same again is not logged again."""
         if isinstance(error, Lost):
-            self._strikes += 1
+            self._losses = [*(each for each in self._losses if self._asked - each < SPAN), self._asked]
         text = str(error) if isinstance(error, NoOpinion) else f"{type(error).__name__}: {error}"
         why = (text.strip().splitlines() or ["it says nothing"])[-1][:MAX_NAME]  # of a trace, what was raised
         if why != self.why_not:

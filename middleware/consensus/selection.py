@@ -14,8 +14,8 @@ class Strategies:
     """The strategies of one node, by name.
 
     One of somebody else is made once and shared by all tasks and auctions, since it has a process; ``stop`` ends it.
-    So what it lost in one task counts in the next: each time the whole node stands still, whichever task it is.  Who
-    is asked no more is out for as long as the node is here, and the next life of the node asks it again.
+    So what it lost in one task counts in the next (``guard.STRIKES``): each time the whole node stands still, whichever
+    task it is.  One that is asked no more is out for as long as the node is here; its next life asks it again.
     """
 
     def __init__(self) -> None:

@@ -9,7 +9,7 @@ from dataclasses import replace
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.consensus.cbba import Cbba
-from middleware.consensus.guard import STRIKES, Guard, Lost
+from middleware.consensus.guard import SPAN, STRIKES, Guard, Lost
 from middleware.consensus.item import Item
 from middleware.consensus.nearest import Nearest
 from middleware.consensus.selection import guarded
@@ -78,6 +78,22 @@ class Slow(Nearest):
     def find(self, contacts: Sequence[Report]) -> Consensus:
         self.asked += 1
         raise Lost("it did not answer in time")
+
+
+class Moments(Nearest):
+    """Late each time that it was asked ``pause`` times."""
+
+    name = "moments"
+    asked = 0
+
+    def __init__(self, pause: int) -> None:
+        self.pause = pause
+
+    def improves(self, current: Report, offer: Report, hysteresis: float) -> bool:
+        self.asked += 1
+        if self.asked % self.pause == 0:
+            raise Lost("it did not answer in time")
+        return super().improves(current, offer, hysteresis)
 
 
 class Inventing(Nearest):
@@ -169,6 +185,17 @@ class GuardTests(SynchronousTestCase):
             self.assertEqual(guard.find(TEAM).assigned_agent, "b")
         self.assertEqual(slow.asked, STRIKES)
         self.assertIn("asked no more", guard.find(TEAM).reason)
+        self.flushLoggedErrors()
+
+    def test_late_now_and_then(self) -> None:
+        """One that is late fewer than ``STRIKES`` times in ``SPAN`` questions is asked for ever; but not more often."""
+        for pause, is_out in ((SPAN // (STRIKES - 1), False), (SPAN // (STRIKES - 1) - 1, True)):
+            moments = Moments(pause)
+            guard = Guard(moments)
+            for _ in range(10 * SPAN):
+                guard.improves(TEAM[0], TEAM[1], 0.1)
+            self.assertEqual(moments.asked < 10 * SPAN, is_out, pause)
+            self.assertEqual(guard.find(TEAM).strategy, "nearest" if is_out else "moments")
         self.flushLoggedErrors()
 
     def test_inventing(self) -> None:
