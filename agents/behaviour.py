@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import importlib
 import random
-from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from typing import Protocol
 
 from agents.context import Context
 from drivers.reading import Action, Observation
+from middleware.deployed import BEHAVIOUR, Deployed, is_deployed, maker_of
 from middleware.errors import MissingExtra, UnknownTask
 from middleware.tasks import Task
 
@@ -50,9 +50,7 @@ class Behaviour(Protocol):
         """What to do next to get it done; None when it is done."""
 
 
-def behaviour_for(
-    task: Task, rng: random.Random, deployed: Mapping[tuple[str, str], Callable[..., Any]] | None = None
-) -> Behaviour:
+def behaviour_for(task: Task, rng: random.Random, deployed: Deployed | None = None) -> Behaviour:
     """The behaviour for ``task.kind``: a built-in one, or an entry point of ``swarm_node.behaviours``.
 
     ``deployed:x`` is the module ``x`` that an operator pushed, among those in ``deployed``.
@@ -61,7 +59,7 @@ def behaviour_for(
     Raises ``UnknownTask``, which names those there are or says what is wrong with the task's parameters, and
     ``MissingExtra`` where the behaviour's libraries are not installed.
     """
-    if task.kind.startswith("deployed:"):
+    if is_deployed(task.kind):
         return _deployed(task, rng, deployed or {})
     target = KINDS.get(task.kind)
     if target is None:
@@ -86,13 +84,10 @@ def behaviour_for(
     return made
 
 
-def _deployed(task: Task, rng: random.Random, deployed: Mapping[tuple[str, str], Callable[..., Any]]) -> Behaviour:
+def _deployed(task: Task, rng: random.Random, deployed: Deployed) -> Behaviour:
     from agents.guarded import Guarded  # most nodes never come here
 
-    make = deployed.get(("behaviour", task.kind.removeprefix("deployed:")))
-    if make is None:
-        known = ", ".join(sorted(f"deployed:{each}" for kind, each in deployed if kind == "behaviour")) or "none"
-        raise UnknownTask(f"no behaviour {task.kind!r} here ([deployment] of this node); there are {known}")
+    make = maker_of(BEHAVIOUR, task.kind, deployed)
     try:
         return Guarded(make(task.parameters, rng), STAND)
     except Exception as error:  # a module of somebody else may fail in any way

@@ -7,7 +7,7 @@ ask the council for a lease, send a camera's frames, and call a peer by name.
 from __future__ import annotations
 
 import random
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property, partial
@@ -19,6 +19,7 @@ from twisted.internet.interfaces import IReactorTime
 from twisted.logger import Logger
 
 from middleware.consensus.strategy import place_of
+from middleware.deployed import Deployed, is_deployed
 from middleware.entangled.background import Background
 from middleware.entangled.data.store import Store
 from middleware.entangled.errors import EntangledError, NotRunning, Refused, WeatherError
@@ -62,8 +63,7 @@ class SwarmNode(Service):
     """One node of a team.
 
     ``device`` is what the node says of itself; ``wall`` gives seconds of the wall clock, for people only.  ``deployed``
-    is what operators pushed and its owner allowed: (kind, name) to what makes it.  ``later(seconds, call, ...)`` is a
-    timer that ends with the node.
+    is what operators pushed and its owner allowed.  ``later(seconds, call, ...)`` is a timer that ends with the node.
     """
 
     _log = Logger()
@@ -89,7 +89,7 @@ class SwarmNode(Service):
         self.uuid = identity.node_id.hex()
         self._chores = Background(clock)
         self.later = self._chores.later
-        self.deployed: Mapping[tuple[str, str], Callable[..., Any]] = {}
+        self.deployed: Deployed = {}
         self.presence = Presence(device, self._announce, self._chores.later)
         self.streams = Streams(self.entangled.endpoint, clock)
         self.joined: Deferred[None] = Deferred()
@@ -217,7 +217,7 @@ class SwarmNode(Service):
 
         Raises ``UnknownStrategy`` where there is no strategy of the name that it gives.
         """
-        if not task.strategy.startswith("deployed:"):  # those are the business of the nodes that have them
+        if not is_deployed(task.strategy):  # those are the business of the nodes that have them
             place_of(task.strategy)
         key = group_key(task.task_id)
         nearest = await self.entangled.find_node(key)

@@ -13,9 +13,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
+from middleware.deployed import KINDS, PREFIX
 from middleware.deployment.manifest import (
     DEPLOYMENTS,
-    KINDS,
     MAX_SOURCE,
     MAX_VERSION,
     NAME,
@@ -59,7 +59,7 @@ def parser() -> argparse.ArgumentParser:
 
     push = verb("push", "Publish a new version of a module, signed by this node.")
     push.add_argument("file", metavar="FILE", help="the Python source, one file")
-    push.add_argument("--name", required=True, help="what tasks call it, after deployed:")
+    push.add_argument("--name", required=True, help=f"what tasks call it, after {PREFIX}")
     push.add_argument("--kind", required=True, choices=KINDS)
     push.add_argument("--version", type=int, metavar="N", help="a higher one than before; the next one if left out")
     back = verb("rollback", "Go back to the version before.")

@@ -75,6 +75,7 @@ PURE = (
     "middleware.dissemination.teller",
     "middleware.dissemination.tree",
     "middleware.consensus.weighted_vote",
+    "middleware.deployed",
     "middleware.deployment.manifest",
     "middleware.entangled.replication.cache",
     "middleware.entangled.errors",

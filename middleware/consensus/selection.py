@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any
-
 from middleware.consensus.guard import Guard
 from middleware.consensus.strategy import BUILT_IN, place_of, strategy_for
+from middleware.deployed import Deployed, is_deployed
 from middleware.errors import UnknownStrategy
 
 
@@ -22,7 +20,7 @@ class Strategies:
         self._foreign: dict[str, Guard] = {}
         self._is_stopped = False
 
-    def named(self, name: str, deployed: Mapping[tuple[str, str], Callable[..., Any]]) -> Guard:
+    def named(self, name: str, deployed: Deployed) -> Guard:
         """The strategy of that name; ``deployed`` are those that an operator pushed, of which the newest is taken.
 
         Raises ``UnknownStrategy`` where there is none, and for one of somebody else once the node has left.
@@ -44,16 +42,14 @@ class Strategies:
             guard.stop()
 
 
-def guarded(
-    name: str, dotted: bool = False, deployed: Mapping[tuple[str, str], Callable[..., Any]] | None = None
-) -> Guard:
+def guarded(name: str, dotted: bool = False, deployed: Deployed | None = None) -> Guard:
     """The strategy of that name: built-in ones run here, all others in a process of their own with a deadline.
 
     What an operator deployed was checked when it came: it runs here, unbounded from then on, and is asked twice.
     Whoever gets one with a process has to ``stop`` it.  Raises ``UnknownStrategy`` where there is none of that name.
     """
     if _runs_here(name, dotted):
-        return Guard(strategy_for(name, dotted, deployed), twice=name.startswith("deployed:"))
+        return Guard(strategy_for(name, dotted, deployed), twice=is_deployed(name))
     from middleware.consensus.worker import Worker  # most nodes never come here
 
     return Guard(Worker(name, place_of(name, dotted)), twice=True)
@@ -61,4 +57,4 @@ def guarded(
 
 def _runs_here(name: str, dotted: bool = False) -> bool:
     """Whether a strategy needs no process of its own; raises ``UnknownStrategy``."""
-    return name.startswith("deployed:") or place_of(name, dotted) in BUILT_IN.values()
+    return is_deployed(name) or place_of(name, dotted) in BUILT_IN.values()

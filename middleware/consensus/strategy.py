@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import hashlib
 import importlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
+from middleware.deployed import STRATEGY, Deployed, is_deployed, maker_of
 from middleware.errors import UnknownStrategy
 
 PROTOCOL = 2
@@ -176,9 +177,7 @@ def digest_of(contacts: Iterable[Report]) -> str:
     return hashlib.blake2s("".join(texts).encode(errors="replace"), digest_size=4).hexdigest()
 
 
-def strategy_for(
-    name: str, dotted: bool = False, deployed: Mapping[tuple[str, str], Callable[..., Any]] | None = None
-) -> ConsensusAlgorithm:
+def strategy_for(name: str, dotted: bool = False, deployed: Deployed | None = None) -> ConsensusAlgorithm:
     """The strategy called ``name``: a built-in one, or an entry point of ``swarm_node.strategies``.
 
     ``deployed:x`` is the module ``x`` that an operator pushed, among those in ``deployed``.
@@ -186,7 +185,7 @@ def strategy_for(
     With ``dotted`` also ``module:Class``, for names out of this machine's own settings: what a peer sends must never
     say what is imported here.  Raises ``UnknownStrategy``, which names those that there are.
     """
-    if name.startswith("deployed:"):
+    if is_deployed(name):
         return _deployed(name, deployed or {})
     module, _, attribute = place_of(name, dotted).partition(":")
     try:
@@ -238,11 +237,8 @@ def _rest(report: Report) -> str:
     return "" if (given, more) == (("", 0, 0, (), "", 1.0, 1), (1.0, 0.0, 0.0)) else f"{given!r}{more!r};"
 
 
-def _deployed(name: str, deployed: Mapping[tuple[str, str], Callable[..., Any]]) -> ConsensusAlgorithm:
-    make = deployed.get(("strategy", name.removeprefix("deployed:")))
-    if make is None:
-        known = ", ".join(sorted(f"deployed:{each}" for kind, each in deployed if kind == "strategy")) or "none"
-        raise UnknownStrategy(f"no strategy {name!r} here ([deployment] of this node); there are {known}")
+def _deployed(name: str, deployed: Deployed) -> ConsensusAlgorithm:
+    make = maker_of(STRATEGY, name, deployed)
     try:
         strategy: ConsensusAlgorithm = make()
     except Exception as error:  # a module of somebody else may fail in any way

@@ -13,6 +13,7 @@ import msgpack
 from twisted.internet.defer import Deferred
 from twisted.logger import Logger
 
+from middleware.deployed import Make
 from middleware.deployment.manifest import MAX_SOURCE, Manifest, digest_of, manifest_of, manifests_key, source_key
 from middleware.deployment.module import loaded
 from middleware.deployment.shelf import Shelf
@@ -30,7 +31,6 @@ EDITIONS = 2
 MAX_JUDGED = 256
 """Manifests that are remembered as judged; more forget the first, which is then judged, and told of, again."""
 
-Make = Callable[..., Any]
 Later = Callable[..., object]
 
 

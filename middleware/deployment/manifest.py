@@ -13,14 +13,11 @@ from dataclasses import asdict, dataclass
 
 import msgpack
 
+from middleware.deployed import KINDS
 from middleware.entangled.record import Record, hashed_key
 from middleware.value import bounded, is_whole, mapping_of
 
 DEPLOYMENTS = "deployments"
-STRATEGY, BEHAVIOUR = "strategy", "behaviour"
-KINDS = (STRATEGY, BEHAVIOUR)
-PREFIX = "deployed:"
-"""Before the name of a module where a task names it as its strategy or its kind."""
 NAME = r"[a-z][a-z0-9_-]{0,31}"
 MAX_SOURCE = 256 * 1024
 """Bytes of a module's source; a strategy has a few thousand."""

@@ -15,7 +15,8 @@ from types import FrameType, ModuleType
 from typing import Any, TypeVar
 
 from middleware.consensus.strategy import Report
-from middleware.deployment.manifest import BEHAVIOUR, MAX_SOURCE, PREFIX, STRATEGY, Manifest, digest_of
+from middleware.deployed import BEHAVIOUR, PREFIX, STRATEGY, Make
+from middleware.deployment.manifest import MAX_SOURCE, Manifest, digest_of
 from middleware.errors import Undeployable
 
 ENTRIES = {STRATEGY: "Strategy", BEHAVIOUR: "Behaviour"}
@@ -31,8 +32,8 @@ class _TooLong(BaseException):
     """More than the allowed steps; no ``except Exception`` of the module may stop it."""
 
 
-def loaded(manifest: Manifest, source: bytes) -> Callable[..., Any]:
-    """What makes a strategy (no arguments) or a behaviour (parameters and dice) of the module; runs its code.
+def loaded(manifest: Manifest, source: bytes) -> Make:
+    """What makes the strategy or the behaviour of the module; runs its code.
 
     Raises ``Undeployable``, which says why not.
     """
@@ -106,7 +107,7 @@ def _forget(name: str, before: ModuleType | None) -> None:
         sys.modules[name] = before
 
 
-def _named(make: Callable[..., Any], manifest: Manifest) -> Callable[..., Any]:
+def _named(make: Make, manifest: Manifest) -> Make:
     """``make`` whose things say under which name and version they were deployed."""
 
     def made(*arguments: object) -> Any:
@@ -118,7 +119,7 @@ def _named(make: Callable[..., Any], manifest: Manifest) -> Callable[..., Any]:
     return made
 
 
-def _faults(kind: str, make: Callable[..., Any]) -> Sequence[str]:
+def _faults(kind: str, make: Make) -> Sequence[str]:
     """What a module lacks of its kind; empty where it conforms."""
     if kind == BEHAVIOUR:
         # To make one takes the parameters of a task.

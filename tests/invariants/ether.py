@@ -17,6 +17,7 @@ from twisted.internet.defer import Deferred, fail, succeed
 from middleware.commitment.lessee import Lease
 from middleware.consensus.guard import Guard
 from middleware.consensus.selection import Strategies
+from middleware.deployed import Deployed
 from middleware.entangled.clock import HeapClock
 from middleware.entangled.errors import Unavailable
 from middleware.entangled.record import Record
@@ -293,7 +294,7 @@ class Node:
         )
         self.entangled = SimpleNamespace(get=self._get)
         self.reached = lambda uuids: ()
-        self.deployed: dict[tuple[str, str], Callable[..., Any]] = {}
+        self.deployed: Deployed = {}
         self.strategies = Strategies()
         self.groups: dict[str, list[tuple[Any, Any]]] = {}
         self.reports: dict[str, Member] = {}

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.consensus.cbba import Cbba
 from middleware.consensus.nearest import Nearest
 from middleware.consensus.selection import Strategies
+from middleware.deployed import Make
 from middleware.errors import UnknownStrategy
 
 
@@ -26,7 +24,7 @@ class StrategiesTests(SynchronousTestCase):
 
     def test_deployed(self) -> None:
         """Each task gets the version that was deployed last; who had the one before keeps it."""
-        deployed: dict[tuple[str, str], Callable[..., Any]] = {("strategy", "best"): Nearest}
+        deployed: dict[tuple[str, str], Make] = {("strategy", "best"): Nearest}
         strategies = Strategies()
         before = strategies.named("deployed:best", deployed)
         deployed["strategy", "best"] = Cbba

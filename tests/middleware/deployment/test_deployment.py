@@ -9,11 +9,10 @@ from pathlib import Path
 import msgpack
 
 from middleware.consensus.strategy import strategy_for
+from middleware.deployed import BEHAVIOUR, STRATEGY
 from middleware.deployment.deployment import RETRY, Deployment
 from middleware.deployment.manifest import (
-    BEHAVIOUR,
     MAX_SOURCE,
-    STRATEGY,
     Manifest,
     manifests_key,
     pushed,

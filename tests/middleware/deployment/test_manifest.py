@@ -9,10 +9,10 @@ from dataclasses import replace
 import msgpack
 from twisted.trial.unittest import SynchronousTestCase
 
+from middleware.deployed import STRATEGY
 from middleware.deployment.manifest import (
     KEPT,
     MAX_VERSION,
-    STRATEGY,
     Edition,
     Manifest,
     manifest_of,

@@ -7,7 +7,8 @@ import sys
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.consensus.strategy import Report
-from middleware.deployment.manifest import BEHAVIOUR, STRATEGY, pushed
+from middleware.deployed import BEHAVIOUR, STRATEGY
+from middleware.deployment.manifest import pushed
 from middleware.deployment.module import loaded
 from middleware.errors import Undeployable
 
