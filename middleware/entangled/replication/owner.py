@@ -212,12 +212,7 @@ class Owner:
         """
         if contact.node_id == self._identity.node_id:
             return self._replica.store(record, left)
-        verdict: object = None
-        if left is None:
-            verdict = await self._shipper.store(contact, record)
-        else:
-            answer = await self._overlay.ask(contact, "store", [record.packed()], [left], changes=True)
-            verdict = answer[0] if isinstance(answer, list) and len(answer) == 1 else None
+        verdict = await self._shipper.store(contact, record, left)
         if type(verdict) is int and (verdict in (0, HELD) or record.sequence <= verdict < MAX_SEQUENCE):
             return verdict
         raise Refused(f"{contact.address} does not take the record")
