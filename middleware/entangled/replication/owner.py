@@ -20,8 +20,7 @@ from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.overlay import Overlay
 from middleware.entangled.record import TEAM_TTL, TOMBSTONE_TTL, Lifetime, Record, Slot
-from middleware.entangled.replication.overlap import pages_of
-from middleware.entangled.replication.replica import HELD, Replica
+from middleware.entangled.replication.replica import HELD, Replica, pages_of
 from middleware.entangled.replication.shipper import Shipper
 from middleware.entangled.replication.watch import digest_of
 from middleware.entangled.wire.endpoint import Endpoint
