@@ -292,13 +292,9 @@ class Engagement:
             self._tell(self.me)
 
     def _yield(self) -> None:
-        """Let another act: stop the body, and only then give the lease back."""
-        was_claiming = self.course.state is State.CLAIMING
-        was_acting = self._stop(State.RELEASING)
-        if was_acting:
-            self._say("gives the task back")
-        if self.lessee is not None and (was_acting or was_claiming or self.lessee.lease is not None):
-            self.lessee.release()
+        """Let another act.  Who only stands by, and holds nothing, keeps its place in the line."""
+        if self.is_acting or (self.lessee is not None and self.lessee.lease is not None):
+            self._give_back()
 
     def _line_up(self) -> None:
         """Be ready to take over at once, where few are before this agent."""

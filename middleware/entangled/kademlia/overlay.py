@@ -118,10 +118,7 @@ class Overlay:
 
         A node that is still joining waits a little, for it knows nobody to ask.
         """
-        for _ in range(PLACING):
-            if self.is_whole or len(self.roster):
-                break
-            await self._chores.sleep(PLACING_STEP)
+        await self._wait(lambda: self.is_whole or len(self.roster) > 0, PLACING, PLACING_STEP)
         if not self.is_sparse:
             self._found.pop(key, None)
             return self.responsible(key)
@@ -131,10 +128,7 @@ class Overlay:
 
     async def met(self) -> None:
         """Give a node that is still joining a moment to learn who is there."""
-        for _ in range(MEETING):
-            if self.is_whole or self.is_large:
-                return
-            await self._chores.sleep(MEETING_STEP)
+        await self._wait(lambda: self.is_whole or self.is_large, MEETING, MEETING_STEP)
 
     def note_found(self, key: bytes, found: list[Contact]) -> None:
         """Keep in mind what a lookup found."""
@@ -286,6 +280,13 @@ class Overlay:
         await self.ask(contact, "ping", self.roster.digest(), changes=True)
 
     # -- inside -----------------------------------------------------------------------------------------------------
+
+    async def _wait(self, is_over: Callable[[], bool], steps: int, step: float) -> None:
+        """Look again every ``step`` seconds until ``is_over``, for so many ``steps`` at most."""
+        for _ in range(steps):
+            if is_over():
+                return
+            await self._chores.sleep(step)
 
     def _known(self, node_id: bytes) -> Contact | None:
         return self.roster.get(node_id) or self.table.get(node_id)

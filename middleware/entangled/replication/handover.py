@@ -23,17 +23,9 @@ from middleware.entangled.kademlia.distance import distance
 from middleware.entangled.kademlia.overlay import K, Overlay
 from middleware.entangled.kademlia.roster import STRUCK_S
 from middleware.entangled.record import Record, Slot, slot_unpacked, unpacked
-from middleware.entangled.replication.overlap import (
-    BITS,
-    GROUPS,
-    PLACES,
-    Mark,
-    Overlap,
-    mark_of,
-    pages_of,
-)
+from middleware.entangled.replication.overlap import BITS, GROUPS, PLACES, Mark, Overlap, mark_of
 from middleware.entangled.replication.owner import REPUBLISH, Owner
-from middleware.entangled.replication.replica import Replica
+from middleware.entangled.replication.replica import Replica, pages_of
 from middleware.entangled.replication.standing import ELDER, NOVICE, SURE, Standing
 from middleware.entangled.replication.watch import digest_of
 from middleware.entangled.wire.endpoint import Endpoint

@@ -6,7 +6,7 @@ It answers DIGESTS, PLACES, FETCH and LACKING; who compares with whom, and when,
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 from twisted.internet.interfaces import IReactorTime
 
@@ -168,17 +168,3 @@ class Overlap:
 def mark_of(record: Record | None) -> Mark:
     """What tells ``record`` from others in its slot, and which of two is newer."""
     return (-1, b"") if record is None else (record.sequence, record.signature[:8])
-
-
-def pages_of(records: list[Record], most: int | None = None) -> Iterator[list[Record]]:
-    """``records``, in order, in pages of about ``PAGE_BYTES`` and at most ``most`` each."""
-    page: list[Record] = []
-    size = 0
-    for record in records:
-        size += record.message_bytes
-        if page and (size > PAGE_BYTES or len(page) == most):
-            yield page
-            page, size = [], record.message_bytes
-        page.append(record)
-    if page:
-        yield page

@@ -20,8 +20,7 @@ from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.overlay import Overlay
 from middleware.entangled.record import TEAM_TTL, TOMBSTONE_TTL, Lifetime, Record, Slot
-from middleware.entangled.replication.overlap import pages_of
-from middleware.entangled.replication.replica import HELD, Replica
+from middleware.entangled.replication.replica import HELD, Replica, pages_of
 from middleware.entangled.replication.shipper import Shipper
 from middleware.entangled.replication.watch import digest_of
 from middleware.entangled.wire.endpoint import Endpoint
@@ -212,12 +211,7 @@ class Owner:
         """
         if contact.node_id == self._identity.node_id:
             return self._replica.store(record, left)
-        verdict: object = None
-        if left is None:
-            verdict = await self._shipper.store(contact, record)
-        else:
-            answer = await self._overlay.ask(contact, "store", [record.packed()], [left], changes=True)
-            verdict = answer[0] if isinstance(answer, list) and len(answer) == 1 else None
+        verdict = await self._shipper.store(contact, record, left)
         if type(verdict) is int and (verdict in (0, HELD) or record.sequence <= verdict < MAX_SEQUENCE):
             return verdict
         raise Refused(f"{contact.address} does not take the record")

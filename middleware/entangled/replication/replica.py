@@ -7,7 +7,8 @@ run out.  It decides nothing about where records belong; ``overlay`` does.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from bisect import bisect_right
+from collections.abc import Callable, Iterator
 from functools import wraps
 
 from twisted.internet.defer import Deferred
@@ -237,18 +238,12 @@ class Replica:
 
     def _page(self, key: bytes, after: list[object] | None) -> tuple[list[object], list[object] | None]:
         cursor = _checked_cursor(after)
-        page: list[object] = []
-        last: list[object] | None = None
-        size = 0
-        for record in self.held(key):
-            if cursor is not None and (record.owner, record.name) <= cursor:
-                continue
-            size += record.message_bytes
-            if page and size > PAGE_BYTES:
-                return page, last
-            page.append(record.packed())
-            last = [record.owner, record.name]
-        return page, None
+        records = self.held(key)
+        begin = bisect_right(records, cursor, key=lambda record: (record.owner, record.name)) if cursor else 0
+        left = records[begin:]
+        page = next(pages_of(left), [])
+        following: list[object] | None = [page[-1].owner, page[-1].name] if len(page) < len(left) else None
+        return [record.packed() for record in page], following
 
     def _gone(self, records: list[Record]) -> None:
         for record in records:
@@ -263,6 +258,20 @@ class Replica:
         self._gone(ended)
         for owner in dict.fromkeys(r.owner for r in ended if r.lifetime == "leased"):
             self.on_silent(owner)
+
+
+def pages_of(records: list[Record], most: int | None = None) -> Iterator[list[Record]]:
+    """``records``, in order, in pages of about ``PAGE_BYTES`` and at most ``most`` each."""
+    page: list[Record] = []
+    size = 0
+    for record in records:
+        size += record.message_bytes
+        if page and (size > PAGE_BYTES or len(page) == most):
+            yield page
+            page, size = [], record.message_bytes
+        page.append(record)
+    if page:
+        yield page
 
 
 def _checked_key(key: object) -> bytes:

@@ -48,8 +48,13 @@ class Shipper:
         self._chores = chores
         self._quays: dict[bytes, _Quay] = {}
 
-    async def store(self, contact: Contact, record: Record) -> object:
-        """What ``contact`` says to ``record`` (see STORE); raises what asking it raises."""
+    async def store(self, contact: Contact, record: Record, left: float | None = None) -> object:
+        """What ``contact`` says to ``record`` (see STORE); raises what asking it raises.
+
+        Another's record, which is to be kept for ``left`` seconds, goes by itself.
+        """
+        if left is not None:
+            return (await self._asked(contact, [record], [left]))[0]
         if record.message_bytes > ROOM:
             return (await self._asked(contact, [record]))[0]  # it goes as a parcel, and takes its time
         quay = self._quays.get(contact.node_id)
@@ -110,8 +115,9 @@ class Shipper:
             for (_, waiting), verdict in zip(load, verdicts, strict=True):
                 waiting.callback(verdict)
 
-    async def _asked(self, contact: Contact, records: list[Record]) -> list[object]:
-        answer = await self._overlay.ask(contact, "store", [record.packed() for record in records], changes=True)
+    async def _asked(self, contact: Contact, records: list[Record], *lives: list[float]) -> list[object]:
+        packed = [record.packed() for record in records]
+        answer = await self._overlay.ask(contact, "store", packed, *lives, changes=True)
         if not isinstance(answer, list) or len(answer) != len(records):
             raise Refused(f"{contact.address} does not take the record")
         return answer
