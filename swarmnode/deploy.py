@@ -32,7 +32,7 @@ from middleware.entangled.control.place import NoControl
 from middleware.entangled.record import Record
 from middleware.errors import Undeployable
 from middleware.presence import devices_of
-from swarmnode.asker import Asker, Refusal
+from swarmnode.asker import Asker, Refusal, printable
 
 SOURCE = "source"
 """The slot of a source under its key."""
@@ -139,7 +139,7 @@ def _status(wishes: argparse.Namespace, ask: Ask) -> Told:
         rows.append({**_told(manifest), "by": by, "operator": record.owner.hex(), "devices": runs})
         lines.append(f"{name}  {manifest.kind}  {manifest.label}  pushed by {by}{_past(manifest)}")
         width = max(map(len, runs), default=0)
-        lines += [f"  {device:{width}}  {_line(label) or '-'}" for device, label in runs.items()]
+        lines += [f"  {device:{width}}  {printable(label) or '-'}" for device, label in runs.items()]
     return rows, lines or ["nothing was pushed"]
 
 
@@ -172,7 +172,3 @@ def _past(manifest: Manifest) -> str:
     taken_back = f", {manifest.withdrawn} was taken back" if manifest.withdrawn > manifest.version else ""
     before = f", before it {manifest.before[0].version}" if manifest.before else ""
     return taken_back + before
-
-
-def _line(text: str) -> str:
-    return "".join(c if c.isprintable() else " " for c in text)

@@ -17,7 +17,7 @@ from middleware.entangled.control.place import NoControl
 from middleware.explanation import as_text, explained
 from middleware.tasks import Task, outcome_of, task_of
 from middleware.verdict import verdict_of, verdicts_text
-from swarmnode.asker import Asker, Refusal
+from swarmnode.asker import Asker, Refusal, printable
 
 LAST = "last"
 LISTED = 5
@@ -52,8 +52,7 @@ def main(words: Sequence[str] | None = None, out: TextIO | None = None, ask: Ask
         out.write(json.dumps({**told, "outcome": ended, "epochs": asdict(explanation)["epochs"]}) + "\n")
         return 0 if explanation.epochs else FAILED
     ended_by = "" if outcome is None else f", {outcome.outcome.lower()} by {outcome.by}"
-    # Both are somebody's words: no control character of theirs reaches the terminal.
-    head = "".join(c if c.isprintable() else " " for c in f"task {task.task_id}: {task.title}{ended_by}")
+    head = printable(f"task {task.task_id}: {task.title}{ended_by}")
     out.write(f"{head}\n{as_text(explanation)}")
     if not explanation.epochs:
         out.write("nobody has decided anything yet\n")

@@ -7,6 +7,10 @@ from enum import Enum
 
 WEB, WITNESSES = "page", ("witness1", "witness2")
 """The nodes beside the bootstrap node and the dogs.  With seven members three may die at once, and four still agree."""
+PHASE_S = (0.2, 2.0)
+"""Seconds from the first move to the loss: anywhere in a period of renewal, and before the task is done."""
+FROZEN_S = (3.0, 5.0)
+"""Seconds that a frozen node stands still: two leases and more."""
 
 
 class Cause(Enum):

@@ -18,20 +18,18 @@ from typing import Any
 from twisted.internet.defer import Deferred
 from twisted.internet.task import deferLater
 
-from benchmarks.takeover.cause import WEB, WITNESSES, Cause, Trial
+from benchmarks.takeover.cause import PHASE_S, WEB, WITNESSES, Cause, Trial
+from benchmarks.takeover.judge import LOOK_S, Judge
 from benchmarks.takeover.lan import PORT, Lan
 from drivers.sim.link import TcpConnector
 from drivers.sim.operator import YardOperator
 from middleware.entangled.data.sqlite import read_records
 from middleware.entangled.errors import EntangledError
-from middleware.tasks import COMPLETED, group_key, outcome_of
+from middleware.tasks import group_key, outcome_of
 from sim.demo.configuration import BOOTSTRAP, DOGS, toml
 from sim.demo.processes import on_leash
 
 YARD_PORT, WEB_PORT = 7400, 8080
-LOOK_S = 0.01
-PHASE_S = (0.2, 2.0)
-FROZEN_S = (3.0, 5.0)
 START_S, LIMIT_S = 60.0, 30.0
 RATE = 31.0
 
@@ -175,23 +173,15 @@ async def _trial(reactor: Any, cause: Cause, seed: int, team: Team, dice: random
     await deferLater(reactor, dice.uniform(*PHASE_S))
     began = time.monotonic()
     team.lose(cause, lost)
-    thaw_at = began + dice.uniform(*FROZEN_S) if cause is Cause.FREEZE else None
-    takeover, overlaps, zombies, outcome = None, 0, 0, None
-    while (outcome is None and time.monotonic() < began + LIMIT_S) or thaw_at is not None:
+    judge = Judge(cause, seed, lost, began, dice, LIMIT_S)
+    while not judge.is_over(time.monotonic()):
         await deferLater(reactor, LOOK_S)
         now = time.monotonic()
-        if thaw_at is not None and now >= thaw_at:
-            thaw_at = None
+        if judge.thaws(now):
             team.thaw(lost)
-        moving = team.moving()
-        overlaps += len(moving) > 1
-        if takeover is None:
-            takeover = now - began if any(name != lost for name in moving) else None
-        else:
-            zombies += lost in moving
-            outcome = outcome or team.outcome(task_id, lost)
-    done = outcome is not None and outcome.outcome == COMPLETED
-    return Trial(cause.value, seed, lost, outcome.by if outcome else "", done, takeover, overlaps, zombies)
+        is_sought = judge.takeover is not None and judge.result is None  # the files are read from disk
+        judge.look(now, team.moving(), team.outcome(task_id, lost) if is_sought else None)
+    return judge.verdict()
 
 
 async def _until(reactor: Any, holds: Any, problem: str, pause: float) -> None:

@@ -8,18 +8,15 @@ from dataclasses import replace
 from twisted.internet.defer import Deferred
 
 from agents.catalogue import task_named
-from benchmarks.takeover.cause import WEB, WITNESSES, Cause, Trial
+from benchmarks.takeover.cause import PHASE_S, WEB, WITNESSES, Cause, Trial
+from benchmarks.takeover.judge import LOOK_S, Judge
 from middleware.entangled.network.switchboard import Weather
 from middleware.entangled.record import Record
-from middleware.tasks import COMPLETED, outcome_of
+from middleware.tasks import outcome_of
 from swarmnode.rehearsal import VirtualTeam
 
 WEATHER = Weather(delay_s=0.03, jitter_s=0.01)
 """One way takes 20 to 40 ms, as on a busy wireless network."""
-LOOK_S = 0.01
-PHASE_S = (0.2, 2.0)
-"""Seconds from the first move to the loss: anywhere in a period of renewal, and before the task is done."""
-FROZEN_S = (3.0, 5.0)
 START_S, LIMIT_S, AFTER_S = 20.0, 25.0, 1.0
 
 
@@ -45,28 +42,15 @@ def trial(cause: Cause, seed: int, loss: float = 0.1) -> Trial:
         return Trial(cause.value, seed, "", "", False, None, 0, 0)
     team.clock.advance(dice.uniform(*PHASE_S))
     _lose(team, cause, lost)
-    began = team.clock.seconds()
-    thaw_at = began + dice.uniform(*FROZEN_S) if cause is Cause.FREEZE else None
-    takeover, overlaps, zombies, ended = None, 0, 0, None
-    while team.clock.seconds() < (began + LIMIT_S if ended is None else ended + AFTER_S) or thaw_at is not None:
+    judge = Judge(cause, seed, lost, team.clock.seconds(), dice, LIMIT_S, AFTER_S)
+    while not judge.is_over(team.clock.seconds()):
         team.clock.advance(LOOK_S)
         now = team.clock.seconds()
-        if thaw_at is not None and now >= thaw_at:
-            thaw_at = None
+        if judge.thaws(now):
             team.thaw(lost)
-        moving = _moving(team)
-        overlaps += len(moving) > 1
-        if takeover is None:
-            takeover = now - began if any(name != lost for name in moving) else None
-        else:
-            zombies += lost in moving
-        outcome = outcome_of(group)
-        if outcome is not None and ended is None:
-            ended = now
-    outcome = outcome_of(group)
+        judge.look(now, _moving(team), outcome_of(group))
     team.stop()
-    done = outcome is not None and outcome.outcome == COMPLETED
-    return Trial(cause.value, seed, lost, outcome.by if outcome else "", done, takeover, overlaps, zombies)
+    return judge.verdict()
 
 
 def _moving(team: VirtualTeam) -> list[str]:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 
 from middleware.consensus.nearest import Nearest
-from middleware.consensus.strategy import Consensus, Report, digest_of, refusal, standing
+from middleware.consensus.strategy import Consensus, Report, led_by, refusal, standing
 
 Point = tuple[float, ...]
 
@@ -23,20 +23,8 @@ class Average(Nearest):
         if not counted:
             return Consensus(None, strategy=self.name, reason="nobody reports a value")
         order = sorted(counted, key=lambda r: (r.cost, r.agent))
-        names = tuple(r.agent for r in order)
         value = self.point([r.value for r in counted], [r.weight for r in counted])
-        first = counted[0]
-        return Consensus(
-            names[0],
-            names[1:],
-            digest_of(counted),
-            first.task,
-            first.epoch,
-            names[:1],
-            value=value,
-            strategy=self.name,
-            reason=f"{self.name} of {len(names)}",
-        )
+        return led_by(self.name, order, counted, f"{self.name} of {len(order)}", value=value)
 
     def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
         """Everybody's newest value, about the first task by name; the fewest numbers that anybody gave say how many."""

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from middleware.consensus.nearest import KEPT
-from middleware.consensus.strategy import Consensus, Report, digest_of, refusal, standing
+from middleware.consensus.nearest import best_of
+from middleware.consensus.strategy import Consensus, Report, led_by, refusal
 
 BATTERY_S = 30.0
 """An empty battery weighs as much as so many seconds of way."""
@@ -25,20 +25,12 @@ class CapabilityCost:
 
     def find(self, contacts: Sequence[Report]) -> Consensus:
         """The consensus point; None is assigned where nobody can, and ``strategy.refused`` says why for each."""
-        order = self._best(contacts)
+        order = best_of(contacts, self.weigh)
         if not order:
             return Consensus(None, strategy=self.name, reason="no device can do it")
         first = order[0]
-        return Consensus(
-            first.agent,
-            tuple(r.agent for r in order[1:]),
-            digest_of(order),
-            first.task,
-            first.epoch,
-            (first.agent,),
-            strategy=self.name,
-            reason=f"{first.cost:.1f} s away, battery {first.battery:.0%}, {first.load:g} other tasks",
-        )
+        reason = f"{first.cost:.1f} s away, battery {first.battery:.0%}, {first.load:g} other tasks"
+        return led_by(self.name, order, order, reason)
 
     def improves(self, current: Report, offer: Report, hysteresis: float) -> bool:
         """Whether ``offer`` weighs less by more than the share ``hysteresis``; who cannot do it never does."""
@@ -48,13 +40,8 @@ class CapabilityCost:
 
     def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
         """The best of both."""
-        return tuple(self._best((*a, *b)))
+        return tuple(best_of((*a, *b), self.weigh))
 
     def weigh(self, report: Report) -> float:
         """What a report weighs, in seconds: it rises with way and load, and falls with the battery."""
         return report.cost + BATTERY_S * (1.0 - report.battery) + LOAD_S * report.load
-
-    def _best(self, contacts: Sequence[Report]) -> list[Report]:
-        """The lightest reports, one of each agent, of the newest epoch and the first task."""
-        counted = standing(contacts, self.weigh)
-        return sorted((r for r in counted if r.task == counted[0].task), key=lambda r: (self.weigh(r), r.agent))[:KEPT]

@@ -9,25 +9,15 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 
 from middleware.consensus.exchange import exchanged
-from middleware.consensus.item import Item, capacities, exact, items_of, listed, shared_out
-from middleware.consensus.nearest import Nearest
+from middleware.consensus.item import Item, Sharing, capacities, exact, listed, shared_out
 from middleware.consensus.strategy import Consensus, Report, standing
 
 
-class Cbba(Nearest):
+class Cbba(Sharing):
     """The greedy assignment, task by task the cheapest pair, improved by exchanges; with one task the nearest."""
 
     name = "cbba"
     version = "1"
-
-    def find(self, contacts: Sequence[Report]) -> Consensus:
-        """The consensus point of the first task by name."""
-        found = self.find_group(contacts, items_of(standing(contacts)))
-        return found[0] if found else super().find(contacts)
-
-    def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
-        """All reports that count of both: each may matter."""
-        return standing((*a, *b))
 
     def find_group(self, contacts: Sequence[Report], items: Sequence[Item]) -> tuple[Consensus, ...]:
         """One consensus point for each item, one agent each, in the order of their names."""

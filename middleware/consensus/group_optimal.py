@@ -9,29 +9,19 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 from middleware.consensus import hungarian
-from middleware.consensus.item import Item, capacities, exact, items_of, listed, shared_out
-from middleware.consensus.nearest import Nearest
+from middleware.consensus.item import Item, Sharing, capacities, exact, listed, shared_out
 from middleware.consensus.strategy import Consensus, Report, standing
 
 BIDS = 20
 """Bids that count of each agent at first; that many fit into one datagram, and cost about 1 % of the optimum."""
 
 
-class GroupOptimal(Nearest):
+class GroupOptimal(Sharing):
     """The cheapest way to serve as many tasks as can be served; with one task it is the nearest."""
 
     name = "group_optimal"
     version = "1"
     bids = BIDS
-
-    def find(self, contacts: Sequence[Report]) -> Consensus:
-        """The consensus point of the first task by name."""
-        found = self.find_group(contacts, items_of(standing(contacts)))
-        return found[0] if found else super().find(contacts)
-
-    def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
-        """All reports that count of both: each may matter."""
-        return standing((*a, *b))
 
     def find_group(self, contacts: Sequence[Report], items: Sequence[Item]) -> tuple[Consensus, ...]:
         """One consensus point for each item, in the order of their names."""

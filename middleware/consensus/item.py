@@ -6,7 +6,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from middleware.consensus.strategy import Consensus, ConsensusAlgorithm, Report, digest_of
+from middleware.consensus.nearest import Nearest
+from middleware.consensus.strategy import Consensus, ConsensusAlgorithm, Report, digest_of, standing
 
 QUANTUM = 1_000_000
 """Costs are compared as whole millionths, so that sums are exact and equal everywhere."""
@@ -26,6 +27,23 @@ class GroupAlgorithm(ConsensusAlgorithm, Protocol):
 
     def find_group(self, contacts: Sequence[Report], items: Sequence[Item]) -> tuple[Consensus, ...]:
         """One consensus point for each item, in the order of their names; nobody acts for more than its capacity."""
+
+
+class Sharing(Nearest):
+    """What the strategies for several tasks have in common; each brings its own ``find_group``."""
+
+    def find(self, contacts: Sequence[Report]) -> Consensus:
+        """The consensus point of the first task by name."""
+        found = self.find_group(contacts, items_of(standing(contacts)))
+        return found[0] if found else super().find(contacts)
+
+    def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
+        """All reports that count of both: each may matter."""
+        return standing((*a, *b))
+
+    def find_group(self, contacts: Sequence[Report], items: Sequence[Item]) -> tuple[Consensus, ...]:
+        """As ``GroupAlgorithm`` promises."""
+        raise NotImplementedError
 
 
 def items_of(contacts: Iterable[Report]) -> list[Item]:

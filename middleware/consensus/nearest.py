@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
-from middleware.consensus.strategy import Consensus, Report, better, digest_of, standing
+from middleware.consensus.strategy import Consensus, Report, better, cost_of, led_by, standing
 
 KEPT = 4
 """How many of the best a summary keeps: one to act, the others to stand by; signed, that many fill a datagram."""
@@ -18,20 +18,10 @@ class Nearest:
 
     def find(self, contacts: Sequence[Report]) -> Consensus:
         """The consensus point; None is assigned where no report counts (``strategy.refused`` says why)."""
-        order = best_of(contacts)
+        order = best_of(contacts, cost_of)
         if not order:
             return Consensus(None, strategy=self.name, reason="no report counts")
-        first = order[0]
-        return Consensus(
-            first.agent,
-            tuple(r.agent for r in order[1:]),
-            digest_of(order),
-            first.task,
-            first.epoch,
-            (first.agent,),
-            strategy=self.name,
-            reason=f"{first.cost:.2f}, least of {len(order)}",
-        )
+        return led_by(self.name, order, order, f"{order[0].cost:.2f}, least of {len(order)}")
 
     def improves(self, current: Report, offer: Report, hysteresis: float) -> bool:
         """Whether ``offer`` is nearer by more than the share ``hysteresis``; what is no distance never is."""
@@ -39,10 +29,10 @@ class Nearest:
 
     def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
         """The best of both."""
-        return tuple(best_of((*a, *b)))
+        return tuple(best_of((*a, *b), cost_of))
 
 
-def best_of(contacts: Sequence[Report]) -> list[Report]:
-    """The lowest costs, one of each agent, the lowest first; of several tasks only the first by name is looked at."""
-    counted = standing(contacts)
-    return sorted((r for r in counted if r.task == counted[0].task), key=lambda r: (r.cost, r.agent))[:KEPT]
+def best_of(contacts: Sequence[Report], rank: Callable[[Report], float]) -> list[Report]:
+    """The lowest by ``rank``, one of each agent, the lowest first; of several tasks only the first by name counts."""
+    counted = standing(contacts, rank)
+    return sorted((r for r in counted if r.task == counted[0].task), key=lambda r: (rank(r), r.agent))[:KEPT]

@@ -166,6 +166,33 @@ def standing(contacts: Iterable[Report], rank: Callable[[Report], float] = cost_
     return tuple(best[key] for key in sorted(best))
 
 
+def led_by(
+    name: str,
+    order: Sequence[Report],
+    counted: Sequence[Report],
+    reason: str,
+    value: tuple[float, ...] = (),
+    choice: str = "",
+) -> Consensus:
+    """What the strategy ``name`` finds: the first of ``order`` acts, the others stand by; without an order nobody does.
+
+    ``counted`` are the reports used, at least one, all of one task and epoch.
+    """
+    agents = tuple(r.agent for r in order)
+    return Consensus(
+        agents[0] if agents else None,
+        agents[1:],
+        digest_of(counted),
+        counted[0].task,
+        counted[0].epoch,
+        agents[:1],
+        value,
+        choice,
+        name,
+        reason,
+    )
+
+
 def better(current: Report, offer: Report, hysteresis: float) -> bool:
     """Whether the cost of ``offer`` is lower than that of ``current`` by more than the share ``hysteresis``."""
     return not refusal(offer) and offer.cost < current.cost * (1.0 - hysteresis)

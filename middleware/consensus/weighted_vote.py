@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 
 from middleware.consensus.nearest import Nearest
-from middleware.consensus.strategy import Consensus, Report, digest_of, standing
+from middleware.consensus.strategy import Consensus, Report, led_by, standing
 
 
 class WeightedVote(Nearest):
@@ -34,24 +34,12 @@ class WeightedVote(Nearest):
         cast = math.fsum(r.weight for r in counted if r.choice)
         best = min(weights, key=lambda option: (-weights[option], _hash(option)), default="")
         told = ", ".join(f"{option}: {weight:g}" for option, weight in weights.items())
-        first = counted[0]
         is_decided = best != "" and (2.0 * weights[best] > all_weight or cast >= all_weight > 0.0)
         if not is_decided:
             why = f"{told or 'no vote'}; more than half of {all_weight:g} decides"
-            return Consensus(None, (), digest_of(counted), first.task, first.epoch, strategy=self.name, reason=why)
+            return led_by(self.name, (), counted, why)
         side = sorted((r for r in counted if r.choice == best), key=lambda r: (r.cost, r.agent))
-        names = tuple(r.agent for r in side)
-        return Consensus(
-            names[0],
-            names[1:],
-            digest_of(counted),
-            first.task,
-            first.epoch,
-            names[:1],
-            choice=best,
-            strategy=self.name,
-            reason=f"{best} of {told}",
-        )
+        return led_by(self.name, side, counted, f"{best} of {told}", choice=best)
 
     def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
         """Everybody's newest vote, about the first task by name."""

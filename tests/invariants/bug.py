@@ -130,18 +130,18 @@ def _buried_and_forgotten(self: Docket, task_id: str, now: float) -> None:
     self._open.pop(task_id, None)
 
 
-def _first_come(contacts: Any) -> list[Report]:
-    return sorted(contacts, key=lambda report: report.cost)
+def _first_come(contacts: Any, rank: Any) -> list[Report]:
+    return sorted(contacts, key=rank)
 
 
-def _numbered_in_a_byte(contacts: Any) -> list[Report]:
-    order = _BEST_OF(contacts)
+def _numbered_in_a_byte(contacts: Any, rank: Any) -> list[Report]:
+    order = _BEST_OF(contacts, rank)
     names = sorted({report.agent for report in contacts})
     return [replace(r, agent=names[(names.index(r.agent) + 128) % 256 - 128]) for r in order]
 
 
-def _not_a_number_first(contacts: Any) -> list[Report]:
-    return sorted(contacts, key=lambda r: (r.cost >= 0, r.cost, r.agent))
+def _not_a_number_first(contacts: Any, rank: Any) -> list[Report]:
+    return sorted(contacts, key=lambda r: (rank(r) >= 0, rank(r), r.agent))
 
 
 _BEST_OF = nearest.best_of

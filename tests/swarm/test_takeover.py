@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import random
+
 from twisted.trial.unittest import SynchronousTestCase
 
 from benchmarks.takeover.cause import Cause, Trial
+from benchmarks.takeover.judge import Judge
 from benchmarks.takeover.rehearsed import trial
 from benchmarks.takeover.report import drawn, table
+from middleware.tasks import COMPLETED, Result
 
 
 class TakeoverTests(SynchronousTestCase):
@@ -36,6 +40,39 @@ class TakeoverTests(SynchronousTestCase):
     def test_polite_leave(self) -> None:
         """A node that leaves in order is replaced."""
         self.take_over(Cause.POLITE_LEAVE, 2)
+
+
+class JudgeTests(SynchronousTestCase):
+    def judge(self, cause: Cause = Cause.CRASH) -> Judge:
+        """One that watches the loss of dog1 at 100 s, for 25 s, and 1 s after the end."""
+        return Judge(cause, 1, "dog1", 100.0, random.Random(1), 25.0, 1.0)
+
+    def test_counts_from_the_loss(self) -> None:
+        """The takeover is when the first other moves; two at once, and the lost one afterwards, are counted apart."""
+        judge = self.judge()
+        looks = [["dog1"], [], ["dog2"], ["dog1", "dog2"], ["dog1"], ["dog3"]]
+        for number, moving in enumerate(looks, start=1):
+            judge.look(100.0 + number, moving, None)
+        self.assertEqual(judge.verdict(), Trial("crash", 1, "dog1", "", False, 3.0, 1, 2))
+
+    def test_goes_on_after_the_end(self) -> None:
+        """It is over a second after the end is seen, or when nothing has come for long."""
+        judge = self.judge()
+        self.assertFalse(judge.is_over(124.9))
+        self.assertTrue(judge.is_over(125.0))
+        for now in (103.0, 103.5):
+            judge.look(now, ["dog2"], Result(COMPLETED, "dog2"))
+        self.assertFalse(judge.is_over(103.9))
+        self.assertTrue(judge.is_over(104.0))
+        self.assertEqual(judge.verdict(), Trial("crash", 1, "dog1", "dog2", True, 3.0, 0, 0))
+
+    def test_thaws_the_frozen_once(self) -> None:
+        """Only who is frozen goes on, once, and the trial is not over before that."""
+        judge = self.judge(Cause.FREEZE)
+        self.assertFalse(judge.is_over(999.0))
+        self.assertEqual([judge.thaws(now) for now in (102.9, 105.1, 105.2)], [False, True, False])
+        self.assertTrue(judge.is_over(999.0))
+        self.assertFalse(self.judge().thaws(105.1))
 
 
 class ReportTests(SynchronousTestCase):

@@ -212,6 +212,14 @@ class DeployTests(SynchronousTestCase):
         self.assertIn("is a strategy", self.refused(again))
         self.assertEqual(self.swarm("status").count("farthest"), 1)
 
+    def test_label_cannot_move_the_cursor(self) -> None:
+        """What a device says that it runs reaches the terminal without its control characters."""
+        self.let_in()
+        self.push()
+        self.team.services["dog1"].assembly.node.presence.change(deployed={"farthest": "1\x1b[2J\nx"})
+        self.team.clock.advance(1.0)
+        self.assertIn("\n  dog1  1 [2J x\n", self.swarm("status"))
+
     def test_keys_and_json(self) -> None:
         """``keys`` tells each device's public key, of which its uuid is the hash; ``--json`` is one line of JSON."""
         self.let_in("farthest")

@@ -8,6 +8,7 @@ import shutil
 import tempfile
 from pathlib import Path
 
+from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.control.place import made
@@ -81,6 +82,13 @@ class WhyTests(SynchronousTestCase):
         self.assertEqual(self.shell.said, f"swarm why: no task begins with 'zz'; the newest are {task}\n")
         self.assertEqual(self.shell.run(main, ["last", "--node", "nobody"])[0], 2)
         self.assertIn("no node 'nobody' runs", self.shell.said)
+
+    def test_title_cannot_move_the_cursor(self) -> None:
+        """What a task is called reaches the terminal without its control characters."""
+        node = self.team.services["vaio"].assembly.node
+        Deferred.fromCoroutine(node.submit(Task("evil", "search", "red\x1b[2J\n target")))
+        self.team.clock.advance(1.0)
+        self.assertTrue(self.shell.run(main, ["evil"])[1].startswith("task evil: red [2J  target\n"))
 
     def test_prefix(self) -> None:
         """A beginning that fits several is refused with their names; a whole id is meant, also where others go on."""

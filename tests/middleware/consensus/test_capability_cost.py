@@ -46,6 +46,12 @@ class CapabilityCostTests(SynchronousTestCase):
         found = self.strategy.find([tired, fresh, busy])
         self.assertEqual((found.assigned_agent, found.standby), ("b", ("a", "c")))
 
+    def test_own_reports(self) -> None:
+        """Of two reports of one device the one counts that weighs less, not the one of the shorter way."""
+        tired, fresh = Report("a", 5.0, battery=0.2), Report("a", 6.0)
+        self.assertEqual(self.strategy.merge([tired], [fresh]), (fresh,))
+        self.assertEqual(self.strategy.find([tired, fresh, Report("b", 10.0)]).assigned_agent, "a")
+
     def test_one_switch_each_swing(self) -> None:
         """A cost that swings changes the holder once for each swing beyond the threshold, and never for less."""
 

@@ -38,6 +38,16 @@ def cost(points: tuple[Consensus, ...], reports: list[Report]) -> float:
     return sum(known[agent, point.task] for point in points for agent in point.assigned)
 
 
+class SharingTests(SynchronousTestCase):
+    def test_one_of_several(self) -> None:
+        """Asked about one, of reports on several tasks, they say who has the first when all are shared out."""
+        bids = {("a", "s"): 1.0, ("b", "s"): 2.0, ("a", "t"): 1.0, ("b", "t"): 10.0}
+        reports = [Report(agent, cost, task=task) for (agent, task), cost in bids.items()]
+        for strategy in (Cbba(), GroupOptimal()):
+            found = strategy.find(reports)
+            self.assertEqual((found.task, found.assigned_agent, found.standby), ("s", "b", ("a",)), strategy.name)
+
+
 class GroupOptimalTests(SynchronousTestCase):
     def test_optimum(self) -> None:
         """With all bids nothing is cheaper: compared with every assignment there is."""

@@ -45,6 +45,12 @@ class WeightedVoteTests(SynchronousTestCase):
         self.assertEqual(self.vote.find(changed).choice, "")
         self.assertEqual(self.vote.find([*changed, vote("c", "red", sequence=2)]).choice, "red")
 
+    def test_digest_of_all_votes(self) -> None:
+        """The digest is of all votes that were counted, those of the losing side, too."""
+        red = [vote("a", "red", 2.0), vote("b", "red")]
+        digests = {self.vote.find([*red, vote("c", choice)]).digest for choice in ("blue", "green")}
+        self.assertEqual(len(digests), 2)
+
     def test_all_have_voted(self) -> None:
         """When everybody has voted, the heaviest option wins without a majority; equal ones go by their hash."""
         votes = [
