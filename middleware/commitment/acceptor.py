@@ -45,13 +45,14 @@ class Acceptor:
         """Promise to accept nothing under a lower ballot, or say what stands against it.
 
         While another holds the lease (a former life of the same agent is another) nothing changes but that the asker
-        is told when it is given back.  A ballot of counter 0 only looks, and is promised nothing: a member whose grant
+        is told when it is given back.  Once it is given back a promise tells how long the robot may still move.  A ballot of counter 0 only looks, and is promised nothing: a member whose grant
         has run out, because it missed a renewal, is not to be lost to its healthy holder.
         """
         entry = self._entry(task_id, configuration, ttl, now)
         if isinstance(entry, Reply):
             return entry
-        if entry.until > now and not entry.ballot.is_kin(ballot):
+        is_kin = entry.ballot.is_kin(ballot)
+        if entry.until > now and not (is_kin or entry.is_given_back):
             self._listen(entry, ballot.agent, now + ttl)
             return self._reply(HELD, entry, now)
         if ballot.counter > 0 and ballot < entry.promised:
@@ -62,7 +63,8 @@ class Acceptor:
             self._ledger.keep(task_id)
         if entry.sealed != NONE:
             return self._reply(SEALED, entry, now)._replace(ballot=entry.sealed)
-        return self._reply(GRANTED, entry, now)
+        reply = self._reply(GRANTED, entry, now)
+        return reply._replace(remaining=0.0) if is_kin else reply
 
     def propose(self, task_id: str, configuration: int, ballot: Ballot, token: int, ttl: float, now: float) -> Reply:
         """Grant the lease for ``ttl`` seconds from now, or renew it, unless a higher ballot or token was seen."""
@@ -74,6 +76,8 @@ class Acceptor:
         is_lower = token < entry.token or (token == entry.token and not ballot.is_kin(entry.ballot))
         if ballot < entry.promised or ballot <= entry.spent or is_lower:
             return self._reply(OUTBID, entry, now)
+        if entry.until > now and not entry.ballot.is_kin(ballot):
+            return self._reply(HELD, entry, now)  # the robot of who gave it back still moves
         is_new = (entry.promised, entry.ballot, entry.token, entry.ttl) != (ballot, ballot, token, ttl)
         entry.promised = entry.ballot = ballot
         entry.token, entry.ttl = token, ttl
@@ -82,17 +86,20 @@ class Acceptor:
             self._ledger.keep(task_id)
         return self._reply(GRANTED, entry, now)
 
-    def release(self, task_id: str, ballot: Ballot, now: float) -> list[str]:
-        """End what was granted under ``ballot``, for good, and name those that are to be told."""
+    def release(self, task_id: str, ballot: Ballot, now: float, rest: float = 0.0) -> list[str]:
+        """End what was granted under ``ballot``, for good, and name those that are to be told.
+
+        ``rest`` is how long the robot may still move: until then others are promised the lease, but not granted.
+        """
         entry = self._ledger.get(task_id)
         if entry is None or ballot not in (entry.ballot, entry.promised) or ballot <= entry.spent:
             return []
         # A proposal of that ballot may still be on its way: it comes too late.
         entry.spent = ballot
         if entry.ballot == ballot:
-            entry.ballot, entry.until = NONE, now
+            entry.until = min(entry.until, now + rest)
         self._ledger.keep(task_id)
-        if entry.until > now:
+        if entry.until > now and not entry.is_given_back:
             return []
         listeners, entry.listeners = entry.listeners, {}
         return [agent for agent, until in listeners.items() if until > now and agent != ballot.agent]

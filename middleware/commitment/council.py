@@ -91,13 +91,14 @@ class Council:
             if reply.kind == BEHIND and newest is not None and newest.configuration == self.configuration:
                 self._install(self.members[place])
 
-    def let_go(self, ballot: Ballot, heirs: Sequence[Contact] = ()) -> Deferred[Any]:
+    def let_go(self, ballot: Ballot, heirs: Sequence[Contact] = (), rest: float = 0.0) -> Deferred[Any]:
         """Give back whatever was promised or granted under ``ballot``, and tell ``heirs``.
 
-        Fires when every member has been told, or does not answer.
+        The robot moves for at most ``rest`` seconds from now on.  Fires when every member has been told, or does not
+        answer.
         """
-        told = [self._ask(member, "lease.release", (self.task_id, ballot.counter)) for member in self.members]
-        told += [self._ask(heir, "lease.freed", (self.task_id, self.token)) for heir in heirs]
+        told = [self._ask(member, "lease.release", (self.task_id, ballot.counter, rest)) for member in self.members]
+        told += [self._ask(heir, "lease.freed", (self.task_id, self.token, rest)) for heir in heirs]
         return DeferredList(told, consumeErrors=True)
 
     def close(self, token: int = 0) -> Deferred[None]:

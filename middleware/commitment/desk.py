@@ -81,13 +81,13 @@ class Desk:
         ballot, now = Ballot(counter, peer.node_id.hex()), self._clock.seconds()
         return self._kept(self._acceptor.propose(task_id, configuration, ballot, token, float(ttl), now))
 
-    def _release(self, peer: Contact, task_id: str, counter: int) -> None:
-        _check(task_id, counter)
+    def _release(self, peer: Contact, task_id: str, counter: int, rest: float) -> None:
+        _check(task_id, counter, rest=rest)
         ballot = Ballot(counter, peer.node_id.hex())
-        for agent in self._acceptor.release(task_id, ballot, self._clock.seconds()):
+        for agent in self._acceptor.release(task_id, ballot, self._clock.seconds(), float(rest)):
             contact = self._contacts.get(agent)
             if contact is not None:
-                self._endpoint.tell(contact, "lease.freed", task_id, 0)
+                self._endpoint.tell(contact, "lease.freed", task_id, 0, rest)
 
     def _close(self, peer: Contact, task_id: str, configuration: int, token: int) -> Answer:
         _check(task_id, configuration, token + 1)
@@ -107,11 +107,11 @@ class Desk:
         members, now = _checked(packed), self._clock.seconds()
         return self._kept(self._acceptor.install(task_id, configuration, members, token, now))
 
-    def _freed(self, peer: Contact, task_id: str, token: int) -> None:
-        _check(task_id, token + 1)
+    def _freed(self, peer: Contact, task_id: str, token: int, rest: float) -> None:
+        _check(task_id, token + 1, rest=rest)
         lessee = self._lessees.get(task_id)
         if lessee is not None:
-            lessee.freed(token)
+            lessee.freed(token, float(rest))
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
@@ -131,11 +131,13 @@ class Desk:
         return packed if written.called and written.result is None else written.addCallback(lambda _: packed)
 
 
-def _check(task_id: str, *numbers: int, ttl: float = 1.0) -> None:
+def _check(task_id: str, *numbers: int, ttl: float = 1.0, rest: float = 0.0) -> None:
     if len(task_id) > MAX_NAME or not all(0 < number < MAX_NUMBER for number in numbers):
         raise Refused("a lease is asked for with a task id and positive numbers below 2^62")
     if not 0.0 < ttl <= MAX_TTL:
         raise Refused(f"a lease lasts more than 0 and at most {MAX_TTL:g} seconds")
+    if not 0.0 <= rest <= MAX_TTL:
+        raise Refused(f"a robot comes to rest within 0 to {MAX_TTL:g} seconds")
 
 
 def _checked(packed: list[object]) -> tuple[Contact, ...]:

@@ -28,7 +28,8 @@ class Entry:
     """What an acceptor knows of one task.
 
     ``promised`` is the highest ballot answered, ``ballot`` that of the lease, which runs ``ttl`` seconds ``until`` then
-    (its ``agent`` holds it); ``spent`` is the highest ballot whose lease was given back.  ``token`` never falls.
+    (its ``agent`` holds it); ``spent`` is the highest ballot whose lease was given back, by an agent whose robot comes
+    to rest until ``until``.  ``token`` never falls.
     ``sealed`` is the ballot under which ``members`` were accepted as the next council; where it is none they are the
     present one, as far as known.
     """
@@ -45,6 +46,11 @@ class Entry:
     until: float = 0.0
     touched_at: float = 0.0
     listeners: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def is_given_back(self) -> bool:
+        """Whether whoever held the lease acts no more: what may still move is its robot, until it is at rest."""
+        return self.ballot <= self.spent
 
     def packed(self) -> list[object]:
         """The entry as it stands in a note; moments mean nothing to a later life and stay behind."""

@@ -16,7 +16,6 @@ from dataclasses import dataclass
 
 from twisted.internet.defer import Deferred, succeed
 from twisted.internet.interfaces import IDelayedCall, IReactorTime
-from twisted.internet.task import deferLater
 
 from middleware.commitment.ballot import GRANTED, NONE, OUTBID, OVER, SEALED, Ballot
 from middleware.commitment.council import Council
@@ -80,7 +79,7 @@ class Lessee:
         self._claimed = NONE
         self._rank = 0
         self._is_wanted = False
-        self._freed_at = -math.inf
+        self._free_at = -math.inf
         self._only_looks = False
         self._must_prepare = False
         self._round: Round | None = None
@@ -116,13 +115,17 @@ class Lessee:
         if self._is_wanted and not self._is_asking and self.lease is None:
             self._look()
 
-    def freed(self, token: int) -> None:
-        """A member says that the lease with that token was given back."""
+    def freed(self, token: int, rest: float = 0.0) -> None:
+        """Somebody says that the lease with that token was given back; its robot moves for ``rest`` more seconds.
+
+        The first in line asks for it at once, so that only the grant is left to ask for when that robot stands still.
+        """
         self.council.token = max(self.council.token, token)
         if self._is_wanted and self.lease is None:
-            self._freed_at = self._clock.seconds()
-            if not self._is_asking:
-                self._again(self._stagger())
+            is_news = not self._is_freed
+            self._free_at = self._clock.seconds() + rest
+            if is_news and not self._is_asking:
+                self._again(self._turn())
 
     def outrank(self, token: int) -> None:
         """A device has obeyed ``token``: from now on nothing is claimed that is not higher, and nothing lower used."""
@@ -134,7 +137,7 @@ class Lessee:
     def release(self, heirs: Sequence[Contact] = ()) -> Deferred[object]:
         """Give the lease back (stop the device first), or stop claiming it; fires when the council knows.
 
-        Where the robot takes a time to come to rest, the council is told when that has passed.  Its members tell those
+        The council is told how long the robot takes to come to rest, and grants nothing before.  Its members tell those
         that stand by; ``heirs`` are told from here, and so half a round trip earlier.
         """
         told: Deferred[object] = succeed(None)
@@ -180,7 +183,12 @@ class Lessee:
             finishing.addErrback(lambda failure: failure.trap(EntangledError))
             finishing.addBoth(lambda _: self._go_on())
             return
-        self._propose(ballot, self._next_token())
+        wait = asked.free_in() if self.lease is None else 0.0
+        if wait > 0.0:
+            # Promised; the robot of who gave it back is about to stand still.
+            self._timer = self._clock.callLater(wait, lambda: self._propose(ballot, self._next_token()))
+        else:
+            self._propose(ballot, self._next_token())
 
     def _next_token(self) -> int:
         """The token to claim: the one that is held while nobody was granted a higher one, else above all seen."""
@@ -227,9 +235,9 @@ class Lessee:
 
     def _wait(self, asked: Round) -> None:
         """Claim when the lease may be free; look again in a third of a ttl at any rate, for a push may be lost."""
-        free_in = 0.0 if self._is_freed else asked.free_in()
         is_outbid = any(reply.kind == OUTBID for reply in asked.replies.values())
-        wait, pause = free_in + self._stagger(), self._rng.uniform(*(BACK_OFF if is_outbid else JITTER))
+        wait = self._turn() if self._is_freed else asked.free_in() + self._stagger()
+        pause = self._rng.uniform(*(BACK_OFF if is_outbid else JITTER))
         # A healthy holder renews well before: what runs out that soon is claimed in time, without a look before.
         self._only_looks = wait > SOON * self._poll_period()
         self._again((self._poll_period() if self._only_looks else wait) + pause)
@@ -255,6 +263,11 @@ class Lessee:
 
     def _stagger(self) -> float:
         return STAGGER * max(0, self._rank - 1)
+
+    def _turn(self) -> float:
+        """Seconds until it claims what was given back: the first in line while the robot still moves, then by rank."""
+        wait = self._stagger()
+        return wait and max(0.0, self._free_at - self._clock.seconds()) + wait
 
     # -- keeping ----------------------------------------------------------------------------------------------------
 
@@ -291,7 +304,7 @@ class Lessee:
     @property
     def _is_freed(self) -> bool:
         """Whether the lease was given back just now: the news may be here before it is at every member."""
-        return self._clock.seconds() - self._freed_at < FRESH
+        return self._clock.seconds() < self._free_at + FRESH
 
     @property
     def _is_asking(self) -> bool:
@@ -302,15 +315,9 @@ class Lessee:
             self._again(self._rng.uniform(*BACK_OFF))
 
     def _let_go(self, ballot: Ballot, heirs: Sequence[Contact] = ()) -> Deferred[object]:
-        """Tell the council, as soon as the robot stands still (it was told to stop at the deadline at the latest)."""
-        rest = self._rest()
-        if rest > 0.0:
-            return deferLater(self._clock, rest, self.council.let_go, ballot, heirs)
-        return self.council.let_go(ballot, heirs)
-
-    def _rest(self) -> float:
-        """Seconds for which the robot may still move."""
-        return self._rests_at - self._clock.seconds()
+        """Tell the council, and for how long the robot may still move (it was told to stop at the deadline at most)."""
+        rest = max(0.0, self._rests_at - self._clock.seconds())
+        return self.council.let_go(ballot, heirs, rest * (1.0 + CLOCK_MARGIN))
 
     def _let_go_of_minority(self) -> None:
         """What a minority granted must not keep a healthier claimant waiting."""

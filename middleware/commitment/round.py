@@ -9,13 +9,15 @@ from typing import Any
 from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IDelayedCall, IReactorTime
 
-from middleware.commitment.ballot import Reply, quorum, reply_of
+from middleware.commitment.ballot import HELD, Reply, quorum, reply_of
 from middleware.entangled.kademlia.contact import Contact
 
 TRIES = 3
 """How often a member is asked at least: a majority is enough, but who missed a renewal may promise to another."""
 PAUSE = 0.1
 """Seconds between two tries with a member that has not answered (consensus rule 6)."""
+LEAST = 0.005
+"""Seconds that pass at least until a member that is about to be free is asked again."""
 
 Ask = Callable[[Contact, str, tuple[Any, ...]], Deferred[Any]]
 """Ask a council member: (member, method, arguments)."""
@@ -24,6 +26,7 @@ Ask = Callable[[Contact, str, tuple[Any, ...]], Deferred[Any]]
 class Round:
     """``outcome`` fires with the round as soon as it is decided whether a majority answers with one of ``kinds``.
 
+    A member where another's lease ends within 100 ms is asked again then.
     It also fires, undecided, when everybody answered or ``patience`` seconds have passed, and soon after a majority has
     answered.  Who has not answered is asked every 100 ms until it is decided, and at least three times in all.
     """
@@ -92,24 +95,29 @@ class Round:
 
     def _try(self) -> None:
         self._tries += 1
-        method, arguments = self._question
         if self._tries < TRIES or not self.outcome.called:
             self._timer = self._clock.callLater(PAUSE, self._try)
-        for place, member in enumerate(self._members):
-            if place not in self.replies and not self._is_closed:
-                asked = self._ask(member, method, arguments)
-                asked.addBoth(self._answered, place, self._clock.seconds())
+        for place in range(len(self._members)):
+            self._ask_one(place)
         if not self._members:
             self._ended()
+
+    def _ask_one(self, place: int) -> None:
+        if place not in self.replies and not self._is_closed:
+            asked = self._ask(self._members[place], *self._question)
+            asked.addBoth(self._answered, place, self._clock.seconds())
 
     def _answered(self, answer: object, place: int, sent: float) -> None:
         """Take in the answer of one member; its silence (a Failure) and what is no answer count for nothing."""
         reply = reply_of(answer)
         if self._is_closed or reply is None or place in self.replies:
             return
-        self.replies[place], self._sent[place] = reply, sent
         # The member counted somewhere between question and answer; to come too early harms nobody.
         self._free_at[place] = (sent + self._clock.seconds()) / 2 + reply.remaining
+        if reply.kind == HELD and reply.remaining < PAUSE:
+            self._clock.callLater(max(LEAST, reply.remaining), self._ask_one, place)
+            return
+        self.replies[place], self._sent[place] = reply, sent
         if len(self.replies) == len(self._members):
             self.close()
         no = len(self.replies) - len(self.yes)

@@ -81,11 +81,11 @@ class Bidder:
         if lessee is not None:
             lessee.release([self.world.contacts[heir] for heir in heirs])
 
-    def freed(self, agent: str, task_id: str, token: int) -> None:
+    def freed(self, agent: str, task_id: str, token: int, rest: float) -> None:
         """Hear that the lease was given back."""
         lessee = self.lessees.get(task_id)
         if lessee is not None:
-            lessee.freed(token)
+            lessee.freed(token, rest)
 
     def _tick(self) -> None:
         for task_id, lessee in self.lessees.items():
@@ -144,9 +144,9 @@ class Bidder:
         ballot = Ballot(counter, agent)
         return self.acceptor.propose(task_id, configuration, ballot, token, ttl, self.machine.seconds())
 
-    def _release(self, agent: str, task_id: str, counter: int) -> None:
-        for listener in self.acceptor.release(task_id, Ballot(counter, agent), self.machine.seconds()):
-            self.world.tell_freed(self.place, listener, task_id)
+    def _release(self, agent: str, task_id: str, counter: int, rest: float) -> None:
+        for listener in self.acceptor.release(task_id, Ballot(counter, agent), self.machine.seconds(), rest):
+            self.world.tell_freed(self.place, listener, task_id, rest)
 
     def _close(self, agent: str, task_id: str, configuration: int, token: int) -> Reply:
         return self.acceptor.close(task_id, agent, configuration, token, self.machine.seconds())

@@ -94,11 +94,14 @@ class Team:
 
         self.radio.send(me.place, to, arrive)
 
-    def tell_freed(self, source: int, agent: str, task_id: str) -> None:
+    def tell_freed(self, source: int, agent: str, task_id: str, rest: float) -> None:
         """Carry the news that a lease was given back."""
         to = self._by_id[agent]
 
-        self.radio.send(source, to, lambda: self.bidders[to].machine.take(self.bidders[to].freed, agent, task_id, 0))
+        def arrive() -> None:
+            self.bidders[to].machine.take(self.bidders[to].freed, agent, task_id, 0, rest)
+
+        self.radio.send(source, to, arrive)
 
     # -- lives ------------------------------------------------------------------------------------------------------
 

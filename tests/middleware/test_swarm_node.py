@@ -212,7 +212,10 @@ class SwarmNodeTests(FleetCase):
         for method, *question in (
             ("lease.prepare", "t", 1, 1, float("nan")),
             ("lease.propose", "t", 1, 1, 0, 1.0),
-            ("lease.release", "t", -1),
+            ("lease.release", "t", -1, 0.0),
+            ("lease.release", "t", 1, -0.1),
+            ("lease.release", "t", 1, 61.0),
+            ("lease.freed", "t", 0, float("nan")),
             ("lease.close", "t", 1, -1),
             ("lease.change", "t", 1, 1, [], 0),
             ("lease.change", "t", 1, 1, [[b"k", "h", 0]], 0),
