@@ -45,8 +45,9 @@ class Acceptor:
         """Promise to accept nothing under a lower ballot, or say what stands against it.
 
         While another holds the lease (a former life of the same agent is another) nothing changes but that the asker
-        is told when it is given back.  Once it is given back a promise tells how long the robot may still move.  A ballot of counter 0 only looks, and is promised nothing: a member whose grant
-        has run out, because it missed a renewal, is not to be lost to its healthy holder.
+        is told when it is given back.  Once it is given back a promise tells how long the robot may still move.  A
+        ballot of counter 0 only looks, and is promised nothing: a member whose grant has run out, because it missed a
+        renewal, is not to be lost to its healthy holder.
         """
         entry = self._entry(task_id, configuration, ttl, now)
         if isinstance(entry, Reply):
@@ -98,6 +99,7 @@ class Acceptor:
         entry.spent = ballot
         if entry.ballot == ballot:
             entry.until = min(entry.until, now + rest)
+            entry.ballot = ballot if entry.until > now else NONE
         self._ledger.keep(task_id)
         if entry.until > now and not entry.is_given_back:
             return []

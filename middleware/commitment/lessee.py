@@ -35,6 +35,8 @@ SOON = 1.5
 """Periods of asking within which a lease that runs out is claimed rather than looked at once more."""
 FRESH = 0.3
 """Seconds for which the news of a release is believed against members that have not heard it."""
+EARLY = 0.25
+"""Share of a round trip after which a member is taken to have counted, when what it promised is asked for."""
 STAGGER = 0.1
 """Seconds by which each rank of those that stand by waits longer than the one before it."""
 TICK = 0.05
@@ -183,9 +185,9 @@ class Lessee:
             finishing.addErrback(lambda failure: failure.trap(EntangledError))
             finishing.addBoth(lambda _: self._go_on())
             return
-        wait = asked.free_in() if self.lease is None else 0.0
+        wait = asked.free_in(EARLY) if self.lease is None else 0.0
         if wait > 0.0:
-            # Promised; the robot of who gave it back is about to stand still.
+            # The robot of who gave it back is about to stand still; who is asked too early is asked again.
             self._timer = self._clock.callLater(wait, lambda: self._propose(ballot, self._next_token()))
         else:
             self._propose(ballot, self._next_token())

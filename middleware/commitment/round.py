@@ -51,7 +51,7 @@ class Round:
         self._needed = quorum(len(members))
         self._patience = patience
         self._sent: dict[int, float] = {}
-        self._free_at: dict[int, float] = {}
+        self._heard: dict[int, tuple[float, float, float]] = {}
         self._tries = 0
         self._is_closed = False
         self._timer: IDelayedCall | None = None
@@ -86,11 +86,15 @@ class Round:
             if timer is not None and timer.active():
                 timer.cancel()
 
-    def free_in(self) -> float:
-        """Seconds until a majority may be free to say yes, as far as its members told."""
+    def free_in(self, share: float = 0.5) -> float:
+        """Seconds until a majority may be free to say yes, as far as its members told.
+
+        A member counted somewhere between question and answer: after ``share`` of the time is the guess.
+        """
+        free_at = {p: sent + share * (heard - sent) + left for p, (sent, heard, left) in self._heard.items()}
         # Of who did not answer nothing is known; where nobody answered, nothing is known against asking at once.
         unknown = math.inf if self.replies else -math.inf
-        waits = sorted(self._free_at.get(place, unknown) for place in range(len(self._members)))
+        waits = sorted(free_at.get(place, unknown) for place in range(len(self._members)))
         return max(0.0, waits[self._needed - 1] - self._clock.seconds()) if waits else 0.0
 
     def _try(self) -> None:
@@ -112,8 +116,7 @@ class Round:
         reply = reply_of(answer)
         if self._is_closed or reply is None or place in self.replies:
             return
-        # The member counted somewhere between question and answer; to come too early harms nobody.
-        self._free_at[place] = (sent + self._clock.seconds()) / 2 + reply.remaining
+        self._heard[place] = sent, self._clock.seconds(), reply.remaining
         if reply.kind == HELD and reply.remaining < PAUSE:
             self._clock.callLater(max(LEAST, reply.remaining), self._ask_one, place)
             return

@@ -83,6 +83,7 @@ _GENUINE = {
         (Session, "open"),
         (Seat, "_load"),
         (ledger.Ledger, "keep"),
+        (Acceptor, "release"),
     ]
 }
 
@@ -96,6 +97,14 @@ def _won_by_one(self: Tally) -> Any:
 
 def _claimed_for_ever(self: Vote, ballot: Any, lease: float, now: float) -> Any:
     return _GENUINE[Vote, "claim"](self, ballot, lease + 1e6, now)
+
+
+def _let_go_as_if_at_rest(self: Lessee, ballot: Any, heirs: Any = ()) -> Any:
+    return self.council.let_go(ballot, heirs)
+
+
+def _released_at_rest(self: Acceptor, task_id: str, ballot: Any, now: float, rest: float = 0.0) -> Any:
+    return _GENUINE[Acceptor, "release"](self, task_id, ballot, now)
 
 
 def _load_without_votes(self: Seat) -> None:
@@ -236,12 +245,13 @@ BUGS: dict[str, list[tuple[Any, str, Any]]] = {
     "minority grants are kept": [(Lessee, "_let_go_of_minority", _idle)],
     "the token is not stored": [(ledger.Ledger, "keep", _forgets_tokens)],
     "the time to stop is ignored": [(Lessee, "_deadline_of", _deadline_without_the_stop)],
-    "released before it stands still": [(Lessee, "_rest", lambda self: 0.0)],
+    "released before it stands still": [(Lessee, "_let_go", _let_go_as_if_at_rest)],
+    "granted before it stands still": [(Acceptor, "release", _released_at_rest)],
     "the device takes lower tokens": [(Gate, "admit", _admits_lower_tokens)],
     "a restarted member grants at once": [(Acceptor, "_silence", lambda self, ttl: 0.0)],
     "the new council decides the change": [(Council, "_decision", _decided_by_the_new)],
 }
-LEASE_BUGS = tuple(list(BUGS)[-12:])
+LEASE_BUGS = tuple(list(BUGS)[-13:])
 
 FINDERS: dict[str, tuple[str, ...]] = {
     "one promise is a majority": ("tuples",),

@@ -101,6 +101,19 @@ class AcceptorTests(SynchronousTestCase):
         self.assertEqual(self.propose(1, "a", 1, 1.0).kind, OUTBID)
         self.assertEqual(self.prepare(2, "b", 1.0).kind, GRANTED)
 
+    def test_release_before_the_robot_rests(self) -> None:
+        """What is given back while the robot still moves is promised to others at once, and granted when it rests."""
+        self.prepare(1, "a", 0.0)
+        self.propose(1, "a", 1, 0.0)
+        self.prepare(2, "b", 0.5)
+        self.assertEqual(self.acceptor.release("t", ballot(1, "a"), 1.0, 0.2), ["b"])
+        promised = self.prepare(2, "b", 1.05)
+        self.assertEqual((promised.kind, round(promised.remaining, 3)), (GRANTED, 0.15))
+        early = self.propose(2, "b", 2, 1.15)
+        self.assertEqual((early.kind, round(early.remaining, 3)), (HELD, 0.05))
+        self.assertEqual(self.propose(1, "a", 1, 1.16).kind, OUTBID)
+        self.assertEqual(self.propose(2, "b", 2, 1.2).kind, GRANTED)
+
     def test_release_that_overtakes_its_proposal(self) -> None:
         """A proposal that arrives after its own release grants nothing."""
         self.prepare(1, "a", 0.0)

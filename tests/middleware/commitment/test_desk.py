@@ -121,6 +121,8 @@ class DeskTests(FleetCase):
         fleet, task, lessees = self.team()
         to = fleet.nodes[2].entangled.contact
         self.assertIsNone(
-            self.done(fleet, fleet.nodes[1].entangled.endpoint.ask(to, "lease.freed", "other", 0, 0.0, changes=True), 0.5)
+            self.done(
+                fleet, fleet.nodes[1].entangled.endpoint.ask(to, "lease.freed", "other", 0, 0.0, changes=True), 0.5
+            )
         )
         self.end(fleet, lessees)

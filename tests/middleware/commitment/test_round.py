@@ -51,6 +51,18 @@ class RoundTests(SynchronousTestCase):
         self.answer(1, NO)
         self.assertFalse(self.successResultOf(asked.outcome).is_won)
 
+    def test_members_about_to_be_free_are_asked_again(self) -> None:
+        """A member where another's lease ends within 100 ms is asked again then; any other has said no."""
+        asked = self.round()
+        self.answer(0, Reply(HELD, remaining=0.03))
+        self.answer(1, NO)
+        self.assertNoResult(asked.outcome)
+        self.clock.advance(0.03)
+        self.assertEqual([member for _, member, _ in self.asked[3:]], [0])
+        self.answer(3, YES)
+        self.answer(2, YES)
+        self.assertTrue(self.successResultOf(asked.outcome).is_won)
+
     def test_silent_members_are_asked_again(self) -> None:
         """Who has not answered is asked each 100 ms until it is decided, and three times at least; who has, once."""
         self.round()
