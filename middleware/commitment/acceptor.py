@@ -126,13 +126,23 @@ class Acceptor:
         return reply._replace(remaining=0.0) if is_done else reply
 
     def change(
-        self, task_id: str, configuration: int, ballot: Ballot, members: tuple[Contact, ...], token: int, now: float
+        self,
+        task_id: str,
+        configuration: int,
+        ballot: Ballot,
+        members: tuple[Contact, ...],
+        token: int,
+        now: float,
+        keep: bool = False,
     ) -> Reply:
-        """Accept ``members`` as the next council: from then on no lease of the present one, unless one is open."""
+        """Accept ``members`` as the next council, unless a lease is open: from then on no lease of the present one.
+
+        With ``keep`` an agent says that its own lease is given back (its robot stands still), and wants it kept so long.
+        """
         entry = self._entry(task_id, configuration, 0.0, now)
         if isinstance(entry, Reply):
             return entry
-        if entry.until > now:
+        if entry.until > now and not (keep and entry.ballot.is_kin(ballot)):
             return self._reply(HELD, entry, now)
         if ballot < entry.promised or ballot <= entry.spent:
             return self._reply(OUTBID, entry, now)
@@ -141,14 +151,26 @@ class Acceptor:
         self._ledger.keep(task_id)
         return self._reply(GRANTED, entry, now)
 
-    def install(self, task_id: str, configuration: int, members: tuple[Contact, ...], token: int, now: float) -> Reply:
-        """Learn that a majority of the council before has chosen ``members``, and above which token they go on."""
+    def install(
+        self,
+        task_id: str,
+        configuration: int,
+        members: tuple[Contact, ...],
+        token: int,
+        now: float,
+        ballot: Ballot = NONE,
+        ttl: float = 0.0,
+    ) -> Reply:
+        """Learn that a majority of the council before has chosen ``members``, and above which token they go on.
+
+        Nobody but the agent of ``ballot`` is granted the lease for ``ttl`` seconds.
+        """
         entry = self._ledger.get(task_id) or self._ledger.add(task_id, FIRST, now)
         if entry is None:
             return Reply(QUIET, remaining=ROOM)
         if configuration > entry.configuration:
             entry.configuration, entry.members, entry.sealed = configuration, members, NONE
-            entry.ballot, entry.until = NONE, now
+            entry.ballot, entry.until = ballot, now if ballot == NONE else now + ttl
             entry.token, entry.touched_at = max(entry.token, token), now
             self._ledger.keep(task_id)
         return self._reply(GRANTED if configuration == entry.configuration else MOVED, entry, now)

@@ -6,6 +6,7 @@ of the old council and by nobody else, never while a claim is open (consensus ru
 
 from __future__ import annotations
 
+import math
 import random
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -66,6 +67,8 @@ class Council:
         self._clock = clock
         self._rounds = 0
         self._life = rng.randrange(LIFE)
+        self._last: Round | None = None
+        self._silent_since: dict[bytes, float] = {}
 
     def next_ballot(self) -> Ballot:
         """A ballot above all that were seen."""
@@ -74,8 +77,25 @@ class Council:
 
     def round(self, method: str, *arguments: Any, kinds: tuple[str, ...] = (GRANTED,)) -> Round:
         """Ask every member; tell ``hear`` what came of it."""
+        self._note_silence()
         question = (self.task_id, self.configuration, *arguments)
-        return Round(self.members, self._ask, self._clock, method, question, kinds, self.ttl / 3)
+        self._last = Round(self.members, self._ask, self._clock, method, question, kinds, self.ttl / 3)
+        return self._last
+
+    def visit(self) -> None:
+        """Ask the members for nothing but whether they are there; ``silent`` knows it later."""
+        self.round("lease.prepare", 0, self.ttl)
+
+    def silent(self, seconds: float) -> tuple[Contact, ...]:
+        """The members that have answered nothing for so long, in spite of questions."""
+        self._note_silence()
+        latest = self._clock.seconds() - seconds
+        return tuple(m for m in self.members if self._silent_since.get(m.node_id, math.inf) <= latest)
+
+    def learn(self, configuration: int, members: Sequence[Contact]) -> None:
+        """The record of the task names the council of that configuration."""
+        if configuration > self.configuration and members:
+            self.configuration, self.members = configuration, tuple(members)
 
     def hear(self, round_: Round) -> None:
         """Learn from answers which numbers are taken, and whether the council is another one now."""
@@ -109,23 +129,32 @@ class Council:
         """
         return Deferred.fromCoroutine(self._close(token))
 
-    def change(self, members: Sequence[Contact]) -> Deferred[None]:
+    def change(self, members: Sequence[Contact], keep: bool = False) -> Deferred[None]:
         """Have ``members`` be the council from now on; fires when a majority of them knows.
 
+        With ``keep`` the own lease is given back with this (``Lessee.move``), and for a ttl granted to nobody else.
         Fails with ``OpenClaim`` while somebody holds a lease, ``NoMajority`` where the old council cannot decide, and
         ``Superseded`` where another change was under way, which is then completed instead.
         """
         wanted = tuple(members)
         if not 0 < len(wanted) <= MAX_COUNCIL:
             raise ValueError(f"a council has 1 to {MAX_COUNCIL} members, not {len(wanted)}")
-        return Deferred.fromCoroutine(self._change(wanted))
+        return Deferred.fromCoroutine(self._change(wanted, keep))
 
-    async def finish(self, ballot: Ballot, prepared: Round) -> None:
+    async def finish(self, ballot: Ballot, prepared: Round, keep: bool = True) -> None:
         """Complete a change that a member has accepted: it may be decided already, so no other may follow."""
         sealed = [reply for reply in prepared.replies.values() if reply.kind == SEALED]
-        await self._decide(ballot, max(sealed, key=lambda reply: reply.ballot).members)
+        await self._decide(ballot, max(sealed, key=lambda reply: reply.ballot).members, keep)
 
     # -- inside -----------------------------------------------------------------------------------------------------
+
+    def _note_silence(self) -> None:
+        """Who did not answer the last round, though it was asked often enough; who did is there."""
+        if self._last is not None:
+            for member in self._last.answered:
+                self._silent_since.pop(member.node_id, None)
+            for member in self._last.silent:
+                self._silent_since.setdefault(member.node_id, self._last.began_at)
 
     async def _close(self, token: int) -> None:
         over_at = 0.0
@@ -153,7 +182,7 @@ class Council:
             self._clock.callLater(rest, waited.callback, None)
             await waited
 
-    async def _change(self, wanted: tuple[Contact, ...]) -> None:
+    async def _change(self, wanted: tuple[Contact, ...], keep: bool) -> None:
         before = self.configuration
         ballot = self.next_ballot()
         asked = self.round("lease.prepare", ballot.counter, self.ttl, kinds=(GRANTED, SEALED))
@@ -165,25 +194,26 @@ class Council:
         if not prepared.is_won:
             _raise(prepared, "the council stays as it is")
         if any(reply.kind == SEALED for reply in prepared.replies.values()):
-            await self.finish(ballot, prepared)
+            await self.finish(ballot, prepared, keep)
         else:
-            await self._decide(ballot, wanted)
+            await self._decide(ballot, wanted, keep)
         if self.configuration == before + 1 and set(self.members) != set(wanted):
             raise Superseded("another change of the council was under way and is complete now; look at it again")
 
-    async def _decide(self, ballot: Ballot, members: tuple[Contact, ...]) -> None:
+    async def _decide(self, ballot: Ballot, members: tuple[Contact, ...], keep: bool) -> None:
         """Let a majority of the old council accept ``members``, then tell these; a majority of them must know."""
         # The council of this object may become another one while answers are awaited; this decision is of this one.
         old, following = self.members, self.configuration + 1
         packed = [member.packed() for member in members]
-        accepted = await self._decision(ballot, packed)
+        accepted = await self._decision(ballot, packed, keep)
         accepted.close()
         if not accepted.is_won:
             self.hear(accepted)
             self.let_go(ballot)
             _raise(accepted, "the council stays as it is")
         token = max(self.token, *(reply.token for reply in accepted.replies.values()))
-        question = (self.task_id, following, packed, token)
+        news = (self.task_id, following, packed, token)
+        question = (*news, ballot.counter if keep else 0, self.ttl)
         told = Round(members, self._ask, self._clock, "lease.install", question, (GRANTED, MOVED), self.ttl / 3)
         installed = await told.outcome
         if not installed.is_won:
@@ -192,18 +222,17 @@ class Council:
         for member in old:
             # So that who leaves can tell where the council is now.
             if member not in members:
-                self._ask(member, "lease.install", question).addErrback(lambda _: None)
+                self._ask(member, "lease.install", (*news, 0, self.ttl)).addErrback(lambda _: None)
 
-    async def _decision(self, ballot: Ballot, packed: list[list[object]]) -> Round:
+    async def _decision(self, ballot: Ballot, packed: list[list[object]], keep: bool) -> Round:
         """A majority of the *old* council decides: so no lease of it can be open, nor another change be chosen."""
-        return await self.round("lease.change", ballot.counter, packed, self.token).outcome
+        return await self.round("lease.change", ballot.counter, packed, self.token, keep).outcome
 
     def _install(self, member: Contact) -> None:
         """Tell ``member`` of the present council, which was chosen by the one before."""
         packed = [one.packed() for one in self.members]
-        self._ask(member, "lease.install", (self.task_id, self.configuration, packed, self.token)).addErrback(
-            lambda _: None
-        )
+        news = (self.task_id, self.configuration, packed, self.token, 0, self.ttl)
+        self._ask(member, "lease.install", news).addErrback(lambda _: None)
 
     def _adopt(self, configuration: int, members: tuple[Contact, ...]) -> None:
         if configuration > self.configuration:

@@ -9,7 +9,7 @@ from twisted.internet.defer import Deferred, maybeDeferred
 from twisted.internet.interfaces import IReactorTime
 
 from middleware.commitment.acceptor import Acceptor
-from middleware.commitment.ballot import MAX_NUMBER, Ballot, Reply, members_of
+from middleware.commitment.ballot import MAX_NUMBER, NONE, Ballot, Reply, members_of
 from middleware.commitment.ledger import Ledger
 from middleware.entangled.data.store import Store
 from middleware.entangled.errors import Refused
@@ -95,17 +95,20 @@ class Desk:
         return self._kept(self._acceptor.close(task_id, agent, configuration, token, now))
 
     def _change(
-        self, peer: Contact, task_id: str, configuration: int, counter: int, packed: list[object], token: int
+        self, peer: Contact, task_id: str, configuration: int, counter: int, packed: list[object], token: int, keep: bool
     ) -> Answer:
         _check(task_id, configuration, counter, token + 1)
         members = _checked(packed)
         ballot, now = Ballot(counter, peer.node_id.hex()), self._clock.seconds()
-        return self._kept(self._acceptor.change(task_id, configuration, ballot, members, token, now))
+        return self._kept(self._acceptor.change(task_id, configuration, ballot, members, token, now, keep))
 
-    def _install(self, peer: Contact, task_id: str, configuration: int, packed: list[object], token: int) -> Answer:
-        _check(task_id, configuration, token + 1)
+    def _install(
+        self, peer: Contact, task_id: str, configuration: int, packed: list[object], token: int, counter: int, ttl: float
+    ) -> Answer:
+        _check(task_id, configuration, token + 1, counter + 1, ttl=ttl)
         members, now = _checked(packed), self._clock.seconds()
-        return self._kept(self._acceptor.install(task_id, configuration, members, token, now))
+        ballot = Ballot(counter, peer.node_id.hex()) if counter else NONE
+        return self._kept(self._acceptor.install(task_id, configuration, members, token, now, ballot, float(ttl)))
 
     def _freed(self, peer: Contact, task_id: str, token: int, rest: float) -> None:
         _check(task_id, token + 1, rest=rest)

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 from twisted.internet.defer import Deferred, succeed
 from twisted.internet.interfaces import IDelayedCall, IReactorTime
+from twisted.internet.task import deferLater
 
 from middleware.commitment.ballot import GRANTED, NONE, OUTBID, OVER, SEALED, Ballot
 from middleware.commitment.council import Council
@@ -153,12 +154,32 @@ class Lessee:
         self.token, self._deadline, self._ballot, self._claimed = 0, 0.0, NONE, NONE
         return told
 
+    def move(self, members: Sequence[Contact]) -> Deferred[None]:
+        """Have ``members`` be the council (stop the device first).
+
+        A lease that is held goes back with it, and is kept for this agent until it has claimed it again there.  Fails
+        as ``Council.change`` does; then the lease is claimed again where it was.
+        """
+        return Deferred.fromCoroutine(self._move(members))
+
     def end(self) -> Deferred[object]:
         """Give the lease back (stop the device first) and have none granted any more: the task has ended."""
         closed: Deferred[object] = self.council.close(self.token).addErrback(
             lambda failure: failure.trap(EntangledError)
         )
         return closed.addCallback(lambda _: self.release())
+
+    async def _move(self, members: Sequence[Contact]) -> None:
+        self._cancel()
+        if self.lease is not None:
+            self.token, self._deadline = 0, 0.0
+            self._rests_at = self._clock.seconds() + self._stop_time
+            await deferLater(self._clock, self._stop_time)
+        try:
+            await self.council.change(members, keep=self._is_wanted)
+        finally:
+            if self._is_wanted and not self._is_asking:
+                self._claim()
 
     # -- claiming ---------------------------------------------------------------------------------------------------
 

@@ -52,6 +52,7 @@ class Round:
         self._patience = patience
         self._sent: dict[int, float] = {}
         self._heard: dict[int, tuple[float, float, float]] = {}
+        self.began_at = clock.seconds()
         self._tries = 0
         self._is_closed = False
         self._timer: IDelayedCall | None = None
@@ -72,6 +73,17 @@ class Round:
     def yes(self) -> list[int]:
         """The places of those that said yes."""
         return [place for place, reply in self.replies.items() if reply.kind in self.kinds]
+
+    @property
+    def answered(self) -> list[Contact]:
+        """The members that have answered."""
+        return [self._members[place] for place in self._heard]
+
+    @property
+    def silent(self) -> list[Contact]:
+        """The members that have not answered, though they were asked as often as a question is put."""
+        asked = self._members if self._tries >= TRIES else ()
+        return [member for place, member in enumerate(asked) if place not in self._heard]
 
     @property
     def sent_at(self) -> float:

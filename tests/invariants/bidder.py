@@ -12,7 +12,7 @@ from drivers.driver import Permit
 from drivers.errors import StaleCommand
 from drivers.gate import Gate
 from middleware.commitment.acceptor import Acceptor
-from middleware.commitment.ballot import Ballot, Reply, members_of
+from middleware.commitment.ballot import NONE, Ballot, Reply, members_of
 from middleware.commitment.council import Council
 from middleware.commitment.ledger import Ledger
 from middleware.commitment.lessee import Lessee
@@ -152,12 +152,14 @@ class Bidder:
         return self.acceptor.close(task_id, agent, configuration, token, self.machine.seconds())
 
     def _change(
-        self, agent: str, task_id: str, configuration: int, counter: int, packed: list[object], token: int
+        self, agent: str, task_id: str, configuration: int, counter: int, packed: list[object], token: int, keep: bool
     ) -> Reply:
-        members = members_of(packed) or ()
-        ballot = Ballot(counter, agent)
-        return self.acceptor.change(task_id, configuration, ballot, members, token, self.machine.seconds())
+        members, now = members_of(packed) or (), self.machine.seconds()
+        return self.acceptor.change(task_id, configuration, Ballot(counter, agent), members, token, now, keep)
 
-    def _install(self, agent: str, task_id: str, configuration: int, packed: list[object], token: int) -> Reply:
-        members = members_of(packed) or ()
-        return self.acceptor.install(task_id, configuration, members, token, self.machine.seconds())
+    def _install(
+        self, agent: str, task_id: str, configuration: int, packed: list[object], token: int, counter: int, ttl: float
+    ) -> Reply:
+        members, now = members_of(packed) or (), self.machine.seconds()
+        ballot = Ballot(counter, agent) if counter else NONE
+        return self.acceptor.install(task_id, configuration, members, token, now, ballot, ttl)

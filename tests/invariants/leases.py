@@ -259,7 +259,7 @@ class Leases(Team):
         self.referee.look_at_cuts()
 
     def _change(self, place: int) -> None:
-        """Somebody has another council chosen, at a moment when the task may be free."""
+        """Somebody has another council chosen, at a moment when the task may be free, or its own."""
         if not self.is_up(place) or not self.has_stores:
             return
         for task_id in self.councils:
@@ -272,5 +272,6 @@ class Leases(Team):
 
     def _change_now(self, place: int, task_id: str, members: Sequence[Contact]) -> None:
         if self.is_up(place):
-            changing: Deferred[None] = self.bidders[place].lessee(task_id).council.change(members)
+            self.referee.stop(place, task_id)
+            changing: Deferred[None] = self.bidders[place].lessee(task_id).move(members)
             changing.addErrback(lambda failure: failure.trap(EntangledError))

@@ -217,9 +217,11 @@ class SwarmNodeTests(FleetCase):
             ("lease.release", "t", 1, 61.0),
             ("lease.freed", "t", 0, float("nan")),
             ("lease.close", "t", 1, -1),
-            ("lease.change", "t", 1, 1, [], 0),
-            ("lease.change", "t", 1, 1, [[b"k", "h", 0]], 0),
-            ("lease.install", "t", 2, [b"?"], 0),
+            ("lease.change", "t", 1, 1, [], 0, False),
+            ("lease.change", "t", 1, 1, [[b"k", "h", 0]], 0, False),
+            ("lease.change", "t", 1, 1, [], 0, 1),
+            ("lease.install", "t", 2, [b"?"], 0, 0, 1.0),
+            ("lease.install", "t", 2, [], 0, 0, 0.0),
         ):
             asked = self.asked(fleet, method, *question)
             fleet.run(0.1)

@@ -114,6 +114,19 @@ class AcceptorTests(SynchronousTestCase):
         self.assertEqual(self.propose(1, "a", 1, 1.16).kind, OUTBID)
         self.assertEqual(self.propose(2, "b", 2, 1.2).kind, GRANTED)
 
+    def test_change_by_the_holder(self) -> None:
+        """Who gives its own lease back by a change keeps others away; the member of the next council does, too."""
+        self.prepare(1, "a", 0.0)
+        self.propose(1, "a", 1, 0.0)
+        self.prepare(2, "a", 0.1)
+        self.assertEqual(self.acceptor.change("t", 1, ballot(2, "a"), MEMBERS[:3], 1, 0.1, True).kind, GRANTED)
+        self.assertEqual(self.prepare(3, "b", 0.2).kind, HELD)
+        self.assertEqual(self.propose(2, "a", 1, 0.2).kind, SEALED)
+        self.acceptor.install("t", 2, MEMBERS[:3], 1, 0.3, ballot(2, "a"), TTL)
+        self.assertEqual(self.acceptor.prepare("t", 2, ballot(3, "b"), TTL, 0.2 + TTL).kind, HELD)
+        self.assertEqual(self.acceptor.prepare("t", 2, ballot(4, "a"), TTL, 0.4).kind, GRANTED)
+        self.assertEqual(self.acceptor.prepare("t", 2, ballot(5, "b"), TTL, 0.3 + TTL).kind, GRANTED)
+
     def test_release_that_overtakes_its_proposal(self) -> None:
         """A proposal that arrives after its own release grants nothing."""
         self.prepare(1, "a", 0.0)

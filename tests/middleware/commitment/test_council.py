@@ -69,6 +69,63 @@ class CouncilTests(RoomCase):
         self.run_for(TTL)
         self.assertEqual(self.holders(), [0])
 
+    def test_moved_by_the_holder(self) -> None:
+        """Who holds the lease has it again in the new council, under a higher token, and nobody else in between."""
+        for stop_time in (0.0, 0.3):
+            self.room = self.made(stop_time)
+            self.wanting(0)
+            self.lessee(1).stand_by(1)
+            self.run_for(TTL)
+            self.room.referee.stop(0, T)
+            moved = self.lessee(0).move([self.room.contacts[n] for n in (3, 4, 6)])
+            self.assertIsNone(self.lessee(0).lease)
+            self.assertIsNone(self.outcome(moved, stop_time + 0.2))
+            self.assertEqual((self.holders(), self.token(0)), ([0], 2))
+            self.assertEqual((self.places(0), self.room.referee.wins), ([3, 4, 6], 2))
+            self.room.kill(5)
+            self.run_for(TTL)
+            self.room.kill(0)
+            self.run_for(2 * TTL)
+            self.assertEqual((self.holders(), self.places(1), self.room.referee.found), ([1], [3, 4, 6], []))
+
+    def test_move_that_fails(self) -> None:
+        """A holder whose council does not change claims the lease again where it was."""
+        self.wanting(0)
+        self.run_for(TTL)
+        moved = self.lessee(0).move([self.room.contacts[n] for n in (1, 2, 6)])
+        self.cut(0, 1, 2, 6)
+        self.assertIsInstance(self.outcome(moved), NoMajority)
+        self.run_for(TTL)
+        self.room.radio.cut.clear()
+        self.run_for(3 * TTL)
+        self.assertEqual(self.holders(), [0])
+
+    def test_silent_members_are_known(self) -> None:
+        """The holder knows who has not answered for how long; who comes back is silent no more."""
+        self.wanting(0)
+        self.cut(4, *range(4), 5, 6)
+        self.run_for(4.0)
+        council = self.lessee(0).council
+        self.assertEqual((council.silent(3.0), council.silent(4.5)), ((self.room.contacts[4],), ()))
+        self.room.radio.cut.clear()
+        self.run_for(TTL)
+        self.assertEqual(council.silent(0.0), ())
+        self.lessee(0).release()
+        self.cut(5, *range(5), 6)
+        self.run_for(5.0)
+        self.assertEqual(council.silent(3.0), ())
+        for _ in range(3):
+            council.visit()
+            self.run_for(2.0)
+        self.assertEqual(council.silent(3.0), (self.room.contacts[5],))
+
+    def test_learnt_from_the_record(self) -> None:
+        """A newer configuration of the task's record is taken over, an older one is not."""
+        council = self.lessee(0).council
+        for configuration, places in ((3, [0, 1, 2]), (2, [4, 5, 6])):
+            council.learn(configuration, [self.room.contacts[n] for n in places])
+            self.assertEqual((council.configuration, self.places(0)), (3, [0, 1, 2]))
+
     def test_minority_of_the_old_council_decides_nothing(self) -> None:
         """Without a majority of the old council nothing changes, whoever the new ones would be."""
         self.cut(1, 4, 5)

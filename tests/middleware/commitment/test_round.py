@@ -63,6 +63,16 @@ class RoundTests(SynchronousTestCase):
         self.answer(2, YES)
         self.assertTrue(self.successResultOf(asked.outcome).is_won)
 
+    def test_who_is_silent(self) -> None:
+        """Whoever answers anything is there; who does not is silent once it was asked three times, and not before."""
+        asked = self.round()
+        self.answer(1, NO)
+        self.assertEqual((asked.answered, asked.silent), ([MEMBERS[1]], []))
+        self.clock.advance(PAUSE * (TRIES - 1))
+        self.assertEqual(asked.silent, [MEMBERS[0], MEMBERS[2]])
+        self.answer(0, Reply(HELD, remaining=0.05))
+        self.assertEqual((asked.answered, asked.silent), ([MEMBERS[1], MEMBERS[0]], [MEMBERS[2]]))
+
     def test_silent_members_are_asked_again(self) -> None:
         """Who has not answered is asked each 100 ms until it is decided, and three times at least; who has, once."""
         self.round()
