@@ -26,6 +26,7 @@ from drivers.driver import Permit
 from drivers.reading import Action, Observation
 from middleware.commitment.lessee import Lease, Lessee
 from middleware.consensus.strategy import ConsensusAlgorithm
+from middleware.entangled.errors import EntangledError
 from middleware.entangled.kademlia.contact import Contact
 from middleware.order import PAUSE, Order
 from middleware.tasks import COMPLETED, FAILED, Member, Result, Task
@@ -78,6 +79,8 @@ class Engagement:
         self.justify: Callable[[Verdict], None] = lambda verdict: None
         self.reached: Callable[[Sequence[str]], Sequence[Contact]] = lambda uuids: ()
         self._heirs: tuple[str, ...] = ()
+        self._successors: tuple[Contact, ...] = ()
+        self._rests_until = 0.0
         self._reporter = Reporter(behaviour, clock)
         self._behaviour = behaviour
         self._execution = Execution(behaviour, task.stall_limit)
@@ -111,6 +114,14 @@ class Engagement:
         return self.course.state in (State.CLAIMING, State.EXECUTING)
 
     @property
+    def keeps_council(self) -> bool:
+        """Whether it falls to this agent to look after the council: it acts, or is the first while nobody does."""
+        is_acting = self.course.state is State.EXECUTING
+        return not (self.is_over or self._concluding) and (
+            is_acting or self._conference.is_first(self._clock.seconds())
+        )
+
+    @property
     def may_be_put_aside(self) -> bool:
         """Whether the body may go to another task of a higher priority now."""
         if self._concluding:
@@ -125,6 +136,9 @@ class Engagement:
         if outcome is not None and (self.result is None or outcome.rank > self.result.rank):
             self._end(outcome)
         self.me = self._conference.hear(members, self.me, now)
+        assigned = self.me.assigned
+        if self.lessee is not None and assigned not in ("", self.me.uuid, *(member.uuid for member in members)):
+            self.lessee.suspect()
         if self._formation.hear(self._conference.others(now)) and not self.is_over:
             self._say(f"one left, {len(self._conference) + 1} here: spreads out")
 
@@ -133,6 +147,16 @@ class Engagement:
         was_paused, self.order = self.is_paused, order
         if order is not None and was_paused != self.is_paused and not self.is_over:
             self._say(f"{'paused' if self.is_paused else 'resumed'} by {order.by}")
+
+    def renewed(self, task: Task) -> None:
+        """Take in what the record of the task says now."""
+        self.task = task
+        if self.lessee is not None:
+            self.lessee.council.learn(task.configuration, task.council)
+
+    def hand_council(self, members: Sequence[Contact]) -> None:
+        """Have ``members`` be the council of the task that it acts for, when the body comes to a safe point."""
+        self._successors = tuple(members)
 
     def look(self, seen: Observation) -> None:
         """Take in what the body senses, and report when it is new to the others."""
@@ -172,6 +196,11 @@ class Engagement:
         if self._execution.has_stalled(now) and self.me.cost is not None:
             self._say("makes no progress")
             self._publish(cost=None, available=False)
+        is_executing = self.course.state is State.EXECUTING
+        if is_executing and self._successors and self._execution.is_safe:
+            self._move_council(now)
+        if is_executing and self.lessee.lease is None and now < self._rests_until:
+            return None
         decision = self._decision(now)
         if decision.assigned == self.me.uuid or self._must_go_on(decision):
             return self._act(decision, now)
@@ -252,6 +281,15 @@ class Engagement:
 
     def _permit(self, lease: Lease) -> Permit:
         return Permit(lease.token, lease.deadline)
+
+    def _move_council(self, now: float) -> None:
+        """Stop the body, and only then have the council changed; it goes on when it has its lease again."""
+        assert self.lessee is not None
+        members, self._successors = self._successors, ()
+        self._halt()
+        self._rests_until = now + self.task.lease_ttl
+        self._say(f"a member of the council is gone: {len(members)} from now on")
+        self.lessee.move(members).addErrback(lambda failure: failure.trap(EntangledError))
 
     def _place(self, decision: Decision) -> None:
         """Go to the state that the decision means for who does not execute."""

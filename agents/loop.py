@@ -21,7 +21,7 @@ from middleware.entangled.record import Record
 from middleware.errors import SwarmError
 from middleware.node import CAMERA, SwarmNode
 from middleware.presence import DONE, IDLE
-from middleware.tasks import Member, Task, group_key, outcome_of, refusals, task_of
+from middleware.tasks import Member, Task, group_key, outcome_of, refusals, tasks_of
 
 TICK = 0.05
 REENGAGE = 0.5
@@ -87,7 +87,7 @@ class Agent(Service):
         return _
 
     def _tasks(self, records: list[Record]) -> None:
-        listed = {task.task_id: task for task in filter(None, map(task_of, records))}
+        listed = tasks_of(records)
         self._docket.forget(listed, self._clock.seconds())
         for task_id, task in sorted(listed.items()):
             if refusals(self._body.driver.description.capabilities, task.requirements):
@@ -98,7 +98,7 @@ class Agent(Service):
             elif task_id in self._docket.open:
                 self._docket.add(task)
                 if task_id in self._parts:
-                    self._parts[task_id].engagement.task = task
+                    self._parts[task_id].engagement.renewed(task)
 
     def _check(self, task: Task) -> None:
         if self.running:
@@ -191,6 +191,7 @@ class Agent(Service):
         self._arrange()
         for part in list(self._parts.values()):
             part.engagement.load = len(self._parts)
+            part.caretaker.look()
             if part is not self._holder:
                 part.engagement.step()
         engagement = self.engagement

@@ -9,6 +9,7 @@ from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorTime
 
 from agents.behaviour import Behaviour
+from agents.caretaker import Caretaker
 from agents.engagement import Engagement
 from middleware.consensus.strategy import ConsensusAlgorithm
 from middleware.entangled.errors import EntangledError
@@ -47,6 +48,7 @@ class Part:
         )
         self.engagement.justify = node.justify
         self.engagement.reached = node.reached
+        self.caretaker = Caretaker(self.engagement, node, clock)
         self._group = node.group(task, self.engagement.heard, self._ordered)
 
     def report(self) -> None:

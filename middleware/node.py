@@ -34,7 +34,7 @@ from middleware.entangled.replication.watch import Changed, Watch
 from middleware.group import Group, Heard
 from middleware.presence import DEVICES, Device, Presence, devices_of
 from middleware.streams import Streams
-from middleware.tasks import ORDER, RESULT, TASKS, Result, Task, group_key
+from middleware.tasks import ORDER, RESULT, TASKS, Result, Task, group_key, tasks_of
 from middleware.value import bounded
 
 if TYPE_CHECKING:
@@ -52,6 +52,8 @@ LARGE = 50
 """Members from which on a council has five instead of three."""
 CAMERA = "camera"
 LEASE_VERBS = ("prepare", "propose", "release", "close", "change", "install", "freed")
+SILENT = 10.0
+"""Seconds of silence after which another takes the seat of a council member."""
 LOOK_AGAIN = 0.3
 """Seconds after which a newcomer looks whether others took the same place in the order of joining."""
 LOOKS = 10
@@ -221,8 +223,7 @@ class SwarmNode(Service):
             place_of(task.strategy)
         key = group_key(task.task_id)
         nearest = await self.entangled.find_node(key)
-        tolerates = max(task.tolerates, 2 if len(self.entangled.overlay.contacts()) >= LARGE else 1)
-        council = closest([*nearest, self.entangled.contact], key, 2 * tolerates + 1)
+        council = closest([*nearest, self.entangled.contact], key, self._seats(task))
         task = replace(task, council=tuple(council))
         await self.entangled.put(TASKS, task.task_id, task.packed(), "team")
         return task
@@ -268,7 +269,7 @@ class SwarmNode(Service):
         """
         written = self.conclude(task.task_id, result)
         with suppress(EntangledError):
-            await self._council(task).close()
+            await self.council(task).close()
         return await written
 
     def strategy(self, name: str) -> Guard:
@@ -286,11 +287,39 @@ class SwarmNode(Service):
         # Imported by the first who has something to claim: a node without a robot is spared the memory.
         from middleware.commitment.lessee import Lessee
 
-        lessee = Lessee(self._council(task, floor), self.clock, self.rng, changed, task.stop_time)
+        lessee = Lessee(self.council(task, floor), self.clock, self.rng, changed, task.stop_time)
         self._desk.enter(lessee)
         return lessee
 
-    def _council(self, task: Task, floor: int = 0) -> Council:
+    def has_vacancy(self, task: Task, council: Council) -> bool:
+        """Whether a seat of ``council`` is empty, or was never taken for want of nodes."""
+        return 0 < len(council.members) < self._seats(task) or bool(council.silent(SILENT))
+
+    async def successors(self, task: Task, council: Council) -> tuple[Contact, ...] | None:
+        """Who should be the council of ``task`` from now on: those of it that are there, and the closest of the others.
+
+        None where there is nobody who would make it better.  Fails with ``EntangledError`` where nobody answers.
+        """
+        from middleware.commitment.vacancy import filled
+
+        key, silent = group_key(task.task_id), council.silent(SILENT)
+        gone = {member.node_id for member in silent}
+        nearest = [node for node in await self.entangled.find_node(key) if node.node_id not in gone]
+        candidates = closest([*nearest, self.entangled.contact], key, len(nearest) + 1)
+        return filled(council.members, silent, candidates, self._seats(task))
+
+    def _seats(self, task: Task) -> int:
+        tolerates = max(task.tolerates, 2 if len(self.entangled.overlay.contacts()) >= LARGE else 1)
+        return 2 * tolerates + 1
+
+    async def _record(self, task: Task) -> None:
+        """Have the record of ``task`` name its present council, unless it names that or a newer one already."""
+        known = tasks_of(await self.entangled.get(TASKS)).get(task.task_id)
+        if known is None or known.configuration < task.configuration:
+            await self.entangled.put(TASKS, task.task_id, task.packed(), "team")
+
+    def council(self, task: Task, floor: int = 0) -> Council:
+        """The council of ``task``, asked in this node's name; what is claimed lies above the token ``floor``."""
         from middleware.commitment.council import Council
 
         ttl = float(task.lease_ttl)
@@ -298,8 +327,13 @@ class SwarmNode(Service):
         def ask(member: Contact, method: str, arguments: tuple[Any, ...]) -> Deferred[Any]:
             return self._desk.ask(self.entangled.contact, member, method, arguments, ttl / 3)
 
+        def moved() -> None:
+            named = replace(task, council=council.members, configuration=council.configuration)
+            self._quietly(Deferred.fromCoroutine(self._record(named)))
+
         pinned = task.task_id, self.uuid, ttl, task.council
-        return Council(*pinned, ask, self.clock, self.rng, task.configuration, floor)
+        council = Council(*pinned, ask, self.clock, self.rng, task.configuration, floor, moved)
+        return council
 
     @cached_property
     def _desk(self) -> Desk:

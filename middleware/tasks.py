@@ -7,7 +7,7 @@ written back.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, asdict, dataclass, field, fields, replace
 from typing import Any
 
@@ -195,6 +195,16 @@ def task_of(record: Record) -> Task | None:
         and are_properties(task.parameters)
     )
     return task if lawful and task.task_id == record.name else None
+
+
+def tasks_of(records: Iterable[Record]) -> dict[str, Task]:
+    """The tasks in ``records`` by their ids.
+
+    Of several records of one task (whoever changes its council writes one more) the newest council's counts.
+    """
+    known = [(task, record.owner) for record in records if (task := task_of(record)) is not None]
+    known.sort(key=lambda pair: (pair[0].generation, pair[0].configuration, pair[0].created, pair[1]))
+    return {task.task_id: task for task, _ in known}
 
 
 def member_of(record: Record) -> Member | None:

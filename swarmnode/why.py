@@ -15,7 +15,7 @@ from typing import TextIO
 from middleware.entangled.control.command import FAILED, WRONG, Ask, asked
 from middleware.entangled.control.place import NoControl
 from middleware.explanation import as_text, explained
-from middleware.tasks import Task, outcome_of, task_of
+from middleware.tasks import Task, outcome_of, tasks_of
 from middleware.verdict import verdict_of, verdicts_text
 from swarmnode.asker import Asker, Refusal, printable
 
@@ -38,7 +38,7 @@ def main(words: Sequence[str] | None = None, out: TextIO | None = None, ask: Ask
     wishes = parser().parse_args(words)
     try:
         asker = Asker(wishes.node, ask)
-        task = chosen(wishes.task, [task for each in asker.records("tasks") if (task := task_of(each)) is not None])
+        task = chosen(wishes.task, list(tasks_of(asker.records("tasks")).values()))
         outcome = outcome_of(asker.records(f"task/{task.task_id}"))
         records = asker.records(verdicts_text(task.task_id))
     except (Refusal, NoControl) as problem:
@@ -60,12 +60,9 @@ def main(words: Sequence[str] | None = None, out: TextIO | None = None, ask: Ask
 
 
 def chosen(wanted: str, tasks: Sequence[Task]) -> Task:
-    """The task whose id begins with ``wanted``, or the newest for ``last``; raises ``Refusal``, which names those near.
-
-    Of two tasks with one id the newer is meant.
-    """
-    newest = {task.task_id: task for task in sorted(tasks, key=lambda task: (task.created, task.task_id))}
-    known = sorted(newest.values(), key=lambda task: (-task.created, task.task_id))
+    """The task whose id begins with ``wanted``, or the newest for ``last``; raises ``Refusal`` with those near."""
+    newest = {task.task_id: task for task in tasks}
+    known = sorted(tasks, key=lambda task: (-task.created, task.task_id))
     if not known:
         raise Refusal("the team has no task")
     if wanted == LAST:

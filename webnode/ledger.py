@@ -14,7 +14,7 @@ from middleware.entangled.record import Record
 from middleware.explanation import explained
 from middleware.order import PAUSE, order_of
 from middleware.presence import DEVICES, Device, devices_of
-from middleware.tasks import TASKS, Task, group_key, member_of, outcome_of, refusals, task_of
+from middleware.tasks import TASKS, Task, group_key, member_of, outcome_of, refusals, tasks_of
 from middleware.verdict import verdict_of, verdicts_key
 from webnode.state import Departed, State, state_of
 
@@ -25,7 +25,7 @@ TASKS_SHOWN = 20
 def state_from(read: Read, departed: Departed, node: str, now: float) -> State:
     """The whole state at ``now`` (unix s); ``departed`` remembers who left, ``node`` is the name of who serves."""
     devices = [device for device, _ in devices_of(read(DEVICES))]
-    tasks = sorted(filter(None, map(task_of, read(TASKS))), key=lambda task: (-task.created, task.task_id))
+    tasks = sorted(tasks_of(read(TASKS)).values(), key=lambda task: (-task.created, task.task_id))
     rows, groups = [], {}
     for task in tasks[:TASKS_SHOWN]:
         records = read(group_key(task.task_id))

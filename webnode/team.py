@@ -15,7 +15,7 @@ from middleware.entangled.replication.watch import Watch
 from middleware.node import CAMERA, SwarmNode
 from middleware.order import PAUSE, RESUME, Order
 from middleware.presence import DEVICES, devices_of
-from middleware.tasks import CANCELLED, TASKS, Result, Task, group_key, outcome_of, task_of
+from middleware.tasks import CANCELLED, TASKS, Result, Task, group_key, outcome_of, tasks_of
 from middleware.verdict import verdicts_key
 from webnode.errors import Refusal
 from webnode.ledger import refused_by
@@ -115,9 +115,7 @@ class TeamDesk:
     def cancel(self, task_id: str) -> None:
         """Record that the task is cancelled; whoever is at it stops."""
         result = Result(CANCELLED, self._node.presence.device.name)
-        task = next(
-            (task for record in self._tasks.records if (task := task_of(record)) and task.task_id == task_id), None
-        )
+        task = tasks_of(self._tasks.records).get(task_id)
         if task is None:
             return self._quietly(self._node.conclude(task_id, result))
         self._quietly(Deferred.fromCoroutine(self._node.cancel(task, result)))
@@ -153,12 +151,11 @@ class TeamDesk:
     # -- inside -----------------------------------------------------------------------------------------------------
 
     def _follow(self, records: list[Record]) -> None:
-        for record in records:
-            task = task_of(record)
-            if task is not None and task.task_id not in self._groups:
-                self._groups[task.task_id] = self._node.watch_group(task.task_id, lambda records: None, keep=True)
-                self._reasons[task.task_id] = self._node.entangled.watch(
-                    verdicts_key(task.task_id), lambda records: None, keep=True
+        for task_id in tasks_of(records):
+            if task_id not in self._groups:
+                self._groups[task_id] = self._node.watch_group(task_id, lambda records: None, keep=True)
+                self._reasons[task_id] = self._node.entangled.watch(
+                    verdicts_key(task_id), lambda records: None, keep=True
                 )
 
     def _order(self, task_id: str, word: str) -> None:
@@ -166,7 +163,7 @@ class TeamDesk:
         self._quietly(self._node.order(task_id, order.packed()))
 
     def _open_tasks(self) -> list[Task]:
-        tasks = filter(None, map(task_of, self._tasks.records))
+        tasks = tasks_of(self._tasks.records).values()
         return [task for task in tasks if outcome_of(self.read(group_key(task.task_id))) is None]
 
     def _record_of(self, uuid: str) -> Record | None:

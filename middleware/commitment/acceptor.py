@@ -137,7 +137,7 @@ class Acceptor:
     ) -> Reply:
         """Accept ``members`` as the next council, unless a lease is open: from then on no lease of the present one.
 
-        With ``keep`` an agent says that its own lease is given back (its robot stands still), and wants it kept so long.
+        With ``keep`` an agent says that its own lease is given back (its robot stands still), and kept for it so long.
         """
         entry = self._entry(task_id, configuration, 0.0, now)
         if isinstance(entry, Reply):

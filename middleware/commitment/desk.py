@@ -95,7 +95,14 @@ class Desk:
         return self._kept(self._acceptor.close(task_id, agent, configuration, token, now))
 
     def _change(
-        self, peer: Contact, task_id: str, configuration: int, counter: int, packed: list[object], token: int, keep: bool
+        self,
+        peer: Contact,
+        task_id: str,
+        configuration: int,
+        counter: int,
+        packed: list[object],
+        token: int,
+        keep: bool,
     ) -> Answer:
         _check(task_id, configuration, counter, token + 1)
         members = _checked(packed)
@@ -103,7 +110,14 @@ class Desk:
         return self._kept(self._acceptor.change(task_id, configuration, ballot, members, token, now, keep))
 
     def _install(
-        self, peer: Contact, task_id: str, configuration: int, packed: list[object], token: int, counter: int, ttl: float
+        self,
+        peer: Contact,
+        task_id: str,
+        configuration: int,
+        packed: list[object],
+        token: int,
+        counter: int,
+        ttl: float,
     ) -> Answer:
         _check(task_id, configuration, token + 1, counter + 1, ttl=ttl)
         members, now = _checked(packed), self._clock.seconds()

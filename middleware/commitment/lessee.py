@@ -176,7 +176,7 @@ class Lessee:
             self._rests_at = self._clock.seconds() + self._stop_time
             await deferLater(self._clock, self._stop_time)
         try:
-            await self.council.change(members, keep=self._is_wanted)
+            await self.council.change(members, keep=True)
         finally:
             if self._is_wanted and not self._is_asking:
                 self._claim()

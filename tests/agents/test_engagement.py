@@ -12,6 +12,7 @@ from agents.behaviour import STAND
 from agents.context import Context
 from agents.engagement import SEARCH_TTL, Deed, Engagement
 from agents.state import State
+from drivers.driver import Permit
 from drivers.reading import Action, Observation
 from middleware.commitment.lessee import Lease
 from middleware.consensus.guard import Guard
@@ -29,6 +30,7 @@ from middleware.verdict import Verdict
 TASK = Task("t1", "find-target", "Find it", waiting_period=2.0)
 LOOK, GO, HOLD = {"base.wz": 1.0}, {"base.vx": 0.1}, {"base.wz": 0.0}
 ME = Identity(bytes([1]) * 32)
+CONTACT = Contact(ME.public, Address("127.0.0.1", 7000))
 
 
 class Dog:
@@ -101,6 +103,16 @@ class Council:
         if self.token:
             self._events.append("released")
         self.is_wanted, self.token = False, 0
+        return succeed(None)
+
+    def suspect(self) -> None:
+        """Note that the holder may be gone."""
+        self._events.append("suspected")
+
+    def move(self, members: Sequence[Contact]) -> Deferred[None]:
+        """Note that there is to be another council; the lease goes back with it."""
+        self._events.append(f"moved to {len(members)}")
+        self.token = 0
         return succeed(None)
 
     def grant(self, token: int, ttl: float = 1.5) -> None:
@@ -226,10 +238,37 @@ class EngagementTests(SynchronousTestCase):
         self.hear(self.report(2, 0.5, EXECUTING), self.report(3, 3.0))
         self.see(1.0)
         self.step()
-        self.assertFalse(self.council.is_wanted)
+        self.assertEqual((self.council.is_wanted, self.events), (False, []))
         self.hear(self.report(3, 3.0))
+        self.assertEqual(self.events, ["suspected"])
         self.step()
         self.assertTrue(self.council.is_wanted)
+
+    def test_council_changes_under_who_acts(self) -> None:
+        """It stands still before the council changes, stays the one that acts, and goes on with its new lease."""
+        self.acting()
+        self.dog.is_safe = False
+        self.engagement.hand_council([CONTACT] * 3)
+        self.assertEqual((self.step().action, self.events), (GO, []))
+        self.dog.is_safe = True
+        self.assertIsNone(self.engagement.step())
+        self.assertEqual(self.events, ["halted", "moved to 3"])
+        self.clock.advance(0.2)
+        self.assertIsNone(self.engagement.step())
+        self.assertEqual(self.told[-1].status, EXECUTING)
+        self.council.grant(9)
+        self.assertEqual(self.step(), Deed(GO, Permit(9, self.council.deadline)))
+        self.assertEqual(self.events, ["halted", "moved to 3"])
+
+    def test_council_that_does_not_come_back(self) -> None:
+        """Without its lease after one ttl it is fenced like anybody whose lease ran out."""
+        self.acting()
+        self.engagement.hand_council([CONTACT] * 3)
+        self.assertIsNone(self.engagement.step())
+        self.clock.advance(TASK.lease_ttl)
+        self.step()
+        self.assertEqual(self.events, ["halted", "moved to 3", "halted"])
+        self.assertNotEqual(self.told[-1].status, EXECUTING)
 
     def test_moved_target_is_reported_again(self) -> None:
         """A distance that grew is reported anew by everybody; one that shrank only by those that do not walk."""

@@ -186,12 +186,6 @@ def _admits_lower_tokens(self: Gate, permit: Any, now: float) -> None:
     self._token, self._deadline = permit.token, permit.deadline
 
 
-async def _moved_while_it_moves(self: Lessee, members: Any) -> None:
-    self._cancel()
-    await self.council.change(members, True)
-    self._claim()
-
-
 async def _decided_by_the_new(self: Council, ballot: Any, packed: Any, keep: bool) -> Round:
     members = members_of(packed) or ()
     question = (self.task_id, self.configuration, ballot.counter, packed, self.token, keep)
@@ -256,9 +250,8 @@ BUGS: dict[str, list[tuple[Any, str, Any]]] = {
     "the device takes lower tokens": [(Gate, "admit", _admits_lower_tokens)],
     "a restarted member grants at once": [(Acceptor, "_silence", lambda self, ttl: 0.0)],
     "the new council decides the change": [(Council, "_decision", _decided_by_the_new)],
-    "the council changes and the holder goes on": [(Lessee, "_move", _moved_while_it_moves)],
 }
-LEASE_BUGS = tuple(list(BUGS)[-14:])
+LEASE_BUGS = tuple(list(BUGS)[-13:])
 
 FINDERS: dict[str, tuple[str, ...]] = {
     "one promise is a majority": ("tuples",),

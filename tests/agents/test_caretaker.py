@@ -1,0 +1,117 @@
+"""Tests of ``agents.caretaker``: the council of a task outlives its members, one after the other."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from twisted.internet.defer import Deferred
+from twisted.trial.unittest import SynchronousTestCase
+
+from agents.caretaker import AGAIN, VISIT
+from agents.catalogue import task_named
+from middleware.entangled.record import Record
+from middleware.node import SILENT
+from middleware.order import PAUSE, RESUME, Order
+from middleware.tasks import COMPLETED, TASKS, Task, outcome_of, tasks_of
+from swarmnode.rehearsal import VirtualTeam
+
+OTHERS = ("witness1", "witness2", "witness3")
+LATEST = SILENT + AGAIN + VISIT + 2.0
+"""Seconds within which a silent member is replaced."""
+TURNS = 60.0
+
+
+class CaretakerTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.made(VirtualTeam(3, 0.1, others=OTHERS))
+
+    def made(self, team: VirtualTeam) -> None:
+        """Begin with ``team``."""
+        self.team = team
+        self.addCleanup(self.team.stop)
+        self.node = self.team.services[VirtualTeam.BOOTSTRAP].assembly.node
+        self.records: list[Record] = []
+        self.group: list[Record] = []
+        self.node.watch_tasks(lambda records: self.records.__setitem__(slice(None), records))
+        self.node.watch_group("turn", lambda records: self.group.__setitem__(slice(None), records))
+
+    def given(self, *council: str, turns: float = TURNS) -> None:
+        """A task to turn around for a long time, with these nodes as its council."""
+        task = replace(task_named("turn-around", "turn", 0.0), waiting_period=1.0, parameters={"turns": turns})
+        members = tuple(self.team.services[name].assembly.node.entangled.contact for name in council)
+        put = self.node.entangled.put(TASKS, "turn", replace(task, council=members).packed(), "team")
+        self.team.clock.advance(0.5)
+        self.successResultOf(put)
+
+    @property
+    def task(self) -> Task:
+        """The task as its newest record tells it."""
+        return tasks_of(self.records)["turn"]
+
+    @property
+    def council(self) -> list[str]:
+        """The names of the members of the task's council, sorted."""
+        names = {service.assembly.node.uuid: name for name, service in self.team.services.items()}
+        return sorted(names[member.node_id.hex()] for member in self.task.council)
+
+    def moving(self) -> list[str]:
+        """The dogs that move."""
+        return [name for name, dog in self.team.yard.world.dogs.items() if dog.is_moving]
+
+    def run_for(self, seconds: float) -> None:
+        """Let time pass, in steps in which no two dogs may move."""
+        end = self.team.clock.seconds() + seconds
+        while self.team.clock.seconds() < end:
+            self.team.clock.advance(0.05)
+            self.assertLessEqual(len(self.moving()), 1)
+
+    def test_who_acts_fills_the_council(self) -> None:
+        """A dead member is replaced while a dog acts, which goes on; another dies, then that dog: the task is done."""
+        self.given("witness1", "witness2", "dog1", turns=12.0)
+        self.run_for(3.0)
+        (first,) = self.moving()
+        gone = "witness1"
+        self.team.kill(gone)
+        self.run_for(LATEST)
+        self.assertEqual((self.task.configuration, len(self.council), self.moving()), (2, 3, [first]))
+        self.assertNotIn(gone, self.council)
+        for gone in ("witness2", first):
+            self.team.kill(gone)
+            self.run_for(LATEST)
+            self.assertNotIn(gone, self.council)
+        outcome = outcome_of(self.group)
+        while outcome is None and self.team.clock.seconds() < 400.0:
+            self.run_for(5.0)
+            outcome = outcome_of(self.group)
+        assert outcome is not None
+        self.assertEqual(outcome.outcome, COMPLETED)
+        self.assertNotEqual(outcome.by, first)
+
+    def test_before_anybody_acts(self) -> None:
+        """While a task rests two of its council die one after the other; it is resumed, and a dog acts."""
+        self.given("witness1", "witness2", "witness3")
+        self.successResultOf(self.ordered(PAUSE))
+        self.run_for(2.0)
+        for gone in ("witness1", "witness2"):
+            self.team.kill(gone)
+            self.run_for(LATEST)
+        self.successResultOf(self.ordered(RESUME))
+        self.run_for(3.0)
+        self.assertEqual(len(self.moving()), 1)
+
+    def test_nobody_to_follow(self) -> None:
+        """Where nobody is left who could take the seat the council stays, and whoever acts is not disturbed."""
+        self.made(VirtualTeam(4, 0.1, dogs=("dog1", "dog2")))
+        self.given("vaio", "dog1", "dog2")
+        self.run_for(3.0)
+        (first,) = self.moving()
+        self.team.kill("dog1" if first == "dog2" else "dog2")
+        self.run_for(LATEST)
+        self.assertEqual((self.task.configuration, self.moving()), (1, [first]))
+
+    def ordered(self, word: str) -> Deferred[Any]:
+        """Tell the team to rest, or to go on."""
+        done = self.node.order("turn", Order(word, "test", 0.0).packed())
+        self.team.clock.advance(0.5)
+        return done
