@@ -32,6 +32,7 @@ from middleware.entangled.record import Record
 from middleware.entangled.replication.owner import Stored
 from middleware.entangled.replication.watch import Changed, Watch
 from middleware.group import Group, Heard
+from middleware.halt import Halt
 from middleware.presence import DEVICES, Device, Presence, devices_of
 from middleware.streams import Streams
 from middleware.tasks import ORDER, RESULT, TASKS, Result, Task, group_key, tasks_of
@@ -65,7 +66,8 @@ class SwarmNode(Service):
     """One node of a team.
 
     ``device`` is what the node says of itself; ``wall`` gives seconds of the wall clock, for people only.  ``deployed``
-    is what operators pushed and its owner allowed.  ``later(seconds, call, ...)`` is a timer that ends with the node.
+    is what operators pushed and its owner allowed; ``halt`` says whether the whole team is to stand.
+    ``later(seconds, call, ...)`` is a timer that ends with the node.
     """
 
     _log = Logger()
@@ -92,6 +94,7 @@ class SwarmNode(Service):
         self._chores = Background(clock)
         self.later = self._chores.later
         self.deployed: Deployed = {}
+        self.halt = Halt()
         self.presence = Presence(device, self._announce, self._chores.later)
         self.streams = Streams(self.entangled.endpoint, clock)
         self.joined: Deferred[None] = Deferred()

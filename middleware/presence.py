@@ -32,7 +32,9 @@ class Device:
 
     ``uuid`` is its node id in hex; ``joined`` its place in the order of joining; ``since`` seconds of the wall clock,
     for people; ``messages`` are its newest (time, text) lines; ``deployed`` maps each module that was pushed to
-    the version and digest that it runs, or says that it was refused.
+    the version and digest that it runs, or says that it was refused; ``pages`` are the URLs at which it serves the page;
+    ``position`` is where it says that it is: ``x`` and ``y`` in metres and ``heading`` in radians in the yard's frame, or
+    ``lat`` and ``lon`` in degrees with ``accuracy`` in metres.
     """
 
     uuid: str
@@ -49,6 +51,8 @@ class Device:
     messages: tuple[tuple[float, str], ...] = ()
     network: Mapping[str, int] = field(default_factory=dict)
     deployed: Mapping[str, str] = field(default_factory=dict)
+    pages: tuple[str, ...] = ()
+    position: Mapping[str, float] = field(default_factory=dict)
 
     def with_message(self, now: float, text: str) -> Device:
         """This device with one more line; the oldest goes when there are more than ``MESSAGES_KEPT``."""
@@ -59,7 +63,12 @@ class Device:
         """The value of its record; where it is too large, messages give way, then description, then ``deployed``."""
         device = self
         while True:
-            value = bytes(msgpack.packb(asdict(device)))
+            content = asdict(device)
+            # Most devices have neither, and each byte of a record is sent again and again.
+            for name in ("pages", "position"):
+                if not content[name]:
+                    del content[name]
+            value = bytes(msgpack.packb(content))
             if len(value) <= MAX_VALUE or not (device.messages or device.description or device.deployed):
                 return value
             if device.messages:
@@ -79,12 +88,14 @@ def device_of(record: Record) -> Device | None:
     try:
         content["messages"] = tuple((float(t), text) for t, text in content.get("messages", ()))
         content["roles"] = tuple(content.get("roles", Device.roles))
+        pages = content.get("pages", [])
+        content["pages"] = tuple(pages) if isinstance(pages, list) else (None,)
         device = Device(**content)
     except (TypeError, ValueError, OverflowError):
         return None
     texts = (device.name, device.kind, device.description, device.address, device.task, device.status, *device.roles)
     lawful = (
-        all(isinstance(text, str) for text in (*texts, *(text for _, text in device.messages)))
+        all(isinstance(text, str) for text in (*texts, *device.pages, *(text for _, text in device.messages)))
         and device.status in STATUSES
         and is_whole(device.joined)
         and all(is_number(n) for n in (device.since, *(t for t, _ in device.messages)))
@@ -93,6 +104,8 @@ def device_of(record: Record) -> Device | None:
         and isinstance(device.deployed, dict)
         and all(isinstance(name, str) and isinstance(label, str) for name, label in device.deployed.items())
         and all(isinstance(name, str) and is_number(n) for name, n in device.network.items())
+        and isinstance(device.position, dict)
+        and all(isinstance(name, str) and is_number(n) for name, n in device.position.items())
     )
     return device if lawful else None
 

@@ -69,6 +69,12 @@ def secret(most: int) -> Rule:
     return _rule(check)
 
 
+def hidden(most: int) -> Rule:
+    """A rule for text of at most ``most`` characters that no error shows."""
+    check = secret(most)["check"]
+    return _rule(lambda value: value if value == "" else check(value))
+
+
 def truth() -> Rule:
     """A rule for true or false."""
 
@@ -200,6 +206,24 @@ def table() -> Rule:
         if not isinstance(value, Mapping):
             raise Wrong(f"must be a table, is {shown(value)}", "write { key = value }")
         return dict(value)
+
+    return _rule(check)
+
+
+def numbers(*sets: Sequence[str]) -> Rule:
+    """A rule for a table of finite numbers that has the keys of one of ``sets``, or none."""
+
+    def check(value: object) -> Mapping[str, float]:
+        remedy = "write { " + ", ".join(f"{key} = 0.0" for key in sets[0]) + " }"
+        if not isinstance(value, Mapping):
+            raise Wrong(f"must be a table of numbers, is {shown(value)}", remedy)
+        for key, inner in value.items():
+            if type(inner) not in (int, float) or not math.isfinite(inner):
+                raise Wrong(f"{shown(key)} must be a number, is {shown(inner)}", remedy)
+        if value and not any(set(value) == set(keys) for keys in sets):
+            known = " or ".join(", ".join(keys) for keys in sets)
+            raise Wrong(f"must have {known}, has {', '.join(map(str, value))}", remedy)
+        return {key: float(inner) for key, inner in value.items()}
 
     return _rule(check)
 

@@ -1,6 +1,6 @@
 """Settings: a node's TOML file, checked and frozen; every knob with its unit and what more and less of it do.
 
-Tables: ``[node]``, ``[agent]``, ``[driver]``, ``[web]`` and ``[deployment]``, one dataclass each.  Whatever is wrong
+Tables: ``[node]``, ``[agent]``, ``[driver]``, ``[web]``, ``[faults]`` and ``[deployment]``, one dataclass each.  Whatever is wrong
 is one ``BadSetting``, which says where, what, and what to write instead.
 """
 
@@ -78,6 +78,12 @@ class NodeSettings:
     """Seconds for which the others believe in the device without a sign of it.  Less notices a loss sooner, and takes
     a slow radio for a loss; more costs fewer datagrams (three are sent to each holder in that time)."""
 
+    position: Mapping[str, float] = field(
+        default_factory=dict, metadata=setting.numbers(("x", "y", "heading"), ("lat", "lon", "accuracy"))
+    )
+    """Where the device stands, for the page's map: ``x`` and ``y`` in metres and ``heading`` in radians, or ``lat`` and
+    ``lon`` in degrees and ``accuracy`` in metres.  A device that moves and knows where it is says so itself."""
+
     @property
     def team_secret(self) -> bytes:
         """The 32 bytes that seal the team's datagrams: the BLAKE2s hash of ``team_key``."""
@@ -119,6 +125,29 @@ class WebSettings:
     yard: Address | None = field(default=None, metadata=setting.address())
     """Where the simulated yard takes its operator's commands, as ``"host:port"``; none where empty."""
 
+    tls: str = field(default="", metadata=setting.one_of(("", "auto")))
+    """``auto``: the page is also served over TLS, with a certificate that the node makes.  Empty: not."""
+
+    tls_port: int = field(default=8443, metadata=setting.port())
+    """The TCP port of the page over TLS; 0 takes any free one."""
+
+    code: str = field(default="", repr=False, metadata=setting.pattern(r"([a-z0-9-]{6,40})?", 'such as "quiet-otter"'))
+    """What operators sign in with; 6 to 40 small letters, digits and ``-``.  Empty: one is made at each start."""
+
+    password: str = field(default="", metadata=setting.hidden(200), repr=False)
+    """The hash of a password to sign in with, as ``swarm password`` prints it.  Empty: the code alone lets in."""
+
+    sign_in: bool = field(default=True, metadata=setting.truth())
+    """False: whoever can open the page is an operator; only where ``host`` is an address of this machine alone."""
+
+
+@dataclass(frozen=True)
+class FaultSettings:
+    """``[faults]``: whether operators may make this node fail, to see the team go on; for demonstrations and tests."""
+
+    allow: bool = field(default=False, metadata=setting.truth())
+    """False: nobody can, whoever asks."""
+
 
 @dataclass(frozen=True)
 class DeploymentSettings:
@@ -144,6 +173,7 @@ TABLES: dict[str, type[Any]] = {
     "agent": AgentSettings,
     "driver": DriverSettings,
     "web": WebSettings,
+    "faults": FaultSettings,
     "deployment": DeploymentSettings,
 }
 
@@ -156,6 +186,7 @@ class Settings:
     agent: AgentSettings = AgentSettings()
     driver: DriverSettings = DriverSettings()
     web: WebSettings = WebSettings()
+    faults: FaultSettings = FaultSettings()
     deployment: DeploymentSettings = DeploymentSettings()
     origin: str = ""
 

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 from twisted.application.service import Service
-from twisted.internet.interfaces import IReactorTime
 from twisted.logger import Logger
 
 from agents.registry import agent_named
@@ -18,35 +15,21 @@ from drivers.registry import describe, driver_for
 from middleware.entangled.data.store import Store
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.identity import Identity
-from middleware.entangled.network.network import Network
 from middleware.errors import SwarmError
+from middleware.halt import answer_halt
 from middleware.node import SwarmNode
 from middleware.presence import Device
 from middleware.settings import Settings
+from middleware.survey import answer_survey
+from middleware.tuning import answer_tuning
+from swarmnode.fault import faulty
+from swarmnode.seams import Seams
 from webnode.errors import WebError
 
 FAULTS = (SwarmError, EntangledError, DriverError, WebError)
 """What a person can mend, and is told in one line."""
 
 _log = Logger()
-
-
-@dataclass(frozen=True)
-class Seams:
-    """Where a node touches the world; everything else is logic.
-
-    ``network`` makes the node's port each time that it enters the network; ``connector`` opens links to robots and
-    yards (None: TCP); ``wall`` is unix time, for people; ``shelf`` is where deployed modules are kept (None: they are
-    forgotten when the node ends).
-    """
-
-    clock: IReactorTime
-    network: Callable[[], Network]
-    store: Store
-    rng: random.Random
-    wall: Callable[[], float]
-    connector: Any = None
-    shelf: Any = None
 
 
 @dataclass
@@ -75,6 +58,7 @@ def assembled(settings: Settings, seams: Seams) -> Assembly:
     Raises ``SwarmError`` or ``DriverError`` where they cannot be met.
     """
     node_settings, driver = settings.node, None
+    seams = faulty(settings, seams)
     capabilities = dict(node_settings.capabilities)
     kind = node_settings.kind
     if settings.driver.kind:
@@ -91,6 +75,7 @@ def assembled(settings: Settings, seams: Seams) -> Assembly:
         description=node_settings.description,
         capabilities=capabilities,
         roles=tuple(node_settings.roles),
+        position=node_settings.position,
     )
     node = SwarmNode(
         device,
@@ -104,6 +89,9 @@ def assembled(settings: Settings, seams: Seams) -> Assembly:
         seams.wall,
         node_settings.presence_lease,
     )
+    answer_survey(node)
+    answer_tuning(node, settings)
+    node.halt = answer_halt(node.entangled)
     if settings.deployment.allow:
         _deployable(node, settings, seams)
     agent = None

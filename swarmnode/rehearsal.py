@@ -20,7 +20,7 @@ from middleware.settings import Settings
 from sim.demo.trials import main as run_trials
 from sim.scene import loaded
 from sim.yard import Yard
-from swarmnode.assembly import Seams
+from swarmnode.seams import Seams
 from swarmnode.frost import Frost
 from swarmnode.service import NodeService
 from webnode.ledger import state_from

@@ -12,7 +12,8 @@ from twisted.logger import Logger
 
 from middleware.node import SwarmNode
 from middleware.settings import Settings
-from swarmnode.assembly import FAULTS, Seams, assembled
+from swarmnode.assembly import FAULTS, assembled
+from swarmnode.seams import Seams
 
 COMING_BACK = 2.0
 """Seconds until a node that could not come back tries again."""

@@ -21,7 +21,7 @@ from middleware.entangled.network.network import Address
 from middleware.errors import BadSetting, MissingExtra
 from middleware.node import SwarmNode
 from middleware.settings import IN_MEMORY, Settings
-from swarmnode.assembly import Seams
+from swarmnode.seams import Seams
 
 _log = Logger()
 

@@ -50,8 +50,14 @@ class DeviceTests(SynchronousTestCase):
     def test_there_and_back(self) -> None:
         """A device comes out of its record as it went in."""
         self.assertEqual(device_of(record(DEVICE.packed())), DEVICE)
+        placed = replace(DEVICE, pages=("http://10.0.0.1:8080",), position={"x": 1.0, "y": 2.5, "heading": -0.5})
+        self.assertEqual(device_of(record(placed.packed())), placed)
         bare = {"uuid": DEVICE.uuid, "name": "dog", "of a later version": 1}
         self.assertEqual(device_of(record(bare)), Device(DEVICE.uuid, "dog"))
+
+    def test_unused_fields_cost_nothing(self) -> None:
+        """The record of a device that serves no page and names no place is no longer for it."""
+        self.assertEqual({"pages", "position"} & set(msgpack.unpackb(DEVICE.packed())), set())
 
     def test_nobody_announces_another(self) -> None:
         """A device in the record of another node is none."""
@@ -77,6 +83,8 @@ class DeviceTests(SynchronousTestCase):
             "since": ["5", float("inf"), None, 1e300],
             "task": [5],
             "status": ["ASLEEP", 5],
+            "pages": [5, "http://a", [5], {"a": 1}],
+            "position": [5, [1.0], {"x": "1"}, {"x": float("nan")}, {5: 1.0}],
             "messages": [5, [5], [[1.0]], [[1.0, 5]], [["x", "y"]], [[float("nan"), "y"]], {"a": 1}],
             "network": [5, {"n": "x"}, {"n": float("inf")}],
         }

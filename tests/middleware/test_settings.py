@@ -25,6 +25,7 @@ store = "dog1.db"
 team_key = "correct horse"
 roles = ["web", "edge"]
 presence_lease = 2
+position = { x = 1, y = 2.5, heading = 0 }
 [node.capabilities.camera]
 width = 208
 lens = "wide"
@@ -38,6 +39,13 @@ options = { robot = "dog1", port = 7400 }
 host = "::1"
 port = 0
 yard = "127.0.0.1:7400"
+tls = "auto"
+tls_port = 0
+code = "quiet-otter"
+password = "scrypt$1"
+sign_in = false
+[faults]
+allow = true
 """
 
 
@@ -76,6 +84,14 @@ class SettingsTest(SynchronousTestCase):
         self.assertEqual((read.agent.module, read.agent.options), ("search", {"speed": 0.2}))
         self.assertEqual((read.driver.kind, read.driver.options), ("sim", {"robot": "dog1", "port": 7400}))
         self.assertEqual((read.web.host, read.web.port, read.web.yard), ("::1", 0, Address("127.0.0.1", 7400)))
+        self.assertEqual(node.position, {"x": 1.0, "y": 2.5, "heading": 0.0})
+        web = read.web
+        self.assertEqual(
+            (web.tls, web.tls_port, web.code, web.password, web.sign_in), ("auto", 0, "quiet-otter", "scrypt$1", False)
+        )
+        self.assertTrue(read.faults.allow)
+        self.assertNotIn("otter", repr(read))
+        self.assertNotIn("scrypt", repr(read))
         self.assertEqual(read.origin, path)
 
     def test_defaults(self) -> None:
@@ -146,6 +162,13 @@ class SettingsTest(SynchronousTestCase):
             ("web", "host"): ["page.local"],
             ("web", "port"): ["8080"],
             ("web", "yard"): ["127.0.0.1", 7400, None],
+            ("web", "tls"): ["yes", True],
+            ("web", "tls_port"): [-1],
+            ("web", "code"): ["short", "Large", 5],
+            ("web", "password"): [5, "x" * 201],
+            ("web", "sign_in"): ["no"],
+            ("faults", "allow"): [1],
+            ("node", "position"): [5, {"x": 1.0}, {"x": 1, "y": "2", "heading": 0}, {"lat": 1, "lon": 2}],
             ("deployment", "allow"): [1, "true", None],
             ("deployment", "operators"): ["ab" * 32, ["ab"], ["AB" * 32], [7], [f"{n:064x}" for n in range(9)]],
             ("deployment", "modules"): ["best", ["../best"], ["Best"], [""], [f"m{n}" for n in range(9)]],

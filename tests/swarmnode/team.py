@@ -11,7 +11,7 @@ from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.network.switchboard import Switchboard
 from middleware.node import SwarmNode
 from middleware.settings import Settings
-from swarmnode.assembly import Seams
+from swarmnode.seams import Seams
 from swarmnode.service import NodeService
 
 
