@@ -32,9 +32,9 @@ class Device:
 
     ``uuid`` is its node id in hex; ``joined`` its place in the order of joining; ``since`` seconds of the wall clock,
     for people; ``messages`` are its newest (time, text) lines; ``deployed`` maps each module that was pushed to
-    the version and digest that it runs, or says that it was refused; ``pages`` are the URLs at which it serves the page;
-    ``position`` is where it says that it is: ``x`` and ``y`` in metres and ``heading`` in radians in the yard's frame, or
-    ``lat`` and ``lon`` in degrees with ``accuracy`` in metres.
+    the version and digest that it runs, or says that it was refused; ``pages`` are the URLs at which it serves the
+    page; ``position`` is where it says that it is: ``x`` and ``y`` in metres and ``heading`` in radians in the yard's
+    frame, or ``lat`` and ``lon`` in degrees with ``accuracy`` in metres.
     """
 
     uuid: str

@@ -1,7 +1,7 @@
 """Settings: a node's TOML file, checked and frozen; every knob with its unit and what more and less of it do.
 
-Tables: ``[node]``, ``[agent]``, ``[driver]``, ``[web]``, ``[faults]`` and ``[deployment]``, one dataclass each.  Whatever is wrong
-is one ``BadSetting``, which says where, what, and what to write instead.
+Tables: ``[node]``, ``[agent]``, ``[driver]``, ``[web]``, ``[faults]`` and ``[deployment]``, one dataclass each.
+Whatever is wrong is one ``BadSetting``, which says where, what, and what to write instead.
 """
 
 from __future__ import annotations

@@ -5,16 +5,21 @@ from __future__ import annotations
 import importlib
 import sys
 from collections.abc import Sequence
+from importlib.util import find_spec
 
 from middleware.errors import MissingExtra
 
 OURS = ("agents", "drivers", "middleware", "sim", "swarmnode", "webnode")
+# A verb whose module is not here is not offered.
 WORKS: dict[str, tuple[str, str]] = {
     "demo": ("sim.demo.demonstration", "three robots, a yard and the page, on this machine"),
     "yard": ("sim.server", "the yard alone"),
     "trials": ("swarmnode.rehearsal", "both experiments, many times"),
+    "chaos": ("swarmnode.chaos", "let a device of a team fail, to see another take over"),
     "deploy": ("swarmnode.deploy", "push a strategy or a behaviour to the team, see who runs it, go back"),
     "why": ("swarmnode.why", "who was chosen for a task, and why"),
+    "web": ("swarmnode.web_code", "where the page is, and the code to sign in with"),
+    "password": ("swarmnode.password", "the hash of a password, for the settings of the page"),
 }
 GROUPS = {
     "dht": "get, put, find, watch, remove: the distributed hash table",
@@ -33,13 +38,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         from middleware.entangled.control.command import main as command
 
         return command(verb, words[1:])
-    if verb not in WORKS:
-        about = {**{name: purpose for name, (_, purpose) in WORKS.items()}, **GROUPS}
+    works = {name: work for name, work in WORKS.items() if find_spec(work[0]) is not None}
+    if verb not in works:
+        about = {**{name: purpose for name, (_, purpose) in works.items()}, **GROUPS}
         lines = "".join(f"  {name:9}{purpose}\n" for name, purpose in about.items())
         sys.stdout.write(f"usage: swarm VERB [options]\n\n{lines}\nswarm VERB --help says more.\n")
         return 0 if verb in ("", "--help", "-h") else 2
     try:
-        module = importlib.import_module(WORKS[verb][0])
+        module = importlib.import_module(works[verb][0])
     except ModuleNotFoundError as error:
         if (error.name or "").split(".")[0] in OURS:
             raise

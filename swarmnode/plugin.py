@@ -22,7 +22,8 @@ from middleware.node import SwarmNode
 from middleware.settings import COMMAND_LINE, Settings
 from swarmnode.assembly import FAULTS
 from swarmnode.service import NodeService
-from swarmnode.world import control_socket, real_seams, resolved, web_page
+from swarmnode.web import web_page
+from swarmnode.world import control_socket, real_seams, resolved
 from webnode.errors import PortTaken
 
 use_monotonic_time()

@@ -20,8 +20,8 @@ from middleware.settings import Settings
 from sim.demo.trials import main as run_trials
 from sim.scene import loaded
 from sim.yard import Yard
-from swarmnode.seams import Seams
 from swarmnode.frost import Frost
+from swarmnode.seams import Seams
 from swarmnode.service import NodeService
 from webnode.ledger import state_from
 from webnode.state import Departed

@@ -1,4 +1,4 @@
-"""World: the real clock, network, store, page and control socket, for nodes that run on this machine."""
+"""World: the real clock, network, store and control socket, for nodes that run on this machine."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from twisted.application.service import IService, MultiService, Service
+from twisted.application.service import IService, Service
 from twisted.logger import Logger
 
 from middleware.entangled.data.memory import MemoryStore
-from middleware.entangled.data.sqlite import SqliteStore, read_records
+from middleware.entangled.data.sqlite import SqliteStore
 from middleware.entangled.data.store import Store
 from middleware.entangled.network.network import Address
-from middleware.errors import BadSetting, MissingExtra
+from middleware.errors import BadSetting
 from middleware.node import SwarmNode
 from middleware.settings import IN_MEMORY, Settings
 from swarmnode.seams import Seams
@@ -69,55 +69,6 @@ def resolved(settings: Settings, look_up: LookUp = socket.getaddrinfo) -> Settin
     if yard is not None and "web" in settings.node.roles:
         yard = figures(yard, "[web] yard", socket.AF_UNSPEC)
     return replace(settings, node=replace(settings.node, known_nodes=known), web=replace(settings.web, yard=yard))
-
-
-class _Page(MultiService):
-    """The page, and its line to the yard where there is one."""
-
-    def __init__(self, web: Service, operator: Any) -> None:
-        super().__init__()
-        self._operator = operator
-        web.setServiceParent(self)
-
-    def startService(self) -> None:
-        super().startService()
-        if self._operator is not None:
-            self._operator.connect().addErrback(lambda _: None)
-
-    def stopService(self) -> Any:
-        if self._operator is not None:
-            self._operator.disconnect()
-        return super().stopService()
-
-
-def web_page(settings: Settings, seams: Seams, reactor: Any, node: SwarmNode) -> IService:
-    """The web role: the page over the node's data store, live streams beside it; raises ``MissingExtra``."""
-    from agents.catalogue import DEMO, TASKS
-
-    try:
-        from webnode.app import create_app
-        from webnode.ledger import state_from
-        from webnode.live import Events, Shots
-        from webnode.server import Files, WebService, caller
-        from webnode.state import Departed
-        from webnode.team import TeamDesk
-    except ModuleNotFoundError as error:
-        raise MissingExtra("the web role", "web") from error
-    from drivers.sim.link import TcpConnector
-    from drivers.sim.operator import YardOperator
-
-    yard = settings.web.yard
-    operator = None if yard is None else YardOperator(TcpConnector(), reactor, yard.host, yard.port)
-    desk = TeamDesk(node, TASKS, DEMO, operator)
-    name = settings.node.name
-    # A memory of the departed each: the file lags what is watched by a commit, and one would doubt the other.
-    live = partial(state_from, desk.read, Departed(), name)
-    on_file = partial(state_from, partial(read_records, Path(settings.node.store)), Departed(), name)
-    stored = live if settings.node.store == IN_MEMORY else on_file
-    app = create_app(lambda: stored(seams.wall()), desk, caller(reactor))
-    events = Events(lambda: live(seams.wall()), reactor, seams.wall, desk.yard)
-    web = WebService(reactor, settings.web.host, settings.web.port, app, events, Shots(desk, reactor), Files())
-    return _Page(web, operator)
 
 
 def control_socket(settings: Settings, reactor: Any, node: SwarmNode) -> IService:

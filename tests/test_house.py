@@ -103,6 +103,12 @@ PURE = (
     "sim.demo.configuration",
     "sim.demo.experiment",
     "sim.demo.story",
+    "webnode.errors",
+    "webnode.field",
+    "webnode.guard",
+    "webnode.journal",
+    "webnode.route",
+    "webnode.state",
 )
 PURE_LAST_NAMES = ("codec",)
 NOT_IN_PURE = ("twisted", "time", "socket", "threading", "asyncio", "selectors", "subprocess", "secrets", "sqlite3")
@@ -120,7 +126,7 @@ WORLD = ("time", "socket", "threading", "asyncio", "selectors", "subprocess", "s
 GUARDED = ("middleware", "agents", "drivers")
 
 ON_DEMAND = ("middleware.deployment", "middleware.explanation", "middleware.verdict")
-HEAVY = ("flask", "jinja2", "cv2", "numpy", "pymunk", "serial", "playwright")
+HEAVY = ("flask", "jinja2", "segno", "prometheus_client", "cv2", "numpy", "pymunk", "serial", "playwright")
 
 
 def _files() -> dict[str, Path]:

@@ -1,76 +1,92 @@
-"""The Flask side: the page and its JSON, over a state and a desk that are handed in.
+"""The Flask side: the page, and every route of the table, over a state and a board that are handed in.
 
-Handlers run on worker threads.  They read a finished state and never wait for the network: a wish is handed to the
-reactor's thread, answered with 202, and its outcome shows in the state.
+Handlers run on worker threads.  They read a finished state and check what came; the answer itself is called on the
+reactor's thread, and what it waits for is waited for here, for a bounded time.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Collection
+import re
+from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
 from flask import Flask, Response, jsonify, render_template, request
+from twisted.internet.defer import Deferred
+from twisted.python.failure import Failure
 from werkzeug.exceptions import HTTPException
 
-from webnode.desk import Desk
+from webnode.board import Board
+from webnode.dispatch import Dispatch
 from webnode.errors import Refusal
-from webnode.field import text
-from webnode.guard import HEADERS, MAX_BODY, is_local_host, is_own_origin
-from webnode.state import GONE, State
+from webnode.guard import MAX_BODY, headers, refusal, token_of
+from webnode.route import API, Ask, Content, Route, checked, guarded
+from webnode.routes.table import TABLE
+from webnode.state import State
 
-MAX_MESSAGE = 140
-MAX_AWAY_S = 600.0
-AWAY_S = 15.0
+MAX_ID = 64
 OnReactor = Callable[..., Any]
 
 
 def _here(wish: Callable[..., Any], *arguments: Any) -> Any:
-    return wish(*arguments)
+    told = wish(*arguments)
+    if not isinstance(told, Deferred):
+        return told
+    came: list[Any] = []
+    told.addBoth(came.append)
+    if not came:
+        raise Refusal("node", "it did not answer in time", "look at the state, then try again", 503)
+    if isinstance(came[0], Failure):
+        came[0].raiseException()
+    return came[0]
 
 
 def create_app(
-    read: Callable[[], State], desk: Desk, on_reactor: OnReactor = _here, hosts: Collection[str] = ()
+    read: Callable[[], State],
+    board: Board,
+    on_reactor: OnReactor = _here,
+    hosts: Collection[str] = (),
+    wall: Callable[[], float] = lambda: 0.0,
+    table: Sequence[Route] = TABLE,
 ) -> Flask:
     """The application.
 
     ``read`` returns the newest state and may be called from any thread; ``on_reactor(f, *arguments)`` calls ``f``
     on the reactor's thread and returns what it returns (``server.caller`` makes one; the default calls at once, for
-    tests); ``hosts`` are names of this machine beside its addresses and local names.
+    tests); ``hosts`` are names of this machine beside its addresses and local names; ``wall`` is unix time.
     """
     app = Flask("webnode", static_folder=None)
     app.config["MAX_CONTENT_LENGTH"] = MAX_BODY
     app.json.sort_keys = False  # type: ignore[attr-defined]
 
-    _guard(app, hosts)
+    # A phone whose page is being closed can still send a last word, but no header with it.
+    unmarked = {(str(route.method), _rule(route.path)) for route in table if route.role == "phone"}
+    _guard(app, board, hosts, lambda: (request.method, str(request.url_rule)) not in unmarked)
     _explain(app)
     _serve_page(app, read)
-    _serve_tasks(app, read, desk, on_reactor)
-    _serve_devices(app, read, desk, on_reactor)
-    _serve_target(app, desk, on_reactor)
+    dispatch = Dispatch()
+    for route in table:
+        if route.answer is not None:
+            _serve(app, route, tuple(table), read, board, wall, lambda *asked: on_reactor(dispatch.carry_out, *asked))
     return app
 
 
-def _guard(app: Flask, hosts: Collection[str]) -> None:
-    """Let in who comes by a name of this machine and from its own page, and send the headers that keep it so."""
+def _guard(app: Flask, board: Board, hosts: Collection[str], needs_mark: Callable[[], bool]) -> None:
+    """Let in who comes by a name of this machine and from a page of the team, and send the headers that keep it so."""
 
     @app.before_request
-    def admit() -> None:
-        host = request.headers.get("Host", "")
-        if not is_local_host(host, hosts):
-            raise Refusal(
-                "Host", "this name is not one of the node's", "use its address, or add the name to the settings", 403
-            )
-        if request.method in ("GET", "HEAD"):
-            return
-        if not is_own_origin(request.headers.get("Origin"), host):
-            raise Refusal("Origin", "another site asked for this", "use the node's own page", 403)
-        if request.headers.get("X-Swarm") != "1" and not request.is_json:
-            raise Refusal("X-Swarm", "the header is missing", "send 'X-Swarm: 1' or JSON with its content type", 403)
+    def admit() -> Response | None:
+        marked = not needs_mark() or request.headers.get("X-Swarm") == "1" or request.is_json
+        host, origin = request.headers.get("Host", ""), request.headers.get("Origin")
+        problem = refusal(request.method, host, origin, marked, hosts, board.fallbacks.lets_in)
+        if problem is not None:
+            raise problem
+        # A browser asks first before it lets a page of another node give an order.
+        return app.response_class(status=204) if request.method == "OPTIONS" else None
 
     @app.after_request
     def strict(response: Response) -> Response:
-        response.headers.update(HEADERS)
+        host, origin = request.headers.get("Host", ""), request.headers.get("Origin")
+        response.headers.update(headers(host, origin, board.fallbacks.lets_in))
         response.headers.setdefault("Cache-Control", "no-store")
         return response
 
@@ -86,7 +102,11 @@ def _explain(app: Flask) -> None:
     def unlawful(error: HTTPException) -> tuple[Response, int]:
         code = error.code or 500
         remedy = "send less" if code == 413 else "look at docs/web.md for what can be asked"
-        return jsonify(Refusal(request.path, error.name.lower(), remedy).fields), code
+        response = jsonify(Refusal(request.path, error.name.lower(), remedy).fields)
+        allowed = getattr(error, "valid_methods", None)
+        if allowed:
+            response.headers["Allow"] = ", ".join(sorted(allowed))
+        return response, code
 
     @app.errorhandler(Exception)
     def broken(error: Exception) -> tuple[Response, int]:
@@ -97,123 +117,53 @@ def _explain(app: Flask) -> None:
 def _serve_page(app: Flask, read: Callable[[], State]) -> None:
     @app.get("/")
     def page() -> Response:
-        response = app.make_response(render_template("index.html", node=read()["node"]))
+        response = app.make_response(render_template("index.html", node=read()["node"], api=API))
         response.headers["Cache-Control"] = "no-cache"
         response.add_etag()
         response.make_conditional(request)
         return response
 
-    @app.get("/api/state")
-    def state() -> Response:
-        return jsonify(read())
+
+def _serve(
+    app: Flask,
+    route: Route,
+    table: tuple[Route, ...],
+    read: Callable[[], State],
+    board: Board,
+    wall: Callable[[], float],
+    carry_out: Callable[[Route, Ask], Any],
+) -> None:
+    def answer(**path: str) -> Response:
+        now = wall()
+        who = board.sessions.visitor(_token(), now)
+        guarded(route.role, who)
+        given = checked(route, path, request.args, {} if route.method == "GET" else _body())
+        told = carry_out(route, Ask(given, who, board, read(), _id(), request.remote_addr or "", now, table))
+        is_content = isinstance(told, Content)
+        response = app.response_class(told.body, content_type=told.kind) if is_content else jsonify(told)
+        response.status_code = route.status
+        return response
+
+    app.add_url_rule(_rule(route.path), route.name, answer, methods=[route.method])
 
 
-def _serve_tasks(app: Flask, read: Callable[[], State], desk: Desk, on_reactor: OnReactor) -> None:
-    @app.get("/api/tasks")
-    def tasks() -> Response:
-        return jsonify(read()["tasks"])
-
-    @app.get("/api/catalogue")
-    def catalogue() -> Response:
-        return jsonify(list(on_reactor(desk.catalogue)))
-
-    @app.post("/api/demo")
-    def demo() -> tuple[Response, int]:
-        return jsonify({"id": on_reactor(desk.run_demo)}), 202
-
-    @app.post("/api/tasks")
-    def assign() -> tuple[Response, int]:
-        name, tolerates = _words("name", 64), _number("tolerates", 1.0)
-        if tolerates not in (1.0, 2.0, 3.0):
-            raise Refusal("tolerates", f"{tolerates:g} is out of range", "give 1, 2 or 3")
-        answer = on_reactor(desk.assign, name, int(tolerates))
-        return jsonify(answer if isinstance(answer, dict) else {"id": answer}), 202
-
-    @app.post("/api/tasks/<task_id>/<any(cancel, pause, resume):wish>")
-    def order(task_id: str, wish: str) -> tuple[Response, int]:
-        if task_id not in [task["id"] for task in read()["tasks"]]:
-            raise Refusal("task", "there is no such task", "choose one of /api/tasks", 404)
-        on_reactor({"cancel": desk.cancel, "pause": desk.pause, "resume": desk.resume}[wish], task_id)
-        return jsonify({"id": task_id}), 202
+def _rule(path: str) -> str:
+    return re.sub(r"\{(\w+)\}", r"<\1>", path)
 
 
-def _serve_devices(app: Flask, read: Callable[[], State], desk: Desk, on_reactor: OnReactor) -> None:
-    @app.get("/api/devices")
-    def devices() -> Response:
-        return jsonify(read()["devices"])
-
-    @app.post("/api/message")
-    def announce() -> tuple[Response, int]:
-        on_reactor(desk.message, "", _words("text", MAX_MESSAGE))
-        return jsonify({}), 202
-
-    @app.post("/api/devices/<uuid>/message")
-    def message(uuid: str) -> tuple[Response, int]:
-        _present(read(), uuid)
-        on_reactor(desk.message, uuid, _words("text", MAX_MESSAGE))
-        return jsonify({"id": uuid}), 202
-
-    @app.post("/api/devices/<uuid>/disconnect")
-    def disconnect(uuid: str) -> tuple[Response, int]:
-        _present(read(), uuid)
-        seconds = _number("seconds", AWAY_S)
-        if not 0.0 < seconds <= MAX_AWAY_S:
-            raise Refusal("seconds", f"{seconds:g} is out of range", f"give more than 0 and at most {MAX_AWAY_S:g}")
-        on_reactor(desk.disconnect, uuid, seconds)
-        return jsonify({"id": uuid, "seconds": seconds}), 202
+def _token() -> str:
+    return token_of(request.headers.get("Authorization", ""), request.args.get("ticket", ""))
 
 
-def _serve_target(app: Flask, desk: Desk, on_reactor: OnReactor) -> None:
-    @app.post("/api/target")
-    def move_target() -> tuple[Response, int]:
-        x, y = _number("x"), _number("y")
-        _in_yard(on_reactor(desk.yard), x, y)
-        on_reactor(desk.move_target, x, y)
-        return jsonify({"x": x, "y": y}), 202
-
-    @app.delete("/api/target")
-    def clear_target() -> tuple[Response, int]:
-        on_reactor(desk.clear_target)
-        return jsonify({}), 202
+def _id() -> str:
+    words = request.headers.get("Idempotency-Key", "")
+    if len(words) > MAX_ID or not words.isprintable():
+        raise Refusal("Idempotency-Key", "it is no name for an order", f"give at most {MAX_ID} characters")
+    return words
 
 
-def _body() -> dict[str, Any]:
+def _body() -> object:
     try:
-        body = request.get_json(force=True) if request.get_data() else {}
+        return request.get_json(force=True) if request.get_data() else {}
     except RecursionError:
-        body = None
-    if not isinstance(body, dict):
-        raise Refusal("body", "it is not a JSON object", 'send something like {"name": "value"}')
-    return body
-
-
-def _words(field: str, limit: int) -> str:
-    value = _body().get(field)
-    if not isinstance(value, str) or not text(value, limit=limit + 1):
-        raise Refusal(field, "it is missing or empty", f"give a text of 1 to {limit} characters")
-    if len(value) > limit:
-        raise Refusal(field, f"it has {len(value)} characters", f"give at most {limit}")
-    return text(value, limit=limit)
-
-
-def _number(field: str, fallback: float | None = None) -> float:
-    value = _body().get(field, fallback)
-    if isinstance(value, bool) or not isinstance(value, int | float) or abs(value) > 1e9 or not math.isfinite(value):
-        raise Refusal(field, "it is missing or no number", "give a finite number")
-    return float(value)
-
-
-def _present(state: State, uuid: str) -> None:
-    found = [device for device in state["devices"] if device["uuid"] == uuid]
-    if not found:
-        raise Refusal("device", "there is no such device", "choose one of /api/devices", 404)
-    if found[0]["status"] == GONE:
-        raise Refusal("device", f"{found[0]['name']} has left the network", "wait until it is back", 409)
-
-
-def _in_yard(yard: Any, x: float, y: float) -> None:
-    if yard is None:
-        raise Refusal("target", "this node has no yard", "start one, or name it in the settings", 409)
-    width, height = yard["walls"]
-    if not (0.0 <= x <= width and 0.0 <= y <= height):
-        raise Refusal("target", f"({x:g}, {y:g}) is outside the yard", f"give x in 0..{width:g} and y in 0..{height:g}")
+        return None

@@ -72,7 +72,7 @@ class MemoryDesk:
     def assign(self, name: str, tolerates: int = 1) -> dict[str, Any]:
         """Return ``assign-N``; nobody is able, nobody is refused."""
         if name not in [task["name"] for task in self.tasks]:
-            raise Refusal("name", f"there is no task {name!r}", "choose one of /api/catalogue", 404)
+            raise Refusal("name", f"there is no task {name!r}", "choose one of /api/v1/catalogue", 404)
         return {"id": self._noted("assign", name), "able": [], "refused": {}}
 
     def catalogue(self) -> list[Mapping[str, Any]]:

@@ -19,7 +19,7 @@ from zope.interface import implementer
 
 from webnode.camera import Camera, FrameSource
 from webnode.errors import Refusal
-from webnode.guard import HEADERS
+from webnode.resource import JsonResource, answer
 from webnode.state import State
 
 BEAT_S = 0.5
@@ -61,7 +61,7 @@ class Viewer:
         self.request.write(f"event: {event}\ndata: {words}\n\n".encode())
 
 
-class Events(Resource):
+class Events(JsonResource):
     """``/events``: the full state, then each change, at most ten a second; a ``beat`` each half second.
 
     Events are ``state`` (``state.state_of``), ``yard`` (the overhead snapshot, or null) and ``beat`` (``now`` in unix
@@ -153,7 +153,7 @@ class Events(Resource):
             self._turn = None
 
 
-class Shots(Resource):
+class Shots(JsonResource):
     """``/shot/<device>?after=N&viewer=V``: the newest picture whose number is not N, as soon as there is one.
 
     The answer carries ``X-Seq``, the number to give as ``after`` next.  204 after five seconds without a new
@@ -199,7 +199,7 @@ class Shots(Resource):
         self._cameras.pop(uuid, None)
 
 
-class _Shot(Resource):
+class _Shot(JsonResource):
     isLeaf = True
 
     def __init__(self, shots: Shots, uuid: str) -> None:
@@ -209,13 +209,3 @@ class _Shot(Resource):
 
     def render_GET(self, request: Request) -> int | bytes:
         return self._shots.ask(self._uuid, request)
-
-
-def answer(request: Request, refusal: Refusal) -> bytes:
-    """The body of a native resource's refusal, with its status and type set."""
-    request.setResponseCode(refusal.status)
-    for name, value in HEADERS.items():
-        request.setHeader(name, value)
-    request.setHeader("Content-Type", "application/json")
-    request.setHeader("Cache-Control", "no-store")
-    return json.dumps(refusal.fields).encode()

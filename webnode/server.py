@@ -1,20 +1,21 @@
-"""The web node's one port: Flask for the page and JSON, native resources for the streams and files, in one ``Site``.
+"""The web node's port: Flask for the page and JSON, native resources for the streams and files, in one ``Site``.
 
 The only module of this room that touches the world: a listening port and a pool of worker threads.
 """
 
 from __future__ import annotations
 
+import gzip
 import hashlib
 import mimetypes
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any
 
 from flask import Flask
 from twisted.application.service import Service
-from twisted.internet.defer import Deferred, maybeDeferred
+from twisted.internet.defer import Deferred, gatherResults, maybeDeferred
 from twisted.internet.error import CannotListenError
 from twisted.internet.interfaces import IListeningPort
 from twisted.python.failure import Failure
@@ -26,16 +27,24 @@ from twisted.web.server import Site
 from twisted.web.wsgi import WSGIResource
 
 from webnode.app import OnReactor, create_app
+from webnode.board import Board, Role
 from webnode.camera import FrameSource
-from webnode.desk import Desk
+from webnode.channel import CappedRequest, guarded
 from webnode.errors import PortTaken, Refusal
-from webnode.guard import HEADERS, MAX_BODY, is_local_host
-from webnode.live import Events, Shots, answer
+from webnode.guard import headers, refusal, token_of
+from webnode.live import Events, Shots
+from webnode.resource import JsonResource, Refused
+from webnode.route import Route
+from webnode.route import guarded as let_in
+from webnode.routes.table import TABLE
 from webnode.state import State
 
 WORKERS = 4
 LIMIT_S = 2.0
 STATIC = Path(__file__).parent / "static"
+
+Door = Callable[[Site], IListeningPort]
+"""Opens a port for a site; raises ``PortTaken``."""
 
 
 def caller(reactor: Any, limit_s: float = LIMIT_S) -> OnReactor:
@@ -59,8 +68,8 @@ def caller(reactor: Any, limit_s: float = LIMIT_S) -> OnReactor:
     return on_reactor
 
 
-class Files(Resource):
-    """``/static``: the page's few files, read once; revalidated by ETag at every visit, so an update shows at once."""
+class Files(JsonResource):
+    """``/static``: the page's few files, read and packed once; revalidated by ETag, so an update shows at once."""
 
     def __init__(self, folder: Path = STATIC) -> None:
         super().__init__()
@@ -69,98 +78,132 @@ class Files(Resource):
                 self.putChild(path.name.encode(), _File(path))
 
 
-class _File(Resource):
+class _File(JsonResource):
     isLeaf = True
+    methods = (b"GET", b"HEAD")
 
     def __init__(self, path: Path) -> None:
         super().__init__()
-        self._content = path.read_bytes()
-        self._etag = b'"' + hashlib.blake2s(self._content, digest_size=8).hexdigest().encode() + b'"'
+        content = path.read_bytes()
+        # Packed by the same hand at every node: no time of day in it, so the tag holds everywhere.
+        packed = gzip.compress(content, 9, mtime=0)
+        self._forms = {"": content, "gzip": packed} if len(packed) < len(content) else {"": content}
+        self._tag = hashlib.blake2s(content, digest_size=8).hexdigest()
         kind = mimetypes.guess_type(path.name)[0] or "application/octet-stream"
         self._kind = kind + ("; charset=utf-8" if kind.startswith("text/") else "")
 
     def render_GET(self, request: Request) -> bytes:
+        form = "gzip" if "gzip" in self._forms and _takes_gzip(request.getHeader("accept-encoding") or "") else ""
         request.setHeader("Content-Type", self._kind)
         request.setHeader("Cache-Control", "no-cache")
-        if request.setETag(self._etag) is CACHED:
+        request.setHeader("Vary", "Accept-Encoding")
+        if request.setETag(f'"{self._tag}{form}"'.encode()) is CACHED:
             return b""
-        return self._content
+        if form:
+            request.setHeader("Content-Encoding", form)
+        return self._forms[form]
 
 
-class _Missing(Resource):
-    isLeaf = True
-
-    def __init__(self, refusal: Refusal) -> None:
-        super().__init__()
-        self._refusal = refusal
-
-    def render(self, request: Request) -> bytes:
-        return answer(request, self._refusal)
+def _takes_gzip(accepted: str) -> bool:
+    """Whether an ``Accept-Encoding`` header names gzip, and not with a weight of zero."""
+    for entry in accepted.split(","):
+        name, _, weight = entry.replace(" ", "").partition(";q=")
+        if name == "gzip":
+            return weight.strip("0.") != "" or not weight
+    return False
 
 
 class Root(Resource):
-    """Who answers what: the native resources by their first word, Flask everything else."""
+    """Who answers what: a native resource where its route begins the path, Flask everything else.
 
-    def __init__(self, flask: IResource, native: dict[bytes, Resource], hosts: Collection[str] = ()) -> None:
+    Native routes are guarded here as Flask's are there; a resource is asked by nobody who may not.
+    """
+
+    def __init__(
+        self,
+        flask: IResource,
+        native: dict[str, Resource],
+        board: Board,
+        wall: Callable[[], float],
+        hosts: Collection[str] = (),
+        table: Sequence[Route] = TABLE,
+    ) -> None:
         super().__init__()
         self._flask = flask
-        self._native = native
+        self._native = [
+            (tuple(path.strip("/").encode().split(b"/")), resource, _role_of(path, table))
+            for path, resource in sorted(native.items(), key=lambda item: -item[0].count("/"))
+        ]
+        self._board = board
+        self._wall = wall
         self._hosts = hosts
 
     def getChild(self, path: bytes, request: SiteRequest) -> IResource:
         """The resource for ``path``."""
-        child = self._native.get(path)
-        if child is None:
-            assert request.prepath is not None and request.postpath is not None
-            request.prepath.pop()
-            request.postpath.insert(0, path)
-            return self._flask
-        if not is_local_host((request.getHeader("host") or ""), self._hosts):
-            return _Missing(Refusal("Host", "this name is not one of the node's", "use its address", 403))
-        for name, value in HEADERS.items():
+        assert request.prepath is not None and request.postpath is not None
+        asked = (path, *request.postpath)
+        for pattern, resource, role in self._native:
+            if _begins(asked, pattern):
+                for _ in pattern[1:]:
+                    request.prepath.append(request.postpath.pop(0))
+                return self._guarded(resource, role, request)
+        request.prepath.pop()
+        request.postpath.insert(0, path)
+        return self._flask
+
+    def _guarded(self, resource: Resource, role: Role, request: SiteRequest) -> IResource:
+        host, origin = request.getHeader("host") or "", request.getHeader("origin")
+        lets_in = self._board.fallbacks.lets_in
+        for name, value in headers(host, origin, lets_in).items():
             request.setHeader(name, value)
-        return child
+        method = (request.method or b"").decode("ascii", "replace")
+        # A page that is being closed can still send a last word, but no header with it.
+        is_marked = role == "phone" or request.getHeader("x-swarm") == "1" or method == "GET"
+        problem = refusal(method, host, origin, is_marked, self._hosts, lets_in)
+        if problem is not None:
+            return Refused(problem)
+        if method == "OPTIONS":
+            return _Preflight()
+        ticket: bytes = (request.args or {}).get(b"ticket", [b""])[0]
+        token = token_of(request.getHeader("authorization") or "", ticket.decode("ascii", "replace"))
+        try:
+            let_in(role, self._board.sessions.visitor(token, self._wall()))
+        except Refusal as no:
+            return Refused(no)
+        return resource
 
 
-class CappedRequest(SiteRequest):
-    """A request whose body is never kept beyond ``guard.MAX_BODY``: answered with 413 and cut off."""
+class _Preflight(Resource):
+    """What a browser asks before it lets a page of another node ask."""
 
-    _taken = 0
-    _cut = False
+    isLeaf = True
 
-    def gotLength(self, length: int | None) -> None:  # noqa: N802
-        """Refuse a body that announces itself as too large."""
-        super().gotLength(0 if length is not None and length > MAX_BODY else length)
-        if length is not None and length > MAX_BODY:
-            self._refuse()
+    def render(self, request: Request) -> bytes:
+        request.setResponseCode(204)
+        return b""
 
-    def handleContentChunk(self, data: bytes) -> None:  # noqa: N802
-        """Take a piece of the body, or refuse the rest."""
-        self._taken += len(data)
-        if self._taken > MAX_BODY:
-            self._refuse()
-        if not self._cut:
-            super().handleContentChunk(data)
 
-    def requestReceived(self, command: bytes, path: bytes, version: bytes) -> None:  # noqa: N802
-        """Go on, unless the body was refused."""
-        if not self._cut:
-            super().requestReceived(command, path, version)
+def _begins(asked: Sequence[bytes], pattern: Sequence[bytes]) -> bool:
+    return len(asked) >= len(pattern) and all(
+        segment == wanted or (wanted.startswith(b"{") and segment != b"")
+        for segment, wanted in zip(asked, pattern, strict=False)
+    )
 
-    def _refuse(self) -> None:
-        if self._cut or self.channel is None:
-            return
-        self._cut = True
-        body = b'{"error": {"field": "body", "problem": "it is too large", "remedy": "send at most 64 KiB"}}'
-        head = b"HTTP/1.1 413 Content Too Large\r\nContent-Type: application/json\r\nConnection: close\r\n"
-        transport = self.channel.transport
-        assert transport is not None
-        transport.write(head + b"Content-Length: %d\r\n\r\n" % len(body) + body)
-        transport.loseConnection()
+
+def _role_of(path: str, table: Sequence[Route]) -> Role:
+    """The role that the native route at ``path``, or below it, wants; one that no route names is for operators."""
+    roles = [route.role for route in table if route.answer is None and f"{route.path}/".startswith(f"{path}/")]
+    return roles[0] if roles else "operator"
 
 
 class QuietSite(Site):
-    """A site that keeps no access log: three cameras alone would write forty lines a second."""
+    """A site that keeps no access log (three cameras alone would write forty lines a second) and names no version."""
+
+    def getResourceFor(self, request: Any) -> IResource:  # noqa: N802
+        """The resource that answers; which Twisted serves it is nobody's business."""
+        request.responseHeaders.removeHeader(b"server")
+        found: IResource = super().getResourceFor(request)
+        return found
 
     def log(self, request: Request) -> None:
         """Write nothing."""
@@ -170,7 +213,7 @@ class WebService(Service):
     """The page as a service of the node's process.
 
     ``startService`` raises ``PortTaken`` (one line for a person) where the port cannot be had; ``port`` 0 takes
-    any, see ``port``.
+    any, see ``port``.  ``doors`` open further ports for the same page.
     """
 
     name = "web"
@@ -184,19 +227,26 @@ class WebService(Service):
         events: Events,
         shots: Shots,
         static: Resource,
+        board: Board,
+        wall: Callable[[], float],
         hosts: Collection[str] = (),
+        doors: Sequence[Door] = (),
     ) -> None:
         self._reactor = reactor
         self._host = host
         self._wanted = port
+        self._doors = doors
         self._pool = ThreadPool(1, WORKERS, "web")
         flask = WSGIResource(reactor, self._pool, app)
-        native: dict[bytes, Resource] = {b"events": events, b"shot": shots, b"static": static}
+        native: dict[str, Resource] = {"/events": events, "/shot": shots, "/static": static}
+        native.update({route.path: route.native(board, reactor) for route in TABLE if route.native is not None})
         self._events = events
         self._shots = shots
-        self.site = QuietSite(Root(flask, native, hosts), requestFactory=CappedRequest, timeout=30)
+        self.site = QuietSite(Root(flask, native, board, wall, hosts), requestFactory=CappedRequest, timeout=30)
         self.site.displayTracebacks = False
+        guarded(self.site, board.limits)
         self._listening: IListeningPort | None = None
+        self._open: list[IListeningPort] = []
 
     @property
     def port(self) -> int:
@@ -213,6 +263,7 @@ class WebService(Service):
             why = getattr(error.socketError, "strerror", None) or str(error.socketError)
             where = f"{self._host or '*'}:{self._wanted}"
             raise PortTaken(f"the page cannot be served on {where} ({why}); choose another port, or 0") from error
+        self._open = [door(self.site) for door in self._doors]
         self._pool.start()
         super().startService()
 
@@ -221,8 +272,8 @@ class WebService(Service):
         super().stopService()
         if self._listening is None:
             return None
-        closed = maybeDeferred(self._listening.stopListening)
-        self._listening = None
+        closed = gatherResults([maybeDeferred(port.stopListening) for port in (self._listening, *self._open)])
+        self._listening, self._open = None, []
         self._events.close()
         self._shots.close()
         self._pool.stop()
@@ -234,13 +285,12 @@ def web_service(
     host: str,
     port: int,
     read: Callable[[], State],
-    desk: Desk,
+    board: Board,
     frames: FrameSource,
     wall: Callable[[], float],
     hosts: Collection[str] = (),
 ) -> WebService:
     """The whole web node from what the front door has; ``wall`` is the unix time in seconds."""
-    app = create_app(read, desk, caller(reactor), hosts)
-    return WebService(
-        reactor, host, port, app, Events(read, reactor, wall, desk.yard), Shots(frames, reactor), Files(), hosts
-    )
+    app = create_app(read, board, caller(reactor), hosts, wall)
+    events, shots = Events(read, reactor, wall, board.desk.yard), Shots(frames, reactor)
+    return WebService(reactor, host, port, app, events, shots, Files(), board, wall, hosts)

@@ -74,7 +74,7 @@ class TeamDesk:
         record = self._record_of(uuid)
         contact = None if record is None else self._node.contact_of(record)
         if contact is None:
-            raise Refusal("device", "there is no such device", "choose one of /api/devices", 404)
+            raise Refusal("device", "there is no such device", "choose one of /api/v1/devices", 404)
         return self._node.streams.look(contact, CAMERA, on_frame)
 
     def yard(self) -> Mapping[str, Any] | None:

@@ -76,7 +76,7 @@ class Team:
     def is_complete(self) -> bool:
         """Whether the page lists the dogs."""
         try:
-            here = {device["name"] for device in self.page("/api/state")["devices"]}
+            here = {device["name"] for device in self.page("/api/v1/state")["devices"]}
         except (OSError, http.client.HTTPException, ValueError):
             return False
         return here >= set(self._names) and self.operator.snapshot is not None
@@ -166,7 +166,7 @@ async def trial(reactor: Any, cause: Cause, seed: int) -> Trial:
 async def _trial(reactor: Any, cause: Cause, seed: int, team: Team, dice: random.Random) -> Trial:
     await _until(reactor, team.is_complete, "the page does not list all devices", 0.2)
     task_id = str(
-        team.page("/api/tasks", {"name": "turn-around", "tolerates": 3 if cause is Cause.TRIPLE_KILL else 1})["id"]
+        team.page("/api/v1/tasks", {"name": "turn-around", "tolerates": 3 if cause is Cause.TRIPLE_KILL else 1})["id"]
     )
     await _until(reactor, lambda: bool(team.moving()), "no dog goes", LOOK_S)
     lost = team.moving()[0]

@@ -81,7 +81,7 @@ class Demonstration:
         await self._operator.scatter(self._seed + number)
         title = f"Experiment {number}: " + ("the nearest dog approaches", "the dog on its way is lost")[number - 1]
         self._say(title)
-        answer = await self._visitor.post("/api/demo")
+        answer = await self._visitor.post("/api/v1/demo")
         run = Experiment(title, str(answer.get("id", "")), number == 2, self._reactor.seconds())
         target_at = self._reactor.seconds() + SEARCH_S
         while not run.is_over:

@@ -16,6 +16,7 @@ from twisted.internet import reactor as _reactor
 from twisted.internet.stdio import StandardIO
 from twisted.protocols.basic import LineReceiver
 
+from webnode.board import Board, OpenSessions
 from webnode.camera import OnFrame
 from webnode.desk import MemoryDesk
 from webnode.server import WebService, web_service
@@ -205,11 +206,16 @@ class Orders(LineReceiver):
             reactor.stop()
 
 
+def board() -> Board:
+    """What the page can ask for: twins in memory, so that every order is taken and none does harm."""
+    return Board(MemoryDesk(CATALOGUE, YARD), OpenSessions())
+
+
 def main() -> None:
     """Serve until the input ends."""
     team = Team()
     port = int(sys.argv[1]) if len(sys.argv) > 1 else 0
-    web = web_service(reactor, "127.0.0.1", port, team.read, MemoryDesk(CATALOGUE, YARD), team, time.time)
+    web = web_service(reactor, "127.0.0.1", port, team.read, board(), team, time.time)
     web.startService()
     reactor.addSystemEventTrigger("before", "shutdown", web.stopService)
     reactor.callWhenRunning(lambda: StandardIO(Orders(team, web)))

@@ -127,7 +127,7 @@ class DemonstrationPageTests(SynchronousTestCase):
     def test_be_looked_at_from_a_desk(self) -> None:
         """On a desk: devices in the order of joining, three cameras whose views move as the dogs search, the map."""
         page = self.opened(DESK)
-        devices = self.api("api/devices")
+        devices = self.api("api/v1/devices")
         self.assertEqual(page.locator(".device b").all_inner_texts(), [device["name"] for device in devices])
         joined = [device["joined"] for device in devices]
         self.assertEqual(joined, sorted(joined))

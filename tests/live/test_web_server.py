@@ -14,6 +14,7 @@ from twisted.trial.unittest import TestCase
 from twisted.web.client import Agent, HTTPConnectionPool, readBody
 from twisted.web.http_headers import Headers
 
+from webnode.board import Board, OpenSessions
 from webnode.camera import MemoryFrames
 from webnode.desk import MemoryDesk
 from webnode.errors import PortTaken
@@ -65,7 +66,8 @@ class WebServiceTests(TestCase):
         await deferLater(reactor, 0.05)
 
     def service(self, port: int) -> WebService:
-        return web_service(reactor, "127.0.0.1", port, self.read, self.desk, self.frames, lambda: 1e9)
+        board = Board(self.desk, OpenSessions())
+        return web_service(reactor, "127.0.0.1", port, self.read, board, self.frames, lambda: 1e9)
 
     def read(self) -> State:
         if threading.current_thread() is not threading.main_thread():
@@ -87,14 +89,14 @@ class WebServiceTests(TestCase):
     async def test_serve_everything(self) -> None:
         """Page, JSON, a file, a picture and a wish all go over the one port."""
         self.assertIn(b"vaio", await self.body("/"))
-        self.assertEqual(json.loads(await self.body("/api/devices"))[0]["name"], "dog1")
+        self.assertEqual(json.loads(await self.body("/api/v1/devices"))[0]["name"], "dog1")
         self.assertIn(b"EventSource", await self.body("/static/stream.js"))
         asked = self.asked("/shot/01?after=")
         while "01" not in self.frames.watched:
             await deferLater(reactor, 0.01)
         self.frames.show("01", 1, b"\xff\xd8.")
         self.assertEqual(await readBody(await asked), b"\xff\xd8.")
-        self.assertEqual(json.loads(await self.body("/api/demo", b"POST")), {"id": "demo-1"})
+        self.assertEqual(json.loads(await self.body("/api/v1/demo", b"POST")), {"id": "demo-1"})
 
     async def test_push_changes(self) -> None:
         """A device that joins is on the open page by itself."""
@@ -106,7 +108,7 @@ class WebServiceTests(TestCase):
     async def test_stream_while_workers_are_stuck(self) -> None:
         """With every worker held, states, files and pictures still go out; afterwards the held answers come too."""
         self.gate.clear()
-        held = [self.asked("/api/state") for _ in range(WORKERS + 2)]
+        held = [self.asked("/api/v1/state") for _ in range(WORKERS + 2)]
         stream = await self.opened("/events")
         await stream.said(b"dog1")
         self.devices.append({"uuid": "02", "name": "dog2", "joined": 2})
@@ -122,7 +124,7 @@ class WebServiceTests(TestCase):
         self.devices.append({"uuid": "02", "name": "dog2", "joined": 2})
         for stream in streams:
             await stream.said(b"dog2")
-        self.assertIn(b"dog2", await self.body("/api/state"))
+        self.assertIn(b"dog2", await self.body("/api/v1/state"))
 
     def test_tell_of_taken_port(self) -> None:
         """A port that another program holds is told in one line that says where and what to do."""

@@ -11,7 +11,8 @@ from twisted.python.failure import Failure
 from twisted.web.resource import IResource
 from twisted.web.server import Site
 
-from webnode.server import CappedRequest
+from webnode.channel import CappedRequest
+from webnode.server import QuietSite
 
 
 class Connection:
@@ -55,4 +56,4 @@ class Connection:
 
 def site_of(root: IResource, clock: Clock) -> Site:
     """A site on ``clock`` with the web node's own kind of requests."""
-    return Site(root, requestFactory=CappedRequest, reactor=clock, timeout=None)
+    return QuietSite(root, requestFactory=CappedRequest, reactor=clock, timeout=None)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from webnode.guard import HEADERS, is_local_host, is_own_origin
+from webnode.guard import HEADERS, headers, is_local_host, is_own_origin, refusal, token_of
 
 
 class GuardTests(SynchronousTestCase):
@@ -32,3 +32,28 @@ class GuardTests(SynchronousTestCase):
         policy = HEADERS["Content-Security-Policy"]
         self.assertIn("default-src 'self'", policy)
         self.assertNotIn("unsafe", policy)
+        self.assertIn("frame-ancestors 'none'", policy)
+        self.assertEqual(HEADERS["Cross-Origin-Opener-Policy"], "same-origin")
+
+    def test_read_the_token(self) -> None:
+        """A bearer's header wins over the ticket in the query; without either there is nothing."""
+        self.assertEqual(token_of("Bearer abc", "t"), "abc")
+        self.assertEqual(token_of("bearer  abc ", ""), "abc")
+        for header in ("", "Basic abc", "Bearer ", "abc"):
+            self.assertEqual(token_of(header, "t"), "t")
+
+    def test_let_in(self) -> None:
+        """Orders want the own page or one of the team, and a mark; looking wants only a name of this machine."""
+
+        def refused(method: str, origin: str | None = None, is_marked: bool = True, host: str = "vaio") -> str:
+            no = refusal(method, host, origin, is_marked, (), lambda origin: origin == "http://other")
+            return "" if no is None else no.field
+
+        self.assertEqual(refused("GET", "http://evil", False), "")
+        self.assertEqual(refused("GET", host="evil.example"), "Host")
+        self.assertEqual(refused("POST", "http://vaio"), "")
+        self.assertEqual(refused("POST", "http://other"), "")
+        self.assertEqual(refused("POST", "http://evil"), "Origin")
+        self.assertEqual(refused("POST", None, False), "X-Swarm")
+        self.assertEqual(refused("OPTIONS", "http://other", False), "")
+        self.assertEqual(headers("vaio", "http://evil", lambda origin: False), HEADERS)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 from collections.abc import Callable
 from typing import Any
 
@@ -12,8 +13,12 @@ from twisted.web.resource import Resource
 from twisted.web.static import Data
 
 from tests.webnode.browser import Connection, site_of
+from tests.webnode.guests import Guests
+from webnode.board import Board, MemoryFallbacks, OpenSessions, Page
+from webnode.desk import MemoryDesk
 from webnode.errors import Refusal
 from webnode.guard import MAX_BODY
+from webnode.resource import JsonResource
 from webnode.server import Files, Root, caller
 
 
@@ -24,19 +29,98 @@ class PathResource(Resource):
         return b"flask " + b"/".join(request.postpath) + b" %d" % len(request.content.read())
 
 
+class Stream(JsonResource):
+    isLeaf = True
+
+    def render_GET(self, request: Any) -> bytes:
+        return b"native"
+
+
+NATIVE: dict[str, Resource] = {"/stream": Stream()}
+
+
 class RootTests(SynchronousTestCase):
     def setUp(self) -> None:
-        native: dict[bytes, Resource] = {b"events": Data(b"native", "text/plain"), b"static": Files()}
-        self.site = site_of(Root(PathResource(), native), Clock())
+        native: dict[str, Resource] = {"/events": Data(b"native", "text/plain"), "/static": Files()}
+        self.board = Board(MemoryDesk(), OpenSessions())
+        self.site = site_of(Root(PathResource(), native, self.board, lambda: 1e9), Clock())
 
-    def asked(self, path: str, **headers: str) -> bytes:
-        return Connection(self.site).ask(path, **headers).taken()
+    def asked(self, path: str, method: str = "GET", **headers: str) -> bytes:
+        return Connection(self.site).ask(path, method, **headers).taken()
 
     def test_divide(self) -> None:
         """Streams and files are native; everything else, the root included, is Flask's with its whole path."""
         self.assertIn(b"native", self.asked("/events"))
-        self.assertIn(b"flask api/state 0", self.asked("/api/state"))
+        self.assertIn(b"flask api/v1/state 0", self.asked("/api/v1/state"))
         self.assertIn(b"flask  0", self.asked("/"))
+
+    def test_refuse_in_json(self) -> None:
+        """Whatever a native route refuses is JSON with the strict headers and no version of the server."""
+        self.site = site_of(Root(PathResource(), {**NATIVE, "/static": Files()}, self.board, lambda: 1e9), Clock())
+        asked = [
+            ("/static/nothing.js", "GET", 404),
+            ("/static/../app.py", "GET", 404),
+            ("/static/", "GET", 404),
+            ("/static", "GET", 404),
+            ("/static/page.js/more", "GET", 404),
+            ("/static/page.js", "POST", 405),
+            ("/stream", "POST", 405),
+            ("/stream", "PUT", 405),
+            ("/stream", "HEAD", 405),
+            ("/stream", "BREW", 405),
+            ("/stream/more", "GET", 404),
+        ]
+        for path, method, status in asked:
+            data = self.asked(path, method, X_Swarm="1")
+            self.assertTrue(data.startswith(f"HTTP/1.1 {status} ".encode()), (path, method, data))
+            self.assertIn(b"Content-Type: application/json", data)
+            self.assertIn(b"frame-ancestors 'none'", data)
+            self.assertNotIn(b"Server:", data)
+            if method != "HEAD":
+                self.assertIn(b'{"error": {"field"', data)
+            if status == 405:
+                self.assertIn(b"Allow: GET", data)
+
+    def test_ask_for_the_role(self) -> None:
+        """A native route is for its role: signed in by a header, or by the ticket in the query; no ticket is told."""
+        self.board.sessions = Guests()
+        self.assertIn(b" 401 ", self.asked("/events"))
+        self.assertIn(b" 401 ", self.asked("/events?ticket=nonsense"))
+        self.assertNotIn(b"nonsense", self.asked("/events?ticket=nonsense"))
+        self.assertIn(b" 403 ", self.asked("/events", Authorization="Bearer phone"))
+        self.assertIn(b"native", self.asked("/events?ticket=viewer"))
+        self.assertIn(b"native", self.asked("/events", Authorization="Bearer operator"))
+        self.assertIn(b" 200 ", self.asked("/static/page.js"))
+
+    def test_find_deep_routes(self) -> None:
+        """A native route may lie below the API; the whole path is matched, and one that no table names is guarded."""
+        native: dict[str, Resource] = {"/api/v1/phones/{uuid}/look": Data(b"seen", "text/plain")}
+        self.site = site_of(Root(PathResource(), native, self.board, lambda: 1e9), Clock())
+        self.assertIn(b"seen", self.asked("/api/v1/phones/01/look"))
+        for path in ("/api/v1/phones/01", "/api/v1/phones/01/leave", "/api/v1/phones//look"):
+            self.assertIn(b"flask " + path[1:].encode(), self.asked(path))
+        self.board.sessions = Guests()
+        self.assertIn(b" 403 ", self.asked("/api/v1/phones/01/look?ticket=viewer"))
+
+    def test_share_with_the_team(self) -> None:
+        """A page of another web node of the team may ask, also for what it needs a preflight; any other may not."""
+        self.board.fallbacks = MemoryFallbacks(Page("02", "http://other:8080"))
+        for method in ("GET", "OPTIONS"):
+            data = self.asked("/events", method, Origin="http://other:8080")
+            self.assertIn(b"Access-Control-Allow-Origin: http://other:8080", data)
+            self.assertNotIn(b"Access-Control", self.asked("/events", method, Origin="http://evil:8080"))
+        self.assertIn(b" 403 ", self.asked("/events", "OPTIONS", Origin="http://evil:8080"))
+
+    def test_pack_files(self) -> None:
+        """A file goes out packed to whoever takes gzip, and plain to others, each under its own tag."""
+        plain = self.asked("/static/page.js")
+        packed = self.asked("/static/page.js", Accept_Encoding="br, gzip;q=0.8")
+        self.assertIn(b"Content-Encoding: gzip", packed)
+        self.assertEqual(gzip.decompress(packed.split(b"\r\n\r\n", 1)[1]), plain.split(b"\r\n\r\n", 1)[1])
+        tags = {data.lower().split(b"etag: ")[1].split(b"\r\n")[0] for data in (plain, packed)}
+        self.assertEqual(len(tags), 2)
+        for refused in ("gzip;q=0", "br", "gzip;q=0.000"):
+            self.assertNotIn(b"Content-Encoding", self.asked("/static/page.js", Accept_Encoding=refused))
 
     def test_be_strict(self) -> None:
         """Native answers carry the strict headers too, and are for this node's own names only."""

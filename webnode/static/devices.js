@@ -92,17 +92,17 @@ export function startDevices() {
   at("d-message").addEventListener("submit", async (event) => {
     event.preventDefault();
     const body = { text: at("d-text").value };
-    if (await wish("Message", `/api/devices/${open}/message`, { body, line, done: () => "Message sent." })) at("d-text").value = "";
+    if (await wish("Message", `/api/v1/devices/${open}/message`, { body, line, done: () => "Message sent." })) at("d-text").value = "";
   });
   at("d-leave").addEventListener("submit", (event) => {
     event.preventDefault();
     const seconds = Number(at("d-seconds").value);
-    wish("Disconnecting", `/api/devices/${open}/disconnect`,
+    wish("Disconnecting", `/api/v1/devices/${open}/disconnect`,
       { body: { seconds }, line, done: () => `It leaves the network and comes back after ${seconds} s.` });
   });
   at("announce").addEventListener("submit", async (event) => {
     event.preventDefault();
     const body = { text: at("announce-text").value };
-    if (await wish("Message", "/api/message", { body, line: say, done: () => "Message sent to all devices." })) at("announce-text").value = "";
+    if (await wish("Message", "/api/v1/message", { body, line: say, done: () => "Message sent to all devices." })) at("announce-text").value = "";
   });
 }

@@ -88,8 +88,8 @@ function want(spot) {
   yard = { ...yard, target: spot && { ...yard.target, ...spot } };
   placeTarget(yard.target);
   send(spot
-    ? () => wish("Moving the target", "/api/target", { body: spot, done: () => `Target moved to ${spot.x.toFixed(2)}, ${spot.y.toFixed(2)} m.` })
-    : () => wish("Taking the target away", "/api/target", { method: "DELETE", done: () => "The target is taken away." }));
+    ? () => wish("Moving the target", "/api/v1/target", { body: spot, done: () => `Target moved to ${spot.x.toFixed(2)}, ${spot.y.toFixed(2)} m.` })
+    : () => wish("Taking the target away", "/api/v1/target", { method: "DELETE", done: () => "The target is taken away." }));
 }
 
 export function startMap() {

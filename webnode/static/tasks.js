@@ -23,11 +23,11 @@ export function showTasks(tasks) {
 
 function row(task) {
   const button = element("button", {}, "Cancel");
-  button.addEventListener("click", () => wish(`Cancelling ${task.title}`, `/api/tasks/${encodeURIComponent(task.id)}/cancel`));
+  button.addEventListener("click", () => wish(`Cancelling ${task.title}`, `/api/v1/tasks/${encodeURIComponent(task.id)}/cancel`));
   const rest = element("button", {}, "Pause");
   rest.addEventListener("click", () => {
     const isPaused = rest.textContent === "Resume";
-    wish(`${isPaused ? "Resuming" : "Pausing"} ${task.title}`, `/api/tasks/${encodeURIComponent(task.id)}/${isPaused ? "resume" : "pause"}`);
+    wish(`${isPaused ? "Resuming" : "Pausing"} ${task.title}`, `/api/v1/tasks/${encodeURIComponent(task.id)}/${isPaused ? "resume" : "pause"}`);
   });
   return element("li", {}, element("b"), badge(), element("span", { class: "note" }),
     element("details", {}, element("summary"), element("div")), button, rest);
@@ -56,7 +56,7 @@ function outcome({ able = [], refused = {} }) {
 
 // The catalogue is read when the page connects, and again after each loss.
 export async function readCatalogue() {
-  const catalogue = await fetch("/api/catalogue").then((answer) => (answer.ok ? answer.json() : null)).catch(() => null);
+  const catalogue = await fetch("/api/v1/catalogue").then((answer) => (answer.ok ? answer.json() : null)).catch(() => null);
   if (!catalogue) return;
   const chosen = at("task").value;
   at("task").replaceChildren(...catalogue.map((task) => element("option", { value: task.name }, task.title || task.name)));
@@ -67,13 +67,13 @@ export function startTasks() {
   at("assign").addEventListener("submit", (event) => {
     event.preventDefault();
     if (!at("task").value) return say("There is no predefined task to assign.");
-    wish("Assigning", "/api/tasks", { body: { name: at("task").value }, done: outcome });
+    wish("Assigning", "/api/v1/tasks", { body: { name: at("task").value }, done: outcome });
   });
   at("demo").addEventListener("click", async () => {
     at("demo").disabled = true;
     say("Starting the demo …");
     try {
-      await ask("/api/demo");
+      await ask("/api/v1/demo");
       say("The demo runs.");
     } catch (error) {
       say(error.message);

@@ -1,4 +1,4 @@
-"""Tests of ``swarmnode.world``: the web role."""
+"""Tests of ``swarmnode.web``: the web role."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.errors import MissingExtra
 from swarmnode.plugin import told
-from swarmnode.world import web_page
+from swarmnode.web import web_page
 from tests.swarmnode.team import World
 
 

@@ -1,0 +1,94 @@
+"""Web: the page of a node that has the role, over the node's data store, with live streams beside it."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from twisted.application.service import IService, MultiService, Service
+
+from middleware.entangled.data.sqlite import read_records
+from middleware.errors import MissingExtra
+from middleware.node import SwarmNode
+from middleware.settings import IN_MEMORY, Settings
+from swarmnode.gateway import gateway
+from swarmnode.seams import Seams
+
+
+class _Page(MultiService):
+    """The page, and its line to the yard where there is one."""
+
+    def __init__(self, web: Service, operator: Any) -> None:
+        super().__init__()
+        self._operator = operator
+        web.setServiceParent(self)
+
+    def startService(self) -> None:
+        super().startService()
+        if self._operator is not None:
+            self._operator.connect().addErrback(lambda _: None)
+
+    def stopService(self) -> Any:
+        if self._operator is not None:
+            self._operator.disconnect()
+        return super().stopService()
+
+
+def web_page(settings: Settings, seams: Seams, reactor: Any, node: SwarmNode) -> IService:
+    """The web role: the page over the node's data store, live streams beside it; raises ``MissingExtra``."""
+    from agents.catalogue import DEMO, TASKS
+
+    try:
+        from webnode.app import create_app
+        from webnode.audit import audit
+        from webnode.board import Board
+        from webnode.certificate import doors
+        from webnode.chronicle import chronicle
+        from webnode.fallback import fallbacks
+        from webnode.ground import Ground
+        from webnode.halting import halts
+        from webnode.ledger import state_from
+        from webnode.limits import limits
+        from webnode.live import Events, Shots
+        from webnode.mischief import faults
+        from webnode.server import Files, WebService, caller
+        from webnode.session import sessions
+        from webnode.state import Departed
+        from webnode.survey import survey
+        from webnode.team import TeamDesk
+        from webnode.tuner import tuning
+    except ModuleNotFoundError as error:
+        raise MissingExtra("the web role", "web") from error
+    from drivers.sim.link import TcpConnector
+    from drivers.sim.operator import YardOperator
+
+    yard = settings.web.yard
+    operator = None if yard is None else YardOperator(TcpConnector(), reactor, yard.host, yard.port)
+    desk = TeamDesk(node, TASKS, DEMO, operator)
+    ground = Ground(settings, node, desk, reactor, seams.wall, seams.rng)
+    board = Board(
+        desk,
+        sessions(ground),
+        audit(ground),
+        chronicle(ground),
+        fallbacks(ground),
+        limits(ground),
+        survey(ground),
+        tuning(ground),
+        halts(ground),
+        faults(ground),
+        gateway(settings, seams, reactor, node),
+    )
+    name = settings.node.name
+    # A memory of the departed each: the file lags what is watched by a commit, and one would doubt the other.
+    live = partial(state_from, desk.read, Departed(), name)
+    on_file = partial(state_from, partial(read_records, Path(settings.node.store)), Departed(), name)
+    stored = live if settings.node.store == IN_MEMORY else on_file
+    app = create_app(lambda: stored(seams.wall()), board, caller(reactor), wall=seams.wall)
+    events = Events(lambda: live(seams.wall()), reactor, seams.wall, desk.yard)
+    shots, address = Shots(desk, reactor), settings.web
+    web = WebService(
+        reactor, address.host, address.port, app, events, shots, Files(), board, seams.wall, doors=doors(ground)
+    )
+    return _Page(web, operator)

@@ -1,0 +1,80 @@
+"""What ``webnode.dispatch`` promises."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from twisted.internet.defer import Deferred
+from twisted.trial.unittest import SynchronousTestCase
+
+from webnode.board import Board, OpenSessions, Visitor
+from webnode.desk import MemoryDesk
+from webnode.dispatch import REMEMBERED, Dispatch
+from webnode.errors import Refusal
+from webnode.route import Ask, Route
+
+
+class DispatchTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.board = Board(MemoryDesk(), OpenSessions())
+        self.dispatch = Dispatch()
+        self.called: list[Ask] = []
+        self.told: Any = {"id": 1}
+
+    def answer(self, ask: Ask) -> Any:
+        self.called.append(ask)
+        if isinstance(self.told, Refusal):
+            raise self.told
+        return self.told
+
+    def asked(
+        self, id: str = "", method: Any = "POST", who: str = "ann", path: str = "/things/{uuid}"
+    ) -> Deferred[Any]:
+        route = Route(method, path, "", "operator", self.answer, status=202)
+        visitor = Visitor(who, "operator", who)
+        return self.dispatch.carry_out(route, Ask({"uuid": "01", "x": 5}, visitor, self.board, {}, id, "10.0.0.9"))
+
+    def test_do_once_what_is_asked_twice(self) -> None:
+        """An order with the id of an earlier one gets that one's answer, also while it is under way or was refused."""
+        self.assertEqual(self.successResultOf(self.asked("a")), {"id": 1})
+        self.told = waiting = Deferred[Any]()
+        self.assertEqual(self.successResultOf(self.asked("a")), {"id": 1})
+        first, second = self.asked("b"), self.asked("b")
+        self.assertNoResult(second)
+        waiting.callback({"id": 2})
+        self.assertEqual([self.successResultOf(each) for each in (first, second)], [{"id": 2}] * 2)
+        self.told = Refusal("device", "it left", "wait", 409)
+        for _ in range(2):
+            self.assertEqual(self.failureResultOf(self.asked("c"), Refusal).value.status, 409)
+        self.assertEqual(len(self.called), 3)
+
+    def test_tell_ids_apart(self) -> None:
+        """The same id of another visitor or for another route is another order; without an id each is one."""
+        for each in (self.asked("a"), self.asked("a", who="bob"), self.asked("a", path="/others"), self.asked()):
+            self.successResultOf(each)
+        self.successResultOf(self.asked())
+        self.assertEqual(len(self.called), 5)
+
+    def test_forget_old_ids(self) -> None:
+        """Only so many orders are remembered, the oldest go first."""
+        for number in range(REMEMBERED + 1):
+            self.successResultOf(self.asked(str(number)))
+        self.successResultOf(self.asked("1"))
+        self.assertEqual(len(self.called), REMEMBERED + 1)
+        self.successResultOf(self.asked("0"))
+        self.assertEqual(len(self.called), REMEMBERED + 2)
+
+    def test_note_each_change(self) -> None:
+        """Each order is a line in the audit with who, from where, what, on what, and how it ended; a look is none."""
+        self.successResultOf(self.asked("a"))
+        self.successResultOf(self.asked("a"))
+        self.successResultOf(self.asked(method="GET"))
+        self.told = Refusal("device", "it left", "wait", 409)
+        self.failureResultOf(self.asked(), Refusal)
+        self.told = Deferred()
+        failing = self.asked()
+        self.told.errback(RuntimeError("secret"))
+        self.failureResultOf(failing, RuntimeError)
+        lines = self.board.audit.newest(9)
+        line = {"who": "ann", "role": "operator", "from": "10.0.0.9", "route": "POST /things/{uuid}", "target": "01"}
+        self.assertEqual(lines, [{**line, "outcome": told} for told in ("500", "409 it left", "202")])

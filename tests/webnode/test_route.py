@@ -1,0 +1,133 @@
+"""What ``webnode.route`` and the table of routes promise."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from webnode.board import Board, OpenSessions, Visitor
+from webnode.desk import MemoryDesk
+from webnode.errors import Refusal
+from webnode.route import ALLOWED, Ask, Field, Route, checked, device, guarded
+from webnode.routes.table import TABLE
+from webnode.state import Departed, state_of
+
+
+def route(*fields: Field) -> Route:
+    return Route("POST", "/api/v1/things/{uuid}", "About a thing", "viewer", lambda ask: {}, fields)
+
+
+class CheckedTests(SynchronousTestCase):
+    def refusal(self, field: Field, value: Any) -> Refusal:
+        place = {field.name: value}
+        query = place if field.where == "query" else {}
+        body = place if field.where == "body" else {}
+        found: Refusal = self.assertRaises(Refusal, checked, route(field), {}, query, body)
+        return found
+
+    def test_take_each_kind(self) -> None:
+        """A lawful value of each kind arrives as what the answer uses, from path, query and body."""
+        fields = (
+            Field("uuid", "text", "", "path"),
+            Field("after", "whole", "", "query"),
+            Field("loud", "flag", "", "query"),
+            Field("name", "text", "", most=5),
+            Field("x", "number", "", least=-1.0, most=1.0),
+            Field("n", "whole", "", least=1, most=3),
+            Field("how", "choice", "", choices=("slow", "fast")),
+            Field("can", "table", ""),
+            Field("all", "list", "", most=2),
+        )
+        body = {"name": " a\tb ", "x": 1, "n": 2.0, "how": "fast", "can": {"see": 1}, "all": [1, 2]}
+        given = checked(route(*fields), {"uuid": "01"}, {"after": "7", "loud": "true", "other": "x"}, body)
+        lawful = {"uuid": "01", "after": 7, "loud": True, "name": "a b", "x": 1.0, "n": 2}
+        self.assertEqual(given, {**lawful, "how": "fast", "can": {"see": 1}, "all": [1, 2]})
+        self.assertIs(type(given["n"]), int)
+
+    def test_refuse_each_kind(self) -> None:
+        """A wrong value is refused by field, problem and remedy, whatever kind it should be."""
+        wrong: list[tuple[Field, list[Any]]] = [
+            (Field("name", "text", "", most=5), [5, None, "", " \x00", "abcdef", ["a"], {}]),
+            (Field("code", "text", "", least=3), ["ab"]),
+            (Field("x", "number", "", least=0.0, most=0.0), ["1", True, None, [], 0.1, -0.1, 10**400, float("nan")]),
+            (Field("x", "number", ""), [float("inf"), 2e9]),
+            (Field("n", "whole", "", least=1, most=3), [0, 4, 1.5, "2"]),
+            (Field("on", "flag", ""), [1, "true", None]),
+            (Field("how", "choice", "", choices=("slow", "fast")), ["fas", 1, None, ["slow"]]),
+            (Field("can", "table", ""), [[], "x", None]),
+            (Field("all", "list", "", least=1, most=2), [{}, "x", [], [1, 2, 3]]),
+            (Field("after", "whole", "", "query"), ["x", "1.5", "nan", "", "1e400"]),
+            (Field("loud", "flag", "", "query"), ["yes", "1"]),
+        ]
+        for field, values in wrong:
+            for value in values:
+                refusal = self.refusal(field, value)
+                self.assertEqual((refusal.field, refusal.status), (field.name, 400), value)
+                self.assertTrue(refusal.problem and refusal.remedy.startswith("give "), refusal)
+
+    def test_ask_for_what_is_missing(self) -> None:
+        """A field that is missing is asked for, or has its default where it is not required."""
+        name, seconds = Field("name", "text", ""), Field("s", "number", "", default=15.0, is_required=False)
+        self.assertEqual(self.assertRaises(Refusal, checked, route(name), {}, {}, {}).field, "name")
+        self.assertEqual(checked(route(seconds), {}, {}, {}), {"s": 15.0})
+
+    def test_refuse_unknown_fields(self) -> None:
+        """A field that the route does not take is refused with the nearest that it does; a body is an object."""
+        refusal = self.assertRaises(Refusal, checked, route(Field("tolerates", "whole", "")), {}, {}, {"toleratse": 1})
+        self.assertEqual(refusal.field, "toleratse")
+        self.assertIn("tolerates", refusal.remedy)
+        self.assertEqual(self.assertRaises(Refusal, checked, route(), {}, {}, {"x": 1}).status, 400)
+        bodies: list[object] = [None, [], "x", 5]
+        for body in bodies:
+            self.assertEqual(self.assertRaises(Refusal, checked, route(), {}, {}, body).field, "body")
+
+
+class GuardedTests(SynchronousTestCase):
+    def test_let_in_by_role(self) -> None:
+        """An operator may do all, a viewer look, a phone what phones do; who is nobody is told to sign in."""
+        for wanted, lawful in ALLOWED.items():
+            for role in ALLOWED:
+                if role in lawful:
+                    guarded(wanted, Visitor("x", role))
+                else:
+                    refusal = self.assertRaises(Refusal, guarded, wanted, Visitor("x", role))
+                    self.assertEqual(refusal.status, 401 if role == "anyone" else 403)
+
+
+class DeviceTests(SynchronousTestCase):
+    def test_find_the_device(self) -> None:
+        """A device that is here is found; one that left is told of with 409, an unknown one with 404."""
+        departed, dogs = Departed(), [{"uuid": f"0{n}", "name": f"dog{n}", "joined": n} for n in (1, 2)]
+        departed.of(dogs, 1.0)
+        state = state_of(dogs[:1], [], {}, departed=departed.of(dogs[:1], 2.0))
+        board = Board(MemoryDesk(), OpenSessions())
+        self.assertEqual(device(Ask({"uuid": "01"}, Visitor(), board, state))["name"], "dog1")
+        for uuid, status in (("02", 409), ("03", 404)):
+            ask = Ask({"uuid": uuid}, Visitor(), board, state)
+            self.assertEqual(self.assertRaises(Refusal, device, ask).status, status)
+
+
+class TableTests(SynchronousTestCase):
+    def test_each_route_is_whole(self) -> None:
+        """Every route says what it does, names every part of its path as a field, and stands once in the table."""
+        for each in TABLE:
+            named = {field.name for field in each.fields if field.where == "path"}
+            self.assertEqual(named, set(re.findall(r"\{(\w+)\}", each.path)), each.name)
+            self.assertTrue(each.about and all(field.about for field in each.fields), each.name)
+            self.assertTrue(each.answer is None or each.path.startswith("/api/v1/"), each.name)
+        names = [each.name for each in TABLE]
+        self.assertEqual(len(names), len(set(names)))
+
+    def test_orders_are_for_operators(self) -> None:
+        """Whatever changes something wants an operator, but for signing in and what a phone does; looking a viewer."""
+        for each in TABLE:
+            if each.method != "GET" and each.role != "operator":
+                self.assertTrue(each.role == "phone" or each.path in FOR_ALL, each.name)
+            if each.method == "GET" and each.role == "anyone":
+                self.assertIn(each.path, FOR_ALL, each.name)
+
+
+FOR_ALL = ("/api/v1/node", "/api/v1/session", "/api/v1/tasks/preview", "/api/v1/ca.crt", "/static/{file}", "/sw.js")
+"""What is no secret, and what a visitor needs before it has signed in."""

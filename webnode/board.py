@@ -1,0 +1,313 @@
+"""The board: all that the answers of the page's routes may use, each part behind a protocol.
+
+Whoever needs a part asks for it here, so that no route knows how it is done.  The parts that every web node has come
+with a twin in memory; what is None the node does not have, and the page, told by ``has``, shows nothing of it.
+Everything is called on the reactor's thread but ``Sessions.visitor`` and ``Fallbacks.lets_in``, which may be called on
+any.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal, Protocol
+
+from twisted.internet.defer import Deferred, succeed
+
+from webnode.desk import Desk
+from webnode.field import Json
+from webnode.state import State
+
+Role = Literal["anyone", "viewer", "operator", "phone"]
+AUDITED = 200
+
+
+@dataclass(frozen=True)
+class Visitor:
+    """Who asks; ``token_id`` names what it signed in with, and is no secret."""
+
+    name: str = ""
+    role: Role = "anyone"
+    token_id: str = ""
+
+
+@dataclass(frozen=True)
+class Token:
+    """What a visitor who signed in shows: ``text`` in a header, ``ticket`` in the query of a GET.
+
+    The ticket stands for the same session and lets look only, as a URL is seen by more than a header.  ``until`` is
+    unix seconds.
+    """
+
+    text: str
+    ticket: str
+    role: Role
+    until: float
+
+
+class Sessions(Protocol):
+    """Who has signed in; ``now`` is unix seconds."""
+
+    def sign_in(self, proof: str, source: str, now: float) -> Deferred[Token]:
+        """Sign in with a code or password, from the address ``source``; fails with ``Refusal`` 401 or 429."""
+
+    def visitor(self, token: str, now: float) -> Visitor:
+        """Who shows this token or ticket; never raises, and changes nothing.  Without one: anyone."""
+
+    def token(self, name: str, role: Role, now: float, seconds: float) -> Token:
+        """A token for somebody who need not sign in."""
+
+    def revoke(self, token_id: str) -> None:
+        """Let in nobody with this token any more."""
+
+
+class OpenSessions:
+    """Everybody is an operator: for a page of this machine alone, and for tests."""
+
+    def sign_in(self, proof: str, source: str, now: float) -> Deferred[Token]:
+        """Let in whoever asks, for a day."""
+        return succeed(self.token("visitor", "operator", now, 86400.0))
+
+    def visitor(self, token: str, now: float) -> Visitor:
+        """Return an operator."""
+        return Visitor("visitor", "operator")
+
+    def token(self, name: str, role: Role, now: float, seconds: float) -> Token:
+        """Return one that says nothing."""
+        return Token("open", "open", role, now + seconds)
+
+    def revoke(self, token_id: str) -> None:
+        """Do nothing."""
+
+
+class Audit(Protocol):
+    """Who changed what."""
+
+    def note(self, who: Visitor, source: str, route: str, target: str, outcome: str) -> None:
+        """Keep one line: ``route`` is method and path, ``target`` what its path named, ``outcome`` the status."""
+
+    def newest(self, count: int) -> list[dict[str, Json]]:
+        """The newest lines, the newest first."""
+
+
+class MemoryAudit:
+    """The newest lines, forgotten when the node ends."""
+
+    def __init__(self) -> None:
+        self._lines: deque[dict[str, Json]] = deque(maxlen=AUDITED)
+
+    def note(self, who: Visitor, source: str, route: str, target: str, outcome: str) -> None:
+        """Keep one line."""
+        line = {"who": who.name, "role": who.role, "from": source, "route": route}
+        self._lines.appendleft({**line, "target": target, "outcome": outcome})
+
+    def newest(self, count: int) -> list[dict[str, Json]]:
+        """The newest lines, the newest first."""
+        return list(self._lines)[:count]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """Something that happened: ``n`` counts them, ``at`` is unix seconds, ``seconds`` how long it took (or None)."""
+
+    n: int
+    at: float
+    kind: str
+    uuid: str
+    task: str
+    text: str
+    seconds: float | None = None
+
+
+class Chronicle(Protocol):
+    """What happened in the team since this node looks."""
+
+    def saw(self, state: State, now: float) -> None:
+        """Take the next state."""
+
+    def faulted(self, uuid: str, kind: str, now: float) -> None:
+        """Remember that a fault was caused on purpose, so that the takeover is timed from it."""
+
+    def since(self, number: int, about: str = "") -> list[Entry]:
+        """The entries after ``number``, those about one device or task where ``about`` names it."""
+
+
+class MemoryChronicle:
+    """Entries put there by hand, in ``entries``; ``faults`` are (uuid, kind, now)."""
+
+    def __init__(self) -> None:
+        self.entries: list[Entry] = []
+        self.faults: list[tuple[str, str, float]] = []
+
+    def saw(self, state: State, now: float) -> None:
+        """Make nothing of it."""
+
+    def faulted(self, uuid: str, kind: str, now: float) -> None:
+        """Write it down."""
+        self.faults.append((uuid, kind, now))
+
+    def since(self, number: int, about: str = "") -> list[Entry]:
+        """The entries after ``number``."""
+        return [entry for entry in self.entries if entry.n > number and about in ("", entry.uuid, entry.task)]
+
+
+@dataclass(frozen=True)
+class Page:
+    """A URL at which a node of the team serves the page; ``node`` is the node's uuid."""
+
+    node: str
+    url: str
+    is_secure: bool = False
+    is_self: bool = False
+
+
+class Fallbacks(Protocol):
+    """The web nodes of the team."""
+
+    def here(self) -> list[Page]:
+        """Where the page is served now."""
+
+    def lets_in(self, origin: str) -> bool:
+        """Whether a page that came from ``origin`` may ask here: it is, or was a short while ago, one of the team's."""
+
+
+class MemoryFallbacks:
+    """The pages that it was made with, and no others."""
+
+    def __init__(self, *pages: Page) -> None:
+        self.pages = list(pages)
+
+    def here(self) -> list[Page]:
+        """Return them."""
+        return self.pages
+
+    def lets_in(self, origin: str) -> bool:
+        """Whether one of them is served there."""
+        return origin in [page.url for page in self.pages]
+
+
+class Limits(Protocol):
+    """How much one address may have open at once."""
+
+    def unfinished(self, address: str) -> bool:
+        """Whether it may have one more request under way."""
+
+    def stream(self, address: str) -> bool:
+        """Whether it may have one more stream open."""
+
+
+class NoLimits:
+    """As much as it likes."""
+
+    def unfinished(self, address: str) -> bool:
+        """Return True."""
+        return True
+
+    def stream(self, address: str) -> bool:
+        """Return True."""
+        return True
+
+
+class Survey(Protocol):
+    """What devices answer when they are asked over the network; Deferreds fail with ``Refusal`` 409 or 504."""
+
+    def network(self) -> Deferred[Json]:
+        """Who knows whom, and how far they are."""
+
+    def inventory(self, uuid: str) -> Deferred[Json]:
+        """What a device stores."""
+
+
+@dataclass(frozen=True)
+class Knob:
+    """A setting of a device that can be changed while it runs."""
+
+    key: str
+    value: Json
+    about: str
+    unit: str = ""
+    least: float | None = None
+    most: float | None = None
+    choices: tuple[str, ...] = ()
+
+
+class Tuning(Protocol):
+    """The settings of devices; Deferreds fail with ``Refusal``: 400 names the key, 409 and 504 the device."""
+
+    def settings(self, uuid: str) -> Deferred[list[Knob]]:
+        """What can be changed."""
+
+    def change(self, uuid: str, changes: Mapping[str, Json]) -> Deferred[list[Knob]]:
+        """Change some, all or none; the device checks them."""
+
+
+class Halts(Protocol):
+    """Stopping the whole team; answers map each uuid to ``stands``, or to why it does not."""
+
+    def halt(self, by: str) -> Deferred[dict[str, str]]:
+        """Let everything stand, and stay."""
+
+    def release(self, by: str) -> Deferred[dict[str, str]]:
+        """Let it go on."""
+
+    def is_halted(self) -> bool:
+        """Whether the team is halted."""
+
+
+class Faults(Protocol):
+    """Faults that are caused on purpose, where devices allow it; each heals itself after its seconds."""
+
+    def kinds(self, uuid: str) -> Sequence[str]:
+        """What can be caused there."""
+
+    def cause(self, uuid: str, kind: str, seconds: float, amount: float) -> Deferred[None]:
+        """Cause one; fails with ``Refusal``."""
+
+    def active(self) -> list[dict[str, Json]]:
+        """Those that go on, and what came of each."""
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What a phone is asked for: so many pictures a second, and words for who holds it."""
+
+    fps: float
+    say: str = ""
+
+
+class Phones(Protocol):
+    """Phones that take part as devices, with this node as their way into the team."""
+
+    def join(self, secret: bytes, name: str, can: Mapping[str, Any]) -> Deferred[str]:
+        """Let a phone take part; returns its uuid, which is the same for the same secret at every web node."""
+
+    def look(self, uuid: str, jpeg: bytes, values: Mapping[str, float]) -> Wanted:
+        """Take what it sees and measures."""
+
+    def leave(self, uuid: str) -> None:
+        """Let it go."""
+
+
+@dataclass
+class Board:
+    """All of it; who may come in is always said, the rest is the twin in memory, or None for what a node may lack."""
+
+    desk: Desk
+    sessions: Sessions
+    audit: Audit = field(default_factory=MemoryAudit)
+    chronicle: Chronicle = field(default_factory=MemoryChronicle)
+    fallbacks: Fallbacks = field(default_factory=MemoryFallbacks)
+    limits: Limits = field(default_factory=NoLimits)
+    survey: Survey | None = None
+    tuning: Tuning | None = None
+    halts: Halts | None = None
+    faults: Faults | None = None
+    phones: Phones | None = None
+
+    @property
+    def has(self) -> list[str]:
+        """What this node has beyond what every web node has, for the page."""
+        parts = ("survey", "tuning", "halts", "faults", "phones")
+        yard = ["yard"] if self.desk.yard() is not None else []
+        return yard + [name for name in parts if getattr(self, name) is not None]

@@ -1,0 +1,76 @@
+"""Dispatch: a route's answer, called once for what is asked once, with a line in the audit for each change."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from typing import Any
+
+from twisted.internet.defer import Deferred, maybeDeferred
+from twisted.python.failure import Failure
+
+from webnode.errors import Refusal
+from webnode.route import Ask, Route
+
+REMEMBERED = 256
+"""Orders that are known again when they are repeated."""
+
+
+class Dispatch:
+    """Carries out what is asked of routes; on the reactor's thread."""
+
+    def __init__(self) -> None:
+        self._answers: OrderedDict[tuple[str, str, str], _Answer] = OrderedDict()
+
+    def carry_out(self, route: Route, ask: Ask) -> Deferred[Any]:
+        """The answer; one that was given to the same id from the same visitor is given again."""
+        if route.method == "GET":
+            return self._called(route, ask)
+        if not ask.id:
+            return self._noted(route, ask)
+        key = ask.who.token_id, route.name, ask.id
+        known = self._answers.get(key)
+        if known is None:
+            known = self._answers[key] = _Answer()
+            while len(self._answers) > REMEMBERED:
+                self._answers.popitem(last=False)
+            self._noted(route, ask).addBoth(known.came)
+        return known.wait()
+
+    def _called(self, route: Route, ask: Ask) -> Deferred[Any]:
+        assert route.answer is not None
+        return maybeDeferred(route.answer, ask)
+
+    def _noted(self, route: Route, ask: Ask) -> Deferred[Any]:
+        def note(outcome: Any) -> Any:
+            told = str(route.status)
+            if isinstance(outcome, Failure):
+                refusal = outcome.value
+                told = f"{refusal.status} {refusal.problem}" if isinstance(refusal, Refusal) else "500"
+            named = {name for name in ask.given if f"{{{name}}}" in route.path}
+            target = " ".join(str(ask.given[name]) for name in sorted(named))
+            ask.board.audit.note(ask.who, ask.source, route.name, target, told)
+            return outcome
+
+        return self._called(route, ask).addBoth(note)
+
+
+class _Answer:
+    """What came, or who waits for it."""
+
+    def __init__(self) -> None:
+        self._outcome: list[Any] = []
+        self._waiting: list[Deferred[Any]] = []
+
+    def wait(self) -> Deferred[Any]:
+        waiter: Deferred[Any] = Deferred()
+        if self._outcome:
+            waiter.callback(self._outcome[0])
+        else:
+            self._waiting.append(waiter)
+        return waiter
+
+    def came(self, outcome: Any) -> None:
+        self._outcome.append(outcome)
+        waiting, self._waiting = self._waiting, []
+        for waiter in waiting:
+            waiter.callback(outcome)

@@ -1,0 +1,24 @@
+"""Ground: what the front door has, from which the parts of the board are made."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from middleware.node import SwarmNode
+from middleware.settings import Settings
+from webnode.team import TeamDesk
+
+
+@dataclass(frozen=True)
+class Ground:
+    """One web node: ``wall`` is unix time in seconds, ``rng`` the dice of the machine."""
+
+    settings: Settings
+    node: SwarmNode
+    desk: TeamDesk
+    reactor: Any
+    wall: Callable[[], float]
+    rng: random.Random

@@ -1,0 +1,118 @@
+"""Routes of the tasks: what there is to do, what is done, and what an operator wants of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from webnode.errors import Refusal
+from webnode.field import Json
+from webnode.route import API, Answer, Ask, Field, Route
+
+TASK = Field("task_id", "text", "the task", "path", most=64)
+
+
+def tasks(ask: Ask) -> Json:
+    """All of them."""
+    listed: Json = ask.state["tasks"]
+    return listed
+
+
+def catalogue(ask: Ask) -> Json:
+    """Those that can be assigned."""
+    return [dict(task) for task in ask.board.desk.catalogue()]
+
+
+def demo(ask: Ask) -> Json:
+    """Run the demonstration."""
+    return {"id": ask.board.desk.run_demo()}
+
+
+def assign(ask: Ask) -> Any:
+    """Assign one; the answer may be its id alone."""
+    answer = ask.board.desk.assign(ask.given["name"], ask.given["tolerates"])
+    return answer if isinstance(answer, dict) else {"id": answer}
+
+
+def _order(wish: Callable[[Ask], Callable[[str], Any]]) -> Answer:
+    def answer(ask: Ask) -> Json:
+        task_id = ask.given["task_id"]
+        if task_id not in [task["id"] for task in ask.state["tasks"]]:
+            raise Refusal("task", "there is no such task", f"choose one of {API}/tasks", 404)
+        wish(ask)(task_id)
+        return {"id": task_id}
+
+    return answer
+
+
+ROUTES = (
+    Route("GET", f"{API}/tasks", "The tasks, the newest first", "viewer", tasks, gives="a list of tasks"),
+    Route(
+        "GET",
+        f"{API}/catalogue",
+        "The predefined tasks",
+        "viewer",
+        catalogue,
+        gives="a list of name, title, requirements",
+    ),
+    Route(
+        "POST",
+        f"{API}/demo",
+        "Run Demo: cancels open tasks, takes the target away, assigns the demonstration's task, places it 5 s later",
+        "operator",
+        demo,
+        gives="id",
+        status=202,
+    ),
+    Route(
+        "POST",
+        f"{API}/tasks",
+        "Assign a predefined task",
+        "operator",
+        assign,
+        (
+            Field("name", "text", "its name in the catalogue", most=64),
+            Field(
+                "tolerates",
+                "whole",
+                "members of its council that may be lost at once",
+                least=1,
+                most=3,
+                default=1,
+                is_required=False,
+            ),
+        ),
+        gives="id, able, refused (why, by name)",
+        status=202,
+    ),
+    Route(
+        "POST",
+        f"{API}/tasks/{{task_id}}/cancel",
+        "End a task; nobody is granted it any more",
+        "operator",
+        _order(lambda ask: ask.board.desk.cancel),
+        (TASK,),
+        gives="id",
+        status=202,
+    ),
+    Route(
+        "POST",
+        f"{API}/tasks/{{task_id}}/pause",
+        "Let a task rest; its devices stop and are free for others",
+        "operator",
+        _order(lambda ask: ask.board.desk.pause),
+        (TASK,),
+        gives="id",
+        status=202,
+    ),
+    Route(
+        "POST",
+        f"{API}/tasks/{{task_id}}/resume",
+        "Let a task go on from where it was",
+        "operator",
+        _order(lambda ask: ask.board.desk.resume),
+        (TASK,),
+        gives="id",
+        status=202,
+    ),
+)
