@@ -19,6 +19,25 @@ FLAGS = [
 ]
 PHONE = {"viewport": {"width": 412, "height": 839}, "has_touch": True}
 DESK = {"viewport": {"width": 1280, "height": 800}}
+PANELS = """async () => {
+  const { panel } = await import("/static/panel.js");
+  const { model } = await import("/static/model.js");
+  globalThis.seen = { model };
+  const needs = { role: "operator", has: "faults" };
+  const noted = (root) => {
+    root.textContent = "second";
+    return {
+      update: (_, event) => { root.dataset.told = `${root.dataset.told ?? "told"} ${event}`; },
+      close: () => { document.body.dataset.closed = root.dataset.told; },
+    };
+  };
+  panel({ place: "tasks", order: 20, title: "Second", needs, load: async () => ({ make: noted }) });
+  panel({ place: "tasks", order: 10, title: "First", needs, make: (root) => {
+    root.textContent = "first";
+    return { update: (_, event) => { if (event === "state") throw new Error("a fault of one"); } };
+  } });
+}"""
+"""Two panels that a node with faults shows to operators; one fails at each state."""
 MISSING = [
     *(() if CHROMIUM else ("the program chromium (apt-get install chromium)",)),
     *(
@@ -192,6 +211,42 @@ class PageTests(SynchronousTestCase):
         phone = self.opened(PHONE)
         phone.locator(".device").first.tap()
         phone.locator("dialog[open]").wait_for()
+
+    def test_go_back_from_a_device(self) -> None:
+        """A device has an address of its own: the back button leaves it, a link leads to it, an unknown place to none."""
+        page = self.opened(DESK)
+        dialog = page.locator("dialog[open]")
+        page.locator(".device").nth(1).dblclick()
+        dialog.wait_for()
+        self.assertIn("#device/0202", page.url)
+        page.go_back()
+        dialog.wait_for(state="hidden")
+        page.evaluate("location.hash = 'device/' + '03'.repeat(16)")
+        page.locator("#d-name", has_text="dog3").wait_for()
+        page.locator("#d-close").click()
+        dialog.wait_for(state="hidden")
+        self.assertNotIn("#device", page.url)
+        page.evaluate("location.hash = 'nowhere/%'")
+        page.locator(".device").first.dblclick()
+        dialog.wait_for()
+        self.assertEqual(self.faults, [])
+
+    def test_give_panels_their_place(self) -> None:
+        """A panel stands where it belongs, in order, for whom and where it is meant, is told what comes, and ends."""
+        page = self.opened(DESK)
+        page.evaluate(PANELS)
+        self.assertEqual(page.locator("#place-tasks > [data-order]").all_inner_texts(), [])
+        page.evaluate("seen.model.has = [...seen.model.has, 'faults']")
+        page.locator("#place-tasks > [data-order]").nth(1).wait_for()
+        self.assertEqual(page.locator("#place-tasks > [data-order]").all_inner_texts(), ["first", "second"])
+        self.team.order("status dog3 DONE")
+        page.locator("[data-told*=state]").wait_for()
+        page.evaluate("seen.model.me = { name: '', role: 'viewer' }")
+        page.locator("body[data-closed^='told  ']").wait_for()
+        self.assertEqual(page.locator("#place-tasks > [data-order]").count(), 0)
+        self.assertEqual(len(self.faults), 1, self.faults)
+        self.assertIn("a fault of one", self.faults[0])
+        page.locator(".device[data-state=DONE]", has_text="dog3").wait_for()
 
     def test_speak_to_a_device(self) -> None:
         """From the dialog a message is sent and a device told to leave; the answer stands there in words."""

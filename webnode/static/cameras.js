@@ -1,7 +1,8 @@
 // Cameras: one loop each, one picture in flight each; the newest wins, and nothing is fetched that nobody sees.
 import { at, attribute, element, keyed, words } from "./element.js";
+import { frames } from "./link.js";
+import { panel } from "./panel.js";
 
-const VIEWER = Math.random().toString(36).slice(2, 12);
 const cameras = new Map();
 
 class Camera {
@@ -37,7 +38,7 @@ class Camera {
       this.flight = new AbortController();
       const deadline = setTimeout(() => this.flight?.abort(), 12000);
       try {
-        const answer = await fetch(`/shot/${this.uuid}?after=${this.seq}&viewer=${VIEWER}`, { signal: this.flight.signal });
+        const answer = await frames(this.uuid, this.seq, this.flight.signal);
         if (answer.status === 200) {
           const picture = await createImageBitmap(await answer.blob());
           this.seq = answer.headers.get("X-Seq");
@@ -79,7 +80,7 @@ class Camera {
 
 const pause = () => new Promise((done) => setTimeout(done, 1000));
 
-export function showCameras(devices) {
+function showCameras(devices) {
   const seeing = devices.filter((device) => device.capabilities.camera);
   at("no-cameras").hidden = seeing.length > 0;
   for (const [uuid, camera] of cameras) {
@@ -101,7 +102,16 @@ export function showCameras(devices) {
     });
 }
 
-export function startCameras() {
-  document.addEventListener("visibilitychange", () => cameras.forEach((camera) => camera.turn()));
-  setInterval(() => cameras.forEach((camera) => camera.tell()), 250);
-}
+panel({
+  place: "cameras",
+  title: "Cameras",
+  make() {
+    document.addEventListener("visibilitychange", () => cameras.forEach((camera) => camera.turn()));
+    setInterval(() => cameras.forEach((camera) => camera.tell()), 250);
+    return {
+      update(model, event) {
+        if (event === "state") showCameras([...model.devices.values()]);
+      },
+    };
+  },
+});

@@ -1,6 +1,8 @@
 // Devices: the list in the order of joining, and the dialog with what is known of one.
 import { at, attribute, badge, element, keyed, span, state, words } from "./element.js";
 import { say, wish } from "./desk.js";
+import { panel } from "./panel.js";
+import { go } from "./shell.js";
 
 let devices = [];
 let open = "";
@@ -8,16 +10,15 @@ let now = 0;
 
 const age = (device) => (device.gone === null ? `here ${span(now - device.since)}` : `gone ${span(now - device.gone)}`);
 
-export function showDevices(list) {
+function showDevices(list) {
   devices = list;
   const here = list.filter((device) => device.gone === null).length;
   words(at("count"), list.length ? String(here) : "");
   at("no-devices").hidden = list.length > 0;
   keyed(at("devices"), list, (device) => device.uuid, row, update);
-  if (open) fill();
 }
 
-export function tellTime(moment) {
+function tellTime(moment) {
   now = moment;
   for (const child of at("devices").children) {
     const device = devices.find((each) => each.uuid === child.dataset.key);
@@ -32,8 +33,8 @@ function row(device) {
   let pointer = "mouse";
   button.addEventListener("pointerdown", (event) => { pointer = event.pointerType; });
   // A tap or Enter opens at once; with a mouse one click only marks, as the double click is what opens.
-  button.addEventListener("click", (event) => { if (event.detail === 0 || pointer !== "mouse") show(device.uuid); });
-  button.addEventListener("dblclick", () => show(device.uuid));
+  button.addEventListener("click", (event) => { if (event.detail === 0 || pointer !== "mouse") go(`device/${device.uuid}`); });
+  button.addEventListener("dblclick", () => go(`device/${device.uuid}`));
   return element("li", {}, button);
 }
 
@@ -50,7 +51,7 @@ function show(uuid) {
   open = uuid;
   words(at("d-answer"), "");
   fill();
-  if (!at("device").open) at("device").showModal();
+  if (!at("place-device").open) at("place-device").showModal();
 }
 
 function facts(list, entries) {
@@ -81,28 +82,64 @@ function fill() {
   const told = device.messages.map(([moment, text]) => [new Date(moment * 1000).toLocaleTimeString(), text]);
   keyed(at("d-messages"), told.length ? told : [["", "No messages."]], (entry) => entry.join(), () => element("li"),
     (item, entry) => words(item, entry.join(" ").trim()));
-  for (const button of at("device").querySelectorAll("form button")) button.disabled = device.gone !== null;
+  for (const button of at("place-device").querySelectorAll("form button")) button.disabled = device.gone !== null;
 }
 
-export function startDevices() {
+function startDevice() {
   const line = (text) => words(at("d-answer"), text);
-  at("d-close").addEventListener("click", () => at("device").close());
-  at("device").addEventListener("close", () => { open = ""; });
-  at("device").addEventListener("click", (event) => { if (event.target === at("device")) at("device").close(); });
+  const dialog = at("place-device");
+  at("d-close").addEventListener("click", () => dialog.close());
+  dialog.addEventListener("close", () => { if (open) go(""); });
+  dialog.addEventListener("click", (event) => { if (event.target === dialog) dialog.close(); });
   at("d-message").addEventListener("submit", async (event) => {
     event.preventDefault();
     const body = { text: at("d-text").value };
-    if (await wish("Message", `/api/v1/devices/${open}/message`, { body, line, done: () => "Message sent." })) at("d-text").value = "";
+    if (await wish("Message", `devices/${open}/message`, { body, line, done: () => "Message sent." })) at("d-text").value = "";
   });
   at("d-leave").addEventListener("submit", (event) => {
     event.preventDefault();
     const seconds = Number(at("d-seconds").value);
-    wish("Disconnecting", `/api/v1/devices/${open}/disconnect`,
+    wish("Disconnecting", `devices/${open}/disconnect`,
       { body: { seconds }, line, done: () => `It leaves the network and comes back after ${seconds} s.` });
   });
+}
+
+function startDevices() {
   at("announce").addEventListener("submit", async (event) => {
     event.preventDefault();
     const body = { text: at("announce-text").value };
-    if (await wish("Message", "/api/v1/message", { body, line: say, done: () => "Message sent to all devices." })) at("announce-text").value = "";
+    if (await wish("Message", "message", { body, line: say, done: () => "Message sent to all devices." })) at("announce-text").value = "";
   });
 }
+
+panel({
+  place: "devices",
+  title: "Devices",
+  make() {
+    startDevices();
+    return {
+      update(model, event) {
+        if (event === "state") showDevices([...model.devices.values()]);
+        if (event === "beat") tellTime(model.now);
+      },
+    };
+  },
+});
+
+panel({
+  place: "device",
+  title: "Device",
+  make(dialog) {
+    startDevice();
+    return {
+      update(model, event) {
+        if (open && event === "state") fill();
+      },
+      show,
+      hide() {
+        open = "";
+        dialog.close();
+      },
+    };
+  },
+});

@@ -1,7 +1,8 @@
 // Groups: what each agent bids for a task, whom it computed as the winner, and whether they agree.
 import { at, attribute, element, keyed, words } from "./element.js";
+import { panel } from "./panel.js";
 
-export function showGroups(groups) {
+function showGroups(groups) {
   at("no-groups").hidden = groups.length > 0;
   keyed(at("groups"), groups, (group) => group.task,
     () => element("article", {}, element("h3"), element("p", { class: "point" }), element("ul", { class: "bids" })), update);
@@ -36,3 +37,15 @@ function bid() {
   return element("li", {}, element("b"), element("span", { class: "bid", "aria-hidden": "true" }, element("i")),
     element("span", { class: "cost" }), element("span", { class: "choice" }));
 }
+
+panel({
+  place: "groups",
+  title: "Consensus",
+  make() {
+    return {
+      update(model, event) {
+        if (event === "state") showGroups([...model.groups.values()]);
+      },
+    };
+  },
+});

@@ -1,6 +1,7 @@
 // The map: the yard from above, in centimetres with y upwards; the target follows a finger, a mouse or the arrow keys.
 import { at, attribute, drawn, keyed, words } from "./element.js";
 import { wish } from "./desk.js";
+import { panel } from "./panel.js";
 
 const STEP = 0.05;
 const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
@@ -16,8 +17,8 @@ const dogs = drawn("g");
 const target = drawn("g", { class: "target", role: "button", tabindex: 0 },
   drawn("circle", { class: "reach", r: 22 }), drawn("circle", { class: "ring", r: 13 }), drawn("circle", { class: "ball", r: 8 }));
 
-export function showYard(snapshot) {
-  at("yard").hidden = !snapshot;
+function showYard(snapshot) {
+  at("place-map").hidden = !snapshot;
   if (snapshot && yard && performance.now() < settleAt) snapshot = { ...snapshot, target: yard.target };
   yard = snapshot;
   if (!snapshot) return;
@@ -88,11 +89,11 @@ function want(spot) {
   yard = { ...yard, target: spot && { ...yard.target, ...spot } };
   placeTarget(yard.target);
   send(spot
-    ? () => wish("Moving the target", "/api/v1/target", { body: spot, done: () => `Target moved to ${spot.x.toFixed(2)}, ${spot.y.toFixed(2)} m.` })
-    : () => wish("Taking the target away", "/api/v1/target", { method: "DELETE", done: () => "The target is taken away." }));
+    ? () => wish("Moving the target", "target", { body: spot, done: () => `Target moved to ${spot.x.toFixed(2)}, ${spot.y.toFixed(2)} m.` })
+    : () => wish("Taking the target away", "target", { method: "DELETE", done: () => "The target is taken away." }));
 }
 
-export function startMap() {
+function startMap() {
   const map = at("map");
   map.append(floor, grid, dogs, target);
   map.addEventListener("click", (event) => {
@@ -115,3 +116,16 @@ export function startMap() {
   at("put").addEventListener("click", () => { if (yard) want(inside(yard.walls[0] / 2, yard.walls[1] / 2)); });
   at("clear").addEventListener("click", () => { if (yard) want(null); });
 }
+
+panel({
+  place: "map",
+  title: "Yard",
+  make() {
+    startMap();
+    return {
+      update(model, event) {
+        if (event === "yard") showYard(model.yard);
+      },
+    };
+  },
+});

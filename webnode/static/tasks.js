@@ -1,11 +1,13 @@
 // Tasks: choosing a predefined one, seeing what became of each, and taking it back.
 import { at, attribute, badge, element, keyed, state, words } from "./element.js";
-import { ask, say, wish } from "./desk.js";
+import { say, wish } from "./desk.js";
+import { ask, get } from "./link.js";
+import { panel } from "./panel.js";
 
 const ENDED = ["COMPLETED", "FAILED", "CANCELLED"];
 const SHOWN = 8;
 
-export function showTasks(tasks) {
+function showTasks(tasks) {
   at("no-tasks").hidden = tasks.length > 0;
   keyed(at("tasks"), tasks.slice(0, SHOWN), (task) => task.id, row, (item, task) => {
     words(item.querySelector("b"), task.title);
@@ -23,11 +25,11 @@ export function showTasks(tasks) {
 
 function row(task) {
   const button = element("button", {}, "Cancel");
-  button.addEventListener("click", () => wish(`Cancelling ${task.title}`, `/api/v1/tasks/${encodeURIComponent(task.id)}/cancel`));
+  button.addEventListener("click", () => wish(`Cancelling ${task.title}`, `tasks/${encodeURIComponent(task.id)}/cancel`));
   const rest = element("button", {}, "Pause");
   rest.addEventListener("click", () => {
     const isPaused = rest.textContent === "Resume";
-    wish(`${isPaused ? "Resuming" : "Pausing"} ${task.title}`, `/api/v1/tasks/${encodeURIComponent(task.id)}/${isPaused ? "resume" : "pause"}`);
+    wish(`${isPaused ? "Resuming" : "Pausing"} ${task.title}`, `tasks/${encodeURIComponent(task.id)}/${isPaused ? "resume" : "pause"}`);
   });
   return element("li", {}, element("b"), badge(), element("span", { class: "note" }),
     element("details", {}, element("summary"), element("div")), button, rest);
@@ -55,25 +57,25 @@ function outcome({ able = [], refused = {} }) {
 }
 
 // The catalogue is read when the page connects, and again after each loss.
-export async function readCatalogue() {
-  const catalogue = await fetch("/api/v1/catalogue").then((answer) => (answer.ok ? answer.json() : null)).catch(() => null);
+async function readCatalogue() {
+  const catalogue = await get("catalogue").catch(() => null);
   if (!catalogue) return;
   const chosen = at("task").value;
   at("task").replaceChildren(...catalogue.map((task) => element("option", { value: task.name }, task.title || task.name)));
   if (chosen) at("task").value = chosen;
 }
 
-export function startTasks() {
+function startTasks() {
   at("assign").addEventListener("submit", (event) => {
     event.preventDefault();
     if (!at("task").value) return say("There is no predefined task to assign.");
-    wish("Assigning", "/api/v1/tasks", { body: { name: at("task").value }, done: outcome });
+    wish("Assigning", "tasks", { body: { name: at("task").value }, done: outcome });
   });
   at("demo").addEventListener("click", async () => {
     at("demo").disabled = true;
     say("Starting the demo …");
     try {
-      await ask("/api/v1/demo");
+      await ask("POST", "demo");
       say("The demo runs.");
     } catch (error) {
       say(error.message);
@@ -81,3 +83,17 @@ export function startTasks() {
     at("demo").disabled = false;
   });
 }
+
+panel({
+  place: "tasks",
+  title: "Tasks",
+  make() {
+    startTasks();
+    return {
+      update(model, event) {
+        if (event === "state") showTasks([...model.tasks.values()]);
+        if (event === "link" && model.link === "live") readCatalogue();
+      },
+    };
+  },
+});

@@ -1,0 +1,50 @@
+// The header: to which node the page is connected, and in one line what was done and what changed.
+import { at, attribute, words } from "./element.js";
+import { say } from "./desk.js";
+import { panel } from "./panel.js";
+
+const LINKS = { live: "connected", lost: "connection lost, trying again", wait: "connecting" };
+let statuses = new Map();
+let link = "wait";
+
+function tellLink(now) {
+  if (now === "lost") say("Connection lost. What you see is the last that was heard.");
+  else if (link === "lost") say("Connected again.");
+  link = now;
+  attribute(at("link"), "data-link", now);
+  attribute(document.body, "data-link", now);
+  words(at("link"), LINKS[now]);
+}
+
+// What changed since the state before, in words for the status line.
+function tellNews({ devices, tasks }) {
+  const news = [];
+  for (const device of devices.values()) {
+    const before = statuses.get(device.uuid);
+    if (before === device.status || statuses.size === 0) continue;
+    if (!before) news.push(`${device.name} joined`);
+    else if (device.gone !== null) news.push(`${device.name} is gone`);
+    else news.push(`${device.name} is ${device.status.toLowerCase()}`);
+  }
+  for (const task of tasks.values()) {
+    const before = statuses.get(task.id);
+    if (before && before !== task.status) news.push(`${task.title}: ${task.status.toLowerCase()}`);
+  }
+  statuses = new Map([...devices, ...tasks].map(([key, each]) => [key, each.status]));
+  if (news.length) say(`${news.join(", ")}.`);
+}
+
+panel({
+  place: "header",
+  title: "Swarm",
+  make() {
+    return {
+      update(model, event) {
+        if (event === "link") tellLink(model.link);
+        if (event !== "state") return;
+        if (model.node) words(at("node"), model.node);
+        tellNews(model);
+      },
+    };
+  },
+});

@@ -1,0 +1,88 @@
+// The shell: gives each panel its place, tells it what came, and which place is looked at.
+import { at } from "./element.js";
+import { panels } from "./panel.js";
+
+const RANKS = ["anyone", "viewer", "operator"];
+const shown = new Map();
+let shared = {};
+let looked = "";
+
+// Look at a place: go("device/UUID"); go("") is the whole page again.
+export function go(view) {
+  if (view) location.hash = view;
+  else if (location.hash) {
+    history.pushState(null, "", location.pathname + location.search);
+    look();
+  }
+}
+
+function wanted({ place, needs = {} }) {
+  const { me, has } = shared.model;
+  const mayLook = RANKS.indexOf(me.role) >= RANKS.indexOf(needs.role ?? "anyone");
+  return at(`place-${place}`) && mayLook && (!needs.has || has.includes(needs.has));
+}
+
+async function open(panel) {
+  const place = at(`place-${panel.place}`);
+  const root = panel.order ? document.createElement("div") : place;
+  const entry = { panel, root, acts: {} };
+  shown.set(panel, entry);
+  if (root !== place) {
+    root.dataset.order = panel.order;
+    place.insertBefore(root, [...place.children].find((other) => Number(other.dataset.order) > panel.order) ?? null);
+  }
+  const make = panel.make ?? (await panel.load()).make;
+  if (shown.get(panel) !== entry) return;
+  entry.acts = make(root, shared) ?? {};
+  entry.acts.update?.(shared.model, "");
+  const [name, argument] = viewed();
+  if (name === panel.place) entry.acts.show?.(argument);
+}
+
+function close(entry) {
+  shown.delete(entry.panel);
+  entry.acts.close?.();
+  if (entry.panel.order) entry.root.remove();
+}
+
+function viewed() {
+  const [name, ...rest] = location.hash.slice(1).split("/");
+  return [name, rest.join("/")];
+}
+
+function look() {
+  const [name, argument] = viewed();
+  for (const { panel, acts } of shown.values()) {
+    if (panel.place === name) acts.show?.(argument);
+    else if (panel.place === looked) acts.hide?.();
+  }
+  looked = name;
+}
+
+// Open the panels that are wanted now, and close those that are not.
+function sort() {
+  for (const panel of panels) {
+    const entry = shown.get(panel);
+    if (!entry && wanted(panel)) open(panel);
+    else if (entry && !wanted(panel)) close(entry);
+  }
+}
+
+export function start(tools) {
+  shared = tools;
+  addEventListener("hashchange", look);
+  sort();
+  look();
+}
+
+// Something came: all panels are told, each by itself, so that the fault of one is not that of all.
+export function tell(event) {
+  sort();
+  for (const { acts } of [...shown.values()]) {
+    try {
+      acts.update?.(shared.model, event);
+    } catch (fault) {
+      reportError(fault);
+    }
+  }
+}
