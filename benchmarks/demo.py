@@ -65,7 +65,7 @@ class Page:
             sizes[path] = len(body)
             found = re.findall(rb'(?:href|src)="(/static/[^"]+)"', body) if path == "/" else []
             if path.endswith(".js"):
-                found = [b"/static/" + name for name in re.findall(rb'from "\./([^"]+)"', body)]
+                found = [b"/static/" + name for name in re.findall(rb'(?:from|import) "\./([^"]+)"', body)]
             waiting += [name.decode() for name in found]
         return sizes
 

@@ -46,5 +46,5 @@ class CappedRequest(SiteRequest):
         transport.loseConnection()
 
 
-def guarded(site: Site, limits: Limits) -> None:
+def limited(site: Site, limits: Limits) -> None:
     """Have the connections of ``site`` keep to ``limits``; there are none so far but the site's own time-out."""

@@ -29,13 +29,12 @@ from twisted.web.wsgi import WSGIResource
 from webnode.app import OnReactor, create_app
 from webnode.board import Board, Role
 from webnode.camera import FrameSource
-from webnode.channel import CappedRequest, guarded
+from webnode.channel import CappedRequest, limited
 from webnode.errors import PortTaken, Refusal
 from webnode.guard import headers, refusal, token_of
 from webnode.live import Events, Shots
 from webnode.resource import JsonResource, Refused
-from webnode.route import Route
-from webnode.route import guarded as let_in
+from webnode.route import Route, guarded
 from webnode.routes.table import TABLE
 from webnode.state import State
 
@@ -167,7 +166,7 @@ class Root(Resource):
         ticket: bytes = (request.args or {}).get(b"ticket", [b""])[0]
         token = token_of(request.getHeader("authorization") or "", ticket.decode("ascii", "replace"))
         try:
-            let_in(role, self._board.sessions.visitor(token, self._wall()))
+            guarded(role, self._board.sessions.visitor(token, self._wall()))
         except Refusal as no:
             return Refused(no)
         return resource
@@ -231,6 +230,7 @@ class WebService(Service):
         wall: Callable[[], float],
         hosts: Collection[str] = (),
         doors: Sequence[Door] = (),
+        table: Sequence[Route] = TABLE,
     ) -> None:
         self._reactor = reactor
         self._host = host
@@ -239,12 +239,13 @@ class WebService(Service):
         self._pool = ThreadPool(1, WORKERS, "web")
         flask = WSGIResource(reactor, self._pool, app)
         native: dict[str, Resource] = {"/events": events, "/shot": shots, "/static": static}
-        native.update({route.path: route.native(board, reactor) for route in TABLE if route.native is not None})
+        native.update({route.path: route.native(board, reactor) for route in table if route.native is not None})
         self._events = events
         self._shots = shots
-        self.site = QuietSite(Root(flask, native, board, wall, hosts), requestFactory=CappedRequest, timeout=30)
+        root = Root(flask, native, board, wall, hosts, table)
+        self.site = QuietSite(root, requestFactory=CappedRequest, timeout=30)
         self.site.displayTracebacks = False
-        guarded(self.site, board.limits)
+        limited(self.site, board.limits)
         self._listening: IListeningPort | None = None
         self._open: list[IListeningPort] = []
 
@@ -289,8 +290,10 @@ def web_service(
     frames: FrameSource,
     wall: Callable[[], float],
     hosts: Collection[str] = (),
+    doors: Sequence[Door] = (),
+    table: Sequence[Route] = TABLE,
 ) -> WebService:
     """The whole web node from what the front door has; ``wall`` is the unix time in seconds."""
-    app = create_app(read, board, caller(reactor), hosts, wall)
+    app = create_app(read, board, caller(reactor), hosts, wall, table)
     events, shots = Events(read, reactor, wall, board.desk.yard), Shots(frames, reactor)
-    return WebService(reactor, host, port, app, events, shots, Files(), board, wall, hosts)
+    return WebService(reactor, host, port, app, events, shots, Files(), board, wall, hosts, doors, table)

@@ -213,7 +213,7 @@ class PageTests(SynchronousTestCase):
         phone.locator("dialog[open]").wait_for()
 
     def test_go_back_from_a_device(self) -> None:
-        """A device has an address of its own: the back button leaves it, a link leads to it, an unknown place to none."""
+        """A device has an address: the back button leaves it, a link leads to it, an unknown place leads nowhere."""
         page = self.opened(DESK)
         dialog = page.locator("dialog[open]")
         page.locator(".device").nth(1).dblclick()

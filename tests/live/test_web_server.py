@@ -13,11 +13,14 @@ from twisted.internet.task import deferLater
 from twisted.trial.unittest import TestCase
 from twisted.web.client import Agent, HTTPConnectionPool, readBody
 from twisted.web.http_headers import Headers
+from twisted.web.static import Data
 
 from webnode.board import Board, OpenSessions
 from webnode.camera import MemoryFrames
 from webnode.desk import MemoryDesk
 from webnode.errors import PortTaken
+from webnode.route import Route
+from webnode.routes.table import TABLE
 from webnode.server import WORKERS, WebService, web_service
 from webnode.state import State, state_of
 
@@ -133,6 +136,28 @@ class WebServiceTests(TestCase):
         self.assertIn(f"127.0.0.1:{self.web.port}", words)
         self.assertIn("choose another port", words)
         self.assertNotIn("\n", words)
+
+    async def test_serve_at_further_doors(self) -> None:
+        """A further door serves the same page, a route's own resource as well, and is closed with the first."""
+        opened: list[Any] = []
+
+        def door(site: Any) -> Any:
+            opened.append(reactor.listenTCP(0, site, interface="127.0.0.1"))
+            return opened[0]
+
+        native = Route(
+            "GET", "/api/v1/note", "A note", "anyone", None, native=lambda board, clock: Data(b"hi", "text/plain")
+        )
+        board = Board(self.desk, OpenSessions())
+        web = web_service(
+            reactor, "127.0.0.1", 0, self.read, board, self.frames, lambda: 1e9, doors=[door], table=[*TABLE, native]
+        )
+        web.startService()
+        url = f"http://127.0.0.1:{opened[0].getHost().port}".encode()
+        for path, words in ((b"/", b"vaio"), (b"/api/v1/note", b"hi"), (b"/api/v1/state", b"dog1")):
+            self.assertIn(words, await readBody(await self.agent.request(b"GET", url + path)))
+        await maybeDeferred(web.stopService)
+        self.assertTrue(opened[0].disconnected)
 
     async def test_stop(self) -> None:
         """Stopping ends the streams and the held questions, frees the port, and leaves nothing that ticks."""
