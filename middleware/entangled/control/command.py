@@ -133,7 +133,7 @@ def main(group: str, words: Sequence[str], out: TextIO | None = None, ask: Ask =
         for line in ask(path, request):
             if "error" in line:
                 if wishes.json:
-                    out.write(json.dumps(line) + "\n")
+                    out.write(word.written(line) + "\n")
                 return _complain(group, line["text"], WRONG if line["error"] == "BadRequest" else FAILED)
             answer = line["answer"] if "answer" in line else line.get("event")
             out.write("".join(f"{text}\n" for text in _texts(wishes.verb, answer, wishes.json)))
@@ -149,13 +149,14 @@ def main(group: str, words: Sequence[str], out: TextIO | None = None, ask: Ask =
 
 def _texts(verb: str, answer: Any, is_json: bool) -> list[str]:
     if is_json:
-        return [json.dumps(answer, ensure_ascii=False)]
+        return [word.written(answer)]
     if answer is None:
         return []
     if verb == "dht find":
-        return [f"{each['id']}  {each['host']}:{each['port']}" for each in answer]
+        return [word.printable(f"{each['id']}  {each['host']}:{each['port']}") for each in answer]
     if verb in ("dht get", "dht watch", "keyword search", "keyword watch"):
-        lines = [f"{each['owner'][:10]}  {each['name'] or '-'}  {_plain(each['value'])}" for each in answer]
+        rows = [f"{each['owner'][:10]}  {each['name'] or '-'}  {_plain(each['value'])}" for each in answer]
+        lines = [word.printable(row) for row in rows]
         return [*lines, *([""] if verb.endswith("watch") else [])]
     if verb == "tuple read" and answer and isinstance(answer[0], list):
         return [word.shown(each) for each in answer]
@@ -163,7 +164,7 @@ def _texts(verb: str, answer: Any, is_json: bool) -> list[str]:
         return [word.shown(answer)]
     if isinstance(answer, dict) and "replicas" in answer:
         return [f"{answer['replicas']} replicas have it"]
-    return [json.dumps(answer, ensure_ascii=False)]
+    return [word.written(answer)]
 
 
 def _is_nothing(verb: str, answer: Any) -> bool:
@@ -190,5 +191,5 @@ def _value(text: str) -> Any:
 
 
 def _complain(group: str, problem: object, code: int) -> int:
-    sys.stderr.write(f"swarm {group}: {problem}\n")
+    sys.stderr.write(word.printable(f"swarm {group}: {problem}") + "\n")
     return code

@@ -94,6 +94,28 @@ class CommandTests(SynchronousTestCase):
         ):
             self.assertEqual(self.run_command(line, {"answer": answer}), (0, shown))
 
+    def test_words_of_others_cannot_move_the_cursor(self) -> None:
+        """Names, values, fields and complaints of other nodes reach the terminal without their control characters."""
+        evil = "red\x1b[2J\x9b2J\n\u202e"
+        record = {**RECORD, "name": evil, "value": evil}
+        for line, answer in (
+            ("dht get a", [record]),
+            ("dht watch a", [record]),
+            ("dht find a", [{"id": "00ff", "host": evil, "port": 7}]),
+            ("keyword search a", [record]),
+            ("tuple get _", [evil]),
+            ("tuple read _ --all", [[evil]]),
+            ("rpc h:1 name", {evil: evil}),
+        ):
+            for each in (line, f"{line} --json"):
+                _, output = self.run_command(each, {"answer": answer})
+                self.assertTrue(output.removesuffix("\n").rstrip("\n").isprintable(), (each, output))
+            self.assertEqual(json.loads(output), answer)
+        for line in ("rpc h:1 name", "rpc h:1 name --json"):
+            _, output = self.run_command(line, {"error": "Refused", "text": evil})
+            self.assertTrue((output + self.said).replace("\n", "").isprintable())
+            self.assertEqual(self.said.count("\n"), 1)
+
     def test_events_are_printed_as_they_come(self) -> None:
         """A watch prints each change, with a blank line behind it."""
         code, output = self.run_command("dht watch a", {"event": [RECORD]}, {"event": []}, {"answer": None})
