@@ -35,9 +35,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return command(verb, words[1:])
     if verb not in WORKS:
         about = {**{name: purpose for name, (_, purpose) in WORKS.items()}, **GROUPS}
+        if verb not in ("", "--help", "-h"):
+            sys.stderr.write(f"swarm: no verb {verb!r}; there are {', '.join(about)}; swarm --help says more\n")
+            return 2
         lines = "".join(f"  {name:9}{purpose}\n" for name, purpose in about.items())
         sys.stdout.write(f"usage: swarm VERB [options]\n\n{lines}\nswarm VERB --help says more.\n")
-        return 0 if verb in ("", "--help", "-h") else 2
+        return 0
     try:
         module = importlib.import_module(WORKS[verb][0])
     except ModuleNotFoundError as error:

@@ -117,9 +117,11 @@ def _push(wishes: argparse.Namespace, ask: Ask) -> Told:
 
 def _rollback(wishes: argparse.Namespace, ask: Ask) -> Told:
     asker = Asker(wishes.node, ask)
-    held = newest(each for each, _ in _manifests(asker) if each.name == wishes.name)
+    manifests = [each for each, _ in _manifests(asker)]
+    held = newest(each for each in manifests if each.name == wishes.name)
     if held is None:
-        raise Refusal(f"nothing called {wishes.name!r} was pushed")
+        there = ", ".join(sorted({each.name for each in manifests})) or "nothing at all"
+        raise Refusal(f"nothing called {wishes.name!r} was pushed; there is {there}")
     manifest = rolled_back(held)
     if manifest is None:
         raise Refusal(f"there is nothing before version {held.version} of {held.name}")

@@ -65,7 +65,7 @@ def chosen(wanted: str, tasks: Sequence[Task]) -> Task:
     newest = {task.task_id: task for task in tasks}
     known = sorted(tasks, key=lambda task: (-task.created, task.task_id))
     if not known:
-        raise Refusal("the team has no task")
+        raise Refusal("the team has no task; assign one on the page of its web node")
     if wanted == LAST:
         return known[0]
     meant = [task for task in known if task.task_id.startswith(wanted)] if wanted else []

@@ -205,12 +205,15 @@ class DeployTests(SynchronousTestCase):
         self.assertIn("line 1", self.refused(f"push {path} --name farthest --kind strategy"))
         self.assertIn("cannot be read", self.refused("push /nowhere --name farthest --kind strategy"))
         self.assertIn("--name must match", self.refused(f"push {path} --name Far/thest --kind strategy"))
-        self.assertIn("nothing called 'farthest'", self.refused("rollback farthest"))
+        self.assertIn(
+            "nothing called 'farthest' was pushed; there is nothing at all", self.refused("rollback farthest")
+        )
         big = self.file("#" * 300_000)
         self.assertIn("bytes", self.refused(f"push {big} --name farthest --kind strategy"))
         self.push()
         again = f"push {self.file(FARTHEST)} --name farthest --kind behaviour"
         self.assertIn("is a strategy", self.refused(again))
+        self.assertIn("nothing called 'nearest' was pushed; there is farthest", self.refused("rollback nearest"))
         self.assertEqual(self.swarm("status").count("farthest"), 1)
 
     def test_devices_cannot_move_the_cursor(self) -> None:

@@ -73,7 +73,7 @@ class WhyTests(SynchronousTestCase):
     def test_errors_by_name(self) -> None:
         """No task, no decision, an unknown id and a missing node are one line each, which names what there is."""
         self.assertEqual(self.shell.run(main, ["last"]), (1, ""))
-        self.assertEqual(self.shell.said, "swarm why: the team has no task\n")
+        self.assertEqual(self.shell.said, "swarm why: the team has no task; assign one on the page of its web node\n")
         task = self.team.run_demo()
         self.team.clock.advance(1.0)
         code, output = self.shell.run(main, ["last"])

@@ -33,7 +33,7 @@ def parser(group: str) -> argparse.ArgumentParser:
         rpc = argparse.ArgumentParser(prog="swarm rpc", parents=[common], description="Call a method of a node.")
         rpc.add_argument("node_asked", metavar="NODE", help="HOST:PORT, or the beginning of a known node's id")
         rpc.add_argument("method", help="for instance ping")
-        rpc.add_argument("arguments", nargs="*", help="JSON where it is JSON, else text")
+        rpc.add_argument("arguments", nargs="*", default=[], help="JSON where it is JSON, else text")
         rpc.add_argument("--changes", action="store_true", help="the method changes something: it is to run once")
         rpc.set_defaults(verb="rpc")
         return rpc
@@ -96,7 +96,7 @@ def _tuple(verb: Callable[[str, str], argparse.ArgumentParser]) -> None:
 
 
 def request_of(wishes: argparse.Namespace) -> dict[str, Any]:
-    """The request that a command line means; raises ``word.BadWord``, or ``OSError`` for a file that cannot be read."""
+    """The request that a command line means; raises ``word.BadWord``, also for a file that cannot be read."""
     given = {name: value for name, value in vars(wishes).items() if name not in ("verb", "node", "json")}
     if "node_asked" in given:
         given["node"] = given.pop("node_asked")
@@ -120,7 +120,8 @@ def asked(path: Path, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
                 for line in lines:
                     yield json.loads(line)
         except (OSError, ValueError) as error:
-            raise NoControl(f"the node behind {path} does not answer ({error}); is it running?") from error
+            why = getattr(error, "strerror", None) or error
+            raise NoControl(f"the node behind {path} does not answer ({why}); start it, or remove that file") from error
 
 
 def main(group: str, words: Sequence[str], out: TextIO | None = None, ask: Ask = asked) -> int:
@@ -186,7 +187,10 @@ def _value(text: str) -> Any:
     if text == "-":
         return word.plain(sys.stdin.buffer.read())
     if text.startswith("@"):
-        return word.plain(Path(text[1:]).read_bytes())
+        try:
+            return word.plain(Path(text[1:]).read_bytes())
+        except OSError as error:
+            raise word.BadWord(f"{text[1:]} cannot be read: {error.strerror or error}") from error
     return text
 
 

@@ -77,7 +77,7 @@ class CommandTests(SynchronousTestCase):
         path.write_bytes(b"\xff")
         self.assertEqual(self.request(f"dht put a @{path}")["with"]["value"], {"base64": "/w=="})
         self.assertEqual(self.run_command("dht put a @/nowhere/at/all")[0], 2)
-        self.assertIn("nowhere", self.said)
+        self.assertEqual(self.said, "swarm dht: /nowhere/at/all cannot be read: No such file or directory\n")
 
     def test_answers_for_people_and_programs(self) -> None:
         """An answer is lines for a person, and one line of JSON with ``--json``."""
@@ -137,15 +137,20 @@ class CommandTests(SynchronousTestCase):
 
     def test_wrong_command_lines(self) -> None:
         """Command lines that make no sense end with exit code 2 before any node is asked."""
+        complaint = io.StringIO()
         for line in ("dht", "dht fly", "dht get", "dht put a", "tuple get", "dht put a b --expect x", "rpc h:1"):
-            caught = self.assertRaises(SystemExit, self.run_command, line)
+            group, *words = line.split()
+            with contextlib.redirect_stderr(complaint):
+                caught = self.assertRaises(SystemExit, main, group, words, io.StringIO(), self.ask)
             self.assertEqual(caught.code, 2)
         self.assertEqual(self.requests, [])
+        self.assertTrue(complaint.getvalue().endswith("the following arguments are required: method\n"))
 
     def test_node_that_does_not_answer(self) -> None:
         """A socket behind which nobody is, and one that speaks another language, are named."""
         path = made("gone")
-        self.assertIn("does not answer", str(self.assertRaises(NoControl, list, asked(path, {}))))
+        said = str(self.assertRaises(NoControl, list, asked(path, {})))
+        self.assertIn("does not answer (No such file or directory); start it, or remove that file", said)
         server = socket.socket(socket.AF_UNIX)
         self.addCleanup(server.close)
         server.bind(str(path))
