@@ -19,7 +19,7 @@ from middleware.entangled.data.store import Store
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.identity import Identity
 from middleware.entangled.network.network import Network
-from middleware.errors import SwarmError
+from middleware.errors import BadSetting, SwarmError
 from middleware.node import SwarmNode
 from middleware.presence import Device
 from middleware.settings import Settings
@@ -75,6 +75,9 @@ def assembled(settings: Settings, seams: Seams) -> Assembly:
     Raises ``SwarmError`` or ``DriverError`` where they cannot be met.
     """
     node_settings, driver = settings.node, None
+    if settings.agent.module and not settings.driver.kind:
+        problem = f"is {settings.agent.module!r}, which has no robot to act with"
+        raise BadSetting(settings.origin, "[agent] module", problem, "name its [driver] kind, or leave the agent out")
     capabilities = dict(node_settings.capabilities)
     kind = node_settings.kind
     if settings.driver.kind:

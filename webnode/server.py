@@ -5,6 +5,7 @@ The only module of this room that touches the world: a listening port and a pool
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import mimetypes
 from collections.abc import Callable, Collection
@@ -212,7 +213,9 @@ class WebService(Service):
         except CannotListenError as error:
             why = getattr(error.socketError, "strerror", None) or str(error.socketError)
             where = f"{self._host or '*'}:{self._wanted}"
-            raise PortTaken(f"the page cannot be served on {where} ({why}); choose another port, or 0") from error
+            is_foreign = getattr(error.socketError, "errno", None) == errno.EADDRNOTAVAIL
+            remedy = "give host an address of this machine" if is_foreign else "choose another port, or 0"
+            raise PortTaken(f"the page cannot be served on {where} ({why}); {remedy}") from error
         self._pool.start()
         super().startService()
 
