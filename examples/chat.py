@@ -14,6 +14,7 @@ from peer import joined
 from twisted.internet import defer, stdio, task
 from twisted.protocols.basic import LineReceiver
 
+from middleware.entangled.control.word import printable
 from middleware.entangled.space.tuplespace import TupleSpace
 
 KEPT = 60.0
@@ -46,7 +47,7 @@ class Keyboard(LineReceiver):
 async def _listen(space: TupleSpace, name: str) -> None:
     while True:
         _, _, speaker, text = await space.get(("line", name, str, str))
-        print(f"{speaker}: {text}", flush=True)
+        print(printable(f"{speaker}: {text}"), flush=True)
 
 
 async def main(reactor: Any, port: int, known: str, name: str) -> None:
@@ -54,7 +55,8 @@ async def main(reactor: Any, port: int, known: str, name: str) -> None:
     node = await joined(reactor, port, known)
     space = TupleSpace(node, reactor, random.SystemRandom())
     await space.put(("here", name))
-    print("here:", *sorted(other for _, other in await space.read_all(("here", str))), flush=True)
+    here = sorted(other for _, other in await space.read_all(("here", str)))
+    print("here:", *map(printable, here), flush=True)
     ended: defer.Deferred[None] = defer.Deferred()
     stdio.StandardIO(Keyboard(space, name, ended))
     listening = defer.ensureDeferred(_listen(space, name))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import sys
 import time
 from functools import partial
@@ -29,7 +30,7 @@ USAGE = 2
 
 def main(arguments: list[str] | None = None, output: TextIO = sys.stdout, errors: TextIO = sys.stderr) -> int:
     """Run a yard until it is interrupted; returns the exit code: 0, or 2 with one line on what to change."""
-    parser = argparse.ArgumentParser(prog="python -m sim.server", description="The simulated yard of the dogs.")
+    parser = argparse.ArgumentParser(prog="swarm yard", description="The simulated yard of the dogs.")
     parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default %(default)s)")
     parser.add_argument("--port", type=int, default=DEFAULT_PORT, help="TCP port, 0 for any (default %(default)s)")
     parser.add_argument("--seed", type=int, default=1, help="the same seed gives the same yard (default %(default)s)")
@@ -57,9 +58,10 @@ def main(arguments: list[str] | None = None, output: TextIO = sys.stdout, errors
     try:
         port = reactor.listenTCP(chosen.port, TcpLinkFactory(yard.attach), interface=chosen.host)
     except CannotListenError as error:
-        return _refused(
-            errors, f"cannot listen on {chosen.host}:{chosen.port}: {error.socketError}; try another --port"
-        )
+        why: OSError = error.socketError
+        is_taken = why.errno in (errno.EADDRINUSE, errno.EACCES)
+        remedy = "try another --port" if is_taken else "give --host an address of this machine"
+        return _refused(errors, f"cannot listen on {chosen.host}:{chosen.port}: {why.strerror or why}; {remedy}")
     address = port.getHost()
     yard.start()
     reactor.addSystemEventTrigger("before", "shutdown", yard.stop)
@@ -72,7 +74,7 @@ def main(arguments: list[str] | None = None, output: TextIO = sys.stdout, errors
 
 
 def _refused(errors: TextIO, problem: str) -> int:
-    print(f"sim.server: {problem}", file=errors)
+    print(f"swarm yard: {problem}", file=errors)
     return USAGE
 
 

@@ -47,11 +47,6 @@ class Asker:
         raise Refusal("the node closed the connection without an answer")
 
 
-def printable(text: str) -> str:
-    """Somebody's words as a terminal may be shown them: each control character is a space."""
-    return "".join(c if c.isprintable() else " " for c in text)
-
-
 def _record(key: bytes, told: dict[str, Any]) -> Record:
     value = word.value(told["value"])
     content = value.encode() if isinstance(value, str) else bytes(value)

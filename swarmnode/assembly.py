@@ -15,7 +15,7 @@ from drivers.registry import describe, driver_for
 from middleware.entangled.data.store import Store
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.identity import Identity
-from middleware.errors import SwarmError
+from middleware.errors import BadSetting, SwarmError
 from middleware.halt import answer_halt
 from middleware.node import SwarmNode
 from middleware.presence import Device
@@ -58,6 +58,9 @@ def assembled(settings: Settings, seams: Seams) -> Assembly:
     Raises ``SwarmError`` or ``DriverError`` where they cannot be met.
     """
     node_settings, driver = settings.node, None
+    if settings.agent.module and not settings.driver.kind:
+        problem = f"is {settings.agent.module!r}, which has no robot to act with"
+        raise BadSetting(settings.origin, "[agent] module", problem, "name its [driver] kind, or leave the agent out")
     seams = faulty(settings, seams)
     capabilities = dict(node_settings.capabilities)
     kind = node_settings.kind

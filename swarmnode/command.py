@@ -41,9 +41,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     works = {name: work for name, work in WORKS.items() if find_spec(work[0]) is not None}
     if verb not in works:
         about = {**{name: purpose for name, (_, purpose) in works.items()}, **GROUPS}
+        if verb not in ("", "--help", "-h"):
+            sys.stderr.write(f"swarm: no verb {verb!r}; there are {', '.join(about)}; swarm --help says more\n")
+            return 2
         lines = "".join(f"  {name:9}{purpose}\n" for name, purpose in about.items())
         sys.stdout.write(f"usage: swarm VERB [options]\n\n{lines}\nswarm VERB --help says more.\n")
-        return 0 if verb in ("", "--help", "-h") else 2
+        return 0
     try:
         module = importlib.import_module(works[verb][0])
     except ModuleNotFoundError as error:

@@ -29,10 +29,11 @@ from middleware.deployment.manifest import (
 from middleware.deployment.module import compiled
 from middleware.entangled.control.command import FAILED, WRONG, Ask, asked
 from middleware.entangled.control.place import NoControl
+from middleware.entangled.control.word import printable
 from middleware.entangled.record import Record
 from middleware.errors import Undeployable
 from middleware.presence import devices_of
-from swarmnode.asker import Asker, Refusal, printable
+from swarmnode.asker import Asker, Refusal
 
 SOURCE = "source"
 """The slot of a source under its key."""
@@ -78,9 +79,9 @@ def main(words: Sequence[str] | None = None, out: TextIO | None = None, ask: Ask
             wishes, ask
         )
     except (Refusal, NoControl, _Wrong) as problem:
-        sys.stderr.write(f"swarm deploy: {problem}\n")
+        sys.stderr.write(printable(f"swarm deploy: {problem}") + "\n")
         return FAILED if isinstance(problem, Refusal) else WRONG
-    out.write(json.dumps(answer) + "\n" if wishes.json else "".join(f"{line}\n" for line in lines))
+    out.write(json.dumps(answer) + "\n" if wishes.json else "".join(f"{printable(line)}\n" for line in lines))
     return 0
 
 
@@ -116,9 +117,11 @@ def _push(wishes: argparse.Namespace, ask: Ask) -> Told:
 
 def _rollback(wishes: argparse.Namespace, ask: Ask) -> Told:
     asker = Asker(wishes.node, ask)
-    held = newest(each for each, _ in _manifests(asker) if each.name == wishes.name)
+    manifests = [each for each, _ in _manifests(asker)]
+    held = newest(each for each in manifests if each.name == wishes.name)
     if held is None:
-        raise Refusal(f"nothing called {wishes.name!r} was pushed")
+        there = ", ".join(sorted({each.name for each in manifests})) or "nothing at all"
+        raise Refusal(f"nothing called {wishes.name!r} was pushed; there is {there}")
     manifest = rolled_back(held)
     if manifest is None:
         raise Refusal(f"there is nothing before version {held.version} of {held.name}")
@@ -139,7 +142,7 @@ def _status(wishes: argparse.Namespace, ask: Ask) -> Told:
         rows.append({**_told(manifest), "by": by, "operator": record.owner.hex(), "devices": runs})
         lines.append(f"{name}  {manifest.kind}  {manifest.label}  pushed by {by}{_past(manifest)}")
         width = max(map(len, runs), default=0)
-        lines += [f"  {device:{width}}  {printable(label) or '-'}" for device, label in runs.items()]
+        lines += [f"  {device:{width}}  {label or '-'}" for device, label in runs.items()]
     return rows, lines or ["nothing was pushed"]
 
 

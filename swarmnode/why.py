@@ -14,10 +14,11 @@ from typing import TextIO
 
 from middleware.entangled.control.command import FAILED, WRONG, Ask, asked
 from middleware.entangled.control.place import NoControl
+from middleware.entangled.control.word import printable
 from middleware.explanation import as_text, explained
 from middleware.tasks import Task, outcome_of, tasks_of
 from middleware.verdict import verdict_of, verdicts_text
-from swarmnode.asker import Asker, Refusal, printable
+from swarmnode.asker import Asker, Refusal
 
 LAST = "last"
 LISTED = 5
@@ -42,7 +43,7 @@ def main(words: Sequence[str] | None = None, out: TextIO | None = None, ask: Ask
         outcome = outcome_of(asker.records(f"task/{task.task_id}"))
         records = asker.records(verdicts_text(task.task_id))
     except (Refusal, NoControl) as problem:
-        sys.stderr.write(f"swarm why: {problem}\n")
+        sys.stderr.write(printable(f"swarm why: {problem}") + "\n")
         return FAILED if isinstance(problem, Refusal) else WRONG
     verdicts = [verdict for each in records if (verdict := verdict_of(each)) is not None]
     explanation = explained(verdict for verdict in verdicts if verdict.task == task.task_id)
@@ -64,7 +65,7 @@ def chosen(wanted: str, tasks: Sequence[Task]) -> Task:
     newest = {task.task_id: task for task in tasks}
     known = sorted(tasks, key=lambda task: (-task.created, task.task_id))
     if not known:
-        raise Refusal("the team has no task")
+        raise Refusal("the team has no task; assign one on the page of its web node")
     if wanted == LAST:
         return known[0]
     meant = [task for task in known if task.task_id.startswith(wanted)] if wanted else []

@@ -3,18 +3,63 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 from twisted.trial.unittest import SynchronousTestCase
 
+from agents import engagement, loop
 from drivers.registry import describe
+from middleware.commitment import ballot, lessee
+from middleware.consensus import guard, strategy, worker
+from middleware.deployment import manifest, module
+from middleware.dissemination import check, party, scale, teller, tree
+from middleware.entangled.control import port
+from middleware.entangled.kademlia import membership, roster
+from middleware.entangled.replication import handover, pusher, replica, subscriber
+from middleware.entangled.space import shelf, template
 from middleware.settings import Settings
+from webnode import live
+from webnode.routes import orders
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), ROOT / "benchmarks" / "README.md"]
 LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
 NAMED = re.compile(r"`([\w./-]+\.(?:py|toml|json|md))(?:::(\w+))?`")
 EXAMPLES = sorted((ROOT / "examples").glob("*.toml"))
+FIGURES: Sequence[tuple[str, str]] = (
+    ("agents", f"one turn each {1000 * loop.TICK:g} ms"),
+    ("agents", f"the first at once, the second {lessee.STAGGER:g} s later"),
+    ("consensus", f"Each rank waits {lessee.STAGGER:g} s longer than the one before it"),
+    ("consensus", f"News of a release is believed for {lessee.FRESH:g} s"),
+    ("consensus", f"*sending* + ttl x {1.0 - lessee.CLOCK_MARGIN:g}"),
+    ("consensus", f"the lowest {ballot.LIFE.bit_length() - 1} bits of the counter"),
+    ("consensus", f"go to its post, for {engagement.SEARCH_TTL:g} s at a time"),
+    ("consensus", f"enormous (above {strategy.MAX_NUMBER:.0e})".replace("e+0", "e")),
+    ("consensus", f"a process of their own with {worker.DEADLINE_S:g} s for each answer"),
+    ("consensus", f"answers more than {worker.MAX_ANSWER // 1024} KiB"),
+    ("consensus", f"after three times in {guard.SPAN:,} questions"),
+    ("consensus", f"| 1 to {scale.MOST_DIRECT} | each bidder tells"),
+    ("consensus", f"| {scale.MOST_DIRECT + 1} and more (back below {scale.LEAST_TREE}) |"),
+    ("consensus", f"waits {1000 * tree.HOLD_PER_BIT:g} ms for each bit"),
+    ("consensus", f"after {teller.STAND_IN:g} s each the next one stands in"),
+    ("consensus", f"told nothing {check.SILENCE:g} s after the waiting period asks"),
+    ("consensus", f"for all behind it after {party.RELAY_SILENCE:g} s"),
+    ("deployment", f"the source has at most {manifest.MAX_SOURCE // 1024} KiB"),
+    ("deployment", f"takes at most {module.STEPS:,} instructions"),
+    ("library", f"After about {membership.SILENCE + roster.STRUCK_S:g} s the absent are struck"),
+    ("library", f"A request has at most {port.MAX_REQUEST:,} bytes, a node {port.MAX_CONNECTIONS} connections"),
+    ("protocol", f"gone on without it for {roster.STRUCK_S:g} s, or for {roster.COUNTED_S:g} s"),
+    ("protocol", f"out of touch with a majority for {handover.OUT_OF_TOUCH:g} s"),
+    ("protocol", f"Pages hold about {replica.PAGE_BYTES:,} bytes"),
+    ("protocol", f"counts for {pusher.WATCH_TTL:g} s and is asked again every {subscriber.RENEW:g} s"),
+    ("tuplespace", f"1 to {template.MAX_FIELDS} fields"),
+    ("tuplespace", f"asked every {shelf.POLL:g} s whether"),
+    ("web", f"`text`, 1 to {orders.MAX_MESSAGE} characters"),
+    ("web", f"`seconds`, {orders.MIN_AWAY_S:g} to {orders.MAX_AWAY_S:g}, default {orders.AWAY_S:g}"),
+    ("web", f"At most {live.MAX_VIEWERS} streams"),
+)
+"""What a document says with a figure of the code in it."""
 
 
 class DocumentTests(SynchronousTestCase):
@@ -38,6 +83,12 @@ class DocumentTests(SynchronousTestCase):
                     defined = rf"^\s*(?:async )?(?:def|class) {name}\b|^(?:[A-Z_]+, )*{name}\b[^=\n]*="
                     text = (ROOT / path).read_text(encoding="utf-8")
                     self.assertTrue(re.search(defined, text, re.MULTILINE), f"{where}::{name}")
+
+    def test_figures_are_those_of_the_code(self) -> None:
+        """Seconds, bytes and numbers that a document takes from a constant are those that the constant has now."""
+        for name, said in FIGURES:
+            text = " ".join((ROOT / "docs" / f"{name}.md").read_text(encoding="utf-8").split())
+            self.assertTrue(said in text, f"docs/{name}.md does not say: {said}")
 
     def test_thesis_is_complete(self) -> None:
         """The page on the thesis has a row for each requirement, assumption and algorithm, and Figures 5.3 to 5.7."""

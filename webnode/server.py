@@ -5,6 +5,7 @@ The only module of this room that touches the world: a listening port and a pool
 
 from __future__ import annotations
 
+import errno
 import gzip
 import hashlib
 import mimetypes
@@ -263,7 +264,9 @@ class WebService(Service):
         except CannotListenError as error:
             why = getattr(error.socketError, "strerror", None) or str(error.socketError)
             where = f"{self._host or '*'}:{self._wanted}"
-            raise PortTaken(f"the page cannot be served on {where} ({why}); choose another port, or 0") from error
+            is_foreign = getattr(error.socketError, "errno", None) == errno.EADDRNOTAVAIL
+            remedy = "give host an address of this machine" if is_foreign else "choose another port, or 0"
+            raise PortTaken(f"the page cannot be served on {where} ({why}); {remedy}") from error
         self._open = [door(self.site) for door in self._doors]
         self._pool.start()
         super().startService()

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import multiprocessing
 import os
 import sys
@@ -26,6 +27,7 @@ from benchmarks.takeover.cause import Cause, Trial
 from benchmarks.takeover.lan import within
 from benchmarks.takeover.rehearsed import trial
 from benchmarks.takeover.report import drawn, table
+from sim.demo.trials import whole
 
 INSIDE = "--inside"
 
@@ -33,7 +35,7 @@ INSIDE = "--inside"
 def rehearsed(causes: Sequence[Cause], count: int, seed: int, loss: float, jobs: int) -> list[Trial]:
     """``count`` trials of each cause in virtual time, ``jobs`` at a time."""
     wanted = [(cause, seed + number) for cause in causes for number in range(count)]
-    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
+    with ProcessPoolExecutor(max(1, jobs), multiprocessing.get_context("spawn")) as pool:
         done = pool.map(partial(trial, loss=loss), *zip(*wanted, strict=True)) if wanted else ()
         return [_told(one) for one in done]
 
@@ -64,22 +66,38 @@ def _told(one: Trial) -> Trial:
     return one
 
 
+def share(word: str) -> float:
+    """A number from 0 to 1, from the command line."""
+    try:
+        number = float(word)
+    except ValueError:
+        number = math.nan
+    if not 0.0 <= number <= 1.0:
+        raise argparse.ArgumentTypeError(f"must be a share from 0 to 1, is {word!r}")
+    return number
+
+
 def main(arguments: Sequence[str] = tuple(sys.argv[1:])) -> int:
     """The command line; returns 0 where every trial held."""
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.takeover", description="Seconds to take over, by cause."
     )
-    parser.add_argument("--count", type=int, default=200, help="trials of each cause in virtual time (%(default)s)")
-    parser.add_argument("--real", type=int, default=0, help="trials of each cause with real processes (%(default)s)")
+    parser.add_argument("--count", type=whole, default=200, help="trials of each cause in virtual time (%(default)s)")
+    parser.add_argument("--real", type=whole, default=0, help="trials of each cause with real processes (%(default)s)")
     parser.add_argument("--seed", type=int, default=1, help="the first seed")
-    parser.add_argument("--loss", type=float, default=0.1, help="share of datagrams lost in virtual time (%(default)s)")
+    parser.add_argument("--loss", type=share, default=0.1, help="share of datagrams lost in virtual time (%(default)s)")
     parser.add_argument("--cause", choices=[c.name.lower() for c in Cause], action="append", help="only this one")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="trials at the same time")
+    parser.add_argument("--jobs", type=whole, default=os.cpu_count() or 1, help="trials at the same time")
     parser.add_argument("--out", type=Path, default=Path("build"), help="folder for the JSON and the pictures")
     parser.add_argument(INSIDE, action="store_true", help=argparse.SUPPRESS)
     given = parser.parse_args(list(arguments))
     causes = [cause for cause in Cause if not given.cause or cause.name.lower() in given.cause]
-    given.out.mkdir(parents=True, exist_ok=True)
+    if not given.count and not given.real:
+        parser.error("--count and --real are both 0; there is nothing to do")
+    try:
+        given.out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        parser.error(f"--out {given.out} cannot be made ({error.strerror}); name another folder")
     if given.inside:
         real_ones = real(causes, given.real, given.seed)
         return _reported(real_ones, given.out, "real", f"real processes, {given.real} a cause")

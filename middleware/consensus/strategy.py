@@ -194,8 +194,13 @@ def led_by(
 
 
 def better(current: Report, offer: Report, hysteresis: float) -> bool:
-    """Whether the cost of ``offer`` is lower than that of ``current`` by more than the share ``hysteresis``."""
-    return not refusal(offer) and offer.cost < current.cost * (1.0 - hysteresis)
+    """Whether the cost of ``offer`` is lower than that of ``current`` by more than the share ``hysteresis``.
+
+    One that counts for nothing is better than no other, and any that counts is better than it.
+    """
+    if refusal(offer):
+        return False
+    return bool(refusal(current)) or offer.cost < current.cost * (1.0 - hysteresis)
 
 
 def digest_of(contacts: Iterable[Report]) -> str:

@@ -92,7 +92,7 @@ class TooLarge(LocalError):
 
 
 class PortInUse(LocalError):
-    """Another program holds the port; choose another one, or 0 for any."""
+    """Another program holds the port, or the address is not one of this machine; the message says what to change."""
 
 
 class BadStore(LocalError):

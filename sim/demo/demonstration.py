@@ -142,16 +142,26 @@ class Demonstration:
 
 
 def _arguments(arguments: Sequence[str]) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="python -m sim.demo", description="Three dogs, a red target and the page.")
+    parser = argparse.ArgumentParser(prog="swarm demo", description="Three dogs, a red target and the page.")
     parser.add_argument("--headless", action="store_true", help="run both experiments, judge them, exit with 0 or 1")
     parser.add_argument("--seed", type=int, default=1, help="seed of the yard (default 1)")
     parser.add_argument("--web-host", default=LOOPBACK, help="address of the page; 0.0.0.0 opens it to the network")
     parser.add_argument(
-        "--web-port", type=int, default=None, help=f"port of the page (default {WEB_PORT}, or a free one)"
+        "--web-port", type=_port, default=None, help=f"port of the page (default {WEB_PORT}, or a free one)"
     )
     parser.add_argument("--run-dir", type=Path, default=Path("run"), help="logs, stores and configurations go there")
     parser.add_argument("--report", type=Path, default=None, help="with --headless: write the verdict there as JSON")
-    return parser.parse_args(arguments)
+    wishes = parser.parse_args(arguments)
+    if wishes.report is not None and not wishes.report.absolute().parent.is_dir():
+        parser.error(f"--report {wishes.report}: there is no such folder; make it, or name another file")
+    return wishes
+
+
+def _port(word: str) -> int:
+    """The number of a port, from the command line; 0 is any."""
+    if not (word.isdecimal() and len(word) <= 5 and int(word) <= 65535):
+        raise argparse.ArgumentTypeError(f"must be 0 to 65535, is {word!r}")
+    return int(word)
 
 
 def _say(line: str) -> None:

@@ -25,11 +25,14 @@ def fresh(run_dir: Path) -> TextIO:
 
     Refuses a folder that holds anything but an earlier demonstration.
     """
-    run_dir.mkdir(parents=True, exist_ok=True)
     mark = run_dir / MARK
-    if not mark.exists() and any(run_dir.iterdir()):
-        raise Trouble(f"{run_dir} is not empty and no earlier demonstration; choose another --run-dir")
-    lock = mark.open("a", encoding="utf-8")
+    try:
+        run_dir.mkdir(parents=True, exist_ok=True)
+        if not mark.exists() and any(run_dir.iterdir()):
+            raise Trouble(f"{run_dir} is not empty and no earlier demonstration; choose another --run-dir")
+        lock = mark.open("a", encoding="utf-8")
+    except OSError as error:
+        raise Trouble(f"{run_dir} cannot be used ({error.strerror}); choose another --run-dir") from error
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:
@@ -51,6 +54,11 @@ def arranged(run_dir: Path, web_host: str, web_port: int | None, usual: bool, sa
     ``usual``: try the usual ports first, for people who look at them; without it all ports are any free ones, so that
     several demonstrations can start at the same moment.
     """
+    try:
+        port.free("tcp", web_host, 1)
+    except OSError as error:
+        remedy = "give --web-host an address of this machine, or 0.0.0.0 for all of them"
+        raise Trouble(f"the page cannot be at {web_host} ({error.strerror}); {remedy}") from error
     if web_port:
         web = port.chosen("tcp", web_host, web_port, "the page")
     else:

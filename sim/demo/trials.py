@@ -187,10 +187,9 @@ def real(count: int, seed: int, run_dir: Path) -> list[bool]:
 
 def whole(word: str) -> int:
     """A number that is not negative, from the command line."""
-    number = int(word)
-    if number < 0:
-        raise ValueError(word)
-    return number
+    if not (word.isdecimal() and len(word) <= 9):
+        raise argparse.ArgumentTypeError(f"must be a whole number from 0 on, is {word!r}")
+    return int(word)
 
 
 def main(arguments: Sequence[str], make_team: MakeTeam) -> int:

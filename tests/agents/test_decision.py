@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
@@ -67,6 +69,16 @@ class DecisionTests(SynchronousTestCase):
     def test_acting_member_without_report_counts_for_nothing(self) -> None:
         """Who says to act and reports nothing does not keep the task from the others."""
         self.assertEqual(decided(member("z", None, EXECUTING), member("a", 5.0)).assigned, "a")
+
+    def test_acting_member_with_an_unlawful_report_gives_way(self) -> None:
+        """Who acts and reports what is no cost, or none on this planet, does not keep the task from the others."""
+        nonsense: list[Any] = [10**400, float("inf"), float("nan"), -1.0, True, "1", 1e300]
+        for cost in nonsense:
+            self.assertIsNone(decided(member("z", cost, EXECUTING)).assigned)
+        for cost in (*nonsense, 2e9):
+            for hysteresis in (0.1, 1.0):
+                decision = decided(member("z", cost, EXECUTING), member("a", 5.0), hysteresis=hysteresis)
+                self.assertEqual(decision.assigned, "a", (cost, hysteresis))
 
     def test_two_acting_members_come_down_to_one(self) -> None:
         """Where two say to act, all name the nearer of them, and of equals the lower uuid."""

@@ -71,7 +71,7 @@ class Council:
     def __init__(self, clock: HeapClock, events: list[str]) -> None:
         self.is_wanted = False
         self.heirs: Sequence[Contact] = ()
-        self.rank = 0
+        self.places: list[int] = []
         self.token = 0
         self.deadline = 0.0
         self._clock = clock
@@ -94,8 +94,8 @@ class Council:
         return succeed(None)
 
     def stand_by(self, rank: int = 1) -> None:
-        """Note the place in the row."""
-        self.rank = rank
+        """Note the place in the line."""
+        self.places.append(rank)
 
     def release(self, heirs: Sequence[Contact] = ()) -> Deferred[object]:
         """Give it back."""
@@ -103,6 +103,7 @@ class Council:
         if self.token:
             self._events.append("released")
         self.is_wanted, self.token = False, 0
+        self.places.append(0)
         return succeed(None)
 
     def suspect(self) -> None:
@@ -225,6 +226,39 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.step().action, HOLD)
         self.assertEqual(self.events, ["halted", "released"])
         self.assertIn("gives the task back", self.said)
+
+    def test_who_stands_by_keeps_its_place(self) -> None:
+        """Who only waits, and holds nothing, stays in the line from its first step on and never goes to its end."""
+        self.hear(self.report(2, 0.5))
+        self.see(1.0)
+        for _ in range(5):
+            self.assertEqual(self.step().action, HOLD)
+            self.clock.advance(0.05)
+        self.assertEqual(self.council.places, [1] * 5)
+
+    def test_who_claims_lets_a_better_one_act(self) -> None:
+        """A better report that comes before the lease was granted ends the claim; there was no body to stop."""
+        self.hear(self.report(2, 2.0))
+        self.see(1.0)
+        self.step()
+        self.assertEqual((self.council.is_wanted, self.engagement.course.state), (True, State.CLAIMING))
+        self.hear(self.report(2, 0.5))
+        self.assertEqual(self.step().action, HOLD)
+        self.assertEqual((self.council.is_wanted, self.council.places), (False, [0, 1]))
+        self.assertEqual(self.events, [])
+
+    def test_lease_that_comes_too_late_is_given_back(self) -> None:
+        """Who stopped because its lease ran out gives back the next one, where another should act meanwhile."""
+        self.acting()
+        self.clock.advance(1.6)
+        self.step()
+        self.assertEqual(self.engagement.course.state, State.FENCED)
+        self.council.grant(6)
+        self.hear(self.report(2, 0.5))
+        for _ in range(3):
+            self.assertEqual(self.step().action, HOLD)
+        self.assertEqual(self.events, ["halted", "released"])
+        self.assertEqual(self.dog.executed, 1)
 
     def test_report_within_the_hysteresis_changes_nothing(self) -> None:
         """A late report that is hardly better leaves the task where it is."""

@@ -211,10 +211,21 @@ class Ether:
             self._order(target, task_id, order)
 
 
+class Council:
+    """A council of the operator alone, which never changes."""
+
+    def learn(self, configuration: int, members: object) -> None:
+        """The record tells nothing new."""
+
+    def visit(self) -> None:
+        """It is there."""
+
+
 class Lessee:
     """The claimant's side of a council that sits at the operator's."""
 
     TTL = 1.5
+    council = Council()
 
     def __init__(self, ether: Ether, place: int, task_id: str, changed: Callable[[], None], floor: int) -> None:
         self._ether, self._place, self._task_id, self._changed, self._floor = ether, place, task_id, changed, floor
@@ -238,6 +249,9 @@ class Lessee:
         if not self._wanted:
             self._wanted = True
             self._ether.clock.callLater(0.02, self._claim, self._life)
+
+    def suspect(self) -> None:
+        """Who wants it asks often enough."""
 
     def end(self) -> Deferred[object]:
         """Give back, as the task has ended."""
@@ -294,6 +308,8 @@ class Node:
         )
         self.entangled = SimpleNamespace(get=self._get)
         self.reached = lambda uuids: ()
+        self.council = lambda task: Council()
+        self.has_vacancy = lambda task, council: False
         self.deployed: Deployed = {}
         self.strategies = Strategies()
         self.groups: dict[str, list[tuple[Any, Any]]] = {}

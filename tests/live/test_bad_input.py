@@ -92,6 +92,17 @@ class BadInputTests(LiveTests):
             line = self.refused("--config", path)
         self.assert_says(line, path, "[web] port", str(port), "choose another port, or 0")
 
+    def test_address_of_another_machine(self) -> None:
+        """An address that this machine has not: file, and an address to be given, not a port."""
+        for text, key in (
+            ('[node]\nname = "a"\nhost = "192.0.2.1"\n', "[node]"),
+            ('[node]\nname = "a"\nroles = ["web"]\n[web]\nhost = "192.0.2.1"\nport = 0\n', "[web]"),
+        ):
+            path = self.file(text)
+            line = self.refused("--config", path)
+            self.assert_says(line, path, key, "192.0.2.1", "give host an address of this machine")
+            self.assertNotIn("choose another", line)
+
     def test_foreign_store(self) -> None:
         """A SQLite file of another program: file, key, the store's name."""
         with closing(sqlite3.connect(self.folder / "birds.sqlite")) as connection:

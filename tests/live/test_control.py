@@ -76,7 +76,7 @@ class ControlTests(SynchronousTestCase):
 
         child.kill()
         child.wait()
-        self.assertIn("is it running?", self.swarm("dht", "get", "colour").stderr)
+        self.assertIn("does not answer (Connection refused); start it", self.swarm("dht", "get", "colour").stderr)
         self.start()
         deadline = time.monotonic() + PATIENCE_S
         while self.swarm("dht", "get", "colour").returncode and time.monotonic() < deadline:

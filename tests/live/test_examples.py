@@ -65,7 +65,7 @@ class ExamplesTests(TestCase):
         self.assertEqual(self.line(self.start("keyvalue", free_port(), known, "colour")), "red")
 
     def test_chat(self) -> None:
-        """A line typed by one is read by the other, and back."""
+        """A line typed by one is read by the other, and back, without what would move the cursor."""
         first = free_port()
         ann = self.start("chat", "--port", first, "ann")
         self.assertEqual(self.line(ann), "here: ann")
@@ -73,8 +73,8 @@ class ExamplesTests(TestCase):
         self.assertEqual(self.line(bob), "here: ann bob")
         self.say(bob, "good morning")
         self.assertEqual(self.line(ann), "bob: good morning")
-        self.say(ann, "hello")
-        self.assertEqual(self.line(bob), "ann: hello")
+        self.say(ann, "hel\x1b[2Jlo")
+        self.assertEqual(self.line(bob), "ann: hel [2Jlo")
 
     def test_workqueue(self) -> None:
         """All jobs are done though a worker dies over its first one."""

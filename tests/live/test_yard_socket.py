@@ -119,13 +119,21 @@ class YardCommandTests(SynchronousTestCase):
         self.assertIn("known are three-dogs", self.refusal("--scene", "nowhere"))
         self.assertIn("1 to 65535", self.refusal("--port", "70000"))
 
+    def test_names_an_address_of_another(self) -> None:
+        """An address that this machine has not, or that is none, ends with code 2 and asks for another address."""
+        for host in ("192.0.2.1", "300.1.1.1"):
+            said = self.refusal("--host", host, "--port", "0")
+            self.assertIn(f"cannot listen on {host}:0: ", said)
+            self.assertTrue(said.endswith("; give --host an address of this machine\n"), said)
+
     def test_names_a_port_in_use(self) -> None:
         """A second yard at the same port ends with code 2 and names the port."""
         first = spawned("--port", "0")
         try:
             assert first.stdout is not None
             port = first.stdout.readline().split(" on ")[1].split(":")[1].strip()
-            self.assertIn(f"cannot listen on 127.0.0.1:{port}", self.refusal("--port", port))
+            said = self.refusal("--port", port)
+            self.assertIn(f"swarm yard: cannot listen on 127.0.0.1:{port}: Address already in use; try another", said)
         finally:
             first.kill()
             first.communicate()

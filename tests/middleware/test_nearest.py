@@ -53,7 +53,7 @@ class NearestTests(SynchronousTestCase):
         self.assertLessEqual(set(named), lawful)
 
     def test_improves(self) -> None:
-        """Only an offer that is nearer by more than the share takes over; what is no distance never does."""
+        """Only an offer nearer by more than the share takes over; what is no distance gives way and never wins."""
         rows = [
             (1.0, 0.89, True),
             (1.0, 0.9, False),
@@ -64,7 +64,7 @@ class NearestTests(SynchronousTestCase):
             (1.0, -5.0, False),
             (1.0, math.nan, False),
             (1.0, -math.inf, False),
-            (math.nan, 1.0, False),
+            (math.nan, 1.0, True),
         ]
         for current, offer, expected in rows:
             improves = self.nearest.improves(Report("a", current), Report("b", offer), 0.1)

@@ -2,15 +2,33 @@
 
 from __future__ import annotations
 
-from twisted.internet.defer import Deferred
+import random
+from collections.abc import Callable
+from typing import Any
 
+from twisted.internet.defer import Deferred
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.entangled.background import Background
+from middleware.entangled.clock import HeapClock
+from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.distance import closest
-from middleware.entangled.kademlia.overlay import FRESH, K
+from middleware.entangled.kademlia.overlay import (
+    FRESH,
+    MEETING,
+    MEETING_STEP,
+    PLACING,
+    PLACING_STEP,
+    K,
+    Overlay,
+)
 from middleware.entangled.kademlia.roster import Roster
 from middleware.entangled.network.network import Address
+from middleware.entangled.network.switchboard import Switchboard
 from middleware.entangled.record import hashed_key
-from tests.fleet import FleetCase
+from middleware.entangled.wire.endpoint import Endpoint
+from tests.fleet import TEAM, FleetCase
 
 
 class OverlayTests(FleetCase):
@@ -104,3 +122,78 @@ class OverlayTests(FleetCase):
         fleet.board.heal()
         fleet.run(12.0)
         self.assertEqual([len(node.overlay.table) for node in fleet.nodes], [3] * 4)
+
+
+class NewcomerTests(SynchronousTestCase):
+    """A node that knows nobody yet, and asks nobody."""
+
+    def setUp(self) -> None:
+        self.clock = HeapClock()
+        self.chores = Background(self.clock)
+        identity, address = Identity(bytes([1]) * 32), Address("10.0.0.1", 1)
+        network = Switchboard(self.clock, random.Random(1)).network(*address)
+        self.me = Contact(identity.public, address)
+        endpoint = Endpoint(identity, TEAM, network, self.clock, random.Random(1))
+        self.overlay = Overlay(lambda: self.me, endpoint, self.clock, self.chores)
+        self.overlay.is_placed = True
+        self.addCleanup(self.chores.stop)
+
+    def meet(self) -> None:
+        """One member of the team is heard."""
+        self.overlay.roster.heard(Contact(Identity(bytes([2]) * 32).public, Address("10.0.0.2", 2)), 0.0)
+
+    def forget(self) -> None:
+        """Know nobody again."""
+        self.overlay.roster = Roster(self.me.node_id)
+        self.overlay.is_whole = self.overlay.is_large = False
+
+    def knows_all(self) -> None:
+        """The roster is that of the whole team."""
+        self.overlay.is_whole = True
+
+    def knows_many(self) -> None:
+        """The team is too large for a roster."""
+        self.overlay.is_large = True
+
+    def holders(self) -> Deferred[list[Contact]]:
+        """Ask for the holders of a key."""
+        return Deferred.fromCoroutine(self.overlay.holders(hashed_key("a")))
+
+    def met(self) -> Deferred[None]:
+        """Ask to have met the team."""
+        return Deferred.fromCoroutine(self.overlay.met())
+
+    def look(self, work: Deferred[Any], news: Callable[[], None], step: float) -> bool:
+        """Whether ``work``, which waits, ends at the first look after ``news``."""
+        self.clock.advance(3.5 * step)
+        self.assertNoResult(work)
+        news()
+        self.clock.advance(step)
+        return bool(work.called)
+
+    def test_holders_wait_for_anybody(self) -> None:
+        """Who knows nobody waits a little with what it stores, until one member is heard or it is known to be alone."""
+        for news in (self.meet, self.knows_all):
+            self.forget()
+            self.assertTrue(self.look(self.holders(), news, PLACING_STEP))
+            self.successResultOf(self.holders())
+        self.forget()
+        alone = self.holders()
+        self.clock.advance((PLACING - 0.5) * PLACING_STEP)
+        self.assertNoResult(alone)
+        self.clock.advance(PLACING_STEP)
+        self.assertEqual(self.successResultOf(alone), [self.me])
+
+    def test_meeting_waits_for_the_team(self) -> None:
+        """What needs a majority waits until the team is known, whole or as too large, and not for one member only."""
+        for news in (self.knows_all, self.knows_many):
+            self.forget()
+            self.assertTrue(self.look(self.met(), news, MEETING_STEP))
+            self.successResultOf(self.met())
+        self.forget()
+        waiting = self.met()
+        self.assertFalse(self.look(waiting, self.meet, MEETING_STEP))
+        self.clock.advance((MEETING - 5) * MEETING_STEP)
+        self.assertNoResult(waiting)
+        self.clock.advance(MEETING_STEP)
+        self.successResultOf(waiting)

@@ -18,7 +18,7 @@ from middleware.entangled.network.network import Address
 from middleware.entangled.network.switchboard import Switchboard
 from middleware.entangled.record import Lifetime, Record, hashed_key, unpacked
 from middleware.entangled.replication.pusher import WATCH_TTL
-from middleware.entangled.replication.replica import SURE, SWEEP, Replica
+from middleware.entangled.replication.replica import PAGE_BYTES, SURE, SWEEP, Replica, pages_of
 from middleware.entangled.replication.watch import digest_of
 from middleware.entangled.wire.endpoint import Endpoint
 
@@ -192,6 +192,18 @@ class ReplicaTests(SynchronousTestCase):
         seen += page[0]
         self.assertEqual([unpacked(fields) for fields in seen], records)
         self.assertGreaterEqual(pages, 2)
+
+    def test_pages_are_full(self) -> None:
+        """Each page takes records until the next one does not fit, the second as the first; a large one goes alone."""
+        records = [record(f"{n}", value=b"v" * 1500) for n in range(30)]
+        pages = list(pages_of(records))
+        self.assertEqual([one for page in pages for one in page], records)
+        self.assertGreater(len(pages), 3)
+        self.assertEqual({len(page) for page in pages[:-1]}, {PAGE_BYTES // records[0].message_bytes})
+        large = record("large", value=b"v" * (PAGE_BYTES + 1))
+        self.assertEqual([len(page) for page in pages_of([large, *records[:2], large, *records[:2]])], [1, 2, 1, 2])
+        self.assertEqual([len(page) for page in pages_of(records[:5], 2)], [2, 2, 1])
+        self.assertEqual(list(pages_of([])), [])
 
     def test_bad_cursors_and_keys(self) -> None:
         """A cursor that is none, or a key of another length, is refused in one line."""

@@ -57,6 +57,19 @@ class ShipperTests(FleetCase):
         self.assertEqual(len(self.world.nodes[1].store.get(KEY)), FLOOD)
         self.assertEqual(self.shipper._quays, {})
 
+    def test_what_is_handed_on_keeps_its_life(self) -> None:
+        """A record of another is kept as long as whoever hands it on would have; an own one for a whole ttl."""
+        self.count_questions()
+        replica, stranger = self.world.nodes[1].replica, Identity(bytes([9]) * 32)
+        own, others = self.record(0), Record(KEY, "s", stranger.public, 1, "team", TEAM_TTL, b"x").signed(stranger)
+        (first,) = self.stored(own)
+        handed = Deferred.fromCoroutine(self.shipper.store(self.there, others, 700.0))
+        self.world.run(1.0)
+        self.assertEqual([self.successResultOf(first), self.successResultOf(handed)], [0, 0])
+        self.assertEqual(self.asked, [1, 1])
+        self.assertAlmostEqual(replica.left(others), 699.0, delta=0.1)
+        self.assertAlmostEqual(replica.left(own), TEAM_TTL - 1.0, delta=0.1)
+
     def test_one_that_is_refused_goes_alone(self) -> None:
         """A replica without room for one of the records takes the others that came with it."""
         replica, keep = self.world.nodes[1].replica, Replica.keep

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from dataclasses import replace
+from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
@@ -91,6 +92,16 @@ class StrategyTests(SynchronousTestCase):
         self.assertTrue(better(Report("a", 10.0), Report("b", 8.9), 0.1))
         for cost in (9.0, 10.0, math.nan, -1.0):
             self.assertFalse(better(Report("a", 10.0), Report("b", cost), 0.1))
+
+    def test_what_counts_for_nothing_gives_way(self) -> None:
+        """Whatever a holder's cost is, a strategy answers; whose report does not count gives way to any that does."""
+        strategies = [strategy_for(name) for name in BUILT_IN]
+        nonsense: list[Any] = [None, "1", True, [], -1.0, math.nan, math.inf, 1e300, 10**400, 10**5000]
+        for cost in nonsense:
+            for strategy in strategies:
+                self.assertIs(strategy.improves(Report("a", cost), Report("b", 9e8), 0.5), True, strategy.name)
+                self.assertIs(strategy.improves(Report("a", cost), Report("b", cost), 0.5), False, strategy.name)
+        self.assertTrue(better(Report("a", 1.0, unmet=("has no camera",)), Report("b", 9.0), 0.1))
 
     def test_digest(self) -> None:
         """Equal reports have one digest in any order, duplicates included, and another cost has another."""

@@ -17,13 +17,15 @@ ROOT = Path(__file__).resolve().parents[2]
 
 class CommandTests(SynchronousTestCase):
     def test_help_lists_the_verbs(self) -> None:
-        """Without a verb, or with --help, the verbs are listed; an unknown one is an error."""
+        """Without a verb, or with --help, the verbs are listed; an unknown one is an error in one line with all."""
         for words, code in (([], 0), (["--help"], 0), (["fly"], 2)):
-            output = io.StringIO()
-            with contextlib.redirect_stdout(output):
+            output, complaint = io.StringIO(), io.StringIO()
+            with contextlib.redirect_stdout(output), contextlib.redirect_stderr(complaint):
                 self.assertEqual(main(words), code)
-            for verb in ("demo", "yard", "trials", "dht", "tuple", "keyword", "rpc"):
-                self.assertIn(verb, output.getvalue())
+            for verb in ("demo", "yard", "trials", "deploy", "why", "dht", "tuple", "keyword", "rpc"):
+                self.assertIn(verb, (complaint if code else output).getvalue())
+        self.assertEqual((output.getvalue(), complaint.getvalue().count("\n")), ("", 1))
+        self.assertIn("no verb 'fly'", complaint.getvalue())
 
     def test_each_verb_explains_itself(self) -> None:
         """Each verb has a help of its own."""

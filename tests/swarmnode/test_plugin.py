@@ -81,6 +81,11 @@ class RefusalTests(SynchronousTestCase):
         path = self.file('[node]\nname = "a"\n[driver]\nkind = "sim"\n[agent]\nmodule = "serch"\n')
         self.assert_says(self.refusal("--config", path, is_made=True), path, "[agent] module", "'serch'", "search")
 
+    def test_refuse_agent_without_robot(self) -> None:
+        """An agent that has no robot to act with is refused, and not left out in silence."""
+        path = self.file('[node]\nname = "a"\n[agent]\nmodule = "search"\n')
+        self.assert_says(self.refusal("--config", path, is_made=True), path, "[agent] module", "name its [driver] kind")
+
     def test_refuse_agent_that_cannot_be_imported(self) -> None:
         """An agent of one's own that cannot be loaded says why."""
         path = self.file('[node]\nname = "a"\n[driver]\nkind = "sim"\n[agent]\nmodule = "no_such_module:Mind"\n')

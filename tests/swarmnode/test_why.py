@@ -73,7 +73,7 @@ class WhyTests(SynchronousTestCase):
     def test_errors_by_name(self) -> None:
         """No task, no decision, an unknown id and a missing node are one line each, which names what there is."""
         self.assertEqual(self.shell.run(main, ["last"]), (1, ""))
-        self.assertEqual(self.shell.said, "swarm why: the team has no task\n")
+        self.assertEqual(self.shell.said, "swarm why: the team has no task; assign one on the page of its web node\n")
         task = self.team.run_demo()
         self.team.clock.advance(1.0)
         code, output = self.shell.run(main, ["last"])
@@ -89,6 +89,17 @@ class WhyTests(SynchronousTestCase):
         Deferred.fromCoroutine(node.submit(Task("evil", "search", "red\x1b[2J\n target")))
         self.team.clock.advance(1.0)
         self.assertTrue(self.shell.run(main, ["evil"])[1].startswith("task evil: red [2J  target\n"))
+
+    def test_ids_cannot_move_the_cursor(self) -> None:
+        """The ids of the tasks that a refusal names reach the terminal without their control characters."""
+        node = self.team.services["vaio"].assembly.node
+        for task_id in ("a\x1b[2J", "a\n"):
+            Deferred.fromCoroutine(node.submit(Task(task_id, "search", "red")))
+        self.team.clock.advance(1.0)
+        self.assertEqual(self.shell.run(main, ["zz"])[0], 1)
+        self.assertEqual(self.shell.said, "swarm why: no task begins with 'zz'; the newest are a , a [2J\n")
+        self.shell.run(main, ["a"])
+        self.assertEqual(self.shell.said, "swarm why: 2 tasks begin with 'a': a , a [2J; say more of the id\n")
 
     def test_prefix(self) -> None:
         """A beginning that fits several is refused with their names; a whole id is meant, also where others go on."""

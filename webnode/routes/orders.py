@@ -6,7 +6,7 @@ from webnode.field import Json
 from webnode.route import API, Ask, Field, Route, device
 
 MAX_MESSAGE = 140
-MAX_AWAY_S = 600.0
+MIN_AWAY_S, MAX_AWAY_S = 0.1, 600.0
 AWAY_S = 15.0
 UUID = Field("uuid", "text", "the device", "path", most=64)
 TEXT = Field("text", "text", "what it is told", most=MAX_MESSAGE)
@@ -53,7 +53,14 @@ ROUTES = (
         (
             UUID,
             Field(
-                "seconds", "number", "how long", least=0.1, most=MAX_AWAY_S, default=AWAY_S, is_required=False, unit="s"
+                "seconds",
+                "number",
+                "how long",
+                least=MIN_AWAY_S,
+                most=MAX_AWAY_S,
+                default=AWAY_S,
+                is_required=False,
+                unit="s",
             ),
         ),
         gives="id, seconds",

@@ -33,7 +33,7 @@ def parser(group: str) -> argparse.ArgumentParser:
         rpc = argparse.ArgumentParser(prog="swarm rpc", parents=[common], description="Call a method of a node.")
         rpc.add_argument("node_asked", metavar="NODE", help="HOST:PORT, or the beginning of a known node's id")
         rpc.add_argument("method", help="for instance ping")
-        rpc.add_argument("arguments", nargs="*", help="JSON where it is JSON, else text")
+        rpc.add_argument("arguments", nargs="*", default=[], help="JSON where it is JSON, else text")
         rpc.add_argument("--changes", action="store_true", help="the method changes something: it is to run once")
         rpc.set_defaults(verb="rpc")
         return rpc
@@ -96,7 +96,7 @@ def _tuple(verb: Callable[[str, str], argparse.ArgumentParser]) -> None:
 
 
 def request_of(wishes: argparse.Namespace) -> dict[str, Any]:
-    """The request that a command line means; raises ``word.BadWord``, or ``OSError`` for a file that cannot be read."""
+    """The request that a command line means; raises ``word.BadWord``, also for a file that cannot be read."""
     given = {name: value for name, value in vars(wishes).items() if name not in ("verb", "node", "json")}
     if "node_asked" in given:
         given["node"] = given.pop("node_asked")
@@ -120,7 +120,8 @@ def asked(path: Path, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
                 for line in lines:
                     yield json.loads(line)
         except (OSError, ValueError) as error:
-            raise NoControl(f"the node behind {path} does not answer ({error}); is it running?") from error
+            why = getattr(error, "strerror", None) or error
+            raise NoControl(f"the node behind {path} does not answer ({why}); start it, or remove that file") from error
 
 
 def main(group: str, words: Sequence[str], out: TextIO | None = None, ask: Ask = asked) -> int:
@@ -133,7 +134,7 @@ def main(group: str, words: Sequence[str], out: TextIO | None = None, ask: Ask =
         for line in ask(path, request):
             if "error" in line:
                 if wishes.json:
-                    out.write(json.dumps(line) + "\n")
+                    out.write(word.written(line) + "\n")
                 return _complain(group, line["text"], WRONG if line["error"] == "BadRequest" else FAILED)
             answer = line["answer"] if "answer" in line else line.get("event")
             out.write("".join(f"{text}\n" for text in _texts(wishes.verb, answer, wishes.json)))
@@ -149,13 +150,14 @@ def main(group: str, words: Sequence[str], out: TextIO | None = None, ask: Ask =
 
 def _texts(verb: str, answer: Any, is_json: bool) -> list[str]:
     if is_json:
-        return [json.dumps(answer, ensure_ascii=False)]
+        return [word.written(answer)]
     if answer is None:
         return []
     if verb == "dht find":
-        return [f"{each['id']}  {each['host']}:{each['port']}" for each in answer]
+        return [word.printable(f"{each['id']}  {each['host']}:{each['port']}") for each in answer]
     if verb in ("dht get", "dht watch", "keyword search", "keyword watch"):
-        lines = [f"{each['owner'][:10]}  {each['name'] or '-'}  {_plain(each['value'])}" for each in answer]
+        rows = [f"{each['owner'][:10]}  {each['name'] or '-'}  {_plain(each['value'])}" for each in answer]
+        lines = [word.printable(row) for row in rows]
         return [*lines, *([""] if verb.endswith("watch") else [])]
     if verb == "tuple read" and answer and isinstance(answer[0], list):
         return [word.shown(each) for each in answer]
@@ -163,7 +165,7 @@ def _texts(verb: str, answer: Any, is_json: bool) -> list[str]:
         return [word.shown(answer)]
     if isinstance(answer, dict) and "replicas" in answer:
         return [f"{answer['replicas']} replicas have it"]
-    return [json.dumps(answer, ensure_ascii=False)]
+    return [word.written(answer)]
 
 
 def _is_nothing(verb: str, answer: Any) -> bool:
@@ -185,10 +187,13 @@ def _value(text: str) -> Any:
     if text == "-":
         return word.plain(sys.stdin.buffer.read())
     if text.startswith("@"):
-        return word.plain(Path(text[1:]).read_bytes())
+        try:
+            return word.plain(Path(text[1:]).read_bytes())
+        except OSError as error:
+            raise word.BadWord(f"{text[1:]} cannot be read: {error.strerror or error}") from error
     return text
 
 
 def _complain(group: str, problem: object, code: int) -> int:
-    sys.stderr.write(f"swarm {group}: {problem}\n")
+    sys.stderr.write(word.printable(f"swarm {group}: {problem}") + "\n")
     return code

@@ -52,5 +52,5 @@ def found(name: str | None) -> Path:
         raise NoControl("no node runs on this machine; start one: twistd -n swarm-node --name NAME")
     there = ", ".join(names)
     if name is None:
-        raise NoControl(f"several nodes run on this machine; say which: --node NAME, one of {there}")
+        raise NoControl(f"several nodes have run on this machine; say which: --node NAME, one of {there}")
     raise NoControl(f"no node {name!r} runs on this machine; there are {there}")

@@ -138,8 +138,11 @@ class Verbs:
 
     async def _contact(self, whom: str) -> Contact:
         host, colon, port = whom.rpartition(":")
-        if colon and port.isdecimal() and 0 < int(port) < 65536:
-            return await self.node.endpoint.greet(Address(host.strip("[]"), int(port)))
+        if colon and port.isdecimal():
+            number = int(port) if len(port) <= 5 else 0
+            if not 0 < number < 65536:
+                raise BadRequest(f"{whom!r:.80}: a port is 1 to 65535")
+            return await self.node.endpoint.greet(Address(host.strip("[]"), number))
         known = self.node.overlay.table.contacts()
         meant = [contact for contact in known if contact.node_id.hex().startswith(whom.lower())] if whom else []
         if len(meant) == 1:
@@ -193,7 +196,7 @@ class Arguments:
         if value is None or value == 0:
             return None
         if type(value) not in (int, float) or not 0 < value <= MAX_WAIT:
-            raise BadRequest(f"{name}: must be seconds, at most {MAX_WAIT:.0f}")
+            raise BadRequest(f"{name}: must be seconds, above 0 and at most {MAX_WAIT:.0f}")
         return float(value)
 
     def flag(self, name: str) -> bool:

@@ -2,6 +2,9 @@
 
 JSON has no bytes: bytes that are UTF-8 text are shown as that text, others as ``{"base64": "..."}``, which is also read
 back.  A tuple's text stays text, its bytes are always ``{"base64": ...}``, since there the two differ.
+
+Any member of the team chooses its own words, and records keep them as they are.  What would move a terminal's cursor
+is taken out where they are shown, and nowhere else: a node that refused them would see another team than the others.
 """
 
 from __future__ import annotations
@@ -87,7 +90,18 @@ def pattern(word: str) -> Any:
 
 def shown(fields: Sequence[Any]) -> str:
     """A tuple for a person: its fields as JSON, side by side."""
-    return " ".join(json.dumps(plain(field), ensure_ascii=False) for field in fields)
+    return " ".join(written(plain(field)) for field in fields)
+
+
+def printable(text: str) -> str:
+    """Somebody's words as a terminal may be shown them, on one line: each control character is a space."""
+    return "".join(c if c.isprintable() else " " for c in text)
+
+
+def written(value: Any) -> str:
+    """Plain JSON on one line that a terminal may be shown; read back it is the same value."""
+    text = json.dumps(value, ensure_ascii=False)
+    return "".join(c if c.isprintable() else json.dumps(c)[1:-1] for c in text)
 
 
 def _refused(constant: str) -> Any:

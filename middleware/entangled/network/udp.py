@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import socket
 from collections import Counter
 from functools import lru_cache
@@ -54,7 +55,9 @@ class UdpNetwork:
             self._port = self._reactor.listenUDP(self._wanted, protocol, self._host, MAX_DATAGRAM + 1)
         except CannotListenError as error:
             why = getattr(error.socketError, "strerror", None) or error.socketError
-            raise PortInUse(f"UDP {self._host}:{self._wanted}: {why}; choose another port, or 0 for any") from error
+            is_foreign = getattr(error.socketError, "errno", None) == errno.EADDRNOTAVAIL
+            remedy = "give host an address of this machine" if is_foreign else "choose another port, or 0 for any"
+            raise PortInUse(f"UDP {self._host}:{self._wanted}: {why}; {remedy}") from error
         self._number = self._port.getHost().port
         try:
             self._port.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)

@@ -77,7 +77,7 @@ class CommandTests(SynchronousTestCase):
         path.write_bytes(b"\xff")
         self.assertEqual(self.request(f"dht put a @{path}")["with"]["value"], {"base64": "/w=="})
         self.assertEqual(self.run_command("dht put a @/nowhere/at/all")[0], 2)
-        self.assertIn("nowhere", self.said)
+        self.assertEqual(self.said, "swarm dht: /nowhere/at/all cannot be read: No such file or directory\n")
 
     def test_answers_for_people_and_programs(self) -> None:
         """An answer is lines for a person, and one line of JSON with ``--json``."""
@@ -93,6 +93,28 @@ class CommandTests(SynchronousTestCase):
             ("rpc h:1 ping", "pong", '"pong"\n'),
         ):
             self.assertEqual(self.run_command(line, {"answer": answer}), (0, shown))
+
+    def test_words_of_others_cannot_move_the_cursor(self) -> None:
+        """Names, values, fields and complaints of other nodes reach the terminal without their control characters."""
+        evil = "red\x1b[2J\x9b2J\n\u202e"
+        record = {**RECORD, "name": evil, "value": evil}
+        for line, answer in (
+            ("dht get a", [record]),
+            ("dht watch a", [record]),
+            ("dht find a", [{"id": "00ff", "host": evil, "port": 7}]),
+            ("keyword search a", [record]),
+            ("tuple get _", [evil]),
+            ("tuple read _ --all", [[evil]]),
+            ("rpc h:1 name", {evil: evil}),
+        ):
+            for each in (line, f"{line} --json"):
+                _, output = self.run_command(each, {"answer": answer})
+                self.assertTrue(output.removesuffix("\n").rstrip("\n").isprintable(), (each, output))
+            self.assertEqual(json.loads(output), answer)
+        for line in ("rpc h:1 name", "rpc h:1 name --json"):
+            _, output = self.run_command(line, {"error": "Refused", "text": evil})
+            self.assertTrue((output + self.said).replace("\n", "").isprintable())
+            self.assertEqual(self.said.count("\n"), 1)
 
     def test_events_are_printed_as_they_come(self) -> None:
         """A watch prints each change, with a blank line behind it."""
@@ -115,15 +137,20 @@ class CommandTests(SynchronousTestCase):
 
     def test_wrong_command_lines(self) -> None:
         """Command lines that make no sense end with exit code 2 before any node is asked."""
+        complaint = io.StringIO()
         for line in ("dht", "dht fly", "dht get", "dht put a", "tuple get", "dht put a b --expect x", "rpc h:1"):
-            caught = self.assertRaises(SystemExit, self.run_command, line)
+            group, *words = line.split()
+            with contextlib.redirect_stderr(complaint):
+                caught = self.assertRaises(SystemExit, main, group, words, io.StringIO(), self.ask)
             self.assertEqual(caught.code, 2)
         self.assertEqual(self.requests, [])
+        self.assertTrue(complaint.getvalue().endswith("the following arguments are required: method\n"))
 
     def test_node_that_does_not_answer(self) -> None:
         """A socket behind which nobody is, and one that speaks another language, are named."""
         path = made("gone")
-        self.assertIn("does not answer", str(self.assertRaises(NoControl, list, asked(path, {}))))
+        said = str(self.assertRaises(NoControl, list, asked(path, {})))
+        self.assertIn("does not answer (No such file or directory); start it, or remove that file", said)
         server = socket.socket(socket.AF_UNIX)
         self.addCleanup(server.close)
         server.bind(str(path))

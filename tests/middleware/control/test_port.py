@@ -147,6 +147,9 @@ class ControlTests(SynchronousTestCase):
         self.assertNotIn("answer", self.ask("rpc", node=where, method="subtract", arguments=[]))
         self.assertIn("begin with", self.refusal("rpc", node="", method="add", arguments=[]).replace("begins", "begin"))
         self.assertIn("no known node", self.refusal("rpc", node="zz", method="add", arguments=[]))
+        for port in ("0", "65536", "9" * 5000):
+            told = self.refusal("rpc", node=f"10.0.0.1:{port}", method="add", arguments=[])
+            self.assertTrue(told.endswith(": a port is 1 to 65535"), told)
 
     def test_wrong_requests(self) -> None:
         """What is wrong is said with the argument's name, and nothing is done."""
@@ -166,6 +169,7 @@ class ControlTests(SynchronousTestCase):
             ("tuple get", {"template": 1}, "template"),
             ("tuple get", {"template": [{"kind": "number"}]}, "template"),
             ("tuple get", {"template": [1], "wait": "long"}, "wait"),
+            ("tuple put", {"fields": [1], "ttl": -1}, "above 0 and at most 86400"),
         ):
             self.assertIn(said, self.refusal(verb, **given))
         self.assertEqual(self.ask("tuple put", fields=[[1]])["error"], "BadTuple")

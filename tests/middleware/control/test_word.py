@@ -63,6 +63,15 @@ class WordTests(SynchronousTestCase):
             self.assertEqual(word.pattern(text), meant)
         self.assertIn("?int", str(self.assertRaises(word.BadWord, word.pattern, "?number")))
 
+    @given(st.text())
+    def test_what_a_terminal_is_shown(self, text: str) -> None:
+        """Of any words no control character is left: as text each is a space, in JSON an escape that is read back."""
+        self.assertTrue(word.printable(text).isprintable())
+        self.assertEqual(len(word.printable(text)), len(text))
+        written = word.written({text: [text]})
+        self.assertTrue(written.isprintable())
+        self.assertEqual(json.loads(written), {text: [text]})
+
     def test_bytes_for_people(self) -> None:
         """A value that is text is shown as text, any other as base64; text that looks like base64 is not bytes."""
         self.assertEqual(word.text_or_base64("dög".encode()), "dög")
@@ -71,3 +80,4 @@ class WordTests(SynchronousTestCase):
         self.assertRaises(word.BadWord, word.value, [{"base64": 7}])
         self.assertEqual(word.plain({"a": float("inf"), b"k": (1, b"x")}), {"a": "inf", "k": [1, {"base64": "eA=="}]})
         self.assertEqual(word.shown(("job", 7, None)), '"job" 7 null')
+        self.assertEqual(word.shown(("dög\x9b2J\u202e",)), '"dög\\u009b2J\\u202e"')

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
+import socket
 import tomllib
 from pathlib import Path
 from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
+from sim.demo import port
 from sim.demo.configuration import DOGS, Plan
 from sim.demo.demonstration import main
 from sim.demo.experiment import LIMIT_S, Experiment, report, table, to_target
-from sim.demo.stage import MARK, Trouble, fresh
+from sim.demo.stage import MARK, Trouble, arranged, fresh
 from sim.demo.story import present, told
 from sim.demo.visitor import MAX_EVENT, EventStream
 
@@ -262,6 +266,25 @@ class StageTests(SynchronousTestCase):
             self.assertNotIn("\n", str(error))
         fresh(self.folder).close()
 
+    def test_what_is_no_folder_is_refused(self) -> None:
+        """A file in the place of the folder, or of the folder above it, is refused with what to do."""
+        self.folder.write_text("mine")
+        for folder in (self.folder, self.folder / "inner"):
+            said = str(self.assertRaises(Trouble, fresh, folder))
+            self.assertTrue(said.startswith(f"{folder} cannot be used ("), said)
+            self.assertIn("choose another --run-dir", said)
+
+    def test_foreign_address_is_refused(self) -> None:
+        """An address that is none of this machine is refused as such, and its port is not called busy."""
+
+        def nowhere(*_: object) -> list[int]:
+            raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
+
+        self.patch(port, "free", nowhere)
+        for wanted in (None, 8080):
+            error = self.assertRaises(Trouble, arranged, self.folder, "nohost", wanted, True, lambda line: None)
+            self.assertIn("the page cannot be at nohost (Name or service not known); give --web-host", str(error))
+
 
 class CommandLineTests(SynchronousTestCase):
     """The command line says what is wrong with it."""
@@ -269,3 +292,15 @@ class CommandLineTests(SynchronousTestCase):
     def test_unknown_option_ends_with_two(self) -> None:
         """An option that does not exist ends the program with exit code 2 before anything starts."""
         self.assertEqual(self.assertRaises(SystemExit, main, ["--nonsense"]).code, 2)
+
+    def test_wrong_values_are_named(self) -> None:
+        """A port that is none, and a report in no folder, are refused before anything starts, with what would do."""
+        for words, said in (
+            (["--web-port", "99999"], "--web-port: must be 0 to 65535, is '99999'"),
+            (["--web-port", "-1"], "--web-port: must be 0 to 65535, is '-1'"),
+            (["--headless", "--report", "/nowhere/x.json"], "--report /nowhere/x.json: there is no such folder; make"),
+        ):
+            errors = io.StringIO()
+            with contextlib.redirect_stderr(errors):
+                self.assertEqual(self.assertRaises(SystemExit, main, words).code, 2)
+            self.assertIn(said, errors.getvalue())
