@@ -255,6 +255,28 @@ class Halts(Protocol):
         """Whether the team is halted."""
 
 
+class MemoryHalts:
+    """The button of a team that obeys; ``devices`` are the uuids of those that say so, ``said`` who pressed what."""
+
+    def __init__(self, *devices: str) -> None:
+        self.devices = devices
+        self.said: list[tuple[str, str]] = []
+
+    def halt(self, by: str) -> Deferred[dict[str, str]]:
+        """All stand."""
+        self.said.append(("halt", by))
+        return succeed(dict.fromkeys(self.devices, "stands"))
+
+    def release(self, by: str) -> Deferred[dict[str, str]]:
+        """All go on."""
+        self.said.append(("release", by))
+        return succeed(dict.fromkeys(self.devices, "goes on"))
+
+    def is_halted(self) -> bool:
+        """Whether the last that was pressed was the halt."""
+        return bool(self.said) and self.said[-1][0] == "halt"
+
+
 class Faults(Protocol):
     """Faults that are caused on purpose, where devices allow it; each heals itself after its seconds."""
 

@@ -12,6 +12,7 @@ from twisted.logger import Logger
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.record import Record
 from middleware.entangled.replication.watch import Watch
+from middleware.halt import HALT
 from middleware.node import CAMERA, SwarmNode
 from middleware.order import PAUSE, RESUME, Order
 from middleware.presence import DEVICES, devices_of
@@ -57,6 +58,7 @@ class TeamDesk:
         self._reasons: dict[str, Watch] = {}
         self._devices = node.watch_devices(lambda records: None, keep=True)
         self._tasks = node.watch_tasks(self._follow, keep=True)
+        node.halt.follow()
 
     # -- what is known ----------------------------------------------------------------------------------------------
 
@@ -66,6 +68,8 @@ class TeamDesk:
             return self._devices.records
         if key == TASKS:
             return self._tasks.records
+        if key == HALT:
+            return self._node.halt.records
         watches = (*self._groups.values(), *self._reasons.values())
         return next((watch.records for watch in watches if watch.key == key), [])
 
