@@ -16,7 +16,7 @@ from twisted.internet import reactor as _reactor
 from twisted.internet.stdio import StandardIO
 from twisted.protocols.basic import LineReceiver
 
-from webnode.board import Board, OpenSessions
+from webnode.board import Board, MemoryHalts, OpenSessions
 from webnode.camera import OnFrame
 from webnode.desk import MemoryDesk
 from webnode.server import WebService, web_service
@@ -94,6 +94,7 @@ class Team:
         now = time.time()
         self.devices = [dog(1, "WAITING", "t1", now), dog(2, "EXECUTING", "t1", now), dog(3, "SEARCHING", "t1", now)]
         self.away: set[str] = set()
+        self.halts = MemoryHalts(*(f"{n:02x}" * 16 for n in (1, 2, 3)))
         self._departed = Departed()
         self.tasks = [
             {
@@ -132,7 +133,8 @@ class Team:
             for each in here
         ]
         gone = self._departed.of(here, time.time())
-        return state_of(here, self.tasks, {"t1": members}, departed=gone, node="vaio")
+        state = state_of(here, self.tasks, {"t1": members}, departed=gone, node="vaio")
+        return {**state, "halted": self.halts.is_halted()}
 
     def watch(self, uuid: str, on_frame: OnFrame) -> Any:
         """Pictures of a floor, a wall and a red ball that rolls, 15 a second."""
@@ -206,16 +208,16 @@ class Orders(LineReceiver):
             reactor.stop()
 
 
-def board() -> Board:
+def board(team: Team) -> Board:
     """What the page can ask for: twins in memory, so that every order is taken and none does harm."""
-    return Board(MemoryDesk(CATALOGUE, YARD), OpenSessions())
+    return Board(MemoryDesk(CATALOGUE, YARD), OpenSessions(), halts=team.halts)
 
 
 def main() -> None:
     """Serve until the input ends."""
     team = Team()
     port = int(sys.argv[1]) if len(sys.argv) > 1 else 0
-    web = web_service(reactor, "127.0.0.1", port, team.read, board(), team, time.time)
+    web = web_service(reactor, "127.0.0.1", port, team.read, board(team), team, time.time)
     web.startService()
     reactor.addSystemEventTrigger("before", "shutdown", web.stopService)
     reactor.callWhenRunning(lambda: StandardIO(Orders(team, web)))

@@ -1,5 +1,6 @@
 // The page: every panel that there is, one stream in, and the model that all of them read.
 import "./header.js";
+import "./halt.js";
 import "./devices.js";
 import "./groups.js";
 import "./cameras.js";
