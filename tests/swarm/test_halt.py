@@ -99,7 +99,7 @@ class HaltTests(SynchronousTestCase):
         team.clock.advance(0.5)
         team.run_demo()
         team.add("dog3")
-        moved = set()
+        moved: set[str] = set()
         for _ in range(100):
             team.clock.advance(0.05)
             moved.update(dog.name for dog in team.yard.world.dogs.values() if dog.is_moving)
