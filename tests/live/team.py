@@ -210,7 +210,10 @@ class Orders(LineReceiver):
 
 def board(team: Team) -> Board:
     """What the page can ask for: twins in memory, so that every order is taken and none does harm."""
-    return Board(MemoryDesk(CATALOGUE, YARD), OpenSessions(), halts=team.halts)
+    desk = MemoryDesk(CATALOGUE, YARD)
+    able = [{"uuid": f"{n:02x}" * 16, "name": f"dog{n}", "busy": "Patrol the yard" * (n == 2)} for n in (1, 2)]
+    desk.previews["search"] = {"able": able, "refused": {"dog3": ["no gripper", "no lift"]}, "likely": None}
+    return Board(desk, OpenSessions(), halts=team.halts)
 
 
 def main() -> None:
