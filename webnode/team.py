@@ -172,10 +172,17 @@ class TeamDesk:
         """Ask a device to leave the network for a while, as if it had failed; fires when it says that it does."""
         return self.call(uuid, "device.disconnect", seconds)
 
-    def call(self, uuid: str, method: str, *arguments: object) -> Deferred[Any]:
+    def call(
+        self,
+        uuid: str,
+        method: str,
+        *arguments: object,
+        refused: Callable[[Refused], Refusal | None] = lambda refused: None,
+    ) -> Deferred[Any]:
         """Ask a device something; fires with its answer, fails with ``Refusal``.
 
-        409: it is not here, leaves while it is asked, or says no; 504: it is here and does not answer.
+        409: it is not here, leaves while it is asked, or says no; 504: it is here and does not answer.  ``refused``
+        may know better what a no means.
         """
         name, record = self._name_of(uuid), self._record_of(uuid)
         contact = None if record is None else self._node.contact_of(record)
@@ -183,7 +190,7 @@ class TeamDesk:
             return fail(Refusal("device", f"{name} is not here", "choose one of /api/v1/devices", 409))
         until = self._node.clock.seconds() + PATIENCE
         asked = self._node.entangled.endpoint.ask(contact, method, *arguments, timeout=PATIENCE, changes=True)
-        return asked.addErrback(self._unanswered, uuid, name, until)
+        return asked.addErrback(self._unanswered, uuid, name, until, refused)
 
     def move_target(self, x: float, y: float) -> Any:
         """Put the target at (x, y)."""
@@ -241,11 +248,15 @@ class TeamDesk:
         devices = devices_of(self._devices.records)
         return next((device.name for device, _ in devices if device.uuid == uuid), uuid[:8])
 
-    def _unanswered(self, failure: Any, uuid: str, name: str, until: float) -> Deferred[Any]:
+    def _unanswered(
+        self, failure: Any, uuid: str, name: str, until: float, refused: Callable[[Refused], Refusal | None]
+    ) -> Deferred[Any]:
         """Say in what way a device failed to do what it was asked."""
         failure.trap(EntangledError)
         if failure.check(Refused):
-            raise Refusal("device", f"{name} says no: {failure.getErrorMessage()}", "ask for something else", 409)
+            raise refused(failure.value) or Refusal(
+                "device", f"{name} says no: {failure.getErrorMessage()}", "ask for something else", 409
+            )
         silent: Deferred[Any] = Deferred()
 
         def judge() -> None:

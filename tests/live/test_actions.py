@@ -25,7 +25,7 @@ class ActionPageTests(SynchronousTestCase):
         self.addCleanup(self.browser.close)
         self.faults: list[str] = []
 
-    def opened(self, screen: dict[str, Any], scheme: str = "light") -> Any:
+    def opened(self, screen: dict[str, Any], scheme: Any = "light") -> Any:
         """The page, when it shows the team."""
         page = self.browser.new_context(**screen, color_scheme=scheme, reduced_motion="reduce").new_page()
         page.set_default_timeout(20000)

@@ -11,7 +11,7 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from tests.webnode.guests import Guests
 from webnode.app import create_app
-from webnode.board import Board, MemoryChronicle, MemoryHalts
+from webnode.board import Board, Knob, MemoryChronicle, MemoryHalts, MemoryTuning
 from webnode.desk import MemoryDesk
 from webnode.errors import Refusal
 from webnode.state import state_of
@@ -25,7 +25,8 @@ class ActionTests(SynchronousTestCase):
         self.desk = MemoryDesk([{"name": "search"}], {"walls": [3.0, 2.4], "dogs": [DOG], "target": None})
         self.halts = MemoryHalts("01", "02")
         self.chronicle = MemoryChronicle()
-        self.board = Board(self.desk, Guests(), chronicle=self.chronicle, halts=self.halts)
+        tuning = MemoryTuning({"01": [Knob("description", "a dog", "A line", most=200.0)]})
+        self.board = Board(self.desk, Guests(), chronicle=self.chronicle, halts=self.halts, tuning=tuning)
         state = state_of([{"uuid": "01", "name": "dog1", "joined": 1}], [], {}, node="vaio")
         app = create_app(lambda: state, self.board, wall=lambda: 1e9)
         app.logger.setLevel(logging.CRITICAL + 1)
@@ -90,6 +91,27 @@ class ActionTests(SynchronousTestCase):
         self.assertEqual(self.desk.asked, [])
         self.desk.ground = None
         self.assertEqual(self.ask("PUT", "yard/robots/dog1", {"x": 1, "y": 1})[0], 409)
+
+    def test_settings(self) -> None:
+        """A viewer reads the settings of a device, an operator changes them; the device's own refusal comes through."""
+        status, rows = self.ask("GET", "devices/01/settings", role="viewer")
+        self.assertEqual(
+            (status, rows[0]["key"], rows[0]["value"], rows[0]["most"]), (200, "description", "a dog", 200.0)
+        )
+        self.assertEqual(self.ask("PUT", "devices/01/settings", {"description": "x"}, "viewer")[0], 403)
+        self.assertEqual(self.ask("PUT", "devices/01/settings", {"description": ""})[1][0]["value"], "")
+        wrong: list[tuple[str, Any, int, str]] = [
+            ("01", {}, 400, "body"),
+            ("01", {"desription": "x"}, 400, "desription"),
+            ("01", {"description": 5}, 400, "description"),
+            ("01", {"camera_fps": 5}, 400, "camera_fps"),
+            ("07", {"description": "x"}, 404, "device"),
+        ]
+        for uuid, body, expected, field in wrong:
+            status, answer = self.ask("PUT", f"devices/{uuid}/settings", body)
+            self.assertEqual((status, answer["error"]["field"]), (expected, field), body)
+        self.board.tuning = None
+        self.assertEqual(self.ask("GET", "devices/01/settings")[0], 409)
 
     def test_orders_answer_what_became_of_them(self) -> None:
         """A message is answered with who has it; a device that was lost meanwhile is an error that says so."""
