@@ -16,7 +16,7 @@ from twisted.internet import reactor as _reactor
 from twisted.internet.stdio import StandardIO
 from twisted.protocols.basic import LineReceiver
 
-from webnode.board import Board, MemoryHalts, OpenSessions
+from webnode.board import Board, Knob, MemoryHalts, MemoryTuning, OpenSessions
 from webnode.camera import OnFrame
 from webnode.desk import MemoryDesk
 from webnode.server import WebService, web_service
@@ -170,6 +170,11 @@ YARD = {
     ],
     "target": {"x": 1.8, "y": 1.7, "radius": 0.08},
 }
+KNOBS = [
+    Knob("description", "The dog with 1 yellow stripe on its head.", "A line about the device", most=200),
+    Knob("presence_lease", 1.0, "How long the others believe in the device", "s", 0.1, 60.0),
+    Knob("capabilities", {"gripper": {"width": 0.1}}, "What the device can do beyond what its driver says"),
+]
 CATALOGUE = [
     {"name": "search", "title": "Find and touch the red target", "requirements": {}},
     {"name": "patrol", "title": "Patrol the yard", "requirements": {}},
@@ -213,7 +218,7 @@ def board(team: Team) -> Board:
     desk = MemoryDesk(CATALOGUE, YARD)
     able = [{"uuid": f"{n:02x}" * 16, "name": f"dog{n}", "busy": "Patrol the yard" * (n == 2)} for n in (1, 2)]
     desk.previews["search"] = {"able": able, "refused": {"dog3": ["no gripper", "no lift"]}, "likely": None}
-    return Board(desk, OpenSessions(), halts=team.halts)
+    return Board(desk, OpenSessions(), halts=team.halts, tuning=MemoryTuning({able[0]["uuid"]: KNOBS}))
 
 
 def main() -> None:
