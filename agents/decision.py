@@ -9,9 +9,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from middleware.consensus.strategy import Consensus, ConsensusAlgorithm, Report
+from middleware.consensus.strategy import Consensus, ConsensusAlgorithm, Report, agreement
+from middleware.consensus.view import view_of
 from middleware.presence import EXECUTING
-from middleware.tasks import Member, is_bid
+from middleware.tasks import Member
+
+REASON = 100
+"""Characters of a strategy's reason for naming nobody: it travels in each report."""
 
 
 @dataclass(frozen=True)
@@ -46,11 +50,12 @@ def decide(
     acts keeps the task until another is better by the ``hysteresis``.
     """
     present = {m.uuid: m for m in members}
-    reports = {m.uuid: Report(m.uuid, m.cost) for m in present.values() if m.cost is not None and is_bid(m.cost)}
+    view = view_of(strategy)
+    reports = {m.uuid: report for m in present.values() if (report := view.report(m)) is not None}
     acting = sorted((m for m in present.values() if m.status == EXECUTING and m.uuid in reports), key=_precedence)
     basis: tuple[object, ...] = (
         tuple(sorted(present)),
-        tuple(sorted((r.agent, r.cost) for r in reports.values())),
+        tuple(sorted(reports.values(), key=lambda report: report.agent)),
         tuple((m.token, m.uuid) for m in acting),
     )
     if not reports or since_first is None:
@@ -62,9 +67,11 @@ def decide(
     consensus, best = _chosen(list(reports.values()), holder, strategy, hysteresis)
     fault = consensus.reason if consensus.strategy not in ("", strategy.name) else ""
     if best is None:
-        return Decision(None, consensus.digest, "no report counts", basis=basis, fault=fault, consensus=consensus)
+        why_not = consensus.reason[:REASON] or "no report counts"
+        return Decision(None, consensus.digest, why_not, basis=basis, fault=fault, consensus=consensus)
     name, cost = present[best].name, reports[best].cost
-    why = f"{name}, {cost:.2f}, best of {len(reports)}"
+    agreed = agreement(consensus.value, consensus.choice)
+    why = f"{name}, {cost:.2f}, best of {len(reports)}" + (f"; agreed on {agreed}" if agreed else "")
     rest = (agent for agent in (consensus.assigned_agent, *consensus.standby) if agent is not None)
     order = tuple(dict.fromkeys((best, *rest)))
     return Decision(best, consensus.digest, f"{why}; {fault}" if fault else why, order, basis, fault, consensus)

@@ -25,7 +25,7 @@ from agents.state import Course, State
 from drivers.driver import Permit
 from drivers.reading import Action, Observation
 from middleware.commitment.lessee import Lease, Lessee
-from middleware.consensus.strategy import ConsensusAlgorithm
+from middleware.consensus.strategy import ConsensusAlgorithm, reads_of
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.kademlia.contact import Contact
 from middleware.order import PAUSE, Order
@@ -81,7 +81,7 @@ class Engagement:
         self._heirs: tuple[str, ...] = ()
         self._successors: tuple[Contact, ...] = ()
         self._rests_until = 0.0
-        self._reporter = Reporter(behaviour, clock)
+        self._reporter = Reporter(behaviour, clock, reads_of(strategy))
         self._behaviour = behaviour
         self._execution = Execution(behaviour, task.stall_limit)
         self._clock = clock
@@ -164,7 +164,7 @@ class Engagement:
         self._behaviour.look(seen, now)
         if self.lessee is None or self.is_paused or self.is_over or self._execution.has_stalled(now):
             return
-        news = self._reporter.news(self.me, self.course.state is State.EXECUTING)
+        news = self._reporter.news(self.me, self.course.state is State.EXECUTING, seen, self.load)
         if news is not None:
             if "cost" in news:
                 cost = news["cost"]
@@ -265,7 +265,7 @@ class Engagement:
             self.course.go(State.EXECUTING)
             self._say(f"goes: {decision.why}")
         self.token = max(self.token, lease.token)
-        turn = self._execution.go_on(now, lease.token, lease.deadline)
+        turn = self._execution.go_on(now, lease.token, lease.deadline, decision.consensus)
         self._publish_decision(decision, lease.token, turn.progress)
         if turn.action is None:
             self._finish(COMPLETED)

@@ -20,6 +20,7 @@ from middleware.consensus.strategy import (
     Consensus,
     ConsensusAlgorithm,
     Report,
+    reads_of,
     refusal,
     standing,
 )
@@ -54,6 +55,7 @@ class Guard:
         self.strategy = strategy
         self.name = str(getattr(strategy, "name", type(strategy).__name__))[:MAX_NAME]
         self.version = str(getattr(strategy, "version", ""))[:MAX_NAME]
+        self.reads = reads_of(strategy)
         self.why_not = ""
         self._fallback = fallback or Nearest()
         self._twice = twice

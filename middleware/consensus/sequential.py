@@ -24,6 +24,7 @@ class Sequential(Cbba):
 
     name = "sequential"
     version = "1"
+    reads = ("value",)
 
     def find_group(self, contacts: Sequence[Report], items: Sequence[Item]) -> tuple[Consensus, ...]:
         """One consensus point for each item, in the order of their names; without positions as ``cbba`` does it."""
