@@ -45,6 +45,8 @@ def decide(
 ) -> Decision:
     """The consensus point of ``members``, as ``strategy`` finds it (a foreign one from behind its guard).
 
+    A strategy that goes by more than these reports has it in ``basis``.
+
     ``since_first`` is the seconds since the first report was seen, None when there is none.  Within the waiting period
     nobody is assigned, unless everybody has reported (or has no body free to do so), or somebody acts already; whoever
     acts keeps the task until another is better by the ``hysteresis``.
@@ -57,6 +59,7 @@ def decide(
         tuple(sorted(present)),
         tuple(sorted(reports.values(), key=lambda report: report.agent)),
         tuple((m.token, m.uuid) for m in acting),
+        *getattr(strategy, "basis", ()),
     )
     if not reports or since_first is None:
         return Decision(None, "", "nobody has reported yet", basis=basis)
@@ -71,7 +74,8 @@ def decide(
         return Decision(None, consensus.digest, why_not, basis=basis, fault=fault, consensus=consensus)
     name, cost = present[best].name, reports[best].cost
     agreed = agreement(consensus.value, consensus.choice)
-    why = f"{name}, {cost:.2f}, best of {len(reports)}" + (f"; agreed on {agreed}" if agreed else "")
+    among = consensus.reason[:REASON] if consensus.task and not fault else f"best of {len(reports)}"
+    why = f"{name}, {cost:.2f}, {among}" + (f"; agreed on {agreed}" if agreed else "")
     rest = (agent for agent in (consensus.assigned_agent, *consensus.standby) if agent is not None)
     order = tuple(dict.fromkeys((best, *rest)))
     return Decision(best, consensus.digest, f"{why}; {fault}" if fault else why, order, basis, fault, consensus)

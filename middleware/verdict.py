@@ -241,7 +241,7 @@ def _outcome(
     if not assigned:
         return found.reason or "no report counts"
     if acting is None:
-        return "nobody acted before"
+        return f"nobody acted before; {found.reason}" if found.task else "nobody acted before"
     name = members[best].name if best is not None and best in members else "nobody"
     if assigned == acting.uuid:
         if best == assigned:

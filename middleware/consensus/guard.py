@@ -89,13 +89,14 @@ class Guard:
             return one_by_one(self.find, lawful, items)
         try:
             self._may_be_asked()
-            return checked_group(whole(lawful, items), lawful, items)
+            found = checked_group(whole(lawful, items), lawful, items)
         except NotImplementedError:
             return one_by_one(self.find, lawful, items)
         except Exception as error:  # the strategy is foreign code
             said = f"{self.name} has no opinion ({self._failed(error)}); {self._fallback.name}: "
             found = one_by_one(self._fallback.find, lawful, items)
             return tuple(replace(p, strategy=self._fallback.name, reason=said + p.reason) for p in found)
+        return tuple(replace(point, strategy=self.name) for point in found)
 
     def improves(self, current: Report, offer: Report, hysteresis: float) -> bool:
         """Whether ``offer`` should take over; the fallback says so where the strategy has no opinion."""
