@@ -21,7 +21,7 @@ from agents.decision import Decision
 from agents.division import Division
 from agents.execution import Execution
 from agents.formation import Formation
-from agents.report import HALVED, NEARER, Reporter
+from agents.report import Reporter
 from agents.state import Course, State
 from drivers.driver import Permit
 from drivers.reading import Action, Observation
@@ -181,11 +181,9 @@ class Engagement:
         is_free = self.lessee is not None or self.is_lent
         if not is_free or self.is_paused or self.is_over or self._execution.has_stalled(now):
             return
-        nearer = NEARER
-        if self.course.state is State.EXECUTING:
-            # In a group somebody is free now and then: what is nearly done must not look as far as at its beginning.
-            nearer = HALVED if self.division is not None else 0.0
-        news = self._reporter.news(self.me, nearer, seen, self.load)
+        # In a group somebody is free now and then: what is nearly done must not look as far away as at its beginning.
+        is_acting = self.course.state is State.EXECUTING and self.division is None
+        news = self._reporter.news(self.me, is_acting, seen, self.load)
         if news is not None:
             if "cost" in news:
                 cost = news["cost"]

@@ -12,9 +12,9 @@ from agents.behaviour import Behaviour
 from drivers.reading import Observation
 from middleware.tasks import Member, is_bid, is_choice, is_value, is_weight
 
-FARTHER, NEARER, HALVED, STEP = 1.15, 0.85, 0.5, 0.05
+FARTHER, NEARER, STEP = 1.15, 0.85, 0.05
 """A report is renewed when the distance grew by 15 % and 5 cm (the target was moved), or shrank so much while the body
-does not act; of a group, when it halved while the body acts."""
+does not act."""
 TURNED = math.radians(15.0)
 """The direction from the target is told again when it changed by so much."""
 DRAINED = 0.05
@@ -34,18 +34,17 @@ class Reporter:
         self._moved_at = -math.inf
 
     def news(
-        self, known: Member, nearer: float = NEARER, seen: Observation | None = None, load: int = 0
+        self, known: Member, is_acting: bool, seen: Observation | None = None, load: int = 0
     ) -> dict[str, Any] | None:
         """What the others do not know yet beside ``known``; None where that is nothing.
 
-        ``nearer`` is the share to which a cost has to shrink to be told again (0: never), ``seen`` what is sensed,
-        ``load`` how many tasks the agent has.
+        ``seen`` is what the body senses, ``load`` how many tasks the agent has.
         """
         cost = self._behaviour.cost
         if not is_bid(cost):
             cost = None  # what is no cost is no bid, whatever a behaviour says
         news: dict[str, Any] = {}
-        if _is_news(cost, known.cost, nearer):
+        if _is_news(cost, known.cost, is_acting):
             news["cost"] = cost
             news["available"] = True
         valid_for = _number(getattr(self._behaviour, "valid_for", 0.0)) or 0.0
@@ -92,10 +91,10 @@ class Reporter:
         return news
 
 
-def _is_news(cost: float | None, known: float | None, nearer: float) -> bool:
+def _is_news(cost: float | None, known: float | None, is_acting: bool) -> bool:
     if cost is None or known is None:
         return (cost is None) != (known is None)
-    return cost > known * FARTHER + STEP or (nearer > 0.0 and cost < known * nearer - STEP)
+    return cost > known * FARTHER + STEP or (not is_acting and cost < known * NEARER - STEP)
 
 
 def _apart(one: float, other: float) -> float:

@@ -7,7 +7,7 @@ from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from agents.report import HALVED, NEARER, PAUSE, Reporter
+from agents.report import PAUSE, Reporter
 from drivers.reading import Observation
 from middleware.consensus.strategy import READABLE
 from middleware.entangled.clock import HeapClock
@@ -40,7 +40,7 @@ class ReporterTests(SynchronousTestCase):
     def news(self, charge: float = 0.8, load: int = 2) -> dict[str, Any]:
         """What is told, and known from then on."""
         seen = Observation(0.0, 0.0, {"power.level": charge})
-        told = self.reporter.news(self.me, NEARER, seen, load) or {}
+        told = self.reporter.news(self.me, False, seen, load) or {}
         self.me = replace(self.me, **told)
         return told
 
@@ -50,20 +50,6 @@ class ReporterTests(SynchronousTestCase):
         self.assertEqual(self.news(), {"cost": 2.0, "available": True, "battery": 0.8, "load": 2, **offer})
         self.clock.advance(9.0)
         self.assertEqual(self.news(), {})
-
-    def test_nearer_is_told_by_whom(self) -> None:
-        """A cost that shrinks is told by who stands by, when it halved by who acts in a group, and else by nobody."""
-        known = replace(ME, cost=2.0)
-        for cost, nearer, told in (
-            (1.6, NEARER, 1.6),
-            (1.6, HALVED, None),
-            (0.9, HALVED, 0.9),
-            (0.0, 0.0, None),
-            (2.4, 0.0, 2.4),
-        ):
-            self.minded.cost = cost
-            news = Reporter(self.minded, self.clock).news(known, nearer) or {}
-            self.assertEqual(news.get("cost"), told, (cost, nearer))
 
     def test_what_nobody_reads_is_not_told(self) -> None:
         """For a strategy that goes by the cost alone nothing else is told."""

@@ -15,7 +15,7 @@ NEAR = math.radians(6.0)
 
 
 class Facing:
-    """Turn to the direction ``towards`` (radians by the compass); what it costs is the angle, in tenths.
+    """Turn to the direction ``towards`` (radians by the compass) at ``speed``; it costs the angle, in tenths.
 
     It votes for the half of the world to which the dog looked first, and offers that direction as a number.
     """
@@ -25,6 +25,7 @@ class Facing:
 
     def __init__(self, parameters: Mapping[str, float | str], rng: random.Random) -> None:
         self._towards = float(parameters["towards"])
+        self._speed = float(parameters.get("speed", SPEED))
         self._first: float | None = None
         self._heading = 0.0
 
@@ -57,7 +58,7 @@ class Facing:
     def execute(self, context: Context) -> Action | None:
         """Turn the shorter way."""
         self.contexts.append(context)
-        return None if abs(self._way) < NEAR else {**STAND, "base.wz": math.copysign(SPEED, self._way)}
+        return None if abs(self._way) < NEAR else {**STAND, "base.wz": math.copysign(self._speed, self._way)}
 
     @property
     def _way(self) -> float:
