@@ -91,6 +91,7 @@ def task_view(fields: Fields) -> State:
         "requirements": properties(fields.get("requirements")),
         "waiting_period": number(fields.get("waiting_period")),
         "strategy": text(fields.get("strategy")),
+        "group": text(fields.get("group"), limit=64),
         "created": number(fields.get("created")),
         "council": texts(fields.get("council")),
         "paused": fields.get("paused") is True,

@@ -129,6 +129,19 @@ class GroupTests(SynchronousTestCase):
                 self.assertEqual(self.began[name], [by[name]])
         self.assertEqual(self.twice, [])
 
+    def test_operator_gives_a_group(self) -> None:
+        """Predefined tasks that are assigned to a group are done at once, one by each dog; the page names the group."""
+        team = VirtualTeam(5)
+        self.addCleanup(team.stop)
+        for _ in DOGS:
+            team.desk.assign("turn-around", group="yard")
+        self.until(team, lambda: self.are_done(team))
+        self.assertEqual(sorted(self.by(team).values()), list(DOGS))
+        told = {(task["group"], task["strategy"]) for task in team.state()["tasks"]}
+        self.assertEqual(told, {("yard", "group_optimal")})
+        began = [task["created"] + task["result"]["took"] for task in team.state()["tasks"]]
+        self.assertLess(max(began) - min(began), 3.0)
+
     def test_newcomer_takes_what_is_left(self) -> None:
         """Two dogs leave the third task alone while they are busy; a dog that joins takes it."""
         team = self.team(("dog1", "dog2"))
