@@ -84,6 +84,9 @@ class DivisionTests(SynchronousTestCase):
         other = self.decided(costs)
         self.assertNotEqual(first["t1"].digest, other["t1"].digest)
         self.assertNotEqual(first["t1"].basis, other["t1"].basis)
+        one_by_one = self.division(costs, "nearest")
+        shares = [one_by_one.share(task(name), 50.0, 40.0).find([]) for name in costs]
+        self.assertEqual(len({point.digest for point in shares}), 1)
 
     def test_more_tasks_than_agents(self) -> None:
         """What nobody is left for waits, and the reason says so."""
