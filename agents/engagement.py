@@ -215,16 +215,17 @@ class Engagement:
         if self._execution.has_stalled(now) and self.me.cost is not None:
             self._say("makes no progress")
             self._publish(cost=None, available=False)
+        if self.lessee is None:  # another task of its group has the body
+            decision = self._decision(now)
+            self._place(decision)
+            self._publish_decision(decision, 0)
+            return None
         is_executing = self.course.state is State.EXECUTING
         if is_executing and self._successors and self._execution.is_safe:
             self._move_council(now)
         if is_executing and self.lessee.lease is None and now < self._rests_until:
             return None
         decision = self._decision(now)
-        if self.lessee is None:
-            self._place(decision)
-            self._publish_decision(decision, 0)
-            return None
         if decision.assigned == self.me.uuid or self._must_go_on(decision):
             return self._act(decision, now)
         self._yield()
