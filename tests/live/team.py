@@ -53,7 +53,7 @@ def dog(number: int, status: str, task: str, started: float) -> dict[str, Any]:
 def why() -> dict[str, Any]:
     """Two decisions: dog3's was overtaken when dog2 came near, and dog3 knew nothing of it."""
     costs = {"dog2": 0.62, "dog1": 1.04, "dog3": 1.37}
-    reports = [{"agent": f"0{name[-1]}" * 16, "name": name, "cost": cost} for name, cost in costs.items()]
+    reports = [{"agent": f"0{name[-1]}" * 16, "name": name, "cost": cost, "more": ""} for name, cost in costs.items()]
     first = {
         "epoch": 1,
         "winner": "03" * 16,
@@ -66,6 +66,7 @@ def why() -> dict[str, Any]:
         "hysteresis": "nobody acted before",
         "standby": ["dog1"],
         "digest": "1a2b3c4d",
+        "agreed": "",
         "token": 1,
         "reported": 2,
         "reports": [{**reports[2], "cost": 1.4}, {**reports[1], "cost": 1.6}],
