@@ -23,6 +23,7 @@ from twisted.protocols.basic import LineReceiver
 from webnode.board import Board, Sessions
 from webnode.camera import OnFrame
 from webnode.desk import MemoryDesk
+from webnode.limits import AddressLimits
 from webnode.password import hashed, is_password
 from webnode.server import WebService, web_service
 from webnode.session import SignedSessions
@@ -218,7 +219,7 @@ class Orders(LineReceiver):
 def board() -> Board:
     """What the page can ask for: twins in memory, so that every order is taken and none does harm."""
     sessions = SignedSessions(b"a team of the tests", "quiet-otter", PASSWORD, random.Random(), checked)
-    return Board(MemoryDesk(CATALOGUE, YARD), sessions)
+    return Board(MemoryDesk(CATALOGUE, YARD), sessions, limits=AddressLimits())
 
 
 def checked(text: str, password: str) -> Deferred[Any]:
