@@ -20,7 +20,7 @@ from twisted.internet.stdio import StandardIO
 from twisted.internet.threads import deferToThread
 from twisted.protocols.basic import LineReceiver
 
-from webnode.board import Board, Sessions
+from webnode.board import Board, MemoryHalts, Sessions
 from webnode.camera import OnFrame
 from webnode.desk import MemoryDesk
 from webnode.limits import AddressLimits
@@ -103,6 +103,7 @@ class Team:
         now = time.time()
         self.devices = [dog(1, "WAITING", "t1", now), dog(2, "EXECUTING", "t1", now), dog(3, "SEARCHING", "t1", now)]
         self.away: set[str] = set()
+        self.halts = MemoryHalts(*(f"{n:02x}" * 16 for n in (1, 2, 3)))
         self._departed = Departed()
         self.tasks = [
             {
@@ -141,7 +142,8 @@ class Team:
             for each in here
         ]
         gone = self._departed.of(here, time.time())
-        return state_of(here, self.tasks, {"t1": members}, departed=gone, node="vaio")
+        state = state_of(here, self.tasks, {"t1": members}, departed=gone, node="vaio")
+        return {**state, "halted": self.halts.is_halted()}
 
     def watch(self, uuid: str, on_frame: OnFrame) -> Any:
         """Pictures of a floor, a wall and a red ball that rolls, 15 a second."""
@@ -217,10 +219,13 @@ class Orders(LineReceiver):
             reactor.stop()
 
 
-def board() -> Board:
+def board(team: Team) -> Board:
     """What the page can ask for: twins in memory, so that every order is taken and none does harm."""
+    desk = MemoryDesk(CATALOGUE, YARD)
+    able = [{"uuid": f"{n:02x}" * 16, "name": f"dog{n}", "busy": "Patrol the yard" * (n == 2)} for n in (1, 2)]
+    desk.previews["search"] = {"able": able, "refused": {"dog3": ["no gripper", "no lift"]}, "likely": None}
     sessions = SignedSessions(b"a team of the tests", "quiet-otter", PASSWORD, random.Random(), checked)
-    return Board(MemoryDesk(CATALOGUE, YARD), sessions, limits=AddressLimits())
+    return Board(desk, sessions, limits=AddressLimits(), halts=team.halts)
 
 
 def checked(text: str, password: str) -> Deferred[Any]:
@@ -232,7 +237,7 @@ def main() -> None:
     """Serve until the input ends."""
     team = Team()
     port = int(sys.argv[1]) if len(sys.argv) > 1 else 0
-    served = board()
+    served = board(team)
     web = web_service(reactor, "127.0.0.1", port, team.read, served, team, time.time)
     web.startService()
     reactor.addSystemEventTrigger("before", "shutdown", web.stopService)
