@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import random
+from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,19 +16,22 @@ from middleware.errors import MissingExtra
 from middleware.node import SwarmNode
 from middleware.settings import IN_MEMORY, Settings
 from swarmnode.gateway import gateway
+from swarmnode.invitation import invited
 from swarmnode.seams import Seams
 
 
 class _Page(MultiService):
-    """The page, and its line to the yard where there is one."""
+    """The page, its line to the yard where there is one, and the note that says where it is."""
 
-    def __init__(self, web: Service, operator: Any) -> None:
+    def __init__(self, web: Service, operator: Any, invite: Callable[[], None]) -> None:
         super().__init__()
         self._operator = operator
+        self._invite = invite
         web.setServiceParent(self)
 
     def startService(self) -> None:
         super().startService()
+        self._invite()
         if self._operator is not None:
             self._operator.connect().addErrback(lambda _: None)
 
@@ -33,6 +39,14 @@ class _Page(MultiService):
         if self._operator is not None:
             self._operator.disconnect()
         return super().stopService()
+
+
+def with_code(settings: Settings, rng: random.Random) -> Settings:
+    """``settings`` with a code to sign in with: made once, as a node that falls off the network comes back with it."""
+    from webnode.session import made
+
+    web = settings.web
+    return settings if web.code or not web.sign_in else replace(settings, web=replace(web, code=made(rng)))
 
 
 def web_page(settings: Settings, seams: Seams, reactor: Any, node: SwarmNode) -> IService:
@@ -91,4 +105,5 @@ def web_page(settings: Settings, seams: Seams, reactor: Any, node: SwarmNode) ->
     web = WebService(
         reactor, address.host, address.port, app, events, shots, Files(), board, seams.wall, doors=doors(ground)
     )
-    return _Page(web, operator)
+    invite = partial(invited, name, address.host, lambda: web.port, board.sessions.code)
+    return _Page(web, operator, invite)

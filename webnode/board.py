@@ -50,6 +50,9 @@ class Token:
 class Sessions(Protocol):
     """Who has signed in; ``now`` is unix seconds."""
 
+    code: str
+    """What operators sign in with; empty where nobody needs to."""
+
     def sign_in(self, proof: str, source: str, now: float) -> Deferred[Token]:
         """Sign in with a code or password, from the address ``source``; fails with ``Refusal`` 401 or 429."""
 
@@ -65,6 +68,8 @@ class Sessions(Protocol):
 
 class OpenSessions:
     """Everybody is an operator: for a page of this machine alone, and for tests."""
+
+    code = ""
 
     def sign_in(self, proof: str, source: str, now: float) -> Deferred[Token]:
         """Let in whoever asks, for a day."""
@@ -188,26 +193,36 @@ class MemoryFallbacks:
         return origin in [page.url for page in self.pages]
 
 
+Kept = Literal["unfinished", "stream", "open"]
+"""Requests that are not complete, answers that are under way, connections."""
+
+
 class Limits(Protocol):
-    """How much one address may have open at once."""
+    """How much one address may have open at once; whoever opens something counts it, and again when it ends."""
 
-    def unfinished(self, address: str) -> bool:
-        """Whether it may have one more request under way."""
+    def may(self, kind: Kept, address: str) -> bool:
+        """Whether it may have one more."""
 
-    def stream(self, address: str) -> bool:
-        """Whether it may have one more stream open."""
+    def count(self, kind: Kept, address: str, by: int) -> None:
+        """Count one more (1), or one less (-1)."""
+
+    def total(self, kind: Kept) -> int:
+        """How many there are of all addresses."""
 
 
 class NoLimits:
     """As much as it likes."""
 
-    def unfinished(self, address: str) -> bool:
+    def may(self, kind: Kept, address: str) -> bool:
         """Return True."""
         return True
 
-    def stream(self, address: str) -> bool:
-        """Return True."""
-        return True
+    def count(self, kind: Kept, address: str, by: int) -> None:
+        """Count nothing."""
+
+    def total(self, kind: Kept) -> int:
+        """Return 0."""
+        return 0
 
 
 class Survey(Protocol):

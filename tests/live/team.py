@@ -1,11 +1,13 @@
 """A web node with three dogs that stand still: the server of the page's tests, run as a child process.
 
-``python -m tests.live.team`` prints the port in its first line.  Lines on its input change the team: ``gone NAME``,
-``back NAME``, ``status NAME STATUS``, ``freeze SECONDS`` (the whole process stands); it ends when its input does.
+``python -m tests.live.team`` prints the port, the code to sign in with, and an operator's token and ticket in its first
+line; whoever has signed in at one is signed in at the next.  Lines on its input change the team: ``gone NAME``, ``back
+NAME``, ``status NAME STATUS``, ``freeze SECONDS`` (the whole process stands); it ends when its input does.
 """
 
 from __future__ import annotations
 
+import random
 import sys
 import time
 from typing import Any
@@ -13,16 +15,22 @@ from typing import Any
 import cv2
 import numpy as np
 from twisted.internet import reactor as _reactor
+from twisted.internet.defer import Deferred
 from twisted.internet.stdio import StandardIO
+from twisted.internet.threads import deferToThread
 from twisted.protocols.basic import LineReceiver
 
-from webnode.board import Board, Knob, MemoryHalts, MemoryTuning, OpenSessions
+from webnode.board import Board, Knob, MemoryHalts, MemoryTuning, Sessions
 from webnode.camera import OnFrame
 from webnode.desk import MemoryDesk
+from webnode.limits import AddressLimits
+from webnode.password import hashed, is_password
 from webnode.server import WebService, web_service
+from webnode.session import SignedSessions
 from webnode.state import Departed, State, state_of
 
 reactor: Any = _reactor
+PASSWORD = hashed("correct horse", bytes(16), 4)
 HUES = {"dog1": (70, 90, 150), "dog2": (70, 150, 90), "dog3": (150, 100, 70)}
 
 
@@ -53,7 +61,7 @@ def dog(number: int, status: str, task: str, started: float) -> dict[str, Any]:
 def why() -> dict[str, Any]:
     """Two decisions: dog3's was overtaken when dog2 came near, and dog3 knew nothing of it."""
     costs = {"dog2": 0.62, "dog1": 1.04, "dog3": 1.37}
-    reports = [{"agent": f"0{name[-1]}" * 16, "name": name, "cost": cost} for name, cost in costs.items()]
+    reports = [{"agent": f"0{name[-1]}" * 16, "name": name, "cost": cost, "more": ""} for name, cost in costs.items()]
     first = {
         "epoch": 1,
         "winner": "03" * 16,
@@ -66,6 +74,7 @@ def why() -> dict[str, Any]:
         "hysteresis": "nobody acted before",
         "standby": ["dog1"],
         "digest": "1a2b3c4d",
+        "agreed": "",
         "token": 1,
         "reported": 2,
         "reports": [{**reports[2], "cost": 1.4}, {**reports[1], "cost": 1.6}],
@@ -186,13 +195,15 @@ class Orders(LineReceiver):
 
     delimiter = b"\n"
 
-    def __init__(self, team: Team, web: WebService) -> None:
+    def __init__(self, team: Team, web: WebService, sessions: Sessions) -> None:
         self._team = team
         self._web = web
+        self._sessions = sessions
 
     def connectionMade(self) -> None:
-        """Say the port."""
-        self.sendLine(str(self._web.port).encode())
+        """Say where the team is, and how to come in."""
+        token = self._sessions.token("operator", "operator", time.time(), 3600.0)
+        self.sendLine(f"{self._web.port} {self._sessions.code} {token.text} {token.ticket}".encode())
 
     def lineReceived(self, line: bytes) -> None:
         """Do one order and repeat it, so that the test knows that it was done."""
@@ -218,17 +229,25 @@ def board(team: Team) -> Board:
     desk = MemoryDesk(CATALOGUE, YARD)
     able = [{"uuid": f"{n:02x}" * 16, "name": f"dog{n}", "busy": "Patrol the yard" * (n == 2)} for n in (1, 2)]
     desk.previews["search"] = {"able": able, "refused": {"dog3": ["no gripper", "no lift"]}, "likely": None}
-    return Board(desk, OpenSessions(), halts=team.halts, tuning=MemoryTuning({able[0]["uuid"]: KNOBS}))
+    sessions = SignedSessions(b"a team of the tests", "quiet-otter", PASSWORD, random.Random(), checked)
+    tuning = MemoryTuning({able[0]["uuid"]: KNOBS})
+    return Board(desk, sessions, limits=AddressLimits(), halts=team.halts, tuning=tuning)
+
+
+def checked(text: str, password: str) -> Deferred[Any]:
+    """Whether it is the password, worked out on a thread."""
+    return deferToThread(is_password, text, password)
 
 
 def main() -> None:
     """Serve until the input ends."""
     team = Team()
     port = int(sys.argv[1]) if len(sys.argv) > 1 else 0
-    web = web_service(reactor, "127.0.0.1", port, team.read, board(team), team, time.time)
+    served = board(team)
+    web = web_service(reactor, "127.0.0.1", port, team.read, served, team, time.time)
     web.startService()
     reactor.addSystemEventTrigger("before", "shutdown", web.stopService)
-    reactor.callWhenRunning(lambda: StandardIO(Orders(team, web)))
+    reactor.callWhenRunning(lambda: StandardIO(Orders(team, web, served.sessions)))
     reactor.run()
 
 

@@ -1,4 +1,5 @@
 // The link: the one line from the page to its node; nobody else fetches anything.
+import { ticket, token } from "./session.js";
 import { stream } from "./stream.js";
 
 const API = "/api/v1/";
@@ -11,11 +12,12 @@ export const base = () => location.origin;
 
 async function call(method, path, body) {
   const order = method !== "GET";
+  const signed = token() ? { Authorization: `Bearer ${token()}` } : {};
   let answer;
   try {
     answer = await fetch(base() + API + path, {
       method,
-      headers: order ? { "Content-Type": "application/json", "X-Swarm": "1", "Idempotency-Key": `${VIEWER}-${++orders}` } : {},
+      headers: order ? { ...signed, "Content-Type": "application/json", "X-Swarm": "1", "Idempotency-Key": `${VIEWER}-${++orders}` } : signed,
       body: order ? JSON.stringify(body) : undefined,
       signal: AbortSignal.timeout(PATIENCE),
     });
@@ -33,9 +35,9 @@ export const get = (path) => call("GET", path);
 export const ask = (method, path, body = {}) => call(method, path, body);
 
 // The next picture of a camera, as a Response: 200, 204 where there is no newer one, or a refusal.
-export const frames = (uuid, after, signal) => fetch(`${base()}/shot/${uuid}?after=${after}&viewer=${VIEWER}`, { signal });
+export const frames = (uuid, after, signal) => fetch(`${base()}/shot/${uuid}?after=${after}&viewer=${VIEWER}&ticket=${ticket()}`, { signal });
 
 // Everything that comes, as onEvent(name, data); "link" says whether anything does: live, lost.
 export function open({ onEvent }) {
-  stream(`${base()}/events`, ["state", "yard", "beat"], onEvent);
+  stream(() => `${base()}/events?ticket=${ticket()}`, ["state", "yard", "beat"], onEvent);
 }

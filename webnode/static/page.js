@@ -7,15 +7,17 @@ import "./cameras.js";
 import "./map.js";
 import "./tasks.js";
 import "./actions.js";
+import { enter } from "./signin.js";
 import { ask, get, open } from "./link.js";
 import { model, take } from "./model.js";
 import { go, start, tell } from "./shell.js";
 
+function onEvent(event, data) {
+  if (event === "link" && data === model.link) return;
+  take(event, data);
+  tell(event);
+}
+
 start({ model, get, ask, go });
-open({
-  onEvent(event, data) {
-    if (event === "link" && data === model.link) return;
-    take(event, data);
-    tell(event);
-  },
-});
+await enter((me) => onEvent("session", me));
+open({ onEvent });

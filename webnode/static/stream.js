@@ -1,4 +1,5 @@
 // The stream of events: opened again by itself when it is lost, and held for lost when two seconds pass without a beat.
+// url() gives its address, which changes with the ticket.
 const PATIENCE = 2000;
 
 export function stream(url, names, onEvent) {
@@ -8,7 +9,7 @@ export function stream(url, names, onEvent) {
   function open() {
     source?.close();
     heard = performance.now();
-    source = new EventSource(url);
+    source = new EventSource(url());
     for (const name of names) {
       source.addEventListener(name, (event) => {
         heard = performance.now();
