@@ -30,7 +30,7 @@ class ActionPageTests(SynchronousTestCase):
         page = self.browser.new_context(**screen, color_scheme=scheme, reduced_motion="reduce").new_page()
         page.set_default_timeout(20000)
         page.on("pageerror", lambda error: self.faults.append(str(error)))
-        page.goto(self.team.url)
+        page.goto(f"{self.team.url}#code={self.team.code}")
         page.locator("#link[data-link=live]").wait_for()
         page.locator(".device").nth(2).wait_for()
         return page
