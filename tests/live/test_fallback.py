@@ -33,7 +33,8 @@ class FallbackTests(SynchronousTestCase):
         self.addCleanup(play.stop)
         self.browser = play.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
         self.addCleanup(self.browser.close)
-        context = self.browser.new_context(**DESK)
+        screen: dict[str, Any] = DESK
+        context = self.browser.new_context(**screen)
         self.page = context.new_page()
         self.page.set_default_timeout(8000)
         self.faults: list[str] = []
@@ -78,12 +79,12 @@ class FallbackTests(SynchronousTestCase):
         self.page.locator("#d-answer", has_text="sent").wait_for()
         self.page.locator("#d-close").click()
         self.served("pi")
+        self.page.locator("#line", has_text="pi serves the page").wait_for()
         self.webs[1].order("status dog3 IDLE")
         self.page.locator(".device[data-state=IDLE]", has_text="dog3").wait_for()
-        self.assertIn("pi serves the page", self.page.locator("#line").inner_text())
 
     def test_go_on_after_a_freeze(self) -> None:
-        """SIGSTOP: within three seconds, though a frozen node still takes connections; an order given meanwhile is done."""
+        """SIGSTOP: within three seconds, though a frozen node still takes connections; an order is done there."""
         self.opened()
         os.kill(self.pid(0), signal.SIGSTOP)
         began = time.monotonic()
