@@ -49,6 +49,9 @@ class Token:
 class Sessions(Protocol):
     """Who has signed in; ``now`` is unix seconds."""
 
+    code: str
+    """What operators sign in with; empty where nobody needs to."""
+
     def sign_in(self, proof: str, source: str, now: float) -> Deferred[Token]:
         """Sign in with a code or password, from the address ``source``; fails with ``Refusal`` 401 or 429."""
 
@@ -64,6 +67,8 @@ class Sessions(Protocol):
 
 class OpenSessions:
     """Everybody is an operator: for a page of this machine alone, and for tests."""
+
+    code = ""
 
     def sign_in(self, proof: str, source: str, now: float) -> Deferred[Token]:
         """Let in whoever asks, for a day."""

@@ -27,6 +27,8 @@ class Plan:
     web_port: int
     yard_port: int
     nodes: Mapping[str, int]
+    code: str
+    """What operators sign in to the page with."""
 
     def file(self, name: str) -> Path:
         """The configuration file of the node ``name``."""
@@ -51,7 +53,8 @@ class Plan:
 
     def _laptop(self) -> str:
         node = self._node(BOOTSTRAP, "laptop", "Bootstrap node and web node", ["bootstrap", "edge", "web"])
-        web = {"host": self.web_host, "port": self.web_port, "yard": f"{LOOPBACK}:{self.yard_port}"}
+        yard = f"{LOOPBACK}:{self.yard_port}"
+        web = {"host": self.web_host, "port": self.web_port, "yard": yard, "code": self.code}
         return toml({"node": node, "web": web})
 
     def _dog(self, name: str) -> str:

@@ -49,8 +49,8 @@ class Demonstration:
         self._team = Team(reactor, plan.run_dir)
         self._operator = YardOperator(TcpConnector(reactor), reactor, LOOPBACK, plan.yard_port, rate=20.0)
         host = LOOPBACK if plan.web_host == "0.0.0.0" else plan.web_host
-        self._visitor = Visitor(reactor, host, plan.web_port, self._on_state)
-        self.address = f"http://{host}:{plan.web_port}"
+        self._visitor = Visitor(reactor, host, plan.web_port, self._on_state, plan.code)
+        self.address = f"http://{host}:{plan.web_port}/#code={plan.code}"
 
     async def start(self) -> None:
         """Start everything and wait until the page lists the three dogs."""
@@ -200,7 +200,8 @@ def _invite(demonstration: Demonstration, plan: Plan) -> None:
     if plan.web_host == LOOPBACK:
         _say("For a phone or tablet in the same network: make demo WEB_HOST=0.0.0.0")
     else:
-        _say(f"In the same network: http://{os.uname().nodename}.local:{plan.web_port}, or this machine's address")
+        _say(f"In the same network: http://{os.uname().nodename}.local:{plan.web_port}, or this machine's address;")
+        _say(f"the code to sign in with: {plan.code}")
 
 
 def main(arguments: Sequence[str] = tuple(sys.argv[1:])) -> None:

@@ -14,6 +14,8 @@ from sim.demo.configuration import BOOTSTRAP, DOGS, LOOPBACK, Plan
 
 WEB_PORT, NODE_PORT, YARD_PORT = 8080, 7000, 7400
 MARK = ".swarm-demo"
+LETTERS = "abcdefghjkmnpqrstuvwxyz"
+"""Of these is the code to sign in with: none looks like another, or like a digit."""
 
 
 class Trouble(Exception):
@@ -72,4 +74,5 @@ def arranged(run_dir: Path, web_host: str, web_port: int | None, usual: bool, sa
             if wish != got:
                 say(f"port {wish} is busy; {what} uses {got}")
     nodes = {BOOTSTRAP: node, **dict(zip(DOGS, others, strict=True))}
-    return Plan(run_dir, secrets.token_hex(32), web_host, web, yard, nodes)
+    code = "".join(secrets.choice(LETTERS) for _ in range(8))
+    return Plan(run_dir, secrets.token_hex(32), web_host, web, yard, nodes, f"{code[:4]}-{code[4:]}")

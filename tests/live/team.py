@@ -1,12 +1,14 @@
 """A web node with three dogs that stand still: the server of the page's tests, run as a child process.
 
-``python -m tests.live.team`` prints the port in its first line.  Lines on its input change the team: ``gone NAME``,
-``back NAME``, ``status NAME STATUS``, ``freeze SECONDS`` (the whole process stands), ``name NAME`` (of the node that
-serves), ``pages NODE=URL ...`` (the web nodes, itself first); it ends when its input does.
+``python -m tests.live.team`` prints the port, the code to sign in with, and an operator's token and ticket in its first
+line; whoever has signed in at one is signed in at the next.  Lines on its input change the team: ``gone NAME``, ``back
+NAME``, ``status NAME STATUS``, ``freeze SECONDS`` (the whole process stands), ``name NAME`` (of the node that serves),
+``pages NODE=URL ...`` (the web nodes, itself first); it ends when its input does.
 """
 
 from __future__ import annotations
 
+import random
 import sys
 import time
 from dataclasses import replace
@@ -15,16 +17,21 @@ from typing import Any
 import cv2
 import numpy as np
 from twisted.internet import reactor as _reactor
+from twisted.internet.defer import Deferred
 from twisted.internet.stdio import StandardIO
+from twisted.internet.threads import deferToThread
 from twisted.protocols.basic import LineReceiver
 
-from webnode.board import Board, MemoryFallbacks, OpenSessions, Page
+from webnode.board import Board, MemoryFallbacks, Page
 from webnode.camera import OnFrame
 from webnode.desk import MemoryDesk
+from webnode.password import hashed, is_password
 from webnode.server import WebService, web_service
+from webnode.session import SignedSessions
 from webnode.state import Departed, State, state_of
 
 reactor: Any = _reactor
+PASSWORD = hashed("correct horse", bytes(16), 4)
 HUES = {"dog1": (70, 90, 150), "dog2": (70, 150, 90), "dog3": (150, 100, 70)}
 
 
@@ -182,14 +189,16 @@ class Orders(LineReceiver):
 
     delimiter = b"\n"
 
-    def __init__(self, team: Team, web: WebService, pages: list[Page]) -> None:
+    def __init__(self, team: Team, web: WebService, board: Board, pages: list[Page]) -> None:
         self._team = team
         self._web = web
+        self._sessions = board.sessions
         self._pages = pages
 
     def connectionMade(self) -> None:
-        """Say the port."""
-        self.sendLine(str(self._web.port).encode())
+        """Say where the team is, and how to come in."""
+        token = self._sessions.token("operator", "operator", time.time(), 3600.0)
+        self.sendLine(f"{self._web.port} {self._sessions.code} {token.text} {token.ticket}".encode())
 
     def lineReceived(self, line: bytes) -> None:
         """Do one order and repeat it, so that the test knows that it was done."""
@@ -217,7 +226,13 @@ class Orders(LineReceiver):
 
 def board() -> Board:
     """What the page can ask for: twins in memory, so that every order is taken and none does harm."""
-    return Board(MemoryDesk(CATALOGUE, YARD), OpenSessions())
+    sessions = SignedSessions(b"a team of the tests", "quiet-otter", PASSWORD, random.Random(), checked)
+    return Board(MemoryDesk(CATALOGUE, YARD), sessions)
+
+
+def checked(text: str, password: str) -> Deferred[Any]:
+    """Whether it is the password, worked out on a thread."""
+    return deferToThread(is_password, text, password)
 
 
 def main() -> None:
@@ -225,10 +240,11 @@ def main() -> None:
     team = Team()
     port = int(sys.argv[1]) if len(sys.argv) > 1 else 0
     pages = MemoryFallbacks()
-    web = web_service(reactor, "127.0.0.1", port, team.read, replace(board(), fallbacks=pages), team, time.time)
+    served = replace(board(), fallbacks=pages)
+    web = web_service(reactor, "127.0.0.1", port, team.read, served, team, time.time)
     web.startService()
     reactor.addSystemEventTrigger("before", "shutdown", web.stopService)
-    reactor.callWhenRunning(lambda: StandardIO(Orders(team, web, pages.pages)))
+    reactor.callWhenRunning(lambda: StandardIO(Orders(team, web, served, pages.pages)))
     reactor.run()
 
 

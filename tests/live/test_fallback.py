@@ -51,7 +51,7 @@ class FallbackTests(SynchronousTestCase):
         page.locator(CAMERAS).nth(2).wait_for()
 
     def opened(self) -> None:
-        self.page.goto(self.webs[0].url)
+        self.page.goto(f"{self.webs[0].url}#code={self.webs[0].code}")
         self.served("vaio")
         self.page.locator("#reserve", has_text="reserve").wait_for()
 

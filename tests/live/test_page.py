@@ -55,7 +55,8 @@ class Team:
         root = Path(__file__).parents[2]
         command = [sys.executable, "-m", "tests.live.team", str(port)]
         self._process = subprocess.Popen(command, cwd=root, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-        self.port = int(self._line())
+        found, self.code, self.token, self.ticket = self._line().split()
+        self.port = int(found)
         self.url = f"http://127.0.0.1:{self.port}/"
         self.pid = self._process.pid
 
@@ -101,7 +102,7 @@ class PageTests(SynchronousTestCase):
         page.on("request", lambda request: self.asked.append(request.url))
         page.on("pageerror", lambda error: self.faults.append(str(error)))
         page.on("console", lambda words: self.faults.append(words.text) if words.type == "error" else None)
-        page.goto(self.team.url)
+        page.goto(f"{self.team.url}#code={self.team.code}")
         page.locator("#link[data-link=live]").wait_for()
         page.locator(".device").nth(2).wait_for()
         return page

@@ -2,7 +2,7 @@
 export const model = {
   node: "",
   api: 1,
-  me: { name: "", role: "operator" },
+  me: { name: "", role: "anyone" },
   has: [],
   devices: new Map(),
   tasks: new Map(),
@@ -58,6 +58,10 @@ const TAKERS = {
   },
   beat({ now }) {
     model.now = now;
+  },
+  session(me) {
+    model.me = me;
+    document.body.dataset.role = me.role;
   },
   link(state) {
     model.link = state;

@@ -193,7 +193,7 @@ class ConfigurationTests(SynchronousTestCase):
     def setUp(self) -> None:
         ports = {"vaio": 7000, "dog1": 7001, "dog2": 7002, "dog3": 7003}
         folder = Path('/tmp/a "strange"\\folder\x7f')
-        self.plan = Plan(folder, "ab" * 32, "127.0.0.1", 8080, 7400, ports)
+        self.plan = Plan(folder, "ab" * 32, "127.0.0.1", 8080, 7400, ports, "quiet-otter")
         self.tables = {name: tomllib.loads(text) for name, text in self.plan.texts().items()}
 
     def test_every_node_has_a_file_in_lawful_toml(self) -> None:
@@ -213,7 +213,8 @@ class ConfigurationTests(SynchronousTestCase):
 
     def test_laptop_has_the_page_and_no_driver(self) -> None:
         """The laptop serves the page over the yard, and has neither agent nor driver."""
-        self.assertEqual(self.tables["vaio"]["web"], {"host": "127.0.0.1", "port": 8080, "yard": "127.0.0.1:7400"})
+        web = {"host": "127.0.0.1", "port": 8080, "yard": "127.0.0.1:7400", "code": "quiet-otter"}
+        self.assertEqual(self.tables["vaio"]["web"], web)
         self.assertEqual(set(self.tables["vaio"]), {"node", "web"})
 
 
