@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from agents.behaviour import Behaviour
 from agents.context import Context
 from drivers.reading import Action
+from middleware.consensus.strategy import Consensus
 
 SHARE = 0.01
 """Less progress than this is none."""
@@ -38,13 +39,17 @@ class Execution:
         self._best = -math.inf
         self._best_at = 0.0
         self._stalled_at = -math.inf
+        self._agreed: tuple[tuple[float, ...], str] = (), ""
 
-    def go_on(self, now: float, token: int, deadline: float) -> Turn:
-        """Do the next bit under the lease of ``token``."""
+    def go_on(self, now: float, token: int, deadline: float, consensus: Consensus | None = None) -> Turn:
+        """Do the next bit under the lease of ``token``; ``consensus`` is what all agree on."""
         is_resumed = token == self._token
         if not is_resumed:
             self._token, self._began, self._best, self._best_at = token, now, -math.inf, now
-        action = self._behaviour.execute(Context(now, token, deadline, self._began, is_resumed))
+            self._agreed = (), ""
+        if consensus is not None and (consensus.value or consensus.choice):
+            self._agreed = consensus.value, consensus.choice
+        action = self._behaviour.execute(Context(now, token, deadline, self._began, is_resumed, *self._agreed))
         progress = getattr(self._behaviour, "progress", None)
         if not isinstance(progress, int | float) or not math.isfinite(progress):
             return Turn(action, None)

@@ -199,26 +199,36 @@ class MemoryFallbacks:
         return origin in [page.url for page in self.pages]
 
 
+Kept = Literal["unfinished", "stream", "open"]
+"""Requests that are not complete, answers that are under way, connections."""
+
+
 class Limits(Protocol):
-    """How much one address may have open at once."""
+    """How much one address may have open at once; whoever opens something counts it, and again when it ends."""
 
-    def unfinished(self, address: str) -> bool:
-        """Whether it may have one more request under way."""
+    def may(self, kind: Kept, address: str) -> bool:
+        """Whether it may have one more."""
 
-    def stream(self, address: str) -> bool:
-        """Whether it may have one more stream open."""
+    def count(self, kind: Kept, address: str, by: int) -> None:
+        """Count one more (1), or one less (-1)."""
+
+    def total(self, kind: Kept) -> int:
+        """How many there are of all addresses."""
 
 
 class NoLimits:
     """As much as it likes."""
 
-    def unfinished(self, address: str) -> bool:
+    def may(self, kind: Kept, address: str) -> bool:
         """Return True."""
         return True
 
-    def stream(self, address: str) -> bool:
-        """Return True."""
-        return True
+    def count(self, kind: Kept, address: str, by: int) -> None:
+        """Count nothing."""
+
+    def total(self, kind: Kept) -> int:
+        """Return 0."""
+        return 0
 
 
 class Survey(Protocol):

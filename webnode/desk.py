@@ -19,8 +19,10 @@ class Desk(Protocol):
     def run_demo(self) -> Any:
         """Assign the demonstration's task; returns its id."""
 
-    def assign(self, name: str, tolerates: int = 1) -> Any:
+    def assign(self, name: str, tolerates: int = 1, group: str = "") -> Any:
         """Assign a predefined task; ``tolerates`` members of its council may be lost at once.
+
+        Tasks of one ``group`` are divided together.
 
         Returns its id, or ``{"id", "able": [names], "refused": {name: [reasons]}}``.
         """
@@ -69,7 +71,7 @@ class MemoryDesk:
         """Return ``demo-N``."""
         return self._noted("demo")
 
-    def assign(self, name: str, tolerates: int = 1) -> dict[str, Any]:
+    def assign(self, name: str, tolerates: int = 1, group: str = "") -> dict[str, Any]:
         """Return ``assign-N``; nobody is able, nobody is refused."""
         if name not in [task["name"] for task in self.tasks]:
             raise Refusal("name", f"there is no task {name!r}", "choose one of /api/v1/catalogue", 404)

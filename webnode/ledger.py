@@ -76,6 +76,7 @@ def _task_row(task: Task, records: list[Record], devices: list[Device]) -> dict[
         "requirements": task.requirements,
         "waiting_period": task.waiting_period,
         "strategy": task.strategy,
+        "group": task.group,
         "created": task.created,
         "council": [str(contact.address) for contact in task.council],
         "status": status,

@@ -22,6 +22,8 @@ from webnode.ledger import refused_by
 
 PLACING = 5.0
 """Seconds between Run Demo and the target's appearance: it is placed while the robots search (thesis, section 5)."""
+DIVIDED = "group_optimal"
+"""The strategy of a task of a group whose catalogue entry says the nearest, which is for one task."""
 
 
 class YardHand(Protocol):
@@ -103,14 +105,20 @@ class TeamDesk:
             self._node.clock.callLater(PLACING, self._place)
         return str(self.assign(self._demo)["id"])
 
-    def assign(self, name: str, tolerates: int = 1) -> dict[str, Any]:
-        """Publish a predefined task; the devices that can do it take it up by themselves."""
+    def assign(self, name: str, tolerates: int = 1, group: str = "") -> dict[str, Any]:
+        """Publish a predefined task; the devices that can do it take it up by themselves.
+
+        Those of one ``group`` are divided together.
+        """
         template = self._predefined.get(name)
         if template is None:
             known = ", ".join(sorted(self._predefined))
             raise Refusal("name", f"there is no predefined task {name!r}", f"choose one of {known}", 404)
         task_id = self._node.rng.randbytes(6).hex()
         task = replace(template, task_id=task_id, created=self._node.wall(), tolerates=tolerates)
+        if group:
+            strategy = DIVIDED if task.strategy == Task.strategy else task.strategy
+            task = replace(task, group=group, strategy=strategy)
         devices = [device for device, _ in devices_of(self._devices.records)]
         refused = refused_by(task, devices)
         self._quietly(Deferred.fromCoroutine(self._node.submit(task)))

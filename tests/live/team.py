@@ -25,6 +25,7 @@ from twisted.protocols.basic import LineReceiver
 from webnode.board import Board, MemoryFallbacks, Page
 from webnode.camera import OnFrame
 from webnode.desk import MemoryDesk
+from webnode.limits import AddressLimits
 from webnode.password import hashed, is_password
 from webnode.server import WebService, web_service
 from webnode.session import SignedSessions
@@ -62,7 +63,7 @@ def dog(number: int, status: str, task: str, started: float) -> dict[str, Any]:
 def why() -> dict[str, Any]:
     """Two decisions: dog3's was overtaken when dog2 came near, and dog3 knew nothing of it."""
     costs = {"dog2": 0.62, "dog1": 1.04, "dog3": 1.37}
-    reports = [{"agent": f"0{name[-1]}" * 16, "name": name, "cost": cost} for name, cost in costs.items()]
+    reports = [{"agent": f"0{name[-1]}" * 16, "name": name, "cost": cost, "more": ""} for name, cost in costs.items()]
     first = {
         "epoch": 1,
         "winner": "03" * 16,
@@ -75,6 +76,7 @@ def why() -> dict[str, Any]:
         "hysteresis": "nobody acted before",
         "standby": ["dog1"],
         "digest": "1a2b3c4d",
+        "agreed": "",
         "token": 1,
         "reported": 2,
         "reports": [{**reports[2], "cost": 1.4}, {**reports[1], "cost": 1.6}],
@@ -227,7 +229,7 @@ class Orders(LineReceiver):
 def board() -> Board:
     """What the page can ask for: twins in memory, so that every order is taken and none does harm."""
     sessions = SignedSessions(b"a team of the tests", "quiet-otter", PASSWORD, random.Random(), checked)
-    return Board(MemoryDesk(CATALOGUE, YARD), sessions)
+    return Board(MemoryDesk(CATALOGUE, YARD), sessions, limits=AddressLimits())
 
 
 def checked(text: str, password: str) -> Deferred[Any]:

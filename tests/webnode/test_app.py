@@ -99,11 +99,19 @@ class AppTests(SynchronousTestCase):
     def test_tell_who_can(self) -> None:
         """Assigning answers the id, who is able, and who was refused and why."""
         answer = {"id": "t2", "able": ["dog1"], "refused": {"dog2": ["no camera"]}}
-        self.desk.assign = lambda name, tolerates=1: {**answer, "for": tolerates}  # type: ignore[method-assign]
+        self.desk.assign = lambda name, tolerates=1, group="": {**answer, "for": tolerates}  # type: ignore[method-assign]
         told = self.client.post("/api/v1/tasks", json={"name": "search"}).get_json()
         self.assertEqual(told, {**answer, "for": 1})
         told = self.client.post("/api/v1/tasks", json={"name": "search", "tolerates": 3}).get_json()
         self.assertEqual(told["for"], 3)
+
+    def test_groups(self) -> None:
+        """A task may be assigned to a group, by a name of 1 to 64 characters."""
+        asked: list[Any] = []
+        self.desk.assign = lambda *wish: asked.append(wish) or {"id": "t"}  # type: ignore
+        for body, code in (({"group": "yard"}, 202), ({}, 202), ({"group": "x" * 65}, 400), ({"group": 5}, 400)):
+            self.assertEqual(self.client.post("/api/v1/tasks", json={"name": "search", **body}).status_code, code)
+        self.assertEqual(asked, [("search", 1, "yard"), ("search", 1, "")])
 
     def test_refuse(self) -> None:
         """Every unlawful wish gets its code and an error with field, problem and remedy, and reaches nobody."""

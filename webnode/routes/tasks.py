@@ -30,7 +30,7 @@ def demo(ask: Ask) -> Json:
 
 def assign(ask: Ask) -> Any:
     """Assign one; the answer may be its id alone."""
-    answer = ask.board.desk.assign(ask.given["name"], ask.given["tolerates"])
+    answer = ask.board.desk.assign(ask.given["name"], ask.given["tolerates"], ask.given["group"])
     return answer if isinstance(answer, dict) else {"id": answer}
 
 
@@ -81,6 +81,7 @@ ROUTES = (
                 default=1,
                 is_required=False,
             ),
+            Field("group", "text", "tasks of one group are divided together", most=64, default="", is_required=False),
         ),
         gives="id, able, refused (why, by name)",
         status=202,
