@@ -63,7 +63,7 @@ def web_page(settings: Settings, seams: Seams, reactor: Any, node: SwarmNode) ->
         from webnode.fallback import fallbacks
         from webnode.ground import Ground
         from webnode.halting import halts
-        from webnode.ledger import state_from
+        from webnode.ledger import Glance, state_from
         from webnode.limits import limits
         from webnode.live import Events, Shots
         from webnode.mischief import faults
@@ -100,7 +100,7 @@ def web_page(settings: Settings, seams: Seams, reactor: Any, node: SwarmNode) ->
     live = partial(state_from, desk.read, Departed(), name)
     on_file = partial(state_from, partial(read_records, Path(settings.node.store)), Departed(), name)
     stored = live if settings.node.store == IN_MEMORY else on_file
-    app = create_app(lambda: stored(seams.wall()), board, caller(reactor), wall=seams.wall)
+    app = create_app(Glance(lambda: stored(seams.wall()), reactor.seconds), board, caller(reactor), wall=seams.wall)
     events = Events(
         lambda: live(seams.wall()),
         reactor,

@@ -22,7 +22,7 @@ from twisted.internet.stdio import StandardIO
 from twisted.internet.threads import deferToThread
 from twisted.protocols.basic import LineReceiver
 
-from webnode.board import Board, MemoryFallbacks, Page
+from webnode.board import Board, MemoryFallbacks, MemoryHalts, Page
 from webnode.camera import OnFrame
 from webnode.desk import MemoryDesk
 from webnode.limits import AddressLimits
@@ -106,6 +106,7 @@ class Team:
         self.devices = [dog(1, "WAITING", "t1", now), dog(2, "EXECUTING", "t1", now), dog(3, "SEARCHING", "t1", now)]
         self.away: set[str] = set()
         self.node = "vaio"
+        self.halts = MemoryHalts(*(f"{n:02x}" * 16 for n in (1, 2, 3)))
         self._departed = Departed()
         self.tasks = [
             {
@@ -144,7 +145,8 @@ class Team:
             for each in here
         ]
         gone = self._departed.of(here, time.time())
-        return state_of(here, self.tasks, {"t1": members}, departed=gone, node=self.node)
+        state = state_of(here, self.tasks, {"t1": members}, departed=gone, node=self.node)
+        return {**state, "halted": self.halts.is_halted()}
 
     def watch(self, uuid: str, on_frame: OnFrame) -> Any:
         """Pictures of a floor, a wall and a red ball that rolls, 15 a second."""
@@ -226,10 +228,13 @@ class Orders(LineReceiver):
             reactor.stop()
 
 
-def board() -> Board:
+def board(team: Team) -> Board:
     """What the page can ask for: twins in memory, so that every order is taken and none does harm."""
+    desk = MemoryDesk(CATALOGUE, YARD)
+    able = [{"uuid": f"{n:02x}" * 16, "name": f"dog{n}", "busy": "Patrol the yard" * (n == 2)} for n in (1, 2)]
+    desk.previews["search"] = {"able": able, "refused": {"dog3": ["no gripper", "no lift"]}, "likely": None}
     sessions = SignedSessions(b"a team of the tests", "quiet-otter", PASSWORD, random.Random(), checked)
-    return Board(MemoryDesk(CATALOGUE, YARD), sessions, limits=AddressLimits())
+    return Board(desk, sessions, limits=AddressLimits(), halts=team.halts)
 
 
 def checked(text: str, password: str) -> Deferred[Any]:
@@ -242,7 +247,7 @@ def main() -> None:
     team = Team()
     port = int(sys.argv[1]) if len(sys.argv) > 1 else 0
     pages = MemoryFallbacks()
-    served = replace(board(), fallbacks=pages)
+    served = replace(board(team), fallbacks=pages)
     web = web_service(reactor, "127.0.0.1", port, team.read, served, team, time.time)
     web.startService()
     reactor.addSystemEventTrigger("before", "shutdown", web.stopService)

@@ -1,9 +1,11 @@
 // The page: every panel that there is, one stream in, and the model that all of them read.
 import "./header.js";
+import "./halt.js";
 import "./devices.js";
 import "./groups.js";
 import "./cameras.js";
 import "./tasks.js";
+import "./actions.js";
 import { enter } from "./signin.js";
 import { ask, get, open } from "./link.js";
 import { model, take } from "./model.js";
@@ -15,7 +17,7 @@ function onEvent(event, data) {
   if (event === "link" && data === model.link) return;
   take(event, data);
   // What few need is loaded when it is there.
-  if (event === "yard" && data) map ??= import("./map.js");
+  if (event === "yard" && data) map ??= import("./map.js").then(() => tell("yard"));
   // Panels read the model: to them a change is a state like any other.
   tell(event === "change" ? "state" : event);
 }
