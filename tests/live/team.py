@@ -2,7 +2,8 @@
 
 ``python -m tests.live.team`` prints the port, the code to sign in with, and an operator's token and ticket in its first
 line; whoever has signed in at one is signed in at the next.  Lines on its input change the team: ``gone NAME``, ``back
-NAME``, ``status NAME STATUS``, ``freeze SECONDS`` (the whole process stands); it ends when its input does.
+NAME``, ``status NAME STATUS``, ``freeze SECONDS`` (the whole process stands), ``name NAME`` (of the node that serves),
+``pages NODE=URL ...`` (the web nodes, itself first); it ends when its input does.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import random
 import sys
 import time
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -20,7 +22,7 @@ from twisted.internet.stdio import StandardIO
 from twisted.internet.threads import deferToThread
 from twisted.protocols.basic import LineReceiver
 
-from webnode.board import Board, MemoryHalts, Sessions
+from webnode.board import Board, MemoryFallbacks, MemoryHalts, Page
 from webnode.camera import OnFrame
 from webnode.desk import MemoryDesk
 from webnode.limits import AddressLimits
@@ -103,6 +105,7 @@ class Team:
         now = time.time()
         self.devices = [dog(1, "WAITING", "t1", now), dog(2, "EXECUTING", "t1", now), dog(3, "SEARCHING", "t1", now)]
         self.away: set[str] = set()
+        self.node = "vaio"
         self.halts = MemoryHalts(*(f"{n:02x}" * 16 for n in (1, 2, 3)))
         self._departed = Departed()
         self.tasks = [
@@ -142,7 +145,7 @@ class Team:
             for each in here
         ]
         gone = self._departed.of(here, time.time())
-        state = state_of(here, self.tasks, {"t1": members}, departed=gone, node="vaio")
+        state = state_of(here, self.tasks, {"t1": members}, departed=gone, node=self.node)
         return {**state, "halted": self.halts.is_halted()}
 
     def watch(self, uuid: str, on_frame: OnFrame) -> Any:
@@ -190,10 +193,11 @@ class Orders(LineReceiver):
 
     delimiter = b"\n"
 
-    def __init__(self, team: Team, web: WebService, sessions: Sessions) -> None:
+    def __init__(self, team: Team, web: WebService, board: Board, pages: list[Page]) -> None:
         self._team = team
         self._web = web
-        self._sessions = sessions
+        self._sessions = board.sessions
+        self._pages = pages
 
     def connectionMade(self) -> None:
         """Say where the team is, and how to come in."""
@@ -209,6 +213,11 @@ class Orders(LineReceiver):
             self._team.away.discard(rest[0])
         elif verb == "status":
             next(each for each in self._team.devices if each["name"] == rest[0])["status"] = rest[1]
+        elif verb == "name":
+            self._team.node = rest[0]
+        elif verb == "pages":
+            named = [each.split("=") for each in rest]
+            self._pages[:] = [Page(node, url, is_self=place == 0) for place, (node, url) in enumerate(named)]
         elif verb == "freeze":
             time.sleep(float(rest[0]))
         self.sendLine(line)
@@ -237,11 +246,12 @@ def main() -> None:
     """Serve until the input ends."""
     team = Team()
     port = int(sys.argv[1]) if len(sys.argv) > 1 else 0
-    served = board(team)
+    pages = MemoryFallbacks()
+    served = replace(board(team), fallbacks=pages)
     web = web_service(reactor, "127.0.0.1", port, team.read, served, team, time.time)
     web.startService()
     reactor.addSystemEventTrigger("before", "shutdown", web.stopService)
-    reactor.callWhenRunning(lambda: StandardIO(Orders(team, web, served.sessions)))
+    reactor.callWhenRunning(lambda: StandardIO(Orders(team, web, served, pages.pages)))
     reactor.run()
 
 
