@@ -22,7 +22,7 @@ from twisted.internet.stdio import StandardIO
 from twisted.internet.threads import deferToThread
 from twisted.protocols.basic import LineReceiver
 
-from webnode.board import Board, MemoryFallbacks, MemoryHalts, Page
+from webnode.board import Board, Knob, MemoryFallbacks, MemoryHalts, MemoryTuning, Page
 from webnode.camera import OnFrame
 from webnode.desk import MemoryDesk
 from webnode.limits import AddressLimits
@@ -182,6 +182,11 @@ YARD = {
     ],
     "target": {"x": 1.8, "y": 1.7, "radius": 0.08},
 }
+KNOBS = [
+    Knob("description", "The dog with 1 yellow stripe on its head.", "A line about the device", most=200),
+    Knob("presence_lease", 1.0, "How long the others believe in the device", "s", 0.1, 60.0),
+    Knob("capabilities", {"gripper": {"width": 0.1}}, "What the device can do beyond what its driver says"),
+]
 CATALOGUE = [
     {"name": "search", "title": "Find and touch the red target", "requirements": {}},
     {"name": "patrol", "title": "Patrol the yard", "requirements": {}},
@@ -234,7 +239,8 @@ def board(team: Team) -> Board:
     able = [{"uuid": f"{n:02x}" * 16, "name": f"dog{n}", "busy": "Patrol the yard" * (n == 2)} for n in (1, 2)]
     desk.previews["search"] = {"able": able, "refused": {"dog3": ["no gripper", "no lift"]}, "likely": None}
     sessions = SignedSessions(b"a team of the tests", "quiet-otter", PASSWORD, random.Random(), checked)
-    return Board(desk, sessions, limits=AddressLimits(), halts=team.halts)
+    tuning = MemoryTuning({able[0]["uuid"]: KNOBS})
+    return Board(desk, sessions, limits=AddressLimits(), halts=team.halts, tuning=tuning)
 
 
 def checked(text: str, password: str) -> Deferred[Any]:
