@@ -5,6 +5,7 @@ import "./groups.js";
 import "./cameras.js";
 import "./map.js";
 import "./tasks.js";
+import "./audit.js";
 import { enter } from "./signin.js";
 import { ask, get, open } from "./link.js";
 import { model, take } from "./model.js";
