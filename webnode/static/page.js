@@ -6,6 +6,7 @@ import "./groups.js";
 import "./cameras.js";
 import "./tasks.js";
 import "./actions.js";
+import "./audit.js";
 import { enter } from "./signin.js";
 import { ask, get, open } from "./link.js";
 import { model, take } from "./model.js";
