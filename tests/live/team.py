@@ -2,14 +2,19 @@
 
 ``python -m tests.live.team`` prints the port, the code to sign in with, and an operator's token and ticket in its first
 line; whoever has signed in at one is signed in at the next.  Lines on its input change the team: ``gone NAME``, ``back
-NAME``, ``status NAME STATUS``, ``freeze SECONDS`` (the whole process stands); it ends when its input does.
+NAME``, ``status NAME STATUS``, ``freeze SECONDS`` (the whole process stands), ``name NAME`` (of the node that serves),
+``pages NODE=URL ...`` (the web nodes, itself first), ``strange FILE`` (devices and tasks whose words are those of that
+JSON list); it ends when its input does.
 """
 
 from __future__ import annotations
 
+import json
 import random
 import sys
 import time
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -20,7 +25,7 @@ from twisted.internet.stdio import StandardIO
 from twisted.internet.threads import deferToThread
 from twisted.protocols.basic import LineReceiver
 
-from webnode.board import Board, Knob, MemoryHalts, MemoryTuning, Sessions
+from webnode.board import Board, Knob, MemoryFallbacks, MemoryHalts, MemoryTuning, Page
 from webnode.camera import OnFrame
 from webnode.desk import MemoryDesk
 from webnode.limits import AddressLimits
@@ -103,7 +108,9 @@ class Team:
         now = time.time()
         self.devices = [dog(1, "WAITING", "t1", now), dog(2, "EXECUTING", "t1", now), dog(3, "SEARCHING", "t1", now)]
         self.away: set[str] = set()
+        self.node = "vaio"
         self.halts = MemoryHalts(*(f"{n:02x}" * 16 for n in (1, 2, 3)))
+        self.batch = 0
         self._departed = Departed()
         self.tasks = [
             {
@@ -129,12 +136,13 @@ class Team:
         """The state as it is now."""
         here = [each for each in self.devices if each["name"] not in self.away]
         costs = {"dog1": 1.04, "dog2": 0.62, "dog3": 1.37}
+        task = self.tasks[0]["id"]
         members = [
             {
                 "uuid": each["uuid"],
                 "name": each["name"],
                 "status": each["status"],
-                "cost": costs[each["name"]],
+                "cost": costs.get(each["name"], 1.0),
                 "assigned": "02" * 16,
                 "token": 1,
                 "why": "the nearest of three" if each["name"] == "dog2" else "",
@@ -142,8 +150,39 @@ class Team:
             for each in here
         ]
         gone = self._departed.of(here, time.time())
-        state = state_of(here, self.tasks, {"t1": members}, departed=gone, node="vaio")
+        state = state_of(here, self.tasks, {str(task): members}, departed=gone, node=self.node)
         return {**state, "halted": self.halts.is_halted()}
+
+    def be_strange(self, words: list[str]) -> None:
+        """A device, a task and a decision of each of ``words``, with them wherever others' words are shown."""
+        now = time.time()
+        self.batch += 1
+        self.devices, self.tasks = [], []
+        for number, said in enumerate(words, 1):
+            strange: dict[str, Any] = {
+                "name": said,
+                "kind": said,
+                "description": said,
+                "address": said,
+                "messages": [[now, said]],
+            }
+            strange |= {"capabilities": {said: {said: said}}, "network": {said: 1}, "deployed": {said: said}}
+            self.devices.append({**dog(number, said, said, now), **strange})
+            told: dict[str, Any] = why()
+            for epoch in told["epochs"]:
+                epoch |= {"chosen": said, "rule": said, "hysteresis": said, "agree": [said], "standby": [said]}
+                epoch["differ"] = [{"name": said, "what": said}]
+                epoch["reports"] = [{"agent": said, "name": said, "cost": 1.0, "more": said}]
+            task = {
+                "id": f"s{self.batch}-{number}",
+                "kind": said,
+                "title": said,
+                "created": now + number,
+                "status": said,
+            }
+            self.tasks.append({**task, "note": said, "strategy": said, "why": told, "requirements": {said: {}}})
+        YARD["dogs"] = [{**YARD["dogs"][0], "name": said} for said in words[:20]]
+        self._departed = Departed()
 
     def watch(self, uuid: str, on_frame: OnFrame) -> Any:
         """Pictures of a floor, a wall and a red ball that rolls, 15 a second."""
@@ -157,7 +196,7 @@ class Team:
                 return
             seq += 1
             picture = np.full((160, 208, 3), (205, 214, 220), np.uint8)
-            picture[70:] = HUES[f"dog{number}"]
+            picture[70:] = HUES[f"dog{1 + (number - 1) % 3}"]
             cv2.circle(picture, ((seq * 3 + 60 * number) % 240 - 16, 96), 8 + 6 * number, (44, 52, 212), -1)
             on_frame(seq, cv2.imencode(".jpg", picture)[1].tobytes())
             reactor.callLater(1 / 15, shoot)
@@ -170,7 +209,7 @@ class Team:
         return stop
 
 
-YARD = {
+YARD: dict[str, Any] = {
     "walls": [3.0, 2.4],
     "dogs": [
         {"name": "dog1", "x": 0.6, "y": 0.6, "heading": 0.5, "stripes": 1},
@@ -195,10 +234,11 @@ class Orders(LineReceiver):
 
     delimiter = b"\n"
 
-    def __init__(self, team: Team, web: WebService, sessions: Sessions) -> None:
+    def __init__(self, team: Team, web: WebService, board: Board, pages: list[Page]) -> None:
         self._team = team
         self._web = web
-        self._sessions = sessions
+        self._sessions = board.sessions
+        self._pages = pages
 
     def connectionMade(self) -> None:
         """Say where the team is, and how to come in."""
@@ -214,8 +254,15 @@ class Orders(LineReceiver):
             self._team.away.discard(rest[0])
         elif verb == "status":
             next(each for each in self._team.devices if each["name"] == rest[0])["status"] = rest[1]
+        elif verb == "name":
+            self._team.node = rest[0]
+        elif verb == "pages":
+            named = [each.split("=") for each in rest]
+            self._pages[:] = [Page(node, url, is_self=place == 0) for place, (node, url) in enumerate(named)]
         elif verb == "freeze":
             time.sleep(float(rest[0]))
+        elif verb == "strange":
+            self._team.be_strange(json.loads(Path(rest[0]).read_text(encoding="utf-8")))
         self.sendLine(line)
 
     def connectionLost(self, reason: Any = None) -> None:
@@ -243,11 +290,12 @@ def main() -> None:
     """Serve until the input ends."""
     team = Team()
     port = int(sys.argv[1]) if len(sys.argv) > 1 else 0
-    served = board(team)
+    pages = MemoryFallbacks()
+    served = replace(board(team), fallbacks=pages)
     web = web_service(reactor, "127.0.0.1", port, team.read, served, team, time.time)
     web.startService()
     reactor.addSystemEventTrigger("before", "shutdown", web.stopService)
-    reactor.callWhenRunning(lambda: StandardIO(Orders(team, web, served.sessions)))
+    reactor.callWhenRunning(lambda: StandardIO(Orders(team, web, served, pages.pages)))
     reactor.run()
 
 

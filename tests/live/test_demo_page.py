@@ -1,4 +1,4 @@
-"""The real demonstration, five processes and the page, driven by taps in Chromium and looked at on a desk."""
+"""The real demonstration, six processes and the page, driven by taps in Chromium and looked at on a desk."""
 
 from __future__ import annotations
 

@@ -58,6 +58,7 @@ class Team:
         found, self.code, self.token, self.ticket = self._line().split()
         self.port = int(found)
         self.url = f"http://127.0.0.1:{self.port}/"
+        self.pid = self._process.pid
 
     def _line(self) -> str:
         assert self._process.stdout is not None

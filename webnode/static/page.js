@@ -4,20 +4,26 @@ import "./halt.js";
 import "./devices.js";
 import "./groups.js";
 import "./cameras.js";
-import "./map.js";
 import "./tasks.js";
 import "./actions.js";
+import "./audit.js";
 import { enter } from "./signin.js";
 import { ask, get, open } from "./link.js";
 import { model, take } from "./model.js";
 import { go, start, tell } from "./shell.js";
 
+let map;
+
 function onEvent(event, data) {
   if (event === "link" && data === model.link) return;
   take(event, data);
-  tell(event);
+  // What few need is loaded when it is there.
+  if (event === "yard" && data) map ??= import("./map.js").then(() => tell("yard"));
+  // Panels read the model: to them a change is a state like any other.
+  tell(event === "change" ? "state" : event);
 }
 
 start({ model, get, ask, go });
 await enter((me) => onEvent("session", me));
 open({ onEvent });
+import("./keep.js");
