@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
@@ -122,6 +123,43 @@ class ActionPageTests(SynchronousTestCase):
             "nose => document.querySelector('.dog[data-key=dog3] > g').getAttribute('transform') !== nose", arg=nose
         )
         self.assertEqual(page.locator("#place").inner_text(), target)
+        self.assertEqual(self.faults, [])
+
+    def test_lift_a_robot_by_touch(self) -> None:
+        """A finger on a robot or the target takes it along, and scrolls nothing meanwhile; a tap turns a robot."""
+        page = self.opened(PHONE)
+        page.locator(".dog .grip").nth(2).wait_for(state="attached")
+        page.locator("#map").scroll_into_view_if_needed()
+        box = page.locator(".floor").bounding_box()
+        touch = page.context.new_cdp_session(page)
+
+        def finger(kind: str, *places: tuple[float, float]) -> None:
+            points = [
+                {"x": box["x"] + box["width"] * x / 3.0, "y": box["y"] + box["height"] * (1 - y / 2.4)}
+                for x, y in places
+            ]
+            touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+
+        before = page.evaluate("scrollY")
+        finger("touchStart", (0.6, 0.6))
+        for step in range(1, 6):
+            finger("touchMove", (0.6, 0.6 + 0.2 * step))
+        finger("touchEnd")
+        self.told(page, "dog1 stands at")
+        x, y = (float(word.strip(",")) for word in page.locator("#line").inner_text().split()[3:5])
+        self.assertLess(abs(x - 0.6) + abs(y - 1.6), 0.1)
+        finger("touchStart", (1.8, 1.7))
+        for step in range(1, 6):
+            finger("touchMove", (1.8, 1.7 - 0.2 * step))
+        finger("touchEnd")
+        page.locator("#place", has_text=re.compile(r"Target at 1\.8\d, 0\.[67]|Target at 1\.7\d, 0\.[67]")).wait_for()
+        self.assertEqual(page.evaluate("scrollY"), before)
+        nose = page.locator(".dog[data-key=dog3] > g").get_attribute("transform")
+        finger("touchStart", (2.5, 0.7))
+        finger("touchEnd")
+        page.wait_for_function(
+            "nose => document.querySelector('.dog[data-key=dog3] > g').getAttribute('transform') !== nose", arg=nose
+        )
         self.assertEqual(self.faults, [])
 
     def test_change_settings(self) -> None:

@@ -81,7 +81,7 @@ class DemonstrationPageTests(SynchronousTestCase):
 
     def opened(self, screen: dict[str, Any]) -> Any:
         page = self.browser.new_context(**screen).new_page()
-        page.set_default_timeout(15_000)
+        page.set_default_timeout(30_000)
         page.on("pageerror", lambda error: self.faults.append(str(error)))
         page.goto(self.invitation)
         page.locator("#link[data-link=live]").wait_for()

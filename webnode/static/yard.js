@@ -73,6 +73,11 @@ export function make(root, { model }) {
     if (shapeOf(event)) event.stopPropagation();
   }
 
+  // A finger on what can be dragged scrolls nothing; the style alone does not see to it inside of a drawing.
+  function touch(event) {
+    if (event.target.closest?.("#map .dog, #map .target")) event.preventDefault();
+  }
+
   let sending = false;
   async function key(event) {
     const dog = robot(shapeOf(event)?.dataset.key);
@@ -87,6 +92,7 @@ export function make(root, { model }) {
 
   const heard = [["pointerdown", down], ["pointermove", move], ["pointerup", up], ["pointercancel", up], ["click", click], ["keydown", key]];
   for (const [name, act] of heard) map.addEventListener(name, act, true);
+  map.addEventListener("touchstart", touch, { passive: false });
 
   return {
     update(_, event) {
@@ -100,6 +106,7 @@ export function make(root, { model }) {
     },
     close() {
       for (const [name, act] of heard) map.removeEventListener(name, act, true);
+      map.removeEventListener("touchstart", touch);
       ghost.remove();
       for (const shape of map.querySelectorAll(".dog")) {
         shape.querySelector(".grip")?.remove();
