@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import socket
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from twisted.application.service import IService, MultiService, Service
+from twisted.application.service import IService, MultiService
 
 from middleware.entangled.data.sqlite import read_records
 from middleware.errors import MissingExtra
@@ -17,15 +19,18 @@ from swarmnode.seams import Seams
 
 
 class _Page(MultiService):
-    """The page, and its line to the yard where there is one."""
+    """The page, and its line to the yard where there is one; ``board`` tells the team where the page is."""
 
-    def __init__(self, web: Service, operator: Any) -> None:
+    def __init__(self, web: Any, operator: Any, board: Any) -> None:
         super().__init__()
+        self._web = web
         self._operator = operator
+        self._board = board
         web.setServiceParent(self)
 
     def startService(self) -> None:
         super().startService()
+        self._board.fallbacks.serves(self._web.urls(_names()))
         if self._operator is not None:
             self._operator.connect().addErrback(lambda _: None)
 
@@ -86,9 +91,30 @@ def web_page(settings: Settings, seams: Seams, reactor: Any, node: SwarmNode) ->
     on_file = partial(state_from, partial(read_records, Path(settings.node.store)), Departed(), name)
     stored = live if settings.node.store == IN_MEMORY else on_file
     app = create_app(lambda: stored(seams.wall()), board, caller(reactor), wall=seams.wall)
-    events = Events(lambda: live(seams.wall()), reactor, seams.wall, desk.yard)
+    events = Events(
+        lambda: live(seams.wall()),
+        reactor,
+        seams.wall,
+        desk.yard,
+        board.fallbacks.here,
+        board.chronicle,
+        lambda: (desk.version, board.halts is not None and board.halts.is_halted()),
+    )
     shots, address = Shots(desk, reactor), settings.web
     web = WebService(
         reactor, address.host, address.port, app, events, shots, Files(), board, seams.wall, doors=doors(ground)
     )
-    return _Page(web, operator)
+    return _Page(web, operator, board)
+
+
+def _names() -> Sequence[str]:
+    """What others in the network call this machine: its address, and its name where that is announced."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as way:
+        try:
+            # Nothing is sent: the system says only from which of its addresses it would be.
+            way.connect(("192.0.2.1", 9))
+            address = str(way.getsockname()[0])
+        except OSError:
+            address = ""
+    name = socket.gethostname().split(".")[0]
+    return (address, f"{name}.local" if name not in ("", "localhost") else "", "" if address else "127.0.0.1")

@@ -9,7 +9,7 @@ any.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
@@ -168,6 +168,9 @@ class Fallbacks(Protocol):
     def here(self) -> list[Page]:
         """Where the page is served now."""
 
+    def serves(self, urls: Iterable[str]) -> None:
+        """Tell the team that this node serves the page at ``urls``, too."""
+
     def lets_in(self, origin: str) -> bool:
         """Whether a page that came from ``origin`` may ask here: it is, or was a short while ago, one of the team's."""
 
@@ -181,6 +184,10 @@ class MemoryFallbacks:
     def here(self) -> list[Page]:
         """Return them."""
         return self.pages
+
+    def serves(self, urls: Iterable[str]) -> None:
+        """Add them as pages of ``here``."""
+        self.pages += [Page("here", url, url.startswith("https:"), True) for url in urls]
 
     def lets_in(self, origin: str) -> bool:
         """Whether one of them is served there."""

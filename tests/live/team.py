@@ -1,13 +1,15 @@
 """A web node with three dogs that stand still: the server of the page's tests, run as a child process.
 
 ``python -m tests.live.team`` prints the port in its first line.  Lines on its input change the team: ``gone NAME``,
-``back NAME``, ``status NAME STATUS``, ``freeze SECONDS`` (the whole process stands); it ends when its input does.
+``back NAME``, ``status NAME STATUS``, ``freeze SECONDS`` (the whole process stands), ``name NAME`` (of the node that
+serves), ``pages NODE=URL ...`` (the web nodes, itself first); it ends when its input does.
 """
 
 from __future__ import annotations
 
 import sys
 import time
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -16,7 +18,7 @@ from twisted.internet import reactor as _reactor
 from twisted.internet.stdio import StandardIO
 from twisted.protocols.basic import LineReceiver
 
-from webnode.board import Board, OpenSessions
+from webnode.board import Board, MemoryFallbacks, OpenSessions, Page
 from webnode.camera import OnFrame
 from webnode.desk import MemoryDesk
 from webnode.server import WebService, web_service
@@ -95,6 +97,7 @@ class Team:
         now = time.time()
         self.devices = [dog(1, "WAITING", "t1", now), dog(2, "EXECUTING", "t1", now), dog(3, "SEARCHING", "t1", now)]
         self.away: set[str] = set()
+        self.node = "vaio"
         self._departed = Departed()
         self.tasks = [
             {
@@ -133,7 +136,7 @@ class Team:
             for each in here
         ]
         gone = self._departed.of(here, time.time())
-        return state_of(here, self.tasks, {"t1": members}, departed=gone, node="vaio")
+        return state_of(here, self.tasks, {"t1": members}, departed=gone, node=self.node)
 
     def watch(self, uuid: str, on_frame: OnFrame) -> Any:
         """Pictures of a floor, a wall and a red ball that rolls, 15 a second."""
@@ -180,9 +183,10 @@ class Orders(LineReceiver):
 
     delimiter = b"\n"
 
-    def __init__(self, team: Team, web: WebService) -> None:
+    def __init__(self, team: Team, web: WebService, pages: list[Page]) -> None:
         self._team = team
         self._web = web
+        self._pages = pages
 
     def connectionMade(self) -> None:
         """Say the port."""
@@ -197,6 +201,11 @@ class Orders(LineReceiver):
             self._team.away.discard(rest[0])
         elif verb == "status":
             next(each for each in self._team.devices if each["name"] == rest[0])["status"] = rest[1]
+        elif verb == "name":
+            self._team.node = rest[0]
+        elif verb == "pages":
+            named = [each.split("=") for each in rest]
+            self._pages[:] = [Page(node, url, is_self=place == 0) for place, (node, url) in enumerate(named)]
         elif verb == "freeze":
             time.sleep(float(rest[0]))
         self.sendLine(line)
@@ -216,10 +225,11 @@ def main() -> None:
     """Serve until the input ends."""
     team = Team()
     port = int(sys.argv[1]) if len(sys.argv) > 1 else 0
-    web = web_service(reactor, "127.0.0.1", port, team.read, board(), team, time.time)
+    pages = MemoryFallbacks()
+    web = web_service(reactor, "127.0.0.1", port, team.read, replace(board(), fallbacks=pages), team, time.time)
     web.startService()
     reactor.addSystemEventTrigger("before", "shutdown", web.stopService)
-    reactor.callWhenRunning(lambda: StandardIO(Orders(team, web)))
+    reactor.callWhenRunning(lambda: StandardIO(Orders(team, web, pages.pages)))
     reactor.run()
 
 

@@ -57,6 +57,7 @@ class Team:
         self._process = subprocess.Popen(command, cwd=root, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         self.port = int(self._line())
         self.url = f"http://127.0.0.1:{self.port}/"
+        self.pid = self._process.pid
 
     def _line(self) -> str:
         assert self._process.stdout is not None

@@ -5,6 +5,7 @@ import "./groups.js";
 import "./cameras.js";
 import "./map.js";
 import "./tasks.js";
+import "./keep.js";
 import { ask, get, open } from "./link.js";
 import { model, take } from "./model.js";
 import { go, start, tell } from "./shell.js";
@@ -14,6 +15,7 @@ open({
   onEvent(event, data) {
     if (event === "link" && data === model.link) return;
     take(event, data);
-    tell(event);
+    // Panels read the model: to them a change is a state like any other.
+    tell(event === "change" ? "state" : event);
   },
 });
