@@ -20,6 +20,7 @@ from twisted.protocols.basic import LineReceiver
 
 from webnode.board import Board, MemoryFallbacks, OpenSessions, Page
 from webnode.camera import OnFrame
+from webnode.chronicle import TeamChronicle
 from webnode.desk import MemoryDesk
 from webnode.server import WebService, web_service
 from webnode.state import Departed, State, state_of
@@ -218,7 +219,7 @@ class Orders(LineReceiver):
 
 def board() -> Board:
     """What the page can ask for: twins in memory, so that every order is taken and none does harm."""
-    return Board(MemoryDesk(CATALOGUE, YARD), OpenSessions())
+    return Board(MemoryDesk(CATALOGUE, YARD), OpenSessions(), chronicle=TeamChronicle())
 
 
 def main() -> None:

@@ -144,7 +144,7 @@ class PageTests(SynchronousTestCase):
 
         for screen in (PHONE, DESK):
             page = self.opened(screen)
-            why = page.locator("#tasks details").first
+            why = page.locator("#tasks .why").first
             self.assertEqual(why.locator("summary").inner_text(), "dog2 \N{EN DASH} 2 of 3 agree, dog3 differs")
             self.assertFalse(why.locator("table").first.is_visible())
             why.locator("summary").click()
@@ -159,7 +159,7 @@ class PageTests(SynchronousTestCase):
             self.assertTrue(why.locator("table").first.is_visible())
             self.assertEqual(Axe().run(page).response["violations"], [])
             self.assertLessEqual(page.evaluate("document.documentElement.scrollWidth - innerWidth"), 0)
-            self.assertEqual(page.locator("#tasks details:visible").count(), 1)
+            self.assertEqual(page.locator("#tasks .why:visible").count(), 1)
             self.team.order("status dog1 WAITING")
 
     def test_show_cameras(self) -> None:
@@ -248,6 +248,29 @@ class PageTests(SynchronousTestCase):
         self.assertEqual(len(self.faults), 1, self.faults)
         self.assertIn("a fault of one", self.faults[0])
         page.locator(".device[data-state=DONE]", has_text="dog3").wait_for()
+
+    def test_tell_what_happened(self) -> None:
+        """What happens is told in words, newest first: of all, of one kind, and of one device or task."""
+        page = self.opened(DESK)
+        story = page.locator("#events li")
+        page.locator("#events li", has_text="begins to look").wait_for()
+        self.team.order("gone dog2")
+        page.locator("#events li[data-kind=gone]", has_text="dog2 is gone").wait_for()
+        self.team.order("status dog1 EXECUTING")
+        page.locator(
+            "#events [data-kind=takeover]", has_text="dog1 takes over Find and touch the red target"
+        ).wait_for()
+        self.assertIn("takes over", story.first.inner_text() + story.nth(1).inner_text())
+        page.locator("#event-kind").select_option("faults")
+        self.assertEqual({item.get_attribute("data-kind") for item in story.all()}, {"gone", "takeover"})
+        page.locator("#tasks .history summary").first.click()
+        page.locator("#tasks .history li[data-kind=takeover]").first.wait_for()
+        page.locator(".device").first.dblclick()
+        page.locator("#d-events li", has_text="dog1: waiting").wait_for()
+        self.team.order("status dog1 DONE")
+        page.locator("#d-events li", has_text="dog1: executing").wait_for()
+        self.assertFalse([words for words in page.locator("#d-events").all_inner_texts() if "dog3" in words])
+        self.assertEqual(self.faults, [])
 
     def test_speak_to_a_device(self) -> None:
         """From the dialog a message is sent and a device told to leave; the answer stands there in words."""

@@ -5,6 +5,7 @@ import "./groups.js";
 import "./cameras.js";
 import "./map.js";
 import "./tasks.js";
+import "./events.js";
 import "./keep.js";
 import { ask, get, open } from "./link.js";
 import { model, take } from "./model.js";
