@@ -18,7 +18,7 @@ from twisted.internet import reactor as _reactor
 from twisted.internet.stdio import StandardIO
 from twisted.protocols.basic import LineReceiver
 
-from webnode.board import Board, MemoryFallbacks, OpenSessions, Page
+from webnode.board import Board, MemoryFallbacks, MemorySurvey, OpenSessions, Page
 from webnode.camera import OnFrame
 from webnode.chronicle import TeamChronicle
 from webnode.desk import MemoryDesk
@@ -219,7 +219,40 @@ class Orders(LineReceiver):
 
 def board() -> Board:
     """What the page can ask for: twins in memory, so that every order is taken and none does harm."""
-    return Board(MemoryDesk(CATALOGUE, YARD), OpenSessions(), chronicle=TeamChronicle())
+    desk, survey = MemoryDesk(CATALOGUE, YARD), MemorySurvey(network(), {f"0{n}" * 16: inventory() for n in (1, 2)})
+    return Board(desk, OpenSessions(), chronicle=TeamChronicle(), survey=survey)
+
+
+def network() -> Any:
+    """Two that know each other and a third, which does not answer."""
+    uuids = {n: f"0{n}" * 16 for n in (1, 2, 3)}
+
+    def view(others: tuple[int, ...], lookups: list[Any]) -> dict[str, Any]:
+        contacts = [{"uuid": uuids[n], "name": f"dog{n}", "rtt_ms": 1.8 * n, "heard_s": 0.2} for n in others]
+        return {
+            "contacts": contacts,
+            "known": len(others),
+            "sent": 1204,
+            "received": 1187,
+            "lost": 2,
+            "lookups": lookups,
+        }
+
+    lookup = {"key": "3fa2" * 10, "asked": 5, "hops": 2, "found": 8, "ms": 12.4}
+    return {"devices": {uuids[1]: view((2, 3), [lookup]), uuids[2]: view((1,), [])}, "silent": [uuids[3]]}
+
+
+def inventory() -> Any:
+    """A handful of records."""
+    newest = [["devices", "dog1", 540, "leased"], ["tasks", "t1", 310, "team"]]
+    return {
+        "records": 9,
+        "deleted": 1,
+        "bytes": 4120,
+        "most_bytes": 2**23,
+        "kinds": {"devices": 4, "tasks": 2},
+        "newest": newest,
+    }
 
 
 def main() -> None:

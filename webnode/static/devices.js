@@ -3,7 +3,7 @@ import { at, attribute, badge, element, keyed, span, state, words } from "./elem
 import { say, wish } from "./desk.js";
 import { History } from "./history.js";
 import { panel } from "./panel.js";
-import { go } from "./shell.js";
+import { back, go } from "./shell.js";
 
 let devices = [];
 let open = "";
@@ -92,7 +92,7 @@ function startDevice() {
   const line = (text) => words(at("d-answer"), text);
   const dialog = at("place-device");
   at("d-close").addEventListener("click", () => dialog.close());
-  dialog.addEventListener("close", () => { if (open) go(""); });
+  dialog.addEventListener("close", () => { if (open) back(); });
   dialog.addEventListener("click", (event) => { if (event.target === dialog) dialog.close(); });
   at("d-message").addEventListener("submit", async (event) => {
     event.preventDefault();
