@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from middleware.entangled.record import hashed_key
 from middleware.entangled.network.switchboard import Weather
+from middleware.entangled.record import hashed_key
 from middleware.node import SwarmNode
 from middleware.survey import NETWORK, answer_survey, network
 from tests.fleet import FleetCase, SwarmFleet
