@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from agents.decision import Decision
 from middleware.consensus.strategy import ConsensusAlgorithm
+from middleware.consensus.view import view_of
 from middleware.presence import EXECUTING
 from middleware.tasks import Member, Task
 from middleware.verdict import Verdict, verdict_from
@@ -42,5 +43,6 @@ class Account:
         rule = decision.consensus.strategy or self._strategy.name
         version = str(getattr(self._strategy, "version", "")) if rule == self._strategy.name else ""
         given = (self._task.task_id, epoch, me, others, rule, version)
-        verdict = verdict_from(*given, decision.consensus, decision.assigned, self._task.hysteresis, token)
+        found, view = decision.consensus, view_of(self._strategy)
+        verdict = verdict_from(*given, found, decision.assigned, self._task.hysteresis, token, view)
         return verdict if verdict.is_witness else None

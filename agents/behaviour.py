@@ -30,7 +30,9 @@ class Behaviour(Protocol):
 
     A behaviour may also have: ``is_safe``, whether the task may change hands now (usually it always may);
     ``progress``, the share that is done, 0 to 1; ``valid_for``, the seconds for which its cost counts (usually as long
-    as its node lives); ``angle`` and ``spread``, see ``agents.formation``.
+    as its node lives); ``angle`` and ``take_post``, see ``agents.formation``.  For strategies that go by it: ``value``,
+    the number or the place that it has to offer (a tuple; metres), ``choice``, the option that it is for, the
+    ``weight`` of both, and ``electorate``, the weight of all that may vote.
     """
 
     def look(self, seen: Observation, now: float) -> None:

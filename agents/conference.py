@@ -7,6 +7,7 @@ from dataclasses import replace
 
 from agents.circle import Circle
 from agents.decision import Decision, decide
+from agents.division import Division
 from agents.epoch import Epoch
 from middleware.consensus.strategy import ConsensusAlgorithm
 from middleware.presence import EXECUTING
@@ -14,10 +15,11 @@ from middleware.tasks import Member, Task
 
 
 class Conference:
-    """One agent's view of it; ``uuid`` is the agent's own."""
+    """One agent's view of it; ``uuid`` is the agent's own, ``division`` that of the task's group, where it has one."""
 
     def __init__(self, uuid: str, strategy: ConsensusAlgorithm) -> None:
         self.strategy = strategy
+        self.division: Division | None = None
         self._uuid = uuid
         self._circle = Circle(uuid)
         self._epoch = Epoch()
@@ -63,7 +65,8 @@ class Conference:
         elif self._first_report_at is None:
             self._first_report_at = now
         since = None if self._first_report_at is None else now - self._first_report_at
-        decision = decide(members, self.strategy, task.hysteresis, task.waiting_period, since)
+        strategy = self.strategy if self.division is None else self.division.share(task, now, since)
+        decision = decide(members, strategy, task.hysteresis, task.waiting_period, since)
         basis = (*decision.basis, task.generation, task.configuration)
         self._epoch.decide(basis, decision.assigned or "", decision.digest, others)
         return decision

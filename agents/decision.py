@@ -9,9 +9,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from middleware.consensus.strategy import Consensus, ConsensusAlgorithm, Report
+from middleware.consensus.strategy import Consensus, ConsensusAlgorithm, Report, agreement
+from middleware.consensus.view import view_of
 from middleware.presence import EXECUTING
-from middleware.tasks import Member, is_bid
+from middleware.tasks import Member
+
+REASON = 100
+"""Characters of a strategy's reason for naming nobody: it travels in each report."""
 
 
 @dataclass(frozen=True)
@@ -41,17 +45,21 @@ def decide(
 ) -> Decision:
     """The consensus point of ``members``, as ``strategy`` finds it (a foreign one from behind its guard).
 
+    A strategy that goes by more than these reports has it in ``basis``.
+
     ``since_first`` is the seconds since the first report was seen, None when there is none.  Within the waiting period
     nobody is assigned, unless everybody has reported (or has no body free to do so), or somebody acts already; whoever
     acts keeps the task until another is better by the ``hysteresis``.
     """
     present = {m.uuid: m for m in members}
-    reports = {m.uuid: Report(m.uuid, m.cost) for m in present.values() if m.cost is not None and is_bid(m.cost)}
+    view = view_of(strategy)
+    reports = {m.uuid: report for m in present.values() if (report := view.report(m)) is not None}
     acting = sorted((m for m in present.values() if m.status == EXECUTING and m.uuid in reports), key=_precedence)
     basis: tuple[object, ...] = (
         tuple(sorted(present)),
-        tuple(sorted((r.agent, r.cost) for r in reports.values())),
+        tuple(sorted(reports.values(), key=lambda report: report.agent)),
         tuple((m.token, m.uuid) for m in acting),
+        *getattr(strategy, "basis", ()),
     )
     if not reports or since_first is None:
         return Decision(None, "", "nobody has reported yet", basis=basis)
@@ -62,9 +70,12 @@ def decide(
     consensus, best = _chosen(list(reports.values()), holder, strategy, hysteresis)
     fault = consensus.reason if consensus.strategy not in ("", strategy.name) else ""
     if best is None:
-        return Decision(None, consensus.digest, "no report counts", basis=basis, fault=fault, consensus=consensus)
+        why_not = consensus.reason[:REASON] or "no report counts"
+        return Decision(None, consensus.digest, why_not, basis=basis, fault=fault, consensus=consensus)
     name, cost = present[best].name, reports[best].cost
-    why = f"{name}, {cost:.2f}, best of {len(reports)}"
+    agreed = agreement(consensus.value, consensus.choice)
+    among = consensus.reason[:REASON] if consensus.task and not fault else f"best of {len(reports)}"
+    why = f"{name}, {cost:.2f}, {among}" + (f"; agreed on {agreed}" if agreed else "")
     rest = (agent for agent in (consensus.assigned_agent, *consensus.standby) if agent is not None)
     order = tuple(dict.fromkeys((best, *rest)))
     return Decision(best, consensus.digest, f"{why}; {fault}" if fault else why, order, basis, fault, consensus)

@@ -18,6 +18,7 @@ from agents.account import Account
 from agents.behaviour import STAND, Behaviour
 from agents.conference import Conference
 from agents.decision import Decision
+from agents.division import Division
 from agents.execution import Execution
 from agents.formation import Formation
 from agents.report import Reporter
@@ -25,7 +26,7 @@ from agents.state import Course, State
 from drivers.driver import Permit
 from drivers.reading import Action, Observation
 from middleware.commitment.lessee import Lease, Lessee
-from middleware.consensus.strategy import ConsensusAlgorithm
+from middleware.consensus.strategy import ConsensusAlgorithm, reads_of
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.kademlia.contact import Contact
 from middleware.order import PAUSE, Order
@@ -51,7 +52,8 @@ class Engagement:
 
     ``tell`` publishes this agent's report; ``conclude`` records the outcome; ``say`` writes a line for people; ``halt``
     stops the body now; ``token`` is the highest token that the body has obeyed so far; ``age`` is how old the task was
-    when the agent took it up.  With a ``lessee`` the agent has its body for this task, without one it only listens.
+    when the agent took it up.  With a ``lessee`` the agent has its body for this task, without one it only listens; and
+    where ``is_lent`` says that another task of its group has the body, it reports and decides all the same.
     ``justify`` is told why, at each decision; ``reached`` knows how the agents of some uuids are reached.
     """
 
@@ -76,12 +78,13 @@ class Engagement:
         self.order: Order | None = None
         self.token = token
         self.lessee: Lessee | None = None
+        self.is_lent = False
         self.justify: Callable[[Verdict], None] = lambda verdict: None
         self.reached: Callable[[Sequence[str]], Sequence[Contact]] = lambda uuids: ()
         self._heirs: tuple[str, ...] = ()
         self._successors: tuple[Contact, ...] = ()
         self._rests_until = 0.0
-        self._reporter = Reporter(behaviour, clock)
+        self._reporter = Reporter(behaviour, clock, reads_of(strategy))
         self._behaviour = behaviour
         self._execution = Execution(behaviour, task.stall_limit)
         self._clock = clock
@@ -107,6 +110,19 @@ class Engagement:
     def is_paused(self) -> bool:
         """Whether an operator wants the task to rest."""
         return self.order is not None and self.order.word == PAUSE
+
+    @property
+    def division(self) -> Division | None:
+        """What divides the task together with others, where it is of a group."""
+        return self._conference.division
+
+    def join(self, division: Division) -> None:
+        """Have the task divided together with others."""
+        self._conference.division = division
+        division.join(self.task, self._members, self._clock.seconds())
+
+    def _members(self, now: float) -> list[Member]:
+        return [self.me, *self._conference.others(now)]
 
     @property
     def is_acting(self) -> bool:
@@ -162,9 +178,12 @@ class Engagement:
         """Take in what the body senses, and report when it is new to the others."""
         now = self._clock.seconds()
         self._behaviour.look(seen, now)
-        if self.lessee is None or self.is_paused or self.is_over or self._execution.has_stalled(now):
+        is_free = self.lessee is not None or self.is_lent
+        if not is_free or self.is_paused or self.is_over or self._execution.has_stalled(now):
             return
-        news = self._reporter.news(self.me, self.course.state is State.EXECUTING)
+        # In a group somebody is free now and then: what is nearly done must not look as far away as at its beginning.
+        is_acting = self.course.state is State.EXECUTING and self.division is None
+        news = self._reporter.news(self.me, is_acting, seen, self.load)
         if news is not None:
             if "cost" in news:
                 cost = news["cost"]
@@ -187,7 +206,7 @@ class Engagement:
         if self._is_late(now) and (self.course.state is State.EXECUTING or self._conference.is_first(now)):
             self._finish(FAILED, f"past its deadline of {self.task.deadline:g} s")
             return None
-        if self.lessee is None or self.is_paused:
+        if self.is_paused or (self.lessee is None and not self.is_lent):
             self._rest_aside("paused" if self.is_paused else self.me.why)
             return None
         if self.course.state is State.IDLE:
@@ -196,6 +215,11 @@ class Engagement:
         if self._execution.has_stalled(now) and self.me.cost is not None:
             self._say("makes no progress")
             self._publish(cost=None, available=False)
+        if self.lessee is None:  # another task of its group has the body
+            decision = self._decision(now)
+            self._place(decision)
+            self._publish_decision(decision, 0)
+            return None
         is_executing = self.course.state is State.EXECUTING
         if is_executing and self._successors and self._execution.is_safe:
             self._move_council(now)
@@ -223,6 +247,13 @@ class Engagement:
             return  # the lease is kept until the outcome is known
         self._rest_aside(why)
         self.lessee = None
+
+    def lend(self) -> None:
+        """Leave the body, which does not act, to another task of the group."""
+        self._yield()
+        if self.lessee is not None:
+            self.lessee.release()
+        self.lessee, self.is_lent = None, True
 
     def abandon(self) -> Deferred[object]:
         """Leave the task (the caller has stopped the body): give the lease back, for good where the task is done.
@@ -265,7 +296,7 @@ class Engagement:
             self.course.go(State.EXECUTING)
             self._say(f"goes: {decision.why}")
         self.token = max(self.token, lease.token)
-        turn = self._execution.go_on(now, lease.token, lease.deadline)
+        turn = self._execution.go_on(now, lease.token, lease.deadline, decision.consensus)
         self._publish_decision(decision, lease.token, turn.progress)
         if turn.action is None:
             self._finish(COMPLETED)

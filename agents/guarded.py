@@ -14,6 +14,17 @@ from agents.context import Context
 from drivers.reading import Action, Observation
 
 T = TypeVar("T")
+OPTIONAL: dict[str, object] = {
+    "is_safe": True,
+    "progress": None,
+    "valid_for": 0.0,
+    "angle": None,
+    "value": (),
+    "choice": "",
+    "weight": 1.0,
+    "electorate": 0.0,
+}
+"""What a behaviour may have beside what it must, and what holds where it has none (``agents.behaviour``)."""
 
 
 class Guarded:
@@ -47,6 +58,13 @@ class Guarded:
     def execute(self, context: Context) -> Action | None:
         """What to do next to get it done; None when it is done."""
         return self._asked(lambda: self._inner.execute(context), self._stand)
+
+    def __getattr__(self, name: str) -> object:
+        """What it may have beside; ``AttributeError`` for anything else."""
+        if name not in OPTIONAL:
+            raise AttributeError(name)
+        usual = OPTIONAL[name]
+        return self._asked(lambda: getattr(self._inner, name, usual), usual)
 
     def _asked(self, ask: Callable[[], T], otherwise: T) -> T:
         if self.has_failed:

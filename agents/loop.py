@@ -11,7 +11,8 @@ from twisted.internet.interfaces import IDelayedCall, IReactorTime
 
 from agents.behaviour import behaviour_for
 from agents.body import Body
-from agents.docket import Docket, next_task
+from agents.division import Division, Key, group_of
+from agents.docket import Docket, next_task, precedence
 from agents.engagement import Engagement
 from agents.part import Part
 from drivers.driver import Driver
@@ -19,6 +20,7 @@ from drivers.reading import Observation
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.record import Record
 from middleware.errors import SwarmError
+from middleware.halt import GOES_ON, NO_ROBOT, STANDS
 from middleware.node import CAMERA, SwarmNode
 from middleware.presence import DONE, IDLE
 from middleware.tasks import Member, Task, group_key, outcome_of, refusals, tasks_of
@@ -42,9 +44,12 @@ class Agent(Service):
         self._docket = Docket()
         self._checking: set[str] = set()
         self._parts: dict[str, Part] = {}
+        self._divisions: dict[Key, Division] = {}
         self._holder: Part | None = None
         self._tick: IDelayedCall | None = None
         self._token = 0
+        self._was_halted = False
+        node.halt.watch(self._obey)
 
     @property
     def engagement(self) -> Engagement | None:
@@ -72,9 +77,9 @@ class Agent(Service):
     def _seen(self, seen: Observation) -> None:
         if seen.frame is not None:
             self._node.streams.offer(CAMERA, seen.frame.seq, seen.frame.data)
-        engagement = self.engagement
-        if engagement is not None and not engagement.is_over:
-            engagement.look(seen)
+        for engagement in self._having_body():
+            if not engagement.is_over:
+                engagement.look(seen)
 
     def _no_body(self, reason: str) -> None:
         self._say(f"has no robot: {reason}")
@@ -83,6 +88,7 @@ class Agent(Service):
 
     def _follow(self, _: object) -> object:
         if self.running:
+            self._node.halt.learn()
             self._node.watch_tasks(self._tasks)
         return _
 
@@ -129,17 +135,38 @@ class Agent(Service):
             if task.task_id not in self._parts:
                 self._engage(task)
         active = [part for part in self._parts.values() if not (part.engagement.is_over or part.engagement.is_paused)]
-        tasks = {part.engagement.task.task_id: part for part in active}
         holder = self._holder if self._holder in active else None
         current = None if holder is None else holder.engagement
+        heads = self._heads(active)
         wanted = next_task(
-            [part.engagement.task for part in active],
-            None if current is None else current.task,
+            [head.engagement.task for head in heads],
+            next((head.engagement.task for head, parts in heads.items() if holder in parts), None),
             current is None or current.may_be_put_aside,
         )
-        part = None if wanted is None else tasks[wanted.task_id]
+        parts = next((parts for head, parts in heads.items() if head.engagement.task is wanted), [])
+        part = due(parts, holder) if parts else None
         if part is not self._holder:
             self._give_body(part)
+        for each in active:
+            each.engagement.is_lent = each in parts and each is not part
+
+    def _heads(self, active: list[Part]) -> dict[Part, list[Part]]:
+        """The most urgent part of each group with all that are in it, and each that is in none by itself."""
+        for task_id, part in self._parts.items():
+            division = part.engagement.division
+            if division is not None and part in active:
+                part.engagement.join(division)
+            elif division is not None:
+                division.leave(task_id)
+        groups: dict[object, list[Part]] = {}
+        for part in sorted(active, key=lambda part: precedence(part.engagement.task)):
+            division = part.engagement.division
+            groups.setdefault(part if division is None else division, []).append(part)
+        return {parts[0]: parts for parts in groups.values()}
+
+    def _having_body(self) -> list[Engagement]:
+        """The engagements that the body is free for: the one that has it, and those of its group."""
+        return [p.engagement for p in list(self._parts.values()) if p is self._holder or p.engagement.is_lent]
 
     def _engage(self, task: Task) -> None:
         try:
@@ -152,14 +179,20 @@ class Agent(Service):
         part = Part(task, self._node, behaviour, strategy, self._clock, self._token, self._told, stop)
         self._parts[task.task_id] = part
         self._say(f"assigned: {task.title}")
-        if self._holder is not None:
+        group = group_of(task)
+        if group is not None:
+            part.engagement.join(self._divisions.setdefault(group, Division(strategy)))
+        if self._holder is not None and (group is None or group != group_of(self._holder.engagement.task)):
             part.engagement.put_aside(f"busy with {self._holder.engagement.task.title}")
         part.report()
 
     def _give_body(self, part: Part | None) -> None:
         """Take the body from the task that has it, and give it to that of ``part``."""
         before, self._holder = self._holder, part
-        if before is not None and not before.engagement.is_over:
+        group = None if part is None else part.engagement.division
+        if before is not None and group is not None and before.engagement.division is group:
+            before.engagement.lend()
+        elif before is not None and not before.engagement.is_over:
             self._body.driver.stop()
             why = f"busy with {part.engagement.task.title}" if part is not None else "paused"
             before.engagement.put_aside(why)
@@ -172,6 +205,11 @@ class Agent(Service):
 
     def _leave(self, task_id: str) -> Deferred[object]:
         part = self._parts.pop(task_id)
+        division = part.engagement.division
+        if division is not None:
+            division.leave(task_id)
+            left = [part.engagement.division for part in self._parts.values()]
+            self._divisions = {key: each for key, each in self._divisions.items() if each in left}
         if part is self._holder:
             self._holder = None
         return part.leave(bool(self.running))
@@ -194,12 +232,15 @@ class Agent(Service):
             part.caretaker.look()
             if part is not self._holder:
                 part.engagement.step()
+        if self._stands():
+            return
         engagement = self.engagement
         if engagement is None:
             return
         has_body = self._body.answers
         if not has_body:
-            engagement.lose_body()
+            for each in self._having_body():
+                each.lose_body()
         # A robot may have obeyed an agent before this one: nothing older than that does it obey now.
         engagement.token = max(engagement.token, self._body.driver.token)
         if engagement.lessee is not None:
@@ -208,6 +249,26 @@ class Agent(Service):
         self._token = max(self._token, engagement.token)
         if deed is not None and has_body and not self._body.do(deed):
             engagement.fence()
+
+    def _stands(self) -> bool:
+        """Whether the team is halted: then the body stands, and what is held is kept, so that nobody takes over."""
+        if not self._node.halt.is_on:
+            return False
+        self._node.halt.learn()  # nobody may have answered so far
+        self._body.driver.stop()
+        return True
+
+    def _obey(self) -> str:
+        """The team is halted or released: do so at once, and say what the body does."""
+        if not self.running:
+            return NO_ROBOT
+        word = self._node.halt.word
+        if word.is_on != self._was_halted:
+            self._was_halted = word.is_on
+            self._say(f"{'stopped' if word.is_on else 'released'} by {word.by}")
+        if not self._stands():
+            return GOES_ON
+        return STANDS if self._body.driver.state == "ready" else "does not reach its robot, which stops by itself"
 
     def _finished(self, part: Part) -> None:
         engagement = part.engagement
@@ -229,3 +290,20 @@ class Agent(Service):
 
     def _say(self, text: str) -> None:
         self._node.presence.say(self._node.wall(), text)
+
+
+def due(parts: list[Part], holder: Part | None) -> Part:
+    """Which of the tasks of one group is to have the body: the one that is given to it, else one it cannot tell of yet.
+
+    ``parts`` are the most urgent first, at least one; ``holder`` has the body now, for one of them or another task.
+    """
+    own = holder if holder in parts else None
+    if own is not None and (own.engagement.is_acting or not own.engagement.may_be_put_aside):
+        return own
+    mine = next((part for part in parts if part.engagement.me.assigned == part.engagement.me.uuid), None)
+    if mine is not None:
+        return mine
+    blind = [part for part in parts if part.engagement.me.cost is None]
+    if own is not None and (own in blind or not blind):
+        return own
+    return (blind or parts)[0]

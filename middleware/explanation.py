@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
+from middleware.consensus.strategy import agreement
 from middleware.verdict import MANY, Reported, Verdict
 
 TOLD = 3
@@ -30,7 +31,7 @@ class Ruling:
     ``winner`` is the uuid named by most (the lowest where two are), ``chosen`` its name; ``agree`` names those that
     named it, ``of`` counts the participants, or those who are to tell where there are many.  ``differ`` has whoever
     named another, used another rule or knew other reports than most of those that agree; the rest is what these wrote.
-    ``token`` is the winner's, 0 where it told of none.
+    ``token`` is the winner's, 0 where it told of none; ``agreed`` is what they agreed on by number, place or vote.
     """
 
     epoch: int
@@ -48,6 +49,7 @@ class Ruling:
     reported: int
     reports: tuple[Reported, ...]
     silent: tuple[str, ...]
+    agreed: str = ""
 
 
 @dataclass(frozen=True)
@@ -105,6 +107,7 @@ def _ruling(epoch: int, verdicts: Sequence[Verdict]) -> Ruling:
         reference.reported,
         reference.reports,
         reference.silent,
+        agreement(reference.value, reference.choice),
     )
 
 
@@ -119,6 +122,9 @@ def _differences(verdict: Verdict, reference: Verdict, names: Mapping[str, str])
         told.append(f"names {_name(verdict.winner, names)}")
     if (verdict.rule, verdict.version) != (reference.rule, reference.version):
         told.append(f"decided by {_rule(verdict)}, not {_rule(reference)}")
+    agreed = agreement(verdict.value, verdict.choice)
+    if agreed != agreement(reference.value, reference.choice):
+        told.append(f"agreed on {agreed or 'nothing'}")
     if verdict.digest != reference.digest:
         told.append(_other_reports(verdict, reference))
     return "; ".join(told)
@@ -135,6 +141,8 @@ def _other_reports(verdict: Verdict, reference: Verdict) -> str:
             told.append(f"a report of {knew[agent].name}")
         elif knew[agent].cost != known[agent].cost:
             told.append(f"{knew[agent].name} at {knew[agent].cost:.2f}, not {known[agent].cost:.2f}")
+        elif knew[agent].more != known[agent].more:
+            told.append(f"{knew[agent].name} with {knew[agent].more or 'nothing more'}")
     if not are_whole or not told:
         return "knew other reports"
     more = [f"{len(told) - TOLD} more"] if len(told) > TOLD else []
@@ -148,9 +156,12 @@ def _paragraph(ruling: Ruling) -> str:
     lines.append(
         f"  by {ruling.rule} {ruling.version}".rstrip() + f" from reports {ruling.digest}: {ruling.hysteresis}"
     )
+    if ruling.agreed:
+        lines.append(f"  agreed on {ruling.agreed}")
     width = max((len(name) for name in (*(r.name for r in ruling.reports), *ruling.silent)), default=0)
     for report in ruling.reports:
-        lines.append(f"  {report.name:{width}}  {report.cost:8.2f}{'  *' if report.agent == ruling.winner else ''}")
+        line = f"  {report.name:{width}}  {report.cost:8.2f}{'  *' if report.agent == ruling.winner else ''}"
+        lines.append(f"{line}  {report.more}" if report.more else line)
     if ruling.reported > len(ruling.reports):
         lines.append(f"  the best {len(ruling.reports)} of {ruling.reported} reports")
     lines += [f"  {name:{width}}  no report" for name in ruling.silent]

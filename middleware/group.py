@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from twisted.internet.defer import Deferred
 
 from middleware.consensus.strategy import Report
+from middleware.consensus.view import View
 from middleware.entangled.node import EntangledNode
 from middleware.entangled.record import Record
 from middleware.entangled.replication.owner import Stored
@@ -31,7 +32,7 @@ class Group:
 
     ``quietly`` takes what may fail without anybody waiting, ``ordered`` all records there are, for an operator's orders
     among them.  With ``enter`` bids go to the task's council as well (``dissemination``), which announces those that
-    decide; the records stay as what people see, and as who is present.
+    decide; the records stay as what people see, and as who is present.  ``view`` is what the task's strategy goes by.
     """
 
     def __init__(
@@ -42,6 +43,7 @@ class Group:
         quietly: Callable[[Deferred[Stored]], None],
         ordered: Callable[[list[Record]], None] = lambda records: None,
         enter: Enter | None = None,
+        view: View | None = None,
     ) -> None:
         self._key = group_key(task_id)
         self._entangled = entangled
@@ -51,7 +53,8 @@ class Group:
         # Imported by the first who takes part: a plain node has no group.
         from middleware.dissemination.roll import Roll
 
-        self._roll = Roll()
+        self._view = view or View()
+        self._roll = Roll(self._view)
         self._outcome: Result | None = None
         self._bidding = enter(self._announced) if enter is not None else None
         self._watch = entangled.watch(self._key, self._changed)
@@ -61,8 +64,9 @@ class Group:
         self._quietly(self._entangled.put(self._key, MEMBER, member.packed(), "leased"))
         if self._bidding is None:
             return
-        if member.cost is not None:
-            self._bidding.report(Report(member.uuid, member.cost))
+        report = self._view.report(member)
+        if report is not None:
+            self._bidding.report(report)
         elif self._bidding.is_standing:  # who has not measured anything yet does not abstain
             self._bidding.withdraw()
 

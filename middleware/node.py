@@ -31,6 +31,7 @@ from middleware.entangled.node import EntangledNode
 from middleware.entangled.record import Record
 from middleware.entangled.replication.owner import Stored
 from middleware.entangled.replication.watch import Changed, Watch
+from middleware.errors import UnknownStrategy
 from middleware.group import Group, Heard
 from middleware.halt import Halt
 from middleware.presence import DEVICES, Device, Presence, devices_of
@@ -44,6 +45,7 @@ if TYPE_CHECKING:
     from middleware.commitment.lessee import Lessee
     from middleware.consensus.guard import Guard
     from middleware.consensus.selection import Strategies
+    from middleware.consensus.view import View
     from middleware.dissemination.bidding import Bidding
     from middleware.dissemination.dissemination import Dissemination
     from middleware.dissemination.party import OnSummary
@@ -241,8 +243,10 @@ class SwarmNode(Service):
 
     def group(self, task: Task, heard: Heard, ordered: Changed = lambda records: None) -> Group:
         """Take part in a task: a place among its participants.  Where it has a council, bids go there, too."""
-        enter = partial(self.bidding, task, task.generation) if task.council else None
-        return Group(task.task_id, self.entangled, heard, self._quietly, ordered, enter)
+        if not task.council:
+            return Group(task.task_id, self.entangled, heard, self._quietly, ordered)
+        enter = partial(self.bidding, task, task.generation)
+        return Group(task.task_id, self.entangled, heard, self._quietly, ordered, enter, self._view(task.strategy))
 
     def bidding(self, task: Task, epoch: int, on_summary: OnSummary) -> Bidding:
         """Bid for ``task`` in ``epoch``: ``on_summary`` is told which bids the task's council announces."""
@@ -281,6 +285,15 @@ class SwarmNode(Service):
         Raises ``UnknownStrategy`` where there is none.
         """
         return self._strategies.named(name, self.deployed)
+
+    def _view(self, strategy: str) -> View:
+        """What the strategy of that name goes by; where there is none, the nearest does."""
+        from middleware.consensus.view import View, view_of
+
+        try:
+            return view_of(self.strategy(strategy))
+        except UnknownStrategy:
+            return View()
 
     def lessee(self, task: Task, changed: Callable[[], None], floor: int) -> Lessee:
         """The claimant of the right to act on ``task``, in this node's name.

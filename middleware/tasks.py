@@ -28,6 +28,10 @@ MEMBER = "member"
 RESULT = "result"
 ORDER = "order"
 MAX_PRIORITY = 1000
+MAX_CHOICE = 64
+MAX_PLACES = 8
+MAX_WEIGHT = 1e9
+"""What is beyond it is no weight, and no number or place to agree on."""
 
 
 def group_key(task_id: str) -> bytes:
@@ -97,6 +101,9 @@ class Member:
     the body is free for this task, ``load`` how many tasks the participant has, ``state`` where exactly it stands
     (``agents.state``), ``progress`` the share that is done, 0 to 1.  ``angle`` is the direction in which it stands as
     seen from the target, and ``post`` the one it goes to, in radians by the compass.
+
+    What only some strategies go by: ``battery`` is the share that is left, ``value`` a number or a place to agree on
+    (in metres), ``choice`` a vote, ``weight`` what both count, and ``electorate`` the weight of all that may vote.
     """
 
     uuid: str
@@ -117,6 +124,11 @@ class Member:
     progress: float | None = None
     angle: float | None = None
     post: float | None = None
+    battery: float = 1.0
+    value: tuple[float, ...] = ()
+    choice: str = ""
+    weight: float = 1.0
+    electorate: float = 0.0
 
     def packed(self) -> bytes:
         """The value of the member's record; what is as usual is left out."""
@@ -215,8 +227,11 @@ def member_of(record: Record) -> Member | None:
     content = mapping_of(record)
     if record.name != MEMBER or content is None:
         return None
+    content = {f.name: content[f.name] for f in fields(Member) if f.name in content}
+    if isinstance(content.get("value"), list):
+        content["value"] = tuple(content["value"])
     try:
-        member = Member(**{f.name: content[f.name] for f in fields(Member) if f.name in content})
+        member = Member(**content)
     except TypeError:
         return None
     texts = (member.uuid, member.name, member.status, member.assigned, member.digest, member.why, member.state)
@@ -228,6 +243,12 @@ def member_of(record: Record) -> Member | None:
         and all(is_number(number) and number >= 0 for number in (member.age, member.valid_for))
         and all(place is None or is_number(place) for place in places)
         and isinstance(member.available, bool)
+        and is_number(member.battery)
+        and 0.0 <= member.battery <= 1.0
+        and is_value(member.value)
+        and is_choice(member.choice)
+        and is_weight(member.weight)
+        and is_weight(member.electorate)
     )
     if not lawful or node_id(record.owner).hex() != member.uuid:
         return None  # nobody reports for another
@@ -237,6 +258,25 @@ def member_of(record: Record) -> Member | None:
 def is_bid(cost: object) -> bool:
     """Whether ``cost`` is one that can win: finite, not negative, and no larger than people can be shown."""
     return is_number(cost) and cost >= 0  # type: ignore[operator]
+
+
+def is_value(value: object) -> bool:
+    """Whether ``value`` is a number or a place to agree on: a tuple of finite numbers, none of them enormous."""
+    return (
+        isinstance(value, tuple)
+        and len(value) <= MAX_PLACES
+        and all(is_number(n) and abs(n) <= MAX_WEIGHT for n in value)
+    )
+
+
+def is_choice(choice: object) -> bool:
+    """Whether ``choice`` is an option that people can be shown, or "" for none."""
+    return isinstance(choice, str) and len(choice) <= MAX_CHOICE and choice.isprintable()
+
+
+def is_weight(weight: object) -> bool:
+    """Whether ``weight`` is what a vote or a value may count."""
+    return is_number(weight) and 0.0 <= weight <= MAX_WEIGHT  # type: ignore[operator]
 
 
 def is_stale(member: Member, since: float) -> bool:

@@ -10,14 +10,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from itertools import zip_longest
 
 import msgpack
 
-from middleware.consensus.strategy import Consensus
+from middleware.consensus.strategy import READABLE, Consensus, Report, agreement
+from middleware.consensus.view import View
 from middleware.entangled.identity import ID_BYTES, node_id
 from middleware.entangled.record import Record, hashed_key
 from middleware.presence import EXECUTING
-from middleware.tasks import Member
+from middleware.tasks import Member, is_choice, is_value
 from middleware.value import is_number, is_whole, mapping_of
 
 SLOT = "verdict"
@@ -29,15 +31,20 @@ STANDBY = 3
 MAX_VERDICT = 3300
 """Bytes of a verdict at most: three datagrams, and one for a team of ten."""
 NAME, WORDS = 40, 160
+USUAL = Report("", 0.0)
 
 
 @dataclass(frozen=True)
 class Reported:
-    """What one participant had reported when it was decided: its uuid, its name, and the cost."""
+    """What one participant had reported when it was decided: its uuid, its name, and the cost.
+
+    ``more`` is what else counted, in words; empty where nothing did, or was as usual.
+    """
 
     agent: str
     name: str
     cost: float
+    more: str = ""
 
 
 @dataclass(frozen=True)
@@ -48,6 +55,7 @@ class Verdict:
     the strategy, ``hysteresis`` tells in words what became of whoever acted before.  ``reports`` are the best first;
     ``reported`` counts all there were, ``silent`` names participants without a report, ``participants`` counts both.
     ``digest`` is of the reports as this agent computed it; ``token`` is not 0 where it holds the right to act.
+    ``value`` and ``choice`` are what was agreed on by number, place or vote, empty where nothing was.
     """
 
     agent: str
@@ -65,6 +73,8 @@ class Verdict:
     reported: int
     reports: tuple[Reported, ...]
     silent: tuple[str, ...]
+    value: tuple[float, ...] = ()
+    choice: str = ""
 
     @property
     def key(self) -> bytes:
@@ -99,7 +109,18 @@ class Verdict:
             "reports": [[bytes.fromhex(r.agent), _cut(r.name, NAME), r.cost] for r in self.reports[:MANY]],
             "silent": [_cut(name, NAME) for name in self.silent[:BEST]],
         }
-        return bytes(msgpack.packb(content))
+        if self.value:
+            content["value"] = list(self.value)
+        if self.choice:
+            content["choice"] = _cut(self.choice, 64)
+        value = bytes(msgpack.packb(content))
+        more = [_cut(r.more, NAME) for r in self.reports[:MANY]]
+        while any(more):
+            told = bytes(msgpack.packb({**content, "more": more}))
+            if len(told) <= MAX_VERDICT:
+                return told
+            more.pop()  # of the worst ones only the cost
+        return value
 
 
 def verdicts_key(task: str) -> bytes:
@@ -128,15 +149,19 @@ def verdict_from(
     assigned: str | None,
     hysteresis: float,
     token: int = 0,
+    view: View | None = None,
 ) -> Verdict:
     """The account of one decision that ``me`` took.
 
     ``consensus`` is what the strategy found among the reports, ``assigned`` who was decided for after the
-    ``hysteresis`` (a share), ``token`` that of the lease which this agent holds, or 0.
+    ``hysteresis`` (a share), ``token`` that of the lease which this agent holds, or 0; ``view`` is what the strategy
+    goes by.
     """
+    view = view or View()
     members = {m.uuid: m for m in (*others, me)}
     fit = [m for m in members.values() if m.cost is not None]
-    reports = sorted((Reported(m.uuid, m.name, float(m.cost or 0.0)) for m in fit), key=lambda r: (r.cost, r.agent))
+    told = (Reported(m.uuid, m.name, float(m.cost or 0.0), _more(view.report(m))) for m in fit)
+    reports = sorted(told, key=lambda r: (r.cost, r.agent))
     best = reports if len(reports) <= MANY else reports[:BEST]
     silent = sorted(m.name for m in members.values() if m.cost is None)
     acting = sorted((m for m in fit if m.status == EXECUTING), key=lambda m: (m.cost, m.uuid))
@@ -149,13 +174,15 @@ def verdict_from(
         version,
         assigned or "",
         tuple(uuid for uuid in (*_first(consensus.assigned_agent), *consensus.standby) if uuid != assigned)[:STANDBY],
-        _outcome(members, acting[0] if acting else None, consensus.assigned_agent, assigned, hysteresis),
+        _outcome(members, acting[0] if acting else None, consensus, assigned, hysteresis),
         consensus.digest,
         token,
         len(members),
         len(reports),
         tuple(best),
         tuple(silent[:BEST]),
+        consensus.value if is_value(consensus.value) else (),
+        consensus.choice if is_choice(consensus.choice) else "",
     )
 
 
@@ -167,12 +194,15 @@ def verdict_of(record: Record) -> Verdict | None:
     texts = [content.get(name) for name in ("name", "task", "rule", "version", "hysteresis", "digest")]
     wholes = [content.get(name) for name in ("epoch", "token", "participants", "reported")]
     winner, standby = content.get("winner"), _uuids(content.get("standby"))
-    reports, silent = _reports(content.get("reports")), content.get("silent")
+    reports, silent = _reports(content.get("reports"), content.get("more", [])), content.get("silent")
+    value, choice = content.get("value", []), content.get("choice", "")
     if not all(_is_line(text) for text in texts) or not all(is_whole(number) for number in wholes):
         return None
     if not isinstance(winner, bytes) or len(winner) not in (0, ID_BYTES) or standby is None or reports is None:
         return None
     if not isinstance(silent, list) or not all(_is_line(name) for name in silent):
+        return None
+    if not isinstance(value, list) or not is_value(tuple(value)) or not is_choice(choice):
         return None
     name, task, rule, version, hysteresis, digest = (str(text) for text in texts)
     epoch, token, participants, reported = (int(number or 0) for number in wholes)
@@ -195,6 +225,8 @@ def verdict_of(record: Record) -> Verdict | None:
         reported,
         reports,
         tuple(silent),
+        tuple(map(float, value)),
+        choice,
     )
 
 
@@ -202,13 +234,14 @@ def verdict_of(record: Record) -> Verdict | None:
 
 
 def _outcome(
-    members: Mapping[str, Member], acting: Member | None, best: str | None, assigned: str | None, hysteresis: float
+    members: Mapping[str, Member], acting: Member | None, found: Consensus, assigned: str | None, hysteresis: float
 ) -> str:
-    """What became of whoever acted, in words."""
+    """What became of whoever acted, in words; where nobody is to act, why not."""
+    best = found.assigned_agent
     if not assigned:
-        return "no report counts"
+        return found.reason or "no report counts"
     if acting is None:
-        return "nobody acted before"
+        return f"nobody acted before; {found.reason}" if found.task else "nobody acted before"
     name = members[best].name if best is not None and best in members else "nobody"
     if assigned == acting.uuid:
         if best == assigned:
@@ -239,16 +272,38 @@ def _uuids(value: object) -> tuple[str, ...] | None:
     return tuple(uuid.hex() for uuid in value) if lawful else None
 
 
-def _reports(value: object) -> tuple[Reported, ...] | None:
+def _more(report: Report | None) -> str:
+    """What of a report counted beside the cost, in words; what is as usual is left out."""
+    if report is None:
+        return ""
+    said = {name: getattr(report, name) for name in READABLE if getattr(report, name) != getattr(USUAL, name)}
+    return ", ".join(_said(name, value) for name, value in said.items())
+
+
+def _said(name: str, value: object) -> str:
+    if name == "battery":
+        return f"battery {value:.0%}"
+    if name == "load":
+        return f"{value:g} other task{'' if value == 1 else 's'}"
+    if name == "choice":
+        return f"for {agreement((), str(value))}"
+    if isinstance(value, tuple):
+        return f"at {agreement(value, '')}"
+    return f"{name} {value:g}"
+
+
+def _reports(value: object, more: object) -> tuple[Reported, ...] | None:
     if not isinstance(value, list) or len(value) > MANY:
         return None
+    if not isinstance(more, list) or len(more) > len(value) or not all(_is_line(each) for each in more):
+        return None
     reports = []
-    for entry in value:
+    for entry, said in zip_longest(value, more, fillvalue=""):
         if not isinstance(entry, list) or len(entry) != 3:
             return None
         agent, name, cost = entry
         is_lawful = isinstance(agent, bytes) and len(agent) == ID_BYTES and _is_line(name)
         if not is_lawful or not is_number(cost) or cost < 0:
             return None
-        reports.append(Reported(agent.hex(), name, float(cost)))
+        reports.append(Reported(agent.hex(), name, float(cost), said))
     return tuple(reports)

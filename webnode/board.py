@@ -10,12 +10,13 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Protocol
 
-from twisted.internet.defer import Deferred, succeed
+from twisted.internet.defer import Deferred, fail, succeed
 
 from webnode.desk import Desk
+from webnode.errors import Refusal
 from webnode.field import Json
 from webnode.state import State
 
@@ -267,6 +268,25 @@ class Tuning(Protocol):
         """Change some, all or none; the device checks them."""
 
 
+class MemoryTuning:
+    """Settings of devices that take whatever they are told; ``knobs`` are those of each uuid."""
+
+    def __init__(self, knobs: Mapping[str, Sequence[Knob]]) -> None:
+        self.knobs = {uuid: list(each) for uuid, each in knobs.items()}
+
+    def settings(self, uuid: str) -> Deferred[list[Knob]]:
+        """Return them."""
+        return succeed(self.knobs.get(uuid, []))
+
+    def change(self, uuid: str, changes: Mapping[str, Json]) -> Deferred[list[Knob]]:
+        """Change them; fails where the device has no such setting."""
+        for key in changes:
+            if key not in [knob.key for knob in self.knobs.get(uuid, [])]:
+                return fail(Refusal(key, "cannot be changed on this device", "leave it out"))
+        self.knobs[uuid] = [replace(knob, value=changes.get(knob.key, knob.value)) for knob in self.knobs[uuid]]
+        return succeed(self.knobs[uuid])
+
+
 class Halts(Protocol):
     """Stopping the whole team; answers map each uuid to ``stands``, or to why it does not."""
 
@@ -278,6 +298,28 @@ class Halts(Protocol):
 
     def is_halted(self) -> bool:
         """Whether the team is halted."""
+
+
+class MemoryHalts:
+    """The button of a team that obeys; ``devices`` are the uuids of those that say so, ``said`` who pressed what."""
+
+    def __init__(self, *devices: str) -> None:
+        self.devices = devices
+        self.said: list[tuple[str, str]] = []
+
+    def halt(self, by: str) -> Deferred[dict[str, str]]:
+        """All stand."""
+        self.said.append(("halt", by))
+        return succeed(dict.fromkeys(self.devices, "stands"))
+
+    def release(self, by: str) -> Deferred[dict[str, str]]:
+        """All go on."""
+        self.said.append(("release", by))
+        return succeed(dict.fromkeys(self.devices, "goes on"))
+
+    def is_halted(self) -> bool:
+        """Whether the last that was pressed was the halt."""
+        return bool(self.said) and self.said[-1][0] == "halt"
 
 
 class Faults(Protocol):

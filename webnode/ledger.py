@@ -12,6 +12,7 @@ from typing import Any
 
 from middleware.entangled.record import Record
 from middleware.explanation import explained
+from middleware.halt import HALT, word_of
 from middleware.order import PAUSE, order_of
 from middleware.presence import DEVICES, Device, devices_of
 from middleware.tasks import TASKS, Task, group_key, member_of, outcome_of, refusals, tasks_of
@@ -33,7 +34,8 @@ def state_from(read: Read, departed: Departed, node: str, now: float) -> State:
         groups[task.task_id] = [asdict(member) for member in members]
         rows.append({**_task_row(task, records, devices), "why": _why(task, read(verdicts_key(task.task_id)))})
     views = [_device_row(device) for device in devices]
-    return state_of(views, rows, groups, departed=departed.of(views, now), node=node)
+    state = state_of(views, rows, groups, departed=departed.of(views, now), node=node)
+    return {**state, "halted": word_of(read(HALT)).is_on}
 
 
 def refused_by(task: Task, devices: list[Device]) -> dict[str, list[str]]:
@@ -76,6 +78,7 @@ def _task_row(task: Task, records: list[Record], devices: list[Device]) -> dict[
         "requirements": task.requirements,
         "waiting_period": task.waiting_period,
         "strategy": task.strategy,
+        "group": task.group,
         "created": task.created,
         "council": [str(contact.address) for contact in task.council],
         "status": status,

@@ -91,6 +91,7 @@ def task_view(fields: Fields) -> State:
         "requirements": properties(fields.get("requirements")),
         "waiting_period": number(fields.get("waiting_period")),
         "strategy": text(fields.get("strategy")),
+        "group": text(fields.get("group"), limit=64),
         "created": number(fields.get("created")),
         "council": texts(fields.get("council")),
         "paused": fields.get("paused") is True,
@@ -186,7 +187,8 @@ def _ruling_view(fields: Fields) -> State:
     for report in fields["reports"]:
         name = report["name"]
         note = "goes" if report["agent"] == winner else "stands by" if name in standby else ""
-        rows[name] = {"name": text(name, limit=64), "cost": number(report["cost"]), "note": note}
+        words = "; ".join(filter(None, (note, text(report["more"], limit=64))))
+        rows[name] = {"name": text(name, limit=64), "cost": number(report["cost"]), "note": words}
     for name in (*fields["silent"], *differ):
         rows.setdefault(name, {"name": text(name, limit=64), "cost": None, "note": ""})
     for name, what in differ.items():
@@ -199,6 +201,7 @@ def _ruling_view(fields: Fields) -> State:
         "differ": texts(list(differ)),
         "rule": text(f"{fields['rule']} {fields['version']}".strip(), limit=100),
         "hysteresis": text(fields["hysteresis"], limit=200),
+        "agreed": text(fields["agreed"], limit=64),
         "digest": text(fields["digest"], limit=64),
         "token": count(fields["token"]),
         "reported": count(fields["reported"]),

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 from benchmarks.consensus.mission import Mission
 from middleware.consensus.cbba import Cbba, greedy
-from middleware.consensus.group_optimal import GroupOptimal
+from middleware.consensus.group_optimal import BIDS, GroupOptimal
 from middleware.consensus.item import GroupAlgorithm, capacities, exact
 from middleware.consensus.nearest import Nearest
 from middleware.consensus.sequential import Sequential
@@ -23,7 +22,7 @@ def in_order(mission: Mission, reports: list[Report]) -> Owners:
     owners: Owners = {}
     bids: dict[str, list[Report]] = {}
     for report in reports:
-        bids.setdefault(report.task, []).append(replace(report, capacity=1))
+        bids.setdefault(report.task, []).append(report)
     for task in mission.places:
         free = [r for r in bids.get(task, ()) if left[r.agent] > 0]
         chosen = Nearest().find(free).assigned_agent
@@ -58,12 +57,17 @@ def with_all_bids() -> GroupOptimal:
     return strategy
 
 
+MEETINGS = "cbba, then meetings"
+TALKED = ("cbba", MEETINGS)
+FEWER = f"group_optimal, {BIDS} bids"
 DECIDERS: dict[str, Decider] = {
     "nearest, in order": in_order,
     "cbba": bundled,
-    "cbba, then meetings": bundled,
+    MEETINGS: bundled,
     "cbba + exchange": shared(Cbba()),
     "sequential": shared(Sequential()),
-    "group_optimal, 20 bids": shared(GroupOptimal()),
+    FEWER: shared(GroupOptimal()),
     "group_optimal": shared(with_all_bids()),
 }
+NAMED = {FEWER: BIDS}
+"""How many bids each agent makes, where that does not depend on the team."""

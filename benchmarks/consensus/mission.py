@@ -25,7 +25,7 @@ class Mission:
     failed: int = 0
     spare: int = 0
 
-    @property
+    @cached_property
     def capacity(self) -> int:
         """How many tasks an agent takes, as few as suffice for those that are left, and ``spare`` more."""
         return math.ceil(self.tasks / max(1, len(self.alive))) + self.spare
@@ -59,12 +59,16 @@ class Mission:
         """The way from each agent to each task, in whole millionths of a metre."""
         return {a: {t: exact(math.dist(s, p)) for t, p in self.places.items()} for a, s in self.starts.items()}
 
+    @cached_property
+    def near(self) -> dict[str, list[tuple[float, str]]]:
+        """The way from each agent to each task in metres, and the task, the nearest first."""
+        return {a: sorted((math.dist(s, p), t) for t, p in self.places.items()) for a, s in self.starts.items()}
+
     def reports(self, agents: list[str], bids: int, also: Collection[str] = ()) -> list[Report]:
         """The bids of some agents, each for as many tasks as there may be ``bids``, the nearest first, and ``also``."""
         found = []
         for agent in agents:
-            start = self.starts[agent]
-            ways = sorted((math.dist(start, place), task) for task, place in self.places.items())
+            start, ways = self.starts[agent], self.near[agent]
             ways = ways[:bids] + [(way, task) for way, task in ways[bids:] if task in also]
             found += [Report(agent, way, task=t, value=start, capacity=self.capacity) for way, t in ways]
         return found

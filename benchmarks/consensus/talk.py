@@ -36,20 +36,20 @@ def after_meetings(mission: Mission, owners: dict[str, str]) -> tuple[dict[str, 
     A meeting is a message there and one back; who has met without success meets the same again only after a change.
     """
     room = dict.fromkeys(mission.alive, mission.capacity)
-    near = {agent: sorted(row, key=lambda task: (row[task], task)) for agent, row in mission.costs.items()}
+    near = {agent: [task for _, task in ways] for agent, ways in mission.near.items()}
     owners = dict(owners)
     held: dict[str, dict[str, str]] = {agent: {} for agent in mission.alive}
     for task, agent in owners.items():
         held[agent][task] = agent
     messages = 0
-    seen: set[tuple[object, ...]] = set()
+    seen: set[frozenset[tuple[str, str]]] = set()
     is_changed = True
     while is_changed:
         is_changed = False
         for agent in mission.alive:
             for other in partners(agent, owners, near[agent]):
                 both = held[agent] | held[other]
-                state = tuple(sorted(both.items()))
+                state = frozenset(both.items())
                 if state in seen:
                     continue
                 seen.add(state)

@@ -16,6 +16,7 @@ class Average(Nearest):
 
     name = "average"
     version = "1"
+    reads = ("value", "weight")
 
     def find(self, contacts: Sequence[Report]) -> Consensus:
         """The consensus point; its ``value`` is () where nobody reports one.  All values have equally many numbers."""

@@ -41,7 +41,7 @@ class Bidder:
         self._rival: dict[str, Statement | None] = dict.fromkeys(self._tasks)
         self._told: dict[str, Statement | None] = dict.fromkeys(self._tasks)
         self._out: dict[tuple[str, str], Statement] = {}
-        self._heard: dict[tuple[str, str, str], int] = {}
+        self._heard: dict[str, dict[tuple[str, str], int]] = {}
         self._touched: set[str] = set()
         self._disowned: set[str] = set()
         self._count = 0
@@ -59,23 +59,26 @@ class Bidder:
         """Take in what a neighbour says; gives what that neighbour should know instead of what it said."""
         corrections = []
         is_moved = False
+        heard = self._heard.setdefault(neighbour, {})
         for said in statements:
-            if said.task not in self._known or not 0.0 <= said.bid <= MAX_NUMBER:
+            task, agent, version, bid = said
+            bids = self._known.get(task)
+            if bids is None or not 0.0 <= bid <= MAX_NUMBER:
                 continue
-            if said.agent == self.agent:
+            if agent == self.agent:
                 is_moved |= self._remembered(said)
                 continue
-            known = self._known[said.task].get(said.agent)
-            if known is None or known.version <= said.version:
-                self._heard[neighbour, said.task, said.agent] = said.version
-            if known is not None and known.version >= said.version:
-                if known.version > said.version:
-                    corrections.append(known)
+            known = bids.get(agent)
+            if known is not None and known.version > version:
+                corrections.append(known)
                 continue
-            self._known[said.task][said.agent] = said
+            heard[task, agent] = version
+            if known is not None and known.version == version:
+                continue
+            bids[agent] = said
             if known is not None and known.bid > 0.0:
-                self._out[said.task, said.agent] = said  # it replaces what was passed on
-            is_moved |= self._looked_again(said, known)
+                self._out[task, agent] = said  # it replaces what was passed on
+            is_moved |= self._looked_again(said)
         if is_moved:
             self._choose()
         return corrections
@@ -89,12 +92,13 @@ class Bidder:
             best = self.winner(task)
             if best is not None and best != self._told[task]:
                 self._out[task, best.agent] = self._told[task] = best
-        news = [self._out[key] for key in sorted(self._out)]
+        news = sorted(self._out.items())
         self._out.clear()
         self._touched.clear()
         found = {}
         for neighbour in self.neighbours:
-            fresh = tuple(s for s in news if self._heard.get((neighbour, s.task, s.agent), 0) < s.version)
+            heard = self._heard.get(neighbour, {})
+            fresh = tuple(said for key, said in news if heard.get(key, 0) < said.version)
             if fresh:
                 found[neighbour] = fresh
         return found
@@ -114,15 +118,17 @@ class Bidder:
         self._disowned.add(said.task)
         return True
 
-    def _looked_again(self, said: Statement, known: Statement | None) -> bool:
+    def _looked_again(self, said: Statement) -> bool:
         """Find the best of the others' bids for that task again; whether the own bundle may be another now."""
         task, before = said.task, self._rival[said.task]
         self._touched.add(task)
-        if before is None or before.agent == said.agent:
+        if said.bid > 0.0 and (before is None or _beats(said.bid, said.agent, before)):
+            after: Statement | None = said
+        elif before is None or before.agent != said.agent:
+            return False  # the best is who it was
+        else:
             others = [s for s in self._known[task].values() if s.agent != self.agent and s.bid > 0.0]
             after = min(others, key=lambda s: (-s.bid, s.agent), default=None)
-        else:
-            after = said if said.bid > 0.0 and _beats(said.bid, said.agent, before) else before
         self._rival[task] = after
         if before is not None and (after is None or _beats(before.bid, before.agent, after)):
             return True  # a bid was taken back: this task may be had now

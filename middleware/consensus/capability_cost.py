@@ -22,6 +22,7 @@ class CapabilityCost:
 
     name = "capability_cost"
     version = "1"
+    reads = ("battery", "load")
 
     def find(self, contacts: Sequence[Report]) -> Consensus:
         """The consensus point; None is assigned where nobody can, and ``strategy.refused`` says why for each."""

@@ -17,7 +17,7 @@ from dataclasses import replace
 from typing import Any
 
 from middleware.consensus.item import Item
-from middleware.consensus.strategy import Consensus, ConsensusAlgorithm, Report, refusal
+from middleware.consensus.strategy import READABLE, Consensus, ConsensusAlgorithm, Report, reads_of, refusal
 
 Make = Callable[[], ConsensusAlgorithm]
 TEAMS = 40
@@ -49,6 +49,7 @@ HOSTILE = (
     {"choice": "x" * 10_000},
 )
 """What makes a report unlawful; each would win, if it counted."""
+_BARE = Report("", 0.0)
 
 
 class Breach(AssertionError):
@@ -231,6 +232,17 @@ def check_group(make: Make) -> None:
         _demand(strategy.find_group([*bids, *hostile], items) == found, "an unlawful bid makes a difference", bids)
 
 
+def check_reads(make: Make) -> None:
+    """What it does not name in ``reads`` is not shown to it in a running team, and must make no difference."""
+    strategy = make()
+    hidden: dict[str, Any] = {name: getattr(_BARE, name) for name in READABLE if name not in reads_of(strategy)}
+    for _, contacts in _teams():
+        whole = strategy.find(contacts)
+        shown = strategy.find([replace(report, **hidden) for report in contacts])
+        same = [(f.assigned_agent, f.standby, f.value, f.choice) for f in (whole, shown)]
+        _demand(same[0] == same[1], f"it goes by more than {', '.join(reads_of(strategy)) or 'the cost'}", contacts)
+
+
 CHECKS: dict[str, Callable[[Make], None]] = {
     "name": check_name,
     "purity": check_purity,
@@ -243,6 +255,7 @@ CHECKS: dict[str, Callable[[Make], None]] = {
     "hashing": check_hashing,
     "many": check_many,
     "group": check_group,
+    "reads": check_reads,
 }
 
 
@@ -305,6 +318,10 @@ class Conformance:
     def test_group(self) -> None:
         """Several tasks at once: one answer each, nobody beyond its capacity."""
         check_group(self._made())
+
+    def test_reads(self) -> None:
+        """What it does not say that it reads makes no difference."""
+        check_reads(self._made())
 
     def _made(self) -> Make:
         make: Make = type(self).make

@@ -6,6 +6,7 @@ agents on what the two of them hold; either way it never costs more than before.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping
 
 SWEEPS = 50
@@ -16,10 +17,12 @@ def exchanged(
 ) -> dict[str, str]:
     """Who has each task afterwards; ``costs`` are by agent and task, and who names none cannot have the task."""
     owner = dict(sorted(owners.items()))
-    agents = sorted(costs)
-    room = {agent: capacities.get(agent, 1) - sum(1 for held in owner.values() if held == agent) for agent in agents}
+    held = Counter(owner.values())
+    room = {agent: capacities.get(agent, 1) - held[agent] for agent in costs}
+    free = {agent for agent, places in room.items() if places > 0}
+    known = {agent: sorted(costs[agent].keys() & owner.keys()) for agent in costs}
     for _ in range(SWEEPS):
-        changed = [_moved(task, owner, costs, agents, room) | _swapped(task, owner, costs) for task in owner]
+        changed = [_moved(task, owner, costs, room, free) | _swapped(task, owner, costs, known) for task in owner]
         if not any(changed):
             break
     return owner
@@ -54,28 +57,32 @@ def _moved(
     task: str,
     owner: dict[str, str],
     costs: Mapping[str, Mapping[str, int]],
-    agents: list[str],
     room: dict[str, int],
+    free: set[str],
 ) -> bool:
-    """Give the task to the agent that has room and to which it costs least."""
-    offers = [(costs[agent][task], agent) for agent in agents if room[agent] > 0 and task in costs[agent]]
+    """Give the task to the agent that has room, as all that are ``free`` have, and to which it costs least."""
+    offers = [(costs[agent][task], agent) for agent in free if task in costs[agent]]
     now = owner[task]
     if not offers or min(offers)[0] >= costs[now][task]:
         return False
     then = min(offers)[1]
     owner[task] = then
-    room[now] += 1
-    room[then] -= 1
+    for agent, more in ((now, 1), (then, -1)):
+        room[agent] += more
+        (free.add if room[agent] > 0 else free.discard)(agent)
     return True
 
 
-def _swapped(task: str, owner: dict[str, str], costs: Mapping[str, Mapping[str, int]]) -> bool:
-    """Swap the task for the one of another agent by which both together gain most."""
+def _swapped(
+    task: str, owner: dict[str, str], costs: Mapping[str, Mapping[str, int]], known: Mapping[str, list[str]]
+) -> bool:
+    """Swap the task for the one of another agent, of those that its own has ``known``, by which both gain most."""
     mine = owner[task]
     row = costs[mine]
     least, best = 0, ""
-    for other, theirs in owner.items():
-        if theirs != mine and other in row and task in costs[theirs]:
+    for other in known[mine]:
+        theirs = owner[other]
+        if theirs != mine and task in costs[theirs]:
             gain = row[other] + costs[theirs][task] - row[task] - costs[theirs][other]
             if gain < least:
                 least, best = gain, other

@@ -26,13 +26,14 @@ class GroupOptimal(Sharing):
     def find_group(self, contacts: Sequence[Report], items: Sequence[Item]) -> tuple[Consensus, ...]:
         """One consensus point for each item, in the order of their names."""
         items = listed(items)
-        counted = [r for r in standing(contacts) if r.task in {item.task for item in items}]
+        slots = {item.task: item.slots for item in items}
+        counted = [r for r in standing(contacts) if r.task in slots]
         room = capacities(counted)
-        rows = [item.task for item in items for _ in range(item.slots)]
+        rows = [task for task, places in slots.items() for _ in range(places)]
         bids = cheapest(counted, self.bids)
         while True:
             owners = _solved(rows, room, bids)
-            holes = {task for task in set(rows) if len(owners.get(task, ())) < rows.count(task)}
+            holes = {task for task, places in slots.items() if len(owners.get(task, ())) < places}
             more = {(r.task, r.agent): exact(r.cost) for r in counted if r.task in holes}
             if more.items() <= bids.items():
                 return shared_out(self.name, counted, items, owners)
@@ -54,14 +55,24 @@ def cheapest(contacts: Iterable[Report], most: int) -> dict[tuple[str, str], int
 def _solved(rows: list[str], room: dict[str, int], bids: dict[tuple[str, str], int]) -> dict[str, list[str]]:
     """The agents of each task; an agent is never twice at one task."""
     columns = [agent for agent, places in room.items() for _ in range(min(places, len(rows)))]
+    of_agent: dict[str, list[int]] = {}
+    for column, agent in enumerate(columns):
+        of_agent.setdefault(agent, []).append(column)
+    of_task: dict[str, list[tuple[str, int]]] = {}
+    for (task, agent), cost in bids.items():
+        of_task.setdefault(task, []).append((agent, cost))
     nobody = sum(sorted(bids.values())[-len(rows) :]) + 1
     width = max(len(columns), len(rows))
     banned: set[tuple[int, str]] = set()
     while True:
         costs = []
         for number, task in enumerate(rows):
-            line = [bids.get((task, a), nobody) if (number, a) not in banned else nobody for a in columns]
-            costs.append(line + [nobody] * (width - len(columns)))
+            line = [nobody] * width
+            for agent, cost in of_task.get(task, ()):
+                if (number, agent) not in banned:
+                    for column in of_agent.get(agent, ()):
+                        line[column] = cost
+            costs.append(line)
         owners: dict[str, list[str]] = {}
         twice = False
         for number, column in enumerate(hungarian.assigned(costs)):

@@ -20,6 +20,7 @@ from middleware.consensus.strategy import (
     Consensus,
     ConsensusAlgorithm,
     Report,
+    reads_of,
     refusal,
     standing,
 )
@@ -54,6 +55,7 @@ class Guard:
         self.strategy = strategy
         self.name = str(getattr(strategy, "name", type(strategy).__name__))[:MAX_NAME]
         self.version = str(getattr(strategy, "version", ""))[:MAX_NAME]
+        self.reads = reads_of(strategy)
         self.why_not = ""
         self._fallback = fallback or Nearest()
         self._twice = twice
@@ -87,13 +89,14 @@ class Guard:
             return one_by_one(self.find, lawful, items)
         try:
             self._may_be_asked()
-            return checked_group(whole(lawful, items), lawful, items)
+            found = checked_group(whole(lawful, items), lawful, items)
         except NotImplementedError:
             return one_by_one(self.find, lawful, items)
         except Exception as error:  # the strategy is foreign code
             said = f"{self.name} has no opinion ({self._failed(error)}); {self._fallback.name}: "
             found = one_by_one(self._fallback.find, lawful, items)
             return tuple(replace(p, strategy=self._fallback.name, reason=said + p.reason) for p in found)
+        return tuple(replace(point, strategy=self.name) for point in found)
 
     def improves(self, current: Report, offer: Report, hysteresis: float) -> bool:
         """Whether ``offer`` should take over; the fallback says so where the strategy has no opinion."""

@@ -119,7 +119,7 @@ def first_of_equals(costs: Costs, columns: Sequence[int], prices: Sequence[float
         least = line[own] - prices[own]
         tight.append([c for c, (cost, price) in enumerate(zip(line, prices, strict=True)) if cost - price == least])
     # Who has a column that no row has may change it for any that costs nothing to leave open.
-    tight += [[column for column, price in enumerate(prices) if price == 0]] * (len(columns) - rows)
+    tight.append([column for column, price in enumerate(prices) if price == 0])
     for row in range(rows):
         for wanted in tight[row]:
             if wanted >= columns[row] or _changed_hands(row, wanted, columns, owner, tight):
@@ -131,6 +131,8 @@ def _changed_hands(row: int, wanted: int, columns: list[int], owner: dict[int, i
     """Give ``wanted`` to ``row`` by a ring of changes among those after it; False where there is none."""
     came = {wanted: row}
     line = [wanted]
+    rows = len(tight) - 1
+    is_asked = False
     for column in line:
         if column == columns[row]:
             while True:
@@ -140,8 +142,11 @@ def _changed_hands(row: int, wanted: int, columns: list[int], owner: dict[int, i
                     return True
                 column = left
         holder = owner[column]
+        if holder >= rows and is_asked:
+            continue  # of those who have what no row has one is asked for all: they may change for the same
+        is_asked |= holder >= rows
         if holder > row:
-            for other in tight[holder]:
+            for other in tight[min(holder, rows)]:
                 if other not in came:
                     came[other] = holder
                     line.append(other)

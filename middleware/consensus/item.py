@@ -87,7 +87,7 @@ def shared_out(
         chosen = tuple(owners.get(item.task, ()))
         order = sorted(bids.get(item.task, []), key=lambda r: (r.cost, r.agent))
         standby = tuple(r.agent for r in order if r.agent not in chosen)[:15]
-        reason = f"with {len(items) - 1} others among {agents}"
+        reason = f"divided with {len(items) - 1} other{'s' * (len(items) != 2)} among {agents}"
         if not chosen:
             reason = "nobody bid for it" if not order else "everybody who bid for it has enough to do"
         points.append(

@@ -15,6 +15,7 @@ class Nearest:
 
     name = "nearest"
     version = "2"
+    reads: tuple[str, ...] = ()
 
     def find(self, contacts: Sequence[Report]) -> Consensus:
         """The consensus point; None is assigned where no report counts (``strategy.refused`` says why)."""

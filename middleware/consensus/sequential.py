@@ -24,15 +24,17 @@ class Sequential(Cbba):
 
     name = "sequential"
     version = "1"
+    reads = ("value",)
 
     def find_group(self, contacts: Sequence[Report], items: Sequence[Item]) -> tuple[Consensus, ...]:
         """One consensus point for each item, in the order of their names; without positions as ``cbba`` does it."""
         items = listed(items)
-        ways = ways_of(contacts, items)
+        counted = [r for r in standing(contacts) if r.value]
+        ways = _ways(counted, items)
         if ways is None:
             return super().find_group(contacts, items)
         owners = {task: [agent] for agent, way in ways.items() for task in way}
-        return shared_out(self.name, [r for r in standing(contacts) if r.value], items, owners)
+        return shared_out(self.name, counted, items, owners)
 
 
 def ways_of(contacts: Sequence[Report], items: Sequence[Item]) -> dict[str, list[str]] | None:
@@ -40,8 +42,11 @@ def ways_of(contacts: Sequence[Report], items: Sequence[Item]) -> dict[str, list
 
     An agent that reports about tasks by name takes only those; one that names none takes any.
     """
-    counted = [r for r in standing(contacts) if r.value]
-    places = {item.task: item.position for item in listed(items)}
+    return _ways([r for r in standing(contacts) if r.value], listed(items))
+
+
+def _ways(counted: Sequence[Report], items: Sequence[Item]) -> dict[str, list[str]] | None:
+    places = {item.task: item.position for item in items}
     starts: dict[str, Place] = {}
     able: dict[str, set[str]] = {}
     for report in counted:
@@ -51,8 +56,9 @@ def ways_of(contacts: Sequence[Report], items: Sequence[Item]) -> dict[str, list
     if len(sizes) != 1 or 0 in sizes:
         return None
     room = capacities(counted)
-    ways = _auctioned(starts, places, room, able)
-    _mended(ways, starts, places, room, able)
+    wanted = {agent: set(places) if "" in tasks else tasks & places.keys() for agent, tasks in able.items()}
+    ways = _auctioned(starts, places, room, wanted)
+    _mended(ways, starts, places, room, wanted)
     return ways
 
 
@@ -73,21 +79,16 @@ def insertion(start: Place, way: Sequence[Place], place: Place) -> tuple[float, 
     return best
 
 
-def _may(able: set[str], task: str) -> bool:
-    return task in able or "" in able
-
-
 def _auctioned(
-    starts: Mapping[str, Place], places: Mapping[str, Place], room: Mapping[str, int], able: Mapping[str, set[str]]
+    starts: Mapping[str, Place], places: Mapping[str, Place], room: Mapping[str, int], wanted: Mapping[str, set[str]]
 ) -> dict[str, list[str]]:
     ways: dict[str, list[str]] = {agent: [] for agent in sorted(starts)}
     left = set(places)
     bids = [
-        (*insertion(starts[agent], (), place)[:1], agent, task, 0)
+        (math.dist(starts[agent], places[task]), agent, task, 0)
         for agent in ways
         if room[agent] > 0
-        for task, place in places.items()
-        if _may(able[agent], task)
+        for task in wanted[agent]
     ]
     heapq.heapify(bids)
     while left and bids:
@@ -100,9 +101,8 @@ def _auctioned(
         left.discard(task)
         if len(way) < room[agent]:
             here = [places[t] for t in way]
-            for other in sorted(left):
-                if _may(able[agent], other):
-                    heapq.heappush(bids, (insertion(starts[agent], here, places[other])[0], agent, other, len(way)))
+            for other in left & wanted[agent]:
+                heapq.heappush(bids, (insertion(starts[agent], here, places[other])[0], agent, other, len(way)))
     return ways
 
 
@@ -111,15 +111,18 @@ def _mended(
     starts: Mapping[str, Place],
     places: Mapping[str, Place],
     room: Mapping[str, int],
-    able: Mapping[str, set[str]],
+    wanted: Mapping[str, set[str]],
 ) -> None:
     """Take single tasks out and put them where they cost less, in the own way or another, and turn parts of ways."""
+    owners = {task: agent for agent, way in ways.items() for task in way}
+    bidders: dict[str, list[str]] = {task: [] for task in sorted(owners)}
+    for agent in ways:
+        for task in wanted[agent] & bidders.keys():
+            bidders[task].append(agent)
     for _ in range(SWEEPS):
         is_changed = False
-        for task in sorted(places):
-            owner = next((agent for agent, way in ways.items() if task in way), None)
-            if owner is not None and _moved(task, owner, ways, starts, places, room, able):
-                is_changed = True
+        for task in bidders:
+            is_changed |= _moved(task, owners, bidders[task], ways, starts, places, room)
         for agent, way in ways.items():
             is_changed |= _turned(way, starts[agent], places)
         if not is_changed:
@@ -128,19 +131,21 @@ def _mended(
 
 def _moved(
     task: str,
-    owner: str,
+    owners: dict[str, str],
+    bidders: Sequence[str],
     ways: dict[str, list[str]],
     starts: Mapping[str, Place],
     places: Mapping[str, Place],
     room: Mapping[str, int],
-    able: Mapping[str, set[str]],
 ) -> bool:
+    owner = owners[task]
     number = ways[owner].index(task)
     rest = [t for t in ways[owner] if t != task]
     spared = length(starts[owner], [places[t] for t in ways[owner]]) - length(starts[owner], [places[t] for t in rest])
     best = (spared - NO_GAIN, owner, number)
-    for agent, way in ways.items():
-        if agent != owner and (len(way) >= room[agent] or not _may(able[agent], task)):
+    for agent in bidders:
+        way = ways[agent]
+        if agent != owner and len(way) >= room[agent]:
             continue
         here = [places[t] for t in (rest if agent == owner else way)]
         more, where = insertion(starts[agent], here, places[task])
@@ -150,6 +155,7 @@ def _moved(
         return False
     ways[owner] = rest
     ways[best[1]].insert(best[2], task)
+    owners[task] = best[1]
     return True
 
 

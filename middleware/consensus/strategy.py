@@ -34,6 +34,9 @@ MAX_NUMBER = 1e9
 """What is beyond it is no cost, place or weight of anything on this planet, and adds up without loss."""
 MAX_WHOLE = 2**53
 MAX_NAME = 200
+READABLE = ("battery", "load", "value", "choice", "weight", "electorate")
+"""What a strategy may go by beside the cost.  In ``reads`` it says what of it; who does not say is given all."""
+SHOWN = 40
 LABELS = ("cost", "weight", "electorate", "load", "age", "valid_for")
 
 
@@ -95,7 +98,10 @@ class Refused(NamedTuple):
 
 
 class ConsensusAlgorithm(Protocol):
-    """What a strategy is.  Each method is a pure function; equal reports in any order give an equal result."""
+    """What a strategy is.  Each method is a pure function; equal reports in any order give an equal result.
+
+    It may also have ``reads``, the names among ``READABLE`` of what it goes by beside the cost.
+    """
 
     name: str
     version: str
@@ -201,6 +207,24 @@ def better(current: Report, offer: Report, hysteresis: float) -> bool:
     if refusal(offer):
         return False
     return bool(refusal(current)) or offer.cost < current.cost * (1.0 - hysteresis)
+
+
+def reads_of(strategy: object) -> tuple[str, ...]:
+    """What ``strategy`` goes by beside the cost, in the order of ``READABLE``; everything where it does not say."""
+    try:
+        said = tuple(getattr(strategy, "reads", READABLE))
+        return tuple(name for name in READABLE if name in said)
+    except Exception:  # the strategy is foreign code
+        return READABLE
+
+
+def agreement(value: tuple[float, ...], choice: str) -> str:
+    """What was agreed on by number, place or vote, as people read it; "" where nothing was."""
+    if choice:
+        return choice[:SHOWN]
+    if len(value) == 1:
+        return f"{value[0]:.2f}"
+    return f"({', '.join(f'{number:.2f}' for number in value)})" if value else ""
 
 
 def digest_of(contacts: Iterable[Report]) -> str:

@@ -20,6 +20,7 @@ class WeightedVote(Nearest):
 
     name = "weighted_vote"
     version = "1"
+    reads = ("choice", "weight", "electorate")
 
     def find(self, contacts: Sequence[Report]) -> Consensus:
         """The consensus point; its ``choice`` is "" where nothing is decided yet."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 from hypothesis import given, settings
@@ -9,7 +10,9 @@ from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 
 from agents.decision import Decision, decide
+from middleware.consensus.guard import Guard
 from middleware.consensus.nearest import Nearest
+from middleware.consensus.strategy import strategy_for
 from middleware.presence import EXECUTING, SEARCHING, WAITING
 from middleware.tasks import Member
 
@@ -33,6 +36,46 @@ REPORTS = st.lists(
     max_size=6,
     unique_by=lambda entry: entry[0],
 )
+
+
+def by(strategy: str, *members: Member) -> Decision:
+    """The decision by another strategy, long after the waiting period."""
+    return decide(members, Guard(strategy_for(strategy)), 0.1, 8.0, 100.0)
+
+
+class ReadingTests(SynchronousTestCase):
+    """Strategies that go by more than the cost are given it."""
+
+    def test_charged_one_is_preferred(self) -> None:
+        """Of two equally near the one with more charge goes, and of equally charged the one with fewer tasks."""
+        low, full = replace(member("a", 5.0), battery=0.2), replace(member("b", 5.0), battery=0.9)
+        self.assertEqual(by("capability_cost", low, full).assigned, "b")
+        self.assertEqual(by("nearest", low, full).assigned, "a")
+        busy, free = replace(member("a", 5.0), load=2), replace(member("b", 5.0), load=1)
+        self.assertEqual(by("capability_cost", busy, free).assigned, "b")
+
+    def test_vote_decides(self) -> None:
+        """The option with most of the weight is agreed on, the cheapest of its side goes, and the reason says so."""
+        one, two = replace(member("a", 1.0), choice="red"), replace(member("b", 2.0), choice="blue")
+        three = replace(member("c", 3.0), choice="blue")
+        decision = by("weighted_vote", one, two, three)
+        self.assertEqual((decision.assigned, decision.consensus and decision.consensus.choice), ("b", "blue"))
+        self.assertEqual(decision.why, "dog-b, 2.00, best of 3; agreed on blue")
+        self.assertEqual(by("weighted_vote", replace(one, weight=9.0), two, three).assigned, "a")
+
+    def test_open_vote_names_nobody(self) -> None:
+        """While no option has more than half of all weight nobody goes, and the reason tells the count."""
+        decision = by("weighted_vote", replace(member("a", 1.0), choice="red", electorate=3.0))
+        self.assertEqual((decision.assigned, decision.why), (None, "red: 1; more than half of 3 decides"))
+
+    def test_mean_is_found(self) -> None:
+        """The mean of the places that are reported is agreed on, and other places are another basis and digest."""
+        near, far = replace(member("a", 1.0), value=(0.0, 2.0)), replace(member("b", 2.0), value=(4.0, 0.0))
+        decision = by("rendezvous", near, far)
+        self.assertEqual(decision.consensus and decision.consensus.value, (2.0, 1.0))
+        other = by("rendezvous", near, replace(far, value=(4.0, 1.0)))
+        self.assertNotEqual(decision.basis, other.basis)
+        self.assertNotEqual(decision.digest, other.digest)
 
 
 class DecisionTests(SynchronousTestCase):

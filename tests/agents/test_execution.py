@@ -9,6 +9,7 @@ from twisted.trial.unittest import SynchronousTestCase
 from agents.behaviour import STAND
 from agents.context import Context
 from agents.execution import Execution
+from middleware.consensus.strategy import Consensus
 
 
 class Digger:
@@ -39,6 +40,15 @@ class ExecutionTests(SynchronousTestCase):
         self.assertEqual(told[0], (1.0, 5, 2.0, 1.0, False))
         self.assertEqual(told[1], (2.0, 5, 3.0, 1.0, True))
         self.assertEqual([row[3:] for row in told[2:]], [(3.0, False), (3.0, True)])
+
+    def test_agreement_is_told(self) -> None:
+        """What was agreed on reaches who acts, and under one token it stays while it is open again."""
+        digger = Digger()
+        execution = self.execution(digger)
+        for token, choice, value in ((5, "red", (1.0, 2.0)), (5, "", ()), (5, "blue", ()), (6, "", ())):
+            execution.go_on(0.0, token, 9.0, Consensus("a", choice=choice, value=value))
+        told = [(context.choice, context.value) for context in digger.contexts]
+        self.assertEqual(told, [("red", (1.0, 2.0)), ("red", (1.0, 2.0)), ("blue", ()), ("", ())])
 
     def test_progress_is_told_in_quarters(self) -> None:
         """What a behaviour says of its progress is told in steps; what is none is not."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
@@ -52,6 +53,16 @@ class GuardedTests(SynchronousTestCase):
         self.assertEqual(guarded.execute(Context(0.0)), STAND)
         self.assertEqual(len(self.flushLoggedErrors(KeyError)), 1)
         self.assertEqual((guarded.execute(Context(0.1)), guarded.search(0.1), guarded.cost), (STAND, STAND, None))
+
+    def test_what_it_may_have_beside(self) -> None:
+        """What a behaviour has beside what it must is asked of it, with the usual value where it has none or raises."""
+        spin = Spin()
+        spin.value, spin.choice = (1.0,), "left"  # type: ignore[attr-defined]
+        guarded: Any = Guarded(spin, STAND)
+        self.assertEqual((guarded.value, guarded.choice, guarded.weight, guarded.is_safe), ((1.0,), "left", 1.0, True))
+        self.assertFalse(hasattr(guarded, "take_post"))
+        guarded.has_failed = True
+        self.assertEqual((guarded.value, guarded.choice), ((), ""))
 
     def test_cost_that_is_no_distance(self) -> None:
         """A cost that is negative, infinite, not a number or none at all is no report."""

@@ -14,6 +14,7 @@ from tests.fleet import Fleet
 from tests.invariants.bug import seeded
 from tests.invariants.deciders import Deciders
 from tests.invariants.disk import DiskFleet
+from tests.invariants.groups import Groups
 from tests.invariants.leases import Leases
 from tests.invariants.records import Records
 from tests.invariants.schedule import Schedule, Workload
@@ -42,10 +43,10 @@ WORKLOADS: dict[str, Callable[[Schedule], Workload]] = {
     "deciders": Deciders,
 }
 """Each may be asked for by name; the order is the one in which they act."""
-ALONE: dict[str, Callable[[int], Alone]] = {"tasks": Tasks, "leases": Leases}
-"""Those that need no fleet: a world of their own beside it, with faults of its own, in every schedule."""
-SHARES = {"records": 1.0, "tuples": 0.06, "stores": 0.06, "wire": 0.06, "deciders": 0.06}
-"""The share of schedules in which each takes part, unless it is asked for."""
+ALONE: dict[str, Callable[[int], Alone]] = {"tasks": Tasks, "leases": Leases, "groups": Groups}
+"""Those that need no fleet: a world of their own beside it, with faults of its own."""
+SHARES = {"records": 1.0, "tuples": 0.06, "stores": 0.06, "wire": 0.06, "deciders": 0.06, "groups": 0.06}
+"""The share of schedules in which each takes part, unless it is asked for; those that are not here are in all."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,10 @@ class Outcome:
 def drawn(seed: int) -> list[str]:
     """The workloads of a seed."""
     dice = random.Random(f"workloads/{seed}")
-    return [*(name for name, share in SHARES.items() if dice.random() < share), *ALONE]
+    return [
+        *(name for name, share in SHARES.items() if dice.random() < share),
+        *(name for name in ALONE if name not in SHARES),
+    ]
 
 
 def run(seed: int, only: tuple[str, ...] = (), bug: str | None = None) -> Outcome:

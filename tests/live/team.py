@@ -23,7 +23,7 @@ from twisted.internet.stdio import StandardIO
 from twisted.internet.threads import deferToThread
 from twisted.protocols.basic import LineReceiver
 
-from webnode.board import Board, Sessions
+from webnode.board import Board, MemoryAudit, MemoryHalts, Sessions
 from webnode.camera import OnFrame
 from webnode.desk import MemoryDesk
 from webnode.limits import AddressLimits
@@ -64,7 +64,7 @@ def dog(number: int, status: str, task: str, started: float) -> dict[str, Any]:
 def why() -> dict[str, Any]:
     """Two decisions: dog3's was overtaken when dog2 came near, and dog3 knew nothing of it."""
     costs = {"dog2": 0.62, "dog1": 1.04, "dog3": 1.37}
-    reports = [{"agent": f"0{name[-1]}" * 16, "name": name, "cost": cost} for name, cost in costs.items()]
+    reports = [{"agent": f"0{name[-1]}" * 16, "name": name, "cost": cost, "more": ""} for name, cost in costs.items()]
     first = {
         "epoch": 1,
         "winner": "03" * 16,
@@ -77,6 +77,7 @@ def why() -> dict[str, Any]:
         "hysteresis": "nobody acted before",
         "standby": ["dog1"],
         "digest": "1a2b3c4d",
+        "agreed": "",
         "token": 1,
         "reported": 2,
         "reports": [{**reports[2], "cost": 1.4}, {**reports[1], "cost": 1.6}],
@@ -106,6 +107,7 @@ class Team:
         self.devices = [dog(1, "WAITING", "t1", now), dog(2, "EXECUTING", "t1", now), dog(3, "SEARCHING", "t1", now)]
         self.away: set[str] = set()
         self.batch = 0
+        self.halts = MemoryHalts(*(f"{n:02x}" * 16 for n in (1, 2, 3)))
         self._departed = Departed()
         self.tasks = [
             {
@@ -145,7 +147,8 @@ class Team:
             for each in here
         ]
         gone = self._departed.of(here, time.time())
-        return state_of(here, self.tasks, {str(task): members}, departed=gone, node="vaio")
+        state = state_of(here, self.tasks, {str(task): members}, departed=gone, node="vaio")
+        return {**state, "halted": self.halts.is_halted()}
 
     def be_strange(self, words: list[str]) -> None:
         """A device, a task and a decision of each of ``words``, with them wherever others' words are shown."""
@@ -254,10 +257,13 @@ class Orders(LineReceiver):
             reactor.stop()
 
 
-def board() -> Board:
+def board(team: Team) -> Board:
     """What the page can ask for: twins in memory, so that every order is taken and none does harm."""
+    desk = MemoryDesk(CATALOGUE, YARD)
+    able = [{"uuid": f"{n:02x}" * 16, "name": f"dog{n}", "busy": "Patrol the yard" * (n == 2)} for n in (1, 2)]
+    desk.previews["search"] = {"able": able, "refused": {"dog3": ["no gripper", "no lift"]}, "likely": None}
     sessions = SignedSessions(b"a team of the tests", "quiet-otter", PASSWORD, random.Random(), checked)
-    return Board(MemoryDesk(CATALOGUE, YARD), sessions, limits=AddressLimits())
+    return Board(desk, sessions, MemoryAudit(time.time), limits=AddressLimits(), halts=team.halts)
 
 
 def checked(text: str, password: str) -> Deferred[Any]:
@@ -269,7 +275,7 @@ def main() -> None:
     """Serve until the input ends."""
     team = Team()
     port = int(sys.argv[1]) if len(sys.argv) > 1 else 0
-    served = board()
+    served = board(team)
     web = web_service(reactor, "127.0.0.1", port, team.read, served, team, time.time)
     web.startService()
     reactor.addSystemEventTrigger("before", "shutdown", web.stopService)

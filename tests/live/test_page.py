@@ -31,8 +31,8 @@ PANELS = """async () => {
       close: () => { document.body.dataset.closed = root.dataset.told; },
     };
   };
-  panel({ place: "tasks", order: 20, title: "Second", needs, load: async () => ({ make: noted }) });
-  panel({ place: "tasks", order: 10, title: "First", needs, make: (root) => {
+  panel({ place: "groups", order: 20, title: "Second", needs, load: async () => ({ make: noted }) });
+  panel({ place: "groups", order: 10, title: "First", needs, make: (root) => {
     root.textContent = "first";
     return { update: (_, event) => { if (event === "state") throw new Error("a fault of one"); } };
   } });
@@ -236,15 +236,15 @@ class PageTests(SynchronousTestCase):
         """A panel stands where it belongs, in order, for whom and where it is meant, is told what comes, and ends."""
         page = self.opened(DESK)
         page.evaluate(PANELS)
-        self.assertEqual(page.locator("#place-tasks > [data-order]").all_inner_texts(), [])
+        self.assertEqual(page.locator("#place-groups > [data-order]").all_inner_texts(), [])
         page.evaluate("seen.model.has = [...seen.model.has, 'faults']")
-        page.locator("#place-tasks > [data-order]").nth(1).wait_for()
-        self.assertEqual(page.locator("#place-tasks > [data-order]").all_inner_texts(), ["first", "second"])
+        page.locator("#place-groups > [data-order]").nth(1).wait_for()
+        self.assertEqual(page.locator("#place-groups > [data-order]").all_inner_texts(), ["first", "second"])
         self.team.order("status dog3 DONE")
         page.locator("[data-told*=state]").wait_for()
         page.evaluate("seen.model.me = { name: '', role: 'viewer' }")
         page.locator("body[data-closed^='told  ']").wait_for()
-        self.assertEqual(page.locator("#place-tasks > [data-order]").count(), 0)
+        self.assertEqual(page.locator("#place-groups > [data-order]").count(), 0)
         self.assertEqual(len(self.faults), 1, self.faults)
         self.assertIn("a fault of one", self.faults[0])
         page.locator(".device[data-state=DONE]", has_text="dog3").wait_for()

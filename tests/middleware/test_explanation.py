@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import random
+from dataclasses import replace
 
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.explanation import as_text, explained
 from middleware.verdict import BEST, MANY
 from tests.middleware.test_verdict import THREE, decided, member
+
+OWN = [decided(n, THREE) for n in (1, 2, 3)]
 
 
 class ExplanationTests(SynchronousTestCase):
@@ -36,6 +39,21 @@ class ExplanationTests(SynchronousTestCase):
         text = as_text(explained([decided(1, THREE), decided(2, THREE), decided(3, missed)]))
         self.assertIn("2 of 3 agree", text)
         self.assertIn("dog3 differs: names dog3; knew no report of dog2", text)
+
+    def test_agreement_is_told(self) -> None:
+        """What was agreed on and what else counted is told, and who agreed on something else differs in that."""
+        known = [
+            replace(each, reports=(replace(each.reports[0], more="battery 40%"), *each.reports[1:])) for each in OWN
+        ]
+        agreed = [replace(each, choice="red") for each in known]
+        text = as_text(explained(agreed))
+        self.assertIn("\n  agreed on red\n", text)
+        self.assertIn("0.50  *  battery 40%\n", text)
+        (ruling,) = explained([*agreed[:2], replace(agreed[2], choice="", value=(1.0, 2.5))]).epochs
+        self.assertEqual([(d.name, d.what) for d in ruling.differ], [("dog3", "agreed on (1.00, 2.50)")])
+        odd = replace(OWN[2], digest="other", choice="red")
+        (ruling,) = explained([*agreed[:2], odd]).epochs
+        self.assertEqual([d.what for d in ruling.differ], ["knew dog2 with nothing more"])
 
     def test_silent_agent_is_named(self) -> None:
         """Who reported and has told no decision is no agreement."""

@@ -70,6 +70,8 @@ class DecoderTests(SynchronousTestCase):
         self.assertEqual(task_of(record("t1", TASK.packed())), TASK)
         self.assertEqual(member_of(record(MEMBER, REPORT.packed())), REPORT)
         self.assertEqual(result_of(record(RESULT, DONE.packed())), DONE)
+        minded = replace(REPORT, battery=0.5, value=(1.0, -2.5), choice="red", weight=2.0, electorate=5.0)
+        self.assertEqual(member_of(record(MEMBER, minded.packed())), minded)
         bare = replace(REPORT, cost=None)
         self.assertEqual(member_of(record(MEMBER, bare.packed())), bare)
 
@@ -136,6 +138,23 @@ class DecoderTests(SynchronousTestCase):
             ("angle", float("inf")),
             ("post", [1.0]),
             ("uuid", 5),
+            ("battery", 1.5),
+            ("battery", None),
+            ("battery", float("nan")),
+            ("value", 5),
+            ("value", "ab"),
+            ("value", ["a"]),
+            ("value", [float("inf")]),
+            ("value", [1e12]),
+            ("value", [0.0] * 9),
+            ("choice", 5),
+            ("choice", "x" * 65),
+            ("choice", "red\x1b[2J"),
+            ("weight", -1.0),
+            ("weight", 1e12),
+            ("weight", True),
+            ("electorate", float("nan")),
+            ("electorate", "all"),
         ]:
             self.assertIsNone(member_of(record(MEMBER, changed(REPORT.packed(), **{name: value}))), (name, value))
         for cost in ("near", -1.0, float("nan"), float("inf"), True, [1]):

@@ -9,7 +9,8 @@ import msgpack
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.consensus.nearest import Nearest
-from middleware.consensus.strategy import Consensus, Report
+from middleware.consensus.strategy import READABLE, Consensus, Report
+from middleware.consensus.view import View
 from middleware.entangled.identity import Identity
 from middleware.entangled.record import MAX_NAME, Record
 from middleware.presence import EXECUTING, WAITING
@@ -82,6 +83,25 @@ class VerdictTests(SynchronousTestCase):
         consensus = Consensus(long[0].uuid, tuple(m.uuid for m in long), "d" * 90)
         given = ("t" * 64, 2**53, long[0], long, "r" * 90, "v" * 90, consensus, long[0].uuid, 0.1, 2**53)
         self.assertLessEqual(len(verdict_from(*given).packed()), MAX_VERDICT)
+        minded = [replace(m, battery=0.123, load=2**53, value=(1e9,) * 8, choice="\N{SNOWMAN}" * 64) for m in long]
+        agreed = replace(consensus, value=(1e9 / 7,) * 8, choice="\N{SNOWMAN}" * 64)
+        given = ("t" * 64, 2**53, minded[0], minded, "r" * 90, "v" * 90, agreed, long[0].uuid, 0.1, 2**53)
+        packed = verdict_from(*given, View(READABLE)).packed()
+        self.assertLessEqual(len(packed), MAX_VERDICT)
+
+    def test_what_counted_is_told(self) -> None:
+        """What a strategy went by beside the cost, and what was agreed on, is on the account, and nothing else."""
+        members = [replace(member(1, 1.5), battery=0.4, load=3), replace(member(2, 0.5), choice="red", weight=2.0)]
+        members.append(replace(member(3, 1.0), value=(1.0, 2.0)))
+        found = Consensus(members[1].uuid, value=(1.0, 2.5), choice="red")
+        given = ("t1", 1, members[0], members[1:], "any", "1", found, found.assigned_agent, 0.1, 0)
+        verdict = verdict_of(record_of(1, verdict_from(*given, View(READABLE))))
+        assert verdict is not None
+        self.assertEqual((verdict.value, verdict.choice), ((1.0, 2.5), "red"))
+        told = {r.name: r.more for r in verdict.reports}
+        self.assertEqual(told["dog1"], "battery 40%, 2 other tasks")
+        self.assertEqual((told["dog2"], told["dog3"]), ("for red, weight 2", "at (1.00, 2.00)"))
+        self.assertEqual({r.more for r in verdict_from(*given, View()).reports}, {""})
 
     def test_hysteresis_is_told(self) -> None:
         """The account says in words what became of whoever acted before."""
@@ -92,6 +112,12 @@ class VerdictTests(SynchronousTestCase):
         ):
             self.assertEqual(decided(3, acting, assigned=assigned).hysteresis, words)
         self.assertEqual(decided(1, THREE).hysteresis, "nobody acted before")
+        found = Consensus(THREE[2].uuid, task="t1", reason="divided with 2 others among 3")
+        shared = verdict_from("t1", 1, THREE[0], THREE[1:], "group_optimal", "1", found, found.assigned_agent, 0.1)
+        self.assertEqual(shared.hysteresis, "nobody acted before; divided with 2 others among 3")
+        open_ = Consensus(None, reason="no vote; more than half of 3 decides")
+        words = verdict_from("t1", 1, THREE[0], THREE[1:], "weighted_vote", "1", open_, None, 0.1).hysteresis
+        self.assertEqual(words, "no vote; more than half of 3 decides")
         self.assertIn("nobody is better", decided(2, [member(1, 0.5, EXECUTING), member(2, 0.7)]).hysteresis)
         self.assertEqual(decided(1, [member(1, None)]).hysteresis, "no report counts")
 
@@ -108,6 +134,9 @@ class VerdictTests(SynchronousTestCase):
             "silent": [None, [7], ["\n"]],
             "reported": [0, 99],
             "participants": [0, None],
+            "value": [5, ["x"], [float("nan")], [0.0] * 9],
+            "choice": [None, 7, "a\x1b[2J", "x" * 65],
+            "more": [None, [7], ["\n"], ["a"] * 4],
         }
         for field, values in bad.items():
             for value in values:

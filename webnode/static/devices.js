@@ -1,6 +1,6 @@
 // Devices: the list in the order of joining, and the dialog with what is known of one.
 import { at, attribute, badge, element, keyed, span, state, words } from "./element.js";
-import { say, wish } from "./desk.js";
+import { delivery, say, wish } from "./desk.js";
 import { panel } from "./panel.js";
 import { go } from "./shell.js";
 
@@ -94,7 +94,7 @@ function startDevice() {
   at("d-message").addEventListener("submit", async (event) => {
     event.preventDefault();
     const body = { text: at("d-text").value };
-    if (await wish("Message", `devices/${open}/message`, { body, line, done: () => "Message sent." })) at("d-text").value = "";
+    if (await wish("Message", `devices/${open}/message`, { body, line, done: delivery })) at("d-text").value = "";
   });
   at("d-leave").addEventListener("submit", (event) => {
     event.preventDefault();
@@ -108,7 +108,7 @@ function startDevices() {
   at("announce").addEventListener("submit", async (event) => {
     event.preventDefault();
     const body = { text: at("announce-text").value };
-    if (await wish("Message", "message", { body, line: say, done: () => "Message sent to all devices." })) at("announce-text").value = "";
+    if (await wish("Message", "message", { body, line: say, done: delivery })) at("announce-text").value = "";
   });
 }
 

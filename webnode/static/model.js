@@ -24,6 +24,7 @@ const TAKERS = {
     model.devices = byKey(state.devices, "uuid");
     model.tasks = byKey(state.tasks, "id");
     model.groups = byKey(state.groups, "task");
+    model.halted = state.halted === true;
   },
   yard(snapshot) {
     model.yard = snapshot;

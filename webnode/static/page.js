@@ -1,11 +1,12 @@
 // The page: every panel that there is, one stream in, and the model that all of them read.
 import "./header.js";
+import "./halt.js";
 import "./devices.js";
 import "./groups.js";
 import "./cameras.js";
 import "./map.js";
 import "./tasks.js";
-import "./audit.js";
+import "./actions.js";
 import { enter } from "./signin.js";
 import { ask, get, open } from "./link.js";
 import { model, take } from "./model.js";

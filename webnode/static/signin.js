@@ -1,5 +1,5 @@
 // Signing in and out: by the code that the node printed, which a link may carry, or by the password.
-import { at, element, words } from "./element.js";
+import { element, words } from "./element.js";
 import { ask, get } from "./link.js";
 import { panel } from "./panel.js";
 import { forget, keep, token } from "./session.js";
@@ -34,54 +34,14 @@ async function check(trouble = "") {
   while (!me || me.role === "anyone") {
     if (me) {
       if (token()) forget();
-      await asked(trouble);
+      const { asked } = await import("./door.js");
+      await asked(trouble, signIn);
     } else await new Promise((done) => setTimeout(done, 1000));
     trouble = "";
     me = await get("session").catch(() => null);
   }
   checking = false;
   told(me);
-}
-
-// Ask for the code until one is right.
-function asked(trouble) {
-  return new Promise((done) => {
-    const line = element("p", { role: "alert" }, trouble);
-    const field = element("input", { id: "signin-code", type: "password", autocomplete: "current-password", maxlength: 300, required: "" });
-    const show = element("button", { type: "button", "aria-pressed": "false" }, "Show");
-    const enterButton = element("button", { class: "primary" }, "Sign in");
-    const form = element("form", {},
-      element("h2", { id: "h-signin" }, "Sign in"),
-      element("p", { class: "hint" }, "The code stands where the node was started; there, the command swarm web tells it, too."),
-      element("label", { for: "signin-code" }, "Code or password"),
-      element("div", { class: "row" }, field, show), line, enterButton);
-    const dialog = element("dialog", { id: "signin", "aria-labelledby": "h-signin", closedby: "none" }, form);
-    show.onclick = () => {
-      const hidden = field.type === "password";
-      field.type = hidden ? "text" : "password";
-      words(show, hidden ? "Hide" : "Show");
-      show.setAttribute("aria-pressed", String(hidden));
-    };
-    // Nothing is behind it that could be used.
-    dialog.oncancel = (event) => event.preventDefault();
-    dialog.onclose = () => { if (dialog.isConnected) dialog.showModal(); };
-    form.onsubmit = async (event) => {
-      event.preventDefault();
-      enterButton.disabled = true;
-      words(line, "");
-      try {
-        await signIn(field.value);
-        dialog.remove();
-        done();
-      } catch (error) {
-        words(line, error.message);
-        field.select();
-      }
-      enterButton.disabled = false;
-    };
-    document.body.append(dialog);
-    dialog.showModal();
-  });
 }
 
 async function invite(line) {
@@ -123,4 +83,12 @@ panel({
       close: () => clearInterval(timer),
     };
   },
+});
+
+panel({
+  place: "more",
+  order: 95,
+  title: "Audit",
+  needs: { role: "operator" },
+  load: () => import("./audit.js"),
 });

@@ -44,7 +44,7 @@ function why(box, epochs) {
   words(box.firstChild, `${epochs[0].chosen} – ${epochs[0].agree} of ${epochs[0].of} agree${epochs[0].differ.map((name) => `, ${name} differs`).join("")}`);
   attribute(box, "data-agree", epochs[0].agree === epochs[0].of && !epochs[0].differ.length);
   box.lastChild.replaceChildren(...epochs.flatMap((each) => [
-    element("p", {}, element("b", {}, `${each.epoch}. ${each.chosen}`), ` by ${each.rule}: ${each.hysteresis}`),
+    element("p", {}, element("b", {}, `${each.epoch}. ${each.chosen}`), ` by ${each.rule}: ${each.hysteresis}${each.agreed && `; agreed on ${each.agreed}`}`),
     element("table", {}, ...each.rows.map((row) => element("tr", {}, element("th", { scope: "row" }, row.name),
       element("td", {}, row.cost?.toFixed(2) ?? "no report"), element("td", {}, row.note)))),
     ...(each.reported > each.rows.length ? [`of ${each.reported} reports`] : [])]));

@@ -6,10 +6,12 @@ import json
 
 from twisted.trial.unittest import SynchronousTestCase
 
+from benchmarks.consensus.__main__ import judged
 from benchmarks.consensus.decider import DECIDERS
 from benchmarks.consensus.mission import Mission
 from benchmarks.consensus.oracle import least_star, least_way, travelled
-from benchmarks.consensus.plot import drawn
+from benchmarks.consensus.outcome import outcome
+from benchmarks.consensus.plot import AFTER, BAR, CALM, drawn
 from benchmarks.consensus.talk import talked
 from middleware.consensus.sequential import ways_of
 
@@ -49,8 +51,48 @@ class BenchConsensusTests(SynchronousTestCase):
             self.assertEqual(sorted(map(len, found.owners.values())), [1] * 12)
             self.assertGreater(found.messages, 1.0)
 
+    def test_talk_is_greedy(self) -> None:
+        """What the bidders end with is the greedy assignment, with the messages that it took them."""
+        mission = Mission(12, 12, 1)
+        talk = talked(mission)
+        found, greedy = outcome("cbba", mission, talk), outcome("cbba", mission)
+        self.assertEqual(found.owners, greedy.owners)
+        self.assertEqual((found.messages, greedy.messages), (talk.messages, 2.0))
+
+    def test_meetings(self) -> None:
+        """Meetings begin where the talk ended, never cost more than that, and their messages are counted on top."""
+        mission = Mission(12, 12, 2)
+        talk = talked(mission)
+        before, after = outcome("cbba", mission, talk), outcome("cbba, then meetings", mission, talk)
+        costs = [sum(mission.costs[a][t] for t, a in found.owners.items()) for found in (before, after)]
+        self.assertLess(costs[1], costs[0])
+        self.assertGreater(after.messages, before.messages)
+        self.assertEqual(after.rounds - before.rounds, after.messages - before.messages)
+
+    def test_asked_again(self) -> None:
+        """Where few bids leave tasks to nobody, all bid for those, until each has an owner; all of it is counted."""
+        mission = Mission(110, 110, 1)
+        found = outcome("cbba", mission)
+        self.assertEqual(set(found.owners), set(mission.places))
+        self.assertGreaterEqual(found.messages, 4.0)
+        self.assertEqual(found.messages, found.rounds)
+        self.assertTrue(40 * 0.012 < found.kB < 110 * 0.012)
+
+    def test_rows(self) -> None:
+        """Each strategy has one row of all missions of a size; none is better than the optimum, and that is reached."""
+        rows = {row["strategy"]: row for row in judged(10, range(1, 4))}
+        self.assertEqual(list(rows), list(DECIDERS))
+        self.assertEqual({row["missions"] for row in rows.values()}, {3})
+        self.assertGreaterEqual(min(min(row["ratio"], row["ratio_failed"]) for row in rows.values()), 1.0)
+        self.assertEqual((rows["group_optimal"]["ratio"], rows["group_optimal"]["ratio_failed"]), (1.0, 1.0))
+        self.assertLess(rows["cbba, then meetings"]["ratio"], rows["cbba"]["ratio"])
+        self.assertEqual((rows["cbba"]["two_owners"], rows["cbba"]["unlike_greedy"]), (0, 0))
+        self.assertGreater(rows["cbba"]["messages"], rows["cbba + exchange"]["messages"])
+
     def test_plot(self) -> None:
-        """The picture is drawn from rows as they are written."""
-        row = {"agents": 3, "strategy": "a < b", "ratio": 1.0, "ratio_failed": 1.25}
+        """The picture is drawn from rows as they are written: a bar as long as what is above the optimum."""
+        row = {"agents": 3, "strategy": "a < b", "ratio": 1.1, "ratio_failed": 1.2}
         picture = drawn(json.loads(json.dumps([row])))
         self.assertIn("a &lt; b", picture)
+        self.assertIn(f'width="{BAR / 2:.1f}" height="7" fill="{CALM}"', picture)
+        self.assertIn(f'width="{BAR:.1f}" height="7" fill="{AFTER}"', picture)

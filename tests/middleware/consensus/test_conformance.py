@@ -186,6 +186,12 @@ class Lazy(Cbba):
         return super().find_group(contacts, items)[: len(items) - 1]
 
 
+class Peeks(CapabilityCost):
+    """Goes by the battery, and does not say so."""
+
+    reads = ("load",)  # type: ignore[assignment]
+
+
 BREACHES: dict[str, tuple[Callable[[], Any], ...]] = {
     "name": (Unnamed,),
     "purity": (Remembers, Sorts),
@@ -198,6 +204,7 @@ BREACHES: dict[str, tuple[Callable[[], Any], ...]] = {
     "hashing": (ByHash,),
     "many": (Raises, SmallIds),
     "group": (Greedy, Lazy),
+    "reads": (Peeks,),
 }
 """Strategies that break each rule."""
 

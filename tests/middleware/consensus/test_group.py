@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import random
+from collections import Counter
 from itertools import product
 from statistics import fmean
 
@@ -124,6 +125,26 @@ class CbbaTests(SynchronousTestCase):
                 cost(Cbba().find_group(reports, items), reports) / cost(best.find_group(reports, items), reports)
             )
         self.assertLessEqual(fmean(ratios), 1.05)
+
+    def test_nothing_left_to_exchange(self) -> None:
+        """Afterwards no task is cheaper with an agent that has room for it, no two swapped; nobody has too many."""
+        for seed in range(60):
+            dice = random.Random(seed)
+            tasks = [f"t{n}" for n in range(9)]
+            costs = {f"a{n}": {t: dice.randrange(99) for t in tasks if dice.random() < 0.6} for n in range(6)}
+            room = {agent: dice.randint(1, 3) for agent in costs}
+            # Greedy with the signs turned: as bad as can be to begin with.
+            worst = greedy({agent: {t: -c for t, c in row.items()} for agent, row in costs.items()}, room)
+            owner = exchanged(worst, costs, room)
+            held = Counter(owner.values())
+            self.assertTrue(all(held[agent] <= room[agent] for agent in held))
+            for task, agent in owner.items():
+                free = [row[task] for other, row in costs.items() if held[other] < room[other] and task in row]
+                self.assertLessEqual(costs[agent][task], min(free, default=99))
+                for other, theirs in owner.items():
+                    if other in costs[agent] and task in costs[theirs]:
+                        now = costs[agent][task] + costs[theirs][other]
+                        self.assertLessEqual(now, costs[agent][other] + costs[theirs][task])
 
     def test_half_of_the_score(self) -> None:
         """The greedy assignment has at least half of the best score, worst case or not."""

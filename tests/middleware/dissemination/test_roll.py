@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.consensus.strategy import Report
+from middleware.consensus.view import View
 from middleware.dissemination.roll import Roll
 from middleware.group import Group, Heard
 from middleware.tasks import Member, Result, Task
@@ -37,6 +40,16 @@ class RollTests(SynchronousTestCase):
         self.roll.announced([Report("a", 2.0), Report("b", 1.0)])
         self.roll.present([member("a", None), member("b", None)])
         self.assertEqual(costs(self.roll.members()), {"a": None, "b": 1.0})
+
+    def test_announced_bids_tell_all_that_is_read(self) -> None:
+        """Of an announced bid all counts that the strategy reads; a record with another vote is the later word."""
+        roll = Roll(View(("choice", "weight")))
+        roll.present([member("a", 3.0), member("b", 2.0)])
+        roll.announced([Report("a", 3.0, choice="red", weight=2.0, battery=0.1), Report("b", 2.0, weight=-1.0)])
+        told = {m.uuid: (m.choice, m.weight, m.battery) for m in roll.members()}
+        self.assertEqual(told, {"a": ("red", 2.0, 1.0), "b": ("", 1.0, 1.0)})
+        roll.present([replace(member("a", 3.0), choice="blue"), member("b", 2.0)])
+        self.assertEqual(roll.members()[0].choice, "blue")
 
     def test_who_left_bids_nothing(self) -> None:
         """What was announced of a member goes with it, and does not count when it comes back."""

@@ -1,0 +1,195 @@
+"""Tests of ``agents.division``: the tasks of one group, divided by each agent for itself."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import permutations
+from types import SimpleNamespace
+from typing import Any
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from agents.decision import Decision, decide
+from agents.division import GATHERING, Division, group_of
+from agents.loop import due
+from middleware.consensus.guard import Guard
+from middleware.consensus.item import Item, Sharing
+from middleware.consensus.strategy import Consensus, Report, strategy_for
+from middleware.presence import EXECUTING, SEARCHING, WAITING
+from middleware.tasks import Member, Task
+from tests.invariants.groups import Groups
+
+AGENTS = ("a", "b", "c")
+Costs = dict[str, dict[str, float | None]]
+"""What each task costs each agent."""
+
+
+def task(name: str, **fields: Any) -> Task:
+    """A task of the group."""
+    return Task(name, "walk", name, strategy="group_optimal", group="g", waiting_period=8.0, **fields)
+
+
+def members(costs: dict[str, float | None], acting: str = "") -> list[Member]:
+    """What the participants of one task report."""
+    statuses = {
+        agent: EXECUTING if agent == acting else SEARCHING if c is None else WAITING for agent, c in costs.items()
+    }
+    return [Member(agent, f"dog-{agent}", statuses[agent], cost) for agent, cost in costs.items()]
+
+
+class DivisionTests(SynchronousTestCase):
+    def division(self, costs: Costs, strategy: str = "group_optimal", **acting: str) -> Division:
+        """All tasks as they were known a while ago; ``acting`` says who acts on which."""
+        division = Division(Guard(strategy_for(strategy)))
+        for name, row in costs.items():
+            here = members(row, acting.get(name, ""))
+            division.join(task(name), lambda now, here=here: here, 0.0)  # type: ignore[misc]
+        return division
+
+    def decided(self, costs: Costs, now: float = 50.0, since: float = 40.0, **acting: Any) -> dict[str, Decision]:
+        """The decision on each task."""
+        division = self.division(costs, **acting)
+        found = {}
+        for name, row in costs.items():
+            share = division.share(task(name), now, since)
+            found[name] = decide(members(row, acting.get(name, "")), share, 0.1, 8.0, since)
+        return found
+
+    def assigned(self, costs: Costs, **acting: Any) -> dict[str, str | None]:
+        """Who is to act on each task."""
+        return {name: decision.assigned for name, decision in self.decided(costs, **acting).items()}
+
+    def test_optimum_of_all_tasks(self) -> None:
+        """Every agent is given one task, and together they cost as little as any assignment of these reports does."""
+        rng = random.Random(4)
+        for _ in range(50):
+            costs: Costs = {t: {a: round(rng.uniform(0.0, 9.0), 2) for a in AGENTS} for t in ("t1", "t2", "t3")}
+            given = self.assigned(costs)
+            self.assertEqual(sorted(map(str, given.values())), list(AGENTS))
+            total = sum(costs[t][str(a)] or 0.0 for t, a in given.items())
+            best = min(
+                sum(costs[t][a] or 0.0 for t, a in zip(costs, order, strict=True)) for order in permutations(AGENTS)
+            )
+            self.assertAlmostEqual(total, best)
+
+    def test_one_digest_of_all_reports(self) -> None:
+        """The decision on each task names the digest of the reports on all of them, and its reason says that."""
+        costs: Costs = {"t1": {"a": 1.0, "b": 2.0}, "t2": {"a": 1.5, "b": 5.0}}
+        first = self.decided(costs)
+        self.assertEqual(first["t1"].digest, first["t2"].digest)
+        self.assertEqual(first["t1"].why, "dog-b, 2.00, divided with 1 other among 2")
+        costs["t2"]["b"] = 6.0
+        other = self.decided(costs)
+        self.assertNotEqual(first["t1"].digest, other["t1"].digest)
+        self.assertNotEqual(first["t1"].basis, other["t1"].basis)
+        one_by_one = self.division(costs, "nearest")
+        shares = [one_by_one.share(task(name), 50.0, 40.0).find([]) for name in costs]
+        self.assertEqual(len({point.digest for point in shares}), 1)
+
+    def test_more_tasks_than_agents(self) -> None:
+        """What nobody is left for waits, and the reason says so."""
+        found = self.decided({"t1": {"a": 1.0}, "t2": {"a": 2.0}})
+        self.assertEqual((found["t1"].assigned, found["t2"].assigned), ("a", None))
+        self.assertEqual(found["t2"].why, "everybody who bid for it has enough to do")
+
+    def test_who_acts_counts_for_its_task_alone(self) -> None:
+        """Whoever acts on a task is given no other, however near it is, and a free one takes what is left."""
+        costs: Costs = {"t1": {"a": 1.0, "b": 9.0}, "t2": {"a": 0.1, "b": 9.0}}
+        self.assertEqual(self.assigned(costs, t1="a"), {"t1": "a", "t2": "b"})
+        self.assertEqual(self.assigned({"t1": costs["t1"], "t2": {"a": 0.1}}, t1="a"), {"t1": "a", "t2": None})
+
+    def test_who_acts_keeps_it_within_the_hysteresis(self) -> None:
+        """A free agent takes a task over only where it is better by the hysteresis; else it is there for the others."""
+        for cost, given in ((0.95, "a"), (0.85, "b")):
+            self.assertEqual(self.assigned({"t1": {"a": 1.0, "b": cost}}, t1="a"), {"t1": given})
+        costs: Costs = {"t1": {"a": 1.0, "b": 0.95}, "t2": {"b": 9.0}}
+        for strategy in ("group_optimal", "cbba"):
+            points = self.division(costs, strategy, t1="a").share(task("t2"), 50.0, 40.0).find([])
+            self.assertEqual(points.assigned_agent, "b", strategy)
+
+    def test_group_is_gathered_first(self) -> None:
+        """Until no task has come for a moment nobody is named; who acts already goes on meanwhile."""
+        costs: Costs = {"t1": {"a": 1.0, "b": 0.1}, "t2": {"a": 2.0, "b": 2.0}}
+        for now, given, why in ((GATHERING - 0.1, None, "waiting for the rest of the group"), (GATHERING, "b", "")):
+            decision = self.decided(costs, now)["t1"]
+            self.assertEqual(decision.assigned, given)
+            self.assertTrue(decision.why.startswith(why))
+        held = self.decided(costs, 0.5, t1="a")["t1"]
+        self.assertEqual((held.assigned, len(held.digest)), ("a", 8))
+
+    def test_missing_reports_on_other_tasks_are_waited_for(self) -> None:
+        """Within the waiting period nobody is named while one has not told what another task of the group costs it."""
+        costs: Costs = {"t1": {"a": 1.0, "b": 2.0}, "t2": {"a": 1.0, "b": None}}
+        found = self.decided(costs, since=7.9)
+        self.assertEqual((found["t1"].assigned, found["t1"].why), (None, "waiting for dog-b"))
+        self.assertEqual(self.decided(costs, since=8.0)["t1"].assigned, "b")
+        self.assertEqual(self.decided(costs, since=7.9, t2="a")["t1"].assigned, "b")
+
+    def test_failing_strategy(self) -> None:
+        """Where the strategy raises, the tasks go to the nearest one by one, and the reason says so."""
+
+        class Broken(Sharing):
+            name = "broken"
+
+            def find_group(self, contacts: Sequence[Report], items: Sequence[Item]) -> tuple[Consensus, ...]:
+                """Fail."""
+                raise ZeroDivisionError("no luck")
+
+        division = Division(Guard(Broken()))
+        here = members({"a": 1.0, "b": 2.0})
+        for name in ("t1", "t2"):
+            division.join(task(name), lambda now: here, 0.0)
+        found = [decide(here, division.share(task(name), 50.0, 40.0), 0.1, 8.0, 40.0) for name in ("t1", "t2")]
+        self.assertEqual([decision.assigned for decision in found], ["a", "b"])
+        self.assertIn("broken has no opinion (ZeroDivisionError: no luck)", found[0].fault)
+        self.assertEqual(len(self.flushLoggedErrors(ZeroDivisionError)), 1)
+
+    def test_what_left_is_not_divided(self) -> None:
+        """A task that has left its group needs nobody any more."""
+        costs: Costs = {"t1": {"a": 1.0}, "t2": {"a": 2.0}}
+        division = self.division(costs)
+        division.leave("t1")
+        decision = decide(members(costs["t2"]), division.share(task("t2"), 50.0, 40.0), 0.1, 8.0, 40.0)
+        self.assertEqual(decision.assigned, "a")
+
+    def test_what_is_divided_together(self) -> None:
+        """Tasks of one group with one strategy and equal requirements are; a task without a group is by itself."""
+        one = task("t1", requirements={"camera": {"width": 1, "colour": "rgb"}, "legs": {}})
+        two = task("t2", requirements={"legs": {}, "camera": {"colour": "rgb", "width": 1}})
+        self.assertEqual(group_of(one), group_of(two))
+        for other in (replace(two, group="h"), replace(two, strategy="cbba"), replace(two, requirements={})):
+            self.assertNotEqual(group_of(one), group_of(other))
+        self.assertIsNone(group_of(replace(one, group="")))
+
+    def test_schedules(self) -> None:
+        """Schedules of groups, faults and operators: each task ends once, no agent acts on two, all name the same."""
+        broken = {seed: found for seed in range(12) if (found := Groups(seed).run())}
+        self.assertEqual(broken, {})
+
+
+class DueTests(SynchronousTestCase):
+    """Which task of a group has the body."""
+
+    def part(self, cost: float | None = 1.0, assigned: str = "", is_acting: bool = False, is_free: bool = True) -> Any:
+        """A part as its agent sees it."""
+        me = Member("a", "dog", WAITING, cost, assigned)
+        return SimpleNamespace(engagement=SimpleNamespace(me=me, is_acting=is_acting, may_be_put_aside=is_free))
+
+    def test_given_task_has_it(self) -> None:
+        """The task that the agent was given has the body, unless it acts for another or writes down how that ended."""
+        other, given = self.part(None), self.part(assigned="a")
+        self.assertIs(due([other, given], other), given)
+        for holder in (self.part(is_acting=True), self.part(is_free=False)):
+            self.assertIs(due([given, holder], holder), holder)
+
+    def test_else_what_it_cannot_tell_yet(self) -> None:
+        """Without a given task the body looks for what it has no cost of; where there is none it stays where it is."""
+        told, blind, also = self.part(), self.part(None), self.part(None, assigned="b")
+        self.assertIs(due([told, blind, also], told), blind)
+        self.assertIs(due([told, blind, also], also), also)
+        self.assertIs(due([told, blind], None), blind)
+        last = self.part(assigned="b")
+        self.assertIs(due([told, last], last), last)
+        self.assertIs(due([told, last], None), told)

@@ -1,0 +1,97 @@
+"""Tests of ``agents.report``: what one body tells of itself, for strategies that go by more than the cost."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from agents.report import PAUSE, Reporter
+from drivers.reading import Observation
+from middleware.consensus.strategy import READABLE
+from middleware.entangled.clock import HeapClock
+from middleware.tasks import Member
+
+ME = Member("a", "dog", "WAITING")
+
+
+class Minded:
+    """A behaviour that has an opinion."""
+
+    cost: float | None = 2.0
+    value: object = (1.0, 2)
+    choice: object = "red"
+    weight: object = 3
+    electorate: object = 9.0
+
+
+class ReporterTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.clock = HeapClock()
+        self.minded = self.made()
+        self.reporter = Reporter(self.minded, self.clock, READABLE)
+        self.me = ME
+
+    def made(self) -> Any:
+        """A behaviour of which the test changes what it likes."""
+        return Minded()
+
+    def news(self, charge: float = 0.8, load: int = 2) -> dict[str, Any]:
+        """What is told, and known from then on."""
+        seen = Observation(0.0, 0.0, {"power.level": charge})
+        told = self.reporter.news(self.me, False, seen, load) or {}
+        self.me = replace(self.me, **told)
+        return told
+
+    def test_all_is_told_at_first(self) -> None:
+        """With its first cost a body tells its charge, its load and what its behaviour offers, and not again."""
+        offer = {"value": (1.0, 2.0), "choice": "red", "weight": 3.0, "electorate": 9.0}
+        self.assertEqual(self.news(), {"cost": 2.0, "available": True, "battery": 0.8, "load": 2, **offer})
+        self.clock.advance(9.0)
+        self.assertEqual(self.news(), {})
+
+    def test_what_nobody_reads_is_not_told(self) -> None:
+        """For a strategy that goes by the cost alone nothing else is told."""
+        self.reporter = Reporter(self.minded, self.clock)
+        self.assertEqual(self.news(), {"cost": 2.0, "available": True})
+
+    def test_without_cost_nothing_is_offered(self) -> None:
+        """Who cannot tell what it would cost has no vote and no value."""
+        self.minded.cost = None
+        self.assertEqual(self.news(), {})
+
+    def test_battery_is_told_in_steps(self) -> None:
+        """A charge that runs down is told each twentieth, one outside of 0 to 1 as the nearest share."""
+        self.news()
+        self.assertEqual([self.news(charge) for charge in (0.79, 0.76)], [{}, {}])
+        self.assertEqual(
+            [self.news(charge) for charge in (0.75, -3.0, 7.0)], [{"battery": b} for b in (0.75, 0.0, 1.0)]
+        )
+        self.assertEqual(self.news(float("nan")), {})
+
+    def test_votes_at_once_and_numbers_at_leisure(self) -> None:
+        """A changed vote is told at once, a number that moves once a second, for it may move with each look."""
+        self.news()
+        self.minded.choice, self.minded.value = "blue", (1.1, 2.0)
+        self.assertEqual(self.news(), {"choice": "blue"})
+        self.clock.advance(PAUSE)
+        self.assertEqual(self.news(), {"value": (1.1, 2.0)})
+        self.minded.value = ()
+        self.assertEqual(self.news(), {"value": ()})
+
+    def test_offers_that_are_none(self) -> None:
+        """What a behaviour offers that is no place, option or weight is not told."""
+        bad: dict[str, list[object]] = {
+            "value": [5, [1.0], ("x",), (float("nan"),), (1e12,), (0.0,) * 9],
+            "choice": [None, 7, "x" * 65, "a\nb"],
+            "weight": [-1.0, "2", float("inf")],
+            "electorate": [None, -0.1],
+        }
+        self.minded.value, self.minded.choice, self.minded.weight, self.minded.electorate = (), "", 1.0, 0.0
+        self.news()
+        for name, values in bad.items():
+            for value in values:
+                setattr(self.minded, name, value)
+                self.clock.advance(PAUSE)
+                self.assertEqual(self.news(), {}, (name, value))

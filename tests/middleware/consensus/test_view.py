@@ -1,0 +1,68 @@
+"""Tests of ``middleware.consensus.view``: what a strategy is shown of the members."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.consensus.guard import Guard
+from middleware.consensus.nearest import Nearest
+from middleware.consensus.strategy import BUILT_IN, READABLE, Report, digest_of, strategy_for
+from middleware.consensus.view import View, view_of
+from middleware.tasks import Member
+
+FULL = Member(
+    "a", "dog", "WAITING", 2.5, load=3, battery=0.5, value=(1.0, 2.0), choice="red", weight=2.0, electorate=5.0
+)
+
+
+class ViewTests(SynchronousTestCase):
+    def test_only_what_is_read_is_shown(self) -> None:
+        """A strategy is given what it names and nothing else; one that does not say is given everything."""
+        self.assertEqual(view_of(Nearest()).report(FULL), Report("a", 2.5))
+        self.assertEqual(View(("battery", "load")).report(FULL), Report("a", 2.5, battery=0.5, load=2.0))
+        whole = Report("a", 2.5, value=(1.0, 2.0), choice="red", weight=2.0, electorate=5.0, battery=0.5, load=2.0)
+        self.assertEqual(view_of(object()).report(FULL), whole)
+        self.assertEqual(view_of(Guard(strategy_for("average"))).reads, ("value", "weight"))
+
+    def test_odd_wishes_are_none(self) -> None:
+        """Whatever a strategy of somebody else says that it reads, only what there is comes of it."""
+
+        class Odd(Nearest):
+            reads: tuple[str, ...] = ("cost", "battery", "uuid")
+
+        self.assertEqual(view_of(Odd()).reads, ("battery",))
+        Odd.reads = 5  # type: ignore[assignment]
+        self.assertEqual(view_of(Odd()).reads, READABLE)
+
+    def test_record_and_bid_are_one_report(self) -> None:
+        """What a member's record says and what its bid says come to the same report, in every digit of its digest."""
+        for name in BUILT_IN:
+            view = view_of(strategy_for(name))
+            bid = view.report(FULL)
+            assert bid is not None
+            heard = view.told(Member("a", "dog", "WAITING", load=3), bid)
+            self.assertEqual(view.report(heard), bid, name)
+        whole = view_of(object())
+        coarse = whole.report(replace(FULL, battery=1, weight=2, value=(1, 2)))
+        fine = whole.report(replace(FULL, battery=1.0, weight=2.0, value=(1.0, 2.0)))
+        assert coarse is not None and fine is not None
+        self.assertEqual(digest_of([coarse]), digest_of([fine]))
+
+    def test_bid_that_is_unlawful_changes_nothing(self) -> None:
+        """A bid with a hostile number, place or word leaves what the record says."""
+        view = view_of(object())
+        for bad in (
+            Report("a", float("nan")),
+            Report("a", 1.0, battery=1.5),
+            Report("a", 1.0, value=("x",)),  # type: ignore[arg-type]
+            Report("a", 1.0, value=(float("inf"),)),
+            Report("a", 1.0, weight=-1.0),
+            Report("a", 1.0, choice="\x1b[2J"),
+        ):
+            self.assertEqual(view.told(FULL, bad), FULL, bad)
+
+    def test_who_reports_nothing_is_shown_to_nobody(self) -> None:
+        """A member without a cost has no report, whatever else it says."""
+        self.assertIsNone(view_of(object()).report(replace(FULL, cost=None)))

@@ -1,0 +1,65 @@
+"""Facing: a behaviour for tests of whole teams: to each dog each task costs something else, and each has an opinion."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Mapping
+
+from agents.behaviour import STAND
+from agents.context import Context
+from drivers.reading import Action, Observation
+
+SPEED = 0.8
+NEAR = math.radians(6.0)
+
+
+class Facing:
+    """Turn to the direction ``towards`` (radians by the compass) at ``speed``; it costs the angle, in tenths.
+
+    It votes for the half of the world to which the dog looked first, and offers that direction as a number.
+    """
+
+    contexts: list[Context] = []
+    """Under what any of them has acted."""
+
+    def __init__(self, parameters: Mapping[str, float | str], rng: random.Random) -> None:
+        self._towards = float(parameters["towards"])
+        self._speed = float(parameters.get("speed", SPEED))
+        self._first: float | None = None
+        self._heading = 0.0
+
+    def look(self, seen: Observation, now: float) -> None:
+        """Take in the compass."""
+        self._heading = float(seen.values["compass.heading"])
+        self._first = self._heading if self._first is None else self._first
+
+    @property
+    def cost(self) -> float | None:
+        """The angle to turn, in radians."""
+        return None if self._first is None else round(abs(self._way), 1)
+
+    @property
+    def choice(self) -> str:
+        """The half of the world."""
+        return "" if self._first is None else "south" if self._first < 0.0 else "north"
+
+    @property
+    def value(self) -> tuple[float, ...]:
+        """The direction."""
+        return () if self._first is None else (round(self._first, 2),)
+
+    def search(self, now: float) -> Action:
+        """Stand."""
+        return STAND
+
+    hold = search
+
+    def execute(self, context: Context) -> Action | None:
+        """Turn the shorter way."""
+        self.contexts.append(context)
+        return None if abs(self._way) < NEAR else {**STAND, "base.wz": math.copysign(self._speed, self._way)}
+
+    @property
+    def _way(self) -> float:
+        return math.remainder(self._towards - self._heading, math.tau)

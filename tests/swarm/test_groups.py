@@ -1,0 +1,155 @@
+"""Whole teams in memory with several tasks that are divided together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import permutations
+
+from twisted.internet.defer import Deferred
+from twisted.trial.unittest import SynchronousTestCase
+
+from agents.behaviour import KINDS
+from middleware.explanation import Ruling, explained
+from middleware.tasks import Member, Task, group_key, member_of
+from middleware.verdict import verdict_of, verdicts_key
+from swarmnode.rehearsal import VirtualTeam
+
+TASKS = {"t0": 1.5, "t1": 2.5, "t2": -2.5}
+"""Where to face.  Task by task the nearest dog would have to turn more in all than these three need."""
+SLOW = 0.25
+"""Radians a second: the nearest turn takes a second, the others four and more."""
+DOGS = VirtualTeam.DOGS
+
+
+class GroupTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        KINDS["facing"] = "tests.swarm.facing:Facing"
+        self.addCleanup(KINDS.pop, "facing")
+        self.costs: dict[str, dict[str, float]] = {}
+        self.began: dict[str, list[str]] = {}
+        self.twice: list[object] = []
+        self.agreed = False
+
+    def team(self, dogs: tuple[str, ...] = DOGS, strategy: str = "group_optimal") -> VirtualTeam:
+        """A team that has just been given the tasks, one after the other."""
+        team = VirtualTeam(5, dogs=dogs)
+        self.addCleanup(team.stop)
+        team.clock.advance(0.5)
+        for name, towards in TASKS.items():
+            parameters = {"towards": towards, "speed": SLOW}
+            shared = {"requirements": {"compass": {}}, "strategy": strategy, "waiting_period": 3.0, "group": "g"}
+            task = Task(name, "facing", name, parameters=parameters, created=team.clock.seconds(), **shared)  # type: ignore[arg-type]
+            Deferred.fromCoroutine(team.services["vaio"].assembly.node.submit(task))
+            team.clock.advance(0.15)
+        return team
+
+    def until(self, team: VirtualTeam, is_so: Callable[[], bool], limit: float = 40.0) -> None:
+        """Let the team live until something is so, and look on."""
+        end = team.clock.seconds() + limit
+        while not is_so():
+            if team.clock.seconds() > end:
+                self.fail(f"not so within {limit:g} s: {team.state()['tasks']}")
+            team.clock.advance(0.05)
+            self.look(team)
+
+    def look(self, team: VirtualTeam) -> None:
+        """Note the first costs, who began what, and who acts on two at a time."""
+        acting: dict[str, list[str]] = {}
+        for name in TASKS:
+            for member in self.members(team, name):
+                if member.cost is not None:
+                    self.costs.setdefault(name, {}).setdefault(member.name, member.cost)
+                if member.status == "EXECUTING":
+                    acting.setdefault(member.name, []).append(name)
+                    if member.name not in self.began.setdefault(name, []):
+                        self.began[name].append(member.name)
+        digests = {m.digest for name in TASKS for m in self.members(team, name)}
+        self.agreed = self.agreed or (len(digests) == 1 and "" not in digests)
+        self.twice += [pair for pair in acting.items() if len(pair[1]) > 1]
+
+    def members(self, team: VirtualTeam, name: str) -> list[Member]:
+        """What is reported on a task."""
+        return [m for record in team.desk.read(group_key(name)) if (m := member_of(record)) is not None]
+
+    def are_done(self, team: VirtualTeam) -> bool:
+        """Whether all tasks are completed."""
+        return [task["status"] for task in team.state()["tasks"]] == ["COMPLETED"] * len(TASKS)
+
+    def by(self, team: VirtualTeam) -> dict[str, str]:
+        """Who did each task that is done."""
+        return {task["id"]: task["result"]["by"] for task in team.state()["tasks"] if task["result"] is not None}
+
+    def ruling(self, team: VirtualTeam, name: str) -> Ruling:
+        """What all say together of the newest decision on a task."""
+        verdicts = [v for record in team.desk.read(verdicts_key(name)) if (v := verdict_of(record)) is not None]
+        return explained(verdicts).epochs[0]
+
+    def test_each_dog_does_one(self) -> None:
+        """Three dogs do three tasks at once, one each; of what they reported no assignment costs less; all agree.
+
+        They agree on the reports on all three tasks: there is one digest.
+        """
+        team = self.team()
+        self.until(team, lambda: len(self.began) == len(TASKS))
+        self.assertTrue(self.agreed)
+        team.clock.advance(1.0)
+        for name in TASKS:
+            ruling = self.ruling(team, name)
+            self.assertEqual((len(ruling.agree), ruling.of, ruling.rule), (3, 3, "group_optimal"))
+            self.assertEqual(ruling.chosen, self.began[name][0])
+        self.until(team, lambda: self.are_done(team))
+        by = self.by(team)
+        self.assertEqual(sorted(by.values()), list(DOGS))
+        self.assertEqual({name: [dog] for name, dog in by.items()}, self.began)
+        self.assertEqual(self.twice, [])
+        best = min(sum(self.costs[t][d] for t, d in zip(TASKS, order, strict=True)) for order in permutations(DOGS))
+        self.assertAlmostEqual(sum(self.costs[name][dog] for name, dog in by.items()), best)
+
+    def test_nearest_one_by_one_costs_more(self) -> None:
+        """The same tasks under ``nearest`` are divided as well, one by one, and cost more: so the strategy is asked."""
+        team = self.team(strategy="nearest")
+        self.until(team, lambda: self.are_done(team), 60.0)
+        best = min(sum(self.costs[t][d] for t, d in zip(TASKS, order, strict=True)) for order in permutations(DOGS))
+        self.assertGreater(sum(self.costs[name][dogs[0]] for name, dogs in self.began.items()), best + 0.5)
+        self.assertEqual(self.twice, [])
+
+    def test_task_of_a_dead_dog_is_done_by_another(self) -> None:
+        """A dog that dies at its task leaves it to one of the others, as soon as one of them is free; theirs go on."""
+        team = self.team()
+        self.until(team, lambda: len(self.began) == len(TASKS))
+        lost = max(TASKS, key=lambda name: self.costs[name][self.began[name][0]])
+        dead = self.began[lost][0]
+        team.kill(dead)
+        self.until(team, lambda: self.are_done(team), 60.0)
+        by = self.by(team)
+        self.assertNotEqual(by[lost], dead)
+        self.assertEqual(self.began[lost], [dead, by[lost]])
+        for name in TASKS:
+            if name != lost:
+                self.assertEqual(self.began[name], [by[name]])
+        self.assertEqual(self.twice, [])
+
+    def test_operator_gives_a_group(self) -> None:
+        """Predefined tasks that are assigned to a group are done at once, one by each dog; the page names the group."""
+        team = VirtualTeam(5)
+        self.addCleanup(team.stop)
+        for _ in DOGS:
+            team.desk.assign("turn-around", group="yard")
+        self.until(team, lambda: self.are_done(team))
+        self.assertEqual(sorted(self.by(team).values()), list(DOGS))
+        told = {(task["group"], task["strategy"]) for task in team.state()["tasks"]}
+        self.assertEqual(told, {("yard", "group_optimal")})
+        began = [task["created"] + task["result"]["took"] for task in team.state()["tasks"]]
+        self.assertLess(max(began) - min(began), 3.0)
+
+    def test_newcomer_takes_what_is_left(self) -> None:
+        """Two dogs leave the third task alone while they are busy; a dog that joins takes it."""
+        team = self.team(("dog1", "dog2"))
+        self.until(team, lambda: len(self.began) == 2)
+        (left,) = set(TASKS) - set(self.began)
+        self.assertIn("everybody who bid for it has enough to do", {m.why for m in self.members(team, left)})
+        team.add("dog3")
+        self.until(team, lambda: left in self.began)
+        self.assertEqual(self.began[left], ["dog3"])
+        self.until(team, lambda: self.are_done(team), 60.0)
+        self.assertEqual(self.twice, [])
