@@ -25,7 +25,7 @@ from twisted.internet.stdio import StandardIO
 from twisted.internet.threads import deferToThread
 from twisted.protocols.basic import LineReceiver
 
-from webnode.board import Board, Knob, MemoryFallbacks, MemoryHalts, MemorySurvey, MemoryTuning, Page
+from webnode.board import Board, Knob, MemoryAudit, MemoryFallbacks, MemoryHalts, MemorySurvey, MemoryTuning, Page
 from webnode.camera import OnFrame
 from webnode.chronicle import TeamChronicle
 from webnode.desk import MemoryDesk
@@ -281,7 +281,7 @@ def board(team: Team) -> Board:
     tuning = MemoryTuning({able[0]["uuid"]: KNOBS})
     survey = MemorySurvey(network(), {f"0{n}" * 16: inventory() for n in (1, 2)})
     parts: dict[str, Any] = {"halts": team.halts, "tuning": tuning, "survey": survey, "chronicle": TeamChronicle()}
-    return Board(desk, sessions, limits=AddressLimits(), **parts)
+    return Board(desk, sessions, MemoryAudit(time.time), limits=AddressLimits(), **parts)
 
 
 def checked(text: str, password: str) -> Deferred[Any]:
