@@ -16,6 +16,8 @@ from middleware.consensus.strategy import Consensus
 
 SHARE = 0.01
 """Less progress than this is none."""
+ASIDE = 1.0
+"""Who is not asked for longer than this was kept from it, and has not stalled meanwhile."""
 TOLD = 0.25
 """The others are told of each quarter."""
 
@@ -40,10 +42,14 @@ class Execution:
         self._best_at = 0.0
         self._stalled_at = -math.inf
         self._agreed: tuple[tuple[float, ...], str] = (), ""
+        self._asked_at = 0.0
 
     def go_on(self, now: float, token: int, deadline: float, consensus: Consensus | None = None) -> Turn:
         """Do the next bit under the lease of ``token``; ``consensus`` is what all agree on."""
         is_resumed = token == self._token
+        if now - self._asked_at > ASIDE:
+            self._best_at += now - self._asked_at
+        self._asked_at = now
         if not is_resumed:
             self._token, self._began, self._best, self._best_at = token, now, -math.inf, now
             self._agreed = (), ""

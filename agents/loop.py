@@ -20,6 +20,7 @@ from drivers.reading import Observation
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.record import Record
 from middleware.errors import SwarmError
+from middleware.halt import GOES_ON, NO_ROBOT, STANDS
 from middleware.node import CAMERA, SwarmNode
 from middleware.presence import DONE, IDLE
 from middleware.tasks import Member, Task, group_key, outcome_of, refusals, tasks_of
@@ -47,6 +48,8 @@ class Agent(Service):
         self._holder: Part | None = None
         self._tick: IDelayedCall | None = None
         self._token = 0
+        self._was_halted = False
+        node.halt.watch(self._obey)
 
     @property
     def engagement(self) -> Engagement | None:
@@ -85,6 +88,7 @@ class Agent(Service):
 
     def _follow(self, _: object) -> object:
         if self.running:
+            self._node.halt.learn()
             self._node.watch_tasks(self._tasks)
         return _
 
@@ -228,6 +232,8 @@ class Agent(Service):
             part.caretaker.look()
             if part is not self._holder:
                 part.engagement.step()
+        if self._stands():
+            return
         engagement = self.engagement
         if engagement is None:
             return
@@ -243,6 +249,26 @@ class Agent(Service):
         self._token = max(self._token, engagement.token)
         if deed is not None and has_body and not self._body.do(deed):
             engagement.fence()
+
+    def _stands(self) -> bool:
+        """Whether the team is halted: then the body stands, and what is held is kept, so that nobody takes over."""
+        if not self._node.halt.is_on:
+            return False
+        self._node.halt.learn()  # nobody may have answered so far
+        self._body.driver.stop()
+        return True
+
+    def _obey(self) -> str:
+        """The team is halted or released: do so at once, and say what the body does."""
+        if not self.running:
+            return NO_ROBOT
+        word = self._node.halt.word
+        if word.is_on != self._was_halted:
+            self._was_halted = word.is_on
+            self._say(f"{'stopped' if word.is_on else 'released'} by {word.by}")
+        if not self._stands():
+            return GOES_ON
+        return STANDS if self._body.driver.state == "ready" else "does not reach its robot, which stops by itself"
 
     def _finished(self, part: Part) -> None:
         engagement = part.engagement

@@ -37,12 +37,18 @@ class Page:
 
     def __init__(self, url: str) -> None:
         self._host = urlsplit(url).netloc
+        self.headers = {"X-Swarm": "1"}
+        code = urlsplit(url).fragment.removeprefix("code=")
+        signed = json.loads(self.ask("/api/v1/session", "POST", body=json.dumps({"code": code}))[1])
+        self.headers["Authorization"] = f"Bearer {signed['token']}"
 
-    def ask(self, path: str, method: str = "GET", limit_s: float = 10.0) -> tuple[http.client.HTTPResponse, bytes]:
+    def ask(
+        self, path: str, method: str = "GET", limit_s: float = 10.0, body: str | None = None
+    ) -> tuple[http.client.HTTPResponse, bytes]:
         """One request on a connection of its own."""
         connection = http.client.HTTPConnection(self._host, timeout=limit_s)
         try:
-            connection.request(method, path, headers={"X-Swarm": "1"})
+            connection.request(method, path, body, self.headers)
             response = connection.getresponse()
             return response, response.read()
         finally:
@@ -100,7 +106,7 @@ class Viewer:
             connection = http.client.HTTPConnection(self._host, timeout=10)
             after = "0"
             while not self._ends:
-                connection.request("GET", f"/shot/{uuid}?after={after}&viewer=bench")
+                connection.request("GET", f"/shot/{uuid}?after={after}&viewer=bench", headers=self._page.headers)
                 response = connection.getresponse()
                 picture = response.read()
                 after = response.headers.get("X-Seq", after)
@@ -113,7 +119,7 @@ class Viewer:
 
     def _events(self) -> None:
         connection = http.client.HTTPConnection(self._host, timeout=10)
-        connection.request("GET", "/events")
+        connection.request("GET", "/events", headers=self._page.headers)
         response = connection.getresponse()
         while not self._ends:
             line = response.readline()

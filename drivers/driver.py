@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from twisted.internet.defer import Deferred
 
 from drivers.reading import Action, Description, Observation
+
+MAX_FPS = 30.0
 
 
 @dataclass(frozen=True)
@@ -23,9 +25,22 @@ class Permit:
     deadline: float
 
 
+@runtime_checkable
+class Filming(Protocol):
+    """A driver whose camera takes as many pictures a second as it is asked for."""
+
+    @property
+    def camera_fps(self) -> float:
+        """So many it takes."""
+
+    def set_camera_fps(self, fps: float) -> None:
+        """Have it take ``fps``, 0 to ``MAX_FPS``; 0: none."""
+
+
 class Driver(Protocol):
     """One robot, asked asynchronously; everything happens on the reactor's thread.
 
+    One whose camera can be asked for more or fewer pictures is ``Filming`` as well.
     ``state`` is one of ``idle connecting ready stale stopped closed``.
     """
 

@@ -135,6 +135,17 @@ def seconds(least: float, most: float) -> Rule:
     return _rule(check, _number)
 
 
+def number(least: float, most: float) -> Rule:
+    """A rule for a number."""
+
+    def check(value: object) -> float:
+        if type(value) not in (int, float) or not isinstance(value, int | float) or not least <= value <= most:
+            raise Wrong(f"must be {least:g}..{most:g}, is {shown(value)}", "write a number")
+        return float(value)
+
+    return _rule(check, _number)
+
+
 def numeric_host(is_told: bool = False) -> Rule:
     """A rule for an address of this machine, in figures; one that ``is_told`` to others must be reachable."""
     example = "192.168.1.10" if is_told else "0.0.0.0"

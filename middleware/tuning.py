@@ -1,10 +1,144 @@
-"""Tuning: the settings of a node that can be changed while it runs."""
+"""Tuning: the settings of a node that can be changed while it runs; what was changed is kept in its store.
+
+The device itself checks each change, by the rule of the settings file.  Nothing writes that file: what is kept goes
+before it, at each start.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, fields, replace
+from difflib import get_close_matches
+from typing import Any
+
+import msgpack
+
+from middleware import setting
+from middleware.entangled.data.store import Store
+from middleware.entangled.errors import Refused
+from middleware.entangled.kademlia.contact import Contact
 from middleware.node import SwarmNode
-from middleware.settings import Settings
+from middleware.presence import Capabilities
+from middleware.settings import NodeSettings, Settings
+from middleware.value import MAX_VALUE
+
+SETTINGS, TUNE = "device.settings", "device.tune"
+WRONG = "setting"
+"""The code of a refusal whose text is ``KEY: problem; remedy``."""
+NOTE = "tuning"
 
 
-def answer_tuning(node: SwarmNode, settings: Settings) -> None:
-    """Have ``node`` tell and change what of ``settings`` can be changed, which is nothing so far."""
+@dataclass(frozen=True)
+class Knob:
+    """One setting: ``rule`` checks what it is to be (``middleware.setting``), ``turn`` makes it so.
+
+    ``least`` and ``most`` bound a number, or the characters of a text; both are for people.
+    """
+
+    key: str
+    about: str
+    read: Callable[[], Any]
+    turn: Callable[[Any], None]
+    rule: setting.Rule
+    unit: str = ""
+    least: float | None = None
+    most: float | None = None
+
+
+class Tuning:
+    """The knobs of one node; what was turned is kept in ``store``."""
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._knobs: dict[str, Knob] = {}
+        self._kept = _kept(store)
+
+    def add(self, knob: Knob) -> None:
+        """Have one more knob, and turn it to where it was left in an earlier life."""
+        self._knobs[knob.key] = knob
+        if knob.key in self._kept:
+            with suppress(setting.Wrong):  # it was lawful when it was kept; the file's value holds
+                knob.turn(knob.rule["check"](self._kept[knob.key]))
+
+    def told(self) -> list[list[object]]:
+        """Each knob as ``[key, value, about, unit, least, most]``."""
+        return [[k.key, k.read(), k.about, k.unit, k.least, k.most] for k in self._knobs.values()]
+
+    def change(self, changes: Mapping[Any, Any]) -> list[list[object]]:
+        """Turn some, all or none; raises ``Refused`` with the code ``WRONG``."""
+        checked = {key: self._checked(key, value) for key, value in changes.items()}
+        before = {key: self._knobs[key].read() for key in checked}
+        for key, value in checked.items():
+            try:
+                self._knobs[key].turn(value)
+            except setting.Wrong as wrong:
+                for other, old in before.items():
+                    self._knobs[other].turn(old)
+                raise _refused(key, wrong) from None
+        self._kept.update(changes)
+        self._store.note(NOTE, bytes(msgpack.packb(self._kept)))
+        return self.told()
+
+    def _checked(self, key: object, value: object) -> Any:
+        if not isinstance(key, str) or key not in self._knobs:
+            near = get_close_matches(str(key)[:64], list(self._knobs), n=1, cutoff=0.0)
+            wrong = setting.Wrong("cannot be changed on this device", f"the nearest is {near[0]}" if near else "let be")
+            raise _refused(key, wrong)
+        try:
+            return self._knobs[key].rule["check"](value)
+        except setting.Wrong as wrong:
+            raise _refused(key, wrong) from None
+
+    def answer_settings(self, peer: Contact) -> list[list[object]]:
+        """Say what can be changed."""
+        return self.told()
+
+    def answer_tune(self, peer: Contact, changes: dict[str, object]) -> list[list[object]]:
+        """Change it."""
+        return self.change(changes)
+
+
+def answer_tuning(node: SwarmNode, settings: Settings, body: Capabilities | None = None) -> Tuning:
+    """Have ``node`` tell and change what of ``settings`` can be changed; ``body`` is what its robot can do."""
+    tuning = Tuning(node.store)
+    rules = {each.name: each.metadata for each in fields(NodeSettings)}
+    extra = dict(settings.node.capabilities)
+
+    def describe(text: str) -> None:
+        node.presence.change(description=text)
+
+    def enable(capabilities: Capabilities) -> None:
+        nonlocal extra
+        device = replace(node.presence.device, capabilities={**(body or {}), **capabilities})
+        if len(device.packed()) > MAX_VALUE:
+            raise setting.Wrong(f"makes the device's record larger than {MAX_VALUE} bytes", "leave some out")
+        extra = dict(capabilities)
+        node.presence.change(capabilities=device.capabilities)
+
+    about = "A line about the device"
+    tuning.add(
+        Knob("description", about, lambda: node.presence.device.description, describe, rules["description"], most=200)
+    )
+    about = "How long the others believe in the device without a sign of it"
+    lease = node.entangled
+    tuning.add(
+        Knob("presence_lease", about, lambda: lease.lease, lease.set_lease, rules["presence_lease"], "s", 0.1, 60.0)
+    )
+    about = "What the device can do beyond what its driver says"
+    tuning.add(Knob("capabilities", about, lambda: extra, enable, rules["capabilities"]))
+    node.entangled.endpoint.expose(SETTINGS, tuning.answer_settings, changes=True, idempotent=True)
+    node.entangled.endpoint.expose(TUNE, tuning.answer_tune, changes=True, idempotent=True)
+    return tuning
+
+
+def _refused(key: object, wrong: setting.Wrong) -> Refused:
+    return Refused(f"{str(key)[:64]}: {wrong.problem}; {wrong.remedy}", WRONG)
+
+
+def _kept(store: Store) -> dict[str, Any]:
+    try:
+        kept = msgpack.unpackb(store.noted(NOTE) or b"\x80")
+    except Exception:  # a rotten file may hold anything
+        return {}
+    return kept if isinstance(kept, dict) else {}

@@ -6,6 +6,7 @@ It knows no sensor, no picture and no connection.  Metres, radians, seconds; x t
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass
 from random import Random
 
@@ -18,6 +19,8 @@ SUBSTEP = 0.008
 """Seconds of one ``step``; the ERS-7 samples its sensors as often."""
 WALL_THICKNESS = 0.04
 TRIES = 2000
+LATEST = 3600.0
+"""Seconds within which a target can be placed later."""
 
 
 class NotPossible(ValueError):
@@ -43,6 +46,7 @@ class World:
         self.collisions = 0
         self._rng = rng
         self._steps = 0
+        self._placing_at = math.inf
         self._space = pymunk.Space()
         # The library's default slop is meant for pixels: in metres, bodies would sink 10 cm into each other.
         self._space.collision_slop = 0.001
@@ -69,6 +73,10 @@ class World:
 
     def step(self) -> None:
         """Let ``SUBSTEP`` seconds pass."""
+        if self.t >= self._placing_at:
+            self._placing_at = math.inf
+            with suppress(NotPossible):  # no place is free: nobody waits for an answer any more
+                self.place_target_at_random()
         for dog in self.dogs.values():
             dog.strive(SUBSTEP)
         self._space.step(SUBSTEP)
@@ -128,8 +136,15 @@ class World:
             raise NotPossible("no place is free; move the dogs apart")
         self.place_target(*best)
 
+    def place_target_later(self, seconds: float) -> None:
+        """Put the target at a free place in ``seconds``, unless it is placed or taken away before."""
+        if not 0.0 <= seconds <= LATEST:
+            raise NotPossible(f"the target is placed within {LATEST:g} s, not in {seconds:g}")
+        self._placing_at = self.t + seconds
+
     def clear_target(self) -> None:
         """Take the target away, if there is one."""
+        self._placing_at = math.inf
         if self._target_shape is not None:
             self._space.remove(self._target_shape)
         self.target = self._target_shape = None

@@ -72,6 +72,7 @@ class Yard:
         self._orders: dict[str, tuple[Callable[..., None], tuple[type, ...]]] = {
             "place_target": (self.world.place_target, (float, float)),
             "place_target_at_random": (self.world.place_target_at_random, ()),
+            "place_target_later": (self.world.place_target_later, (float,)),
             "clear_target": (self.world.clear_target, ()),
             "move_dog": (self.world.move_dog, (str, float, float, float)),
             "scatter": (self.world.scatter, (int,)),

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import random
 from dataclasses import dataclass
+from functools import partial
 
 from twisted.application.service import Service
 from twisted.logger import Logger
 
 from agents.registry import agent_named
-from drivers.driver import Driver
+from drivers.driver import MAX_FPS, Driver, Filming
 from drivers.errors import DriverError
 from drivers.registry import describe, driver_for
+from middleware import setting
 from middleware.entangled.data.store import Store
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.identity import Identity
@@ -21,7 +23,7 @@ from middleware.node import SwarmNode
 from middleware.presence import Device
 from middleware.settings import Settings
 from middleware.survey import answer_survey
-from middleware.tuning import answer_tuning
+from middleware.tuning import Knob, answer_tuning
 from swarmnode.fault import faulty
 from swarmnode.seams import Seams
 from webnode.errors import WebError
@@ -93,7 +95,10 @@ def assembled(settings: Settings, seams: Seams) -> Assembly:
         node_settings.presence_lease,
     )
     answer_survey(node)
-    answer_tuning(node, settings)
+    tuning = answer_tuning(node, settings, {} if driver is None else driver.description.capabilities)
+    filming: object = driver
+    if isinstance(filming, Filming) and "camera" in capabilities:
+        tuning.add(_camera_knob(filming))
     node.halt = answer_halt(node.entangled)
     if settings.deployment.allow:
         _deployable(node, settings, seams)
@@ -101,6 +106,12 @@ def assembled(settings: Settings, seams: Seams) -> Assembly:
     if settings.agent.module and driver is not None:
         agent = agent_named(settings.agent.module)(node, driver, seams.clock, seams.rng)
     return Assembly(node, agent, driver)
+
+
+def _camera_knob(driver: Filming) -> Knob:
+    about, rule = "Pictures that the camera takes", setting.number(0.0, MAX_FPS)
+    read = partial(getattr, driver, "camera_fps")
+    return Knob("camera_fps", about, read, driver.set_camera_fps, rule, "per second", 0.0, MAX_FPS)
 
 
 def _deployable(node: SwarmNode, settings: Settings, seams: Seams) -> None:

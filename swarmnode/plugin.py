@@ -22,7 +22,7 @@ from middleware.node import SwarmNode
 from middleware.settings import COMMAND_LINE, Settings
 from swarmnode.assembly import FAULTS
 from swarmnode.service import NodeService
-from swarmnode.web import web_page
+from swarmnode.web import web_page, with_code
 from swarmnode.world import control_socket, real_seams, resolved
 from webnode.errors import PortTaken
 
@@ -91,6 +91,7 @@ def makeService(options: Options) -> IService:
         seams = real_seams(settings, reactor)
         fronts: list[Callable[[SwarmNode], IService]] = [partial(control_socket, settings, reactor)]
         if "web" in settings.node.roles:
+            settings = with_code(settings, seams.rng)
             fronts.append(partial(web_page, settings, seams, reactor))
         reactor.callLater(SETTLED, _give_back)
         return _Checked(settings, seams, fronts)

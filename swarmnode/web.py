@@ -2,35 +2,37 @@
 
 from __future__ import annotations
 
+import random
 import socket
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from twisted.application.service import IService, MultiService
+from twisted.application.service import IService, MultiService, Service
 
 from middleware.entangled.data.sqlite import read_records
 from middleware.errors import MissingExtra
 from middleware.node import SwarmNode
 from middleware.settings import IN_MEMORY, Settings
 from swarmnode.gateway import gateway
+from swarmnode.invitation import invited
 from swarmnode.seams import Seams
 
 
 class _Page(MultiService):
-    """The page, and its line to the yard where there is one; ``board`` tells the team where the page is."""
+    """The page, its line to the yard where there is one, and what says where it is: to its user and to the team."""
 
-    def __init__(self, web: Any, operator: Any, board: Any) -> None:
+    def __init__(self, web: Service, operator: Any, tell: Callable[[], None]) -> None:
         super().__init__()
-        self._web = web
         self._operator = operator
-        self._board = board
+        self._tell = tell
         web.setServiceParent(self)
 
     def startService(self) -> None:
         super().startService()
-        self._board.fallbacks.serves(self._web.urls(_names()))
+        self._tell()
         if self._operator is not None:
             self._operator.connect().addErrback(lambda _: None)
 
@@ -38,6 +40,14 @@ class _Page(MultiService):
         if self._operator is not None:
             self._operator.disconnect()
         return super().stopService()
+
+
+def with_code(settings: Settings, rng: random.Random) -> Settings:
+    """``settings`` with a code to sign in with: made once, as a node that falls off the network comes back with it."""
+    from webnode.session import made
+
+    web = settings.web
+    return settings if web.code or not web.sign_in else replace(settings, web=replace(web, code=made(rng)))
 
 
 def web_page(settings: Settings, seams: Seams, reactor: Any, node: SwarmNode) -> IService:
@@ -53,7 +63,7 @@ def web_page(settings: Settings, seams: Seams, reactor: Any, node: SwarmNode) ->
         from webnode.fallback import fallbacks
         from webnode.ground import Ground
         from webnode.halting import halts
-        from webnode.ledger import state_from
+        from webnode.ledger import Glance, state_from
         from webnode.limits import limits
         from webnode.live import Events, Shots
         from webnode.mischief import faults
@@ -90,7 +100,7 @@ def web_page(settings: Settings, seams: Seams, reactor: Any, node: SwarmNode) ->
     live = partial(state_from, desk.read, Departed(), name)
     on_file = partial(state_from, partial(read_records, Path(settings.node.store)), Departed(), name)
     stored = live if settings.node.store == IN_MEMORY else on_file
-    app = create_app(lambda: stored(seams.wall()), board, caller(reactor), wall=seams.wall)
+    app = create_app(Glance(lambda: stored(seams.wall()), reactor.seconds), board, caller(reactor), wall=seams.wall)
     events = Events(
         lambda: live(seams.wall()),
         reactor,
@@ -104,7 +114,12 @@ def web_page(settings: Settings, seams: Seams, reactor: Any, node: SwarmNode) ->
     web = WebService(
         reactor, address.host, address.port, app, events, shots, Files(), board, seams.wall, doors=doors(ground)
     )
-    return _Page(web, operator, board)
+
+    def tell() -> None:
+        invited(name, address.host, lambda: web.port, board.sessions.code)
+        board.fallbacks.serves(web.urls(_names()))
+
+    return _Page(web, operator, tell)
 
 
 def _names() -> Sequence[str]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Protocol
 
 from twisted.internet.defer import Deferred, fail, succeed
@@ -50,6 +50,9 @@ class Token:
 class Sessions(Protocol):
     """Who has signed in; ``now`` is unix seconds."""
 
+    code: str
+    """What operators sign in with; empty where nobody needs to."""
+
     def sign_in(self, proof: str, source: str, now: float) -> Deferred[Token]:
         """Sign in with a code or password, from the address ``source``; fails with ``Refusal`` 401 or 429."""
 
@@ -65,6 +68,8 @@ class Sessions(Protocol):
 
 class OpenSessions:
     """Everybody is an operator: for a page of this machine alone, and for tests."""
+
+    code = ""
 
     def sign_in(self, proof: str, source: str, now: float) -> Deferred[Token]:
         """Let in whoever asks, for a day."""
@@ -195,26 +200,36 @@ class MemoryFallbacks:
         return origin in [page.url for page in self.pages]
 
 
+Kept = Literal["unfinished", "stream", "open"]
+"""Requests that are not complete, answers that are under way, connections."""
+
+
 class Limits(Protocol):
-    """How much one address may have open at once."""
+    """How much one address may have open at once; whoever opens something counts it, and again when it ends."""
 
-    def unfinished(self, address: str) -> bool:
-        """Whether it may have one more request under way."""
+    def may(self, kind: Kept, address: str) -> bool:
+        """Whether it may have one more."""
 
-    def stream(self, address: str) -> bool:
-        """Whether it may have one more stream open."""
+    def count(self, kind: Kept, address: str, by: int) -> None:
+        """Count one more (1), or one less (-1)."""
+
+    def total(self, kind: Kept) -> int:
+        """How many there are of all addresses."""
 
 
 class NoLimits:
     """As much as it likes."""
 
-    def unfinished(self, address: str) -> bool:
+    def may(self, kind: Kept, address: str) -> bool:
         """Return True."""
         return True
 
-    def stream(self, address: str) -> bool:
-        """Return True."""
-        return True
+    def count(self, kind: Kept, address: str, by: int) -> None:
+        """Count nothing."""
+
+    def total(self, kind: Kept) -> int:
+        """Return 0."""
+        return 0
 
 
 class Survey(Protocol):
@@ -268,6 +283,25 @@ class Tuning(Protocol):
         """Change some, all or none; the device checks them."""
 
 
+class MemoryTuning:
+    """Settings of devices that take whatever they are told; ``knobs`` are those of each uuid."""
+
+    def __init__(self, knobs: Mapping[str, Sequence[Knob]]) -> None:
+        self.knobs = {uuid: list(each) for uuid, each in knobs.items()}
+
+    def settings(self, uuid: str) -> Deferred[list[Knob]]:
+        """Return them."""
+        return succeed(self.knobs.get(uuid, []))
+
+    def change(self, uuid: str, changes: Mapping[str, Json]) -> Deferred[list[Knob]]:
+        """Change them; fails where the device has no such setting."""
+        for key in changes:
+            if key not in [knob.key for knob in self.knobs.get(uuid, [])]:
+                return fail(Refusal(key, "cannot be changed on this device", "leave it out"))
+        self.knobs[uuid] = [replace(knob, value=changes.get(knob.key, knob.value)) for knob in self.knobs[uuid]]
+        return succeed(self.knobs[uuid])
+
+
 class Halts(Protocol):
     """Stopping the whole team; answers map each uuid to ``stands``, or to why it does not."""
 
@@ -279,6 +313,28 @@ class Halts(Protocol):
 
     def is_halted(self) -> bool:
         """Whether the team is halted."""
+
+
+class MemoryHalts:
+    """The button of a team that obeys; ``devices`` are the uuids of those that say so, ``said`` who pressed what."""
+
+    def __init__(self, *devices: str) -> None:
+        self.devices = devices
+        self.said: list[tuple[str, str]] = []
+
+    def halt(self, by: str) -> Deferred[dict[str, str]]:
+        """All stand."""
+        self.said.append(("halt", by))
+        return succeed(dict.fromkeys(self.devices, "stands"))
+
+    def release(self, by: str) -> Deferred[dict[str, str]]:
+        """All go on."""
+        self.said.append(("release", by))
+        return succeed(dict.fromkeys(self.devices, "goes on"))
+
+    def is_halted(self) -> bool:
+        """Whether the last that was pressed was the halt."""
+        return bool(self.said) and self.said[-1][0] == "halt"
 
 
 class Faults(Protocol):

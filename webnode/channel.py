@@ -1,12 +1,51 @@
-"""Channel: one connection to the page, and what it keeps to before anybody is asked; it knows no routes."""
+"""Channel: one connection to the page, and what it keeps to before anybody is asked; it knows no routes.
+
+Twisted ends a connection that is idle, and a client that sends a byte now and then never is.  So each part of a request
+has a time in which it is complete, an address may have so many that are not, and who reads nothing is let go.
+"""
 
 from __future__ import annotations
 
+import json
+from typing import Any
+
+from twisted.internet.interfaces import IDelayedCall
+from twisted.python.failure import Failure
+from twisted.web.http import HTTPChannel
 from twisted.web.server import Request as SiteRequest
 from twisted.web.server import Site
 
-from webnode.board import Limits
-from webnode.guard import MAX_BODY
+from webnode.board import Kept, Limits
+from webnode.errors import Refusal
+from webnode.guard import HEADERS, MAX_BODY
+
+HEAD_S = 10.0
+"""A request's lines are complete so long after its first byte, or after the connection was made."""
+KEEP_S = 15.0
+"""A connection waits so long for its next request."""
+GRACE_S, PACE = 2.0, 1000.0
+"""After so long a body has come with at least so many bytes a second."""
+STALL_S = 30.0
+"""An answer of which nothing is taken for so long is given up."""
+CLOSE_S = 2.0
+"""A refused client has so long to read why."""
+STATUS = {400: "Bad Request", 408: "Request Timeout", 413: "Content Too Large", 503: "Service Unavailable"}
+
+TOO_LARGE = Refusal("body", "it is too large", "send at most 64 KiB", 413)
+UNREADABLE = Refusal("request", "it is no HTTP that can be read", "send HTTP/1.1, with at most 16 KiB of headers", 400)
+LATE_HEAD = Refusal("request", "it was not complete in time", f"send its head within {HEAD_S:g} s", 408)
+LATE_BODY = Refusal("body", "it comes too slowly", f"send at least {PACE:g} bytes a second", 408)
+TOO_MANY = Refusal("request", "too many from this address are unfinished", "finish those first", 503)
+TOO_BUSY = Refusal("request", "too many from this address are being answered", "close some, then try again", 503)
+
+
+def raw(refusal: Refusal) -> bytes:
+    """The whole answer of a refusal that nobody else can give, as bytes of HTTP."""
+    body = json.dumps(refusal.fields).encode()
+    lines = [f"HTTP/1.1 {refusal.status} {STATUS[refusal.status]}", "Content-Type: application/json"]
+    lines += [f"{name}: {value}" for name, value in HEADERS.items()]
+    lines += ["Cache-Control: no-store", "Connection: close", f"Content-Length: {len(body)}", "", ""]
+    return "\r\n".join(lines).encode() + body
 
 
 class CappedRequest(SiteRequest):
@@ -38,13 +77,179 @@ class CappedRequest(SiteRequest):
         if self._cut or self.channel is None:
             return
         self._cut = True
-        body = b'{"error": {"field": "body", "problem": "it is too large", "remedy": "send at most 64 KiB"}}'
-        head = b"HTTP/1.1 413 Content Too Large\r\nContent-Type: application/json\r\nConnection: close\r\n"
-        transport = self.channel.transport
-        assert transport is not None
-        transport.write(head + b"Content-Length: %d\r\n\r\n" % len(body) + body)
-        transport.loseConnection()
+        channel: Any = self.channel
+        if isinstance(channel, Channel):
+            channel.refuse(TOO_LARGE)
+        else:
+            channel.transport.write(raw(TOO_LARGE))
+            channel.transport.loseConnection()
+
+
+class Channel(HTTPChannel):
+    """A connection with deadlines; ``factory`` is a site that was ``limited``."""
+
+    factory: Any
+    transport: Any
+    limits: Limits
+    _phase = "idle"
+    _due: IDelayedCall | None = None
+    _stalled: IDelayedCall | None = None
+    _counted: Kept | None = None
+    _open = False
+    _over = False
+    _came = 0
+    _since = 0.0
+
+    def connectionMade(self) -> None:  # noqa: N802
+        """Wait for a request, unless its address has far too many connections."""
+        super().connectionMade()
+        self.limits = self.factory.limits
+        self._address = str(getattr(self.getPeer(), "host", ""))
+        if not self.limits.may("open", self._address):
+            self._over = True
+            self.transport.abortConnection()
+            return
+        self.limits.count("open", self._address, 1)
+        self._open = True
+        self._within(HEAD_S, self._close)
+
+    def dataReceived(self, data: bytes) -> None:  # noqa: N802
+        """Take bytes, and see what they complete."""
+        if self._over:
+            return
+        if self._phase == "idle":
+            self._begin()
+        self._came += len(data)
+        super().dataReceived(data)
+        self._weigh()
+
+    def allHeadersReceived(self) -> None:  # noqa: N802
+        """From here the body has its own pace."""
+        if self._over:
+            return
+        self._phase, self._since = "body", self._now()
+        self._within(GRACE_S, self._pace)
+        super().allHeadersReceived()
+
+    def allContentReceived(self) -> None:  # noqa: N802
+        """From here it is ours to answer."""
+        if self._over:
+            return
+        self._phase = "answer"
+        self._end(self._due)
+        self._due = None
+        if not self.limits.may("stream", self._address):
+            self.refuse(TOO_BUSY)
+            return
+        self._count("stream")
+        super().allContentReceived()
+
+    def requestDone(self, request: Any) -> None:  # noqa: N802
+        """The answer is out; the next request may have come already, or begun to."""
+        self._count(None)
+        self._phase = "idle"
+        waits = bool(self._dataBuffer)
+        self._within(KEEP_S, self._close)
+        if waits:
+            self._begin()
+        super().requestDone(request)
+        self._weigh()
+
+    def pauseProducing(self) -> None:  # noqa: N802
+        """The client does not take what it asked for."""
+        super().pauseProducing()
+        if self._stalled is None and not self._over:
+            self._stalled = self.callLater(STALL_S, self._abort)
+
+    def resumeProducing(self) -> None:  # noqa: N802
+        """It does again."""
+        super().resumeProducing()
+        self._end(self._stalled)
+        self._stalled = None
+
+    def connectionLost(self, reason: Failure) -> None:  # type: ignore[override]  # noqa: N802
+        """Forget all of it."""
+        self._over = True
+        self._count(None)
+        if self._open:
+            self.limits.count("open", self._address, -1)
+            self._open = False
+        for each in (self._due, self._stalled):
+            self._end(each)
+        self._due = self._stalled = None
+        super().connectionLost(reason)
+
+    def refuse(self, refusal: Refusal) -> None:
+        """Answer what is no whole request, and end the connection."""
+        if self._over:
+            return
+        self._over = True
+        self._count(None)
+        self.transport.write(raw(refusal))
+        self.loseConnection()
+        self._within(CLOSE_S, self._abort)
+
+    def lineLengthExceeded(self, line: bytes) -> None:  # noqa: N802
+        """Refuse a line that is longer than all headers may be."""
+        self.refuse(UNREADABLE)
+
+    def _respondToBadRequestAndDisconnect(self) -> None:  # noqa: N802
+        # Twisted's own name: it would answer without a body and without the headers that all answers have.
+        self.refuse(UNREADABLE)
+
+    def _begin(self) -> None:
+        self._phase, self._came = "head", 0
+        self._within(HEAD_S, lambda: self.refuse(LATE_HEAD))
+
+    def _weigh(self) -> None:
+        """Count a request that is not complete for now; most are, with the bytes that they begin with."""
+        if self._over or self._phase not in ("head", "body") or self._counted:
+            return
+        if not self.limits.may("unfinished", self._address):
+            self.refuse(TOO_MANY)
+            return
+        self._count("unfinished")
+
+    def _pace(self) -> None:
+        if self._came < PACE * (self._now() - self._since - GRACE_S):
+            self.refuse(LATE_BODY)
+        else:
+            self._within(1.0, self._pace)
+
+    def _count(self, kind: Kept | None) -> None:
+        if self._counted != kind:
+            if self._counted:
+                self.limits.count(self._counted, self._address, -1)
+            if kind:
+                self.limits.count(kind, self._address, 1)
+            self._counted = kind
+
+    def _within(self, seconds: float, late: Any) -> None:
+        self._end(self._due)
+        self._due = self.callLater(seconds, late)
+
+    def _end(self, call: IDelayedCall | None) -> None:
+        if call is not None and call.active():
+            call.cancel()
+
+    def _now(self) -> float:
+        return float(self.factory.reactor.seconds())
+
+    def _close(self) -> None:
+        self._over = True
+        self.loseConnection()
+        self._within(CLOSE_S, self._abort)
+
+    def _abort(self) -> None:
+        self._over = True
+        self.transport.abortConnection()
 
 
 def limited(site: Site, limits: Limits) -> None:
-    """Have the connections of ``site`` keep to ``limits``; there are none so far but the site's own time-out."""
+    """Have the connections of ``site`` keep to ``limits`` and to the deadlines above."""
+    held: Any = site
+    held.protocol = Channel
+    held.limits = limits
+    held.timeOut = None
+    # A channel of this kind speaks nothing newer, whatever is installed.
+    held.acceptableProtocols = lambda: [b"http/1.1"]

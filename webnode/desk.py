@@ -30,6 +30,13 @@ class Desk(Protocol):
     def catalogue(self) -> Sequence[Mapping[str, Any]]:
         """The predefined tasks: ``{"name", "title", "requirements"}`` each."""
 
+    def preview(self, name: str) -> Any:
+        """Who could take a predefined task, of whom nothing is asked.
+
+        ``{"able": [{"uuid", "name", "busy"}], "refused": {name: [reasons]}, "likely": name | None}``; ``busy`` is the
+        task that a device has now, ``likely`` who would take it by what is known already.
+        """
+
     def cancel(self, task_id: str) -> Any:
         """End a task; its devices stop."""
 
@@ -40,16 +47,22 @@ class Desk(Protocol):
         """Let a task that rests go on, from where it was."""
 
     def message(self, uuid: str, text: str) -> Any:
-        """Send ``text`` to one device, or to all where ``uuid`` is empty."""
+        """Send ``text`` to one device, or to all where ``uuid`` is empty.
+
+        ``{"delivered": [names], "failed": {name: why}}``; for one device a failure is a ``Refusal``.
+        """
 
     def disconnect(self, uuid: str, seconds: float) -> Any:
-        """Let a device leave the network and come back after ``seconds``."""
+        """Let a device leave the network and come back after ``seconds``; done when it says that it will."""
 
     def move_target(self, x: float, y: float) -> Any:
         """Put the target at (x, y), metres in the yard's frame."""
 
     def clear_target(self) -> Any:
         """Take the target away."""
+
+    def move_robot(self, name: str, x: float, y: float, heading: float) -> Any:
+        """Lift a robot of the yard and set it down at (x, y), looking along ``heading`` (radians)."""
 
     def yard(self) -> Mapping[str, Any] | None:
         """The newest overhead snapshot, or None where there is no yard.
@@ -65,6 +78,7 @@ class MemoryDesk:
     def __init__(self, catalogue: Sequence[Mapping[str, Any]] = (), yard: Mapping[str, Any] | None = None) -> None:
         self.asked: list[tuple[Any, ...]] = []
         self.tasks = list(catalogue)
+        self.previews: dict[str, dict[str, Any]] = {}
         self.ground: dict[str, Any] | None = dict(yard) if yard is not None else None
 
     def run_demo(self) -> str:
@@ -76,6 +90,12 @@ class MemoryDesk:
         if name not in [task["name"] for task in self.tasks]:
             raise Refusal("name", f"there is no task {name!r}", "choose one of /api/v1/catalogue", 404)
         return {"id": self._noted("assign", name), "able": [], "refused": {}}
+
+    def preview(self, name: str) -> dict[str, Any]:
+        """Return what is in ``previews``, else that nobody is able and nobody refused."""
+        if name not in [task["name"] for task in self.tasks]:
+            raise Refusal("name", f"there is no task {name!r}", "choose one of /api/v1/catalogue", 404)
+        return self.previews.get(name, {"able": [], "refused": {}, "likely": None})
 
     def catalogue(self) -> list[Mapping[str, Any]]:
         """Return what the desk was made with."""
@@ -93,9 +113,10 @@ class MemoryDesk:
         """Write it down."""
         self._noted("resume", task_id)
 
-    def message(self, uuid: str, text: str) -> None:
-        """Write it down."""
+    def message(self, uuid: str, text: str) -> dict[str, Any]:
+        """Write it down; nobody is here to have it."""
         self._noted("message", uuid, text)
+        return {"delivered": [], "failed": {}}
 
     def disconnect(self, uuid: str, seconds: float) -> None:
         """Write it down."""
@@ -112,6 +133,14 @@ class MemoryDesk:
         self._noted("clear")
         if self.ground is not None:
             self.ground = {**self.ground, "target": None}
+
+    def move_robot(self, name: str, x: float, y: float, heading: float) -> None:
+        """Move it."""
+        self._noted("robot", name, x, y, heading)
+        if self.ground is not None:
+            place = {"x": x, "y": y, "heading": heading}
+            dogs = [{**dog, **place} if dog["name"] == name else dog for dog in self.ground["dogs"]]
+            self.ground = {**self.ground, "dogs": dogs}
 
     def yard(self) -> dict[str, Any] | None:
         """Return the ground."""

@@ -12,6 +12,7 @@ from typing import Any
 
 from middleware.entangled.record import Record
 from middleware.explanation import explained
+from middleware.halt import HALT, word_of
 from middleware.order import PAUSE, order_of
 from middleware.presence import DEVICES, Device, devices_of
 from middleware.tasks import TASKS, Task, group_key, member_of, outcome_of, refusals, tasks_of
@@ -20,6 +21,25 @@ from webnode.state import Departed, State, state_of
 
 Read = Callable[[bytes], list[Record]]
 TASKS_SHOWN = 20
+FRESH_S = 0.1
+"""A state as old as this will do: nobody can tell, and a hundred who ask at once are answered by ten."""
+
+
+class Glance:
+    """The newest state for whoever asks, on any thread, read at most each ``FRESH_S``."""
+
+    def __init__(self, read: Callable[[], State], clock: Callable[[], float]) -> None:
+        self._read = read
+        self._clock = clock
+        self._seen: tuple[float, State] = (-FRESH_S, {})
+
+    def __call__(self) -> State:
+        """Return it; it is shared, and nobody writes in it."""
+        now, (at, state) = self._clock(), self._seen
+        if not state or now - at >= FRESH_S:
+            state = self._read()
+            self._seen = (now, state)
+        return state
 
 
 def state_from(read: Read, departed: Departed, node: str, now: float) -> State:
@@ -33,7 +53,8 @@ def state_from(read: Read, departed: Departed, node: str, now: float) -> State:
         groups[task.task_id] = [asdict(member) for member in members]
         rows.append({**_task_row(task, records, devices), "why": _why(task, read(verdicts_key(task.task_id)))})
     views = [_device_row(device) for device in devices]
-    return state_of(views, rows, groups, departed=departed.of(views, now), node=node)
+    state = state_of(views, rows, groups, departed=departed.of(views, now), node=node)
+    return {**state, "halted": word_of(read(HALT)).is_on}
 
 
 def refused_by(task: Task, devices: list[Device]) -> dict[str, list[str]]:

@@ -2,10 +2,40 @@
 
 from __future__ import annotations
 
-from webnode.board import Limits, NoLimits
+from collections import Counter
+
+from webnode.board import Kept, Limits
 from webnode.ground import Ground
+
+MOST: dict[Kept, int] = {"unfinished": 16, "stream": 128, "open": 256}
+"""Requests that are not complete, answers that are under way (streams and long polls among them), connections.
+
+A browser sends its requests whole; so 16 that are not are many, even of a classroom that comes by one address.
+"""
+
+
+class AddressLimits:
+    """Counts what each address has open."""
+
+    def __init__(self, most: dict[Kept, int] = MOST) -> None:
+        self._most = most
+        self._counts: Counter[tuple[Kept, str]] = Counter()
+
+    def may(self, kind: Kept, address: str) -> bool:
+        """Whether it may have one more."""
+        return self._counts[kind, address] < self._most[kind]
+
+    def count(self, kind: Kept, address: str, by: int) -> None:
+        """Count one more, or one less; nothing is kept of an address that has none."""
+        self._counts[kind, address] += by
+        if not self._counts[kind, address]:
+            del self._counts[kind, address]
+
+    def total(self, kind: Kept) -> int:
+        """How many there are of all addresses."""
+        return sum(count for (each, _), count in self._counts.items() if each == kind)
 
 
 def limits(ground: Ground) -> Limits:
-    """What the connections of the page keep to; there are no limits for one address so far."""
-    return NoLimits()
+    """What the connections of the page keep to."""
+    return AddressLimits()

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Protocol
 
-from twisted.internet.defer import Deferred
+from twisted.internet.defer import Deferred, DeferredList, fail
 from twisted.logger import Logger
 
-from middleware.entangled.errors import EntangledError
+from middleware.entangled.errors import EntangledError, Refused
 from middleware.entangled.record import Record
 from middleware.entangled.replication.watch import Watch
+from middleware.halt import HALT
 from middleware.node import CAMERA, SwarmNode
 from middleware.order import PAUSE, RESUME, Order
-from middleware.presence import DEVICES, devices_of
-from middleware.tasks import CANCELLED, TASKS, Result, Task, group_key, outcome_of, tasks_of
+from middleware.presence import DEVICES, Device, devices_of
+from middleware.tasks import CANCELLED, TASKS, Result, Task, group_key, member_of, outcome_of, tasks_of
 from middleware.verdict import verdicts_key
 from webnode.errors import Refusal
 from webnode.ledger import refused_by
@@ -24,6 +26,8 @@ PLACING = 5.0
 """Seconds between Run Demo and the target's appearance: it is placed while the robots search (thesis, section 5)."""
 DIVIDED = "group_optimal"
 """The strategy of a task of a group whose catalogue entry says the nearest, which is for one task."""
+PATIENCE = 1.5
+"""Seconds that a device has to answer an order: less than the page's own patience, so that its visitor is told why."""
 
 
 class YardHand(Protocol):
@@ -36,11 +40,14 @@ class YardHand(Protocol):
     def place_target(self, x: float, y: float) -> Deferred[bool]:
         """Put the target at a place."""
 
-    def place_target_at_random(self) -> Deferred[bool]:
-        """Put the target anywhere."""
+    def place_target_later(self, seconds: float) -> Deferred[bool]:
+        """Put the target anywhere after a while, whoever is still there then."""
 
     def clear_target(self) -> Deferred[bool]:
         """Take the target away."""
+
+    def move_dog(self, name: str, x: float, y: float, heading: float) -> Deferred[bool]:
+        """Lift a robot and set it down."""
 
 
 class TeamDesk:
@@ -63,6 +70,7 @@ class TeamDesk:
         self.version = 0
         self._devices = node.watch_devices(self._count, keep=True)
         self._tasks = node.watch_tasks(self._follow, keep=True)
+        node.halt.follow()
 
     # -- what is known ----------------------------------------------------------------------------------------------
 
@@ -72,6 +80,8 @@ class TeamDesk:
             return self._devices.records
         if key == TASKS:
             return self._tasks.records
+        if key == HALT:
+            return self._node.halt.records
         watches = (*self._groups.values(), *self._reasons.values())
         return next((watch.records for watch in watches if watch.key == key), [])
 
@@ -102,7 +112,8 @@ class TeamDesk:
             self.cancel(task.task_id)
         if self._yard is not None:
             self._quietly(self._yard.clear_target())
-            self._node.clock.callLater(PLACING, self._place)
+            # By the yard itself: this node may be gone by then.
+            self._quietly(self._yard.place_target_later(PLACING))
         return str(self.assign(self._demo)["id"])
 
     def assign(self, name: str, tolerates: int = 1, group: str = "") -> dict[str, Any]:
@@ -110,10 +121,7 @@ class TeamDesk:
 
         Those of one ``group`` are divided together.
         """
-        template = self._predefined.get(name)
-        if template is None:
-            known = ", ".join(sorted(self._predefined))
-            raise Refusal("name", f"there is no predefined task {name!r}", f"choose one of {known}", 404)
+        template = self._template(name)
         task_id = self._node.rng.randbytes(6).hex()
         task = replace(template, task_id=task_id, created=self._node.wall(), tolerates=tolerates)
         if group:
@@ -123,6 +131,18 @@ class TeamDesk:
         refused = refused_by(task, devices)
         self._quietly(Deferred.fromCoroutine(self._node.submit(task)))
         return {"id": task_id, "able": [d.name for d in devices if d.name not in refused], "refused": refused}
+
+    def preview(self, name: str) -> dict[str, Any]:
+        """Who could take a predefined task and who not, and why; nothing is asked of anybody."""
+        task = self._template(name)
+        devices = [device for device, _ in devices_of(self._devices.records)]
+        refused = refused_by(task, devices)
+        titles = {task_id: each.title for task_id, each in tasks_of(self._tasks.records).items()}
+        able = [device for device in devices if device.name not in refused]
+        rows = [
+            {"uuid": d.uuid, "name": d.name, "busy": titles.get(d.task, "another task" * bool(d.task))} for d in able
+        ]
+        return {"able": rows, "refused": refused, "likely": self._likely(task, [device.uuid for device in able])}
 
     def cancel(self, task_id: str) -> None:
         """Record that the task is cancelled; whoever is at it stops."""
@@ -140,17 +160,49 @@ class TeamDesk:
         """Record that the task is to go on."""
         self._order(task_id, RESUME)
 
-    def message(self, uuid: str, text: str) -> None:
-        """Send a text to one device, or to all."""
-        for device, record in devices_of(self._devices.records):
-            if uuid in ("", device.uuid):
-                self._call(record, "device.message", text)
+    def message(self, uuid: str, text: str) -> Deferred[dict[str, Any]]:
+        """Send a text to one device, or to all; fires with who has it, and by name why others have not."""
+        delivered: list[str] = []
+        failed: dict[str, str] = {}
 
-    def disconnect(self, uuid: str, seconds: float) -> None:
-        """Ask a device to leave the network for a while, as if it had failed."""
-        record = self._record_of(uuid)
-        if record is not None:
-            self._call(record, "device.disconnect", seconds)
+        def told(device: Device) -> Deferred[Any]:
+            asked = self.call(device.uuid, "device.message", text)
+            return asked.addCallback(lambda _: delivered.append(device.name))
+
+        def untold(failure: Any, name: str) -> None:
+            failure.trap(Refusal)
+            failed[name] = failure.value.problem
+
+        if uuid:
+            one = self.call(uuid, "device.message", text)
+            return one.addCallback(lambda _: {"delivered": [self._name_of(uuid)], "failed": failed})
+        devices = [device for device, _ in devices_of(self._devices.records)]
+        all_told = DeferredList([told(device).addErrback(untold, device.name) for device in devices])
+        return all_told.addCallback(lambda _: {"delivered": sorted(delivered), "failed": failed})
+
+    def disconnect(self, uuid: str, seconds: float) -> Deferred[Any]:
+        """Ask a device to leave the network for a while, as if it had failed; fires when it says that it does."""
+        return self.call(uuid, "device.disconnect", seconds)
+
+    def call(
+        self,
+        uuid: str,
+        method: str,
+        *arguments: object,
+        refused: Callable[[Refused], Refusal | None] = lambda refused: None,
+    ) -> Deferred[Any]:
+        """Ask a device something; fires with its answer, fails with ``Refusal``.
+
+        409: it is not here, leaves while it is asked, or says no; 504: it is here and does not answer.  ``refused``
+        may know better what a no means.
+        """
+        name, record = self._name_of(uuid), self._record_of(uuid)
+        contact = None if record is None else self._node.contact_of(record)
+        if contact is None:
+            return fail(Refusal("device", f"{name} is not here", "choose one of /api/v1/devices", 409))
+        until = self._node.clock.seconds() + PATIENCE
+        asked = self._node.entangled.endpoint.ask(contact, method, *arguments, timeout=PATIENCE, changes=True)
+        return asked.addErrback(self._unanswered, uuid, name, until, refused)
 
     def move_target(self, x: float, y: float) -> Any:
         """Put the target at (x, y)."""
@@ -160,7 +212,30 @@ class TeamDesk:
         """Take the target away."""
         return self._with_yard().clear_target().addErrback(_refused)
 
+    def move_robot(self, name: str, x: float, y: float, heading: float) -> Any:
+        """Lift a robot of the yard and set it down at (x, y)."""
+        return self._with_yard().move_dog(name, x, y, heading).addErrback(_refused, name)
+
     # -- inside -----------------------------------------------------------------------------------------------------
+
+    def _template(self, name: str) -> Task:
+        template = self._predefined.get(name)
+        if template is None:
+            known = ", ".join(sorted(self._predefined))
+            raise Refusal("name", f"there is no predefined task {name!r}", f"choose one of {known}", 404)
+        return template
+
+    def _likely(self, task: Task, able: Sequence[str]) -> str | None:
+        """Who of ``able`` would be the nearest by what is reported to open tasks of that kind; None: nobody knows."""
+        costs: dict[str, float] = {}
+        for other in self._open_tasks():
+            if (other.kind, other.parameters) == (task.kind, task.parameters):
+                for record in self.read(group_key(other.task_id)):
+                    member = member_of(record)
+                    if member is not None and member.cost is not None and member.uuid in able:
+                        costs[member.uuid] = min(member.cost, costs.get(member.uuid, math.inf))
+        nearest = min(costs, key=lambda uuid: (costs[uuid], uuid), default=None)
+        return None if nearest is None else self._name_of(nearest)
 
     def _follow(self, records: list[Record]) -> None:
         self._count(records)
@@ -183,19 +258,36 @@ class TeamDesk:
     def _record_of(self, uuid: str) -> Record | None:
         return next((record for device, record in devices_of(self._devices.records) if device.uuid == uuid), None)
 
-    def _call(self, record: Record, method: str, argument: object) -> None:
-        contact = self._node.contact_of(record)
-        if contact is not None:
-            self._quietly(self._node.entangled.endpoint.ask(contact, method, argument, changes=True))
+    def _name_of(self, uuid: str) -> str:
+        devices = devices_of(self._devices.records)
+        return next((device.name for device, _ in devices if device.uuid == uuid), uuid[:8])
+
+    def _unanswered(
+        self, failure: Any, uuid: str, name: str, until: float, refused: Callable[[Refused], Refusal | None]
+    ) -> Deferred[Any]:
+        """Say in what way a device failed to do what it was asked."""
+        failure.trap(EntangledError)
+        if failure.check(Refused):
+            raise refused(failure.value) or Refusal(
+                "device", f"{name} says no: {failure.getErrorMessage()}", "ask for something else", 409
+            )
+        silent: Deferred[Any] = Deferred()
+
+        def judge() -> None:
+            remedy = "look whether it was done all the same, then try again"
+            refusal = Refusal("device", f"{name} did not answer", remedy, 504)
+            if self._record_of(uuid) is None:
+                refusal = Refusal("device", f"{name} left while it was asked", "wait until it is back", 409)
+            silent.errback(refusal)
+
+        # Its presence outlives it for a moment: whether it is gone or only silent shows then.
+        self._node.later(max(0.0, until - self._node.clock.seconds()), judge)
+        return silent
 
     def _with_yard(self) -> YardHand:
         if self._yard is None:
             raise Refusal("target", "this node has no yard", "start one, or name it in the settings", 409)
         return self._yard
-
-    def _place(self) -> None:
-        if self._yard is not None and self._node.running:
-            self._quietly(self._yard.place_target_at_random())
 
     def _quietly(self, work: Deferred[Any]) -> None:
         def ended(failure: Any) -> None:
@@ -205,5 +297,5 @@ class TeamDesk:
         work.addErrback(ended)
 
 
-def _refused(failure: Any) -> None:
-    raise Refusal("target", failure.getErrorMessage(), "choose another place, or look whether the yard runs", 409)
+def _refused(failure: Any, what: str = "target") -> None:
+    raise Refusal(what, failure.getErrorMessage(), "choose another place, or look whether the yard runs", 409)

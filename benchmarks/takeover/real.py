@@ -31,6 +31,7 @@ from sim.demo.processes import on_leash
 
 YARD_PORT, WEB_PORT = 7400, 8080
 START_S, LIMIT_S = 60.0, 30.0
+CODE, SESSION = "take-over", "/api/v1/session"
 RATE = 31.0
 
 
@@ -48,6 +49,7 @@ class Team:
         self._names = (BOOTSTRAP, *others, *DOGS)
         self._lan = Lan(self._names)
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
+        self._token = ""
         key = random.Random(seed).randbytes(32).hex()
         yard = on_leash(["-m", "sim.server", "--host", "0.0.0.0", "--port", str(YARD_PORT), "--seed", str(seed)])
         self._start("yard", yard)
@@ -62,9 +64,11 @@ class Team:
 
     def page(self, path: str, body: object = None) -> Any:
         """Ask the page, or (with a ``body``) tell it something."""
+        if not self._token and path != SESSION:
+            self._token = self.page(SESSION, {"code": CODE})["token"]
         connection = http.client.HTTPConnection(self._lan.host(self.web), WEB_PORT, timeout=2.0)
         try:
-            headers = {"X-Swarm": "1", "Content-Type": "application/json"}
+            headers = {"Authorization": f"Bearer {self._token}", "Content-Type": "application/json"}
             if body is None:
                 connection.request("GET", path, headers=headers)
             else:
@@ -144,7 +148,7 @@ class Team:
         tables: dict[str, Any] = {"node": node}
         if name == self.web:
             node["roles"] = ["edge", "web"]
-            tables["web"] = {"host": self._lan.host(name), "port": WEB_PORT}
+            tables["web"] = {"host": self._lan.host(name), "port": WEB_PORT, "code": CODE}
         if name in DOGS:
             options = {"host": self._lan.router(name), "port": YARD_PORT, "robot": name, "camera_fps": 0.1}
             tables["agent"] = {"module": "search"}

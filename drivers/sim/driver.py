@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 from twisted.internet.defer import Deferred, fail, succeed
@@ -162,6 +163,16 @@ class SimDriver:
         self._rest()
         self._send(Halt())
         return dict(self._motion)
+
+    @property
+    def camera_fps(self) -> float:
+        """Pictures a second that the camera is asked for."""
+        return self._options.wanted_fps
+
+    def set_camera_fps(self, fps: float) -> None:
+        """Ask the camera for so many pictures a second from now on; 0: none."""
+        self._options = replace(self._options, camera_fps=fps)
+        self._send(Hello(VERSION, self._options.robot, self._options.wanted_fps))
 
     def observe(self) -> Observation | None:
         """The newest observation; never blocks."""

@@ -95,6 +95,10 @@ class YardOperator:
         """Put the red target at a free place, at clearly different distances from the dogs."""
         return self._order("place_target_at_random")
 
+    def place_target_later(self, seconds: float) -> Deferred[bool]:
+        """Put the red target at a free place after ``seconds`` of the yard's time, unless it is moved before."""
+        return self._order("place_target_later", float(seconds))
+
     def clear_target(self) -> Deferred[bool]:
         """Take the red target away."""
         return self._order("clear_target")

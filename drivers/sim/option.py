@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from drivers.driver import MAX_FPS
 from drivers.errors import UsageError
 from drivers.reading import Description
 
 DEFAULT_PORT = 7400
-MAX_FPS = 30.0
 
 
 @dataclass(frozen=True)

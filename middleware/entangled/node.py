@@ -154,6 +154,11 @@ class EntangledNode:
             self._chores.stop()
             self.endpoint.stop()
 
+    def set_lease(self, lease: float) -> None:
+        """Have what this node owns on lease outlive its last sign of life for so many seconds from now on."""
+        self.lease = lease
+        self._owner.set_lease(lease)
+
     # -- verbs ------------------------------------------------------------------------------------------------------
 
     def put(

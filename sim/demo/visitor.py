@@ -9,13 +9,14 @@ import json
 from collections.abc import Callable
 from typing import Any
 
-from twisted.internet.defer import Deferred
-from twisted.internet.interfaces import IDelayedCall, IReactorTime
+from twisted.internet.defer import Deferred, succeed
+from twisted.internet.interfaces import IConsumer, IDelayedCall, IReactorTime
 from twisted.internet.protocol import Protocol, connectionDone
 from twisted.python.failure import Failure
 from twisted.web.client import Agent, readBody
 from twisted.web.http_headers import Headers
-from twisted.web.iweb import IResponse
+from twisted.web.iweb import IBodyProducer, IResponse
+from zope.interface import implementer
 
 RETRY_S = 0.5
 LIMIT_S = 5.0
@@ -59,14 +60,24 @@ class Visitor:
     """One visitor of the page at ``http://HOST:PORT``.
 
     ``on_state(before, after)`` is called at each new state; ``state`` is the newest, empty before the first one.
+    ``code`` is what it signs in with; it signs in again when the page no longer knows it.
     """
 
-    def __init__(self, reactor: Any, host: str, port: int, on_state: Callable[[dict[str, Any], dict[str, Any]], None]):
+    def __init__(
+        self,
+        reactor: Any,
+        host: str,
+        port: int,
+        on_state: Callable[[dict[str, Any], dict[str, Any]], None],
+        code: str = "",
+    ) -> None:
         self.state: dict[str, Any] = {}
         self._clock = IReactorTime(reactor)
         self._agent = Agent(reactor, connectTimeout=LIMIT_S)
         self._address = f"http://{host}:{port}"
         self._on_state = on_state
+        self._code = code
+        self._token = ""
         self._stream: _Stream | None = None
         self._retry: IDelayedCall | None = None
         self._following = False
@@ -92,21 +103,41 @@ class Visitor:
         """Ask the page."""
         return await self._ask(b"GET", path)
 
-    async def _ask(self, verb: bytes, path: str) -> dict[str, Any]:
-        asked = self._agent.request(verb, (self._address + path).encode(), Headers({"X-Swarm": ["1"]}))
+    async def _ask(self, verb: bytes, path: str, content: dict[str, str] | None = None) -> dict[str, Any]:
+        if content is None:
+            await self._sign_in()
+        producer = None if content is None else _Body(json.dumps(content).encode())
+        asked = self._agent.request(verb, (self._address + path).encode(), self._headers(), producer)
         response = await asked.addTimeout(LIMIT_S, self._clock)
         body = await readBody(response).addTimeout(LIMIT_S, self._clock)
         try:
             answer = json.loads(body)
         except ValueError:
             answer = None
+        if response.code == 401:
+            self._token = ""
         if response.code >= 400 or not isinstance(answer, dict):
             raise PageError(f"{path}: {response.code} {body[:200].decode(errors='replace')}")
         return answer
 
+    async def _sign_in(self) -> None:
+        if self._code and not self._token:
+            answer = await self._ask(b"POST", "/api/v1/session", {"code": self._code})
+            self._token = str(answer.get("token", ""))
+
+    def _headers(self) -> Headers:
+        signed = {"Authorization": [f"Bearer {self._token}"]} if self._token else {}
+        return Headers({"X-Swarm": ["1"], **signed})
+
     def _open(self) -> None:
-        asked = self._agent.request(b"GET", f"{self._address}/events".encode())
-        asked.addCallbacks(self._opened, self._lost)
+        Deferred.fromCoroutine(self._asked_stream()).addCallbacks(self._opened, self._lost)
+
+    async def _asked_stream(self) -> IResponse:
+        await self._sign_in()
+        response = await self._agent.request(b"GET", f"{self._address}/events?whole=1".encode(), self._headers())
+        if response.code == 401:
+            self._token = ""
+        return response
 
     def _opened(self, response: IResponse) -> None:
         self._stream = _Stream(self._heard)
@@ -130,6 +161,28 @@ class Visitor:
         if isinstance(state, dict):
             before, self.state = self.state, state
             self._on_state(before, state)
+
+
+@implementer(IBodyProducer)
+class _Body:
+    """A body that is there as a whole."""
+
+    def __init__(self, content: bytes) -> None:
+        self.length = len(content)
+        self._content = content
+
+    def startProducing(self, consumer: IConsumer) -> Deferred[None]:
+        consumer.write(self._content)
+        return succeed(None)
+
+    def pauseProducing(self) -> None:
+        pass
+
+    def resumeProducing(self) -> None:
+        pass
+
+    def stopProducing(self) -> None:
+        pass
 
 
 class _Stream(Protocol):

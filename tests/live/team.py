@@ -1,12 +1,14 @@
 """A web node with three dogs that stand still: the server of the page's tests, run as a child process.
 
-``python -m tests.live.team`` prints the port in its first line.  Lines on its input change the team: ``gone NAME``,
-``back NAME``, ``status NAME STATUS``, ``freeze SECONDS`` (the whole process stands), ``name NAME`` (of the node that
-serves), ``pages NODE=URL ...`` (the web nodes, itself first); it ends when its input does.
+``python -m tests.live.team`` prints the port, the code to sign in with, and an operator's token and ticket in its first
+line; whoever has signed in at one is signed in at the next.  Lines on its input change the team: ``gone NAME``, ``back
+NAME``, ``status NAME STATUS``, ``freeze SECONDS`` (the whole process stands), ``name NAME`` (of the node that serves),
+``pages NODE=URL ...`` (the web nodes, itself first); it ends when its input does.
 """
 
 from __future__ import annotations
 
+import random
 import sys
 import time
 from dataclasses import replace
@@ -15,17 +17,23 @@ from typing import Any
 import cv2
 import numpy as np
 from twisted.internet import reactor as _reactor
+from twisted.internet.defer import Deferred
 from twisted.internet.stdio import StandardIO
+from twisted.internet.threads import deferToThread
 from twisted.protocols.basic import LineReceiver
 
-from webnode.board import Board, MemoryFallbacks, MemorySurvey, OpenSessions, Page
+from webnode.board import Board, MemoryFallbacks, MemoryHalts, MemorySurvey, Page
 from webnode.camera import OnFrame
 from webnode.chronicle import TeamChronicle
 from webnode.desk import MemoryDesk
+from webnode.limits import AddressLimits
+from webnode.password import hashed, is_password
 from webnode.server import WebService, web_service
+from webnode.session import SignedSessions
 from webnode.state import Departed, State, state_of
 
 reactor: Any = _reactor
+PASSWORD = hashed("correct horse", bytes(16), 4)
 HUES = {"dog1": (70, 90, 150), "dog2": (70, 150, 90), "dog3": (150, 100, 70)}
 
 
@@ -99,6 +107,7 @@ class Team:
         self.devices = [dog(1, "WAITING", "t1", now), dog(2, "EXECUTING", "t1", now), dog(3, "SEARCHING", "t1", now)]
         self.away: set[str] = set()
         self.node = "vaio"
+        self.halts = MemoryHalts(*(f"{n:02x}" * 16 for n in (1, 2, 3)))
         self._departed = Departed()
         self.tasks = [
             {
@@ -137,7 +146,8 @@ class Team:
             for each in here
         ]
         gone = self._departed.of(here, time.time())
-        return state_of(here, self.tasks, {"t1": members}, departed=gone, node=self.node)
+        state = state_of(here, self.tasks, {"t1": members}, departed=gone, node=self.node)
+        return {**state, "halted": self.halts.is_halted()}
 
     def watch(self, uuid: str, on_frame: OnFrame) -> Any:
         """Pictures of a floor, a wall and a red ball that rolls, 15 a second."""
@@ -184,14 +194,16 @@ class Orders(LineReceiver):
 
     delimiter = b"\n"
 
-    def __init__(self, team: Team, web: WebService, pages: list[Page]) -> None:
+    def __init__(self, team: Team, web: WebService, board: Board, pages: list[Page]) -> None:
         self._team = team
         self._web = web
+        self._sessions = board.sessions
         self._pages = pages
 
     def connectionMade(self) -> None:
-        """Say the port."""
-        self.sendLine(str(self._web.port).encode())
+        """Say where the team is, and how to come in."""
+        token = self._sessions.token("operator", "operator", time.time(), 3600.0)
+        self.sendLine(f"{self._web.port} {self._sessions.code} {token.text} {token.ticket}".encode())
 
     def lineReceived(self, line: bytes) -> None:
         """Do one order and repeat it, so that the test knows that it was done."""
@@ -217,10 +229,14 @@ class Orders(LineReceiver):
             reactor.stop()
 
 
-def board() -> Board:
+def board(team: Team) -> Board:
     """What the page can ask for: twins in memory, so that every order is taken and none does harm."""
-    desk, survey = MemoryDesk(CATALOGUE, YARD), MemorySurvey(network(), {f"0{n}" * 16: inventory() for n in (1, 2)})
-    return Board(desk, OpenSessions(), chronicle=TeamChronicle(), survey=survey)
+    desk = MemoryDesk(CATALOGUE, YARD)
+    able = [{"uuid": f"{n:02x}" * 16, "name": f"dog{n}", "busy": "Patrol the yard" * (n == 2)} for n in (1, 2)]
+    desk.previews["search"] = {"able": able, "refused": {"dog3": ["no gripper", "no lift"]}, "likely": None}
+    sessions = SignedSessions(b"a team of the tests", "quiet-otter", PASSWORD, random.Random(), checked)
+    survey = MemorySurvey(network(), {f"0{n}" * 16: inventory() for n in (1, 2)})
+    return Board(desk, sessions, chronicle=TeamChronicle(), limits=AddressLimits(), halts=team.halts, survey=survey)
 
 
 def network() -> Any:
@@ -255,15 +271,21 @@ def inventory() -> Any:
     }
 
 
+def checked(text: str, password: str) -> Deferred[Any]:
+    """Whether it is the password, worked out on a thread."""
+    return deferToThread(is_password, text, password)
+
+
 def main() -> None:
     """Serve until the input ends."""
     team = Team()
     port = int(sys.argv[1]) if len(sys.argv) > 1 else 0
     pages = MemoryFallbacks()
-    web = web_service(reactor, "127.0.0.1", port, team.read, replace(board(), fallbacks=pages), team, time.time)
+    served = replace(board(team), fallbacks=pages)
+    web = web_service(reactor, "127.0.0.1", port, team.read, served, team, time.time)
     web.startService()
     reactor.addSystemEventTrigger("before", "shutdown", web.stopService)
-    reactor.callWhenRunning(lambda: StandardIO(Orders(team, web, pages.pages)))
+    reactor.callWhenRunning(lambda: StandardIO(Orders(team, web, served, pages.pages)))
     reactor.run()
 
 

@@ -1,4 +1,4 @@
-"""The real demonstration, five processes and the page, driven by taps in Chromium and looked at on a desk."""
+"""The real demonstration, six processes and the page, driven by taps in Chromium and looked at on a desk."""
 
 from __future__ import annotations
 
@@ -48,7 +48,10 @@ class DemonstrationPageTests(SynchronousTestCase):
         else:
             self.fail("".join(said) + log.read_text(encoding="utf-8"))
         threading.Thread(target=demo.stdout.read, daemon=True).start()
-        self.url = said[-1].split()[2] + "/"
+        self.invitation = said[-1].split()[2]
+        self.url, _, code = self.invitation.partition("#code=")
+        self.token = ""
+        self.token = self.api("api/v1/session", json.dumps({"code": code}).encode())["token"]
         play = sync_playwright().start()
         self.addCleanup(play.stop)
         self.browser = play.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
@@ -59,7 +62,7 @@ class DemonstrationPageTests(SynchronousTestCase):
         page = self.browser.new_context(**screen).new_page()
         page.set_default_timeout(15_000)
         page.on("pageerror", lambda error: self.faults.append(str(error)))
-        page.goto(self.url)
+        page.goto(self.invitation)
         page.locator("#link[data-link=live]").wait_for()
         page.locator(".device").nth(3).wait_for()
         return page
@@ -78,8 +81,10 @@ class DemonstrationPageTests(SynchronousTestCase):
         self.assertEqual(cut, [], when)
         self.assertEqual(self.faults, [], when)
 
-    def api(self, path: str) -> Any:
-        with urllib.request.urlopen(self.url + path, timeout=5) as answer:
+    def api(self, path: str, body: bytes | None = None) -> Any:
+        headers = {"Content-Type": "application/json", "Authorization": f"Bearer {self.token}"}
+        asked = urllib.request.Request(self.url + path, body, headers)
+        with urllib.request.urlopen(asked, timeout=5) as answer:
             return json.load(answer)
 
     def test_be_driven_by_taps(self) -> None:

@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
+import threading
 import time
+from pathlib import Path
 from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
+from benchmarks.demo import family
 from tests.live.test_page import CHROMIUM, DESK, FLAGS, MISSING, Team
 
 NAMES = ("vaio", "pi")
@@ -51,7 +56,7 @@ class FallbackTests(SynchronousTestCase):
         page.locator(CAMERAS).nth(2).wait_for()
 
     def opened(self) -> None:
-        self.page.goto(self.webs[0].url)
+        self.page.goto(f"{self.webs[0].url}#code={self.webs[0].code}")
         self.served("vaio")
         self.page.locator("#reserve", has_text="reserve").wait_for()
 
@@ -107,3 +112,73 @@ class FallbackTests(SynchronousTestCase):
             "caches.open('swarm.shell').then(c => c.keys()).then(k => k.map(r => new URL(r.url).pathname))"
         )
         self.assertEqual([path for path in kept if path != "/" and not path.startswith("/static/")], [])
+
+
+class DemonstrationFallbackTests(SynchronousTestCase):
+    """Experiment 2 of the thesis with the real team, and its web node lost on top."""
+
+    if MISSING:
+        skip = f"THE DEMONSTRATION IS NOT TESTED IN A BROWSER: missing {'; '.join(MISSING)}"
+
+    def setUp(self) -> None:
+        from playwright.sync_api import sync_playwright
+
+        log, run_dir = Path(self.mktemp()), Path(self.mktemp()).absolute()
+        command = [sys.executable, "-m", "sim.demo", "--run-dir", str(run_dir), "--web-port", "0"]
+        with log.open("w", encoding="utf-8") as errors:
+            root = Path(__file__).parents[2]
+            self.demo = subprocess.Popen(command, cwd=root, stdout=subprocess.PIPE, stderr=errors, text=True)
+        self.addCleanup(self.demo.wait, 20)
+        self.addCleanup(self.demo.terminate)
+        assert self.demo.stdout is not None
+        said = []
+        for line in self.demo.stdout:
+            said.append(line)
+            if line.startswith("The page: "):
+                break
+        else:
+            self.fail("".join(said) + log.read_text(encoding="utf-8"))
+        threading.Thread(target=self.demo.stdout.read, daemon=True).start()
+        self.url = said[-1].split()[2]
+        play = sync_playwright().start()
+        self.addCleanup(play.stop)
+        self.browser = play.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        self.addCleanup(self.browser.close)
+
+    def strike(self, name: str, how: signal.Signals) -> int:
+        pid = next(pid for pid, each in family(self.demo.pid).items() if each == name)
+        os.kill(pid, how)
+        return pid
+
+    def lost_on_the_way(self, how: signal.Signals, limit_s: float) -> int:
+        """The dog on its way and the page's node are lost at once; returns the process id of the latter."""
+        screen: dict[str, Any] = DESK
+        page = self.browser.new_context(**screen).new_page()
+        page.set_default_timeout(15_000)
+        page.goto(self.url)
+        page.locator("#reserve", has_text="pi").wait_for()
+        page.get_by_role("button", name="Run Demo").click()
+        going = page.locator(".device[data-state=EXECUTING] b")
+        going.wait_for(timeout=45_000)
+        dog = going.inner_text()
+        self.strike(dog, signal.SIGKILL)
+        web = self.strike("vaio", how)
+        began = time.monotonic()
+        page.locator("#node", has_text="pi").wait_for()
+        page.locator("#link[data-link=live]").wait_for()
+        self.assertLess(time.monotonic() - began, limit_s)
+        page.locator("#tasks li", has_text="completed").wait_for(timeout=60_000)
+        done = page.locator("#tasks li").first.inner_text()
+        self.assertIn("Done by dog", done)
+        self.assertNotIn(f"Done by {dog}", done)
+        page.locator(CAMERAS).first.wait_for()
+        return web
+
+    def test_experiment_2_and_a_crash(self) -> None:
+        """The dog on its way and the web node are killed: the page goes on within two seconds, another dog finishes."""
+        self.lost_on_the_way(signal.SIGKILL, CRASH_S)
+
+    def test_experiment_2_and_a_freeze(self) -> None:
+        """The web node is frozen instead: the page goes on within three seconds, and another dog finishes as well."""
+        web = self.lost_on_the_way(signal.SIGSTOP, FREEZE_S)
+        os.kill(web, signal.SIGCONT)

@@ -33,8 +33,8 @@ PANELS = """async () => {
       close: () => { document.body.dataset.closed = root.dataset.told; },
     };
   };
-  panel({ place: "tasks", order: 20, title: "Second", needs, load: async () => ({ make: noted }) });
-  panel({ place: "tasks", order: 10, title: "First", needs, make: (root) => {
+  panel({ place: "groups", order: 20, title: "Second", needs, load: async () => ({ make: noted }) });
+  panel({ place: "groups", order: 10, title: "First", needs, make: (root) => {
     root.textContent = "first";
     return { update: (_, event) => { if (event === "state") throw new Error("a fault of one"); } };
   } });
@@ -57,7 +57,8 @@ class Team:
         root = Path(__file__).parents[2]
         command = [sys.executable, "-m", "tests.live.team", str(port)]
         self._process = subprocess.Popen(command, cwd=root, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-        self.port = int(self._line())
+        found, self.code, self.token, self.ticket = self._line().split()
+        self.port = int(found)
         self.url = f"http://127.0.0.1:{self.port}/"
         self.pid = self._process.pid
 
@@ -103,7 +104,7 @@ class PageTests(SynchronousTestCase):
         page.on("request", lambda request: self.asked.append(request.url))
         page.on("pageerror", lambda error: self.faults.append(str(error)))
         page.on("console", lambda words: self.faults.append(words.text) if words.type == "error" else None)
-        page.goto(self.team.url)
+        page.goto(f"{self.team.url}#code={self.team.code}")
         page.locator("#link[data-link=live]").wait_for()
         page.locator(".device").nth(2).wait_for()
         return page
@@ -329,15 +330,15 @@ class PageTests(SynchronousTestCase):
         """A panel stands where it belongs, in order, for whom and where it is meant, is told what comes, and ends."""
         page = self.opened(DESK)
         page.evaluate(PANELS)
-        self.assertEqual(page.locator("#place-tasks > [data-order]").all_inner_texts(), [])
+        self.assertEqual(page.locator("#place-groups > [data-order]").all_inner_texts(), [])
         page.evaluate("seen.model.has = [...seen.model.has, 'faults']")
-        page.locator("#place-tasks > [data-order]").nth(1).wait_for()
-        self.assertEqual(page.locator("#place-tasks > [data-order]").all_inner_texts(), ["first", "second"])
+        page.locator("#place-groups > [data-order]").nth(1).wait_for()
+        self.assertEqual(page.locator("#place-groups > [data-order]").all_inner_texts(), ["first", "second"])
         self.team.order("status dog3 DONE")
         page.locator("[data-told*=state]").wait_for()
         page.evaluate("seen.model.me = { name: '', role: 'viewer' }")
         page.locator("body[data-closed^='told  ']").wait_for()
-        self.assertEqual(page.locator("#place-tasks > [data-order]").count(), 0)
+        self.assertEqual(page.locator("#place-groups > [data-order]").count(), 0)
         self.assertEqual(len(self.faults), 1, self.faults)
         self.assertIn("a fault of one", self.faults[0])
         page.locator(".device[data-state=DONE]", has_text="dog3").wait_for()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from twisted.internet.address import IPv4Address
 from twisted.internet.error import ConnectionDone
 from twisted.internet.task import Clock
 from twisted.internet.testing import StringTransport
@@ -11,15 +12,16 @@ from twisted.python.failure import Failure
 from twisted.web.resource import IResource
 from twisted.web.server import Site
 
-from webnode.channel import CappedRequest
+from webnode.board import Limits
+from webnode.channel import CappedRequest, limited
 from webnode.server import QuietSite
 
 
 class Connection:
     """One connection to a site."""
 
-    def __init__(self, site: Site) -> None:
-        self.transport = StringTransport()
+    def __init__(self, site: Site, address: str = "192.168.1.1") -> None:
+        self.transport = StringTransport(peerAddress=IPv4Address("TCP", address, 54321))
         self.protocol: Any = site.buildProtocol(self.transport.getPeer())
         self.protocol.makeConnection(self.transport)
 
@@ -54,6 +56,9 @@ class Connection:
         self.protocol.connectionLost(Failure(ConnectionDone()))
 
 
-def site_of(root: IResource, clock: Clock) -> Site:
-    """A site on ``clock`` with the web node's own kind of requests."""
-    return QuietSite(root, requestFactory=CappedRequest, reactor=clock, timeout=None)
+def site_of(root: IResource, clock: Clock, limits: Limits | None = None) -> Site:
+    """A site on ``clock`` with the web node's own kind of requests, and of connections where there are ``limits``."""
+    site = QuietSite(root, requestFactory=CappedRequest, reactor=clock, timeout=None)
+    if limits is not None:
+        limited(site, limits)
+    return site

@@ -56,6 +56,8 @@ class TwinTests(SynchronousTestCase):
         """What a node lacks is not said to the page; a yard counts where there is one."""
         bare = Board(MemoryDesk(), OpenSessions())
         self.assertEqual(bare.has, [])
-        self.assertTrue(NoLimits().stream("10.0.0.9") and NoLimits().unfinished("10.0.0.9"))
+        NoLimits().count("stream", "10.0.0.9", 1)
+        self.assertTrue(NoLimits().may("stream", "10.0.0.9"))
+        self.assertEqual(NoLimits().total("stream"), 0)
         yard = MemoryDesk(yard={"walls": [3.0, 2.4], "dogs": [], "target": None})
         self.assertEqual(Board(yard, OpenSessions()).has, ["yard"])

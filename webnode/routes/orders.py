@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+from twisted.internet.defer import maybeDeferred
+
 from webnode.field import Json
 from webnode.route import API, Ask, Field, Route, device
 
@@ -12,28 +16,32 @@ UUID = Field("uuid", "text", "the device", "path", most=64)
 TEXT = Field("text", "text", "what it is told", most=MAX_MESSAGE)
 
 
-def announce(ask: Ask) -> Json:
+def announce(ask: Ask) -> Any:
     """Tell all of them."""
-    ask.board.desk.message("", ask.given["text"])
-    return {}
+    return ask.board.desk.message("", ask.given["text"])
 
 
-def message(ask: Ask) -> Json:
+def message(ask: Ask) -> Any:
     """Tell one."""
     uuid = device(ask)["uuid"]
-    ask.board.desk.message(uuid, ask.given["text"])
-    return {"id": uuid}
+    told = maybeDeferred(ask.board.desk.message, uuid, ask.given["text"])
+    return told.addCallback(lambda answer: {"id": uuid, **answer})
 
 
-def disconnect(ask: Ask) -> Json:
+def disconnect(ask: Ask) -> Any:
     """Take one off the network."""
     uuid, seconds = device(ask)["uuid"], ask.given["seconds"]
-    ask.board.desk.disconnect(uuid, seconds)
-    return {"id": uuid, "seconds": seconds}
+
+    def left(_: object) -> Json:
+        ask.board.chronicle.faulted(uuid, "disconnect", ask.now)
+        return {"id": uuid, "seconds": seconds}
+
+    return maybeDeferred(ask.board.desk.disconnect, uuid, seconds).addCallback(left)
 
 
+GIVES = "delivered (names), failed (why, by name)"
 ROUTES = (
-    Route("POST", f"{API}/message", "A message to all devices", "operator", announce, (TEXT,), status=202),
+    Route("POST", f"{API}/message", "A message to all devices", "operator", announce, (TEXT,), GIVES, 202),
     Route(
         "POST",
         f"{API}/devices/{{uuid}}/message",
@@ -41,7 +49,7 @@ ROUTES = (
         "operator",
         message,
         (UUID, TEXT),
-        gives="id",
+        gives=f"id, {GIVES}",
         status=202,
     ),
     Route(

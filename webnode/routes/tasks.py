@@ -34,6 +34,11 @@ def assign(ask: Ask) -> Any:
     return answer if isinstance(answer, dict) else {"id": answer}
 
 
+def preview(ask: Ask) -> Any:
+    """Who could take one."""
+    return ask.board.desk.preview(ask.given["name"])
+
+
 def _order(wish: Callable[[Ask], Callable[[str], Any]]) -> Answer:
     def answer(ask: Ask) -> Json:
         task_id = ask.given["task_id"]
@@ -45,6 +50,7 @@ def _order(wish: Callable[[Ask], Callable[[str], Any]]) -> Answer:
     return answer
 
 
+NAME = Field("name", "text", "its name in the catalogue", most=64)
 ROUTES = (
     Route("GET", f"{API}/tasks", "The tasks, the newest first", "viewer", tasks, gives="a list of tasks"),
     Route(
@@ -71,7 +77,7 @@ ROUTES = (
         "operator",
         assign,
         (
-            Field("name", "text", "its name in the catalogue", most=64),
+            NAME,
             Field(
                 "tolerates",
                 "whole",
@@ -85,6 +91,15 @@ ROUTES = (
         ),
         gives="id, able, refused (why, by name)",
         status=202,
+    ),
+    Route(
+        "POST",
+        f"{API}/tasks/preview",
+        "Who could take a predefined task and who not, and why; nothing is assigned",
+        "viewer",
+        preview,
+        (NAME,),
+        gives="able (uuid, name, busy: its task now), refused (why, by name), likely (a name, or null)",
     ),
     Route(
         "POST",

@@ -6,6 +6,13 @@ export function say(text) {
   words(at("line"), text);
 }
 
+// Who has a message, and who has not, and why.
+export function delivery({ delivered = [], failed = {} }) {
+  const no = Object.entries(failed).map(([name, why]) => ` ${name} has it not: ${why}.`).join("");
+  const yes = delivered.length ? ` to ${delivered.join(", ")}` : "";
+  return no && !yes ? `Nobody has the message.${no}` : `Message sent${yes}.${no}`;
+}
+
 // Ask, and say in a line what happened; true where the wish was taken.
 export async function wish(doing, path, { body, method = "POST", done, line = say } = {}) {
   line(`${doing} …`);

@@ -3,6 +3,7 @@ const SHELL = "swarm.shell";
 
 async function keep() {
   await navigator.serviceWorker.register("/sw.js");
+  await navigator.serviceWorker.ready;
   const loaded = performance.getEntriesByType("resource").map((entry) => new URL(entry.name));
   const files = loaded.filter((url) => url.origin === location.origin && url.pathname.startsWith("/static/"));
   const shell = await caches.open(SHELL);
@@ -10,4 +11,4 @@ async function keep() {
 }
 
 // A page that is not kept works as long as its node, which is what it did before.
-if (navigator.serviceWorker && isSecureContext) addEventListener("load", () => keep().catch(() => {}));
+if (navigator.serviceWorker && isSecureContext) keep().catch(() => {});

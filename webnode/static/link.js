@@ -1,6 +1,7 @@
 // The link: the one line from the page to its team; nobody else fetches anything.  When the node that serves is lost
 // it goes on with another one, and what was asked meanwhile is asked there.
 import { race, remember } from "./reserve.js";
+import { ticket, token } from "./session.js";
 import { stream } from "./stream.js";
 
 const API = "/api/v1/";
@@ -51,9 +52,10 @@ async function fly(address, options) {
 // what may be done twice is repeated, which a new task is not.
 async function call(method, path, body) {
   const order = method !== "GET";
+  const signed = token() ? { Authorization: `Bearer ${token()}` } : {};
   const options = {
     method,
-    headers: order ? { "Content-Type": "application/json", "X-Swarm": "1", "Idempotency-Key": `${VIEWER}-${++orders}` } : {},
+    headers: order ? { ...signed, "Content-Type": "application/json", "X-Swarm": "1", "Idempotency-Key": `${VIEWER}-${++orders}` } : signed,
     body: order ? JSON.stringify(body) : undefined,
   };
   const end = performance.now() + PATIENCE;
@@ -80,7 +82,7 @@ export const get = (path) => call("GET", path);
 export const ask = (method, path, body = {}) => call(method, path, body);
 
 // The next picture of a camera, as a Response: 200, 204 where there is no newer one, or a refusal.
-export const frames = (uuid, after, signal) => fetch(`${here}/shot/${uuid}?after=${after}&viewer=${VIEWER}`, { signal });
+export const frames = (uuid, after, signal) => fetch(`${here}/shot/${uuid}?after=${after}&viewer=${VIEWER}&ticket=${ticket()}`, { signal });
 
 // Everything that comes, as onEvent(name, data); "link" says whether anything does: live, lost.  A page that nobody
 // sees hears nothing, and is told what it missed when somebody looks again.
@@ -93,7 +95,7 @@ export function open({ onEvent }) {
     url: () => {
       if (served !== here) last = "";
       served = here;
-      return `${here}/events?since=${last}`;
+      return `${here}/events?since=${last}&ticket=${ticket()}`;
     },
     heard(name, data, id) {
       last = id;

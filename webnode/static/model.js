@@ -2,7 +2,7 @@
 export const model = {
   node: "",
   api: 1,
-  me: { name: "", role: "operator" },
+  me: { name: "", role: "anyone" },
   has: [],
   devices: new Map(),
   tasks: new Map(),
@@ -61,6 +61,10 @@ const TAKERS = {
   },
   has(names) {
     model.has = [...names, ...(model.yard && !names.includes("yard") ? ["yard"] : [])];
+  },
+  session(me) {
+    model.me = me;
+    document.body.dataset.role = me.role;
   },
   link(state) {
     model.link = state;

@@ -1,25 +1,35 @@
 // The page: every panel that there is, one stream in, and the model that all of them read.
 import "./header.js";
+import "./halt.js";
 import "./devices.js";
 import "./groups.js";
-import "./cameras.js";
-import "./map.js";
 import "./tasks.js";
-import "./events.js";
 import "./views.js";
-import "./keep.js";
+import "./actions.js";
+import { enter } from "./signin.js";
 import { ask, get, open } from "./link.js";
 import { model, take } from "./model.js";
 import { go, start, tell } from "./shell.js";
+
+// What few need is loaded when it is there.
+const LATER = {
+  yard: { is: () => model.yard, load: () => import("./map.js") },
+  state: { is: () => [...model.devices.values()].some(({ capabilities }) => capabilities.camera), load: () => import("./cameras.js") },
+};
 
 function onEvent(event, data) {
   if (event === "link" && data === model.link) return;
   take(event, data);
   // Panels read the model: to them a change is a state like any other.
-  tell(event === "change" ? "state" : event);
+  const told = event === "change" ? "state" : event;
+  const later = LATER[told];
+  if (later?.is()) later.loaded ??= later.load().then(() => tell(told));
+  tell(told);
   // Another node may have other parts.
   if (event === "link" && data === "live") get("node").then(({ has }) => onEvent("has", has), () => {});
 }
 
 start({ model, get, ask, go });
+await enter((me) => onEvent("session", me));
 open({ onEvent });
+import("./keep.js");

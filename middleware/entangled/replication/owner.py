@@ -6,6 +6,7 @@ goes on until all have them, keeps leases alive, and mends what replicas have lo
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from typing import Literal
@@ -89,6 +90,7 @@ class Owner:
         self._said_at: dict[Slot, float] = {}
         self._bringing: set[bytes] = set()
         self._republishing = False
+        self._next_beat: Callable[[], None] | None = None
         self._first = self._last = self._noted = 0
         endpoint.expose("missing", self._answer_missing, changes=True)
 
@@ -97,8 +99,15 @@ class Owner:
         for record in self._store.owned(self._identity.public):
             if record.lifetime == "team" and not record.is_tombstone:
                 self._own[record.slot] = record
-        self._chores.every(self._lease / BEATS_PER_LEASE, self._beat)
+        self._next_beat = self._chores.later(self._lease / BEATS_PER_LEASE, self._go_on)
         self._chores.every(RETRY, self._republish)
+
+    def set_lease(self, lease: float) -> None:
+        """Have own leases run for so many seconds from now on; they are told at once."""
+        self._lease = lease
+        if self._next_beat is not None:
+            self._next_beat()
+            self._go_on()
 
     def owns(self, slot: Slot) -> bool:
         """Whether this node looks after what is in ``slot``."""
@@ -280,6 +289,10 @@ class Owner:
 
     def _leased(self) -> list[Record]:
         return [r for r in self._own.values() if r.lifetime == "leased"]
+
+    def _go_on(self) -> None:
+        self._next_beat = self._chores.later(self._lease / BEATS_PER_LEASE, self._go_on)
+        self._beat()
 
     def _beat(self) -> None:
         """Say to every replica of an own lease that this node lives, and what it should hold."""

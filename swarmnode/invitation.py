@@ -1,0 +1,73 @@
+"""Invitation: where the page of a node of this machine is and how to sign in there, in the log and in a note.
+
+The note lies beside the node's control socket, for the eyes of the node's user alone; ``swarm web`` reads it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from twisted.logger import Logger
+
+from middleware.entangled.control.place import NoControl, folder, made
+
+ENDING = ".page"
+ANY = ("0.0.0.0", "::")
+
+_log = Logger()
+
+
+@dataclass(frozen=True)
+class Invitation:
+    """The page of the node ``name``: ``pid`` is the node's process, ``code`` is empty where nobody needs to sign in."""
+
+    name: str
+    url: str
+    code: str
+    pid: int
+
+    @property
+    def link(self) -> str:
+        """The address that signs in by itself; what stands behind the ``#`` is never sent."""
+        return f"{self.url}#code={self.code}" if self.code else self.url
+
+
+def url_of(host: str, port: int) -> str:
+    """The address of a page, for a browser of this machine."""
+    here = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
+    return f"http://[{here}]:{port}/" if ":" in here else f"http://{here}:{port}/"
+
+
+def invited(name: str, host: str, port: Callable[[], int], code: str) -> None:
+    """Say in the log where the page is, and leave the note; where none can be left, the log says why."""
+    invitation = Invitation(name, url_of(host, port()), code, os.getpid())
+    how = f"; sign in with the code {code}, or open {invitation.link}" if code else "; whoever opens it is an operator"
+    _log.info("the page is at {url}{how}", url=invitation.url, how=how)
+    try:
+        path = made(name).with_suffix(ENDING)
+        fresh = path.with_suffix(f"{ENDING}.new")
+        with suppress(FileNotFoundError):
+            fresh.unlink()
+        with open(os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="utf-8") as note:
+            json.dump(asdict(invitation), note)
+        fresh.replace(path)
+    except (NoControl, OSError) as error:
+        _log.warn("swarm web will not know of the page: {error}", error=error)
+
+
+def invitations(where: Path | None = None) -> list[Invitation]:
+    """The pages of this machine whose nodes run, by name."""
+    found = []
+    for path in sorted((where or folder()).glob(f"*{ENDING}")):
+        try:
+            invitation = Invitation(**json.loads(path.read_text(encoding="utf-8")))
+            os.kill(invitation.pid, 0)
+        except (OSError, ValueError, TypeError):
+            continue
+        found.append(invitation)
+    return found

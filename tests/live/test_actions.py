@@ -1,0 +1,140 @@
+"""What an operator does on the page, in a real browser: by touch, by mouse and by keyboard alone."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from tests.live.test_page import CHROMIUM, DESK, FLAGS, MISSING, PHONE, Team
+
+
+class ActionPageTests(SynchronousTestCase):
+    timeout = 170
+    if MISSING:
+        skip = f"needs {', '.join(MISSING)}"
+
+    def setUp(self) -> None:
+        from playwright.sync_api import sync_playwright
+
+        self.team = Team()
+        self.addCleanup(self.team.stop)
+        running = sync_playwright().start()
+        self.addCleanup(running.stop)
+        self.browser = running.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        self.addCleanup(self.browser.close)
+        self.faults: list[str] = []
+
+    def opened(self, screen: dict[str, Any], scheme: Any = "light") -> Any:
+        """The page, when it shows the team."""
+        page = self.browser.new_context(**screen, color_scheme=scheme, reduced_motion="reduce").new_page()
+        page.set_default_timeout(20000)
+        page.on("pageerror", lambda error: self.faults.append(str(error)))
+        page.goto(f"{self.team.url}#code={self.team.code}")
+        page.locator("#link[data-link=live]").wait_for()
+        page.locator(".device").nth(2).wait_for()
+        return page
+
+    def told(self, page: Any, words: str) -> None:
+        """Wait until the page says so."""
+        page.locator("#line", has_text=words).wait_for()
+
+    def tab_to(self, page: Any, what: str) -> None:
+        """Go there by the Tab key alone."""
+        for _ in range(60):
+            if page.evaluate(f"document.activeElement.matches({what!r})"):
+                return
+            page.keyboard.press("Tab")
+        self.fail(f"no way to {what} by keyboard")
+
+    def test_stop_from_everywhere(self) -> None:
+        """One touch stops the team, wherever the page is scrolled and before an open device; another lets it go on."""
+        page = self.opened(PHONE)
+        corner = page.locator(".stop").bounding_box()
+        page.locator(".stop").tap()
+        self.told(page, "Stopped: 3 robots stand.")
+        page.locator(".halted").wait_for()
+        page.get_by_role("button", name="Let it go on").tap()
+        self.told(page, "The team goes on.")
+        page.locator(".halted").wait_for(state="hidden")
+        page.locator("#assign").scroll_into_view_if_needed()
+        self.assertEqual(page.locator(".stop").bounding_box(), corner)
+        page.locator(".device").first.tap()
+        page.locator("dialog[open] .stop").wait_for()
+        self.assertEqual(page.locator(".stop").bounding_box(), corner)
+        page.locator(".stop").tap()
+        page.locator("body[data-halted=true]").wait_for()
+        page.locator("#d-close").tap()
+        page.locator("header .stop").wait_for()
+        self.assertEqual(page.locator(".stop").bounding_box(), corner)
+        self.assertEqual(self.faults, [])
+
+    def test_stop_by_keyboard(self) -> None:
+        """With the Tab and Enter keys alone the team is stopped and let go on; the stop is near the beginning."""
+        page = self.opened(DESK)
+        page.keyboard.press("Tab")
+        page.keyboard.press("Tab")
+        self.tab_to(page, ".stop")
+        page.keyboard.press("Enter")
+        self.told(page, "Stopped")
+        page.locator(".halted").wait_for()
+        self.tab_to(page, ".halted button")
+        page.keyboard.press("Enter")
+        self.told(page, "The team goes on.")
+
+    def test_ask_before_assigning(self) -> None:
+        """Who could take the chosen task and who not, and why, stands below it before it is assigned."""
+        page = self.opened(PHONE)
+        page.locator(".preview [data-can=can]", has_text="dog1, dog2 (now: Patrol the yard)").wait_for()
+        self.assertIn("dog3: no gripper, no lift", page.locator(".preview").inner_text())
+        page.locator("#task").select_option("patrol")
+        page.locator(".preview [data-can=nobody]", has_text="No device here can take it").wait_for()
+
+    def test_lift_a_robot(self) -> None:
+        """A robot is dragged elsewhere, moved by the arrow keys and turned by a click or Enter; the target stays."""
+        page = self.opened(DESK)
+        box = page.locator(".floor").bounding_box()
+
+        def at(x: float, y: float) -> tuple[float, float]:
+            return box["x"] + box["width"] * x / 3.0, box["y"] + box["height"] * (1 - y / 2.4)
+
+        page.locator(".dog .grip").nth(2).wait_for(state="attached")
+        target = page.locator("#place").inner_text()
+        page.mouse.move(*at(0.6, 0.6))
+        page.mouse.down()
+        page.mouse.move(*at(1.0, 0.8), steps=4)
+        page.locator(".ghost").wait_for(state="attached")
+        page.mouse.move(*at(2.2, 2.0), steps=4)
+        page.mouse.up()
+        self.told(page, "dog1 stands at 2.2")
+        self.assertEqual(page.locator(".ghost").count(), 0)
+        page.locator(".dog[data-key=dog2]").focus()
+        page.keyboard.press("ArrowRight")
+        self.told(page, "dog2 stands at 1.45, 1.20")
+        nose = page.locator(".dog[data-key=dog2] > g").get_attribute("transform")
+        page.keyboard.press("Enter")
+        page.wait_for_function(
+            "nose => document.querySelector('.dog[data-key=dog2] > g').getAttribute('transform') !== nose", arg=nose
+        )
+        nose = page.locator(".dog[data-key=dog3] > g").get_attribute("transform")
+        page.mouse.click(*at(2.5, 0.7))
+        page.wait_for_function(
+            "nose => document.querySelector('.dog[data-key=dog3] > g').getAttribute('transform') !== nose", arg=nose
+        )
+        self.assertEqual(page.locator("#place").inner_text(), target)
+        self.assertEqual(self.faults, [])
+
+    def test_be_accessible(self) -> None:
+        """Stopped, on phone and desk, light and dark, axe finds nothing and nothing is cut off or too small."""
+        from axe_playwright_python.sync_playwright import Axe
+
+        for screen in (PHONE, DESK):
+            for scheme in ("light", "dark"):
+                page = self.opened(screen, scheme)
+                page.locator(".preview li").first.wait_for()
+                page.locator(".stop").click()
+                page.locator(".halted").wait_for()
+                found = Axe().run(page).response["violations"]
+                self.assertEqual([(each["id"], each["nodes"][0]["html"]) for each in found], [])
+                self.assertLessEqual(page.evaluate("document.documentElement.scrollWidth - innerWidth"), 0)
+                page.context.close()

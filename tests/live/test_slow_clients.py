@@ -1,0 +1,117 @@
+"""A real page among clients that send a byte a second, send nothing or read nothing: they are let go, others served."""
+
+from __future__ import annotations
+
+import http.client
+import selectors
+import socket
+import time
+from importlib.util import find_spec
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from tests.live.test_page import Team
+
+MISSING = [name for name in ("flask", "cv2") if find_spec(name) is None]
+CLOSED_S = 15.0
+ANSWER_S = 1.0
+"""On two shared cores; alone it is some milliseconds."""
+BEGUN = b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX-Slow: "
+
+
+class Crowd:
+    """Clients of the page; ``open`` are those that it has not let go."""
+
+    def __init__(self, port: int) -> None:
+        self._port = port
+        self._selector = selectors.DefaultSelector()
+        self.open: set[socket.socket] = set()
+        self.heard: list[bytes] = []
+
+    def join(self, count: int, begun: bytes, hosts: int = 1, first: int = 1) -> None:
+        """Connect so many, from so many addresses, each of which sends the beginning of a request."""
+        for number in range(count):
+            client = socket.create_connection(
+                ("127.0.0.1", self._port), 5.0, (f"127.0.{first}.{1 + number % hosts}", 0)
+            )
+            client.setblocking(False)
+            if begun:
+                client.send(begun)
+            self.open.add(client)
+            self._selector.register(client, selectors.EVENT_READ)
+
+    def live(self, seconds: float, drip: bytes = b"") -> None:
+        """Hear what comes for so long; then each that is left sends ``drip``."""
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0.0:
+            for key, _ in self._selector.select(left):
+                client = key.fileobj
+                assert isinstance(client, socket.socket)
+                try:
+                    data = client.recv(65536)
+                except OSError:
+                    data = b""
+                if data:
+                    self.heard.append(data)
+                else:
+                    self._selector.unregister(client)
+                    self.open.discard(client)
+                    client.close()
+        for client in list(self.open):
+            try:
+                client.send(drip)
+            except OSError:
+                continue
+
+    def leave(self) -> None:
+        """Close all."""
+        for client in self.open:
+            client.close()
+        self._selector.close()
+
+
+class SlowClientTests(SynchronousTestCase):
+    if MISSING:
+        skip = f"SLOW CLIENTS ARE NOT TESTED: missing {', '.join(MISSING)}"
+
+    def setUp(self) -> None:
+        self.team = Team()
+        self.addCleanup(lambda: self.team.stop())
+        self.crowd = Crowd(self.team.port)
+        self.addCleanup(lambda: self.crowd.leave())
+
+    def answer_s(self) -> float:
+        """Seconds until the state is answered."""
+        began = time.monotonic()
+        page = http.client.HTTPConnection("127.0.0.1", self.team.port, timeout=10)
+        page.request("GET", "/api/v1/state", headers={"Authorization": f"Bearer {self.team.token}"})
+        answer = page.getresponse()
+        answer.read()
+        page.close()
+        self.assertEqual(answer.status, 200)
+        return time.monotonic() - began
+
+    def test_let_go_who_dribbles(self) -> None:
+        """Three hundred that send a byte a second, from many addresses, are all closed in time; others are served."""
+        began = time.monotonic()
+        self.crowd.join(300, BEGUN, hosts=30)
+        slowest = 0.0
+        while self.crowd.open and time.monotonic() - began < CLOSED_S + 5.0:
+            self.crowd.live(1.0, b"x")
+            slowest = max(slowest, self.answer_s())
+        self.assertEqual(len(self.crowd.open), 0)
+        self.assertLess(time.monotonic() - began, CLOSED_S)
+        self.assertLess(slowest, ANSWER_S)
+        self.assertEqual({data[:12] for data in self.crowd.heard}, {b"HTTP/1.1 408"})
+
+    def test_bear_one_address(self) -> None:
+        """Of a hundred dribblers of one address 16 are borne, the others told at once; a whole request gets through."""
+        self.crowd.join(100, BEGUN, first=7)
+        self.crowd.live(1.5)
+        self.assertEqual(len(self.crowd.open), 16)
+        self.assertEqual(sum(data.startswith(b"HTTP/1.1 503") for data in self.crowd.heard), 84)
+        whole = Crowd(self.team.port)
+        self.addCleanup(whole.leave)
+        whole.join(1, b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n", first=7)
+        whole.live(1.0)
+        self.assertTrue(whole.heard[0].startswith(b"HTTP/1.1 200"))

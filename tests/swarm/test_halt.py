@@ -1,0 +1,155 @@
+"""A whole team in memory is stopped in the middle of its work, and goes on from there."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from twisted.internet.defer import Deferred
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.halt import HALT, SLOT, UNHEARD, Word
+from middleware.presence import DEVICES
+from swarmnode.rehearsal import VirtualTeam
+from webnode.halting import TeamHalts
+
+BRAKING = 0.2
+"""Seconds in which all three dogs stand, from the press of the button."""
+
+
+class HaltTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.team = VirtualTeam(5)
+        self.addCleanup(self.team.stop)
+        self.halts = TeamHalts(self.node("vaio"), lambda: self.team.desk.read(DEVICES))
+
+    def node(self, name: str) -> Any:
+        """The node of a device."""
+        return self.team.services[name].assembly.node
+
+    def moving(self) -> list[str]:
+        """The dogs that move now."""
+        return [dog.name for dog in self.team.yard.world.dogs.values() if dog.is_moving]
+
+    def moved_in(self, seconds: float) -> set[str]:
+        """The dogs that move in the next seconds."""
+        moved: set[str] = set()
+        for _ in range(round(seconds / 0.05)):
+            self.team.clock.advance(0.05)
+            moved.update(self.moving())
+        return moved
+
+    def executing(self) -> list[str]:
+        """Who acts, as the page tells."""
+        return [row["name"] for row in self.team.state()["devices"] if row["status"] == "EXECUTING"]
+
+    def told(self, asked: Deferred[dict[str, str]]) -> dict[str, str]:
+        """What each device says, by name."""
+        return {name: said for uuid, said in self.successResultOf(asked).items() if (name := self.name_of(uuid))}
+
+    def name_of(self, uuid: str) -> str:
+        """The name of a node."""
+        return next(name for name, service in self.team.services.items() if service.assembly.node.uuid == uuid)
+
+    def until_executing(self) -> str:
+        """Run the demonstration until one acts; its name."""
+        self.team.run_demo()
+        for _ in range(800):
+            self.team.clock.advance(0.05)
+            if self.executing() and self.moving():
+                return self.executing()[0]
+        self.fail("nobody acts")
+
+    def test_all_stand_at_once_and_go_on(self) -> None:
+        """Pressed while one acts, all dogs stand in 0.2 s and none moves for 10 s; released, the same one goes on."""
+        acting = self.until_executing()
+        token = self.team.services[acting].assembly.agent.engagement.lessee.token  # type: ignore[union-attr]
+        asked = self.halts.halt("ann")
+        self.team.clock.advance(BRAKING)
+        self.assertEqual(self.moving(), [])
+        said = {"vaio": "has no robot", "dog1": "stands", "dog2": "stands", "dog3": "stands"}
+        self.assertEqual(self.told(asked), said)
+        self.assertEqual(self.moved_in(10.0), set())
+        self.assertTrue(self.team.state()["halted"])
+        self.assertEqual(self.executing(), [acting])
+        agent: Any = self.team.services[acting].assembly.agent
+        self.assertEqual(agent.engagement.lessee.lease.token, token)
+        self.halts.release("ann")
+        self.assertIn(acting, self.moved_in(1.0))
+        self.team.clock.advance(30.0)
+        state = self.team.state()
+        self.assertFalse(state["halted"])
+        self.assertEqual((state["tasks"][0]["status"], state["tasks"][0]["result"]["by"]), ("COMPLETED", acting))
+
+    def test_nobody_takes_over(self) -> None:
+        """The dog that acted dies while all stand: no other moves until the team is released, and then one does."""
+        acting = self.until_executing()
+        self.halts.halt("ann")
+        self.team.clock.advance(1.0)
+        self.team.kill(acting)
+        self.assertEqual(self.moved_in(8.0), set())
+        self.halts.release("ann")
+        self.assertTrue(self.moved_in(5.0) - {acting})
+
+    def test_who_comes_later_stands(self) -> None:
+        """A dog that joins a halted team, and finds a task there, does not move until the team is released."""
+        team = VirtualTeam(6, dogs=("dog1", "dog2"))
+        self.addCleanup(team.stop)
+        halts = TeamHalts(team.services["vaio"].assembly.node, lambda: team.desk.read(DEVICES))
+        halts.halt("ann")
+        team.clock.advance(0.5)
+        team.run_demo()
+        team.add("dog3")
+        moved: set[str] = set()
+        for _ in range(100):
+            team.clock.advance(0.05)
+            moved.update(dog.name for dog in team.yard.world.dogs.values() if dog.is_moving)
+        self.assertEqual(moved, set())
+        self.assertTrue(team.services["dog3"].assembly.node.halt.word.is_on)
+        halts.release("ann")
+        team.clock.advance(2.0)
+        self.assertTrue([dog.name for dog in team.yard.world.dogs.values() if dog.is_moving])
+
+    def test_who_cannot_be_told_reads_it(self) -> None:
+        """A dog that is out of reach is told of as such, and stands as soon as it hears the others again."""
+        self.team.run_demo()
+        self.team.clock.advance(1.0)
+        self.team.silence("dog2")
+        asked = self.halts.halt("ann")
+        self.team.clock.advance(2.0)
+        self.assertEqual(self.told(asked)["dog2"], UNHEARD)
+        self.team.board.heal()
+        self.team.clock.advance(15.0)
+        self.assertTrue(self.node("dog2").halt.word.is_on)
+        self.assertEqual(self.moved_in(3.0), set())
+
+    def test_a_higher_word_is_outbid(self) -> None:
+        """A web node that does not know how far the count is says its word again with a higher one, and is obeyed."""
+        self.node("dog1").halt.take(Word(41, False, "bob"))
+        asked = self.halts.halt("ann")
+        self.team.clock.advance(0.2)
+        self.assertEqual(self.told(asked)["dog1"], "stands")
+        self.assertEqual({self.node(name).halt.word.count for name in ("vaio", "dog1", "dog2")}, {42})
+
+    def test_of_two_the_stop_wins(self) -> None:
+        """One releases and another halts with the same number: the team stands, whatever was heard first."""
+        for name, words in (("dog1", (True, False)), ("dog2", (False, True))):
+            for is_on in words:
+                self.node(name).halt.take(Word(7, is_on, "ann"))
+            self.assertTrue(self.node(name).halt.is_on)
+
+    def test_a_record_that_is_no_word_is_nothing(self) -> None:
+        """What a peer writes there that is no word halts nobody and breaks nothing."""
+        for value in (b"", b"\xc1", b"\x93\x01\x02\x03", b"\x93\xff\xc3\xa1x", b"\x80"):
+            self.node("vaio").entangled.put(HALT, SLOT, value, "team")
+            self.team.clock.advance(0.5)
+            self.assertFalse(self.team.state()["halted"])
+        self.assertFalse(self.node("dog1").halt.is_on)
+
+    def test_the_device_says_who(self) -> None:
+        """Each device has a line that says who stopped it, and who released it."""
+        self.halts.halt("ann")
+        self.team.clock.advance(0.5)
+        self.halts.release("bob")
+        self.team.clock.advance(0.5)
+        row = next(row for row in self.team.state()["devices"] if row["name"] == "dog1")
+        self.assertEqual([text for _, text in row["messages"]][-2:], ["stopped by ann", "released by bob"])

@@ -1,0 +1,74 @@
+"""Tests of ``swarmnode.invitation`` and of ``swarm web``: where the page is, and how to sign in."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import stat
+import sys
+from pathlib import Path
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from swarmnode.invitation import Invitation, invitations, invited, url_of
+from swarmnode.web_code import main
+
+OWN = Invitation("vaio", "http://127.0.0.1:8080/", "quiet-otter", os.getpid())
+
+
+class InvitationTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        # Not under the folder of the tests: a socket's path, beside which the note lies, is short.
+        self.where = Path(self.mktemp())
+        self.patch(os, "environ", {**os.environ, "XDG_RUNTIME_DIR": str(self.where)})
+
+    def test_leave_a_note(self) -> None:
+        """A node that serves leaves its address and code, for its own user alone; the next start replaces them."""
+        self.patch(sys.modules["middleware.entangled.control.place"], "MAX_PATH", 4096)
+        for code in ("quiet-otter", "loud-otter"):
+            invited("vaio", "0.0.0.0", lambda: 8080, code)
+        self.assertEqual(invitations(), [Invitation("vaio", "http://127.0.0.1:8080/", "loud-otter", os.getpid())])
+        (note,) = (self.where / "swarm-node").iterdir()
+        self.assertEqual(stat.S_IMODE(note.stat().st_mode), 0o600)
+
+    def test_pass_over_what_is_no_note(self) -> None:
+        """The note of a node that has ended, and what is no note, are passed over."""
+        self.where.mkdir()
+        for name, words in (
+            ("a", "{}"),
+            ("b", "no JSON"),
+            ("c", '{"name": "c", "url": "", "code": "", "pid": 4194305}'),
+        ):
+            (self.where / f"{name}.page").write_text(words)
+        self.assertEqual(invitations(self.where), [])
+
+    def test_name_an_address_for_this_machine(self) -> None:
+        """An address that stands for all of the machine's is told as one that a browser there can open."""
+        self.assertEqual(url_of("0.0.0.0", 80), "http://127.0.0.1:80/")
+        self.assertEqual(url_of("::", 80), "http://[::1]:80/")
+        self.assertEqual(url_of("192.168.0.2", 8080), "http://192.168.0.2:8080/")
+
+
+class WebCodeTests(SynchronousTestCase):
+    def asked(self, *words: str, here: list[Invitation] | None = None) -> tuple[int, str, str]:
+        out, errors = io.StringIO(), io.StringIO()
+        self.patch(sys, "stderr", errors)
+        code = main(words, out, lambda: [OWN] if here is None else here)
+        return code, out.getvalue(), errors.getvalue()
+
+    def test_tell_the_code(self) -> None:
+        """The code is told, and the link that carries it; as JSON for programs; without signing in, that is said."""
+        code, out, _ = self.asked()
+        self.assertEqual(code, 0)
+        self.assertIn("vaio: http://127.0.0.1:8080/  code quiet-otter, or open", out)
+        self.assertIn("http://127.0.0.1:8080/#code=quiet-otter", out)
+        self.assertEqual(json.loads(self.asked("--json")[1])["code"], "quiet-otter")
+        self.assertIn("no sign-in", self.asked(here=[Invitation("a", "http://127.0.0.1:1/", "", 1)])[1])
+
+    def test_tell_that_there_is_none(self) -> None:
+        """Where there is no page, or not that one, one line says which there are, and the exit code is 2."""
+        code, out, errors = self.asked("--node", "dog1")
+        self.assertEqual((code, out), (2, ""))
+        self.assertIn("no page of a node 'dog1' runs on this machine; there are those of vaio", errors)
+        self.assertIn("start a node with the role", self.asked(here=[])[2])

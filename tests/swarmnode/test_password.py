@@ -1,0 +1,47 @@
+"""Tests of ``swarm password``."""
+
+from __future__ import annotations
+
+import io
+import sys
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.settings import Settings
+from swarmnode.password import main
+from webnode.password import is_password
+
+
+class PasswordCommandTests(SynchronousTestCase):
+    def typed(self, *answers: str) -> tuple[int, str, str]:
+        said, out, errors = list(answers), io.StringIO(), io.StringIO()
+        self.patch(sys, "stderr", errors)
+
+        def ask(prompt: str) -> str:
+            if not said:
+                raise EOFError
+            return said.pop(0)
+
+        return main([], out, ask, bytes), out.getvalue(), errors.getvalue()
+
+    def test_print_a_line_for_the_settings(self) -> None:
+        """What is printed is a line of TOML that the settings take, and it lets in whoever knows the password."""
+        code, out, _ = self.typed("correct horse", "correct horse")
+        self.assertEqual(code, 0)
+        path = self.mktemp()
+        with open(path, "w", encoding="utf-8") as file:
+            file.write(f'[node]\nname = "vaio"\n[web]\n{out}')
+        self.assertTrue(is_password(Settings.load(path).web.password, "correct horse"))
+        self.assertNotIn("horse", out)
+
+    def test_refuse_in_one_line(self) -> None:
+        """Too short, not the same twice, not to be typed into a page, or none: one line says so, and exit code 1."""
+        for answers, words in (
+            (("short",), "5 characters"),
+            (("correct horse", "correct hors"), "not the same"),
+            ((" correct horse",), "a space"),
+            ((), "there was none"),
+        ):
+            code, out, errors = self.typed(*answers)
+            self.assertEqual((code, out, errors.count("\n")), (1, "", 1))
+            self.assertIn(words, errors)

@@ -1,0 +1,134 @@
+"""The routes of what an operator does: stopping the team, asking before assigning, lifting robots."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+from flask.testing import FlaskClient
+from twisted.internet.defer import Deferred, fail
+from twisted.trial.unittest import SynchronousTestCase
+
+from tests.webnode.guests import Guests
+from webnode.app import create_app
+from webnode.board import Board, Knob, MemoryChronicle, MemoryHalts, MemoryTuning
+from webnode.desk import MemoryDesk
+from webnode.errors import Refusal
+from webnode.state import state_of
+
+DOG = {"name": "dog1", "x": 0.5, "y": 0.5, "heading": 0.25, "stripes": 1}
+API = "/api/v1"
+
+
+class ActionTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.desk = MemoryDesk([{"name": "search"}], {"walls": [3.0, 2.4], "dogs": [DOG], "target": None})
+        self.halts = MemoryHalts("01", "02")
+        self.chronicle = MemoryChronicle()
+        tuning = MemoryTuning({"01": [Knob("description", "a dog", "A line", most=200.0)]})
+        self.board = Board(self.desk, Guests(), chronicle=self.chronicle, halts=self.halts, tuning=tuning)
+        state = state_of([{"uuid": "01", "name": "dog1", "joined": 1}], [], {}, node="vaio")
+        app = create_app(lambda: state, self.board, wall=lambda: 1e9)
+        app.logger.setLevel(logging.CRITICAL + 1)
+        self.client: FlaskClient = app.test_client()
+
+    def ask(self, method: str, path: str, body: Any = None, role: str = "operator") -> tuple[int, Any]:
+        """Status and JSON of an answer."""
+        headers = {"Authorization": f"Bearer {role}", "X-Swarm": "1"}
+        answer = self.client.open(f"{API}/{path}", method=method, json=body, headers=headers)
+        return answer.status_code, answer.get_json()
+
+    def test_stop_and_go_on(self) -> None:
+        """Both are answered with what each device does, and noted with who asked; whether it is stopped can be read."""
+        stopped = (200, {"halted": True, "devices": {"01": "stands", "02": "stands"}})
+        self.assertEqual(self.ask("POST", "halt", {}), stopped)
+        self.assertEqual(self.ask("GET", "halt", role="viewer"), (200, {"halted": True}))
+        self.assertEqual(self.ask("DELETE", "halt")[1]["devices"], {"01": "goes on", "02": "goes on"})
+        self.assertEqual(self.halts.said, [("halt", "operator"), ("release", "operator")])
+        self.assertEqual(
+            [line["route"] for line in self.board.audit.newest(2)], [f"DELETE {API}/halt", f"POST {API}/halt"]
+        )
+
+    def test_stop_is_for_operators(self) -> None:
+        """A viewer stops nobody, and neither does a node without the means, which says so."""
+        for method in ("POST", "DELETE"):
+            self.assertEqual(self.ask(method, "halt", {}, "viewer")[0], 403)
+        self.assertEqual(self.halts.said, [])
+        self.board.halts = None
+        status, answer = self.ask("POST", "halt", {})
+        self.assertEqual((status, answer["error"]["field"]), (409, "halt"))
+
+    def test_preview_is_for_viewers(self) -> None:
+        """Who would take a task can be asked by who only looks; a task that is not there is named."""
+        preview = {"able": [{"uuid": "01", "name": "dog1", "busy": ""}], "refused": {"vaio": ["no camera"]}}
+        self.desk.previews["search"] = {**preview, "likely": None}
+        self.assertEqual(
+            self.ask("POST", "tasks/preview", {"name": "search"}, "viewer"), (200, {**preview, "likely": None})
+        )
+        status, answer = self.ask("POST", "tasks/preview", {"name": "fly"}, "viewer")
+        self.assertEqual((status, answer["error"]["field"]), (404, "name"))
+        self.assertEqual(self.desk.asked, [])
+
+    def test_lift_a_robot(self) -> None:
+        """A robot is set down where it is wanted, looking as before unless said otherwise."""
+        self.assertEqual(self.ask("PUT", "yard/robots/dog1", {"x": 1, "y": 2})[0], 202)
+        self.assertEqual(self.ask("PUT", "yard/robots/dog1", {"x": 1, "y": 2, "heading": -1.5})[0], 202)
+        self.assertEqual(self.desk.asked, [("robot", "dog1", 1.0, 2.0, 0.25), ("robot", "dog1", 1.0, 2.0, -1.5)])
+
+    def test_refuse_what_no_robot_can(self) -> None:
+        """A robot that is not there, a place outside, a heading that is none: each names the field and the remedy."""
+        wrong: list[tuple[str, Any, int, str]] = [
+            ("cat", {"x": 1, "y": 1}, 404, "name"),
+            ("dog1", {"x": 9, "y": 1}, 400, "robot"),
+            ("dog1", {"x": 1}, 400, "y"),
+            ("dog1", {"x": 1, "y": 1, "heading": 99}, 400, "heading"),
+            ("dog1", {"x": 1, "y": 1, "heading": "north"}, 400, "heading"),
+        ]
+        for name, body, status, field in wrong:
+            came, answer = self.ask("PUT", f"yard/robots/{name}", body)
+            self.assertEqual((came, answer["error"]["field"]), (status, field), body)
+            self.assertTrue(answer["error"]["remedy"])
+        self.assertEqual(self.desk.asked, [])
+        self.desk.ground = None
+        self.assertEqual(self.ask("PUT", "yard/robots/dog1", {"x": 1, "y": 1})[0], 409)
+
+    def test_settings(self) -> None:
+        """A viewer reads the settings of a device, an operator changes them; the device's own refusal comes through."""
+        status, rows = self.ask("GET", "devices/01/settings", role="viewer")
+        self.assertEqual(
+            (status, rows[0]["key"], rows[0]["value"], rows[0]["most"]), (200, "description", "a dog", 200.0)
+        )
+        self.assertEqual(self.ask("PUT", "devices/01/settings", {"description": "x"}, "viewer")[0], 403)
+        self.assertEqual(self.ask("PUT", "devices/01/settings", {"description": ""})[1][0]["value"], "")
+        wrong: list[tuple[str, Any, int, str]] = [
+            ("01", {}, 400, "body"),
+            ("01", {"desription": "x"}, 400, "desription"),
+            ("01", {"description": 5}, 400, "description"),
+            ("01", {"camera_fps": 5}, 400, "camera_fps"),
+            ("07", {"description": "x"}, 404, "device"),
+        ]
+        for uuid, body, expected, field in wrong:
+            status, answer = self.ask("PUT", f"devices/{uuid}/settings", body)
+            self.assertEqual((status, answer["error"]["field"]), (expected, field), body)
+        self.board.tuning = None
+        self.assertEqual(self.ask("GET", "devices/01/settings")[0], 409)
+
+    def test_orders_answer_what_became_of_them(self) -> None:
+        """A message is answered with who has it; a device that was lost meanwhile is an error that says so."""
+        self.assertEqual(self.ask("POST", "message", {"text": "sit"}), (202, {"delivered": [], "failed": {}}))
+        self.assertEqual(self.ask("POST", "devices/01/message", {"text": "sit"})[1]["id"], "01")
+        left = Refusal("device", "dog1 left while it was asked", "wait until it is back", 409)
+
+        def lost(*wish: object) -> Deferred[Any]:
+            return fail(left)
+
+        desk: Any = self.desk
+        desk.message = desk.disconnect = lost
+        for path, body in (("message", {"text": "sit"}), ("disconnect", {})):
+            self.assertEqual(self.ask("POST", f"devices/01/{path}", body), (409, left.fields))
+        self.assertEqual(self.chronicle.faults, [])
+
+    def test_disconnecting_is_a_fault_on_purpose(self) -> None:
+        """A device that was told to leave is in the chronicle as such, so that the takeover is timed from there."""
+        self.ask("POST", "devices/01/disconnect", {"seconds": 5})
+        self.assertEqual(self.chronicle.faults, [("01", "disconnect", 1e9)])

@@ -1,0 +1,38 @@
+"""Tests of ``webnode.password``: hashes of passwords."""
+
+from __future__ import annotations
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from webnode.password import LOG_N, P, R, hashed, is_password, read
+
+
+class PasswordTests(SynchronousTestCase):
+    def test_know_the_password_again(self) -> None:
+        """The password is known by its hash, any other is not; the same password hashes otherwise with another salt."""
+        text = hashed("correct horse", bytes(16), 4)
+        self.assertTrue(is_password(text, "correct horse"))
+        for other in ("correct hors", "Correct horse", "", text):
+            self.assertFalse(is_password(text, other))
+        self.assertNotEqual(text, hashed("correct horse", bytes(15) + b"\x01", 4))
+        self.assertNotIn("horse", text)
+
+    def test_be_hard_to_guess(self) -> None:
+        """What is made without further words takes 16 MiB and five rounds of it."""
+        self.assertEqual(read(hashed("correct horse", bytes(16)))[:3], (LOG_N, R, P))
+        self.assertEqual((128 * R * 2**LOG_N, P), (16 * 1024 * 1024, 5))
+
+    def test_refuse_what_is_no_hash(self) -> None:
+        """What is no hash, or one that would take all the memory, is told at once."""
+        good = hashed("x", bytes(16), 4)
+        tail = good.split("$", 4)[4]
+        for text in (
+            "",
+            "secret",
+            "bcrypt$4$8$5$a$b",
+            f"scrypt$30$8$5${tail}",
+            f"scrypt$x$8$5${tail}",
+            good + "$",
+            "$" * 5,
+        ):
+            self.assertRaises(ValueError, read, text)

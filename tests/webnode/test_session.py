@@ -1,0 +1,155 @@
+"""Tests of ``webnode.session``: signing in, by code, password and invitation."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import replace
+from typing import Any, cast
+
+from twisted.internet.defer import Deferred, succeed
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.errors import BadSetting
+from middleware.settings import Settings
+from webnode.board import OpenSessions, Token, Visitor
+from webnode.errors import Refusal
+from webnode.ground import Ground
+from webnode.password import hashed, is_password
+from webnode.session import AT_ONCE, SIGNED_S, WAITING, SignedSessions, made, sessions
+
+HASH = hashed("correct horse", bytes(16), 4)
+HOME = "127.0.0.1"
+
+
+class SignedSessionsTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.sessions = self.node()
+
+    def node(self, secret: bytes = b"the team's secret", password: str = "", check: Any = None) -> SignedSessions:
+        there = check or (lambda text, word: succeed(is_password(text, word)))
+        return SignedSessions(secret, "quiet-otter", password, random.Random(1), there)
+
+    def signed(self, proof: str = "quiet-otter", now: float = 0.0, source: str = HOME) -> Token:
+        return self.successResultOf(self.sessions.sign_in(proof, source, now))
+
+    def refused(self, proof: str, now: float = 0.0, source: str = HOME) -> Refusal:
+        refusal: Refusal = self.failureResultOf(self.sessions.sign_in(proof, source, now), Refusal).value
+        return refusal
+
+    def test_sign_in_by_the_code(self) -> None:
+        """The code makes an operator, however it is written, for twelve hours; its ticket a viewer for as long."""
+        for words in ("quiet-otter", " Quiet Otter ", "QUIETOTTER"):
+            token = self.signed(words)
+            self.assertEqual((token.role, token.until), ("operator", SIGNED_S))
+        who = self.sessions.visitor(token.text, SIGNED_S - 1.0)
+        self.assertEqual((who.name, who.role), ("operator", "operator"))
+        looks = self.sessions.visitor(token.ticket, SIGNED_S - 1.0)
+        self.assertEqual((looks.role, looks.token_id), ("viewer", who.token_id))
+        for text in (token.text, token.ticket):
+            self.assertEqual(self.sessions.visitor(text, SIGNED_S), Visitor())
+
+    def test_hold_at_every_web_node_of_the_team(self) -> None:
+        """Who signed in at one web node is known at another of the team, and at none of another team."""
+        token = self.signed()
+        self.assertEqual(self.node().visitor(token.text, 1.0).role, "operator")
+        self.assertEqual(self.node(b"another secret").visitor(token.text, 1.0), Visitor())
+
+    def test_refuse_what_is_not_the_code(self) -> None:
+        """Anything else is refused with 401 and words that say where the code stands; no token is nobody."""
+        for words in ("", "quiet", "quiet-otter1", "\N{DOG FACE}", "A" * 60):
+            refusal = self.refused(words)
+            self.assertEqual((refusal.status, refusal.field), (401, "code"))
+        self.assertIn("swarm web", refusal.remedy)
+        self.assertEqual(self.sessions.visitor("", 0.0), Visitor())
+
+    def test_slow_guesses_down(self) -> None:
+        """Of a thousand guesses ten are looked at, then even the code waits; from elsewhere one signs in meanwhile."""
+        told = [self.refused(f"guess {n}").status for n in range(1000)]
+        self.assertEqual((told.count(401), told.count(429)), (10, 990))
+        self.assertIn("wait 4 s", self.refused("quiet-otter").remedy)
+        self.signed(source="192.168.0.7")
+        self.signed(now=4.0)
+        self.assertEqual(self.refused("wrong", 4.0).status, 401)
+
+    def test_sign_in_by_the_password(self) -> None:
+        """Where there is a password it lets in as the code does, and a wrong one does not."""
+        self.sessions = self.node(password=HASH)
+        self.assertEqual(self.signed("correct horse").role, "operator")
+        self.assertEqual(self.signed().role, "operator")
+        self.assertEqual(self.refused("correct hors").status, 401)
+
+    def test_check_two_passwords_at_once(self) -> None:
+        """Of a storm of passwords two are worked at, some wait, the others are told to come back; each is a guess."""
+        asked: list[Deferred[bool]] = []
+
+        def check(text: str, word: str) -> Deferred[bool]:
+            asked.append(Deferred())
+            return asked[-1]
+
+        self.sessions = self.node(password=HASH, check=check)
+        storm = [self.sessions.sign_in("wrong", f"10.0.0.{n}", 0.0) for n in range(50)]
+        self.assertEqual(len(asked), AT_ONCE)
+        busy = [self.failureResultOf(each, Refusal).value.status for each in storm[AT_ONCE + WAITING :]]
+        self.assertEqual(busy, [503] * (50 - AT_ONCE - WAITING))
+        while asked:
+            asked.pop(0).callback(False)
+        for each in storm[: AT_ONCE + WAITING]:
+            self.failureResultOf(each, Refusal)
+        many = [self.sessions.sign_in("wrong", HOME, 0.0) for _ in range(11)]
+        self.assertEqual(self.failureResultOf(many[-1], Refusal).value.status, 429)
+
+    def test_invite(self) -> None:
+        """An invitation signs in by itself, in its role and for no longer; its ticket and an old one do not."""
+        invitation = self.sessions.token("guest", "viewer", 0.0, 100.0)
+        token = self.signed(invitation.text, 10.0)
+        self.assertEqual((token.role, token.until), ("viewer", 100.0))
+        self.assertNotEqual(token.text, invitation.text)
+        self.assertEqual(self.sessions.visitor(token.text, 50.0).name, "guest")
+        self.assertEqual(self.refused(invitation.ticket, 10.0).status, 401)
+        self.assertEqual(self.refused(invitation.text, 100.0).status, 401)
+        long = self.sessions.token("guest", "viewer", 0.0, 10 * SIGNED_S)
+        self.assertEqual(self.signed(long.text, 1.0).until, SIGNED_S + 1.0)
+
+    def test_sign_out(self) -> None:
+        """A token that is given back lets in nobody, nor does its ticket; others stay."""
+        token, other = self.signed(), self.signed()
+        self.sessions.revoke(self.sessions.visitor(token.text, 1.0).token_id)
+        for text in (token.text, token.ticket):
+            self.assertEqual(self.sessions.visitor(text, 1.0), Visitor())
+        self.assertEqual(self.sessions.visitor(other.text, 1.0).role, "operator")
+
+
+class FactoryTests(SynchronousTestCase):
+    def ground(self, **web: object) -> Ground:
+        settings = Settings.from_mapping({"node": {"name": "vaio", "team_key": "x" * 20}, "web": web}, "vaio.toml")
+        nothing = cast(Any, None)
+        return Ground(settings, nothing, nothing, nothing, lambda: 0.0, random.Random(1))
+
+    def test_have_the_code_of_the_settings(self) -> None:
+        """The code is that of the settings; where there is none, one is made that cannot be misread."""
+        self.assertEqual(sessions(self.ground(code="quiet-otter")).code, "quiet-otter")
+        self.assertRegex(sessions(self.ground()).code, r"^[a-hj-km-np-z]{4}-[a-hj-km-np-z]{4}$")
+        self.assertNotEqual(made(random.Random(1)), made(random.Random(2)))
+
+    def test_do_without_on_this_machine_alone(self) -> None:
+        """Without signing in a page is served to this machine alone; open to a network it is refused in one line."""
+        self.assertIsInstance(sessions(self.ground(sign_in=False)), OpenSessions)
+        self.assertIsInstance(sessions(self.ground(sign_in=False, host="::1")), OpenSessions)
+        for host in ("0.0.0.0", "192.168.0.2", "::"):
+            error = self.assertRaises(BadSetting, sessions, self.ground(sign_in=False, host=host))
+            self.assertIn("vaio.toml: [web] sign_in", str(error))
+
+    def test_refuse_a_password_that_is_no_hash(self) -> None:
+        """A password that stands there as it is typed is refused, and not shown."""
+        error = self.assertRaises(BadSetting, sessions, self.ground(password="correct horse"))
+        self.assertIn("swarm password", str(error))
+        self.assertNotIn("horse", str(error))
+
+    def test_keep_a_team_without_secret_apart(self) -> None:
+        """Where the team's key is the one that everybody knows, nobody can make a token with it."""
+        ground = self.ground(code="quiet-otter")
+        settings = Settings.from_mapping({"node": {"name": "vaio"}, "web": {"code": "quiet-otter"}}, "vaio.toml")
+        first, second = (sessions(replace(ground, settings=settings)) for _ in range(2))
+        token = first.token("operator", "operator", 0.0, 10.0)
+        self.assertEqual(first.visitor(token.text, 1.0).role, "operator")
+        self.assertEqual(second.visitor(token.text, 1.0), Visitor())

@@ -1,0 +1,95 @@
+"""Tests of ``webnode.routes.session``: signing in over the API."""
+
+from __future__ import annotations
+
+import random
+from typing import Any
+
+from twisted.internet.defer import succeed
+from twisted.trial.unittest import SynchronousTestCase
+
+from webnode.app import create_app
+from webnode.board import Board, MemoryAudit
+from webnode.desk import MemoryDesk
+from webnode.password import hashed, is_password
+from webnode.session import SignedSessions
+from webnode.state import state_of
+
+
+class SessionRouteTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        check: Any = lambda text, word: succeed(is_password(text, word))  # noqa: E731
+        password = hashed("correct horse", bytes(16), 4)
+        sessions = SignedSessions(b"the team's secret", "quiet-otter", password, random.Random(1), check)
+        self.audit = MemoryAudit()
+        state = state_of([], [], {}, node="vaio")
+        board = Board(MemoryDesk(), sessions, self.audit)
+        self.client = create_app(lambda: state, board, wall=lambda: 1000.0).test_client()
+
+    def signed(self, **body: str) -> dict[str, Any]:
+        answer = self.client.post("/api/v1/session", json=body)
+        self.assertEqual(answer.status_code, 200, answer.get_json())
+        return dict(answer.get_json())
+
+    def bearer(self, token: str) -> dict[str, str]:
+        return {"Authorization": f"Bearer {token}"}
+
+    def test_sign_in_and_out(self) -> None:
+        """Code and password sign in; the token gives orders, its ticket looks, and neither does after signing out."""
+        for body in ({"code": "quiet-otter"}, {"password": "correct horse"}):
+            told = self.signed(**body)
+            self.assertEqual((told["role"], told["until"]), ("operator", 1000.0 + 12 * 3600))
+            bearer = self.bearer(told["token"])
+            self.assertEqual(self.client.get("/api/v1/session", headers=bearer).get_json()["role"], "operator")
+            self.assertEqual(self.client.post("/api/v1/demo", json={}, headers=bearer).status_code, 202)
+            ticket = f"ticket={told['ticket']}"
+            self.assertEqual(self.client.get(f"/api/v1/state?{ticket}").status_code, 200)
+            self.assertEqual(self.client.post(f"/api/v1/demo?{ticket}", json={}).status_code, 403)
+            self.assertEqual(self.client.delete("/api/v1/session", headers={**bearer, "X-Swarm": "1"}).status_code, 200)
+            self.assertEqual(self.client.post("/api/v1/demo", json={}, headers=bearer).status_code, 401)
+            self.assertEqual(self.client.get(f"/api/v1/state?{ticket}").status_code, 401)
+
+    def test_be_nobody_without(self) -> None:
+        """Whoever has not signed in is anyone, who may look at nothing and order nothing."""
+        self.assertEqual(self.client.get("/api/v1/session").get_json(), {"name": "", "role": "anyone"})
+        self.assertEqual(self.client.get("/api/v1/state").status_code, 401)
+        self.assertEqual(self.client.post("/api/v1/demo", json={}).status_code, 401)
+        self.assertEqual(self.client.delete("/api/v1/session", headers={"X-Swarm": "1"}).status_code, 200)
+
+    def test_refuse_bad_words(self) -> None:
+        """Neither, both, or a wrong one: each is refused in words, and the proof stands in no answer and no audit."""
+        for body, status in (
+            ({}, 400),
+            ({"code": "quiet-otter", "password": "correct horse"}, 400),
+            ({"code": "s3cr3t-guess"}, 401),
+            ({"password": "s3cr3t-guess"}, 401),
+            ({"code": 7}, 400),
+            ({"code": "x" * 301}, 400),
+        ):
+            answer = self.client.post("/api/v1/session", json=body)
+            self.assertEqual(answer.status_code, status, body)
+            self.assertNotIn("s3cr3t", answer.get_data(as_text=True))
+        self.assertNotIn("s3cr3t", str(self.audit.newest(100)))
+        self.assertIn("401", str(self.audit.newest(100)))
+
+    def test_answer_each_visitor_for_itself(self) -> None:
+        """Two who sign in under the same idempotency key get two sessions: nobody is told what another was."""
+        key = {"Idempotency-Key": "1"}
+        first = self.client.post("/api/v1/session", json={"code": "quiet-otter"}, headers=key)
+        second = self.client.post("/api/v1/session", json={"code": "a wrong one"}, headers=key)
+        self.assertEqual((first.status_code, second.status_code), (200, 401))
+
+    def test_invite(self) -> None:
+        """An operator's invitation signs a viewer in, who can invite nobody; it ends when it should."""
+        bearer = self.bearer(self.signed(code="quiet-otter")["token"])
+        body = {"role": "viewer", "name": "Ada", "seconds": 60}
+        invited = self.client.post("/api/v1/invitations", json=body, headers=bearer).get_json()
+        self.assertEqual((invited["role"], invited["until"]), ("viewer", 1060.0))
+        told = self.signed(code=invited["token"])
+        viewer = self.bearer(told["token"])
+        self.assertEqual(
+            self.client.get("/api/v1/session", headers=viewer).get_json(), {"name": "Ada", "role": "viewer"}
+        )
+        self.assertEqual(self.client.post("/api/v1/invitations", json=body, headers=viewer).status_code, 403)
+        for wrong in ({"role": "phone"}, {"role": "viewer", "seconds": 0}, {}):
+            self.assertEqual(self.client.post("/api/v1/invitations", json=wrong, headers=bearer).status_code, 400)

@@ -1,0 +1,121 @@
+"""What ``webnode.team`` promises: what devices say to an order, in a small team in memory."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from twisted.internet.defer import Deferred
+from twisted.trial.unittest import SynchronousTestCase
+
+from swarmnode.rehearsal import VirtualTeam
+from webnode.errors import Refusal
+from webnode.team import PATIENCE, PLACING
+
+
+class TeamDeskTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.team = VirtualTeam(3, dogs=("dog1", "dog2"))
+        self.addCleanup(self.team.stop)
+        self.desk = self.team.desk
+
+    def uuid(self, name: str) -> str:
+        """The uuid of a device."""
+        return str(self.team.services[name].assembly.node.uuid)
+
+    def refusal(self, asked: Deferred[Any], seconds: float = PATIENCE + 0.2) -> Refusal:
+        """Why an order was not carried out."""
+        self.team.clock.advance(seconds)
+        refusal = self.failureResultOf(asked, Refusal).value
+        assert isinstance(refusal, Refusal)
+        return refusal
+
+    def test_say_who_has_a_message(self) -> None:
+        """A message to all is answered with who has it, and by name with why another has not."""
+        told = self.desk.message("", "sit")
+        self.team.clock.advance(0.1)
+        self.assertEqual(self.successResultOf(told), {"delivered": ["dog1", "dog2", "vaio"], "failed": {}})
+        self.team.silence("dog2")
+        told = self.desk.message("", "stay")
+        self.team.clock.advance(PATIENCE + 0.2)
+        answer = self.successResultOf(told)
+        self.assertEqual(answer["delivered"], ["dog1", "vaio"])
+        self.assertEqual(list(answer["failed"]), ["dog2"])
+
+    def test_device_that_vanishes_is_told(self) -> None:
+        """A device that dies while it is asked is reported so, before the visitor's own patience ends."""
+        orders: list[tuple[Any, Any]] = [(self.desk.message, "sit"), (self.desk.disconnect, 5.0)]
+        for order, what in orders:
+            uuid = self.uuid("dog2")
+            self.team.kill("dog2")
+            refusal = self.refusal(order(uuid, what))
+            self.assertEqual((refusal.field, refusal.status), ("device", 409))
+            self.assertEqual(refusal.problem, "dog2 left while it was asked")
+            self.team.add("dog2")
+            self.team.clock.advance(1.0)
+
+    def test_device_that_is_silent_is_told(self) -> None:
+        """A device that others still hear and that does not answer is reported with 504."""
+        presence = self.team.services["dog2"].assembly.node
+        presence.entangled.endpoint.expose("device.message", lambda peer, text: Deferred(), changes=True)
+        refusal = self.refusal(self.desk.message(self.uuid("dog2"), "sit"))
+        self.assertEqual((refusal.status, refusal.problem), (504, "dog2 did not answer"))
+
+    def test_device_that_says_no_is_told(self) -> None:
+        """What a device refuses is passed on in its own words; who is unknown is no device."""
+        refusal = self.refusal(self.desk.message(self.uuid("dog2"), "x" * 300))
+        self.assertEqual(refusal.status, 409)
+        self.assertIn("dog2 says no: a message is a text of 1 to 200 characters", refusal.problem)
+        self.assertIn("is not here", self.refusal(self.desk.disconnect("ab" * 16, 5.0)).problem)
+
+    def test_disconnect_is_answered_before_it_leaves(self) -> None:
+        """A device says that it leaves, and then does."""
+        gone = self.desk.disconnect(self.uuid("dog2"), 5.0)
+        self.team.clock.advance(0.03)
+        self.assertEqual(self.successResultOf(gone), "leaving")
+        self.team.state()
+        self.team.clock.advance(2.0)
+        self.assertEqual([row["status"] for row in self.team.state()["devices"] if row["name"] == "dog2"], ["GONE"])
+
+    def test_preview(self) -> None:
+        """Who can take a task and who not is told with why, and that nobody knows who would; nothing is assigned."""
+        preview = self.desk.preview("find-red-target")
+        self.assertEqual([(row["name"], row["busy"]) for row in preview["able"]], [("dog1", ""), ("dog2", "")])
+        self.assertIn("vaio", preview["refused"])
+        self.assertIsNone(preview["likely"])
+        self.assertEqual(self.team.state()["tasks"], [])
+        self.assertEqual(self.assertRaises(Refusal, self.desk.preview, "fly").status, 404)
+
+    def test_preview_by_what_is_reported(self) -> None:
+        """While the same task is under way, its reports say who is busy with it and who is the nearest."""
+        self.team.run_demo()
+        for _ in range(60):
+            self.team.clock.advance(0.5)
+            preview = self.desk.preview("find-red-target")
+            if preview["likely"]:
+                break
+        (group,) = self.team.state()["groups"]
+        costs = {row["name"]: row["cost"] for row in group["members"] if row["cost"] is not None}
+        self.assertEqual(preview["likely"], min(costs, key=lambda name: costs[name]))
+        title = self.team.state()["tasks"][0]["title"]
+        self.assertEqual({row["busy"] for row in preview["able"]}, {title})
+        self.assertIsNone(self.desk.preview("turn-around")["likely"])
+
+    def test_target_comes_without_the_node_that_ordered_it(self) -> None:
+        """The web node that ran the demonstration dies before the target is placed: the yard places it all the same."""
+        self.team.run_demo()
+        self.team.clock.advance(1.0)
+        self.assertIsNone(self.team.truth()["target"])
+        self.team.kill("vaio")
+        self.team.clock.advance(PLACING)
+        self.assertIsNotNone(self.team.truth()["target"])
+
+    def test_lift_a_robot(self) -> None:
+        """A robot is set down where it is wanted; a place that is taken is refused in the yard's words."""
+        moved = self.desk.move_robot("dog1", 1.0, 1.0, 0.5)
+        self.team.clock.advance(0.1)
+        self.assertIsNone(moved.addCallback(lambda _: None).result)
+        dog = self.team.truth()["dogs"][0]
+        self.assertLess(abs(dog["x"] - 1.0) + abs(dog["y"] - 1.0), 0.05)
+        refusal = self.refusal(self.desk.move_robot("dog2", 1.0, 1.0, 0.5), 0.1)
+        self.assertEqual((refusal.field, refusal.status), ("dog2", 409))
+        self.assertIn("dog1 stands at", refusal.problem)

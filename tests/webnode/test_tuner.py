@@ -1,0 +1,134 @@
+"""What ``webnode.tuner`` and ``middleware.tuning`` promise: settings of running devices, in a small team in memory."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import replace
+from typing import Any
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from swarmnode.assembly import assembled
+from swarmnode.rehearsal import VirtualTeam
+from webnode.errors import Refusal
+from webnode.tuner import TeamTuning
+
+KEYS = ["description", "presence_lease", "capabilities", "camera_fps"]
+
+
+class TunerTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.team = VirtualTeam(4, dogs=("dog1", "dog2"))
+        self.addCleanup(self.team.stop)
+        self.tuning = TeamTuning(self.team.desk)
+        self.node = self.team.services["dog1"].assembly.node
+
+    def told(self, name: str = "dog1") -> dict[str, Any]:
+        """The settings of a device, as it tells."""
+        asked = self.tuning.settings(self.team.services[name].assembly.node.uuid)
+        self.team.clock.advance(0.1)
+        return {knob.key: knob.value for knob in self.successResultOf(asked)}
+
+    def change(self, **changes: Any) -> dict[str, Any]:
+        """Change settings of dog1; what it tells then."""
+        asked = self.tuning.change(self.node.uuid, changes)
+        self.team.clock.advance(0.1)
+        return {knob.key: knob.value for knob in self.successResultOf(asked)}
+
+    def refusal(self, **changes: Any) -> Refusal:
+        """Why dog1 does not change them."""
+        asked = self.tuning.change(self.node.uuid, changes)
+        self.team.clock.advance(0.1)
+        refusal = self.failureResultOf(asked, Refusal).value
+        assert isinstance(refusal, Refusal)
+        return refusal
+
+    def row(self) -> dict[str, Any]:
+        """dog1 as the page shows it."""
+        return next(dict(row) for row in self.team.state()["devices"] if row["name"] == "dog1")
+
+    def test_tell_what_can_be_changed(self) -> None:
+        """A robot with a camera has four settings, a laptop three; each with its bounds and its unit."""
+        self.assertEqual(list(self.told()), KEYS)
+        self.assertEqual(list(self.told("vaio")), KEYS[:3])
+        asked = self.tuning.settings(self.node.uuid)
+        self.team.clock.advance(0.1)
+        lease = self.successResultOf(asked)[1]
+        self.assertEqual((lease.value, lease.unit, lease.least, lease.most), (1.0, "s", 0.1, 60.0))
+
+    def test_change_what_others_see(self) -> None:
+        """A description and a capability that are changed are what the whole team sees of the device."""
+        told = self.change(description="lame", capabilities={"gripper": {"width": 0.1}})
+        self.assertEqual((told["description"], told["capabilities"]), ("lame", {"gripper": {"width": 0.1}}))
+        self.team.clock.advance(1.0)
+        row = self.row()
+        self.assertEqual((row["description"], row["capabilities"]["gripper"]), ("lame", {"width": 0.1}))
+        self.assertIn("camera", row["capabilities"])
+        self.change(capabilities={})
+        self.team.clock.advance(1.0)
+        self.assertNotIn("gripper", self.row()["capabilities"])
+
+    def test_lease_says_how_soon_a_loss_is_seen(self) -> None:
+        """With a lease of 4 s a dead device is believed in for 3 to 5 s; with a short one it is gone in one."""
+        for lease, earliest, latest in ((4.0, 2.6, 5.0), (0.4, 0.2, 1.0)):
+            self.change(presence_lease=lease)
+            self.team.clock.advance(6.0)
+            self.assertEqual(self.row()["status"], "IDLE")
+            self.team.kill("dog1")
+            seconds = 0.0
+            while self.row()["status"] != "GONE" and seconds < 10.0:
+                self.team.clock.advance(0.1)
+                seconds += 0.1
+            self.assertTrue(earliest < seconds < latest, seconds)
+            self.team.add("dog1")
+            self.team.clock.advance(1.0)
+            self.node = self.team.services["dog1"].assembly.node
+
+    def test_camera_takes_as_many_pictures(self) -> None:
+        """A camera that is set to 2 a second takes so many, and none at 0; the robot goes on all the same."""
+        driver: Any = self.team.services["dog1"].assembly.driver
+        for fps in (2.0, 0.0, 10.0):
+            self.assertEqual(self.change(camera_fps=fps)["camera_fps"], fps)
+            self.team.clock.advance(0.5)
+            before = driver.diagnostics()["pictures"]
+            self.team.clock.advance(5.0)
+            self.assertAlmostEqual(driver.diagnostics()["pictures"] - before, 5.0 * fps, delta=1.5)
+            self.assertEqual(driver.state, "ready")
+
+    def test_refuse_what_is_wrong(self) -> None:
+        """Each wrong value is refused by the device, with the key, the problem and the remedy; nothing is changed."""
+        before = self.told()
+        wrong: list[tuple[str, Any]] = [
+            ("presence_lease", 0.01),
+            ("presence_lease", float("nan")),
+            ("camera_fps", 31.0),
+            ("camera_fps", True),
+            ("description", "two\nlines"),
+            ("description", "x" * 201),
+            ("capabilities", {"arm": 3}),
+            ("capabilities", {f"arm{n}": {"length": 1.0} for n in range(80)}),
+            ("team_key", "stolen"),
+        ]
+        for key, value in wrong:
+            refusal = self.refusal(**{"description": "never", key: value})
+            self.assertEqual((refusal.field, refusal.status), (key, 400))
+            self.assertTrue(refusal.problem and refusal.remedy)
+        self.assertEqual(self.told(), before)
+
+    def test_device_that_is_gone_is_told(self) -> None:
+        """The settings of a device that has just died are refused as those of one that left."""
+        self.team.kill("dog1")
+        asked = self.tuning.settings(self.node.uuid)
+        self.team.clock.advance(2.0)
+        self.assertEqual(self.failureResultOf(asked, Refusal).value.status, 409)
+
+    def test_kept_for_the_next_life(self) -> None:
+        """What was changed holds when the device comes back from its store, and a rotten note does no harm."""
+        self.change(description="lame", presence_lease=2.5)
+        service = self.team.services["dog1"]
+        seams = replace(service._seams, rng=random.Random(1))
+        again = assembled(service.settings, seams).node
+        self.assertEqual((again.presence.device.description, again.entangled.lease), ("lame", 2.5))
+        for note in (b"\xc1", b"\x01", b"\x81\xaedescription\x05", b"\x81\xb0presence_lease!!\x05"):
+            seams.store.note("tuning", note)
+            self.assertEqual(assembled(service.settings, seams).node.presence.device.description, "")

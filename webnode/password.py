@@ -1,0 +1,53 @@
+"""Password: the hash of one, made and checked.
+
+scrypt with N = 2^14, r = 8, p = 5 takes 16 MiB, which a small device has, and is one of the choices of the OWASP
+Password Storage Cheat Sheet, beside N = 2^17, p = 1 with 128 MiB.  It takes some tenths of a second, so it never runs
+on the reactor's thread.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import hmac
+
+LOG_N, R, P = 14, 8, 5
+MEMORY = 64 * 1024 * 1024
+SALT, SIZE = 16, 32
+LEAST, MOST = 8, 200
+"""Characters of a password."""
+
+
+def hashed(password: str, salt: bytes, log_n: int = LOG_N) -> str:
+    """The text to put into the settings; ``salt`` are 16 random bytes."""
+    digest = _scrypt(password, salt, log_n, R, P)
+    return "$".join(("scrypt", str(log_n), str(R), str(P), _text(salt), _text(digest)))
+
+
+def is_password(text: str, password: str) -> bool:
+    """Whether ``text`` is the hash of ``password``; raises ``ValueError`` where it is no hash."""
+    log_n, r, p, salt, digest = read(text)
+    return hmac.compare_digest(_scrypt(password, salt, log_n, r, p), digest)
+
+
+def read(text: str) -> tuple[int, int, int, bytes, bytes]:
+    """The parts of a hash; raises ``ValueError`` where it is none, or one that takes too much memory."""
+    kind, *figures, salt, digest = text.split("$")
+    if kind != "scrypt" or len(figures) != 3:
+        raise ValueError("it does not begin with scrypt and three numbers")
+    log_n, r, p = (int(figure) for figure in figures)
+    if not (1 <= log_n <= 20 and 1 <= r <= 32 and 1 <= p <= 16 and 128 * r * 2**log_n <= MEMORY // 2):
+        raise ValueError("its numbers are out of range")
+    return log_n, r, p, _bytes(salt), _bytes(digest)
+
+
+def _scrypt(password: str, salt: bytes, log_n: int, r: int, p: int) -> bytes:
+    return hashlib.scrypt(password.encode(), salt=salt, n=2**log_n, r=r, p=p, maxmem=MEMORY, dklen=SIZE)
+
+
+def _text(data: bytes) -> str:
+    return base64.urlsafe_b64encode(data).decode().rstrip("=")
+
+
+def _bytes(text: str) -> bytes:
+    return base64.b64decode(text.encode("ascii") + b"=" * (-len(text) % 4), b"-_", validate=True)

@@ -1,0 +1,43 @@
+// The door: asks for the code, or the password, until one is right; fetched by who is not let in yet.
+import { element, words } from "./element.js";
+
+// Resolves when `signIn` takes what was typed; `trouble` is shown at first.
+export function asked(trouble, signIn) {
+  return new Promise((done) => {
+    const line = element("p", { role: "alert" }, trouble);
+    const field = element("input", { id: "signin-code", type: "password", autocomplete: "current-password", maxlength: 300, required: "" });
+    const show = element("button", { type: "button", "aria-pressed": "false" }, "Show");
+    const enterButton = element("button", { class: "primary" }, "Sign in");
+    const form = element("form", {},
+      element("h2", { id: "h-signin" }, "Sign in"),
+      element("p", { class: "hint" }, "The code stands where the node was started; there, the command swarm web tells it, too."),
+      element("label", { for: "signin-code" }, "Code or password"),
+      element("div", { class: "row" }, field, show), line, enterButton);
+    const dialog = element("dialog", { id: "signin", "aria-labelledby": "h-signin", closedby: "none" }, form);
+    show.onclick = () => {
+      const hidden = field.type === "password";
+      field.type = hidden ? "text" : "password";
+      words(show, hidden ? "Hide" : "Show");
+      show.setAttribute("aria-pressed", String(hidden));
+    };
+    // Nothing is behind it that could be used.
+    dialog.oncancel = (event) => event.preventDefault();
+    dialog.onclose = () => { if (dialog.isConnected) dialog.showModal(); };
+    form.onsubmit = async (event) => {
+      event.preventDefault();
+      enterButton.disabled = true;
+      words(line, "");
+      try {
+        await signIn(field.value);
+        dialog.remove();
+        done();
+      } catch (error) {
+        words(line, error.message);
+        field.select();
+      }
+      enterButton.disabled = false;
+    };
+    document.body.append(dialog);
+    dialog.showModal();
+  });
+}

@@ -1,0 +1,86 @@
+// Signing in and out: by the code that the node printed, which a link may carry, or by the password.
+import { element, words } from "./element.js";
+import { ask, get } from "./link.js";
+import { panel } from "./panel.js";
+import { forget, keep, token } from "./session.js";
+
+const PAUSE = 3000;
+let checking = false;
+let told = () => {};
+
+// The code of a link is used once and taken out of the address, so that it is in no bookmark and no screenshot.
+function codeOfLink() {
+  const code = /^#code=(.+)$/.exec(location.hash)?.[1];
+  if (code) history.replaceState(null, "", location.pathname + location.search);
+  return code ? decodeURIComponent(code) : "";
+}
+
+async function signIn(code) {
+  keep(await ask("POST", "session", { code }));
+}
+
+// Resolves when the visitor is let in, as often as it has to; `onMe` gets { name, role } each time.
+export async function enter(onMe) {
+  told = onMe;
+  const code = codeOfLink();
+  let trouble = "";
+  if (code) await signIn(code).catch((error) => { trouble = error.message; });
+  await check(trouble);
+}
+
+async function check(trouble = "") {
+  checking = true;
+  let me = await get("session").catch(() => null);
+  while (!me || me.role === "anyone") {
+    if (me) {
+      if (token()) forget();
+      const { asked } = await import("./door.js");
+      await asked(trouble, signIn);
+    } else await new Promise((done) => setTimeout(done, 1000));
+    trouble = "";
+    me = await get("session").catch(() => null);
+  }
+  checking = false;
+  told(me);
+}
+
+async function invite(line) {
+  const { token: code } = await ask("POST", "invitations", { role: "viewer" });
+  line.hidden = false;
+  line.value = `${location.origin}/#code=${code}`;
+  line.select();
+}
+
+panel({
+  place: "more",
+  order: 90,
+  title: "Session",
+  needs: { role: "viewer" },
+  make(root) {
+    const who = element("p", { class: "hint" });
+    const out = element("button", {}, "Sign out");
+    const more = element("button", { class: "operators" }, "Invite a viewer");
+    const address = element("input", { readonly: "", hidden: "", "aria-label": "Link for a viewer, good for a day" });
+    const trouble = element("p", { role: "status" });
+    out.onclick = async () => {
+      await ask("DELETE", "session").catch(() => null);
+      forget();
+      location.reload();
+    };
+    more.onclick = () => invite(address).then(() => words(trouble, "Whoever has this link may look for a day."), (error) => words(trouble, error.message));
+    let link = "wait";
+    // A stream that ends may have ended because the session did.
+    const timer = setInterval(() => { if (link === "lost" && !checking) check(); }, PAUSE);
+    root.className = "session";
+    root.append(who, element("div", { class: "row" }, more, out), address, trouble);
+    return {
+      update(model) {
+        link = model.link;
+        const { name, role } = model.me;
+        words(who, `Signed in as ${name && name !== role ? `${name}, ${role}` : role}.`);
+        out.hidden = !token();
+      },
+      close: () => clearInterval(timer),
+    };
+  },
+});
