@@ -252,6 +252,24 @@ class Survey(Protocol):
         """What a device stores."""
 
 
+class MemorySurvey:
+    """Answers that it was made with: of the network, and of each device by uuid."""
+
+    def __init__(self, network: Json, inventories: Mapping[str, Json]) -> None:
+        self._network = network
+        self._inventories = inventories
+
+    def network(self) -> Deferred[Json]:
+        """Return it."""
+        return succeed(self._network)
+
+    def inventory(self, uuid: str) -> Deferred[Json]:
+        """Return it, or fail with 504: the device did not answer."""
+        if uuid not in self._inventories:
+            return fail(Refusal("device", "it did not answer", "wait a moment, then try again", 504))
+        return succeed(self._inventories[uuid])
+
+
 @dataclass(frozen=True)
 class Knob:
     """A setting of a device that can be changed while it runs."""

@@ -25,8 +25,9 @@ from twisted.internet.stdio import StandardIO
 from twisted.internet.threads import deferToThread
 from twisted.protocols.basic import LineReceiver
 
-from webnode.board import Board, Knob, MemoryFallbacks, MemoryHalts, MemoryTuning, Page
+from webnode.board import Board, Knob, MemoryAudit, MemoryFallbacks, MemoryHalts, MemorySurvey, MemoryTuning, Page
 from webnode.camera import OnFrame
+from webnode.chronicle import TeamChronicle
 from webnode.desk import MemoryDesk
 from webnode.limits import AddressLimits
 from webnode.password import hashed, is_password
@@ -278,12 +279,46 @@ def board(team: Team) -> Board:
     desk.previews["search"] = {"able": able, "refused": {"dog3": ["no gripper", "no lift"]}, "likely": None}
     sessions = SignedSessions(b"a team of the tests", "quiet-otter", PASSWORD, random.Random(), checked)
     tuning = MemoryTuning({able[0]["uuid"]: KNOBS})
-    return Board(desk, sessions, limits=AddressLimits(), halts=team.halts, tuning=tuning)
+    survey = MemorySurvey(network(), {f"0{n}" * 16: inventory() for n in (1, 2)})
+    parts: dict[str, Any] = {"halts": team.halts, "tuning": tuning, "survey": survey, "chronicle": TeamChronicle()}
+    return Board(desk, sessions, MemoryAudit(time.time), limits=AddressLimits(), **parts)
 
 
 def checked(text: str, password: str) -> Deferred[Any]:
     """Whether it is the password, worked out on a thread."""
     return deferToThread(is_password, text, password)
+
+
+def network() -> Any:
+    """Two that know each other and a third, which does not answer."""
+    uuids = {n: f"0{n}" * 16 for n in (1, 2, 3)}
+
+    def view(others: tuple[int, ...], lookups: list[Any]) -> dict[str, Any]:
+        contacts = [{"uuid": uuids[n], "name": f"dog{n}", "rtt_ms": 1.8 * n, "heard_s": 0.2} for n in others]
+        return {
+            "contacts": contacts,
+            "known": len(others),
+            "sent": 1204,
+            "received": 1187,
+            "lost": 2,
+            "lookups": lookups,
+        }
+
+    lookup = {"key": "3fa2" * 10, "asked": 5, "hops": 2, "found": 8, "ms": 12.4}
+    return {"devices": {uuids[1]: view((2, 3), [lookup]), uuids[2]: view((1,), [])}, "silent": [uuids[3]]}
+
+
+def inventory() -> Any:
+    """A handful of records."""
+    newest = [["devices", "dog1", 540, "leased"], ["tasks", "t1", 310, "team"]]
+    return {
+        "records": 9,
+        "deleted": 1,
+        "bytes": 4120,
+        "most_bytes": 2**23,
+        "kinds": {"devices": 4, "tasks": 2},
+        "newest": newest,
+    }
 
 
 def main() -> None:

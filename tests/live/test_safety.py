@@ -7,7 +7,7 @@ import json
 import re
 import socket
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from email.message import Message
 from importlib.util import find_spec
 from typing import Any, get_args
@@ -178,12 +178,17 @@ class SafetyTests(SynchronousTestCase):
             self.assertTrue(headers["Content-Type"].startswith("application/json"), name)
             self.assertEqual(set(json.loads(body)["error"]), {"field", "problem", "remedy"}, name)
             self.assertNotIn(b"Traceback", body, name)
-            # The best of some: other programs share the machine.
-            took = []
-            for _ in range(5):
-                began = time.perf_counter()
-                ask()
-                took.append(time.perf_counter() - began)
-            if min(took) > REFUSED_S:
-                slow.append((name, min(took)))
+            took = self.best(ask)
+            # Where other programs keep the machine busy, a lawful question takes long, too.
+            if took > REFUSED_S and took > 3 * self.best(lambda: self.asked("GET", "/api/v1/tasks", None, **signed)):
+                slow.append((name, took))
         self.assertEqual(slow, [])
+
+    def best(self, ask: Callable[[], object]) -> float:
+        """Seconds that it takes, the best of five."""
+        took = []
+        for _ in range(5):
+            began = time.perf_counter()
+            ask()
+            took.append(time.perf_counter() - began)
+        return min(took)

@@ -1,6 +1,5 @@
 // The audit: who changed what through this node, for operators; fetched when it is opened and not before.
 import { element, keyed, words } from "./element.js";
-import { panel } from "./panel.js";
 
 const SHOWN = 50;
 
@@ -18,28 +17,22 @@ function tell(item, line) {
   words(how, `${line.outcome}, from ${line.from}${line.repeated ? `, and ${line.repeated} times more before` : ""}`);
 }
 
-panel({
-  place: "more",
-  order: 95,
-  title: "Audit",
-  needs: { role: "operator" },
-  make(root, { get }) {
-    const list = element("ol", { class: "audit" });
-    const line = element("p", { role: "status" });
-    const again = element("button", { type: "button" }, "Look again");
-    const box = element("details", {}, element("summary", {}, "Who changed what"), line, list, again);
-    async function look() {
-      try {
-        const lines = await get(`audit?count=${SHOWN}`);
-        keyed(list, lines, (each) => `${each.at} ${each.session} ${each.route} ${each.target}`, row, tell);
-        words(line, lines.length ? "" : "Nobody has changed anything so far.");
-      } catch (error) {
-        words(line, error.message);
-      }
+export function make(root, { get }) {
+  const list = element("ol", { class: "audit" });
+  const line = element("p", { role: "status" });
+  const again = element("button", { type: "button" }, "Look again");
+  const box = element("details", {}, element("summary", {}, "Who changed what"), line, list, again);
+  async function look() {
+    try {
+      const lines = await get(`audit?count=${SHOWN}`);
+      keyed(list, lines, (each) => `${each.at} ${each.session} ${each.route} ${each.target}`, row, tell);
+      words(line, lines.length ? "" : "Nobody has changed anything so far.");
+    } catch (error) {
+      words(line, error.message);
     }
-    box.ontoggle = () => { if (box.open) look(); };
-    again.onclick = look;
-    root.append(box);
-    return {};
-  },
-});
+  }
+  box.ontoggle = () => { if (box.open) look(); };
+  again.onclick = look;
+  root.append(box);
+  return {};
+}

@@ -59,6 +59,9 @@ const TAKERS = {
   beat({ now }) {
     model.now = now;
   },
+  has(names) {
+    model.has = [...names, ...(model.yard && !names.includes("yard") ? ["yard"] : [])];
+  },
   session(me) {
     model.me = me;
     document.body.dataset.role = me.role;

@@ -6,6 +6,7 @@ import { panel } from "./panel.js";
 
 const ENDED = ["COMPLETED", "FAILED", "CANCELLED"];
 const SHOWN = 8;
+const histories = new Map();
 
 function showTasks(tasks) {
   at("no-tasks").hidden = tasks.length > 0;
@@ -14,7 +15,7 @@ function showTasks(tasks) {
     state(item.querySelector(".badge"), task.status);
     const result = task.result ? `Done by ${task.result.by} in ${task.result.took.toFixed(1)} s. ` : "";
     words(item.querySelector(".note"), result + task.note);
-    why(item.querySelector("details"), task.why);
+    why(item.querySelector(".why"), task.why);
     const [button, rest] = item.querySelectorAll("button");
     button.hidden = rest.hidden = ENDED.includes(task.status);
     button.setAttribute("aria-label", `Cancel ${task.title}`);
@@ -32,7 +33,19 @@ function row(task) {
     wish(`${isPaused ? "Resuming" : "Pausing"} ${task.title}`, `tasks/${encodeURIComponent(task.id)}/${isPaused ? "resume" : "pause"}`);
   });
   return element("li", {}, element("b"), badge(), element("span", { class: "note" }),
-    element("details", {}, element("summary"), element("div")), button, rest);
+    element("details", { class: "why" }, element("summary"), element("div")), history(task), button, rest);
+}
+
+// What became of a task so far, read when somebody wants to know.
+function history(task) {
+  const list = element("ol", { class: "story", tabindex: 0, "aria-label": `History of ${task.title}, the newest first` });
+  const box = element("details", { class: "history" }, element("summary", {}, "History"), list);
+  box.addEventListener("toggle", async () => {
+    const { History } = await import("./history.js");
+    if (box.open) histories.set(task.id, new History(list, task.id));
+    else histories.delete(task.id);
+  });
+  return box;
 }
 
 // Why: the newest decision in one line; opened, each with its rule and who reported what.
@@ -92,6 +105,7 @@ panel({
     return {
       update(model, event) {
         if (event === "state") showTasks([...model.tasks.values()]);
+        if (event === "event") histories.forEach((each) => each.update());
         if (event === "link" && model.link === "live") readCatalogue();
       },
     };
