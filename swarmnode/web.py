@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Callable
+import socket
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -21,17 +22,17 @@ from swarmnode.seams import Seams
 
 
 class _Page(MultiService):
-    """The page, its line to the yard where there is one, and the note that says where it is."""
+    """The page, its line to the yard where there is one, and what says where it is: to its user and to the team."""
 
-    def __init__(self, web: Service, operator: Any, invite: Callable[[], None]) -> None:
+    def __init__(self, web: Service, operator: Any, tell: Callable[[], None]) -> None:
         super().__init__()
         self._operator = operator
-        self._invite = invite
+        self._tell = tell
         web.setServiceParent(self)
 
     def startService(self) -> None:
         super().startService()
-        self._invite()
+        self._tell()
         if self._operator is not None:
             self._operator.connect().addErrback(lambda _: None)
 
@@ -62,7 +63,7 @@ def web_page(settings: Settings, seams: Seams, reactor: Any, node: SwarmNode) ->
         from webnode.fallback import fallbacks
         from webnode.ground import Ground
         from webnode.halting import halts
-        from webnode.ledger import state_from
+        from webnode.ledger import Glance, state_from
         from webnode.limits import limits
         from webnode.live import Events, Shots
         from webnode.mischief import faults
@@ -99,11 +100,36 @@ def web_page(settings: Settings, seams: Seams, reactor: Any, node: SwarmNode) ->
     live = partial(state_from, desk.read, Departed(), name)
     on_file = partial(state_from, partial(read_records, Path(settings.node.store)), Departed(), name)
     stored = live if settings.node.store == IN_MEMORY else on_file
-    app = create_app(lambda: stored(seams.wall()), board, caller(reactor), wall=seams.wall)
-    events = Events(lambda: live(seams.wall()), reactor, seams.wall, desk.yard)
+    app = create_app(Glance(lambda: stored(seams.wall()), reactor.seconds), board, caller(reactor), wall=seams.wall)
+    events = Events(
+        lambda: live(seams.wall()),
+        reactor,
+        seams.wall,
+        desk.yard,
+        board.fallbacks.here,
+        board.chronicle,
+        lambda: (desk.version, board.halts is not None and board.halts.is_halted()),
+    )
     shots, address = Shots(desk, reactor), settings.web
     web = WebService(
         reactor, address.host, address.port, app, events, shots, Files(), board, seams.wall, doors=doors(ground)
     )
-    invite = partial(invited, name, address.host, lambda: web.port, board.sessions.code)
-    return _Page(web, operator, invite)
+
+    def tell() -> None:
+        invited(name, address.host, lambda: web.port, board.sessions.code)
+        board.fallbacks.serves(web.urls(_names()))
+
+    return _Page(web, operator, tell)
+
+
+def _names() -> Sequence[str]:
+    """What others in the network call this machine: its address, and its name where that is announced."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as way:
+        try:
+            # Nothing is sent: the system says only from which of its addresses it would be.
+            way.connect(("192.0.2.1", 9))
+            address = str(way.getsockname()[0])
+        except OSError:
+            address = ""
+    name = socket.gethostname().split(".")[0]
+    return (address, f"{name}.local" if name not in ("", "localhost") else "", "" if address else "127.0.0.1")

@@ -10,6 +10,7 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from agents import engagement, loop
 from drivers.registry import describe
+from middleware import halt
 from middleware.commitment import ballot, lessee
 from middleware.consensus import guard, strategy, worker
 from middleware.deployment import manifest, module
@@ -19,7 +20,7 @@ from middleware.entangled.kademlia import membership, roster
 from middleware.entangled.replication import handover, pusher, replica, subscriber
 from middleware.entangled.space import shelf, template
 from middleware.settings import Settings
-from webnode import channel, limits, live
+from webnode import channel, limits, live, team
 from webnode.board import AUDITED
 from webnode.routes import orders
 
@@ -67,6 +68,9 @@ FIGURES: Sequence[tuple[str, str]] = (
     ("safety", f"the newest {AUDITED} in memory"),
     ("tuplespace", f"1 to {template.MAX_FIELDS} fields"),
     ("tuplespace", f"asked every {shelf.POLL:g} s whether"),
+    ("actions", f"after {team.PATIENCE:g} s at the latest"),
+    ("actions", f"place the target, {team.PLACING:g} s later"),
+    ("protocol", f"is on: bool, by: at most {halt.MAX_NAME} characters"),
     ("web", f"`text`, 1 to {orders.MAX_MESSAGE} characters"),
     ("web", f"`seconds`, {orders.MIN_AWAY_S:g} to {orders.MAX_AWAY_S:g}, default {orders.AWAY_S:g}"),
     ("web", f"At most {live.MAX_VIEWERS} streams"),

@@ -9,7 +9,7 @@ any.
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Protocol
 
@@ -184,6 +184,9 @@ class Fallbacks(Protocol):
     def here(self) -> list[Page]:
         """Where the page is served now."""
 
+    def serves(self, urls: Iterable[str]) -> None:
+        """Tell the team that this node serves the page at ``urls``, too."""
+
     def lets_in(self, origin: str) -> bool:
         """Whether a page that came from ``origin`` may ask here: it is, or was a short while ago, one of the team's."""
 
@@ -197,6 +200,10 @@ class MemoryFallbacks:
     def here(self) -> list[Page]:
         """Return them."""
         return self.pages
+
+    def serves(self, urls: Iterable[str]) -> None:
+        """Add them as pages of ``here``."""
+        self.pages += [Page("here", url, url.startswith("https:"), True) for url in urls]
 
     def lets_in(self, origin: str) -> bool:
         """Whether one of them is served there."""
@@ -243,6 +250,24 @@ class Survey(Protocol):
 
     def inventory(self, uuid: str) -> Deferred[Json]:
         """What a device stores."""
+
+
+class MemorySurvey:
+    """Answers that it was made with: of the network, and of each device by uuid."""
+
+    def __init__(self, network: Json, inventories: Mapping[str, Json]) -> None:
+        self._network = network
+        self._inventories = inventories
+
+    def network(self) -> Deferred[Json]:
+        """Return it."""
+        return succeed(self._network)
+
+    def inventory(self, uuid: str) -> Deferred[Json]:
+        """Return it, or fail with 504: the device did not answer."""
+        if uuid not in self._inventories:
+            return fail(Refusal("device", "it did not answer", "wait a moment, then try again", 504))
+        return succeed(self._inventories[uuid])
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,25 @@ from webnode.state import Departed, State, state_of
 
 Read = Callable[[bytes], list[Record]]
 TASKS_SHOWN = 20
+FRESH_S = 0.1
+"""A state as old as this will do: nobody can tell, and a hundred who ask at once are answered by ten."""
+
+
+class Glance:
+    """The newest state for whoever asks, on any thread, read at most each ``FRESH_S``."""
+
+    def __init__(self, read: Callable[[], State], clock: Callable[[], float]) -> None:
+        self._read = read
+        self._clock = clock
+        self._seen: tuple[float, State] = (-FRESH_S, {})
+
+    def __call__(self) -> State:
+        """Return it; it is shared, and nobody writes in it."""
+        now, (at, state) = self._clock(), self._seen
+        if not state or now - at >= FRESH_S:
+            state = self._read()
+            self._seen = (now, state)
+        return state
 
 
 def state_from(read: Read, departed: Departed, node: str, now: float) -> State:

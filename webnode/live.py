@@ -1,13 +1,15 @@
 """The live side: native resources beside Flask, for the state (server-sent events) and the cameras (long polls).
 
-A stream that goes through a WSGI worker holds it for good, so none does.  A client that reads slowly is skipped and
-counted, never queued for: what it gets next is the newest.
+A stream that goes through a WSGI worker holds it for good, so none does.  A client that reads slowly is put off and
+counted, never queued for: what it gets next is what it missed, or the newest where that is too much.
 """
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Mapping
+import socket
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict
+from functools import partial
 from typing import Any
 
 from twisted.internet.interfaces import IDelayedCall, IPushProducer, IReactorTime
@@ -17,23 +19,37 @@ from twisted.web.resource import Resource
 from twisted.web.server import NOT_DONE_YET
 from zope.interface import implementer
 
+from webnode.board import Chronicle, MemoryChronicle, Page
 from webnode.camera import Camera, FrameSource
 from webnode.errors import Refusal
+from webnode.journal import Journal, dumped
 from webnode.resource import JsonResource, answer
 from webnode.state import State
 
-BEAT_S = 0.5
+BEAT_S = 0.2
 PACE_S = 0.1
+IDLE_S = 1.0
+"""How often the state is looked at when nobody does: for the chronicle, and because the departed are forgotten."""
 MAX_VIEWERS = 256
-MAX_WAITING = 64
+MAX_WAITING = 256
+ENTRIES = 100
+"""Of the chronicle, for a page that is opened."""
+SENT_AHEAD, SYSTEM_AHEAD = 4096, 16384
+"""Bytes that may wait for a slow client here, and in the system: seconds of a slow line would be the past."""
 
 
 @implementer(IPushProducer)
 class Viewer:
-    """One open event stream; the transport pauses it while its client does not keep up."""
+    """One open event stream; the transport pauses it while its client does not keep up.
 
-    def __init__(self, request: Request) -> None:
+    ``heard`` is the number of the last change that it was told, ``entry`` that of the chronicle.
+    """
+
+    def __init__(self, request: Request, is_whole: bool = False, heard: int = 0) -> None:
         self.request = request
+        self.is_whole = is_whole
+        self.heard = heard
+        self.entry = 0
         self.paused = False
         self.skipped = 0
         self.seen: dict[str, str] = {}
@@ -50,23 +66,25 @@ class Viewer:
         """Stop writing for good."""
         self.paused = True
 
-    def offer(self, event: str, words: str) -> None:
-        """Write an event if it is news to this viewer, or count that it was skipped."""
-        if self.seen.get(event) == words:
-            return
-        if self.paused:
-            self.skipped += 1
-            return
-        self.seen[event] = words
-        self.request.write(f"event: {event}\ndata: {words}\n\n".encode())
+    def narrow(self) -> None:
+        """Let little wait between this node and a slow client."""
+        transport: Any = getattr(self.request.channel, "transport", None)
+        handle = transport.getHandle() if hasattr(transport, "getHandle") else None
+        if isinstance(handle, socket.socket):
+            transport.bufferSize = SENT_AHEAD
+            handle.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SYSTEM_AHEAD)
 
 
 class Events(JsonResource):
-    """``/events``: the full state, then each change, at most ten a second; a ``beat`` each half second.
+    """``/events?since=ID&whole=1``: the state, then each change, at most ten a second; a ``beat`` five times a second.
 
-    Events are ``state`` (``state.state_of``), ``yard`` (the overhead snapshot, or null) and ``beat`` (``now`` in unix
-    seconds, ``skipped``: how many events this slow client missed).  ``read`` and ``yard`` are asked only while somebody
-    looks.
+    Events are ``state`` (``state.state_of``, with ``resync``: whether it replaces changes that were missed), ``change``
+    (``journal.Change``), ``yard`` (the overhead snapshot, or null), ``pages`` (where the team serves the page),
+    ``event`` (entries of the chronicle) and ``beat`` (``now`` in unix seconds, ``skipped``: how often this slow client
+    was put off).  ``since``, or the header ``Last-Event-ID``, is the last id that was heard: what came after it is
+    told, where it is still kept.  With ``whole`` each change is a ``state``.
+
+    ``version`` is asked instead of reading the state again: while it is the same nothing has changed.
     """
 
     isLeaf = True
@@ -78,20 +96,36 @@ class Events(JsonResource):
         clock: IReactorTime,
         wall: Callable[[], float],
         yard: Callable[[], Mapping[str, Any] | None] = lambda: None,
+        pages: Callable[[], Iterable[Page]] = lambda: (),
+        chronicle: Chronicle | None = None,
+        version: Callable[[], object] | None = None,
     ) -> None:
         super().__init__()
-        self._sources: dict[str, Callable[[], Any]] = {"state": read, "yard": yard}
+        self._read = read
         self._clock = clock
         self._wall = wall
+        self._newest: dict[str, Callable[[], Any]] = {"yard": yard, "pages": lambda: [asdict(page) for page in pages()]}
+        self._chronicle = MemoryChronicle() if chronicle is None else chronicle
+        self._version = version
+        self._known: object = None
+        self._read_at = -IDLE_S
+        self._journal = Journal(f"{int(1000 * wall()):x}")
+        self._whole = (0, "")
         self._viewers: list[Viewer] = []
         self._turn: IDelayedCall | None = None
         self._beat_at = 0.0
         self._failing: dict[str, bool] = {}
+        self._is_open = False
 
     @property
     def viewers(self) -> int:
         """How many streams are open."""
         return len(self._viewers)
+
+    def open(self) -> None:
+        """Look at the state from now on, for the chronicle, also while nobody else does."""
+        self._is_open = True
+        self._schedule(IDLE_S)
 
     def render_GET(self, request: Request) -> int | bytes:
         """Open a stream."""
@@ -100,57 +134,120 @@ class Events(JsonResource):
         request.setHeader("Content-Type", "text/event-stream; charset=utf-8")
         request.setHeader("Cache-Control", "no-store")
         request.setHeader("X-Accel-Buffering", "no")
-        viewer = Viewer(request)
+        since = request.getHeader("last-event-id") or _argument(request, b"since")
+        viewer = Viewer(request, _argument(request, b"whole") in ("1", "true"), self._journal.number(since))
         self._viewers.append(viewer)
         request.notifyFinish().addBoth(lambda _: self._close(viewer))
+        viewer.narrow()
         request.registerProducer(viewer, True)
-        request.write(b"retry: 1000\n\n")
-        for event, words in self._news().items():
-            viewer.offer(event, words)
-        self._beat([viewer])
-        if self._turn is None:
+        self._look()
+        words = ["retry: 1000\n\n", self._missed(viewer, bool(since)), self._offered(viewer, self._news())]
+        request.write("".join([*words, self._beat(viewer)]).encode())
+        if len(self._viewers) == 1:
             self._beat_at = self._clock.seconds() + BEAT_S
-            self._turn = self._clock.callLater(PACE_S, self._tick)
+            self._schedule(PACE_S)
         return NOT_DONE_YET
 
     def close(self) -> None:
         """End every stream."""
+        self._is_open = False
         for viewer in list(self._viewers):
             viewer.request.unregisterProducer()
             viewer.request.finish()
+        self._schedule(None)
+
+    def _schedule(self, seconds: float | None) -> None:
+        if self._turn is not None and self._turn.active():
+            self._turn.cancel()
+        self._turn = None if seconds is None else self._clock.callLater(seconds, self._tick)
 
     def _tick(self) -> None:
-        self._turn = self._clock.callLater(PACE_S, self._tick)
-        for event, words in self._news().items():
-            for viewer in list(self._viewers):
-                viewer.offer(event, words)
-        if self._clock.seconds() >= self._beat_at:
+        self._schedule(PACE_S if self._viewers else IDLE_S)
+        self._look()
+        if not self._viewers:
+            return
+        news, is_beat = self._news(), self._clock.seconds() >= self._beat_at
+        if is_beat:
             self._beat_at = self._clock.seconds() + BEAT_S - PACE_S / 2
-            self._beat(list(self._viewers))
+        for viewer in list(self._viewers):
+            if viewer.paused:
+                viewer.skipped += viewer.heard < self._journal.n
+                continue
+            words = self._missed(viewer, True) + self._offered(viewer, news) + (self._beat(viewer) if is_beat else "")
+            if words:
+                viewer.request.write(words.encode())
 
-    def _beat(self, viewers: list[Viewer]) -> None:
-        for viewer in viewers:
-            viewer.offer("beat", json.dumps({"now": round(self._wall(), 3), "skipped": viewer.skipped}))
+    def _look(self) -> None:
+        """Take the state, where it may have changed."""
+        now, version = self._clock.seconds(), None if self._version is None else self._version()
+        if version is not None and version == self._known and now - self._read_at < IDLE_S:
+            return
+        self._known, self._read_at = version, now
+        with_state = self._sound("state", lambda: self._journal.take(self._read()))
+        if with_state:
+            self._chronicle.saw(self._journal.state, self._wall())
+
+    def _missed(self, viewer: Viewer, is_again: bool) -> str:
+        """What a viewer was not told of the state and of the chronicle."""
+        journal, words = self._journal, []
+        missed = None if viewer.is_whole else journal.since(viewer.heard)
+        if missed is not None:
+            words = [f"id: {journal.id(each.n)}\nevent: change\ndata: {each.words}\n\n" for each in missed]
+        elif viewer.heard < journal.n:
+            if self._whole[0] != journal.n:
+                self._whole = (journal.n, dumped(journal.state)[1:])
+            start = "true," if is_again and not viewer.is_whole else "false,"
+            words = [f'id: {journal.id(journal.n)}\nevent: state\ndata: {{"resync":{start}{self._whole[1]}\n\n']
+        viewer.heard = journal.n
+        entries = self._chronicle.since(viewer.entry)[-ENTRIES:]
+        if entries:
+            viewer.entry = entries[-1].n
+            words.append(_event("event", dumped([asdict(entry) for entry in entries])))
+        return "".join(words)
+
+    def _offered(self, viewer: Viewer, news: Mapping[str, str]) -> str:
+        """Of what only the newest counts, that which a viewer has not seen."""
+        fresh = {event: words for event, words in news.items() if viewer.seen.get(event) != words}
+        viewer.seen |= fresh
+        return "".join(_event(event, words) for event, words in fresh.items())
+
+    def _beat(self, viewer: Viewer) -> str:
+        return _event("beat", dumped({"now": round(self._wall(), 3), "skipped": viewer.skipped}))
 
     def _news(self) -> dict[str, str]:
-        news: dict[str, str] = {}
-        for event, source in self._sources.items():
-            try:
-                news[event] = json.dumps(source(), separators=(",", ":"), allow_nan=False)
-            except Exception:
-                # The sources are the front door's; a store that cannot be read for a moment must not end the streams.
-                if not self._failing.get(event):
-                    self._log.failure("the page's {event} cannot be read; the streams go on without", event=event)
-                self._failing[event] = True
-            else:
-                self._failing[event] = False
-        return news
+        told = {event: self._sound(event, partial(_written, source)) for event, source in self._newest.items()}
+        return {event: words for event, words in told.items() if words is not None}
+
+    def _sound(self, event: str, made: Callable[[], Any]) -> Any:
+        """What ``made`` makes, or None where it fails, which is logged once."""
+        try:
+            found = made()
+        except Exception:
+            # The sources are the front door's; a store that cannot be read for a moment must not end the streams.
+            if not self._failing.get(event):
+                self._log.failure("the page's {event} cannot be read; the streams go on without", event=event)
+            self._failing[event] = True
+            return None
+        self._failing[event] = False
+        return found
 
     def _close(self, viewer: Viewer) -> None:
         self._viewers.remove(viewer)
-        if not self._viewers and self._turn is not None:
-            self._turn.cancel()
-            self._turn = None
+        if not self._viewers:
+            self._schedule(IDLE_S if self._is_open else None)
+
+
+def _written(source: Callable[[], Any]) -> str:
+    return dumped(source())
+
+
+def _event(event: str, words: str) -> str:
+    return f"event: {event}\ndata: {words}\n\n"
+
+
+def _argument(request: Request, name: bytes) -> str:
+    values: list[bytes] = (request.args or {}).get(name, [b""])
+    return values[0][:40].decode("ascii", "replace")
 
 
 class Shots(JsonResource):

@@ -149,7 +149,8 @@ def _json(schema: dict[str, Any]) -> dict[str, Any]:
 
 def _name(route: Route) -> str:
     words = re.findall(r"\w+", route.path.removeprefix(API).replace("{", "").replace("}", ""))
-    return "_".join([route.method.lower(), *words])
+    # What the page reads beside the API may have the name of a route of it.
+    return "_".join([route.method.lower(), *([] if route.path.startswith(API) else ["page"]), *words])
 
 
 def _tag(route: Route) -> str:

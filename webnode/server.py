@@ -9,6 +9,7 @@ import errno
 import gzip
 import hashlib
 import mimetypes
+import re
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from queue import Empty, SimpleQueue
@@ -32,6 +33,7 @@ from webnode.board import Board, Role
 from webnode.camera import FrameSource
 from webnode.channel import CappedRequest, limited
 from webnode.errors import PortTaken, Refusal
+from webnode.fallback import urls_at
 from webnode.guard import headers, refusal, token_of
 from webnode.live import Events, Shots
 from webnode.resource import JsonResource, Refused
@@ -84,7 +86,7 @@ class _File(JsonResource):
 
     def __init__(self, path: Path) -> None:
         super().__init__()
-        content = path.read_bytes()
+        content = sent(path)
         # Packed by the same hand at every node: no time of day in it, so the tag holds everywhere.
         packed = gzip.compress(content, 9, mtime=0)
         self._forms = {"": content, "gzip": packed} if len(packed) < len(content) else {"": content}
@@ -102,6 +104,12 @@ class _File(JsonResource):
         if form:
             request.setHeader("Content-Encoding", form)
         return self._forms[form]
+
+
+def sent(path: Path) -> bytes:
+    """What is sent of a file: of a script, its comments are empty lines, so that all others keep their number."""
+    content = path.read_bytes()
+    return re.sub(rb"^ *//.*$", b"", content, flags=re.MULTILINE) if path.suffix == ".js" else content
 
 
 def _takes_gzip(accepted: str) -> bool:
@@ -257,6 +265,12 @@ class WebService(Service):
             self._wanted if self._listening is None else int(getattr(self._listening.getHost(), "port", self._wanted))
         )
 
+    def urls(self, names: Collection[str]) -> list[str]:
+        """Where others find the page; ``names`` are the machine's, for a page that is served at every address."""
+        secure = [int(getattr(door.getHost(), "port", 0)) for door in self._open]
+        doors = [url for port in secure for url in urls_at(self._host, port, names, is_secure=True)]
+        return [*urls_at(self._host, self.port, names), *doors]
+
     def startService(self) -> None:
         """Open the port, then the workers."""
         try:
@@ -269,6 +283,7 @@ class WebService(Service):
             raise PortTaken(f"the page cannot be served on {where} ({why}); {remedy}") from error
         self._open = [door(self.site) for door in self._doors]
         self._pool.start()
+        self._events.open()
         super().startService()
 
     def stopService(self) -> Deferred[None] | None:
@@ -298,5 +313,6 @@ def web_service(
 ) -> WebService:
     """The whole web node from what the front door has; ``wall`` is the unix time in seconds."""
     app = create_app(read, board, caller(reactor), hosts, wall, table)
-    events, shots = Events(read, reactor, wall, board.desk.yard), Shots(frames, reactor)
+    events = Events(read, reactor, wall, board.desk.yard, board.fallbacks.here, board.chronicle)
+    shots = Shots(frames, reactor)
     return WebService(reactor, host, port, app, events, shots, Files(), board, wall, hosts, doors, table)

@@ -51,7 +51,10 @@ class YardHand(Protocol):
 
 
 class TeamDesk:
-    """The desk of a running team; ``predefined`` and ``demo`` come from the catalogue of tasks."""
+    """The desk of a running team; ``predefined`` and ``demo`` come from the catalogue of tasks.
+
+    ``version`` is another number whenever what is known has changed.
+    """
 
     _log = Logger()
 
@@ -64,7 +67,8 @@ class TeamDesk:
         self._yard = yard
         self._groups: dict[str, Watch] = {}
         self._reasons: dict[str, Watch] = {}
-        self._devices = node.watch_devices(lambda records: None, keep=True)
+        self.version = 0
+        self._devices = node.watch_devices(self._count, keep=True)
         self._tasks = node.watch_tasks(self._follow, keep=True)
         node.halt.follow()
 
@@ -234,12 +238,14 @@ class TeamDesk:
         return None if nearest is None else self._name_of(nearest)
 
     def _follow(self, records: list[Record]) -> None:
+        self._count(records)
         for task_id in tasks_of(records):
             if task_id not in self._groups:
-                self._groups[task_id] = self._node.watch_group(task_id, lambda records: None, keep=True)
-                self._reasons[task_id] = self._node.entangled.watch(
-                    verdicts_key(task_id), lambda records: None, keep=True
-                )
+                self._groups[task_id] = self._node.watch_group(task_id, self._count, keep=True)
+                self._reasons[task_id] = self._node.entangled.watch(verdicts_key(task_id), self._count, keep=True)
+
+    def _count(self, records: list[Record]) -> None:
+        self.version += 1
 
     def _order(self, task_id: str, word: str) -> None:
         order = Order(word, self._node.presence.device.name, self._node.wall())

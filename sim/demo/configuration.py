@@ -12,6 +12,7 @@ from pathlib import Path
 
 LOOPBACK = "127.0.0.1"
 BOOTSTRAP = "vaio"
+RESERVE = "pi"
 DOGS = ("dog1", "dog2", "dog3")
 
 Table = Mapping[str, object]
@@ -29,14 +30,19 @@ class Plan:
     nodes: Mapping[str, int]
     code: str
     """What operators sign in to the page with."""
+    reserve_port: int
+    """Where the second web node serves the page, for when the first is lost."""
 
     def file(self, name: str) -> Path:
         """The configuration file of the node ``name``."""
         return self.run_dir / f"{name}.toml"
 
     def texts(self) -> dict[str, str]:
-        """The configuration of every node: the laptop that is bootstrap and web node, then the dogs."""
-        return {BOOTSTRAP: self._laptop(), **{name: self._dog(name) for name in DOGS}}
+        """The configuration of every node: the laptop that lets others in, the other web node, then the dogs."""
+        laptop = self._node(BOOTSTRAP, "laptop", "Bootstrap node and web node", ["bootstrap", "edge", "web"])
+        reserve = self._node(RESERVE, "computer", "Web node for when the other is lost", ["edge", "web"])
+        webs = {BOOTSTRAP: self._web(laptop, self.web_port), RESERVE: self._web(reserve, self.reserve_port)}
+        return {**webs, **{name: self._dog(name) for name in DOGS}}
 
     def _node(self, name: str, kind: str, description: str, roles: list[str]) -> Table:
         return {
@@ -51,10 +57,9 @@ class Plan:
             "roles": roles,
         }
 
-    def _laptop(self) -> str:
-        node = self._node(BOOTSTRAP, "laptop", "Bootstrap node and web node", ["bootstrap", "edge", "web"])
+    def _web(self, node: Table, port: int) -> str:
         yard = f"{LOOPBACK}:{self.yard_port}"
-        web = {"host": self.web_host, "port": self.web_port, "yard": yard, "code": self.code}
+        web = {"host": self.web_host, "port": port, "yard": yard, "code": self.code}
         return toml({"node": node, "web": web})
 
     def _dog(self, name: str) -> str:

@@ -1,4 +1,4 @@
-"""The demonstration: three dogs, a laptop and a yard as five processes of this machine, told in words.
+"""The demonstration: three dogs, two web nodes and a yard as six processes of this machine, told in words.
 
 ``python -m sim.demo`` keeps the team running until Ctrl-C; with ``--headless`` it runs both experiments of the thesis,
 judges them by where the dogs really are, and exits with 0 or 1.  The nodes decide everything; this module only starts,
@@ -22,7 +22,7 @@ from twisted.internet.task import deferLater, react
 
 from drivers.sim.link import TcpConnector
 from drivers.sim.operator import YardOperator
-from sim.demo.configuration import BOOTSTRAP, DOGS, LOOPBACK, Plan
+from sim.demo.configuration import DOGS, LOOPBACK, Plan
 from sim.demo.experiment import Experiment, report, table
 from sim.demo.port import PortBusy
 from sim.demo.processes import Team
@@ -37,7 +37,7 @@ TICK_S = 0.05
 
 
 class Demonstration:
-    """Five processes, an eye on the page, and an eye over the yard."""
+    """Six processes, an eye on the page, and an eye over the yard."""
 
     def __init__(self, reactor: Any, plan: Plan, seed: int, say: Callable[[str], None]) -> None:
         self._reactor = reactor
@@ -61,7 +61,7 @@ class Demonstration:
         yard = ["--host", LOOPBACK, "--port", str(self._plan.yard_port), "--seed", str(self._seed)]
         self._team.add("yard", ["-m", "sim.server", *yard])
         twistd = str(Path(sys.executable).parent / "twistd")
-        for name in (BOOTSTRAP, *DOGS):
+        for name in self._plan.nodes:
             self._team.add(name, [twistd, "-n", "--pidfile=", "swarm-node", "--config", str(self._plan.file(name))])
         self._team.start()
         self._operator.connect().addErrback(lambda _: None)
@@ -197,6 +197,7 @@ async def _run(reactor: Any, wishes: argparse.Namespace) -> None:
 
 def _invite(demonstration: Demonstration, plan: Plan) -> None:
     _say(f"The page: {demonstration.address}   (logs: {plan.run_dir}; end with Ctrl-C)")
+    _say("If the node that serves it is lost, the page goes on at another: end the process of vaio, and see.")
     if plan.web_host == LOOPBACK:
         _say("For a phone or tablet in the same network: make demo WEB_HOST=0.0.0.0")
     else:

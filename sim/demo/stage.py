@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TextIO
 
 from sim.demo import port
-from sim.demo.configuration import BOOTSTRAP, DOGS, LOOPBACK, Plan
+from sim.demo.configuration import BOOTSTRAP, DOGS, LOOPBACK, RESERVE, Plan
 
 WEB_PORT, NODE_PORT, YARD_PORT = 8080, 7000, 7400
 MARK = ".swarm-demo"
@@ -65,14 +65,15 @@ def arranged(run_dir: Path, web_host: str, web_port: int | None, usual: bool, sa
         web = port.chosen("tcp", web_host, web_port, "the page")
     else:
         web = port.preferred("tcp", web_host, WEB_PORT if usual else 0)
+    reserve = port.preferred("tcp", web_host, web + 1 if usual and web < 65535 else 0)
     yard = port.preferred("tcp", LOOPBACK, YARD_PORT if usual else 0)
-    node, *others = port.free("udp", LOOPBACK, 1 + len(DOGS))
+    node, *others = port.free("udp", LOOPBACK, 2 + len(DOGS))
     if usual:
         node = port.preferred("udp", LOOPBACK, NODE_PORT)
         wanted = (("the page", web_port or WEB_PORT, web), ("the yard", YARD_PORT, yard), ("vaio", NODE_PORT, node))
         for what, wish, got in wanted:
             if wish != got:
                 say(f"port {wish} is busy; {what} uses {got}")
-    nodes = {BOOTSTRAP: node, **dict(zip(DOGS, others, strict=True))}
+    nodes = {BOOTSTRAP: node, **dict(zip((RESERVE, *DOGS), others, strict=True))}
     code = "".join(secrets.choice(LETTERS) for _ in range(8))
-    return Plan(run_dir, secrets.token_hex(32), web_host, web, yard, nodes, f"{code[:4]}-{code[4:]}")
+    return Plan(run_dir, secrets.token_hex(32), web_host, web, yard, nodes, f"{code[:4]}-{code[4:]}", reserve)

@@ -134,7 +134,7 @@ class Visitor:
 
     async def _asked_stream(self) -> IResponse:
         await self._sign_in()
-        response = await self._agent.request(b"GET", f"{self._address}/events".encode(), self._headers())
+        response = await self._agent.request(b"GET", f"{self._address}/events?whole=1".encode(), self._headers())
         if response.code == 401:
             self._token = ""
         return response

@@ -2,8 +2,9 @@
 
 ``python -m tests.live.team`` prints the port, the code to sign in with, and an operator's token and ticket in its first
 line; whoever has signed in at one is signed in at the next.  Lines on its input change the team: ``gone NAME``, ``back
-NAME``, ``status NAME STATUS``, ``freeze SECONDS`` (the whole process stands), ``strange FILE`` (devices and tasks whose
-words are those of that JSON list); it ends when its input does.
+NAME``, ``status NAME STATUS``, ``freeze SECONDS`` (the whole process stands), ``name NAME`` (of the node that serves),
+``pages NODE=URL ...`` (the web nodes, itself first), ``strange FILE`` (devices and tasks whose words are those of that
+JSON list); it ends when its input does.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import json
 import random
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +25,9 @@ from twisted.internet.stdio import StandardIO
 from twisted.internet.threads import deferToThread
 from twisted.protocols.basic import LineReceiver
 
-from webnode.board import Board, MemoryAudit, MemoryHalts, Sessions
+from webnode.board import Board, Knob, MemoryAudit, MemoryFallbacks, MemoryHalts, MemorySurvey, MemoryTuning, Page
 from webnode.camera import OnFrame
+from webnode.chronicle import TeamChronicle
 from webnode.desk import MemoryDesk
 from webnode.limits import AddressLimits
 from webnode.password import hashed, is_password
@@ -106,8 +109,9 @@ class Team:
         now = time.time()
         self.devices = [dog(1, "WAITING", "t1", now), dog(2, "EXECUTING", "t1", now), dog(3, "SEARCHING", "t1", now)]
         self.away: set[str] = set()
-        self.batch = 0
+        self.node = "vaio"
         self.halts = MemoryHalts(*(f"{n:02x}" * 16 for n in (1, 2, 3)))
+        self.batch = 0
         self._departed = Departed()
         self.tasks = [
             {
@@ -147,7 +151,7 @@ class Team:
             for each in here
         ]
         gone = self._departed.of(here, time.time())
-        state = state_of(here, self.tasks, {str(task): members}, departed=gone, node="vaio")
+        state = state_of(here, self.tasks, {str(task): members}, departed=gone, node=self.node)
         return {**state, "halted": self.halts.is_halted()}
 
     def be_strange(self, words: list[str]) -> None:
@@ -169,7 +173,7 @@ class Team:
             for epoch in told["epochs"]:
                 epoch |= {"chosen": said, "rule": said, "hysteresis": said, "agree": [said], "standby": [said]}
                 epoch["differ"] = [{"name": said, "what": said}]
-                epoch["reports"] = [{"agent": said, "name": said, "cost": 1.0}]
+                epoch["reports"] = [{"agent": said, "name": said, "cost": 1.0, "more": said}]
             task = {
                 "id": f"s{self.batch}-{number}",
                 "kind": said,
@@ -215,6 +219,11 @@ YARD: dict[str, Any] = {
     ],
     "target": {"x": 1.8, "y": 1.7, "radius": 0.08},
 }
+KNOBS = [
+    Knob("description", "The dog with 1 yellow stripe on its head.", "A line about the device", most=200),
+    Knob("presence_lease", 1.0, "How long the others believe in the device", "s", 0.1, 60.0),
+    Knob("capabilities", {"gripper": {"width": 0.1}}, "What the device can do beyond what its driver says"),
+]
 CATALOGUE = [
     {"name": "search", "title": "Find and touch the red target", "requirements": {}},
     {"name": "patrol", "title": "Patrol the yard", "requirements": {}},
@@ -226,10 +235,11 @@ class Orders(LineReceiver):
 
     delimiter = b"\n"
 
-    def __init__(self, team: Team, web: WebService, sessions: Sessions) -> None:
+    def __init__(self, team: Team, web: WebService, board: Board, pages: list[Page]) -> None:
         self._team = team
         self._web = web
-        self._sessions = sessions
+        self._sessions = board.sessions
+        self._pages = pages
 
     def connectionMade(self) -> None:
         """Say where the team is, and how to come in."""
@@ -245,6 +255,11 @@ class Orders(LineReceiver):
             self._team.away.discard(rest[0])
         elif verb == "status":
             next(each for each in self._team.devices if each["name"] == rest[0])["status"] = rest[1]
+        elif verb == "name":
+            self._team.node = rest[0]
+        elif verb == "pages":
+            named = [each.split("=") for each in rest]
+            self._pages[:] = [Page(node, url, is_self=place == 0) for place, (node, url) in enumerate(named)]
         elif verb == "freeze":
             time.sleep(float(rest[0]))
         elif verb == "strange":
@@ -263,7 +278,10 @@ def board(team: Team) -> Board:
     able = [{"uuid": f"{n:02x}" * 16, "name": f"dog{n}", "busy": "Patrol the yard" * (n == 2)} for n in (1, 2)]
     desk.previews["search"] = {"able": able, "refused": {"dog3": ["no gripper", "no lift"]}, "likely": None}
     sessions = SignedSessions(b"a team of the tests", "quiet-otter", PASSWORD, random.Random(), checked)
-    return Board(desk, sessions, MemoryAudit(time.time), limits=AddressLimits(), halts=team.halts)
+    tuning = MemoryTuning({able[0]["uuid"]: KNOBS})
+    survey = MemorySurvey(network(), {f"0{n}" * 16: inventory() for n in (1, 2)})
+    parts: dict[str, Any] = {"halts": team.halts, "tuning": tuning, "survey": survey, "chronicle": TeamChronicle()}
+    return Board(desk, sessions, MemoryAudit(time.time), limits=AddressLimits(), **parts)
 
 
 def checked(text: str, password: str) -> Deferred[Any]:
@@ -271,15 +289,48 @@ def checked(text: str, password: str) -> Deferred[Any]:
     return deferToThread(is_password, text, password)
 
 
+def network() -> Any:
+    """Two that know each other and a third, which does not answer."""
+    uuids = {n: f"0{n}" * 16 for n in (1, 2, 3)}
+
+    def view(others: tuple[int, ...], lookups: list[Any]) -> dict[str, Any]:
+        contacts = [{"uuid": uuids[n], "name": f"dog{n}", "rtt_ms": 1.8 * n, "heard_s": 0.2} for n in others]
+        return {
+            "contacts": contacts,
+            "known": len(others),
+            "sent": 1204,
+            "received": 1187,
+            "lost": 2,
+            "lookups": lookups,
+        }
+
+    lookup = {"key": "3fa2" * 10, "asked": 5, "hops": 2, "found": 8, "ms": 12.4}
+    return {"devices": {uuids[1]: view((2, 3), [lookup]), uuids[2]: view((1,), [])}, "silent": [uuids[3]]}
+
+
+def inventory() -> Any:
+    """A handful of records."""
+    newest = [["devices", "dog1", 540, "leased"], ["tasks", "t1", 310, "team"]]
+    return {
+        "records": 9,
+        "deleted": 1,
+        "bytes": 4120,
+        "most_bytes": 2**23,
+        "kinds": {"devices": 4, "tasks": 2},
+        "newest": newest,
+    }
+
+
 def main() -> None:
     """Serve until the input ends."""
     team = Team()
     port = int(sys.argv[1]) if len(sys.argv) > 1 else 0
-    served = board(team)
+    pages = MemoryFallbacks()
+    served = replace(board(team), fallbacks=pages)
     web = web_service(reactor, "127.0.0.1", port, team.read, served, team, time.time)
     web.startService()
     reactor.addSystemEventTrigger("before", "shutdown", web.stopService)
-    reactor.callWhenRunning(lambda: StandardIO(Orders(team, web, served.sessions)))
+    reactor.callWhenRunning(lambda: StandardIO(Orders(team, web, served, pages.pages)))
     reactor.run()
 
 

@@ -30,7 +30,7 @@ class ActionPageTests(SynchronousTestCase):
         page = self.browser.new_context(**screen, color_scheme=scheme, reduced_motion="reduce").new_page()
         page.set_default_timeout(20000)
         page.on("pageerror", lambda error: self.faults.append(str(error)))
-        page.goto(self.team.url)
+        page.goto(f"{self.team.url}#code={self.team.code}")
         page.locator("#link[data-link=live]").wait_for()
         page.locator(".device").nth(2).wait_for()
         return page
@@ -124,6 +124,29 @@ class ActionPageTests(SynchronousTestCase):
         self.assertEqual(page.locator("#place").inner_text(), target)
         self.assertEqual(self.faults, [])
 
+    def test_change_settings(self) -> None:
+        """A device's settings are read, changed and saved by keyboard; what is no table is said so."""
+        page = self.opened(PHONE)
+        page.locator(".device").first.tap()
+        name = page.get_by_label("A line about the device")
+        name.fill("lame")
+        page.keyboard.press("Enter")
+        answer = page.locator("#place-device .hint")
+        page.locator("#place-device .hint", has_text="The device has taken it").wait_for()
+        self.assertEqual(name.input_value(), "lame")
+        page.get_by_role("button", name="Save settings").tap()
+        self.assertEqual(answer.inner_text(), "Nothing was changed.")
+        page.get_by_label("beyond what its driver says").fill("{arm")
+        page.get_by_role("button", name="Save settings").tap()
+        self.assertIn("it is no table", answer.inner_text())
+        page.get_by_label("How long the others believe").fill("99")
+        page.get_by_role("button", name="Save settings").tap()
+        self.assertFalse(page.get_by_label("How long the others believe").evaluate("e => e.checkValidity()"))
+        page.locator("#d-close").tap()
+        page.locator(".device").nth(1).tap()
+        page.locator("#place-device .hint", has_text="no settings that can be changed").wait_for()
+        self.assertEqual(self.faults, [])
+
     def test_be_accessible(self) -> None:
         """Stopped, on phone and desk, light and dark, axe finds nothing and nothing is cut off or too small."""
         from axe_playwright_python.sync_playwright import Axe
@@ -134,6 +157,11 @@ class ActionPageTests(SynchronousTestCase):
                 page.locator(".preview li").first.wait_for()
                 page.locator(".stop").click()
                 page.locator(".halted").wait_for()
+                found = Axe().run(page).response["violations"]
+                self.assertEqual([(each["id"], each["nodes"][0]["html"]) for each in found], [])
+                page.locator(".device").first.focus()
+                page.keyboard.press("Enter")
+                page.locator("dialog[open] .knob").first.wait_for()
                 found = Axe().run(page).response["violations"]
                 self.assertEqual([(each["id"], each["nodes"][0]["html"]) for each in found], [])
                 self.assertLessEqual(page.evaluate("document.documentElement.scrollWidth - innerWidth"), 0)

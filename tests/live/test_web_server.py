@@ -94,6 +94,7 @@ class WebServiceTests(TestCase):
         self.assertIn(b"vaio", await self.body("/"))
         self.assertEqual(json.loads(await self.body("/api/v1/devices"))[0]["name"], "dog1")
         self.assertIn(b"EventSource", await self.body("/static/stream.js"))
+        self.assertIn(b"caches", await self.body("/sw.js"))
         asked = self.asked("/shot/01?after=")
         while "01" not in self.frames.watched:
             await deferLater(reactor, 0.01)

@@ -11,8 +11,10 @@ from twisted.trial.unittest import SynchronousTestCase
 from twisted.web.resource import Resource
 
 from tests.webnode.browser import Connection, site_of
+from webnode.board import Entry, MemoryChronicle, Page
 from webnode.camera import MemoryFrames, OnFrame
 from webnode.errors import Refusal
+from webnode.journal import KEPT
 from webnode.live import MAX_VIEWERS, MAX_WAITING, Events, Shots
 
 JPEG = b"\xff\xd8 a picture"
@@ -26,13 +28,28 @@ def events_in(data: bytes) -> list[tuple[str, Any]]:
     ]
 
 
+def last_id(data: bytes) -> str:
+    return data.decode().rpartition("id: ")[2].split("\n")[0]
+
+
 class EventsTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.clock = Clock()
         self.state: dict[str, Any] = {"n": 0}
         self.yard: dict[str, Any] | None = None
         self.reads = 0
-        self.events = Events(self.read, self.clock, lambda: 1e9 + self.clock.seconds(), lambda: self.yard)
+        self.pages: list[Page] = []
+        self.chronicle = MemoryChronicle()
+        self.version: int | None = None
+        self.events = Events(
+            self.read,
+            self.clock,
+            lambda: 1e9 + self.clock.seconds(),
+            lambda: self.yard,
+            lambda: self.pages,
+            self.chronicle,
+            lambda: self.version,
+        )
         root = Resource()
         root.putChild(b"events", self.events)
         self.site = site_of(root, self.clock)
@@ -41,28 +58,93 @@ class EventsTests(SynchronousTestCase):
         self.reads += 1
         return dict(self.state)
 
-    def connected(self) -> Connection:
-        return Connection(self.site).ask("/events")
+    def connected(self, query: str = "", **headers: str) -> Connection:
+        return Connection(self.site).ask(f"/events{query}", **headers)
 
     def test_start_with_everything(self) -> None:
-        """A new page gets the whole state, the yard and a beat at once, in a stream that nobody caches."""
+        """A new page gets the whole state, the yard, the pages and a beat at once, in a stream that nobody caches."""
         data = self.connected().taken()
         self.assertIn(b"text/event-stream", data)
         self.assertIn(b"no-store", data)
         beat = {"now": 1e9, "skipped": 0}
-        self.assertEqual(events_in(data), [("state", {"n": 0}), ("yard", None), ("beat", beat)])
+        told: list[Any] = [("state", {"resync": False, "n": 0}), ("yard", None), ("pages", []), ("beat", beat)]
+        self.assertEqual(events_in(data), told)
 
     def test_tell_changes_only(self) -> None:
-        """A change is told within a tenth of a second, once; without one there are only beats, each half second."""
+        """A change is told within a tenth of a second, once; without one there are only beats, five a second."""
         page = self.connected()
         page.taken()
         self.state["n"] = 1
         self.clock.advance(0.1)
-        self.assertEqual(events_in(page.taken()), [("state", {"n": 1})])
+        self.assertEqual(events_in(page.taken()), [("change", {"n": 1})])
         self.clock.pump([0.1] * 20)
         told = events_in(page.taken())
         self.assertEqual({name for name, _ in told}, {"beat"})
-        self.assertIn(len(told), (4, 5))
+        self.assertIn(len(told), (9, 10, 11))
+
+    def test_tell_programs_whole_states(self) -> None:
+        """A program that asks for whole states gets one at each change, and need not put changes together."""
+        program = self.connected("?whole=1")
+        program.taken()
+        self.state["n"] = 1
+        self.clock.advance(0.1)
+        self.assertEqual(events_in(program.taken()), [("state", {"resync": False, "n": 1})])
+
+    def test_resume(self) -> None:
+        """A page that comes back with the last id that it heard, in either way, is told what it missed and no more."""
+        page = self.connected()
+        heard = last_id(page.taken())
+        page.leave()
+        watcher = self.connected()
+        for n in (1, 2):
+            self.state["n"] = n
+            self.clock.advance(0.1)
+        for back in (self.connected(f"?since={heard}"), self.connected(Last_Event_ID=heard)):
+            told = [event for event in events_in(back.taken()) if event[0] in ("state", "change")]
+            self.assertEqual(told, [("change", {"n": 1}), ("change", {"n": 2})])
+        self.assertIn(("state", {"resync": True, "n": 2}), events_in(self.connected("?since=other-3").taken()))
+        watcher.leave()
+
+    def test_tell_pages(self) -> None:
+        """A web node that joins the team is told to every page that is open."""
+        page = self.connected()
+        page.taken()
+        self.pages.append(Page("01", "http://127.0.0.1:8081"))
+        self.clock.advance(0.1)
+        row = {"node": "01", "url": "http://127.0.0.1:8081", "is_secure": False, "is_self": False}
+        self.assertEqual(events_in(page.taken()), [("pages", [row])])
+
+    def test_tell_what_happened(self) -> None:
+        """Entries of the chronicle are told once to each page, and to a new one from the start."""
+        page = self.connected()
+        page.taken()
+        self.chronicle.entries.append(Entry(1, 1e9, "joined", "01", "", "dog1 joined"))
+        self.clock.advance(0.1)
+        ((name, (row,)),) = events_in(page.taken())
+        self.assertEqual((name, row["n"], row["text"]), ("event", 1, "dog1 joined"))
+        self.clock.advance(0.1)
+        self.assertEqual([each for each in events_in(page.taken()) if each[0] == "event"], [])
+        self.assertIn("event", [name for name, _ in events_in(self.connected().taken())])
+
+    def test_read_what_changed_only(self) -> None:
+        """While the version says that nothing changed the state is read once a second; a change is told at once."""
+        self.version = 1
+        page = self.connected()
+        reads = self.reads
+        self.clock.pump([0.1] * 30)
+        self.assertIn(self.reads - reads, (2, 3))
+        page.taken()
+        self.state["n"], self.version = 1, 2
+        self.clock.advance(0.1)
+        self.assertIn(("change", {"n": 1}), events_in(page.taken()))
+
+    def test_keep_the_chronicle_with_nobody_there(self) -> None:
+        """Once opened, the chronicle is told of states with no page open, each second, and no more when closed."""
+        self.events.open()
+        self.clock.pump([0.5] * 6)
+        self.assertEqual(self.reads, 3)
+        self.events.close()
+        self.assertEqual(self.clock.getDelayedCalls(), [])
 
     def test_limit_pace(self) -> None:
         """However often the state changes, a page gets at most ten a second, and the newest last."""
@@ -71,13 +153,13 @@ class EventsTests(SynchronousTestCase):
         for n in range(1, 101):
             self.state["n"] = n
             self.clock.advance(0.01)
-        told = [words["n"] for name, words in events_in(page.taken()) if name == "state"]
+        told = [words["n"] for name, words in events_in(page.taken()) if name == "change"]
         self.assertLessEqual(len(told), 10)
         self.assertGreaterEqual(len(told), 9)
         self.assertEqual(told, sorted(told))
 
-    def test_skip_slow_pages(self) -> None:
-        """A page that does not read is written nothing; when it reads again it gets the newest state and the count."""
+    def test_put_off_slow_pages(self) -> None:
+        """A page that does not read is written nothing; when it reads again it gets what it missed, and the count."""
         slow, quick = self.connected(), self.connected()
         slow.taken()
         slow.pause()
@@ -85,12 +167,25 @@ class EventsTests(SynchronousTestCase):
             self.state["n"] = n
             self.clock.advance(0.1)
         self.assertEqual(slow.taken(), b"")
-        self.assertIn(("state", {"n": 5}), events_in(quick.taken()))
+        self.assertIn(("change", {"n": 5}), events_in(quick.taken()))
         slow.resume()
         self.clock.pump([0.1] * 6)
         told = events_in(slow.taken())
-        self.assertEqual([words for name, words in told if name == "state"], [{"n": 5}])
+        self.assertEqual([words["n"] for name, words in told if name == "change"], [1, 2, 3, 4, 5])
         self.assertGreaterEqual([words for name, words in told if name == "beat"][-1]["skipped"], 5)
+
+    def test_spare_slow_pages_the_past(self) -> None:
+        """A page that missed more than is kept gets the newest state instead, marked as such."""
+        slow = self.connected()
+        slow.taken()
+        slow.pause()
+        for n in range(1, KEPT + 3):
+            self.state["n"] = n
+            self.clock.advance(0.1)
+        slow.resume()
+        self.clock.advance(0.1)
+        told = [event for event in events_in(slow.taken()) if event[0] in ("state", "change")]
+        self.assertEqual(told, [("state", {"resync": True, "n": KEPT + 2})])
 
     def test_rest_when_nobody_looks(self) -> None:
         """When the last page has gone, nothing is read and no timer is left."""
@@ -112,7 +207,7 @@ class EventsTests(SynchronousTestCase):
         self.assertEqual(len(self.flushLoggedErrors(ValueError)), 1)
         self.state["n"] = 2
         self.clock.advance(0.1)
-        self.assertIn(("state", {"n": 2}), events_in(page.taken()))
+        self.assertIn(("change", {"n": 2}), events_in(page.taken()))
 
     def test_cap_pages(self) -> None:
         """One page too many is told so, and costs no stream."""

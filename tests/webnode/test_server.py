@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from twisted.internet.defer import Deferred, succeed
@@ -19,7 +20,7 @@ from webnode.desk import MemoryDesk
 from webnode.errors import Refusal
 from webnode.guard import MAX_BODY
 from webnode.resource import JsonResource
-from webnode.server import Files, Root, caller
+from webnode.server import Files, Root, caller, sent
 
 
 class PathResource(Resource):
@@ -37,6 +38,14 @@ class Stream(JsonResource):
 
 
 NATIVE: dict[str, Resource] = {"/stream": Stream()}
+
+
+class SentTests(SynchronousTestCase):
+    def test_send_no_comments(self) -> None:
+        """Scripts are sent without their comments, each line at its number; what looks like one in a line stays."""
+        script = Path(self.mktemp()).with_suffix(".js")
+        script.write_text("// About it.\nconst a = 1; // one\n  // More.\nexport const URL = `http://a`;\n")
+        self.assertEqual(sent(script), b"\nconst a = 1; // one\n\nexport const URL = `http://a`;\n")
 
 
 class RootTests(SynchronousTestCase):

@@ -14,6 +14,7 @@ class Camera {
     this.gone = false;
     this.closed = false;
     this.flight = null;
+    this.moved = false;
     this.trouble = "";
     this.canvas = element("canvas", { width: 208, height: 160, role: "img" });
     this.name = element("b");
@@ -50,11 +51,19 @@ class Camera {
           await pause();
         }
       } catch {
-        if (this.wanted) await pause();
+        if (this.wanted && !this.moved) await pause();
+        this.moved = false;
       }
       clearTimeout(deadline);
     }
     this.flight = null;
+  }
+
+  // Ask the node that serves now; what the last one still owes is of no use.
+  renew() {
+    this.seq = "";
+    this.moved = this.flight !== null;
+    this.flight?.abort();
   }
 
   draw(picture) {
@@ -111,6 +120,7 @@ panel({
     return {
       update(model, event) {
         if (event === "state") showCameras([...model.devices.values()]);
+        if (event === "link" && model.link === "live") cameras.forEach((camera) => camera.renew());
       },
     };
   },

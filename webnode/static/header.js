@@ -6,6 +6,7 @@ import { panel } from "./panel.js";
 const LINKS = { live: "connected", lost: "connection lost, trying again", wait: "connecting" };
 let statuses = new Map();
 let link = "wait";
+let node = "";
 
 function tellLink(now) {
   if (now === "lost") say("Connection lost. What you see is the last that was heard.");
@@ -17,8 +18,7 @@ function tellLink(now) {
 }
 
 // What changed since the state before, in words for the status line.
-function tellNews({ devices, tasks }) {
-  const news = [];
+function tellNews({ devices, tasks }, ...news) {
   for (const device of devices.values()) {
     const before = statuses.get(device.uuid);
     if (before === device.status || statuses.size === 0) continue;
@@ -34,6 +34,16 @@ function tellNews({ devices, tasks }) {
   if (news.length) say(`${news.join(", ")}.`);
 }
 
+// Which node serves, and which others could.
+function tellNodes(model) {
+  const others = model.pages.filter((page) => !page.is_self).map((page) => model.devices.get(page.node)?.name ?? "another");
+  words(at("reserve"), others.length ? `, ${[...new Set(others)].join(", ")} in reserve` : "");
+  if (model.node) words(at("node"), model.node);
+  const news = node && model.node !== node ? [`${node} is lost, ${model.node} serves the page`] : [];
+  node = model.node;
+  return news;
+}
+
 panel({
   place: "header",
   title: "Swarm",
@@ -41,9 +51,8 @@ panel({
     return {
       update(model, event) {
         if (event === "link") tellLink(model.link);
-        if (event !== "state") return;
-        if (model.node) words(at("node"), model.node);
-        tellNews(model);
+        if (event === "pages") tellNodes(model);
+        if (event === "state") tellNews(model, ...tellNodes(model));
       },
     };
   },

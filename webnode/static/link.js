@@ -1,28 +1,75 @@
-// The link: the one line from the page to its node; nobody else fetches anything.
+// The link: the one line from the page to its team; nobody else fetches anything.  When the node that serves is lost
+// it goes on with another one, and what was asked meanwhile is asked there.
+import { race, remember } from "./reserve.js";
 import { ticket, token } from "./session.js";
 import { stream } from "./stream.js";
 
 const API = "/api/v1/";
 const PATIENCE = 5000;
+const PAUSE = 300;
 const VIEWER = Math.random().toString(36).slice(2, 12);
+const NAMES = ["state", "change", "yard", "event", "pages", "beat"];
+const flying = new Set();
+let here = location.origin;
+let finding = null;
 let orders = 0;
 
-// Where the page is served from: the origin of every address.
-export const base = () => location.origin;
+// Where the page is served from now: the origin of every address.
+export const base = () => here;
 
+const pause = (ms) => new Promise((done) => setTimeout(done, ms));
+
+// Look for a node that answers until there is one; whoever calls meanwhile waits for the same.
+function find() {
+  finding ??= (async () => {
+    for (;;) {
+      const found = await race(here).catch(() => "");
+      if (found) {
+        if (found !== here) flying.forEach((flight) => flight.abort());
+        here = found;
+        finding = null;
+        return;
+      }
+      await pause(PAUSE);
+    }
+  })();
+  return finding;
+}
+
+async function fly(address, options) {
+  const flight = new AbortController();
+  const deadline = setTimeout(() => flight.abort(), PATIENCE);
+  flying.add(flight);
+  try {
+    return await fetch(address, { ...options, signal: flight.signal });
+  } finally {
+    clearTimeout(deadline);
+    flying.delete(flight);
+  }
+}
+
+// A node does once what has one id, so that it can be asked again.  Another node knows nothing of that: there only
+// what may be done twice is repeated, which a new task is not.
 async function call(method, path, body) {
   const order = method !== "GET";
   const signed = token() ? { Authorization: `Bearer ${token()}` } : {};
+  const options = {
+    method,
+    headers: order ? { ...signed, "Content-Type": "application/json", "X-Swarm": "1", "Idempotency-Key": `${VIEWER}-${++orders}` } : signed,
+    body: order ? JSON.stringify(body) : undefined,
+  };
+  const end = performance.now() + PATIENCE;
   let answer;
-  try {
-    answer = await fetch(base() + API + path, {
-      method,
-      headers: order ? { ...signed, "Content-Type": "application/json", "X-Swarm": "1", "Idempotency-Key": `${VIEWER}-${++orders}` } : signed,
-      body: order ? JSON.stringify(body) : undefined,
-      signal: AbortSignal.timeout(PATIENCE),
-    });
-  } catch {
-    throw new Error(`The node does not answer. ${order ? "Nothing may have been done; look" : "Look"} at the state, then try again.`);
+  for (let asked = here; !answer;) {
+    try {
+      answer = await fly(here + API + path, options);
+    } catch {
+      await Promise.race([find(), pause(Math.max(0, end - performance.now()))]);
+      if (performance.now() >= end || (asked !== here && method === "POST" && path === "tasks")) {
+        throw new Error(`The node does not answer. ${order ? "Nothing may have been done; look" : "Look"} at the state, then try again.`);
+      }
+      await pause(50);
+    }
   }
   const told = await answer.json().catch(() => ({}));
   if (answer.ok) return told;
@@ -35,9 +82,41 @@ export const get = (path) => call("GET", path);
 export const ask = (method, path, body = {}) => call(method, path, body);
 
 // The next picture of a camera, as a Response: 200, 204 where there is no newer one, or a refusal.
-export const frames = (uuid, after, signal) => fetch(`${base()}/shot/${uuid}?after=${after}&viewer=${VIEWER}&ticket=${ticket()}`, { signal });
+export const frames = (uuid, after, signal) => fetch(`${here}/shot/${uuid}?after=${after}&viewer=${VIEWER}&ticket=${ticket()}`, { signal });
 
-// Everything that comes, as onEvent(name, data); "link" says whether anything does: live, lost.
+// Everything that comes, as onEvent(name, data); "link" says whether anything does: live, lost.  A page that nobody
+// sees hears nothing, and is told what it missed when somebody looks again.
 export function open({ onEvent }) {
-  stream(() => `${base()}/events?ticket=${ticket()}`, ["state", "yard", "beat"], onEvent);
+  let last = "";
+  let served = here;
+  let losses = 0;
+  const line = stream({
+    names: NAMES,
+    url: () => {
+      if (served !== here) last = "";
+      served = here;
+      return `${here}/events?since=${last}&ticket=${ticket()}`;
+    },
+    heard(name, data, id) {
+      last = id;
+      losses = 0;
+      if (name === "pages") remember(data);
+      onEvent("link", "live");
+      onEvent(name, data);
+    },
+    async lost() {
+      onEvent("link", "lost");
+      await pause(Math.min(50 * 2 ** losses++, 2000));
+      await find();
+      look();
+    },
+  });
+
+  function look() {
+    if (document.hidden) line.close();
+    else line.open();
+  }
+
+  document.addEventListener("visibilitychange", look);
+  look();
 }

@@ -124,7 +124,7 @@ panel({
     startMap();
     return {
       update(model, event) {
-        if (event === "yard") showYard(model.yard);
+        if (event === "yard" || !event) showYard(model.yard);
       },
     };
   },

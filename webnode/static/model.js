@@ -16,15 +16,41 @@ export const model = {
 };
 
 const byKey = (rows, key) => new Map(rows.map((row) => [row[key], row]));
+const inOrder = (map, compare) => new Map([...map].sort(([, a], [, b]) => compare(a, b)));
+const KEYS = { devices: "uuid", tasks: "id", groups: "task" };
+const ENTRIES = 2000;
 
 // Take what the stream says; maps keep the order of the node's lists.
 const TAKERS = {
   state(state) {
+    // Another node counts what happened from its own start.
+    if (state.node !== model.node) model.events = [];
     model.node = state.node || model.node;
     model.devices = byKey(state.devices, "uuid");
     model.tasks = byKey(state.tasks, "id");
     model.groups = byKey(state.groups, "task");
-    model.halted = state.halted === true;
+    model.halted = state.halted ?? false;
+  },
+  // Rows that are other or new, and the keys of those that are gone; the order is that of the node's lists.
+  change({ without = {}, ...told }) {
+    for (const [name, key] of Object.entries(KEYS)) {
+      if (!told[name] && !without[name]) continue;
+      model[name] = new Map([...model[name], ...byKey(told[name] ?? [], key)]);
+      without[name]?.forEach((each) => model[name].delete(each));
+    }
+    if (told.devices) model.devices = inOrder(model.devices, (a, b) => a.joined - b.joined || (a.uuid < b.uuid ? -1 : 1));
+    if (told.tasks) model.tasks = inOrder(model.tasks, (a, b) => b.created - a.created || (a.id < b.id ? -1 : 1));
+    const places = [...model.tasks.keys()];
+    if (told.groups) model.groups = inOrder(model.groups, (a, b) => places.indexOf(a.task) - places.indexOf(b.task));
+    model.node = told.node ?? model.node;
+    model.halted = told.halted ?? model.halted;
+  },
+  pages(pages) {
+    model.pages = pages;
+  },
+  event(entries) {
+    const newest = model.events.at(-1)?.n ?? 0;
+    model.events = [...model.events, ...entries.filter((entry) => entry.n > newest)].slice(-ENTRIES);
   },
   yard(snapshot) {
     model.yard = snapshot;
@@ -36,6 +62,9 @@ const TAKERS = {
   session(me) {
     model.me = me;
     document.body.dataset.role = me.role;
+  },
+  has(names) {
+    model.has = [...names, ...(model.yard && !names.includes("yard") ? ["yard"] : [])];
   },
   link(state) {
     model.link = state;

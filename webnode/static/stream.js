@@ -1,29 +1,39 @@
-// The stream of events: opened again by itself when it is lost, and held for lost when two seconds pass without a beat.
-// url() gives its address, which changes with the ticket.
-const PATIENCE = 2000;
+// The stream of events: held for lost when it breaks, or when nothing is heard for a while.
+// url() gives its address anew each time; heard(name, data, id) is told each event, lost() once that it is over.
+const PATIENCE = 1500;
 
-export function stream(url, names, onEvent) {
-  let source;
-  let heard = 0;
+export function stream({ url, names, heard, lost }) {
+  let source = null;
+  let at = 0;
 
-  function open() {
+  function close() {
     source?.close();
-    heard = performance.now();
-    source = new EventSource(url());
-    for (const name of names) {
-      source.addEventListener(name, (event) => {
-        heard = performance.now();
-        onEvent("link", "live");
-        onEvent(name, JSON.parse(event.data));
-      });
-    }
-    source.onerror = () => onEvent("link", "lost");
+    source = null;
   }
 
-  open();
+  function fail() {
+    close();
+    lost();
+  }
+
   setInterval(() => {
-    if (performance.now() - heard < PATIENCE) return;
-    onEvent("link", "lost");
-    open();
-  }, 250);
+    if (source && performance.now() - at > PATIENCE) fail();
+  }, 100);
+
+  return {
+    close,
+    open() {
+      close();
+      at = performance.now();
+      const opened = source = new EventSource(url());
+      for (const name of names) {
+        source.addEventListener(name, (event) => {
+          if (source !== opened) return;
+          at = performance.now();
+          heard(name, JSON.parse(event.data), event.lastEventId);
+        });
+      }
+      source.onerror = () => { if (source === opened) fail(); };
+    },
+  };
 }

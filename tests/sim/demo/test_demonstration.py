@@ -191,17 +191,17 @@ class ConfigurationTests(SynchronousTestCase):
     """The configurations are TOML that says what was planned."""
 
     def setUp(self) -> None:
-        ports = {"vaio": 7000, "dog1": 7001, "dog2": 7002, "dog3": 7003}
+        ports = {"vaio": 7000, "pi": 7004, "dog1": 7001, "dog2": 7002, "dog3": 7003}
         folder = Path('/tmp/a "strange"\\folder\x7f')
-        self.plan = Plan(folder, "ab" * 32, "127.0.0.1", 8080, 7400, ports, "quiet-otter")
+        self.plan = Plan(folder, "ab" * 32, "127.0.0.1", 8080, 7400, ports, "quiet-otter", 8081)
         self.tables = {name: tomllib.loads(text) for name, text in self.plan.texts().items()}
 
     def test_every_node_has_a_file_in_lawful_toml(self) -> None:
-        """One laptop and three dogs, each with its own port and store, whatever the folder is called."""
-        self.assertEqual(list(self.tables), ["vaio", *DOGS])
+        """Two web nodes and three dogs, each with its own port and store, whatever the folder is called."""
+        self.assertEqual(list(self.tables), ["vaio", "pi", *DOGS])
         nodes = [table["node"] for table in self.tables.values()]
-        self.assertEqual([node["port"] for node in nodes], [7000, 7001, 7002, 7003])
-        self.assertEqual(nodes[1]["store"], str(self.plan.run_dir / "dog1.sqlite"))
+        self.assertEqual([node["port"] for node in nodes], [7000, 7004, 7001, 7002, 7003])
+        self.assertEqual(nodes[1]["store"], str(self.plan.run_dir / "pi.sqlite"))
         self.assertEqual({node["team_key"] for node in nodes}, {"ab" * 32})
 
     def test_dogs_know_the_laptop_and_drive_themselves(self) -> None:
@@ -216,6 +216,13 @@ class ConfigurationTests(SynchronousTestCase):
         web = {"host": "127.0.0.1", "port": 8080, "yard": "127.0.0.1:7400", "code": "quiet-otter"}
         self.assertEqual(self.tables["vaio"]["web"], web)
         self.assertEqual(set(self.tables["vaio"]), {"node", "web"})
+
+    def test_page_has_a_reserve(self) -> None:
+        """A second web node serves the page of the same yard at a port of its own, with the same code."""
+        self.assertEqual(self.tables["pi"]["web"], {**self.tables["vaio"]["web"], "port": 8081})
+        self.assertEqual(
+            (self.tables["pi"]["node"]["roles"], set(self.tables["pi"])), (["edge", "web"], {"node", "web"})
+        )
 
 
 class EventStreamTests(SynchronousTestCase):

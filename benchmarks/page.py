@@ -1,0 +1,277 @@
+"""The page under load: ``python -m benchmarks.page``.
+
+200 event streams, 12 camera viewers of three robots at 30 pictures a second, 500 clients that send a byte a second, and
+100 requests a second, each kind from 64 addresses of this machine; beside them one viewer on a slow line.  Says whether
+all were fed, how old pictures were, how late the web node's own timers, what it weighs, and exits with 1 where a target
+is missed.  Ages are from the robot's process, over UDP and the web node, to a viewer's: neither lens nor screen.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import resource
+import socket
+import struct
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Coroutine, Sequence
+from typing import Any
+
+from benchmarks.page_team import CODE, MARK, ROBOTS
+from sim.demo import port
+
+ADDRESSES = 64
+DRIBBLE_S = 1.0
+ARRIVAL_S = 5.0
+"""All clients come within so long; what is timed counts from then."""
+SLOW_BYTES = 32_000
+"""Bytes a second of the slow line, of which a picture takes 6,000."""
+TARGETS = {"api": 100.0, "closed": 15.0, "late": 50.0, "memory": 30.0, "lag": 0.5, "glass": 300.0, "unfed": 0.0}
+
+
+class Connection:
+    """One connection to the page from an address of its own."""
+
+    def __init__(self, where: int, number: int, window: int = 0) -> None:
+        self._where = where
+        self._from = f"127.0.1.{1 + number % ADDRESSES}"
+        self._window = window
+
+    async def __aenter__(self) -> Connection:
+        raw = socket.socket()
+        raw.setblocking(False)
+        if self._window:
+            raw.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, self._window)
+        raw.bind((self._from, 0))
+        await asyncio.get_running_loop().sock_connect(raw, ("127.0.0.1", self._where))
+        limit = self._window or 1 << 16
+        self.reader, self.writer = await asyncio.open_connection(sock=raw, limit=limit)
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self.writer.close()
+
+    async def ask(self, path: str, method: str = "GET", body: str = "") -> tuple[int, dict[str, str]]:
+        """Send one request; the status and the headers of the answer."""
+        head = f"{method} {path} HTTP/1.1\r\nHost: 127.0.0.1\r\nX-Swarm: 1\r\nContent-Length: {len(body)}\r\n\r\n"
+        self.writer.write(head.encode() + body.encode())
+        lines = (await self.reader.readuntil(b"\r\n\r\n")).decode().split("\r\n")
+        headers = {name.lower(): value.strip() for name, _, value in (line.partition(":") for line in lines[1:])}
+        return int(lines[0].split()[1]), headers
+
+    async def whole(self, path: str, method: str = "GET", body: str = "") -> tuple[int, dict[str, str], bytes]:
+        """Send one request; status, headers and body."""
+        status, headers = await self.ask(path, method, body)
+        return status, headers, await self.reader.readexactly(int(headers.get("content-length", 0)))
+
+
+class Load:
+    """All clients of one web node, and what they saw."""
+
+    def __init__(self, where: int, ticket: str, uuids: Sequence[str]) -> None:
+        self.beats: dict[int, float] = {}
+        self.longest = 0.0
+        self.ages: list[float] = []
+        self.slow: list[float] = []
+        self.closed: list[float] = []
+        self.answers: list[float] = []
+        self.refused = 0
+        self._where = where
+        self._ticket = ticket
+        self._uuids = uuids
+
+    def forget(self) -> None:
+        """Count anew what is timed: all clients have come."""
+        self.longest = 0.0
+        for each in (self.ages, self.slow, self.answers):
+            each.clear()
+
+    async def events(self, number: int) -> None:
+        """One open page."""
+        async with Connection(self._where, number) as line:
+            await line.ask(f"/events?ticket={self._ticket}")
+            self.beats[number] = time.monotonic()
+            while True:
+                if (await line.reader.readline()).startswith(b"event: beat"):
+                    now = time.monotonic()
+                    self.longest = max(self.longest, now - self.beats[number])
+                    self.beats[number] = now
+
+    async def camera(self, number: int) -> None:
+        """One viewer of a camera, as fast as there are pictures."""
+        async with Connection(self._where, number) as line:
+            after = ""
+            while True:
+                status, headers, body = await line.whole(self._shot(number, after))
+                if status == 200:
+                    after = headers["x-seq"]
+                    self.ages.append(_age(body))
+
+    async def slowly(self, number: int) -> None:
+        """One viewer on a slow line: how old a picture is when it is there as a whole."""
+        async with Connection(self._where, number, 4096) as line:
+            after = ""
+            while True:
+                status, headers = await line.ask(self._shot(number, after))
+                size, body = int(headers.get("content-length", 0)), b""
+                while len(body) < size:
+                    body += await line.reader.read(min(1000, size - len(body)))
+                    await asyncio.sleep(1000 / SLOW_BYTES)
+                if status == 200:
+                    after = headers["x-seq"]
+                    self.slow.append(_age(body))
+
+    async def dribble(self, number: int) -> None:
+        """One client that sends a byte a second, as long as it may."""
+        async with Connection(self._where, number) as line:
+            began = time.monotonic()
+            over = asyncio.ensure_future(line.reader.read())
+            for byte in b"GET /" + b"a" * 1000:
+                line.writer.write(bytes([byte]))
+                if (await asyncio.wait([over], timeout=DRIBBLE_S))[0]:
+                    break
+            self.closed.append(time.monotonic() - began)
+
+    async def requests(self, rate: float) -> None:
+        """``rate`` requests a second in all, each timed from when it was due."""
+        await asyncio.gather(*(self._requests(number, rate / 20, number / rate) for number in range(20)))
+
+    async def _requests(self, number: int, rate: float, first: float) -> None:
+        due = time.monotonic() + first
+        async with Connection(self._where, number) as line:
+            while True:
+                await asyncio.sleep(max(0.0, due - time.monotonic()))
+                status, _, _ = await line.whole(f"/api/v1/state?ticket={self._ticket}")
+                self.answers.append(time.monotonic() - due)
+                self.refused += status != 200
+                due += 1 / rate
+
+    def _shot(self, number: int, after: str) -> str:
+        uuid = self._uuids[number % len(self._uuids)]
+        return f"/shot/{uuid}?after={after}&viewer=bench{number}&ticket={self._ticket}"
+
+
+def _age(picture: bytes) -> float:
+    return time.monotonic() - float(struct.unpack("!d", picture[len(MARK) : len(MARK) + 8])[0])
+
+
+class Child:
+    """One process of the team."""
+
+    def __init__(self, *arguments: object) -> None:
+        command = [sys.executable, "-m", "benchmarks.page_team", *map(str, arguments)]
+        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        assert self._process.stdout is not None and self._process.stdin is not None
+        self._said, self._asked = self._process.stdout, self._process.stdin
+        if not self._said.readline():
+            raise SystemExit("bench-page: a process of the team ended; its own words are above")
+
+    def figures(self) -> dict[str, float]:
+        """What it measured since the last time."""
+        self._asked.write("?\n")
+        self._asked.flush()
+        told: dict[str, float] = json.loads(self._said.readline())
+        return told
+
+    def stop(self) -> None:
+        """End it."""
+        self._asked.close()
+        self._process.wait(15)
+
+
+async def signed_in(where: int) -> tuple[str, list[str]]:
+    """A ticket, and the robots' uuids as soon as all are there."""
+    async with Connection(where, 0) as line:
+        _, _, body = await line.whole("/api/v1/session", "POST", json.dumps({"code": CODE}))
+        ticket = json.loads(body)["ticket"]
+        for _ in range(200):
+            _, _, body = await line.whole(f"/api/v1/devices?ticket={ticket}")
+            found = {device["name"]: device["uuid"] for device in json.loads(body)}
+            if set(ROBOTS) <= set(found):
+                return ticket, [found[name] for name in ROBOTS]
+            await asyncio.sleep(0.1)
+    raise SystemExit("bench-page: the robots did not join")
+
+
+async def measured(given: Any, web: Child, where: int) -> list[str]:
+    """The lines of the table."""
+    ticket, uuids = await signed_in(where)
+    load = Load(where, ticket, uuids)
+    await asyncio.sleep(2)
+    before = web.figures()
+    kinds = [(load.events, given.streams), (load.camera, given.cameras), (load.dribble, given.dribblers)]
+    tasks = [
+        asyncio.ensure_future(_after(ARRIVAL_S * number / count, client, number))
+        for client, count in kinds
+        for number in range(count)
+    ]
+    tasks += [asyncio.ensure_future(load.slowly(1)), asyncio.ensure_future(load.requests(given.rate))]
+    await asyncio.sleep(ARRIVAL_S + 1)
+    load.forget()
+    web.figures()
+    await asyncio.sleep(given.seconds)
+    after = web.figures()
+    unfed = given.streams - sum(time.monotonic() - at < 2 for at in load.beats.values())
+    open_still = given.dribblers - len(load.closed)
+    broken = [task for task in tasks if task.done() and task.exception() is not None]
+    for task in tasks:
+        task.cancel()
+    await asyncio.gather(*tasks, return_exceptions=True)
+    rate = len(load.ages) / given.seconds / max(1, given.cameras)
+    return [
+        _line("streams not fed", unfed, "of them", "unfed", f" (longest time without a beat {load.longest:.2f} s)"),
+        _line("API, 99 of 100", 1000 * _part(load.answers, 0.99), "ms", "api", f" ({len(load.answers)} answers)"),
+        _line("picture's age, p95", 1000 * _part(load.ages, 0.95), "ms", "glass", f" ({rate:.1f} a second and viewer)"),
+        _line("slow viewer, oldest", max(load.slow, default=99.0), "s", "lag", f" ({len(load.slow)} pictures)"),
+        _line("dribblers closed", max(load.closed, default=0.0), "s", "closed", f" ({open_still} are still open)"),
+        _line("timers late", after["late_ms"], "ms", "late", f" (99 of 100: {after['late_p99_ms']:.1f} ms)"),
+        _line("memory more", after["rss"] - before["rss"], "MiB", "memory", f" (of {after['rss']:.0f})"),
+        *([f"{load.refused} requests were REFUSED"] if load.refused else []),
+        *([f"{len(broken)} clients BROKE: {broken[0].exception()!r}"] if broken else []),
+        *([f"{open_still} dribblers MISSED: still open"] if open_still and given.seconds > 20 else []),
+    ]
+
+
+async def _after(seconds: float, client: Callable[[int], Coroutine[Any, Any, None]], number: int) -> None:
+    await asyncio.sleep(seconds)
+    await client(number)
+
+
+def _part(values: list[float], part: float) -> float:
+    return sorted(values)[int(part * len(values))] if values else 99.0
+
+
+def _line(what: str, value: float, unit: str, target: str, note: str) -> str:
+    limit = TARGETS[target]
+    return f"{what:22}{value:8.2f} {unit:8} target {limit:g}: {'held' if value <= limit else 'MISSED'}{note}"
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Load, measure and print."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.page", description="The page under load.")
+    parser.add_argument("--seconds", type=float, default=30.0)
+    parser.add_argument("--streams", type=int, default=200)
+    parser.add_argument("--cameras", type=int, default=12)
+    parser.add_argument("--dribblers", type=int, default=500)
+    parser.add_argument("--rate", type=float, default=100.0, help="requests a second")
+    given = parser.parse_args(arguments)
+    most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+    # Both ends of each connection are files; the children inherit this.
+    resource.setrlimit(resource.RLIMIT_NOFILE, (min(4096, most), most))
+    udp, where = port.free("udp", "127.0.0.1", 1)[0], port.free("tcp", "127.0.0.1", 1)[0]
+    web = Child("web", udp, where)
+    robots = Child("robots", udp)
+    try:
+        lines = asyncio.run(measured(given, web, where))
+    finally:
+        robots.stop()
+        web.stop()
+    sys.stdout.write("\n".join(lines) + "\n")
+    return 1 if any(word in line for line in lines for word in ("MISSED", "REFUSED", "BROKE")) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

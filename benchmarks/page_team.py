@@ -1,0 +1,142 @@
+"""The team that ``benchmarks.page`` loads: a real web node, or three robots whose pictures say when they were taken.
+
+``python -m benchmarks.page_team web`` says its port, and at each line on its input how late its timers were and what it
+weighs; ``robots UDP_PORT`` joins three robots.  Each is a process of its own, and ends when its input does.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+import sys
+import time
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from twisted.internet.stdio import StandardIO
+from twisted.protocols.basic import LineReceiver
+
+from middleware.entangled.clock import use_monotonic_time
+from middleware.node import CAMERA
+from middleware.settings import Settings
+from swarmnode.service import NodeService
+from swarmnode.web import web_page
+from swarmnode.world import real_seams
+
+ROBOTS = ("dog1", "dog2", "dog3")
+CODE = "page-bench"
+KEY = "5b" * 32
+FPS, PICTURE = 30.0, 6000
+"""Pictures a second of each robot, and their bytes, as of the dogs of the yard."""
+WORDS_S = 0.5
+"""How often each robot says something, so that the state changes."""
+TICK_S = 0.002
+MARK = b"\xff\xd8"
+
+
+def settings(name: str, port: int, **tables: Any) -> Settings:
+    """A node on this machine that forgets all when it ends; ``port`` is the web node's."""
+    known = [] if "web" in tables else [f"127.0.0.1:{port}"]
+    node = {"name": name, "host": "127.0.0.1", "port": port if "web" in tables else 0, "known_nodes": known}
+    roles = ["edge", "web"] if "web" in tables else ["edge"]
+    return Settings.from_mapping({"node": {**node, "team_key": KEY, "roles": roles, "store": ":memory:"}, **tables}, "")
+
+
+def rss() -> float:
+    """The memory of this process, in MiB."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / (1 << 20)
+
+
+class Orders(LineReceiver):
+    """Answers each line with figures; the end of the input ends the process."""
+
+    delimiter = b"\n"
+
+    def __init__(self, reactor: Any, first: dict[str, Any], late: list[float]) -> None:
+        self._reactor = reactor
+        self._first = first
+        self._late = late
+
+    def connectionMade(self) -> None:
+        """Say that the team is there."""
+        self.sendLine(json.dumps(self._first).encode())
+
+    def lineReceived(self, line: bytes) -> None:
+        """Say how late the timers were since the last line, in ms, and the memory."""
+        late = sorted(self._late) or [0.0]
+        self._late.clear()
+        told = {"late_ms": 1000 * late[-1], "late_p99_ms": 1000 * late[int(0.99 * len(late))], "rss": rss()}
+        self.sendLine(json.dumps(told).encode())
+
+    def connectionLost(self, reason: Any = None) -> None:
+        """End."""
+        if self._reactor.running:
+            self._reactor.stop()
+
+
+def main(arguments: list[str]) -> None:
+    """Be the web node, or the robots."""
+    use_monotonic_time()
+    from twisted.internet import reactor as made
+
+    reactor: Any = made
+    late: list[float] = []
+    if arguments[0] == "web":
+        ports = [int(word) for word in arguments[1:]]
+        wanted = settings("vaio", ports[0], web={"host": "127.0.0.1", "port": ports[1], "code": CODE})
+        seams = real_seams(wanted, reactor)
+        services = [NodeService(wanted, seams, [partial(web_page, wanted, seams, reactor)])]
+
+        def tick(due: float) -> None:
+            now = reactor.seconds()
+            late.append(now - due)
+            reactor.callLater(TICK_S, tick, now + TICK_S)
+
+        reactor.callWhenRunning(lambda: tick(reactor.seconds()))
+    else:
+        port = int(arguments[1])
+        services = [robot(name, port, reactor) for name in ROBOTS]
+    for service in services:
+        reactor.callWhenRunning(service.startService)
+        reactor.addSystemEventTrigger("before", "shutdown", service.stopService)
+    reactor.callWhenRunning(lambda: StandardIO(Orders(reactor, {"is": arguments[0]}, late), reactor=reactor))
+    reactor.run()
+
+
+def robot(name: str, port: int, reactor: Any) -> NodeService:
+    """A robot with a camera, which shows the moment, and a word now and then."""
+    wanted = settings(name, port)
+    camera = {CAMERA: {"width": 208, "height": 160, "fps": FPS}}
+    wanted = Settings.from_mapping(
+        {
+            "node": {
+                "name": name,
+                "team_key": KEY,
+                "host": "127.0.0.1",
+                "port": 0,
+                "store": ":memory:",
+                "known_nodes": [f"127.0.0.1:{port}"],
+                "capabilities": camera,
+            }
+        },
+        "",
+    )
+    service = NodeService(wanted, real_seams(wanted, reactor))
+    node = service.assembly.node
+
+    def shoot(number: int) -> None:
+        node.streams.offer(CAMERA, number, MARK + struct.pack("!d", time.monotonic()) + bytes(PICTURE))
+        reactor.callLater(1 / FPS, shoot, number + 1)
+
+    def say(number: int) -> None:
+        node.presence.say(time.time(), f"word {number}")
+        reactor.callLater(WORDS_S, say, number + 1)
+
+    reactor.callWhenRunning(shoot, 1)
+    node.joined.addCallback(lambda _: say(1))
+    return service
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,81 @@
+"""What ``webnode.fallback`` promises."""
+
+from __future__ import annotations
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.presence import Device
+from tests.fleet import FleetCase, SwarmFleet
+from webnode.board import Page
+from webnode.fallback import REMEMBERED_S, TeamFallbacks, origin_of, pages_of, urls_at
+
+
+class UrlTests(SynchronousTestCase):
+    def test_name_an_origin_as_browsers_do(self) -> None:
+        """Case, usual ports and the ways to say this machine make no difference; a path of its own is no page."""
+        for url, origin in (
+            ("http://192.168.0.5:8080", "http://192.168.0.5:8080"),
+            ("http://VAIO.local:8080/", "http://vaio.local:8080"),
+            ("https://192.168.0.5", "https://192.168.0.5:443"),
+            ("http://localhost:8080", "http://127.0.0.1:8080"),
+            ("http://[fe80::1]:8080", "http://[fe80::1]:8080"),
+        ):
+            self.assertEqual(origin_of(url), origin)
+
+    def test_follow_no_url_out_of_the_house(self) -> None:
+        """What is no page of a machine in the local network is none, whoever signed it."""
+        for url in (
+            "https://evil.example",
+            "javascript:alert(1)",
+            "http://192.168.0.5/elsewhere",
+            "http://dog@192.168.0.5",
+            "http://192.168.0.5:99999",
+            "http://192.168.0.5:8080?x=1",
+            "http://192.168.0.5:8080\n",
+            "http://" + "a" * 100,
+            "",
+            "null",
+        ):
+            self.assertEqual(origin_of(url), "", url)
+        device = Device("01", "dog1", pages=("https://evil.example", "http://192.168.0.5:8080"))
+        self.assertEqual(pages_of([device]), [Page("01", "http://192.168.0.5:8080")])
+
+    def test_give_every_name_of_an_open_page(self) -> None:
+        """A page at one address has that URL alone; one that is served at all of them has the machine's names."""
+        self.assertEqual(urls_at("127.0.0.1", 8080, ["vaio.local"]), ["http://127.0.0.1:8080"])
+        self.assertEqual(
+            urls_at("0.0.0.0", 80, ["10.0.0.5", "", "v.local"]), ["http://10.0.0.5:80", "http://v.local:80"]
+        )
+        self.assertEqual(urls_at("::1", 8443, [], is_secure=True), ["https://[::1]:8443"])
+
+
+class TeamFallbacksTests(FleetCase):
+    def web_nodes(self) -> tuple[SwarmFleet, list[TeamFallbacks]]:
+        """Two nodes of which each serves the page at a port of its own."""
+        swarm = self.swarm(2)
+        webs = [TeamFallbacks(node, swarm.clock.seconds) for node in swarm.nodes]
+        for place, web in enumerate(webs):
+            web.serves([f"http://127.0.0.1:808{place}"])
+        swarm.run(2)
+        return swarm, webs
+
+    def test_know_each_other(self) -> None:
+        """Each web node knows where the other serves, names its own first, and lets the other's page in."""
+        _, (first, second) = self.web_nodes()
+        self.assertEqual([page.url for page in first.here()], ["http://127.0.0.1:8080", "http://127.0.0.1:8081"])
+        self.assertEqual([page.is_self for page in second.here()], [True, False])
+        self.assertTrue(first.lets_in("http://127.0.0.1:8081"))
+        self.assertTrue(second.lets_in("http://localhost:8080"))
+        self.assertFalse(first.lets_in("https://127.0.0.1:8081"))
+        self.assertFalse(first.lets_in("http://192.168.0.9:8081"))
+
+    def test_let_in_the_page_of_the_dead(self) -> None:
+        """A web node that dies is listed no more; its page, which still runs in a browser, is let in for an hour."""
+        swarm, (first, second) = self.web_nodes()
+        swarm.nodes[0].vanish()
+        swarm.run(3)
+        self.assertEqual([page.url for page in second.here()], ["http://127.0.0.1:8081"])
+        self.assertTrue(second.lets_in("http://127.0.0.1:8080"))
+        swarm.run(REMEMBERED_S)
+        self.assertFalse(second.lets_in("http://127.0.0.1:8080"))
+        self.assertTrue(second.lets_in("http://127.0.0.1:8081"))

@@ -1,0 +1,86 @@
+"""What ``webnode.journal`` promises."""
+
+from __future__ import annotations
+
+import random
+from typing import Any
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from webnode.journal import KEPT, KEYS, Journal
+
+
+def state(**devices: Any) -> dict[str, Any]:
+    rows = [{"uuid": uuid, "status": status} for uuid, status in devices.items()]
+    return {"node": "vaio", "devices": rows, "tasks": [], "groups": []}
+
+
+def applied(known: dict[str, Any], content: Any) -> dict[str, Any]:
+    """What a page knows after a change, each list as a table."""
+    now = {name: dict(value) if name in KEYS else value for name, value in known.items()}
+    for name, value in content.items():
+        if name in KEYS:
+            now[name] |= {row[KEYS[name]]: row for row in value}
+        elif name != "without":
+            now[name] = value
+    for name, gone in content.get("without", {}).items():
+        for each in gone:
+            del now[name][each]
+    return now
+
+
+class JournalTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.journal = Journal("ab")
+
+    def taken(self, *states: dict[str, Any]) -> Any:
+        for each in states:
+            change = self.journal.take(each)
+        return None if change is None else change.content
+
+    def test_tell_what_differs(self) -> None:
+        """A change names the rows that are new or other, those that are gone, and nothing else."""
+        self.taken(state(a="IDLE", b="IDLE"))
+        self.assertEqual(self.taken(state(a="DONE", b="IDLE")), {"devices": [{"uuid": "a", "status": "DONE"}]})
+        self.assertEqual(self.taken(state(a="DONE")), {"devices": [], "without": {"devices": ["b"]}})
+        self.assertEqual(self.taken({**state(a="DONE"), "halted": True}), {"halted": True})
+        self.assertIsNone(self.taken({**state(a="DONE"), "halted": True}))
+
+    def test_resume(self) -> None:
+        """Who names what it heard last gets what came after it, in order."""
+        self.taken(state(a="IDLE"), state(a="DONE"), state(b="DONE"))
+        missed = self.journal.since(self.journal.number("ab-1"))
+        self.assertEqual([change.n for change in missed or []], [2, 3])
+        self.assertEqual(self.journal.since(self.journal.number(self.journal.id(3))), [])
+
+    def test_tell_all_after_a_gap(self) -> None:
+        """An id that is too old, of another node or start, from the future, or no id is answered with everything."""
+        for n in range(KEPT + 3):
+            self.taken(state(a=n))
+        for name in ("ab-1", "ab-2", "ac-60", "ab-999", "ab-", "ab-x", "ab--1", "", "ab-" + "9" * 40, "ab-²"):
+            self.assertIsNone(self.journal.since(self.journal.number(name)), name)
+        self.assertEqual(len(self.journal.since(self.journal.number("ab-3")) or []), KEPT)
+
+    def test_take_nothing_that_json_cannot_carry(self) -> None:
+        """A state with what is no JSON is refused, and the next one is told against the last that was taken."""
+        self.taken(state(a="IDLE"))
+        self.assertRaises(ValueError, self.journal.take, state(a=float("nan")))
+        self.assertRaises(ValueError, self.journal.take, {**state(a="IDLE"), "halted": float("nan")})
+        self.assertEqual((self.journal.n, self.taken(state(a="IDLE"))), (1, None))
+
+    def test_end_where_the_state_is(self) -> None:
+        """Whatever happens, changes applied to any earlier state that is still kept give the newest one."""
+        dice = random.Random(5)
+        known = []
+        for _ in range(200):
+            devices = {uuid: dice.choice(("IDLE", "DONE")) for uuid in "abcdef" if dice.random() < 0.7}
+            now = {**state(**devices), "halted": dice.random() < 0.5}
+            self.journal.take(now)
+            tables = {name: {row[KEYS[name]]: row for row in now[name]} for name in KEYS}
+            known.append((self.journal.n, {**now, **tables}))
+        for n, before in known:
+            missed = self.journal.since(n)
+            if missed is not None:
+                for change in missed:
+                    before = applied(before, change.content)
+                self.assertEqual(before, known[-1][1])

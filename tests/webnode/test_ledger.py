@@ -1,0 +1,25 @@
+"""What ``webnode.ledger`` promises of its glances; its states are tested over whole teams."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from twisted.internet.task import Clock
+from twisted.trial.unittest import SynchronousTestCase
+
+from webnode.ledger import FRESH_S, Glance
+
+
+class GlanceTests(SynchronousTestCase):
+    def test_read_once_for_many(self) -> None:
+        """Who asks within a tenth of a second gets what the one before got; later it is read again."""
+        clock, read = Clock(), [0]
+
+        def state() -> dict[str, Any]:
+            read[0] += 1
+            return {"n": read[0]}
+
+        glance = Glance(state, clock.seconds)
+        self.assertEqual([glance()["n"] for _ in range(100)], [1] * 100)
+        clock.advance(FRESH_S)
+        self.assertEqual((glance()["n"], glance()["n"]), (2, 2))

@@ -1,0 +1,52 @@
+// The reserve: where else the team serves the page, and which of its nodes answers now.
+const VERSION = 1;
+const PATIENCE = 800;
+const LEAD = 150;
+const KEPT = "swarm.pages";
+const isLoopback = (url) => /^https?:\/\/(127\.|localhost[:/]|localhost$|\[::1\])/.test(url);
+let pages = kept();
+
+// What was heard before counts for a page that the browser kept while its own node is gone.
+function kept() {
+  try {
+    return JSON.parse(localStorage.getItem(KEPT)) ?? [];
+  } catch {
+    return [];
+  }
+}
+
+export function remember(told) {
+  pages = told;
+  try {
+    localStorage.setItem(KEPT, JSON.stringify(told));
+  } catch {
+    // A browser that keeps nothing goes on without.
+  }
+}
+
+// A page of this machine is meant for this machine alone, and no page over TLS may ask one without.
+function reachable({ url }) {
+  if (isLoopback(url)) return isLoopback(location.origin);
+  return url.startsWith("https:") || location.protocol === "http:";
+}
+
+// A node that is frozen still takes connections: only a full answer counts.
+async function present(url, node) {
+  const answer = await fetch(`${url}/api/v1/node`, { cache: "no-store", signal: AbortSignal.timeout(PATIENCE) });
+  const told = await answer.json();
+  if (!answer.ok || told.api !== VERSION || (node && told.node !== node)) throw new Error(url);
+  return url;
+}
+
+// The first that answers; `first` is asked first, each other a little later, or as soon as the one before has failed.
+export async function race(first) {
+  const known = new Map([[first, ""], [location.origin, ""]]);
+  for (const page of pages.filter(reachable)) if (!known.has(page.url)) known.set(page.url, page.node);
+  const asked = [];
+  for (const [url, node] of known) {
+    asked.push(present(url, node));
+    const won = await Promise.race([Promise.any(asked).catch(() => ""), new Promise((done) => setTimeout(done, LEAD, ""))]);
+    if (won) return won;
+  }
+  return Promise.any(asked);
+}
