@@ -20,7 +20,7 @@ from middleware.entangled.kademlia import membership, roster
 from middleware.entangled.replication import handover, pusher, replica, subscriber
 from middleware.entangled.space import shelf, template
 from middleware.settings import Settings
-from webnode import channel, limits, live, session, team
+from webnode import channel, limits, live, team
 from webnode.board import AUDITED
 from webnode.routes import orders
 
@@ -65,7 +65,6 @@ FIGURES: Sequence[tuple[str, str]] = (
         f"{limits.MOST['unfinished']} requests that are not complete, {limits.MOST['stream']} answers under way",
     ),
     ("safety", f"and {limits.MOST['open']} connections"),
-    ("safety", f"Where more than {session.WAITING} wait".lower()),
     ("safety", f"the newest {AUDITED} in memory"),
     ("tuplespace", f"1 to {template.MAX_FIELDS} fields"),
     ("tuplespace", f"asked every {shelf.POLL:g} s whether"),

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Collection, Sequence
+from functools import partial
 from typing import Any
 
 from flask import Flask, Response, jsonify, render_template, request
@@ -27,7 +28,7 @@ MAX_ID = 64
 OnReactor = Callable[..., Any]
 
 
-def _here(wish: Callable[..., Any], *arguments: Any) -> Any:
+def _here(wish: Callable[..., Any], *arguments: Any, limit_s: float | None = None) -> Any:
     told = wish(*arguments)
     if not isinstance(told, Deferred):
         return told
@@ -66,7 +67,7 @@ def create_app(
     dispatch = Dispatch()
     for route in table:
         if route.answer is not None:
-            _serve(app, route, tuple(table), read, board, wall, lambda *asked: on_reactor(dispatch.carry_out, *asked))
+            _serve(app, route, tuple(table), read, board, wall, partial(on_reactor, dispatch.carry_out))
     return app
 
 
@@ -131,14 +132,15 @@ def _serve(
     read: Callable[[], State],
     board: Board,
     wall: Callable[[], float],
-    carry_out: Callable[[Route, Ask], Any],
+    carry_out: Callable[..., Any],
 ) -> None:
     def answer(**path: str) -> Response:
         now = wall()
         who = board.sessions.visitor(_token(), now)
         guarded(route.role, who)
         given = checked(route, path, request.args, {} if route.method == "GET" else _body())
-        told = carry_out(route, Ask(given, who, board, read(), _id(), request.remote_addr or "", now, table))
+        ask = Ask(given, who, board, read(), _id(), request.remote_addr or "", now, table)
+        told = carry_out(route, ask, limit_s=route.limit_s)
         is_content = isinstance(told, Content)
         response = app.response_class(told.body, content_type=told.kind) if is_content else jsonify(told)
         response.status_code = route.status

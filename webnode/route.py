@@ -87,6 +87,7 @@ class Route:
     """One line of the API.
 
     ``answer`` None: the route is not Flask's but a Twisted resource's, made by ``native`` or by the front door.
+    ``limit_s`` is for answers that may take longer than the others.
     """
 
     method: Literal["GET", "POST", "PUT", "DELETE"]
@@ -98,6 +99,7 @@ class Route:
     gives: str = ""
     status: int = 200
     native: Native | None = None
+    limit_s: float | None = None
 
     @property
     def name(self) -> str:

@@ -49,18 +49,18 @@ Door = Callable[[Site], IListeningPort]
 """Opens a port for a site; raises ``PortTaken``."""
 
 
-def caller(reactor: Any, limit_s: float = LIMIT_S) -> OnReactor:
+def caller(reactor: Any, usual_s: float = LIMIT_S) -> OnReactor:
     """What Flask's workers call the desk with: run on the reactor's thread, wait at most ``limit_s`` for the answer.
 
-    A Deferred is waited for.  Where no answer comes in time a ``Refusal`` with status 503 is raised; the wish may still
-    be granted.
+    Without ``limit_s`` it is ``usual_s``.  A Deferred is waited for.  Where no answer comes in time a ``Refusal`` with
+    status 503 is raised; the wish may still be granted.
     """
 
-    def on_reactor(wish: Callable[..., Any], *arguments: Any) -> Any:
+    def on_reactor(wish: Callable[..., Any], *arguments: Any, limit_s: float | None = None) -> Any:
         answers: SimpleQueue[Any] = SimpleQueue()
         reactor.callFromThread(lambda: maybeDeferred(wish, *arguments).addBoth(answers.put))
         try:
-            outcome = answers.get(timeout=limit_s)
+            outcome = answers.get(timeout=usual_s if limit_s is None else limit_s)
         except Empty:
             raise Refusal("node", "it did not answer in time", "look at the state, then try again", 503) from None
         if isinstance(outcome, Failure):

@@ -26,8 +26,9 @@ SIGNED_S = 12 * 3600.0
 """How long one is signed in."""
 LETTERS = "abcdefghjkmnpqrstuvwxyz"
 """Of these is a code that the node makes: none looks like another, or like a digit."""
-AT_ONCE, WAITING = 2, 16
-"""Passwords that are checked at the same time, and those that may wait for it."""
+AT_ONCE, WAITING = 2, 1
+"""Passwords that are checked at the same time, and those that may wait for it: each holds one of the page's four
+workers, and whoever guesses must not hold them all."""
 REVOKED = 4096
 
 Check = Callable[[str, str], Deferred[bool]]

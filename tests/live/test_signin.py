@@ -37,6 +37,11 @@ class SigningInTests(SynchronousTestCase):
         page.locator("#link[data-link=live]").wait_for()
         page.locator(".device").nth(2).wait_for()
 
+    def see(self, page: Any, view: str) -> None:
+        """Look at a view; a phone shows one at a time."""
+        page.evaluate(f"location.hash = '{view}'")
+        page.locator(f"body[data-view={view}]").wait_for()
+
     def test_sign_in_by_hand(self) -> None:
         """Without a session the page shows nothing of the team and asks; wrong is told, Escape leads nowhere."""
         from axe_playwright_python.sync_playwright import Axe
@@ -79,9 +84,11 @@ class SigningInTests(SynchronousTestCase):
         self.is_in(page)
         viewer = self.opened(PHONE, f"#code={self.invitation(page)}")
         self.is_in(viewer)
+        self.see(viewer, "more")
         viewer.locator(".session", has_text="viewer").wait_for()
         offered = [button.inner_text() for button in viewer.locator("button:not(.device):visible").all()]
         self.assertEqual(offered, ["Sign out"])
+        self.see(viewer, "cameras")
         viewer.locator("#cameras").scroll_into_view_if_needed()
         viewer.locator("figure[data-camera=live]").first.wait_for()
         told = viewer.evaluate(
@@ -99,6 +106,7 @@ class SigningInTests(SynchronousTestCase):
             self.is_in(page)
             page.get_by_role("button", name="Run Demo").click()
             page.locator("#line", has_text="The demo runs").wait_for()
+            self.see(page, "more")
             page.get_by_text("Who changed what").focus()
             page.keyboard.press("Enter")
             page.locator(".audit li", has_text="POST demo").first.wait_for()

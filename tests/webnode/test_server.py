@@ -192,5 +192,6 @@ class CallerTests(SynchronousTestCase):
     def test_wait_no_longer_than_the_limit(self) -> None:
         """A desk that does not answer costs the worker only the limit, and the visitor is told to look."""
         never: Deferred[None] = Deferred()
-        error = self.assertRaises(Refusal, caller(QuickReactor(), 0.0), lambda: never)
-        self.assertEqual(error.status, 503)
+        for usual_s, given in ((0.0, {}), (1e6, {"limit_s": 0.0})):
+            error = self.assertRaises(Refusal, caller(QuickReactor(), usual_s), lambda: never, **given)
+            self.assertEqual(error.status, 503)

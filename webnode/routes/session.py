@@ -56,6 +56,8 @@ ROUTES = (
             Field("password", "text", "the password", is_required=False, default=""),
         ),
         gives="token, ticket, role, until (unix seconds)",
+        # A password takes a small device a while.
+        limit_s=4.5,
     ),
     Route("GET", f"{API}/session", "Who asks: anyone, until signed in", "anyone", session, gives="name, role"),
     Route("DELETE", f"{API}/session", "Sign out: the token and its ticket let in nobody more", "anyone", sign_out),
