@@ -1,11 +1,182 @@
-"""Chronicle: what happened in the team."""
+"""Chronicle: what happened in the team, told from one state to the next.  Pure.
+
+Two states in, entries out: who came and went, what became of each task, on whom a group agreed, and how long a takeover
+took.  It begins when its node begins to look, and knows nothing of what was before.
+"""
 
 from __future__ import annotations
 
-from webnode.board import Chronicle, MemoryChronicle
+from collections import deque
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from webnode.board import Chronicle, Entry
 from webnode.ground import Ground
+from webnode.state import GONE, State
+
+KEPT = 2000
+"""Entries that are remembered: an hour of a lively team."""
+DOUBTED_S = 60.0
+"""Seconds after which a fault that took nobody away explains no takeover any more."""
+EXECUTING = "EXECUTING"
+DECIDED = ("COMPLETED", "FAILED", "CANCELLED")
 
 
 def chronicle(ground: Ground) -> Chronicle:
-    """What this node saw; nobody writes it down so far."""
-    return MemoryChronicle()
+    """What this node sees from now on."""
+    return TeamChronicle()
+
+
+@dataclass
+class _Loss:
+    """Who was acting on a task when something befell it, and when that was."""
+
+    uuid: str
+    name: str
+    at: float
+    is_gone: bool
+
+
+class TeamChronicle:
+    """The newest entries, forgotten when the node ends.
+
+    A takeover is timed from the moment at which whoever acted was seen to be gone, or, where the fault was caused on
+    purpose, from that.
+    """
+
+    def __init__(self, kept: int = KEPT) -> None:
+        self._entries: deque[Entry] = deque(maxlen=kept)
+        self._n = 0
+        self._before: State = {}
+        self._acting: dict[str, set[str]] = {}
+        self._lost: dict[str, _Loss] = {}
+
+    def saw(self, state: State, now: float) -> None:
+        """Take the next state, seen at ``now`` (unix seconds)."""
+        before, self._before = self._before, state
+        if not before:
+            self._add(now, "start", text=f"{state.get('node') or 'this node'} begins to look")
+        self._devices(_by(before, "devices", "uuid"), _rows(state, "devices"), now)
+        titles = {task["id"]: task["title"] for task in _rows(state, "tasks")}
+        self._tasks(_by(before, "tasks", "id"), _rows(state, "tasks"), now)
+        self._groups(_by(before, "groups", "task"), _rows(state, "groups"), now)
+        self._takeovers(state, titles, now)
+        if bool(state.get("halted")) != bool(before.get("halted")):
+            self._add(now, "halt", text="the team is halted" if state.get("halted") else "the team goes on")
+
+    def faulted(self, uuid: str, kind: str, now: float) -> None:
+        """Remember that a fault was caused on purpose, so that the takeover is timed from it."""
+        name = _by(self._before, "devices", "uuid").get(uuid, {}).get("name", uuid[:8])
+        task = next((task for task, acting in self._acting.items() if uuid in acting), "")
+        if task:
+            self._lost[task] = _Loss(uuid, name, now, False)
+        self._add(now, "fault", uuid, task, f"{name}: {kind}, caused on purpose")
+
+    def since(self, number: int, about: str = "") -> list[Entry]:
+        """The entries after ``number``, those about one device or task where ``about`` names it."""
+        if number >= self._n:
+            return []
+        return [entry for entry in self._entries if entry.n > number and about in ("", entry.uuid, entry.task)]
+
+    # -- inside -----------------------------------------------------------------------------------------------------
+
+    def _add(
+        self, at: float, kind: str, uuid: str = "", task: str = "", text: str = "", seconds: float | None = None
+    ) -> None:
+        self._n += 1
+        self._entries.append(Entry(self._n, at, kind, uuid, task, text, seconds))
+
+    def _devices(self, before: Mapping[str, State], devices: Iterable[State], now: float) -> None:
+        for device in devices:
+            uuid, name, task = device["uuid"], device["name"], device["task"]
+            old = before.get(uuid)
+            if device["status"] == GONE:
+                if old is not None and old["status"] != GONE:
+                    self._add(now, "gone", uuid, task, f"{name} is gone")
+                continue
+            if old is None:
+                place = f", number {device['joined']}" if device["joined"] else ""
+                self._add(now, "here", uuid, task, f"{name} is here{place}: {device['status'].lower()}")
+            elif old["status"] == GONE:
+                self._add(now, "back", uuid, task, f"{name} is back: {device['status'].lower()}")
+            elif old["status"] != device["status"]:
+                change = f"{old['status'].lower()} \N{RIGHTWARDS ARROW} {device['status'].lower()}"
+                self._add(now, "status", uuid, task or old["task"], f"{name}: {change}")
+            if old is not None:
+                for _, text in [line for line in device["messages"] if line not in old["messages"]]:
+                    self._add(now, "message", uuid, task, f"{name}: {text}")
+
+    def _tasks(self, before: Mapping[str, State], tasks: Iterable[State], now: float) -> None:
+        for task in tasks:
+            name, title, status = task["id"], task["title"], task["status"]
+            old = before.get(name, {})
+            if old.get("status") != status:
+                result, took = task["result"], None
+                change = f"{old['status'].lower()} \N{RIGHTWARDS ARROW} {status.lower()}" if old else status.lower()
+                if result and status in DECIDED:
+                    took = result["took"] if status == "COMPLETED" else None
+                    change += f" by {result['by']}" + (f" in {took:.1f} s" if took else "")
+                self._add(now, "task", "", name, f"{title}: {change}", took)
+            elif old and old["paused"] != task["paused"]:
+                self._add(now, "task", "", name, f"{title}: {'paused' if task['paused'] else 'goes on'}")
+            elif task["note"] and task["note"] != old.get("note"):
+                self._add(now, "task", "", name, f"{title}: {task['note']}")
+
+    def _groups(self, before: Mapping[str, State], groups: Iterable[State], now: float) -> None:
+        for group in groups:
+            agreed = bool(group["assigned_uuid"]) and group["agree"] == group["of"]
+            if agreed and _point(group) != _point(before.get(group["task"], {})):
+                bids = ", ".join(f"{m['name']} {m['cost']:.2f} m" for m in group["members"] if m["cost"] is not None)
+                told = f"{group['agree']} of {group['of']} agree on {group['assigned']}" + (
+                    f" ({bids})" if bids else ""
+                )
+                self._add(now, "agreed", group["assigned_uuid"], group["task"], told)
+
+    def _takeovers(self, state: State, titles: Mapping[str, str], now: float) -> None:
+        names = {device["uuid"]: device["name"] for device in _rows(state, "devices")}
+        acting: dict[str, set[str]] = {}
+        for device in _rows(state, "devices"):
+            if device["status"] == EXECUTING and device["task"]:
+                acting.setdefault(device["task"], set()).add(device["uuid"])
+        for device in _rows(state, "devices"):
+            for task in [task for task, uuids in self._acting.items() if device["uuid"] in uuids]:
+                if device["status"] == GONE:
+                    loss = self._lost.get(task)
+                    at = loss.at if loss is not None and loss.uuid == device["uuid"] else now
+                    self._lost[task] = _Loss(device["uuid"], device["name"], at, True)
+        for task, uuids in acting.items():
+            self._followed(task, titles.get(task, task), uuids, names, now)
+        ended = {task["id"] for task in _rows(state, "tasks") if task["status"] in DECIDED}
+        for task in [*self._lost]:
+            if task in ended or (not self._lost[task].is_gone and now - self._lost[task].at > DOUBTED_S):
+                del self._lost[task]
+        # Between two who act there may be nobody for a while: whoever was last is remembered until somebody is.
+        self._acting = {**{task: who for task, who in self._acting.items() if task not in ended}, **acting}
+
+    def _followed(self, task: str, title: str, uuids: set[str], names: Mapping[str, str], now: float) -> None:
+        before, loss = self._acting.get(task, set()), self._lost.get(task)
+        fresh = sorted(uuids - before)
+        if loss is not None and loss.is_gone and loss.uuid in uuids:
+            del self._lost[task]  # it came back before anybody took over
+        elif fresh and loss is not None and loss.uuid not in uuids:
+            took = round(now - loss.at, 2)
+            told = f"{names[fresh[0]]} takes over {title} from {loss.name}: {took:.1f} s"
+            self._add(now, "takeover", fresh[0], task, told, took)
+            del self._lost[task]
+        elif fresh and before and not before & uuids:
+            left = names.get(min(before), "one that left")
+            self._add(now, "handover", fresh[0], task, f"{names[fresh[0]]} goes on with {title} in place of {left}")
+
+
+def _point(group: Mapping[str, Any]) -> tuple[Any, ...]:
+    return group.get("assigned_uuid"), group.get("agree"), group.get("of")
+
+
+def _rows(state: State, name: str) -> list[State]:
+    rows = state.get(name)
+    return rows if isinstance(rows, list) else []
+
+
+def _by(state: State, name: str, key: str) -> dict[str, State]:
+    return {row[key]: row for row in _rows(state, name)}

@@ -18,7 +18,9 @@ FLAGS = [
     *("--disable-component-update", "--disable-sync", "--disable-dev-shm-usage"),
 ]
 PHONE = {"viewport": {"width": 412, "height": 839}, "has_touch": True}
+TABLET = {"viewport": {"width": 820, "height": 1180}, "has_touch": True}
 DESK = {"viewport": {"width": 1280, "height": 800}}
+VIEWS = ("tasks", "cameras", "map", "groups", "network", "events", "more", "devices")
 PANELS = """async () => {
   const { panel } = await import("/static/panel.js");
   const { model } = await import("/static/model.js");
@@ -110,34 +112,124 @@ class PageTests(SynchronousTestCase):
     def told(self, page: Any, words: str) -> None:
         page.locator("#line", has_text=words).wait_for()
 
+    def view(self, page: Any, name: str) -> None:
+        """Look at a view, as a link to it does."""
+        page.evaluate(f"location.hash = {name!r}")
+        page.locator(f"body[data-view={name}]").wait_for()
+
     def names(self, page: Any) -> list[str]:
         return list(page.locator(".device b").all_inner_texts())
 
     def test_be_accessible(self) -> None:
-        """On phone and desk, light and dark, dialog open or not, axe finds nothing, nothing is cut off or small."""
+        """On each screen, in each view and a device, light and dark, axe finds nothing, nothing is cut off or small."""
         from axe_playwright_python.sync_playwright import Axe
 
-        for screen in (PHONE, DESK):
+        for screen in (PHONE, TABLET, DESK):
             for scheme in ("light", "dark"):
                 page = self.opened(screen, scheme)
-                page.locator("#tasks li").first.wait_for()
-                for dialog in (False, True):
-                    if dialog:
-                        page.locator(".device").first.focus()
-                        page.keyboard.press("Enter")
-                        page.locator("dialog[open]").wait_for()
-                    found = Axe().run(page).response["violations"]
-                    self.assertEqual([(each["id"], each["nodes"][0]["html"]) for each in found], [])
-                    wide = page.evaluate("document.documentElement.scrollWidth - innerWidth")
-                    self.assertLessEqual(wide, 0)
-                small = page.evaluate(
-                    "[...document.querySelectorAll('button, input, select')].filter(e => e.offsetParent)"
-                    ".filter(e => e.offsetHeight < 44 || e.offsetWidth < 44 || e.scrollWidth > e.clientWidth + 1)"
-                    ".map(e => e.outerHTML)"
-                )
-                self.assertEqual(small, [])
-                self.assertEqual(self.faults, [])
+                page.locator("#tasks li").first.wait_for(state="attached")
+                for view in VIEWS if screen is PHONE else ("network",):
+                    self.view(page, view)
+                    if view == "network":
+                        page.locator("#ties td").first.wait_for()
+                    self.sound(page, Axe())
+                self.view(page, "devices")
+                page.locator(".device").first.focus()
+                page.keyboard.press("Enter")
+                page.locator("dialog[open] tr").first.wait_for()
+                self.sound(page, Axe())
+                page.context.close()
         self.assertEqual([url for url in self.asked if not url.startswith(self.team.url)], [])
+
+    def sound(self, page: Any, axe: Any) -> None:
+        """What stands there now has no fault."""
+        where = page.evaluate("`${innerWidth} ${location.hash}`")
+        found = axe.run(page).response["violations"]
+        self.assertEqual([(each["id"], each["nodes"][0]["html"]) for each in found], [], where)
+        self.assertLessEqual(page.evaluate("document.documentElement.scrollWidth - innerWidth"), 0, where)
+        small = page.evaluate(
+            "[...document.querySelectorAll('button, input, select, nav a')].filter(e => e.offsetParent)"
+            ".filter(e => e.offsetHeight < 44 || e.offsetWidth < 44 || e.scrollWidth > e.clientWidth + 1)"
+            ".map(e => e.outerHTML)"
+        )
+        self.assertEqual((small, self.faults), ([], []), where)
+
+    def test_reach_each_view(self) -> None:
+        """On a phone each view is at most two taps away and alone; keys, back and links lead there as well."""
+        page = self.opened(PHONE)
+        shown = (
+            "[...document.querySelectorAll('main > section, footer')].filter(e => e.checkVisibility()).map(e => e.id)"
+        )
+        for name, ways in {
+            "devices": ["Devices"],
+            "tasks": ["Tasks"],
+            "cameras": ["Cameras"],
+            "map": ["Yard"],
+            "groups": ["More", "Consensus"],
+            "network": ["More", "Network"],
+            "events": ["More", "Events"],
+            "more": ["More"],
+        }.items():
+            for way in ways:
+                page.get_by_role("link", name=way, exact=True).tap()
+            page.locator(f"body[data-view={name}]").wait_for()
+            beside = ["place-groups"] if name == "tasks" else []
+            self.assertEqual(sorted(page.evaluate(shown)), sorted([f"place-{name}", *beside]))
+            self.assertEqual(page.locator("#views [aria-current=page]").count(), len(ways) == 1)
+        page.go_back()
+        page.locator("body[data-view=events]").wait_for()
+        page.locator("#views a").nth(2).focus()
+        page.keyboard.press("Enter")
+        page.locator("body[data-view=cameras]").wait_for()
+        page.evaluate("location.hash = 'device/' + '01'.repeat(16)")
+        page.locator("dialog[open]").wait_for()
+        page.keyboard.press("Escape")
+        page.locator("dialog[open]").wait_for(state="hidden")
+        self.assertEqual(page.evaluate(shown), ["place-cameras"])
+        self.assertEqual(self.faults, [])
+
+    def test_choose_colours(self) -> None:
+        """Light and dark can be chosen against the system's, and stay chosen."""
+        page = self.opened(DESK, "light")
+        dark = "getComputedStyle(document.body).backgroundColor"
+        before = page.evaluate(dark)
+        page.locator("#theme").select_option("dark")
+        chosen = page.evaluate(dark)
+        self.assertNotEqual(chosen, before)
+        page.reload()
+        page.locator(".device").first.wait_for()
+        self.assertEqual((page.evaluate(dark), page.locator("#theme").input_value()), (chosen, "dark"))
+
+    def test_fill_a_wall(self) -> None:
+        """A wall may show one view alone, as large as it is; a large screen shows all of them at once."""
+        page = self.opened({"viewport": {"width": 2560, "height": 1440}})
+        heights = page.evaluate("[...document.querySelectorAll('main > section')].map(e => e.getBoundingClientRect())")
+        self.assertEqual(len([box for box in heights if box["top"] < 1440]), 7)
+        page.goto(f"{self.team.url}?view=cameras")
+        page.locator("figure[data-camera=live]").nth(2).wait_for()
+        self.assertEqual(page.locator("main > section:visible").count(), 1)
+        self.assertGreater(page.locator("canvas").first.bounding_box()["width"], 600)
+
+    def test_ask_devices(self) -> None:
+        """What is known of the network is asked only while it is looked at; what a device stores, when it is opened."""
+        page = self.opened(PHONE)
+        page.wait_for_timeout(300)
+        self.assertFalse([url for url in self.asked if url.endswith("/network")])
+        self.view(page, "network")
+        page.locator("#network-line", has_text="dog3 did not answer").wait_for()
+        rows = [row.split("\t") for row in page.locator("#ties tr").all_inner_texts()]
+        self.assertEqual(rows[1:], [["dog1", "", "3.6", "5.4"], ["dog2", "1.8", "", "not known"]])
+        self.assertEqual(page.locator(".tie").count(), 2)
+        self.assertIn("5 asked in 2 hops, 8 found", page.locator("#lookups").inner_text())
+        self.view(page, "devices")
+        page.locator(".device").first.tap()
+        page.locator("dialog", has_text="9 records, 4120 B of 8.0 MiB").wait_for()
+        self.assertIn("4 of devices", page.locator("dialog").inner_text())
+        page.evaluate("location.hash = 'device/' + '03'.repeat(16)")
+        page.locator("dialog", has_text="it did not answer").wait_for()
+        self.asked.clear()
+        page.wait_for_timeout(2500)
+        self.assertFalse([url for url in self.asked if url.endswith("/network")])
 
     def test_tell_why(self) -> None:
         """A task says who agrees and who differs; opened, it tells each decision's rule and reports, and stays open."""
@@ -145,7 +237,8 @@ class PageTests(SynchronousTestCase):
 
         for screen in (PHONE, DESK):
             page = self.opened(screen)
-            why = page.locator("#tasks details").first
+            self.view(page, "tasks")
+            why = page.locator("#tasks .why").first
             self.assertEqual(why.locator("summary").inner_text(), "dog2 \N{EN DASH} 2 of 3 agree, dog3 differs")
             self.assertFalse(why.locator("table").first.is_visible())
             why.locator("summary").click()
@@ -156,11 +249,11 @@ class PageTests(SynchronousTestCase):
             )
             self.assertIn("differs: names dog3; knew no report of dog2", rows[2])
             self.team.order("status dog1 SEARCHING")
-            page.locator(".device .badge[data-state=SEARCHING]").nth(1).wait_for()
+            page.locator(".device .badge[data-state=SEARCHING]").nth(1).wait_for(state="attached")
             self.assertTrue(why.locator("table").first.is_visible())
             self.assertEqual(Axe().run(page).response["violations"], [])
             self.assertLessEqual(page.evaluate("document.documentElement.scrollWidth - innerWidth"), 0)
-            self.assertEqual(page.locator("#tasks details:visible").count(), 1)
+            self.assertEqual(page.locator("#tasks .why:visible").count(), 1)
             self.team.order("status dog1 WAITING")
 
     def test_show_cameras(self) -> None:
@@ -179,7 +272,7 @@ class PageTests(SynchronousTestCase):
         phone = self.opened(PHONE)
         phone.wait_for_timeout(500)
         self.assertFalse([url for url in self.asked if "/shot/" in url])
-        phone.locator("#cameras").scroll_into_view_if_needed()
+        phone.get_by_role("link", name="Cameras").tap()
         phone.locator("figure[data-camera=live]").first.wait_for()
 
     def test_show_who_left(self) -> None:
@@ -223,8 +316,8 @@ class PageTests(SynchronousTestCase):
         self.assertIn("#device/0202", page.url)
         page.go_back()
         dialog.wait_for(state="hidden")
-        page.evaluate("location.hash = 'device/' + '03'.repeat(16)")
-        page.locator("#d-name", has_text="dog3").wait_for()
+        page.evaluate("location.hash = 'device/' + '01'.repeat(16)")
+        page.locator("#d-name", has_text="dog1").wait_for()
         page.locator("#d-close").click()
         dialog.wait_for(state="hidden")
         self.assertNotIn("#device", page.url)
@@ -250,6 +343,29 @@ class PageTests(SynchronousTestCase):
         self.assertIn("a fault of one", self.faults[0])
         page.locator(".device[data-state=DONE]", has_text="dog3").wait_for()
 
+    def test_tell_what_happened(self) -> None:
+        """What happens is told in words, newest first: of all, of one kind, and of one device or task."""
+        page = self.opened(DESK)
+        story = page.locator("#events li")
+        page.locator("#events li", has_text="begins to look").wait_for()
+        self.team.order("gone dog2")
+        page.locator("#events li[data-kind=gone]", has_text="dog2 is gone").wait_for()
+        self.team.order("status dog1 EXECUTING")
+        page.locator(
+            "#events [data-kind=takeover]", has_text="dog1 takes over Find and touch the red target"
+        ).wait_for()
+        self.assertIn("takes over", story.first.inner_text() + story.nth(1).inner_text())
+        page.locator("#event-kind").select_option("faults")
+        self.assertEqual({item.get_attribute("data-kind") for item in story.all()}, {"gone", "takeover"})
+        page.locator("#tasks .history summary").first.click()
+        page.locator("#tasks .history li[data-kind=takeover]").first.wait_for()
+        page.locator(".device").first.dblclick()
+        page.locator("#d-events li", has_text="dog1: waiting").wait_for()
+        self.team.order("status dog1 DONE")
+        page.locator("#d-events li", has_text="dog1: executing").wait_for()
+        self.assertFalse([words for words in page.locator("#d-events").all_inner_texts() if "dog3" in words])
+        self.assertEqual(self.faults, [])
+
     def test_speak_to_a_device(self) -> None:
         """From the dialog a message is sent and a device told to leave; the answer stands there in words."""
         page = self.opened(DESK)
@@ -266,6 +382,7 @@ class PageTests(SynchronousTestCase):
         page = self.opened(PHONE)
         page.get_by_role("button", name="Run Demo").tap()
         self.told(page, "The demo runs")
+        page.get_by_role("link", name="Tasks").tap()
         page.locator("#task").select_option("patrol")
         page.get_by_role("button", name="Assign").tap()
         self.told(page, "Assigned")
@@ -276,8 +393,10 @@ class PageTests(SynchronousTestCase):
     def test_show_consensus(self) -> None:
         """The group's consensus point and every bid stand there; a status is a word and a shape."""
         page = self.opened(PHONE)
+        self.view(page, "groups")
         self.assertEqual(page.locator(".point").inner_text(), "dog2 – 3 of 3 agree")
         self.assertEqual(page.locator(".cost").all_inner_texts(), ["1.04 m", "0.62 m", "1.37 m"])
+        self.view(page, "devices")
         shapes = [path.get_attribute("d") for path in page.locator("#devices .badge path").all()]
         self.assertEqual(len(set(shapes)), 3)
         self.team.order("status dog3 DONE")

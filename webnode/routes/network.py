@@ -1,7 +1,46 @@
-"""Routes of the network: who knows whom."""
+"""Routes of the network: who knows whom, and what each device stores."""
 
 from __future__ import annotations
 
-from webnode.route import Route
+from typing import Any
 
-ROUTES: tuple[Route, ...] = ()
+from webnode.board import Survey
+from webnode.errors import Refusal
+from webnode.route import API, Ask, Field, Route, device
+
+
+def network(ask: Ask) -> Any:
+    """Who knows whom, and how far they are."""
+    return _survey(ask).network()
+
+
+def inventory(ask: Ask) -> Any:
+    """What a device stores."""
+    return _survey(ask).inventory(device(ask)["uuid"])
+
+
+def _survey(ask: Ask) -> Survey:
+    if ask.board.survey is None:
+        raise Refusal("node", "it cannot ask devices", "ask another web node of the team", 409)
+    return ask.board.survey
+
+
+ROUTES = (
+    Route(
+        "GET",
+        f"{API}/network",
+        "Who knows whom, with round trips, traffic and the newest lookups; each device is asked",
+        "viewer",
+        network,
+        gives="devices (by uuid: contacts, known, sent, received, lost, lookups), silent",
+    ),
+    Route(
+        "GET",
+        f"{API}/devices/{{uuid}}/inventory",
+        "What a device stores; the device is asked",
+        "viewer",
+        inventory,
+        (Field("uuid", "text", "the device", "path", most=64),),
+        gives="records, deleted, bytes, most_bytes, kinds, newest (kind, name, bytes, lifetime)",
+    ),
+)

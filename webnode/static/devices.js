@@ -1,11 +1,13 @@
 // Devices: the list in the order of joining, and the dialog with what is known of one.
 import { at, attribute, badge, element, keyed, span, state, words } from "./element.js";
 import { delivery, say, wish } from "./desk.js";
+import { History } from "./history.js";
 import { panel } from "./panel.js";
-import { go } from "./shell.js";
+import { back, go } from "./shell.js";
 
 let devices = [];
 let open = "";
+let history = null;
 let now = 0;
 
 const age = (device) => (device.gone === null ? `here ${span(now - device.since)}` : `gone ${span(now - device.gone)}`);
@@ -50,6 +52,7 @@ function update(item, device) {
 function show(uuid) {
   open = uuid;
   words(at("d-answer"), "");
+  history = new History(at("d-events"), uuid);
   fill();
   if (!at("place-device").open) at("place-device").showModal();
 }
@@ -89,7 +92,7 @@ function startDevice() {
   const line = (text) => words(at("d-answer"), text);
   const dialog = at("place-device");
   at("d-close").addEventListener("click", () => dialog.close());
-  dialog.addEventListener("close", () => { if (open) go(""); });
+  dialog.addEventListener("close", () => { if (open) back(); });
   dialog.addEventListener("click", (event) => { if (event.target === dialog) dialog.close(); });
   at("d-message").addEventListener("submit", async (event) => {
     event.preventDefault();
@@ -134,6 +137,7 @@ panel({
     return {
       update(model, event) {
         if (open && event === "state") fill();
+        if (open && event === "event") history.update();
       },
       show,
       hide() {

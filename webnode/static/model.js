@@ -63,6 +63,9 @@ const TAKERS = {
     model.me = me;
     document.body.dataset.role = me.role;
   },
+  has(names) {
+    model.has = [...names, ...(model.yard && !names.includes("yard") ? ["yard"] : [])];
+  },
   link(state) {
     model.link = state;
   },

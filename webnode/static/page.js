@@ -3,7 +3,6 @@ import "./header.js";
 import "./halt.js";
 import "./devices.js";
 import "./groups.js";
-import "./cameras.js";
 import "./tasks.js";
 import "./actions.js";
 import { enter } from "./signin.js";
@@ -20,9 +19,13 @@ function onEvent(event, data) {
   if (event === "yard" && data) map ??= import("./map.js").then(() => tell("yard"));
   // Panels read the model: to them a change is a state like any other.
   tell(event === "change" ? "state" : event);
+  // Another node may have other parts.
+  if (event === "link" && data === "live") get("node").then(({ has }) => onEvent("has", has), () => {});
 }
 
 start({ model, get, ask, go });
 await enter((me) => onEvent("session", me));
 open({ onEvent });
-import("./keep.js");
+// The team is there first; what else there is to see comes after it.
+await Promise.all([import("./cameras.js"), import("./events.js"), import("./views.js"), import("./audit.js"), import("./keep.js")]);
+tell("state");

@@ -6,13 +6,35 @@ const RANKS = ["anyone", "viewer", "operator"];
 const shown = new Map();
 let shared = {};
 let looked = "";
+// On a phone one of these is looked at at a time, and the bar below leads to them; on a wall ?view=cameras is all.
+const VIEWS = ["devices", "tasks", "cameras", "map", "groups", "network", "events", "more"];
+const only = new URLSearchParams(location.search).get("view");
 
-// Look at a place: go("device/UUID"); go("") is the whole page again.
+// Look at a place: go("device/UUID"); go("") is the first view, and back() the one that was looked at before a device.
 export function go(view) {
   if (view) location.hash = view;
   else if (location.hash) {
     history.pushState(null, "", location.pathname + location.search);
     look();
+  }
+}
+
+export const back = () => go(view() === VIEWS[0] ? "" : view());
+
+const view = () => document.body.dataset.view ?? VIEWS[0];
+
+// What is not looked at is there for other screens: the style sheet says on which.
+function lookAt(name) {
+  document.body.dataset.view = name;
+  document.body.toggleAttribute("data-only", VIEWS.includes(only));
+  for (const each of VIEWS) {
+    const place = at(`place-${each}`);
+    place?.classList.toggle("other", each !== name && !(name === "tasks" && each === "groups"));
+    place?.classList.toggle("aside", VIEWS.includes(only) && each !== only);
+  }
+  for (const link of document.querySelectorAll("#views a")) {
+    if (link.hash === `#${name}`) link.setAttribute("aria-current", "page");
+    else link.removeAttribute("aria-current");
   }
 }
 
@@ -56,6 +78,11 @@ function look() {
     if (panel.place === name) acts.show?.(argument);
     else if (panel.place === looked) acts.hide?.();
   }
+  if (VIEWS.includes(name)) {
+    lookAt(name);
+    // The lists have these names, too, and a browser would go to where they begin.
+    at(`place-${name}`)?.scrollIntoView();
+  } else if (!name || !document.body.dataset.view) lookAt(VIEWS[0]);
   looked = name;
 }
 

@@ -1,11 +1,13 @@
 // Tasks: choosing a predefined one, seeing what became of each, and taking it back.
 import { at, attribute, badge, element, keyed, state, words } from "./element.js";
 import { say, wish } from "./desk.js";
+import { History } from "./history.js";
 import { ask, get } from "./link.js";
 import { panel } from "./panel.js";
 
 const ENDED = ["COMPLETED", "FAILED", "CANCELLED"];
 const SHOWN = 8;
+const histories = new Map();
 
 function showTasks(tasks) {
   at("no-tasks").hidden = tasks.length > 0;
@@ -14,7 +16,7 @@ function showTasks(tasks) {
     state(item.querySelector(".badge"), task.status);
     const result = task.result ? `Done by ${task.result.by} in ${task.result.took.toFixed(1)} s. ` : "";
     words(item.querySelector(".note"), result + task.note);
-    why(item.querySelector("details"), task.why);
+    why(item.querySelector(".why"), task.why);
     const [button, rest] = item.querySelectorAll("button");
     button.hidden = rest.hidden = ENDED.includes(task.status);
     button.setAttribute("aria-label", `Cancel ${task.title}`);
@@ -32,7 +34,18 @@ function row(task) {
     wish(`${isPaused ? "Resuming" : "Pausing"} ${task.title}`, `tasks/${encodeURIComponent(task.id)}/${isPaused ? "resume" : "pause"}`);
   });
   return element("li", {}, element("b"), badge(), element("span", { class: "note" }),
-    element("details", {}, element("summary"), element("div")), button, rest);
+    element("details", { class: "why" }, element("summary"), element("div")), history(task), button, rest);
+}
+
+// What became of a task so far, read when somebody wants to know.
+function history(task) {
+  const list = element("ol", { class: "story", tabindex: 0, "aria-label": `History of ${task.title}, the newest first` });
+  const box = element("details", { class: "history" }, element("summary", {}, "History"), list);
+  box.addEventListener("toggle", () => {
+    if (box.open) histories.set(task.id, new History(list, task.id));
+    else histories.delete(task.id);
+  });
+  return box;
 }
 
 // Why: the newest decision in one line; opened, each with its rule and who reported what.
@@ -92,6 +105,7 @@ panel({
     return {
       update(model, event) {
         if (event === "state") showTasks([...model.tasks.values()]);
+        if (event === "event") histories.forEach((each) => each.update());
         if (event === "link" && model.link === "live") readCatalogue();
       },
     };

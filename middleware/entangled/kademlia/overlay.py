@@ -8,9 +8,9 @@ iterative lookups find them.
 from __future__ import annotations
 
 import random
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, NamedTuple
 
 from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorTime
@@ -45,7 +45,19 @@ MEETING, MEETING_STEP = 75, 0.02
 NOBODY = b""
 """Stands for members that must be there, though none is known yet."""
 
+LOOKUPS_KEPT = 16
+
 OnContact = Callable[[Contact], None]
+
+
+class Looked(NamedTuple):
+    """A lookup that has ended: how many were asked, in how many hops, how many were found, in how many seconds."""
+
+    key: bytes
+    asked: int
+    hops: int
+    found: int
+    seconds: float
 
 
 class Overlay:
@@ -77,6 +89,7 @@ class Overlay:
         self._found: OrderedDict[bytes, list[Contact]] = OrderedDict()
         self._misses: dict[bytes, tuple[int, float]] = {}
         self._checked_at: dict[bytes, float] = {}
+        self.lookups: deque[Looked] = deque(maxlen=LOOKUPS_KEPT)
         endpoint.on_contact = self.proved
         endpoint.expose("find_node", self._answer_find_node)
 
@@ -152,14 +165,24 @@ class Overlay:
         """The k live nodes closest to ``target``, this one not included (Kademlia, section 2.3)."""
         seeds = [*self.table.closest(target), *(self.roster.closest(target, K, self.me()) if len(self.roster) else ())]
         lookup = Lookup(target, K, ALPHA, seeds, exclude=self.own_id)
-        self.table.searched(target, self._clock.seconds())
+        began = self._clock.seconds()
+        self.table.searched(target, began)
+        hops: dict[bytes, int] = {}
+        asked: list[int] = []
 
         async def visit(contact: Contact) -> None:
+            asked.append(hops.setdefault(contact.node_id, 1))
             answer = await self.ask(contact, "find_node", target)
-            lookup.answered(contact, contacts_of(answer))
+            named = contacts_of(answer)
+            for other in named:
+                hops.setdefault(other.node_id, hops[contact.node_id] + 1)
+            lookup.answered(contact, named)
 
         await self.walk(lookup, visit)
-        return lookup.closest()
+        found = lookup.closest()
+        took = self._clock.seconds() - began
+        self.lookups.append(Looked(target, len(asked), max(asked, default=0), len(found), took))
+        return found
 
     async def walk(
         self, lookup: Lookup, visit: Callable[[Contact], Any], is_done: Callable[[], bool] = lambda: False

@@ -46,6 +46,11 @@ class RoundTrip:
         self.wait = min(LONGEST, max(self._shortest, self._smoothed + max(GRAIN, 4 * self._deviation)))
 
     @property
+    def mean(self) -> float | None:
+        """The smoothed round trip in seconds, or None where nothing was measured yet."""
+        return self._smoothed if self.is_measured else None
+
+    @property
     def usual(self) -> float:
         """Within how many seconds nearly every answer comes; the first wait where nothing was measured yet."""
         if not self.is_measured:

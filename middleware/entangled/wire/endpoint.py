@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import random
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from twisted.internet import defer
@@ -182,6 +182,16 @@ class Endpoint:
         """Whether there is a session with ``contact``, so that a question needs one round trip and no handshake."""
         peer = self._peers.known(contact.public)
         return peer is not None and peer.session is not None
+
+    def round_trip(self, contact: Contact) -> float | None:
+        """How long an answer of ``contact`` takes, in seconds, or None where nobody was timed yet."""
+        peer = self._peers.known(contact.public)
+        return None if peer is None else peer.round_trip.mean
+
+    @property
+    def traffic(self) -> Mapping[str, int]:
+        """What the network underneath counts (``sent``, ``received``, ...); empty where it counts nothing."""
+        return dict(getattr(self._network, "counters", {}))
 
     def greet(self, address: Address, timeout: float = PATIENCE) -> Deferred[Contact]:
         """Learn who listens at ``address``; fails with ``NoAnswer``.  The contact has not proved its key yet."""

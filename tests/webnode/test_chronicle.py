@@ -1,0 +1,161 @@
+"""What ``webnode.chronicle`` promises."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from tests.webnode.guests import Guests
+from webnode.app import create_app
+from webnode.board import Board
+from webnode.chronicle import TeamChronicle
+from webnode.desk import MemoryDesk
+from webnode.state import Departed, State, state_of
+
+
+def uuid(number: int) -> str:
+    return f"{number:032x}"
+
+
+def dog(number: int, status: str = "IDLE", task: str = "", **more: Any) -> dict[str, Any]:
+    return {"uuid": uuid(number), "name": f"dog{number}", "joined": number, "status": status, "task": task, **more}
+
+
+def job(status: str, **more: Any) -> dict[str, Any]:
+    return {"id": "t1", "title": "Find it", "created": 1.0, "status": status, **more}
+
+
+class ChronicleTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.chronicle = TeamChronicle()
+        self.departed = Departed()
+        self.heard = 0
+
+    def saw(self, now: float, *devices: dict[str, Any], tasks: Any = (), groups: Any = None, **more: Any) -> list[str]:
+        """What is told of a team of these; ``more`` stands in the state as well."""
+        gone = self.departed.of(devices, now)
+        state: State = {**state_of(devices, tasks, groups or {}, departed=gone, node="vaio"), **more}
+        self.chronicle.saw(state, now)
+        return self.told()
+
+    def told(self) -> list[str]:
+        entries = self.chronicle.since(self.heard)
+        self.heard = entries[-1].n if entries else self.heard
+        return [entry.text for entry in entries]
+
+    def test_begin_with_who_is_here(self) -> None:
+        """It begins with when it began and who was here then; a state that is the same adds nothing."""
+        self.assertEqual(
+            self.saw(1.0, dog(1), dog(2)),
+            ["vaio begins to look", "dog1 is here, number 1: idle", "dog2 is here, number 2: idle"],
+        )
+        self.assertEqual(self.saw(2.0, dog(1), dog(2)), [])
+
+    def test_tell_of_devices(self) -> None:
+        """Who changes, says something, leaves and comes back is told once each."""
+        self.saw(1.0, dog(1, messages=[[0.5, "ready"]]))
+        told = self.saw(2.0, dog(1, "SEARCHING", "t1", messages=[[0.5, "ready"], [1.5, "seen"]]))
+        self.assertEqual(told, ["dog1: idle → searching", "dog1: seen"])
+        self.assertEqual(self.saw(3.0), ["dog1 is gone"])
+        self.assertEqual(self.saw(4.0), [])
+        self.assertEqual(self.saw(5.0, dog(1)), ["dog1 is back: idle"])
+
+    def test_tell_of_tasks(self) -> None:
+        """A task is told from its beginning to its end, with who ended it and how long that took."""
+        self.saw(1.0)
+        self.assertEqual(self.saw(2.0, tasks=[job("OPEN")]), ["Find it: open"])
+        self.assertEqual(self.saw(3.0, tasks=[job("OPEN", paused=True)]), ["Find it: paused"])
+        self.assertEqual(self.saw(3.5, tasks=[job("OPEN", note="no device is here")]), ["Find it: goes on"])
+        self.assertEqual(self.saw(3.6, tasks=[job("OPEN", note="nobody can")]), ["Find it: nobody can"])
+        done = job("COMPLETED", result={"by": "dog2", "took": 13.24})
+        self.assertEqual(self.saw(4.0, tasks=[done]), ["Find it: open → completed by dog2 in 13.2 s"])
+        self.assertEqual(self.chronicle.since(0)[-1].seconds, 13.24)
+
+    def test_tell_of_consensus(self) -> None:
+        """That a group agrees is told with the bids, once, and not while some are undecided."""
+        first = {**dog(1), "cost": 1.04, "assigned": uuid(2)}
+        second = {**dog(2), "cost": 0.62, "assigned": ""}
+        self.saw(1.0)
+        self.assertEqual(self.saw(2.0, groups={"t1": [first, second]}), [])
+        agreed = {"t1": [first, {**second, "assigned": uuid(2)}]}
+        self.assertEqual(self.saw(3.0, groups=agreed), ["2 of 2 agree on dog2 (dog1 1.04 m, dog2 0.62 m)"])
+        self.assertEqual(self.saw(4.0, groups=agreed), [])
+
+    def test_tell_of_halting(self) -> None:
+        """That the whole team is halted, and goes on, is told."""
+        self.saw(1.0)
+        self.assertEqual(self.saw(2.0, halted=True), ["the team is halted"])
+        self.assertEqual(self.saw(3.0, halted=False), ["the team goes on"])
+
+    def takeover(self) -> list[tuple[str, str, float | None]]:
+        kinds = ("takeover", "handover")
+        return [(entry.kind, entry.uuid, entry.seconds) for entry in self.chronicle.since(0) if entry.kind in kinds]
+
+    def test_time_a_takeover(self) -> None:
+        """From when who acted was seen to be gone until another acts: that is a takeover, with its seconds."""
+        tasks = [job("EXECUTING")]
+        self.saw(1.0, dog(1, "EXECUTING", "t1"), dog(2, "WAITING", "t1"), tasks=tasks)
+        self.saw(10.0, dog(2, "WAITING", "t1"), tasks=tasks)
+        self.saw(10.6, dog(2, "ASSIGNED", "t1"), tasks=tasks)
+        told = self.saw(11.3, dog(2, "EXECUTING", "t1"), tasks=tasks)
+        self.assertIn("dog2 takes over Find it from dog1: 1.3 s", told)
+        self.assertEqual(self.takeover(), [("takeover", uuid(2), 1.3)])
+        # It comes back and stands by; nothing more has been taken over.
+        self.saw(20.0, dog(1, "WAITING", "t1"), dog(2, "EXECUTING", "t1"), tasks=tasks)
+        self.assertEqual(len(self.takeover()), 1)
+
+    def test_time_a_takeover_from_the_fault(self) -> None:
+        """Where the fault was caused on purpose, the takeover is timed from that, not from when it showed."""
+        tasks = [job("EXECUTING")]
+        both = dog(1, "EXECUTING", "t1"), dog(2, "WAITING", "t1")
+        self.saw(1.0, *both, tasks=tasks)
+        self.chronicle.faulted(uuid(1), "radio", 9.0)
+        self.assertEqual(self.told(), ["dog1: radio, caused on purpose"])
+        self.saw(10.0, both[1], tasks=tasks)
+        self.saw(10.5, dog(2, "EXECUTING", "t1"), tasks=tasks)
+        self.assertEqual(self.takeover(), [("takeover", uuid(2), 1.5)])
+
+    def test_take_no_handover_for_a_takeover(self) -> None:
+        """Where one is relieved that is still here, or whose fault is long over, nothing is timed."""
+        tasks = [job("EXECUTING")]
+        self.saw(1.0, dog(1, "EXECUTING", "t1"), dog(2, "WAITING", "t1"), tasks=tasks)
+        self.chronicle.faulted(uuid(1), "skew", 2.0)
+        self.saw(70.0, dog(1, "EXECUTING", "t1"), dog(2, "WAITING", "t1"), tasks=tasks)
+        self.saw(71.0, dog(1, "WAITING", "t1"), dog(2, "EXECUTING", "t1"), tasks=tasks)
+        self.assertEqual(self.takeover(), [("handover", uuid(2), None)])
+        # One more who acts at the same time replaces nobody.
+        self.saw(72.0, dog(1, "EXECUTING", "t1"), dog(2, "EXECUTING", "t1"), tasks=tasks)
+        self.assertEqual(len(self.takeover()), 1)
+
+    def test_forget_a_loss_that_mends(self) -> None:
+        """Who comes back and acts on was not taken over from, also when another relieves it later."""
+        tasks = [job("EXECUTING")]
+        self.saw(1.0, dog(1, "EXECUTING", "t1"), tasks=tasks)
+        self.saw(2.0, tasks=tasks)
+        self.saw(2.5, dog(1, "EXECUTING", "t1"), tasks=tasks)
+        self.saw(9.0, dog(1, "IDLE"), dog(2, "EXECUTING", "t1"), tasks=tasks)
+        self.assertEqual(self.takeover(), [("handover", uuid(2), None)])
+
+    def test_keep_so_many(self) -> None:
+        """Of a long story the newest entries are kept, their numbers going on; one can ask for one device or task."""
+        self.chronicle = TeamChronicle(kept=3)
+        self.saw(1.0, dog(1), dog(2), tasks=[job("OPEN")])
+        self.assertEqual([entry.n for entry in self.chronicle.since(0)], [2, 3, 4])
+        self.assertEqual([entry.n for entry in self.chronicle.since(3)], [4])
+        self.assertEqual([entry.n for entry in self.chronicle.since(0, uuid(2))], [3])
+        self.assertEqual([entry.n for entry in self.chronicle.since(0, "t1")], [4])
+
+    def test_ask_by_http(self) -> None:
+        """A viewer reads the chronicle whole, from a number on, or of one device; a wrong number is refused by name."""
+        self.saw(1.0, dog(1), dog(2))
+        app = create_app(lambda: state_of([], [], {}), Board(MemoryDesk(), Guests(), chronicle=self.chronicle))
+        client = app.test_client()
+
+        def asked(query: str) -> Any:
+            return client.get(f"/api/v1/events?ticket=viewer{query}", headers={"Host": "vaio"}).get_json()
+
+        self.assertEqual([entry["n"] for entry in asked("")], [1, 2, 3])
+        self.assertEqual(asked("&after=2")[0]["text"], "dog2 is here, number 2: idle")
+        self.assertEqual([entry["n"] for entry in asked(f"&about={uuid(1)}")], [2])
+        self.assertEqual(asked("&after=x")["error"]["field"], "after")

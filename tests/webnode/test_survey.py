@@ -1,0 +1,142 @@
+"""What ``webnode.survey`` and ``middleware.survey`` promise, over nodes on one turned clock."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from middleware.entangled.network.switchboard import Weather
+from middleware.entangled.record import hashed_key
+from middleware.node import SwarmNode
+from middleware.survey import NETWORK, answer_survey, network
+from tests.fleet import FleetCase, SwarmFleet
+from tests.webnode.guests import Guests
+from webnode.app import create_app
+from webnode.board import Board, MemorySurvey
+from webnode.desk import MemoryDesk
+from webnode.errors import Refusal
+from webnode.state import state_of
+from webnode.survey import PATIENCE_S, TeamSurvey
+
+
+class SurveyTests(FleetCase):
+    def setUp(self) -> None:
+        super().setUp()
+        self.team: SwarmFleet = self.swarm(3, weather=Weather(delay_s=0.003))
+        self.team.run(3)
+        for node in self.team.nodes:
+            answer_survey(node)
+        self.dogs = [node.uuid for node in self.team.nodes]
+        watch = self.team.nodes[0].watch_devices(lambda records: None, keep=True)
+        self.team.run(1)
+        self.survey = TeamSurvey(self.team.nodes[0], lambda: watch.records)
+
+    def network(self) -> Any:
+        return self.done(self.team, self.survey.network(), PATIENCE_S + 1)
+
+    def test_tell_who_knows_whom(self) -> None:
+        """Each of three, in the order of joining, names the two others with a round trip and when it heard them."""
+        told = self.network()
+        self.assertEqual((list(told["devices"]), told["silent"]), (self.dogs, []))
+        for place, view in enumerate(told["devices"].values()):
+            others = {f"dog{other}" for other in range(3) if other != place}
+            self.assertEqual({contact["name"] for contact in view["contacts"]}, others)
+            self.assertTrue(all(0 < contact["rtt_ms"] < 50 for contact in view["contacts"]), view)
+            self.assertTrue(all(contact["heard_s"] < 3 for contact in view["contacts"]), view)
+
+    def test_ask_once_for_all_who_look(self) -> None:
+        """Many who look at once, and a moment later, cost one question to each device."""
+        asked: list[str] = []
+
+        def expose(node: SwarmNode) -> None:
+            def answer(peer: object) -> dict[str, int]:
+                asked.append(node.uuid)
+                return {"known": 2}
+
+            node.entangled.endpoint.expose(NETWORK, answer)
+
+        for node in self.team.nodes[1:]:
+            expose(node)
+        waiting: list[Any] = [self.survey.network() for _ in range(20)]
+        self.team.run(0.5)
+        waiting.append(self.survey.network())
+        self.assertEqual(len([self.successResultOf(each) for each in waiting]), 21)
+        self.assertEqual(sorted(asked), sorted(self.dogs[1:]))
+        self.team.run(1)
+        self.network()
+        self.assertEqual(len(asked), 4)
+
+    def test_name_the_silent(self) -> None:
+        """A device that does not answer is named as silent; the others are shown, in time."""
+        self.team.nodes[2].vanish()
+        waiting = self.survey.network()
+        self.team.run(PATIENCE_S + 0.3)
+        told: Any = self.successResultOf(waiting)
+        self.assertEqual((list(told["devices"]), told["silent"]), (self.dogs[:2], self.dogs[2:]))
+
+    def test_believe_nothing_unlawful(self) -> None:
+        """Answers of the wrong shape become empty ones."""
+        for told in ({"contacts": [3, {"uuid": 5}, {"uuid": "ab", "rtt_ms": "x"}], "lookups": 7, "sent": []}, "no", {}):
+            self.team.nodes[1].entangled.endpoint.expose(NETWORK, lambda peer, told=told: told)
+            self.team.run(2)
+            view = self.network()["devices"].get(self.dogs[1])
+            if isinstance(told, dict):
+                unknown = [{"uuid": "ab", "name": "ab", "rtt_ms": None, "heard_s": None}]
+                self.assertEqual(view["contacts"], unknown if told else [])
+                self.assertEqual((view["lookups"], view["sent"]), ([], 0))
+            else:
+                self.assertIsNone(view)
+
+    def test_tell_what_is_stored(self) -> None:
+        """A device tells how much it holds of each kind, and its newest records; another one, or the node itself."""
+        self.done(self.team, self.team.nodes[1].entangled.put(hashed_key("a"), "note", b"\xa1x", "team"), 1)
+        for uuid in self.dogs[:2]:
+            told: Any = self.done(self.team, self.survey.inventory(uuid), 1)
+            self.assertEqual(told["kinds"], {"devices": 3, "other": 1})
+            self.assertEqual((told["records"], told["deleted"]), (4, 0))
+            kind, name, size, lifetime = told["newest"][0]
+            self.assertEqual((kind, name, lifetime), ("other", "note", "team"))
+            self.assertTrue(0 < size < told["bytes"] < told["most_bytes"])
+
+    def test_say_who_did_not_answer(self) -> None:
+        """A device that is silent is 504, one that knows no such question 409, one that is not here 409 at once."""
+        self.assertEqual(self.assertRaises(Refusal, self.survey.inventory, "ff").status, 409)
+        self.team.nodes[1].entangled.endpoint.expose("device.inventory", _refuse)
+        waiting = self.survey.inventory(self.dogs[1])
+        self.team.run(1)
+        self.assertEqual(self.failureResultOf(waiting, Refusal).value.status, 409)
+        self.team.nodes[2].vanish()
+        waiting = self.survey.inventory(self.dogs[2])
+        self.team.run(PATIENCE_S + 0.3)
+        refusal = self.failureResultOf(waiting, Refusal).value
+        self.assertEqual((refusal.status, refusal.problem), (504, "dog2 did not answer"))
+
+    def test_remember_lookups(self) -> None:
+        """A lookup is remembered with how many it asked, in how many hops, and how many it found."""
+        large = self.swarm(12, weather=Weather(delay_s=0.003))
+        large.run(3)
+        node: SwarmNode = large.nodes[11]
+        self.done(large, node.entangled.find_node(hashed_key("x")), 1)
+        lookups = network(node)["lookups"]
+        self.assertTrue(lookups)
+        for each in lookups:
+            self.assertTrue(1 <= each["hops"] <= each["asked"] and each["found"] == 8 and each["ms"] > 0, each)
+
+    def test_ask_by_http(self) -> None:
+        """Both are read by viewers; an unknown device is 404, a silent one 504, a node that cannot ask says so."""
+        state = state_of([{"uuid": "01", "name": "dog1"}, {"uuid": "02", "name": "dog2"}], [], {})
+        survey = MemorySurvey({"devices": {}, "silent": ["02"]}, {"01": {"records": 4}})
+
+        def asked(board: Board, path: str) -> tuple[int, Any]:
+            client = create_app(lambda: state, board).test_client()
+            answer = client.get(f"/api/v1/{path}?ticket=viewer", headers={"Host": "vaio"})
+            return answer.status_code, answer.get_json()
+
+        board = Board(MemoryDesk(), Guests(), survey=survey)
+        self.assertEqual(asked(board, "network"), (200, {"devices": {}, "silent": ["02"]}))
+        self.assertEqual(asked(board, "devices/01/inventory"), (200, {"records": 4}))
+        self.assertEqual([asked(board, f"devices/{uuid}/inventory")[0] for uuid in ("02", "03")], [504, 404])
+        self.assertEqual(asked(Board(MemoryDesk(), Guests()), "network")[0], 409)
+
+
+def _refuse(peer: object, too: int, many: int) -> None:
+    """Takes more than is asked with."""

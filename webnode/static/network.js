@@ -1,0 +1,95 @@
+// The network: who knows whom and how far they are, asked of the devices while somebody looks.
+import { at, attribute, drawn, element, keyed, words } from "./element.js";
+import { get } from "./link.js";
+
+const EVERY = 2000;
+const DRAWN = 12;
+const SIDE = 300;
+
+const ms = (value) => (value === null ? "–" : value < 10 ? value.toFixed(1) : String(Math.round(value)));
+
+// Those that were asked, and those that others know but nobody asked.
+function nodesOf({ devices, silent }, known) {
+  const names = new Map(Object.keys(devices).map((uuid) => [uuid, known.get(uuid)?.name ?? uuid.slice(0, 8)]));
+  for (const uuid of silent) names.set(uuid, known.get(uuid)?.name ?? uuid.slice(0, 8));
+  for (const view of Object.values(devices)) for (const each of view.contacts) if (!names.has(each.uuid)) names.set(each.uuid, each.name);
+  return [...names].slice(0, DRAWN).map(([uuid, name], place, all) => {
+    const turn = (2 * Math.PI * place) / all.length - Math.PI / 2;
+    return { uuid, name, x: SIDE / 2 + 105 * Math.cos(turn), y: SIDE / 2 + 105 * Math.sin(turn), silent: silent.includes(uuid) };
+  });
+}
+
+function draw(told, nodes) {
+  const knows = (a, b) => told.devices[a.uuid]?.contacts.some((each) => each.uuid === b.uuid) ?? false;
+  const pairs = nodes.flatMap((a, place) => nodes.slice(place + 1).map((b) => ({ a, b, ways: knows(a, b) + knows(b, a) })));
+  const graph = at("graph");
+  graph.replaceChildren(
+    ...pairs.filter(({ ways }) => ways > 0).map(({ a, b, ways }) => drawn("path", { class: "tie", "data-ways": ways, d: `M${a.x} ${a.y}L${b.x} ${b.y}` })),
+    ...nodes.map(({ name, x, y, silent }) => drawn("g", { class: "peer", "data-silent": silent, transform: `translate(${x} ${y})` },
+      drawn("circle", { r: 9 }), drawn("text", { y: y < SIDE / 2 ? -16 : 26 }, silent ? `${name}: silent` : name))));
+}
+
+function table(told, nodes) {
+  const asked = nodes.filter(({ uuid }) => told.devices[uuid]);
+  const head = element("tr", {}, element("td", {}), ...nodes.map(({ name }) => element("th", { scope: "col" }, name)));
+  const rows = asked.map(({ uuid, name }) => element("tr", {}, element("th", { scope: "row" }, name), ...nodes.map((other) => {
+    const tie = told.devices[uuid].contacts.find((each) => each.uuid === other.uuid);
+    return element("td", {}, other.uuid === uuid ? "" : tie ? ms(tie.rtt_ms) : "not known");
+  })));
+  at("ties").replaceChildren(element("caption", {}, "Round trips in milliseconds, as each measured them"), head, ...rows);
+}
+
+function show(told, known) {
+  const nodes = nodesOf(told, known);
+  draw(told, nodes);
+  table(told, nodes);
+  keyed(at("traffic"), Object.entries(told.devices), ([uuid]) => uuid, () => element("li", {}, element("b"), " ", element("span")),
+    (item, [uuid, view]) => {
+      words(item.firstChild, known.get(uuid)?.name ?? uuid.slice(0, 8));
+      const traffic = view.sent || view.received ? `, ${view.sent} datagrams sent, ${view.received} received` : "";
+      words(item.lastChild, `knows ${view.known}${traffic}, ${view.lost} dropped`);
+    });
+  const lookups = Object.entries(told.devices).flatMap(([uuid, view]) => view.lookups.map((each) => ({ ...each, by: known.get(uuid)?.name ?? "" })));
+  words(at("no-lookups"), lookups.length ? "Newest lookups" : "No lookups: everybody knows everybody.");
+  keyed(at("lookups"), lookups.slice(0, 24), (each) => `${each.by} ${each.key} ${each.ms}`, () => element("li"),
+    (item, each) => words(item, `${each.by} sought ${each.key.slice(0, 8)}: ${each.asked} asked in ${each.hops} ${each.hops === 1 ? "hop" : "hops"}, ${each.found} found, ${ms(each.ms)} ms`));
+  const silent = told.silent.map((uuid) => known.get(uuid)?.name ?? uuid.slice(0, 8));
+  words(at("network-line"), silent.length ? `${silent.join(", ")} did not answer.` : "All of them answered.");
+}
+
+export function make(root, { model }) {
+  let inSight = false;
+  let timer = null;
+  root.append(
+    element("p", { class: "hint", id: "network-line", role: "status" }),
+    drawn("svg", { id: "graph", viewBox: `0 0 ${SIDE} ${SIDE}`, role: "img", "aria-label": "Who knows whom; the table has the same in numbers" }),
+    element("div", { class: "wide", tabindex: 0, role: "region", "aria-label": "Round trips" }, element("table", { id: "ties" })),
+    element("ul", { id: "traffic" }), element("h3", { id: "no-lookups" }), element("ol", { id: "lookups", class: "plain" }));
+
+  async function turn() {
+    clearTimeout(timer);
+    timer = null;
+    if (!inSight || document.hidden) return;
+    timer = setTimeout(turn, EVERY);
+    try {
+      show(await get("network"), model.devices);
+    } catch (error) {
+      words(at("network-line"), error.message);
+    }
+  }
+
+  const watch = new IntersectionObserver(([entry]) => {
+    inSight = entry.isIntersecting;
+    if (inSight !== Boolean(timer)) turn();
+  });
+  watch.observe(root);
+  document.addEventListener("visibilitychange", turn);
+  return {
+    close() {
+      inSight = false;
+      watch.disconnect();
+      document.removeEventListener("visibilitychange", turn);
+      turn();
+    },
+  };
+}

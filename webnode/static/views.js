@@ -1,0 +1,40 @@
+// Views: what leads to the further ones, and the panels that are loaded only where the node can fill them.
+import { element } from "./element.js";
+import { panel } from "./panel.js";
+
+const MORE = { groups: "Consensus", network: "Network", events: "Events" };
+const THEMES = { "light dark": "As the system", light: "Light", dark: "Dark" };
+const KEPT = "swarm.theme";
+
+function kept() {
+  try {
+    return localStorage.getItem(KEPT);
+  } catch {
+    return null;
+  }
+}
+
+// What is looked at less often, and how the page looks.
+function more(root) {
+  const choice = element("select", { id: "theme" }, ...Object.entries(THEMES).map(([value, name]) => element("option", { value }, name)));
+  choice.value = kept() in THEMES ? kept() : "light dark";
+  const apply = () => { document.documentElement.style.colorScheme = choice.value; };
+  choice.addEventListener("change", () => {
+    apply();
+    try {
+      localStorage.setItem(KEPT, choice.value);
+    } catch {
+      // A browser that keeps nothing asks the system again.
+    }
+  });
+  apply();
+  root.append(
+    element("nav", { class: "further", "aria-label": "More views" },
+      ...Object.entries(MORE).map(([place, name]) => element("a", { href: `#${place}` }, name))),
+    element("div", { class: "row" }, element("label", { for: "theme" }, "Colours"), choice));
+}
+
+panel({ place: "more", order: 30, title: "More", make: more });
+
+panel({ place: "network", order: 10, title: "Network", needs: { has: "survey" }, load: () => import("./network.js") });
+panel({ place: "device", order: 10, title: "Stores", needs: { has: "survey" }, load: () => import("./inventory.js") });
