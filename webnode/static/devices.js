@@ -1,7 +1,6 @@
 // Devices: the list in the order of joining, and the dialog with what is known of one.
 import { at, attribute, badge, element, keyed, span, state, words } from "./element.js";
 import { delivery, say, wish } from "./desk.js";
-import { History } from "./history.js";
 import { panel } from "./panel.js";
 import { back, go } from "./shell.js";
 
@@ -52,7 +51,8 @@ function update(item, device) {
 function show(uuid) {
   open = uuid;
   words(at("d-answer"), "");
-  history = new History(at("d-events"), uuid);
+  history = null;
+  import("./history.js").then(({ History }) => { if (open === uuid) history = new History(at("d-events"), uuid); });
   fill();
   if (!at("place-device").open) at("place-device").showModal();
 }
@@ -137,7 +137,7 @@ panel({
     return {
       update(model, event) {
         if (open && event === "state") fill();
-        if (open && event === "event") history.update();
+        if (open && event === "event") history?.update();
       },
       show,
       hide() {

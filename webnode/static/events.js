@@ -1,7 +1,6 @@
 // Events: what this node saw happen in the team, all of it or of one kind.
 import { at, words } from "./element.js";
 import { listEntries, since } from "./history.js";
-import { panel } from "./panel.js";
 
 const KINDS = {
   all: () => true,
@@ -10,20 +9,16 @@ const KINDS = {
   messages: ({ kind }) => kind === "message",
 };
 
-panel({
-  place: "events",
-  title: "Events",
-  make(root, { model }) {
-    const show = () => {
-      const entries = model.events.filter(KINDS[at("event-kind").value]);
-      words(at("events-since"), `${model.node ? `What ${model.node} saw` : "What was seen"} ${since(model.events)}`.trim());
-      listEntries(at("events"), entries);
-    };
-    at("event-kind").addEventListener("change", show);
-    return {
-      update(_, event) {
-        if (["", "event", "state"].includes(event)) show();
-      },
-    };
-  },
-});
+export function make(root, { model }) {
+  const show = () => {
+    const entries = model.events.filter(KINDS[at("event-kind").value]);
+    words(at("events-since"), `${model.node ? `What ${model.node} saw` : "What was seen"} ${since(model.events)}`.trim());
+    listEntries(at("events"), entries);
+  };
+  at("event-kind").addEventListener("change", show);
+  return {
+    update(_, event) {
+      if (["", "event", "state"].includes(event)) show();
+    },
+  };
+}

@@ -1,7 +1,6 @@
 // Tasks: choosing a predefined one, seeing what became of each, and taking it back.
 import { at, attribute, badge, element, keyed, state, words } from "./element.js";
 import { say, wish } from "./desk.js";
-import { History } from "./history.js";
 import { ask, get } from "./link.js";
 import { panel } from "./panel.js";
 
@@ -41,7 +40,8 @@ function row(task) {
 function history(task) {
   const list = element("ol", { class: "story", tabindex: 0, "aria-label": `History of ${task.title}, the newest first` });
   const box = element("details", { class: "history" }, element("summary", {}, "History"), list);
-  box.addEventListener("toggle", () => {
+  box.addEventListener("toggle", async () => {
+    const { History } = await import("./history.js");
     if (box.open) histories.set(task.id, new History(list, task.id));
     else histories.delete(task.id);
   });

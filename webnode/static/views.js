@@ -36,5 +36,6 @@ function more(root) {
 
 panel({ place: "more", order: 30, title: "More", make: more });
 
+panel({ place: "events", title: "Events", load: () => import("./events.js") });
 panel({ place: "network", order: 10, title: "Network", needs: { has: "survey" }, load: () => import("./network.js") });
 panel({ place: "device", order: 10, title: "Stores", needs: { has: "survey" }, load: () => import("./inventory.js") });
