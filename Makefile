@@ -25,7 +25,7 @@ BROWSER := $(VENV)/.stamp-browser
 BENCH   := $(VENV)/.stamp-bench
 
 .PHONY: help demo test trials check format cov live schedules browser \
-    bench-demo bench-dht bench-consensus bench-takeover api dist clean
+    bench-demo bench-page bench-dht bench-consensus bench-takeover api dist clean
 
 help:
 	@echo 'make demo [HEADLESS=1] [SEED=1]       three dogs, a red target and the page; HEADLESS: both experiments, then exit'
@@ -39,6 +39,7 @@ help:
 	@echo 'make live                             only the tests with real sockets and processes'
 	@echo 'make browser                          only the tests of the page in Chromium'
 	@echo 'make bench-demo                       what the demonstration costs: memory, datagrams, seconds'
+	@echo 'make bench-page                       the page under load: streams, cameras, dribblers, requests, a slow line'
 	@echo 'make bench-dht [NODES=8,32] [SECONDS=5] [PEERS=..]   the peer-to-peer library beside others of its kind'
 	@echo 'make bench-takeover [N=200] [REAL=20]   seconds to take over, for each way to lose who acts'
 	@echo 'make bench-consensus [QUICK=1]        every strategy over the same missions: cost, messages, time to agree'
@@ -82,6 +83,9 @@ browser: $(BROWSER)
 
 bench-demo: $(RUNTIME)
 	$(PY) -m benchmarks.demo --seed $(SEED)
+
+bench-page: $(RUNTIME)
+	$(PY) -m benchmarks.page
 
 # In a network of its own, where that is allowed, the counted datagrams are those of the nodes alone.
 bench-dht: $(BENCH)

@@ -211,7 +211,7 @@ async def measured(given: Any, web: Child, where: int) -> list[str]:
     tasks += [asyncio.ensure_future(load.slowly(1)), asyncio.ensure_future(load.requests(given.rate))]
     await asyncio.sleep(ARRIVAL_S + 1)
     load.forget()
-    web.figures()
+    midway = web.figures()
     await asyncio.sleep(given.seconds)
     after = web.figures()
     unfed = given.streams - sum(time.monotonic() - at < 2 for at in load.beats.values())
@@ -229,6 +229,7 @@ async def measured(given: Any, web: Child, where: int) -> list[str]:
         _line("dribblers closed", max(load.closed, default=0.0), "s", "closed", f" ({open_still} are still open)"),
         _line("timers late", after["late_ms"], "ms", "late", f" (99 of 100: {after['late_p99_ms']:.1f} ms)"),
         _line("memory more", after["rss"] - before["rss"], "MiB", "memory", f" (of {after['rss']:.0f})"),
+        f"processor             {(after['processor_s'] - midway['processor_s']) / given.seconds:8.2f} of one core",
         *([f"{load.refused} requests were REFUSED"] if load.refused else []),
         *([f"{len(broken)} clients BROKE: {broken[0].exception()!r}"] if broken else []),
         *([f"{open_still} dribblers MISSED: still open"] if open_still and given.seconds > 20 else []),

@@ -82,7 +82,7 @@ class Events(JsonResource):
     (``journal.Change``), ``yard`` (the overhead snapshot, or null), ``pages`` (where the team serves the page),
     ``event`` (entries of the chronicle) and ``beat`` (``now`` in unix seconds, ``skipped``: how often this slow client
     was put off).  ``since``, or the header ``Last-Event-ID``, is the last id that was heard: what came after it is
-    told, where it is still kept.  With ``whole`` each change is a ``state``.
+    told, where it is still kept and less than the whole state.  With ``whole`` each change is a ``state``.
 
     ``version`` is asked instead of reading the state again: while it is the same nothing has changed.
     """
@@ -188,22 +188,28 @@ class Events(JsonResource):
             self._chronicle.saw(self._journal.state, self._wall())
 
     def _missed(self, viewer: Viewer, is_again: bool) -> str:
-        """What a viewer was not told of the state and of the chronicle."""
+        """What a viewer was not told of the state, as changes or whole, whichever is less, and of the chronicle."""
         journal, words = self._journal, []
         missed = None if viewer.is_whole else journal.since(viewer.heard)
+        if missed is not None and len(missed) > 1 and sum(len(each.words) for each in missed) > len(self._written()):
+            missed = None
         if missed is not None:
             words = [f"id: {journal.id(each.n)}\nevent: change\ndata: {each.words}\n\n" for each in missed]
         elif viewer.heard < journal.n:
-            if self._whole[0] != journal.n:
-                self._whole = (journal.n, dumped(journal.state)[1:])
             start = "true," if is_again and not viewer.is_whole else "false,"
-            words = [f'id: {journal.id(journal.n)}\nevent: state\ndata: {{"resync":{start}{self._whole[1]}\n\n']
+            words = [f'id: {journal.id(journal.n)}\nevent: state\ndata: {{"resync":{start}{self._written()}\n\n']
         viewer.heard = journal.n
         entries = self._chronicle.since(viewer.entry)[-ENTRIES:]
         if entries:
             viewer.entry = entries[-1].n
             words.append(_event("event", dumped([asdict(entry) for entry in entries])))
         return "".join(words)
+
+    def _written(self) -> str:
+        """The whole state as JSON without its first brace, written once for all who need it."""
+        if self._whole[0] != self._journal.n:
+            self._whole = (self._journal.n, dumped(self._journal.state)[1:])
+        return self._whole[1]
 
     def _offered(self, viewer: Viewer, news: Mapping[str, str]) -> str:
         """Of what only the newest counts, that which a viewer has not seen."""
@@ -215,7 +221,7 @@ class Events(JsonResource):
         return _event("beat", dumped({"now": round(self._wall(), 3), "skipped": viewer.skipped}))
 
     def _news(self) -> dict[str, str]:
-        told = {event: self._sound(event, partial(_written, source)) for event, source in self._newest.items()}
+        told = {event: self._sound(event, partial(_read_out, source)) for event, source in self._newest.items()}
         return {event: words for event, words in told.items() if words is not None}
 
     def _sound(self, event: str, made: Callable[[], Any]) -> Any:
@@ -237,7 +243,7 @@ class Events(JsonResource):
             self._schedule(IDLE_S if self._is_open else None)
 
 
-def _written(source: Callable[[], Any]) -> str:
+def _read_out(source: Callable[[], Any]) -> str:
     return dumped(source())
 
 

@@ -114,6 +114,11 @@ class FallbackTests(SynchronousTestCase):
         self.assertEqual([path for path in kept if path != "/" and not path.startswith("/static/")], [])
 
 
+def stretch() -> float:
+    """How much longer all takes here, as the machine has more to do than it has cores; 1 where it has not."""
+    return max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
+
+
 class DemonstrationFallbackTests(SynchronousTestCase):
     """Experiment 2 of the thesis with the real team, and its web node lost on top."""
 
@@ -166,7 +171,7 @@ class DemonstrationFallbackTests(SynchronousTestCase):
         began = time.monotonic()
         page.locator("#node", has_text="pi").wait_for()
         page.locator("#link[data-link=live]").wait_for()
-        self.assertLess(time.monotonic() - began, limit_s)
+        self.assertLess(time.monotonic() - began, limit_s * stretch())
         page.locator("#tasks li", has_text="completed").wait_for(timeout=60_000)
         done = page.locator("#tasks li").first.inner_text()
         self.assertIn("Done by dog", done)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import socket
 import threading
 from typing import Any
 
@@ -45,6 +47,15 @@ class Stream(Protocol):
         self._waiting.append((words, found))
         self.dataReceived(b"")
         return found.addTimeout(5, reactor)
+
+
+def read(connection: socket.socket) -> bytes:
+    """What has come and waits to be read."""
+    taken = b""
+    with contextlib.suppress(BlockingIOError):
+        while data := connection.recv(1 << 16):
+            taken += data
+    return taken
 
 
 class WebServiceTests(TestCase):
@@ -129,6 +140,26 @@ class WebServiceTests(TestCase):
         for stream in streams:
             await stream.said(b"dog2")
         self.assertIn(b"dog2", await self.body("/api/v1/state"))
+
+    async def test_keep_little_for_a_slow_page(self) -> None:
+        """A page that stops reading has less than 200 kB of 1.5 MB waiting, and then has the newest state at once."""
+        self.devices[0]["description"] = "x" * 250
+        self.devices += [{**self.devices[0], "uuid": f"a{n}", "name": f"dog{n}"} for n in range(100)]
+        with socket.socket() as slow:
+            slow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 16384)
+            slow.setblocking(False)
+            slow.connect_ex(("127.0.0.1", self.web.port))
+            await deferLater(reactor, 0.1)
+            slow.send(b"GET /events HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+            for n in range(30):
+                self.devices = [{**device, "description": f"{n} {'x' * 250}"} for device in self.devices]
+                await deferLater(reactor, 0.11)
+            taken = held = read(slow)
+            while b'"29 xx' not in taken[-60_000:]:
+                await deferLater(reactor, 0.01)
+                taken += read(slow)
+        self.assertLess(len(held), 200_000)
+        self.assertLess(len(taken), 400_000)
 
     def test_tell_of_taken_port(self) -> None:
         """A port that another program holds is told in one line that says where and what to do."""

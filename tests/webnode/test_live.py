@@ -17,6 +17,8 @@ from webnode.errors import Refusal
 from webnode.journal import KEPT
 from webnode.live import MAX_VIEWERS, MAX_WAITING, Events, Shots
 
+MORE = "x" * 999
+"""What makes a state longer than a few changes."""
 JPEG = b"\xff\xd8 a picture"
 
 
@@ -92,6 +94,7 @@ class EventsTests(SynchronousTestCase):
 
     def test_resume(self) -> None:
         """A page that comes back with the last id that it heard, in either way, is told what it missed and no more."""
+        self.state["more"] = MORE
         page = self.connected()
         heard = last_id(page.taken())
         page.leave()
@@ -102,7 +105,8 @@ class EventsTests(SynchronousTestCase):
         for back in (self.connected(f"?since={heard}"), self.connected(Last_Event_ID=heard)):
             told = [event for event in events_in(back.taken()) if event[0] in ("state", "change")]
             self.assertEqual(told, [("change", {"n": 1}), ("change", {"n": 2})])
-        self.assertIn(("state", {"resync": True, "n": 2}), events_in(self.connected("?since=other-3").taken()))
+        whole = ("state", {"resync": True, "n": 2, "more": MORE})
+        self.assertIn(whole, events_in(self.connected("?since=other-3").taken()))
         watcher.leave()
 
     def test_tell_pages(self) -> None:
@@ -160,6 +164,7 @@ class EventsTests(SynchronousTestCase):
 
     def test_put_off_slow_pages(self) -> None:
         """A page that does not read is written nothing; when it reads again it gets what it missed, and the count."""
+        self.state["more"] = MORE
         slow, quick = self.connected(), self.connected()
         slow.taken()
         slow.pause()
@@ -175,17 +180,19 @@ class EventsTests(SynchronousTestCase):
         self.assertGreaterEqual([words for name, words in told if name == "beat"][-1]["skipped"], 5)
 
     def test_spare_slow_pages_the_past(self) -> None:
-        """A page that missed more than is kept gets the newest state instead, marked as such."""
-        slow = self.connected()
-        slow.taken()
-        slow.pause()
-        for n in range(1, KEPT + 3):
-            self.state["n"] = n
+        """A page that missed more than is kept, or more than the newest state is long, gets that, marked as such."""
+        for more, missed in ((MORE, KEPT + 2), ("", 4)):
+            self.state.update({"more": more, "n": 0})
+            slow = self.connected()
+            slow.taken()
+            slow.pause()
+            for n in range(1, missed + 1):
+                self.state["n"] = n
+                self.clock.advance(0.1)
+            slow.resume()
             self.clock.advance(0.1)
-        slow.resume()
-        self.clock.advance(0.1)
-        told = [event for event in events_in(slow.taken()) if event[0] in ("state", "change")]
-        self.assertEqual(told, [("state", {"resync": True, "n": KEPT + 2})])
+            told = [event for event in events_in(slow.taken()) if event[0] in ("state", "change")]
+            self.assertEqual(told, [("state", {"resync": True, "n": missed, "more": more})])
 
     def test_rest_when_nobody_looks(self) -> None:
         """When the last page has gone, nothing is read and no timer is left."""
@@ -311,6 +318,13 @@ class ShotsTests(SynchronousTestCase):
         self.assertEqual((list(self.frames.watched), self.shots.watched), ([], []))
         self.assertEqual(self.clock.getDelayedCalls(), [])
         self.assertTrue(page.taken() and again.taken())
+
+    def test_look_once_for_hundreds(self) -> None:
+        """Two hundred viewers of one camera cost one upstream, and all get the picture."""
+        pages = [self.asked(viewer=f"v{n}") for n in range(200)]
+        self.frames.show("ab", 1, JPEG)
+        self.assertEqual(self.frames.opened, 1)
+        self.assertTrue(all(page.taken().endswith(JPEG) for page in pages))
 
     def test_forget_who_left(self) -> None:
         """A viewer that closes its connection is waited for no longer."""
