@@ -105,19 +105,21 @@ class Halt:
 
     async def _order(self, is_on: bool, by: str, contacts: Collection[Contact]) -> dict[str, str]:
         assert self._entangled is not None
-        told: dict[str, str] = {}
         for _ in range(TRIES):
             word = Word(self.word.count + 1, is_on, by[:MAX_NAME])
-            told[self._entangled.contact.node_id.hex()] = self.take(word)
-            asked = [self._tell(contact, word, told) for contact in contacts]
+            told = {self._entangled.contact.node_id.hex(): self.take(word)}
+            settled: Deferred[None] = Deferred()
+            asked = DeferredList([self._tell(contact, word, told, settled) for contact in contacts])
+            asked.addCallback(_all_said, settled)
             # Who cannot be told now, or comes later, reads it.
             self._entangled.put(HALT, SLOT, word.packed(), "team").addErrback(_unwritten)
-            await DeferredList(asked)
+            await settled
             if self.word.is_on == is_on:
                 break
         return told
 
-    def _tell(self, contact: Contact, word: Word, told: dict[str, str]) -> Deferred[None]:
+    def _tell(self, contact: Contact, word: Word, told: dict[str, str], settled: Deferred[None]) -> Deferred[None]:
+        """Say ``word`` to one; ``settled`` fires at once where it turns out that it has to be said again."""
         assert self._entangled is not None
 
         def answered(answer: Any) -> None:
@@ -126,6 +128,8 @@ class Halt:
             known = _word(fields)
             if known is not None and _rank(known) > _rank(self.word):
                 self.take(known)
+                if known.is_on != word.is_on:
+                    _settle(settled)
 
         def unanswered(failure: Any) -> None:
             failure.trap(EntangledError)
@@ -187,6 +191,15 @@ def _word(fields: object) -> Word | None:
     count, is_on, by = fields
     is_lawful = is_whole(count) and isinstance(is_on, bool) and isinstance(by, str) and len(by) <= MAX_NAME
     return Word(count, is_on, by) if is_lawful else None
+
+
+def _settle(settled: Deferred[None]) -> None:
+    if not settled.called:
+        settled.callback(None)
+
+
+def _all_said(answers: object, settled: Deferred[None]) -> None:
+    _settle(settled)
 
 
 def _unwritten(failure: Any) -> None:

@@ -10,6 +10,7 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from agents import engagement, loop
 from drivers.registry import describe
+from middleware import halt
 from middleware.commitment import ballot, lessee
 from middleware.consensus import guard, strategy, worker
 from middleware.deployment import manifest, module
@@ -19,7 +20,8 @@ from middleware.entangled.kademlia import membership, roster
 from middleware.entangled.replication import handover, pusher, replica, subscriber
 from middleware.entangled.space import shelf, template
 from middleware.settings import Settings
-from webnode import live
+from webnode import channel, limits, live, session, team
+from webnode.board import AUDITED
 from webnode.routes import orders
 
 ROOT = Path(__file__).parents[1]
@@ -53,8 +55,23 @@ FIGURES: Sequence[tuple[str, str]] = (
     ("protocol", f"out of touch with a majority for {handover.OUT_OF_TOUCH:g} s"),
     ("protocol", f"Pages hold about {replica.PAGE_BYTES:,} bytes"),
     ("protocol", f"counts for {pusher.WATCH_TTL:g} s and is asked again every {subscriber.RENEW:g} s"),
+    ("safety", f"the head of a request | {channel.HEAD_S:g} s after its first byte"),
+    ("safety", f"less than {channel.PACE / 1000:g} kB/s on the average after {channel.GRACE_S:g} s"),
+    ("safety", f"that has had an answer | {channel.KEEP_S:g} s"),
+    ("safety", f"nothing is taken | {channel.STALL_S:g} s"),
+    ("safety", f"does not hang up | {channel.CLOSE_S:g} s"),
+    (
+        "safety",
+        f"{limits.MOST['unfinished']} requests that are not complete, {limits.MOST['stream']} answers under way",
+    ),
+    ("safety", f"and {limits.MOST['open']} connections"),
+    ("safety", f"Where more than {session.WAITING} wait".lower()),
+    ("safety", f"the newest {AUDITED} in memory"),
     ("tuplespace", f"1 to {template.MAX_FIELDS} fields"),
     ("tuplespace", f"asked every {shelf.POLL:g} s whether"),
+    ("actions", f"after {team.PATIENCE:g} s at the latest"),
+    ("actions", f"place the target, {team.PLACING:g} s later"),
+    ("protocol", f"is on: bool, by: at most {halt.MAX_NAME} characters"),
     ("web", f"`text`, 1 to {orders.MAX_MESSAGE} characters"),
     ("web", f"`seconds`, {orders.MIN_AWAY_S:g} to {orders.MAX_AWAY_S:g}, default {orders.AWAY_S:g}"),
     ("web", f"At most {live.MAX_VIEWERS} streams"),

@@ -1,11 +1,117 @@
-"""Audit: who changed what through the page."""
+"""Audit: who changed what through the page, one line of JSON each, in a file beside the node's store."""
 
 from __future__ import annotations
 
-from webnode.board import Audit, MemoryAudit
+import json
+import os
+from collections import Counter, OrderedDict, deque
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from twisted.logger import Logger
+
+from middleware.settings import IN_MEMORY
+from webnode.board import AUDITED, Audit, MemoryAudit, Visitor
+from webnode.field import Json
 from webnode.ground import Ground
+
+ENDING = ".audit"
+MOST = 1 << 20
+"""Bytes of the file; then it is put aside as ``.1`` and a new one begun, so there are at most two."""
+TAIL = 1 << 16
+QUIET_S, KNOWN = 60.0, 256
+"""The same from the same stranger is one line in so many seconds, and of so many strangers that is known."""
+
+
+class FileAudit:
+    """Lines in a file that are kept when the node ends, the newest of them also in memory.
+
+    A file that cannot be written is told of once in the log; the page goes on.
+    """
+
+    _log = Logger()
+
+    def __init__(self, path: Path, wall: Callable[[], float], most: int = MOST) -> None:
+        self._path = path
+        self._wall = wall
+        self._most = most
+        self._newest: deque[dict[str, Json]] = deque(_tail(path), maxlen=AUDITED)
+        self._counts: Counter[tuple[str, str]] = Counter()
+        self._strangers: OrderedDict[tuple[str, str, str], list[float]] = OrderedDict()
+        self._is_failing = False
+
+    def note(self, who: Visitor, source: str, route: str, target: str, outcome: str) -> None:
+        """Keep one line."""
+        self._counts[who.role, outcome[:3]] += 1
+        now = self._wall()
+        repeated = self._repeated((source, route, outcome), now) if who.role == "anyone" else 0
+        if repeated is None:
+            return
+        line: dict[str, Json] = {"at": round(now, 3), "who": who.name, "role": who.role, "from": source}
+        line |= {"session": who.token_id, "route": route, "target": target, "outcome": outcome}
+        if repeated:
+            line["repeated"] = repeated
+        self._newest.appendleft(line)
+        try:
+            self._write(json.dumps(line) + "\n")
+        except OSError as error:
+            if not self._is_failing:
+                self._log.warn("the audit {path} cannot be written: {error}", path=self._path, error=error)
+            self._is_failing = True
+        else:
+            self._is_failing = False
+
+    def newest(self, count: int) -> list[dict[str, Json]]:
+        """The newest lines, the newest first."""
+        return list(self._newest)[:count]
+
+    def counts(self) -> Mapping[tuple[str, str], int]:
+        """How many there were since the start, by role and status, those that are no line of their own included."""
+        return self._counts
+
+    def _repeated(self, what: tuple[str, str, str], now: float) -> int | None:
+        """How often it was left out since its last line; None where it is to be left out again."""
+        known = self._strangers.get(what)
+        if known is not None and 0.0 <= now - known[0] < QUIET_S:
+            known[1] += 1
+            return None
+        self._strangers[what] = [now, 0]
+        self._strangers.move_to_end(what)
+        if len(self._strangers) > KNOWN:
+            self._strangers.popitem(last=False)
+        return 0 if known is None else int(known[1])
+
+    def _write(self, line: str) -> None:
+        descriptor = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
+        with open(descriptor, "a", encoding="utf-8") as file:
+            is_full = file.tell() + len(line) > self._most
+            if not is_full:
+                file.write(line)
+        if is_full:
+            os.replace(self._path, self._path.with_name(f"{self._path.name}.1"))
+            self._write(line[: self._most])
+
+
+def _tail(path: Path) -> list[dict[str, Json]]:
+    """The newest lines of the file, the newest first."""
+    try:
+        with path.open("rb") as file:
+            file.seek(max(0, path.stat().st_size - TAIL))
+            rows = file.read().splitlines()
+    except OSError:
+        return []
+    found = []
+    for row in rows[-AUDITED:]:
+        try:
+            line = json.loads(row)
+        except ValueError:
+            continue
+        if isinstance(line, dict):
+            found.append(line)
+    return found[::-1]
 
 
 def audit(ground: Ground) -> Audit:
-    """The newest changes; they are forgotten when the node ends."""
-    return MemoryAudit()
+    """The audit in a file, or in memory alone where the store is there, too."""
+    store = ground.settings.node.store
+    return MemoryAudit(ground.wall) if store == IN_MEMORY else FileAudit(Path(f"{store}{ENDING}"), ground.wall)

@@ -8,8 +8,8 @@ any.
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Protocol
 
@@ -94,23 +94,33 @@ class Audit(Protocol):
         """Keep one line: ``route`` is method and path, ``target`` what its path named, ``outcome`` the status."""
 
     def newest(self, count: int) -> list[dict[str, Json]]:
-        """The newest lines, the newest first."""
+        """The newest lines, the newest first; at most ``AUDITED``."""
+
+    def counts(self) -> Mapping[tuple[str, str], int]:
+        """How many there were since the start, by role and status."""
 
 
 class MemoryAudit:
-    """The newest lines, forgotten when the node ends."""
+    """The newest lines, forgotten when the node ends; ``wall`` is unix time in seconds."""
 
-    def __init__(self) -> None:
+    def __init__(self, wall: Callable[[], float] = lambda: 0.0) -> None:
+        self._wall = wall
         self._lines: deque[dict[str, Json]] = deque(maxlen=AUDITED)
+        self._counts: Counter[tuple[str, str]] = Counter()
 
     def note(self, who: Visitor, source: str, route: str, target: str, outcome: str) -> None:
         """Keep one line."""
-        line = {"who": who.name, "role": who.role, "from": source, "route": route}
-        self._lines.appendleft({**line, "target": target, "outcome": outcome})
+        self._counts[who.role, outcome[:3]] += 1
+        line: dict[str, Json] = {"at": round(self._wall(), 3), "who": who.name, "role": who.role, "from": source}
+        self._lines.appendleft({**line, "session": who.token_id, "route": route, "target": target, "outcome": outcome})
 
     def newest(self, count: int) -> list[dict[str, Json]]:
         """The newest lines, the newest first."""
         return list(self._lines)[:count]
+
+    def counts(self) -> Mapping[tuple[str, str], int]:
+        """How many there were."""
+        return self._counts
 
 
 @dataclass(frozen=True)

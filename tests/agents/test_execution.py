@@ -56,6 +56,15 @@ class ExecutionTests(SynchronousTestCase):
             self.assertEqual(self.execution(Digger(said)).go_on(0.0, 1, 1.0).progress, told, said)
         self.assertIsNone(self.execution(Digger(float("nan"))).go_on(0.0, 1, 1.0).progress)
 
+    def test_who_is_kept_from_it_does_not_stall(self) -> None:
+        """A minute in which nobody asks, because the team is stopped, does not count as one without progress."""
+        execution = self.execution(Digger(), 2.0)
+        for moment in (0.0, 0.5, 1.0, 61.0, 61.5):
+            execution.go_on(moment, 1, 99.0)
+            self.assertFalse(execution.has_stalled(moment), moment)
+        execution.go_on(62.2, 1, 99.0)
+        self.assertTrue(execution.has_stalled(62.2))
+
     def test_stall(self) -> None:
         """Without progress for longer than the limit it has stalled, for as long as it tried; with progress never."""
         digger = Digger()

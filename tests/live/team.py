@@ -3,15 +3,18 @@
 ``python -m tests.live.team`` prints the port, the code to sign in with, and an operator's token and ticket in its first
 line; whoever has signed in at one is signed in at the next.  Lines on its input change the team: ``gone NAME``, ``back
 NAME``, ``status NAME STATUS``, ``freeze SECONDS`` (the whole process stands), ``name NAME`` (of the node that serves),
-``pages NODE=URL ...`` (the web nodes, itself first); it ends when its input does.
+``pages NODE=URL ...`` (the web nodes, itself first), ``strange FILE`` (devices and tasks whose words are those of that
+JSON list); it ends when its input does.
 """
 
 from __future__ import annotations
 
+import json
 import random
 import sys
 import time
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -22,7 +25,7 @@ from twisted.internet.stdio import StandardIO
 from twisted.internet.threads import deferToThread
 from twisted.protocols.basic import LineReceiver
 
-from webnode.board import Board, MemoryFallbacks, MemoryHalts, MemorySurvey, Page
+from webnode.board import Board, Knob, MemoryAudit, MemoryFallbacks, MemoryHalts, MemorySurvey, MemoryTuning, Page
 from webnode.camera import OnFrame
 from webnode.chronicle import TeamChronicle
 from webnode.desk import MemoryDesk
@@ -108,6 +111,7 @@ class Team:
         self.away: set[str] = set()
         self.node = "vaio"
         self.halts = MemoryHalts(*(f"{n:02x}" * 16 for n in (1, 2, 3)))
+        self.batch = 0
         self._departed = Departed()
         self.tasks = [
             {
@@ -133,12 +137,13 @@ class Team:
         """The state as it is now."""
         here = [each for each in self.devices if each["name"] not in self.away]
         costs = {"dog1": 1.04, "dog2": 0.62, "dog3": 1.37}
+        task = self.tasks[0]["id"]
         members = [
             {
                 "uuid": each["uuid"],
                 "name": each["name"],
                 "status": each["status"],
-                "cost": costs[each["name"]],
+                "cost": costs.get(each["name"], 1.0),
                 "assigned": "02" * 16,
                 "token": 1,
                 "why": "the nearest of three" if each["name"] == "dog2" else "",
@@ -146,8 +151,39 @@ class Team:
             for each in here
         ]
         gone = self._departed.of(here, time.time())
-        state = state_of(here, self.tasks, {"t1": members}, departed=gone, node=self.node)
+        state = state_of(here, self.tasks, {str(task): members}, departed=gone, node=self.node)
         return {**state, "halted": self.halts.is_halted()}
+
+    def be_strange(self, words: list[str]) -> None:
+        """A device, a task and a decision of each of ``words``, with them wherever others' words are shown."""
+        now = time.time()
+        self.batch += 1
+        self.devices, self.tasks = [], []
+        for number, said in enumerate(words, 1):
+            strange: dict[str, Any] = {
+                "name": said,
+                "kind": said,
+                "description": said,
+                "address": said,
+                "messages": [[now, said]],
+            }
+            strange |= {"capabilities": {said: {said: said}}, "network": {said: 1}, "deployed": {said: said}}
+            self.devices.append({**dog(number, said, said, now), **strange})
+            told: dict[str, Any] = why()
+            for epoch in told["epochs"]:
+                epoch |= {"chosen": said, "rule": said, "hysteresis": said, "agree": [said], "standby": [said]}
+                epoch["differ"] = [{"name": said, "what": said}]
+                epoch["reports"] = [{"agent": said, "name": said, "cost": 1.0, "more": said}]
+            task = {
+                "id": f"s{self.batch}-{number}",
+                "kind": said,
+                "title": said,
+                "created": now + number,
+                "status": said,
+            }
+            self.tasks.append({**task, "note": said, "strategy": said, "why": told, "requirements": {said: {}}})
+        YARD["dogs"] = [{**YARD["dogs"][0], "name": said} for said in words[:20]]
+        self._departed = Departed()
 
     def watch(self, uuid: str, on_frame: OnFrame) -> Any:
         """Pictures of a floor, a wall and a red ball that rolls, 15 a second."""
@@ -161,7 +197,7 @@ class Team:
                 return
             seq += 1
             picture = np.full((160, 208, 3), (205, 214, 220), np.uint8)
-            picture[70:] = HUES[f"dog{number}"]
+            picture[70:] = HUES[f"dog{1 + (number - 1) % 3}"]
             cv2.circle(picture, ((seq * 3 + 60 * number) % 240 - 16, 96), 8 + 6 * number, (44, 52, 212), -1)
             on_frame(seq, cv2.imencode(".jpg", picture)[1].tobytes())
             reactor.callLater(1 / 15, shoot)
@@ -174,7 +210,7 @@ class Team:
         return stop
 
 
-YARD = {
+YARD: dict[str, Any] = {
     "walls": [3.0, 2.4],
     "dogs": [
         {"name": "dog1", "x": 0.6, "y": 0.6, "heading": 0.5, "stripes": 1},
@@ -183,6 +219,11 @@ YARD = {
     ],
     "target": {"x": 1.8, "y": 1.7, "radius": 0.08},
 }
+KNOBS = [
+    Knob("description", "The dog with 1 yellow stripe on its head.", "A line about the device", most=200),
+    Knob("presence_lease", 1.0, "How long the others believe in the device", "s", 0.1, 60.0),
+    Knob("capabilities", {"gripper": {"width": 0.1}}, "What the device can do beyond what its driver says"),
+]
 CATALOGUE = [
     {"name": "search", "title": "Find and touch the red target", "requirements": {}},
     {"name": "patrol", "title": "Patrol the yard", "requirements": {}},
@@ -221,6 +262,8 @@ class Orders(LineReceiver):
             self._pages[:] = [Page(node, url, is_self=place == 0) for place, (node, url) in enumerate(named)]
         elif verb == "freeze":
             time.sleep(float(rest[0]))
+        elif verb == "strange":
+            self._team.be_strange(json.loads(Path(rest[0]).read_text(encoding="utf-8")))
         self.sendLine(line)
 
     def connectionLost(self, reason: Any = None) -> None:
@@ -235,8 +278,15 @@ def board(team: Team) -> Board:
     able = [{"uuid": f"{n:02x}" * 16, "name": f"dog{n}", "busy": "Patrol the yard" * (n == 2)} for n in (1, 2)]
     desk.previews["search"] = {"able": able, "refused": {"dog3": ["no gripper", "no lift"]}, "likely": None}
     sessions = SignedSessions(b"a team of the tests", "quiet-otter", PASSWORD, random.Random(), checked)
+    tuning = MemoryTuning({able[0]["uuid"]: KNOBS})
     survey = MemorySurvey(network(), {f"0{n}" * 16: inventory() for n in (1, 2)})
-    return Board(desk, sessions, chronicle=TeamChronicle(), limits=AddressLimits(), halts=team.halts, survey=survey)
+    parts: dict[str, Any] = {"halts": team.halts, "tuning": tuning, "survey": survey, "chronicle": TeamChronicle()}
+    return Board(desk, sessions, MemoryAudit(time.time), limits=AddressLimits(), **parts)
+
+
+def checked(text: str, password: str) -> Deferred[Any]:
+    """Whether it is the password, worked out on a thread."""
+    return deferToThread(is_password, text, password)
 
 
 def network() -> Any:
@@ -269,11 +319,6 @@ def inventory() -> Any:
         "kinds": {"devices": 4, "tasks": 2},
         "newest": newest,
     }
-
-
-def checked(text: str, password: str) -> Deferred[Any]:
-    """Whether it is the password, worked out on a thread."""
-    return deferToThread(is_password, text, password)
 
 
 def main() -> None:

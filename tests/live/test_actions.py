@@ -57,7 +57,10 @@ class ActionPageTests(SynchronousTestCase):
         page.get_by_role("button", name="Let it go on").tap()
         self.told(page, "The team goes on.")
         page.locator(".halted").wait_for(state="hidden")
-        page.locator("#assign").scroll_into_view_if_needed()
+        for view in ("Tasks", "More", "Devices"):
+            page.get_by_role("link", name=view, exact=True).tap()
+            self.assertEqual(page.locator(".stop").bounding_box(), corner)
+        page.mouse.wheel(0, 400)
         self.assertEqual(page.locator(".stop").bounding_box(), corner)
         page.locator(".device").first.tap()
         page.locator("dialog[open] .stop").wait_for()
@@ -85,6 +88,7 @@ class ActionPageTests(SynchronousTestCase):
     def test_ask_before_assigning(self) -> None:
         """Who could take the chosen task and who not, and why, stands below it before it is assigned."""
         page = self.opened(PHONE)
+        page.get_by_role("link", name="Tasks", exact=True).tap()
         page.locator(".preview [data-can=can]", has_text="dog1, dog2 (now: Patrol the yard)").wait_for()
         self.assertIn("dog3: no gripper, no lift", page.locator(".preview").inner_text())
         page.locator("#task").select_option("patrol")
@@ -124,6 +128,29 @@ class ActionPageTests(SynchronousTestCase):
         self.assertEqual(page.locator("#place").inner_text(), target)
         self.assertEqual(self.faults, [])
 
+    def test_change_settings(self) -> None:
+        """A device's settings are read, changed and saved by keyboard; what is no table is said so."""
+        page = self.opened(PHONE)
+        page.locator(".device").first.tap()
+        name = page.get_by_label("A line about the device")
+        name.fill("lame")
+        page.keyboard.press("Enter")
+        answer = page.locator("#place-device .hint")
+        page.locator("#place-device .hint", has_text="The device has taken it").wait_for()
+        self.assertEqual(name.input_value(), "lame")
+        page.get_by_role("button", name="Save settings").tap()
+        self.assertEqual(answer.inner_text(), "Nothing was changed.")
+        page.get_by_label("beyond what its driver says").fill("{arm")
+        page.get_by_role("button", name="Save settings").tap()
+        self.assertIn("it is no table", answer.inner_text())
+        page.get_by_label("How long the others believe").fill("99")
+        page.get_by_role("button", name="Save settings").tap()
+        self.assertFalse(page.get_by_label("How long the others believe").evaluate("e => e.checkValidity()"))
+        page.locator("#d-close").tap()
+        page.locator(".device").nth(1).tap()
+        page.locator("#place-device .hint", has_text="no settings that can be changed").wait_for()
+        self.assertEqual(self.faults, [])
+
     def test_be_accessible(self) -> None:
         """Stopped, on phone and desk, light and dark, axe finds nothing and nothing is cut off or too small."""
         from axe_playwright_python.sync_playwright import Axe
@@ -131,9 +158,14 @@ class ActionPageTests(SynchronousTestCase):
         for screen in (PHONE, DESK):
             for scheme in ("light", "dark"):
                 page = self.opened(screen, scheme)
-                page.locator(".preview li").first.wait_for()
+                page.locator(".preview li").first.wait_for(state="attached")
                 page.locator(".stop").click()
                 page.locator(".halted").wait_for()
+                found = Axe().run(page).response["violations"]
+                self.assertEqual([(each["id"], each["nodes"][0]["html"]) for each in found], [])
+                page.locator(".device").first.focus()
+                page.keyboard.press("Enter")
+                page.locator("dialog[open] .knob").first.wait_for()
                 found = Axe().run(page).response["violations"]
                 self.assertEqual([(each["id"], each["nodes"][0]["html"]) for each in found], [])
                 self.assertLessEqual(page.evaluate("document.documentElement.scrollWidth - innerWidth"), 0)

@@ -25,6 +25,27 @@ MOVED = 4.0
 """Mean difference of two such pictures, of 255, that noise alone does not reach and a turning dog does."""
 
 
+STOPPED = """async () => {
+  const { model } = await import("/static/model.js");
+  const moving = () => model.yard.dogs.filter((dog) => dog.moving).length;
+  const wait = (ms) => new Promise((go) => setTimeout(go, ms));
+  while (!moving()) await wait(20);
+  document.querySelector(".stop").click();
+  const pressed = performance.now();
+  while (moving()) await wait(5);
+  const took = performance.now() - pressed;
+  let moved = 0;
+  for (let n = 0; n < 150; n += 1) {
+    await wait(20);
+    moved += moving();
+  }
+  return { took, moved };
+}"""
+"""Press stop while a dog moves: ms until all stand by the view from above, and how often one moved after that."""
+STANDING = 1500.0
+"""Milliseconds in which all stand: 200 to brake; the view from above is 200 old, and more on a busy machine."""
+
+
 class DemonstrationPageTests(SynchronousTestCase):
     if MISSING:
         skip = f"THE DEMONSTRATION IS NOT TESTED IN A BROWSER: missing {'; '.join(MISSING)}"
@@ -151,3 +172,16 @@ class DemonstrationPageTests(SynchronousTestCase):
         page.locator("#tasks li button:visible").first.click()
         page.locator("#tasks li", has_text="cancelled").first.wait_for()
         self.assert_sound(page, "desk, cancelled")
+
+    def test_stop(self) -> None:
+        """Stop, pressed while dogs search, has all three stand at once and for 3 s; let go on, they finish the task."""
+        page = self.opened(PHONE)
+        page.get_by_role("button", name="Run Demo").tap()
+        seen = page.evaluate(STOPPED)
+        self.assertLess(seen["took"], STANDING, seen)
+        self.assertEqual(seen["moved"], 0)
+        page.locator(".halted").wait_for()
+        self.assert_sound(page, "stopped")
+        page.get_by_role("button", name="Let it go on").tap()
+        page.locator(".halted").wait_for(state="hidden")
+        page.locator("#tasks li", has_text="completed").first.wait_for(timeout=60_000)

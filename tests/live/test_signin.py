@@ -77,21 +77,47 @@ class SigningInTests(SynchronousTestCase):
         """An operator's invitation makes a viewer, who sees all and is offered nothing that it may not do."""
         page = self.opened(DESK, f"#code={self.team.code}")
         self.is_in(page)
-        page.get_by_role("button", name="Invite a viewer").click()
-        page.locator(".session [role=status]", has_text="for a day").wait_for()
-        link = page.locator(".session input").input_value()
-        viewer = self.opened(PHONE, link.removeprefix(self.team.url))
+        viewer = self.opened(PHONE, f"#code={self.invitation(page)}")
         self.is_in(viewer)
-        viewer.locator(".session", has_text="viewer").wait_for()
-        offered = [button.inner_text() for button in viewer.locator("button:not(.device):visible").all()]
+        offered = []
+        for view in ("Devices", "Tasks", "Yard", "More", "Cameras"):
+            viewer.get_by_role("link", name=view, exact=True).tap()
+            if view == "More":
+                viewer.locator(".session", has_text="viewer").wait_for()
+            offered += [button.inner_text() for button in viewer.locator("button:not(.device):visible").all()]
         self.assertEqual(offered, ["Sign out"])
-        viewer.locator("#cameras").scroll_into_view_if_needed()
         viewer.locator("figure[data-camera=live]").first.wait_for()
         told = viewer.evaluate(
             "fetch('/api/v1/demo', {method: 'POST', headers: {'X-Swarm': '1', Authorization: 'Bearer ' + "
             "JSON.parse(localStorage['swarm-session']).token}}).then(answer => answer.status)"
         )
         self.assertEqual(told, 403)
+
+    def test_read_the_audit(self) -> None:
+        """An operator opens who changed what by keyboard, reads what it just did, and a viewer is not offered it."""
+        from axe_playwright_python.sync_playwright import Axe
+
+        for screen, scheme in ((PHONE, "dark"), (DESK, "light")):
+            page = self.opened(screen, f"#code={self.team.code}", scheme)
+            self.is_in(page)
+            page.get_by_role("button", name="Run Demo").click()
+            page.locator("#line", has_text="The demo runs").wait_for()
+            page.evaluate("location.hash = 'more'")
+            page.get_by_text("Who changed what").focus()
+            page.keyboard.press("Enter")
+            page.locator(".audit li", has_text="POST demo").first.wait_for()
+            self.assertIn("operator", page.locator(".audit li").first.inner_text())
+            page.get_by_role("button", name="Look again").click()
+            self.assertEqual(Axe().run(page).response["violations"], [])
+            self.assertLessEqual(page.evaluate("document.documentElement.scrollWidth - innerWidth"), 0)
+        viewer = self.opened(DESK, f"#code={self.invitation(page)}")
+        self.is_in(viewer)
+        self.assertEqual(viewer.get_by_text("Who changed what").count(), 0)
+
+    def invitation(self, page: Any) -> str:
+        page.get_by_role("button", name="Invite a viewer").click()
+        page.locator(".session [role=status]", has_text="for a day").wait_for()
+        return str(page.locator(".session input").input_value()).partition("#code=")[2]
 
     def test_ask_again_when_the_session_ends(self) -> None:
         """When the node no longer knows the session, the page asks, and goes on where it was."""

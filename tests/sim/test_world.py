@@ -100,6 +100,22 @@ class WorldTests(SynchronousTestCase):
         self.world.move_dog("dog2", 2.4, 0.5, 0.0)
         self.assertIsNone(self.world.distance_ahead(self.dog, 0.1, 1.0))
 
+    def test_places_the_target_later(self) -> None:
+        """A target that was asked for later comes then, and not where one was placed or taken away meanwhile."""
+        self.world.place_target_later(1.0)
+        run(self.world, 0.9)
+        self.assertIsNone(self.world.target)
+        run(self.world, 0.2)
+        self.assertIsNotNone(self.world.target)
+        for change in (self.world.clear_target, lambda: self.world.place_target(2.0, 2.0)):
+            self.world.place_target_later(1.0)
+            change()
+            before = self.world.target
+            run(self.world, 1.2)
+            self.assertEqual(self.world.target, before)
+        for seconds in (-1.0, 1e9, math.nan):
+            self.assertRaises(NotPossible, self.world.place_target_later, seconds)
+
     def test_places_the_target_clear_of_everything(self) -> None:
         """Over many seeds the random target keeps its distances, and one dog is clearly the nearest."""
         for seed in range(60):

@@ -53,8 +53,8 @@ class HaltTests(SynchronousTestCase):
     def until_executing(self) -> str:
         """Run the demonstration until one acts; its name."""
         self.team.run_demo()
-        for _ in range(800):
-            self.team.clock.advance(0.05)
+        for _ in range(400):
+            self.team.clock.advance(0.1)
             if self.executing() and self.moving():
                 return self.executing()[0]
         self.fail("nobody acts")
@@ -129,6 +129,17 @@ class HaltTests(SynchronousTestCase):
         self.team.clock.advance(0.2)
         self.assertEqual(self.told(asked)["dog1"], "stands")
         self.assertEqual({self.node(name).halt.word.count for name in ("vaio", "dog1", "dog2")}, {42})
+
+    def test_nobody_waits_for_who_is_silent(self) -> None:
+        """The word that has to be said again is said again at once, though another device does not answer at all."""
+        acting = self.until_executing()
+        silent = "dog2" if acting == "dog1" else "dog1"
+        self.node(acting).halt.take(Word(41, False, "bob"))
+        self.team.silence(silent)
+        self.halts.halt("ann")
+        self.team.clock.advance(BRAKING)
+        self.assertNotIn(acting, self.moving())
+        self.assertTrue(self.node(acting).halt.word.is_on)
 
     def test_of_two_the_stop_wins(self) -> None:
         """One releases and another halts with the same number: the team stands, whatever was heard first."""

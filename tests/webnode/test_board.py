@@ -8,15 +8,19 @@ from webnode.board import (
     AUDITED,
     Board,
     Entry,
+    Knob,
     MemoryAudit,
     MemoryChronicle,
     MemoryFallbacks,
+    MemoryHalts,
+    MemoryTuning,
     NoLimits,
     OpenSessions,
     Page,
     Visitor,
 )
 from webnode.desk import MemoryDesk
+from webnode.errors import Refusal
 
 
 class TwinTests(SynchronousTestCase):
@@ -51,6 +55,23 @@ class TwinTests(SynchronousTestCase):
         self.assertEqual([page.node for page in fallbacks.here()], ["02"])
         self.assertTrue(fallbacks.lets_in("http://10.0.0.2:8080"))
         self.assertFalse(fallbacks.lets_in("http://10.0.0.2:8081"))
+
+    def test_team_in_memory_obeys(self) -> None:
+        """The twin of the stop has all its devices stand and go on, and knows which was said last."""
+        halts = MemoryHalts("01", "02")
+        self.assertFalse(halts.is_halted())
+        self.assertEqual(self.successResultOf(halts.halt("ann")), {"01": "stands", "02": "stands"})
+        self.assertTrue(halts.is_halted())
+        self.assertEqual(self.successResultOf(halts.release("bob")), {"01": "goes on", "02": "goes on"})
+        self.assertFalse(halts.is_halted())
+
+    def test_settings_in_memory(self) -> None:
+        """The twin of the settings takes what a device has, and refuses the rest by its key."""
+        tuning = MemoryTuning({"01": [Knob("description", "a dog", "A line")]})
+        self.assertEqual(self.successResultOf(tuning.settings("02")), [])
+        (knob,) = self.successResultOf(tuning.change("01", {"description": "lame"}))
+        self.assertEqual(knob.value, "lame")
+        self.assertEqual(self.failureResultOf(tuning.change("01", {"colour": "red"}), Refusal).value.field, "colour")
 
     def test_board_says_what_it_has(self) -> None:
         """What a node lacks is not said to the page; a yard counts where there is one."""

@@ -77,4 +77,5 @@ class DispatchTests(SynchronousTestCase):
         self.failureResultOf(failing, RuntimeError)
         lines = self.board.audit.newest(9)
         line = {"who": "ann", "role": "operator", "from": "10.0.0.9", "route": "POST /things/{uuid}", "target": "01"}
-        self.assertEqual(lines, [{**line, "outcome": told} for told in ("500", "409 it left", "202")])
+        when: dict[str, object] = {"at": 0.0, "session": "ann"}
+        self.assertEqual(lines, [{**line, **when, "outcome": told} for told in ("500", "409 it left", "202")])

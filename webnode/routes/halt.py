@@ -17,12 +17,16 @@ def is_halted(ask: Ask) -> Json:
 
 def halt(ask: Ask) -> Any:
     """Stop all of it."""
-    return _halts(ask).halt(ask.who.name).addCallback(lambda devices: {"halted": True, "devices": devices})
+    return _halts(ask).halt(_name(ask)).addCallback(lambda devices: {"halted": True, "devices": devices})
 
 
 def release(ask: Ask) -> Any:
     """Let it go on."""
-    return _halts(ask).release(ask.who.name).addCallback(lambda devices: {"halted": False, "devices": devices})
+    return _halts(ask).release(_name(ask)).addCallback(lambda devices: {"halted": False, "devices": devices})
+
+
+def _name(ask: Ask) -> str:
+    return ask.who.name or ask.who.role
 
 
 def _halts(ask: Ask) -> Halts:

@@ -59,12 +59,12 @@ const TAKERS = {
   beat({ now }) {
     model.now = now;
   },
-  has(names) {
-    model.has = [...names, ...(model.yard && !names.includes("yard") ? ["yard"] : [])];
-  },
   session(me) {
     model.me = me;
     document.body.dataset.role = me.role;
+  },
+  has(names) {
+    model.has = [...names, ...(model.yard && !names.includes("yard") ? ["yard"] : [])];
   },
   link(state) {
     model.link = state;

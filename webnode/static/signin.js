@@ -84,3 +84,11 @@ panel({
     };
   },
 });
+
+panel({
+  place: "more",
+  order: 95,
+  title: "Audit",
+  needs: { role: "operator" },
+  load: () => import("./audit.js"),
+});

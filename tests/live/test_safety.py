@@ -1,0 +1,194 @@
+"""Every route of a real page, asked by each role and in unlawful ways: who is let in, and how the rest is told."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import re
+import socket
+import time
+from collections.abc import Callable, Iterator
+from email.message import Message
+from importlib.util import find_spec
+from typing import Any, get_args
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from tests.live.test_page import Team
+from webnode.board import Role
+from webnode.guard import HEADERS
+from webnode.route import ALLOWED, Route
+from webnode.routes.table import TABLE
+from webnode.seal import Claim, Seal
+
+MISSING = [name for name in ("flask", "cv2") if find_spec(name) is None]
+NAMES = {"uuid": "01" * 16, "task_id": "t1", "file": "page.js"}
+REFUSED_S = 0.05
+DEEP = b'{"text": ' + b"[" * 100_000 + b"]" * 100_000 + b"}"
+Answer = tuple[int, Message, bytes]
+
+
+def path_of(route: Route) -> str:
+    """The path of a route, with names in it that are there, where the test knows one."""
+    return re.sub(r"\{(\w+)\}", lambda found: NAMES.get(found[1], "x"), route.path)
+
+
+class SafetyTests(SynchronousTestCase):
+    if MISSING:
+        skip = f"THE SAFETY OF THE PAGE IS NOT TESTED: missing {', '.join(MISSING)}"
+
+    def setUp(self) -> None:
+        self.team = Team()
+        self.addCleanup(lambda: self.team.stop())
+        self._seal = Seal(b"a team of the tests")
+        self._number = 0
+
+    def token(self, role: Role, ticket: bool = False) -> str:
+        """A token that was used by nobody before; none for anyone."""
+        if role == "anyone":
+            return ""
+        self._number += 1
+        claim = Claim(f"{self._number:016x}", role, role, int(time.time()) + 600)
+        return self._seal.text(claim.ticket if ticket else claim)
+
+    def asked(self, method: str, path: str, body: bytes | None = None, **headers: str) -> Answer:
+        """One request on a connection of its own; of a stream only its beginning is read."""
+        given = {name.replace("_", "-"): value for name, value in headers.items()}
+        connection = http.client.HTTPConnection("127.0.0.1", self.team.port, timeout=10)
+        try:
+            connection.request(method, path, body, {"Content-Type": "application/json", **given})
+            answer = connection.getresponse()
+            is_stream = answer.getheader("Content-Type", "").startswith("text/event-stream")
+            return answer.status, answer.headers, b"" if is_stream else answer.read()
+        finally:
+            connection.close()
+
+    def bearer(self, role: Role) -> dict[str, str]:
+        """The header of somebody of that role."""
+        token = self.token(role)
+        return {"Authorization": f"Bearer {token}"} if token else {}
+
+    def test_let_in_whom_the_table_says(self) -> None:
+        """Each route lets in the roles that its line in the table names, by token, and nobody else: 401, or 403."""
+        wrong = []
+        for route in TABLE:
+            for role in get_args(Role):
+                body = None if route.method == "GET" else b"{}"
+                status = self.asked(route.method, path_of(route), body, **self.bearer(role))[0]
+                wanted = 200 if role in ALLOWED[route.role] else 401 if role == "anyone" else 403
+                if (status if status in (401, 403) else 200) != wanted:
+                    wrong.append((route.name, role, status))
+        self.assertEqual(wrong, [])
+
+    def test_let_a_ticket_look_only(self) -> None:
+        """The ticket of an operator opens what a viewer may look at, and gives no order and tells no secret."""
+        wrong = []
+        for route in TABLE:
+            if route.role not in ("viewer", "operator"):
+                continue
+            body = None if route.method == "GET" else b"{}"
+            status = self.asked(route.method, f"{path_of(route)}?ticket={self.token('operator', True)}", body)[0]
+            if (status == 403) != (route.role == "operator"):
+                wrong.append((route.name, status))
+        self.assertEqual(wrong, [])
+
+    def test_take_no_other_token(self) -> None:
+        """Tokens that have run out, of another team, cut short, or made up open nothing."""
+        old = Claim("ab" * 8, "x", "operator", int(time.time()) - 1)
+        good = self.token("operator")
+        forged = Seal(b"another team").text(Claim("ab" * 8, "x", "operator", int(time.time()) + 600))
+        for token in (self._seal.text(old), forged, good[:-2], good[:-1] + "%", "null", "operator", "A" * 4000):
+            status, _, body = self.asked("GET", "/api/v1/state", Authorization=f"Bearer {token}")
+            self.assertEqual(status, 401, token[:40])
+            self.assertNotIn(token.encode(), body)
+
+    def test_send_every_header(self) -> None:
+        """Each route and each refusal is answered with all headers that keep a browser strict, and names no server."""
+        wrong = []
+        for name, (_, headers, _) in self.answers():
+            lacks = [key for key, value in HEADERS.items() if headers.get(key) != value]
+            lacks += [key for key in ("Server", "Set-Cookie", "X-Powered-By") if headers.get(key)]
+            if lacks:
+                wrong.append((name, lacks))
+        self.assertEqual(wrong, [])
+
+    def answers(self) -> Iterator[tuple[str, Answer]]:
+        """An answer of each route, to somebody who may and to nobody, and of each kind of error."""
+        for route in TABLE:
+            for role in ("anyone", "operator"):
+                body = None if route.method == "GET" else b"{}"
+                yield route.name, self.asked(route.method, path_of(route), body, **self.bearer(role))
+        for method, path in (("GET", "/nothing"), ("PUT", "/"), ("PUT", "/events"), ("GET", "/static/../app.py")):
+            yield f"{method} {path}", self.asked(method, path)
+        yield "host", self.asked("GET", "/", Host="evil.example")
+        for data in (b"nonsense\r\n\r\n", b"GET / HTTP/1.1\r\nno colon\r\n\r\n"):
+            yield data.decode(), self.raw(data)
+        yield "413", self.raw(b"POST / HTTP/1.1\r\nHost: vaio\r\nContent-Length: 10485760\r\n\r\n")
+
+    def raw(self, data: bytes) -> Answer:
+        """What bytes are answered with that no client would send."""
+        with socket.create_connection(("127.0.0.1", self.team.port), 5.0) as client:
+            client.sendall(data)
+            answer = http.client.HTTPResponse(client)
+            answer.begin()
+            return answer.status, answer.headers, answer.read()
+
+    def test_refuse_at_once_and_in_words(self) -> None:
+        """Whatever is unlawful is refused within 50 ms, in JSON that names field and remedy, without a trace."""
+        signed = self.bearer("operator")
+        dog = f"/api/v1/devices/{'01' * 16}"
+
+        def told(path: str, body: bytes, method: str = "POST", **headers: str) -> Any:
+            return lambda: self.asked(method, path, body, **{**signed, **headers})
+
+        head = b"POST /api/v1/message HTTP/1.1\r\nHost: vaio\r\n"
+        cases = (
+            ("10 MiB", 413, lambda: self.raw(head + b"Content-Length: 10485760\r\n\r\n")),
+            ("65 KiB", 413, told("/api/v1/message", b"x" * 65 * 1024 + b"x")),
+            ("deep", 413, told("/api/v1/message", DEEP)),
+            ("deep, and small", 400, told("/api/v1/message", DEEP[:30_000])),
+            ("many keys", 400, told("/api/v1/message", json.dumps({str(n): 1 for n in range(6000)}).encode())),
+            ("NaN", 400, told("/api/v1/target", b'{"x": NaN, "y": 1}')),
+            ("infinite", 400, told("/api/v1/target", b'{"x": 1e999, "y": 1}')),
+            ("huge", 400, told("/api/v1/target", b'{"x": 1' + b"0" * 4000 + b', "y": 1}')),
+            ("type", 400, told("/api/v1/message", b'{"text": {"a": 1}}')),
+            ("list", 400, told("/api/v1/message", b"[1]")),
+            ("no JSON", 400, told("/api/v1/message", b"{'text': 'x'}")),
+            ("no UTF-8", 400, told("/api/v1/message", b'{"text": "\xff\xfe"}')),
+            ("unknown field", 400, told("/api/v1/message", b'{"txet": "x"}')),
+            ("host", 403, told("/api/v1/message", b'{"text": "x"}', Host="evil.example")),
+            ("origin", 403, told("/api/v1/message", b'{"text": "x"}', Origin="http://evil.example")),
+            ("form", 403, told("/api/v1/message", b"text=x", Content_Type="application/x-www-form-urlencoded")),
+            ("method", 405, told("/api/v1/message", b"{}", "PUT")),
+            ("override", 405, told("/api/v1/state", b"{}", X_HTTP_Method_Override="GET")),
+            ("unknown device", 404, told(f"{dog}0/message", b'{"text": "x"}')),
+            ("traversal", 404, told("/static/../../setup.cfg", b"", "GET")),
+            ("hidden traversal", 404, told("/static/%2e%2e%2fapp.py", b"", "GET")),
+            ("zero byte", 404, told("/static/page.js%00", b"", "GET")),
+            ("both lengths", 400, lambda: self.raw(head + b"Content-Length: 5\r\nTransfer-Encoding: chunked\r\n\r\n")),
+            ("two lengths", 400, lambda: self.raw(head + b"Content-Length: 5\r\nContent-Length: 6\r\n\r\n")),
+            ("long line", 400, lambda: self.raw(b"GET /" + b"x" * 20_000 + b" HTTP/1.1\r\n\r\n")),
+            ("many headers", 400, lambda: self.raw(head + b"X: y\r\n" * 600 + b"\r\n")),
+            ("wrong code", 401, told("/api/v1/session", b'{"code": "nonsense"}')),
+        )  # fmt: skip
+        slow = []
+        for name, wanted, ask in cases:
+            status, headers, body = ask()
+            self.assertEqual(status, wanted, (name, body[:300]))
+            self.assertTrue(headers["Content-Type"].startswith("application/json"), name)
+            self.assertEqual(set(json.loads(body)["error"]), {"field", "problem", "remedy"}, name)
+            self.assertNotIn(b"Traceback", body, name)
+            took = self.best(ask)
+            # Where other programs keep the machine busy, a lawful question takes long, too.
+            if took > REFUSED_S and took > 3 * self.best(lambda: self.asked("GET", "/api/v1/tasks", None, **signed)):
+                slow.append((name, took))
+        self.assertEqual(slow, [])
+
+    def best(self, ask: Callable[[], object]) -> float:
+        """Seconds that it takes, the best of five."""
+        took = []
+        for _ in range(5):
+            began = time.perf_counter()
+            ask()
+            took.append(time.perf_counter() - began)
+        return min(took)

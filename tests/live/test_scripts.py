@@ -1,0 +1,134 @@
+"""Two hundred pieces of script as names, tasks and messages: the page shows each as text, and none runs."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from tests.live.test_page import CHROMIUM, DESK, FLAGS, MISSING, Team
+
+BARE = (
+    *("<script>ran()</script>", "<script src=//evil.example/x.js></script>", "<img src=x onerror=ran()>"),
+    *(
+        "<svg onload=ran()>",
+        "<svg><script>ran()</script></svg>",
+        "<body onload=ran()>",
+        "<iframe src=javascript:ran()>",
+    ),
+    *(
+        "<iframe srcdoc='<script>parent.ran()</script>'>",
+        "<a href=javascript:ran()>x</a>",
+        "<details open ontoggle=ran()>",
+    ),
+    *(
+        "<input autofocus onfocus=ran()>",
+        "<video><source onerror=ran()></video>",
+        "<math href=javascript:ran()>x</math>",
+    ),
+    *(
+        "<object data=javascript:ran()>",
+        "<embed src=javascript:ran()>",
+        "<form action=javascript:ran()><button>x</form>",
+    ),
+    *(
+        "<base href=//evil.example/>",
+        "<link rel=stylesheet href=//evil.example/x.css>",
+        "<meta http-equiv=refresh content=0>",
+    ),
+    *("<style>@import '//evil.example/x.css'</style>", "<div style=background:url(//evil.example/x.png)>x</div>"),
+    *(
+        "<template><script>ran()</script></template>",
+        "<marquee onstart=ran()>x</marquee>",
+        "<img src=//evil.example/x.png>",
+    ),
+    "<svg><animate onbegin=ran() attributeName=x dur=1s></svg>",
+)
+WAYS = (
+    "{}",
+    "\"'>{}",
+    "</title></style></script></textarea>{}",
+    "${{ran()}}{{{{ran()}}}}<%= ran() %>{}",
+    "javascript:ran()//{}",
+    "\N{RIGHT-TO-LEFT OVERRIDE}\N{FULLWIDTH LESS-THAN SIGN}script\N{FULLWIDTH GREATER-THAN SIGN}{}",
+    "&lt;script&gt;ran()&lt;/script&gt;&#60;img src=x onerror=ran()&#62;{}",
+    "data: x\n\nevent: state\ndata: {{}}\n\n{}",
+)
+BATCH = 8
+PAYLOADS = [way.format(bare) for way in WAYS for bare in BARE]
+WATCH = """
+globalThis.violations = [];
+globalThis.ran = () => { globalThis.hasRun = true; };
+addEventListener("securitypolicyviolation", ({ effectiveDirective }) => violations.push(effectiveDirective));
+"""
+
+
+class ScriptTests(SynchronousTestCase):
+    if MISSING:
+        skip = f"FOREIGN WORDS ARE NOT TESTED IN A BROWSER: missing {'; '.join(MISSING)}"
+
+    def setUp(self) -> None:
+        from playwright.sync_api import sync_playwright
+
+        self.team = Team()
+        self.addCleanup(lambda: self.team.stop())
+        play = sync_playwright().start()
+        self.addCleanup(play.stop)
+        browser: Any = play.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        self.addCleanup(browser.close)
+        self.page = browser.new_context(**DESK).new_page()
+        self.page.set_default_timeout(20_000)
+        self.dialogs: list[str] = []
+        self.asked: list[str] = []
+        self.faults: list[str] = []
+        self.page.on("dialog", self.on_dialog)
+        self.page.on("request", lambda request: self.asked.append(request.url))
+        self.page.on("pageerror", lambda error: self.faults.append(str(error)))
+        self.page.add_init_script(WATCH)
+
+    def on_dialog(self, dialog: Any) -> None:
+        self.dialogs.append(dialog.message)
+        dialog.dismiss()
+
+    def show(self, words: list[str]) -> None:
+        """Have the team made of ``words``."""
+        path = Path(self.mktemp()).absolute()
+        path.write_text(json.dumps(words), encoding="utf-8")
+        self.team.order(f"strange {path}")
+
+    def test_show_scripts_as_text(self) -> None:
+        """Of 200 scripts as names, titles, notes, messages and capabilities none runs; the CSP has none to report."""
+        self.assertEqual(len(set(PAYLOADS)), 200)
+        self.show(PAYLOADS)
+        self.page.goto(f"{self.team.url}#code={self.team.code}")
+        self.page.locator(".device").nth(199).wait_for()
+        shown = self.page.locator(".device b").all_inner_texts()
+        self.assertEqual(len(shown), 200)
+        self.assertTrue(any("<script>ran()</script>" in name for name in shown))
+        for number in (1, 27, 52, 180):
+            self.page.evaluate(f"location.hash = 'device/{f'{number:02x}' * 16}'")
+            self.page.locator("dialog[open]").wait_for()
+            self.assertIn("<", self.page.locator("dialog[open]").inner_text())
+            self.page.keyboard.press("Escape")
+            self.page.locator("dialog[open]").wait_for(state="hidden")
+        # The page lists the newest tasks only, so each batch has its turn.
+        for number in range(len(PAYLOADS) // BATCH):
+            self.show(PAYLOADS[number * BATCH : (number + 1) * BATCH])
+            self.page.locator(f"#tasks li[data-key=s{2 + number}-{BATCH}]").wait_for()
+            self.page.evaluate("document.querySelectorAll('details').forEach((each) => { each.open = true; })")
+        self.page.wait_for_timeout(1000)
+        self.assertEqual(self.page.evaluate("[globalThis.hasRun ?? false, violations]"), [False, []])
+        self.assertEqual((self.dialogs, self.faults), ([], []))
+        self.assertEqual([url for url in self.asked if not url.startswith((self.team.url, "data:"))], [])
+        self.assertEqual(
+            self.page.locator("main :is(script, iframe, object, embed, base, link, style, img)").count(), 0
+        )
+
+    def test_notice_what_would_run(self) -> None:
+        """The test would see it: markup that is put into the page as such is reported by the CSP."""
+        self.page.goto(f"{self.team.url}#code={self.team.code}")
+        self.page.locator(".device").first.wait_for()
+        self.page.evaluate("document.body.insertAdjacentHTML('beforeend', '<img src=x onerror=ran()>')")
+        self.page.wait_for_function("violations.length > 0")

@@ -1,0 +1,118 @@
+"""Tests of ``webnode.audit``: who changed what, in a file that outlives the node."""
+
+from __future__ import annotations
+
+import json
+import random
+import stat
+from pathlib import Path
+from typing import Any, cast
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.settings import IN_MEMORY, Settings
+from tests.webnode.guests import Guests
+from webnode.app import create_app
+from webnode.audit import QUIET_S, FileAudit, audit
+from webnode.board import AUDITED, Board, MemoryAudit, Visitor
+from webnode.desk import MemoryDesk
+from webnode.ground import Ground
+from webnode.state import state_of
+
+ANN = Visitor("ann", "operator", "ab12")
+NOBODY = Visitor()
+
+
+class FileAuditTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.now = 1000.0
+        self.path = Path(self.mktemp())
+
+    def audit(self, most: int = 1 << 20) -> FileAudit:
+        return FileAudit(self.path, lambda: self.now, most)
+
+    def test_keep_each_line(self) -> None:
+        """Each change is one line of JSON with time, who, from where, what and how it ended, for the owner alone."""
+        self.audit().note(ANN, "10.0.0.9", "POST /x/{uuid}", "01\n\x1b[2J", "202")
+        (line,) = self.path.read_text().splitlines()
+        told = {"at": 1000.0, "who": "ann", "role": "operator", "from": "10.0.0.9", "session": "ab12"}
+        self.assertEqual(
+            json.loads(line), {**told, "route": "POST /x/{uuid}", "target": "01\n\x1b[2J", "outcome": "202"}
+        )
+        self.assertEqual(stat.S_IMODE(self.path.stat().st_mode), 0o600)
+
+    def test_outlive_the_node(self) -> None:
+        """After a start the lines of before are told, the newest first; what is broken in the file is passed over."""
+        first = self.audit()
+        for number in range(3):
+            first.note(ANN, "h", "POST /x", str(number), "202")
+        with self.path.open("a") as file:
+            file.write("no JSON\n[]\n")
+        again = self.audit()
+        again.note(ANN, "h", "POST /x", "3", "202")
+        self.assertEqual([line["target"] for line in again.newest(3)], ["3", "2", "1"])
+        self.assertEqual(again.counts(), {("operator", "202"): 1})
+
+    def test_stay_within_its_room(self) -> None:
+        """A full file is put aside once, so the two never take more than twice the most; the newest lines stay."""
+        audit = self.audit(2000)
+        for number in range(200):
+            audit.note(ANN, "h", "POST /x", str(number), "202")
+        aside = self.path.with_name(f"{self.path.name}.1")
+        self.assertLessEqual(self.path.stat().st_size, 2000)
+        self.assertLessEqual(aside.stat().st_size, 2000)
+        self.assertIn('"199"', self.path.read_text())
+        self.assertEqual(len(audit.newest(1000)), AUDITED)
+
+    def test_let_nobody_flood_it(self) -> None:
+        """What a stranger does again and again is one line a minute that says how often; others' lines stay."""
+        audit = self.audit()
+        audit.note(ANN, "h", "POST /x", "", "202")
+        for _ in range(1000):
+            audit.note(NOBODY, "10.0.0.9", "POST /api/v1/session", "", "429 too many")
+        audit.note(NOBODY, "10.0.0.8", "POST /api/v1/session", "", "429 too many")
+        self.now += QUIET_S
+        audit.note(NOBODY, "10.0.0.9", "POST /api/v1/session", "", "429 too many")
+        lines = audit.newest(99)
+        self.assertEqual([line.get("repeated", 0) for line in lines], [999, 0, 0, 0])
+        self.assertEqual(lines[-1]["who"], "ann")
+        self.assertEqual(audit.counts()["anyone", "429"], 1002)
+
+    def test_go_on_without_a_file(self) -> None:
+        """Where the file cannot be written the page goes on, and the newest lines are still told."""
+        self.path = Path(self.mktemp()) / "missing" / "audit"
+        audit = self.audit()
+        for number in range(2):
+            audit.note(ANN, "h", "POST /x", str(number), "202")
+        self.assertEqual(len(audit.newest(9)), 2)
+
+
+class AuditRouteTests(SynchronousTestCase):
+    def test_tell_operators(self) -> None:
+        """An operator reads who did what, the newest first, as many as it wants; a viewer does not."""
+        state = state_of([], [], {}, node="vaio")
+        client = create_app(lambda: state, Board(MemoryDesk(), Guests())).test_client()
+        bearer = {"Authorization": "Bearer operator"}
+        for _ in range(3):
+            client.post("/api/v1/demo", json={}, headers=bearer)
+        told = client.get("/api/v1/audit?count=2", headers=bearer).get_json()
+        self.assertEqual([line["route"] for line in told], ["POST /api/v1/demo"] * 2)
+        self.assertEqual(
+            (told[0]["who"], told[0]["session"], told[0]["outcome"]), ("operator", "id of operator", "202")
+        )
+        self.assertEqual(client.get("/api/v1/audit", headers={"Authorization": "Bearer viewer"}).status_code, 403)
+        for count in ("0", "x", "1e9", "1.5"):
+            self.assertEqual(client.get(f"/api/v1/audit?count={count}", headers=bearer).status_code, 400)
+
+    def test_lie_beside_the_store(self) -> None:
+        """The file lies beside the node's store; a node that stores nothing keeps the audit in memory, too."""
+        folder = Path(self.mktemp())
+        folder.mkdir()
+        nothing = cast(Any, None)
+        for store, kind in ((str(folder / "a.sqlite"), FileAudit), (IN_MEMORY, MemoryAudit)):
+            settings = Settings.from_mapping({"node": {"name": "a", "store": store}}, "a.toml")
+            made = audit(Ground(settings, nothing, nothing, nothing, lambda: 7.0, random.Random(1)))
+            self.assertIsInstance(made, kind)
+            made.note(ANN, "h", "POST /x", "", "202")
+            self.assertEqual(made.newest(1)[0]["at"], 7.0)
+        self.assertEqual([path.name for path in folder.iterdir()], ["a.sqlite.audit"])

@@ -1,0 +1,82 @@
+"""Tests of ``webnode.metrics``: figures for Prometheus."""
+
+from __future__ import annotations
+
+import sys
+from importlib.util import find_spec
+from typing import Any
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from tests.webnode.guests import Guests
+from webnode.app import create_app
+from webnode.board import Board, Visitor
+from webnode.desk import MemoryDesk
+from webnode.limits import AddressLimits
+from webnode.state import state_of
+
+DOG = {"uuid": "01", "name": 'do"g\n1', "joined": 1, "since": 5.0, "network": {"contacts": 3, "sent": 7}}
+
+
+class MetricsTests(SynchronousTestCase):
+    if find_spec("prometheus_client") is None:
+        skip = "THE METRICS ARE NOT TESTED: missing prometheus-client (pip install -e '.[web]')"
+
+    def setUp(self) -> None:
+        self.limits = AddressLimits()
+        self.board = Board(MemoryDesk(), Guests(), limits=self.limits)
+        tasks = [{"id": "t1", "title": "Find", "created": 1.0, "status": "EXECUTING"}]
+        state = state_of(
+            [{**DOG, "status": "IDLE"}], tasks, {"t1": [{"uuid": "01", "name": "x", "cost": 1.0}]}, node="v"
+        )
+        self.client = create_app(lambda: state, self.board, wall=lambda: 9.5).test_client()
+
+    def read(self) -> Any:
+        answer = self.client.get("/metrics", headers={"Authorization": "Bearer viewer"})
+        self.assertEqual((answer.status_code, answer.content_type), (200, "text/plain; version=0.0.4; charset=utf-8"))
+        from prometheus_client.parser import text_string_to_metric_families
+
+        families = text_string_to_metric_families(answer.get_data(as_text=True))
+        return {
+            (each.name, tuple(v for _, v in sorted(each.labels.items()))): each.value
+            for family in families
+            for each in family.samples
+        }
+
+    def test_tell_the_team(self) -> None:
+        """Devices and tasks by status, what devices send, and groups are told, whatever the devices are called."""
+        told = self.read()
+        self.assertEqual(told["swarm_devices", ("IDLE",)], 1)
+        self.assertEqual(told["swarm_tasks", ("EXECUTING",)], 1)
+        name = 'do"g 1'
+        self.assertEqual(told["swarm_device_contacts", (name, "01")], 3)
+        self.assertEqual(told["swarm_device_datagrams_total", (name, "sent", "01")], 7)
+        self.assertNotIn(("swarm_device_datagrams_total", (name, "dropped", "01")), told)
+        self.assertEqual(told["swarm_group_members", ("t1",)], 1)
+        self.assertEqual(told["swarm_page_time_seconds", ()], 9.5)
+
+    def test_tell_the_page(self) -> None:
+        """Connections by kind, and orders by role and status, are counted; a look at them is none."""
+        self.limits.count("stream", "10.0.0.1", 2)
+        self.board.audit.note(Visitor("ann", "operator"), "h", "POST /x", "", "409 it left")
+        told = self.read()
+        self.assertEqual(told["swarm_page_connections", ("stream",)], 2)
+        self.assertEqual(told["swarm_page_orders_total", ("operator", "409")], 1)
+        self.assertEqual(self.read(), told)
+
+    def test_keep_strangers_out(self) -> None:
+        """Without a token there is nothing to read; a ticket in the query will do."""
+        self.assertEqual(self.client.get("/metrics").status_code, 401)
+        self.assertEqual(self.client.get("/metrics?ticket=viewer").status_code, 200)
+
+    def test_tell_of_a_missing_library(self) -> None:
+        """Where the library is not installed, that and what installs it is said."""
+        hidden = {
+            name: sys.modules.pop(name) for name in list(sys.modules) if name.split(".")[0] == "prometheus_client"
+        }
+        sys.modules["prometheus_client"] = None  # type: ignore[assignment]
+        self.addCleanup(sys.modules.update, hidden)
+        self.addCleanup(sys.modules.pop, "prometheus_client")
+        answer = self.client.get("/metrics?ticket=viewer")
+        self.assertEqual(answer.status_code, 404)
+        self.assertIn("swarm-node[web]", answer.get_json()["error"]["remedy"])

@@ -1,0 +1,94 @@
+"""Tests of ``webnode.openapi``: the document says what the table says."""
+
+from __future__ import annotations
+
+import json
+import re
+from typing import Any
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from tests.webnode.guests import Guests
+from webnode.app import create_app
+from webnode.board import Board
+from webnode.desk import MemoryDesk
+from webnode.openapi import document
+from webnode.route import Field, Route
+from webnode.routes.table import TABLE
+from webnode.state import state_of
+
+FIELDS = (
+    Field("uuid", "text", "which", "path", most=64),
+    Field("after", "whole", "a number", "query", least=0, most=9, default=0, is_required=False),
+    Field("x", "number", "where", unit="m"),
+    Field("kind", "choice", "what", choices=("a", "b"), default="a", is_required=False),
+    Field("name", "text", "who", default="", is_required=False),
+)
+
+
+class DocumentTests(SynchronousTestCase):
+    def operation(self, route: Route) -> Any:
+        return document([route])["paths"][route.path][route.method.lower()]
+
+    def test_have_every_route(self) -> None:
+        """Every route of the table is in the document by method and path, under a name of its own, and none besides."""
+        told = document(TABLE)
+        found = {f"{method.upper()} {path}" for path, each in told["paths"].items() for method in each}
+        self.assertEqual(found, {route.name for route in TABLE})
+        names = [each["operationId"] for methods in told["paths"].values() for each in methods.values()]
+        self.assertEqual(len(set(names)), len(TABLE))
+        self.assertEqual(json.loads(json.dumps(told)), told)
+
+    def test_say_what_a_field_may_be(self) -> None:
+        """Bounds, choices, defaults, units and places of fields are those that are checked; no others may be given."""
+        told = self.operation(Route("POST", "/api/v1/things/{uuid}", "About", "operator", lambda ask: {}, FIELDS))
+        by_name = {each["name"]: each for each in told["parameters"]}
+        self.assertEqual(by_name["uuid"]["schema"]["maxLength"], 64)
+        self.assertTrue(by_name["uuid"]["required"])
+        self.assertEqual((by_name["after"]["in"], by_name["after"]["required"]), ("query", False))
+        self.assertEqual([by_name["after"]["schema"][key] for key in ("minimum", "maximum", "default")], [0, 9, 0])
+        body = told["requestBody"]["content"]["application/json"]["schema"]
+        self.assertEqual((body["required"], body["additionalProperties"]), (["x"], False))
+        self.assertEqual(body["properties"]["x"]["description"], "where (m)")
+        self.assertEqual(body["properties"]["kind"]["enum"], ["a", "b"])
+        self.assertNotIn("default", body["properties"]["name"])
+        self.assertFalse(by_name["X-Swarm"]["required"])
+
+    def test_say_who_may(self) -> None:
+        """What anyone may ask needs nothing; a viewer's looks take a token or a ticket, orders a token alone."""
+        for role, method, wanted in (
+            ("anyone", "GET", ()),
+            ("viewer", "GET", ("token", "ticket")),
+            ("operator", "GET", ("token",)),
+            ("operator", "POST", ("token",)),
+            ("phone", "POST", ("token", "ticket")),
+        ):
+            told = self.operation(Route(method, "/api/v1/x", "X", role, lambda ask: {}))  # type: ignore[arg-type]
+            self.assertEqual((told["security"], told["x-role"]), ([{each: []} for each in wanted], role))
+
+    def test_say_what_is_given(self) -> None:
+        """A media type stands as such, everything else as JSON in words, and whatever is refused as an error."""
+        picture = self.operation(Route("GET", "/shot", "A picture", "viewer", None, gives="image/jpeg"))
+        self.assertEqual(list(picture["responses"]["200"]["content"]), ["image/jpeg"])
+        order = self.operation(Route("POST", "/api/v1/x", "X", "operator", lambda ask: {}, gives="id", status=202))
+        self.assertEqual(order["responses"]["202"]["description"], "id")
+        self.assertEqual(order["responses"]["default"], {"$ref": "#/components/responses/Refused"})
+
+    def test_refer_to_what_is_there(self) -> None:
+        """Every reference in the document leads to a part of it."""
+        told = document(TABLE)
+        for reference in re.findall(r'"\$ref": "#/([^"]+)"', json.dumps(told)):
+            part: Any = told
+            for step in reference.split("/"):
+                part = part[step]
+            self.assertTrue(part)
+
+    def test_be_served(self) -> None:
+        """A viewer is given the document of the very table that is served, with the node's name."""
+        state = state_of([], [], {}, node="vaio")
+        extra = Route("GET", "/api/v1/extra", "More", "viewer", lambda ask: {})
+        client = create_app(lambda: state, Board(MemoryDesk(), Guests()), table=(*TABLE, extra)).test_client()
+        self.assertEqual(client.get("/api/v1/openapi.json").status_code, 401)
+        told = client.get("/api/v1/openapi.json?ticket=viewer").get_json()
+        self.assertIn("vaio", told["info"]["title"])
+        self.assertIn("/api/v1/extra", told["paths"])
