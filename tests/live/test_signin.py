@@ -82,9 +82,10 @@ class SigningInTests(SynchronousTestCase):
         offered = []
         for view in ("Devices", "Tasks", "Yard", "More", "Cameras"):
             viewer.get_by_role("link", name=view, exact=True).tap()
+            viewer.locator("#views [aria-current=page]", has_text=view).wait_for()
             if view == "More":
                 viewer.locator(".session", has_text="viewer").wait_for()
-            offered += [button.inner_text() for button in viewer.locator("button:not(.device):visible").all()]
+            offered += viewer.locator("button:not(.device):visible").all_inner_texts()
         self.assertEqual(offered, ["Sign out"])
         viewer.locator("figure[data-camera=live]").first.wait_for()
         told = viewer.evaluate(
