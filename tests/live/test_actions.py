@@ -58,7 +58,10 @@ class ActionPageTests(SynchronousTestCase):
         page.get_by_role("button", name="Let it go on").tap()
         self.told(page, "The team goes on.")
         page.locator(".halted").wait_for(state="hidden")
-        page.locator("#assign").scroll_into_view_if_needed()
+        for view in ("Tasks", "More", "Devices"):
+            page.get_by_role("link", name=view, exact=True).tap()
+            self.assertEqual(page.locator(".stop").bounding_box(), corner)
+        page.mouse.wheel(0, 400)
         self.assertEqual(page.locator(".stop").bounding_box(), corner)
         page.locator(".device").first.tap()
         page.locator("dialog[open] .stop").wait_for()
@@ -86,6 +89,7 @@ class ActionPageTests(SynchronousTestCase):
     def test_ask_before_assigning(self) -> None:
         """Who could take the chosen task and who not, and why, stands below it before it is assigned."""
         page = self.opened(PHONE)
+        page.get_by_role("link", name="Tasks", exact=True).tap()
         page.locator(".preview [data-can=can]", has_text="dog1, dog2 (now: Patrol the yard)").wait_for()
         self.assertIn("dog3: no gripper, no lift", page.locator(".preview").inner_text())
         page.locator("#task").select_option("patrol")
@@ -192,7 +196,7 @@ class ActionPageTests(SynchronousTestCase):
         for screen in (PHONE, DESK):
             for scheme in ("light", "dark"):
                 page = self.opened(screen, scheme)
-                page.locator(".preview li").first.wait_for()
+                page.locator(".preview li").first.wait_for(state="attached")
                 page.locator(".stop").click()
                 page.locator(".halted").wait_for()
                 found = Axe().run(page).response["violations"]

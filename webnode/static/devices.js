@@ -82,7 +82,7 @@ function fill() {
     ["address", device.address], ["roles", device.roles.join(", ")], ["joined", device.joined ? `as number ${device.joined}` : ""],
     ...Object.entries(device.network), ...Object.entries(device.deployed).map(([name, label]) => [`deployed ${name}`, label]),
     ["uuid", device.uuid]]);
-  const told = device.messages.map(([moment, text]) => [new Date(moment * 1000).toLocaleTimeString(), text]);
+  const told = device.messages.map(([moment, text]) => [new Date(moment * 1000).toLocaleTimeString([], { hourCycle: "h23" }), text]);
   keyed(at("d-messages"), told.length ? told : [["", "No messages."]], (entry) => entry.join(), () => element("li"),
     (item, entry) => words(item, entry.join(" ").trim()));
   for (const button of at("place-device").querySelectorAll("form button")) button.disabled = device.gone !== null;

@@ -5,7 +5,7 @@ import { get } from "./link.js";
 const size = (bytes) => (bytes < 10000 ? `${bytes} B` : bytes < 2 ** 20 ? `${Math.round(bytes / 1024)} KiB` : `${(bytes / 2 ** 20).toFixed(1)} MiB`);
 
 export function make(root) {
-  const line = element("p", { class: "hint", role: "status" });
+  const line = element("p", { class: "note", role: "status" });
   const kinds = element("ul", { class: "plain" });
   const newest = element("table");
   const again = element("button", {}, "Ask again");

@@ -8,6 +8,7 @@ let shared = {};
 let looked = "";
 // On a phone one of these is looked at at a time, and the bar below leads to them; on a wall ?view=cameras is all.
 const VIEWS = ["devices", "tasks", "cameras", "map", "groups", "network", "events", "more"];
+const NARROW = matchMedia("(max-width: 43.99rem)");
 const only = new URLSearchParams(location.search).get("view");
 
 // Look at a place: go("device/UUID"); go("") is the first view, and back() the one that was looked at before a device.
@@ -81,7 +82,8 @@ function look() {
   if (VIEWS.includes(name)) {
     lookAt(name);
     // The lists have these names, too, and a browser would go to where they begin.
-    at(`place-${name}`)?.scrollIntoView();
+    if (NARROW.matches) scrollTo(0, 0);
+    else at(`place-${name}`)?.scrollIntoView();
   } else if (!name || !document.body.dataset.view) lookAt(VIEWS[0]);
   looked = name;
 }
