@@ -15,6 +15,8 @@ BOOTSTRAP = "vaio"
 DOGS = ("dog1", "dog2", "dog3")
 
 Table = Mapping[str, object]
+FAULTS: Table = {"allow": True}
+"""A demonstration is there to see robots fail."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,7 @@ class Plan:
     def _laptop(self) -> str:
         node = self._node(BOOTSTRAP, "laptop", "Bootstrap node and web node", ["bootstrap", "edge", "web"])
         web = {"host": self.web_host, "port": self.web_port, "yard": f"{LOOPBACK}:{self.yard_port}"}
-        return toml({"node": node, "web": web})
+        return toml({"node": node, "web": web, "faults": FAULTS})
 
     def _dog(self, name: str) -> str:
         options = {"host": LOOPBACK, "port": self.yard_port, "robot": name, "camera_fps": 15}
@@ -61,6 +63,7 @@ class Plan:
                 "node": self._node(name, "robot", f"Simulated ERS-7 with {name[-1]} yellow stripes", ["edge"]),
                 "agent": {"module": "search"},
                 "driver": {"kind": "sim", "options": options},
+                "faults": FAULTS,
             }
         )
 
