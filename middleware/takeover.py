@@ -33,12 +33,14 @@ class Takeover:
     seconds: float | None = None
     to: str = ""
 
-    def look(self, acts: Mapping[str, str], now: float) -> None:
-        """Take in who acts (uuid to task) at the moment ``now``."""
-        if self.is_open(now):
-            others = sorted(uuid for uuid, task in acts.items() if task == self.task and uuid != self.lost)
-            if others:
-                self.seconds, self.to = now - self.began, others[0]
+    def look(self, acts: Mapping[str, str], now: float) -> bool:
+        """Take in who acts (uuid to task) at the moment ``now``; True where that is what stops the clock."""
+        if not self.is_open(now):
+            return False
+        others = sorted(uuid for uuid, task in acts.items() if task == self.task and uuid != self.lost)
+        if others:
+            self.seconds, self.to = now - self.began, others[0]
+        return bool(others)
 
     def is_open(self, now: float) -> bool:
         """Whether the clock runs: somebody may still take over."""

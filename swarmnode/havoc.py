@@ -98,7 +98,8 @@ def play(scenario: Scenario, seed: int, stage: Stage, say: Callable[[str], None]
         task = acting(stage.devices()).get(device.uuid, "")
         stage.cause(device, step.fault)
         now = stage.seconds()
-        say(f"{device.name}: {step.fault.kind} for {step.fault.seconds:g} s")
+        lasts = "" if step.fault.kind == "kill" else f" for {step.fault.seconds:g} s"
+        say(f"{device.name}: {step.fault.kind}{lasts}")
         losses.append(Loss(device.name, step.fault, Takeover(device.uuid, task, now, now + step.fault.seconds)))
     while any(_is_open(loss, stage.seconds()) for loss in losses):
         _look(stage, losses, say)
@@ -123,11 +124,9 @@ def _look(stage: Stage, losses: Iterable[Loss], say: Callable[[str], None]) -> N
     devices = stage.devices()
     acts, names = acting(devices), {device.uuid: device.name for device in devices}
     for loss in losses:
-        if loss.clock.seconds is None:
-            loss.clock.look(acts, stage.seconds())
-            if loss.clock.seconds is not None:
-                loss.to = names[loss.clock.to]
-                say(str(loss))
+        if loss.clock.look(acts, stage.seconds()):
+            loss.to = names[loss.clock.to]
+            say(str(loss))
 
 
 def _device(

@@ -16,7 +16,8 @@ from twisted.internet import reactor as _reactor
 from twisted.internet.stdio import StandardIO
 from twisted.protocols.basic import LineReceiver
 
-from webnode.board import Board, OpenSessions
+from middleware.fault import KINDS
+from webnode.board import Board, MemoryFaults, OpenSessions
 from webnode.camera import OnFrame
 from webnode.desk import MemoryDesk
 from webnode.server import WebService, web_service
@@ -209,7 +210,7 @@ class Orders(LineReceiver):
 
 def board() -> Board:
     """What the page can ask for: twins in memory, so that every order is taken and none does harm."""
-    return Board(MemoryDesk(CATALOGUE, YARD), OpenSessions())
+    return Board(MemoryDesk(CATALOGUE, YARD), OpenSessions(), faults=MemoryFaults(*KINDS))
 
 
 def main() -> None:

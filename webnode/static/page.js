@@ -5,6 +5,7 @@ import "./groups.js";
 import "./cameras.js";
 import "./map.js";
 import "./tasks.js";
+import "./chaos.js";
 import { ask, get, open } from "./link.js";
 import { model, take } from "./model.js";
 import { go, start, tell } from "./shell.js";
