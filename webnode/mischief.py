@@ -26,6 +26,8 @@ PATIENCE_S = 1.5
 TOLD_S = 60.0
 """Seconds for which one still tells of a fault that is over."""
 KEPT = 50
+REMEMBERED = 1000
+"""Devices beyond which one forgets those that are not here."""
 
 
 @dataclass
@@ -45,6 +47,7 @@ class Mischief:
         self._node = node
         self._clock = clock
         self._kinds: dict[str, tuple[str, ...]] = {}
+        self._asked: set[str] = set()
         self._names: dict[str, str] = {}
         self._caused: list[_Caused] = []
         self._count = 0
@@ -119,17 +122,15 @@ class Mischief:
         self._names.update({device.uuid: device.name for device, _ in devices})
         for each in self._caused:
             each.clock.look(acts, now)
-        here = {device.uuid for device, _ in devices}
-        for uuid in self._kinds.keys() - here:
-            del self._kinds[uuid]  # it may come back with other settings
-        for uuid in (
-            self._names.keys() - here - {uuid for each in self._caused for uuid in (each.clock.to, each.clock.lost)}
-        ):
-            del self._names[uuid]
         for device, record in devices:
-            if device.uuid not in self._kinds:
-                self._kinds[device.uuid] = ()
+            if device.uuid not in self._asked:
+                self._asked.add(device.uuid)
                 self._learn(device.uuid, record)
+        # Who comes back may have other settings, and is asked again; until then what it said before holds.
+        self._asked &= {device.uuid for device, _ in devices}
+        if len(self._names) > REMEMBERED:
+            self._names = {device.uuid: device.name for device, _ in devices}
+            self._kinds = {uuid: self._kinds[uuid] for uuid in self._names.keys() & self._kinds.keys()}
 
     def _learn(self, uuid: str, record: Record) -> None:
         contact = self._node.contact_of(record)
@@ -138,13 +139,15 @@ class Mischief:
 
         def told(answer: Any) -> None:
             kinds = answer.get("kinds") if isinstance(answer, dict) else None
-            if uuid in self._kinds and isinstance(kinds, list):
+            if isinstance(kinds, list):
                 self._kinds[uuid] = tuple(kind for kind in KINDS if kind in kinds)
 
         def untold(failure: Any) -> None:
             failure.trap(EntangledError)
             if failure.check(NoAnswer):
-                self._kinds.pop(uuid, None)  # asked again at the next change of any device
+                self._asked.discard(uuid)  # once more at the next change of any device
+            else:
+                self._kinds.pop(uuid, None)
 
         asked = self._node.entangled.call(contact, ASKED).addCallbacks(told, untold)
         asked.addErrback(lambda failure: self._log.failure("while asking for faults", failure))

@@ -49,13 +49,16 @@ class MischiefTests(SynchronousTestCase):
         self.fail("nobody ever acted")
 
     def test_learn_what_can_fail(self) -> None:
-        """Each device is asked what it can suffer; of one that is not there, or has left, nothing is known."""
+        """Each device is asked what it can suffer; of one that never came nothing is known."""
         self.assertEqual(list(self.mischief.kinds(self.uuid("dog1"))), list(KINDS))
         self.assertNotIn("battery", self.mischief.kinds(self.uuid("vaio")))
         self.assertEqual(list(self.mischief.kinds("00" * 20)), [])
         self.assertIsNone(self.cause(self.uuid("dog1"), "kill"))
         self.team.clock.advance(5.0)
-        self.assertEqual(list(self.mischief.kinds(self.uuid("dog1"))), [])
+        self.assertEqual(list(self.mischief.kinds(self.uuid("dog1"))), list(KINDS))
+        self.assertEqual(self.cause(self.uuid("dog1"), "loss").problem, "it has left the network")
+        self.team.clock.advance(20.0)
+        self.assertIsNone(self.cause(self.uuid("dog1"), "loss"))
 
     def test_takeover_clock(self) -> None:
         """Who acts is cut off: the clock runs, stops when another acts, below two seconds, and names who."""
