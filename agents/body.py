@@ -18,6 +18,8 @@ from drivers.reading import Observation
 WAKE_AGAIN = 0.5
 PATIENCE = 0.5
 """Seconds for which a robot may fall silent before its agent takes its report back."""
+EMPTY = 0.05
+"""Charge (0 to 1) below which a robot is as good as silent: it goes home while it still can."""
 
 
 class Body:
@@ -55,9 +57,18 @@ class Body:
             self._unsubscribe()
 
     @property
-    def answers(self) -> bool:
-        """Whether the robot answers with its motors on, or did so a moment ago."""
+    def is_empty(self) -> bool:
+        """Whether the robot says that it has hardly any charge left; one that does not say has enough."""
         seen = self.driver.observe()
+        charge = None if seen is None else seen.values.get("power.level")
+        return isinstance(charge, float | int) and charge < EMPTY
+
+    @property
+    def answers(self) -> bool:
+        """Whether the robot answers with its motors on and some charge left, or did so a moment ago."""
+        seen = self.driver.observe()
+        if self.is_empty:
+            return False
         has_motors = seen is None or seen.values.get("estop.engaged") is not True
         now = self._clock.seconds()
         if self.is_awake and has_motors and self.driver.state == "ready":

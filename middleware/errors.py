@@ -9,6 +9,7 @@
       UnknownStrategy    ask for a consensus strategy that exists
       UnknownAgent       ask for an agent that exists
       Undeployable       mend the module, and push it again as a higher version
+      BadFault           ask for a fault that exists, within its bounds
 """
 
 from __future__ import annotations
@@ -66,3 +67,16 @@ class Undeployable(SwarmError):
 
     def __str__(self) -> str:
         return " ".join(f"the module {self.name} cannot run: {self.problem}".split())
+
+
+class BadFault(SwarmError):
+    """A fault that cannot be caused: which field of it, what is wrong, and what to do."""
+
+    def __init__(self, field: str, problem: str, remedy: str) -> None:
+        super().__init__(field, problem, remedy)
+        self.field = field
+        self.problem = problem
+        self.remedy = remedy
+
+    def __str__(self) -> str:
+        return f"{self.field}: {self.problem}; {self.remedy}"

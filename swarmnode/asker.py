@@ -23,12 +23,12 @@ class Asker:
         self._path: Path = found(node)
         self._ask = ask
 
-    def records(self, key: str) -> list[Record]:
-        """What the network holds under the key of a text.
+    def records(self, key: str, concern: str = "majority") -> list[Record]:
+        """What the network holds under the key of a text; the ``concern`` ``fast`` takes the first answer.
 
         The node has checked the signatures; they do not come through the socket.  Raises ``Refusal``.
         """
-        answer = self._answer("dht get", key=key, concern="majority")
+        answer = self._answer("dht get", key=key, concern=concern)
         if not isinstance(answer, list):
             raise Refusal(f"the node's answer to a read of {key!r} is no list of records")
         return [_record(hashed_key(key), each) for each in answer]
@@ -37,6 +37,10 @@ class Asker:
         """Store ``value`` in the node's own slot; returns how many replicas have it.  Raises ``Refusal``."""
         given = {"base64": base64.b64encode(value).decode()}
         return int(self._answer("dht put", key=key, name=name, value=given)["replicas"])
+
+    def call(self, address: str, method: str, *arguments: Any) -> Any:
+        """Let the node at ``address`` (HOST:PORT) do something, once; returns its answer.  Raises ``Refusal``."""
+        return self._answer("rpc", node=address, method=method, arguments=list(arguments), changes=True)
 
     def _answer(self, verb: str, **given: Any) -> Any:
         for line in self._ask(self._path, {"verb": verb, "with": given}):

@@ -24,7 +24,6 @@ from middleware.presence import Device
 from middleware.settings import Settings
 from middleware.survey import answer_survey
 from middleware.tuning import Knob, answer_tuning
-from swarmnode.fault import faulty
 from swarmnode.seams import Seams
 from webnode.errors import WebError
 
@@ -63,7 +62,12 @@ def assembled(settings: Settings, seams: Seams) -> Assembly:
     if settings.agent.module and not settings.driver.kind:
         problem = f"is {settings.agent.module!r}, which has no robot to act with"
         raise BadSetting(settings.origin, "[agent] module", problem, "name its [driver] kind, or leave the agent out")
-    seams = faulty(settings, seams)
+    frailty = None
+    if settings.faults.allow:
+        from swarmnode.frailty import Frailty  # any other node is spared the memory
+
+        frailty = Frailty(seams)
+        seams = frailty.seams
     capabilities = dict(node_settings.capabilities)
     kind = node_settings.kind
     if settings.driver.kind:
@@ -73,6 +77,7 @@ def assembled(settings: Settings, seams: Seams) -> Assembly:
         driver = driver_for(
             settings.driver.kind, settings.driver.options, node_settings.name, seams.clock, seams.connector
         )
+        driver = driver if frailty is None else frailty.drained(driver)
     device = Device(
         uuid="",
         name=node_settings.name,
@@ -100,6 +105,8 @@ def assembled(settings: Settings, seams: Seams) -> Assembly:
     if isinstance(filming, Filming) and "camera" in capabilities:
         tuning.add(_camera_knob(filming))
     node.halt = answer_halt(node.entangled)
+    if frailty is not None:
+        frailty.answer(node)
     if settings.deployment.allow:
         _deployable(node, settings, seams)
     agent = None

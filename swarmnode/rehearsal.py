@@ -31,12 +31,17 @@ LAN = Weather(delay_s=0.002, jitter_s=0.001)
 """A quiet network in one house."""
 
 
+RESTARTED = 15.0
+"""Seconds after which a node that was killed by a fault is there again, as in a demonstration."""
+
+
 class VirtualTeam:
     """A laptop and its dogs; a seed replays them exactly.
 
     What runs is what runs on a robot: the real node, agent, driver, yard and detection.  ``dogs`` are those that are
     there from the start, the yard has a body for each of ``DOGS``; ``others`` are nodes without a body, which join
-    before the dogs; ``weather`` is that of every link.
+    before the dogs; ``weather`` is that of every link; with ``faults`` the nodes can be made to fail as in a
+    demonstration.
     """
 
     BOOTSTRAP = "vaio"
@@ -51,6 +56,7 @@ class VirtualTeam:
         weather: Weather = LAN,
         dogs: tuple[str, ...] = DOGS,
         others: tuple[str, ...] = (),
+        faults: bool = False,
     ) -> None:
         self.clock = HeapClock()
         self.board = Switchboard(self.clock, random.Random(f"{seed}/board"), weather)
@@ -62,6 +68,7 @@ class VirtualTeam:
         self._names = (self.BOOTSTRAP, *self.DOGS, *others)
         self._seed = seed
         self._fps = camera_fps
+        self._faults = faults
         for name in (self.BOOTSTRAP, *others, *dogs):
             self.add(name)
             self.clock.advance(self.JOINING)
@@ -83,6 +90,8 @@ class VirtualTeam:
         if name in self.DOGS:
             mapping["agent"] = {"module": "search"}
             mapping["driver"] = {"kind": "sim", "options": {"robot": name, "camera_fps": self._fps}}
+        if self._faults:
+            mapping["faults"] = {"allow": True}
         mapping.update(tables or {})
         frost = self.frosts[name] = Frost(self.clock)
         connector = self.connectors[name] = self.yard.connector()
@@ -94,6 +103,7 @@ class VirtualTeam:
             self.clock.seconds,
             frost.connector(connector),
             shelf,
+            _Plug(self, name),
         )
         self.services[name] = NodeService(Settings.from_mapping(mapping, f"seed {self._seed}"), seams)
         self.services[name].startService()
@@ -144,6 +154,19 @@ class VirtualTeam:
         self.clock.advance(self.GOING)
         self._operator.disconnect()
         self.yard.stop()
+
+
+class _Plug:
+    def __init__(self, team: VirtualTeam, name: str) -> None:
+        self._team = team
+        self._name = name
+
+    def kill(self) -> None:
+        self._team.services[self._name].leave(RESTARTED)
+
+    def freeze(self, seconds: float) -> None:
+        self._team.freeze(self._name)
+        self._team.clock.callLater(seconds, self._team.thaw, self._name)
 
 
 def main(arguments: list[str]) -> int:

@@ -45,7 +45,12 @@ def real_seams(settings: Settings, reactor: Any) -> Seams:
         from middleware.deployment.shelf import FileShelf
 
         shelf = FileShelf(Path(f"{path}.deployed"))
-    return Seams(reactor, network, store, rng, time.time, shelf=shelf)
+    plug = None
+    if settings.faults.allow:
+        from swarmnode.plug import ProcessPlug
+
+        plug = ProcessPlug()
+    return Seams(reactor, network, store, rng, time.time, shelf=shelf, plug=plug)
 
 
 LookUp = Callable[..., Sequence[tuple[Any, ...]]]

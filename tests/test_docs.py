@@ -8,9 +8,9 @@ from pathlib import Path
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from agents import engagement, loop
+from agents import body, engagement, loop
 from drivers.registry import describe
-from middleware import halt
+from middleware import fault, halt, takeover
 from middleware.commitment import ballot, lessee
 from middleware.consensus import guard, strategy, worker
 from middleware.deployment import manifest, module
@@ -49,6 +49,9 @@ FIGURES: Sequence[tuple[str, str]] = (
     ("consensus", f"for all behind it after {party.RELAY_SILENCE:g} s"),
     ("deployment", f"the source has at most {manifest.MAX_SOURCE // 1024} KiB"),
     ("deployment", f"takes at most {module.STEPS:,} instructions"),
+    ("faults", f"Seconds are {fault.MIN_S:g} to {fault.MAX_S:g}, {fault.USUAL_S:g} where"),
+    ("faults", f"later than {takeover.TARGET_S:g} s, or nobody took over"),
+    ("faults", f"below {body.EMPTY:g} its agent takes its report back"),
     ("library", f"After about {membership.SILENCE + roster.STRUCK_S:g} s the absent are struck"),
     ("library", f"A request has at most {port.MAX_REQUEST:,} bytes, a node {port.MAX_CONNECTIONS} connections"),
     ("protocol", f"gone on without it for {roster.STRUCK_S:g} s, or for {roster.COUNTED_S:g} s"),

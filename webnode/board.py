@@ -353,11 +353,50 @@ class Faults(Protocol):
     def kinds(self, uuid: str) -> Sequence[str]:
         """What can be caused there."""
 
-    def cause(self, uuid: str, kind: str, seconds: float, amount: float) -> Deferred[None]:
-        """Cause one; fails with ``Refusal``."""
+    def cause(self, uuid: str, kind: str, seconds: float, amount: float | None) -> Deferred[None]:
+        """Cause one, without an ``amount`` as much as is usual; fires when the device has said that it will.
+
+        Fails with ``Refusal``: 400 names the field, 409 and 504 the device.
+        """
 
     def active(self) -> list[dict[str, Json]]:
-        """Those that go on, and what came of each."""
+        """Those that go on or ended a short while ago, the newest first, and what came of each.
+
+        ``n`` counts them; ``left_s`` and ``since_s`` are its seconds to come and gone; ``task`` is what the device was
+        at; ``takeover_s`` and ``to`` are the seconds until another (by name) acted on that task, None and empty until
+        then; ``watched`` says whether the clock runs.
+        """
+
+
+class MemoryFaults:
+    """Faults that are only written down, in ``caused`` as (uuid, kind, seconds, amount); ``rows`` are those told of."""
+
+    def __init__(self, *kinds: str) -> None:
+        self.caused: list[tuple[str, str, float, float | None]] = []
+        self.rows: list[dict[str, Json]] = []
+        self._kinds = kinds
+
+    def kinds(self, uuid: str) -> Sequence[str]:
+        """Return what it was made with."""
+        return self._kinds
+
+    def cause(self, uuid: str, kind: str, seconds: float, amount: float | None) -> Deferred[None]:
+        """Write it down; nothing comes of it."""
+        self.caused.append((uuid, kind, seconds, amount))
+        row: dict[str, Json] = {
+            "n": len(self.caused),
+            "uuid": uuid,
+            "name": uuid[:4],
+            "kind": kind,
+            "amount": amount,
+            "left_s": seconds,
+        }
+        self.rows.insert(0, {**row, "task": "t1", "since_s": 0.0, "takeover_s": None, "to": "", "watched": True})
+        return succeed(None)
+
+    def active(self) -> list[dict[str, Json]]:
+        """Those that were caused, the newest first."""
+        return self.rows
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,8 @@ RESERVE = "pi"
 DOGS = ("dog1", "dog2", "dog3")
 
 Table = Mapping[str, object]
+FAULTS: Table = {"allow": True}
+"""A demonstration is there to see robots fail."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,7 @@ class Plan:
     def _web(self, node: Table, port: int) -> str:
         yard = f"{LOOPBACK}:{self.yard_port}"
         web = {"host": self.web_host, "port": port, "yard": yard, "code": self.code}
-        return toml({"node": node, "web": web})
+        return toml({"node": node, "web": web, "faults": FAULTS})
 
     def _dog(self, name: str) -> str:
         options = {"host": LOOPBACK, "port": self.yard_port, "robot": name, "camera_fps": 15}
@@ -69,6 +71,7 @@ class Plan:
                 "node": self._node(name, "robot", f"Simulated ERS-7 with {name[-1]} yellow stripes", ["edge"]),
                 "agent": {"module": "search"},
                 "driver": {"kind": "sim", "options": options},
+                "faults": FAULTS,
             }
         )
 

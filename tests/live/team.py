@@ -25,7 +25,18 @@ from twisted.internet.stdio import StandardIO
 from twisted.internet.threads import deferToThread
 from twisted.protocols.basic import LineReceiver
 
-from webnode.board import Board, Knob, MemoryAudit, MemoryFallbacks, MemoryHalts, MemorySurvey, MemoryTuning, Page
+from middleware.fault import KINDS
+from webnode.board import (
+    Board,
+    Knob,
+    MemoryAudit,
+    MemoryFallbacks,
+    MemoryFaults,
+    MemoryHalts,
+    MemorySurvey,
+    MemoryTuning,
+    Page,
+)
 from webnode.camera import OnFrame
 from webnode.chronicle import TeamChronicle
 from webnode.desk import MemoryDesk
@@ -281,6 +292,7 @@ def board(team: Team) -> Board:
     tuning = MemoryTuning({able[0]["uuid"]: KNOBS})
     survey = MemorySurvey(network(), {f"0{n}" * 16: inventory() for n in (1, 2)})
     parts: dict[str, Any] = {"halts": team.halts, "tuning": tuning, "survey": survey, "chronicle": TeamChronicle()}
+    parts["faults"] = MemoryFaults(*KINDS)
     return Board(desk, sessions, MemoryAudit(time.time), limits=AddressLimits(), **parts)
 
 

@@ -2,6 +2,85 @@
 
 from __future__ import annotations
 
-from webnode.route import Route
+from typing import Any
 
-ROUTES: tuple[Route, ...] = ()
+from middleware.fault import KINDS, MAX_S, MIN_S, USUAL_S
+from webnode.errors import Refusal
+from webnode.field import Json
+from webnode.route import API, Ask, Field, Route, device
+
+
+def faults(ask: Ask) -> Json:
+    """What can be caused where, and what goes on; nothing where this node has no faults."""
+    known = ask.board.faults
+    if known is None:
+        return {"kinds": [], "can": {}, "active": []}
+    kinds: list[Json] = [
+        {
+            "kind": name,
+            "about": kind.about,
+            "is_lost": kind.is_lost,
+            "unit": kind.unit,
+            "means": kind.means,
+            "amount": kind.amount,
+            "least": kind.least,
+            "most": kind.most,
+        }
+        for name, kind in KINDS.items()
+    ]
+    can: dict[str, Json] = {each["uuid"]: list(known.kinds(each["uuid"])) for each in ask.state["devices"]}
+    active: list[Json] = list(known.active())
+    return {"kinds": kinds, "can": can, "active": active}
+
+
+def cause(ask: Ask) -> Any:
+    """Let a device fail."""
+    uuid, board, kind = device(ask)["uuid"], ask.board, ask.given["kind"]
+    if board.faults is None:
+        raise Refusal(
+            "device", "this node causes no faults", 'write "allow = true" below [faults] of its settings', 409
+        )
+    seconds, amount = ask.given["seconds"], ask.given["amount"]
+
+    def taken(_: object) -> Json:
+        board.chronicle.faulted(uuid, kind, ask.now)
+        return {"id": uuid, "kind": kind, "seconds": seconds}
+
+    return board.faults.cause(uuid, kind, seconds, amount).addCallback(taken)
+
+
+_USUAL = "; ".join(f"{name}: {kind.amount:g} {kind.unit}" for name, kind in KINDS.items() if kind.unit)
+ROUTES = (
+    Route(
+        "GET",
+        f"{API}/faults",
+        "What can be made to fail, and what was, with the seconds until another took over",
+        "viewer",
+        faults,
+        gives="kinds, can (kinds by uuid), active (n, uuid, name, kind, amount, left_s, since_s, task, takeover_s, to)",
+    ),
+    Route(
+        "POST",
+        f"{API}/devices/{{uuid}}/faults",
+        "Let a device fail on purpose, where its settings allow it; it heals by itself",
+        "operator",
+        cause,
+        (
+            Field("uuid", "text", "the device", "path", most=64),
+            Field("kind", "choice", "what it suffers", choices=tuple(KINDS)),
+            Field(
+                "seconds",
+                "number",
+                "how long",
+                least=MIN_S,
+                most=MAX_S,
+                default=USUAL_S,
+                is_required=False,
+                unit="s",
+            ),
+            Field("amount", "number", f"how much, where it has an amount (usual {_USUAL})", is_required=False),
+        ),
+        gives="id, kind, seconds",
+        status=202,
+    ),
+)

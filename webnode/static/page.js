@@ -4,7 +4,6 @@ import "./halt.js";
 import "./devices.js";
 import "./groups.js";
 import "./tasks.js";
-import "./views.js";
 import "./actions.js";
 import { enter } from "./signin.js";
 import { ask, get, open } from "./link.js";
@@ -32,4 +31,7 @@ function onEvent(event, data) {
 start({ model, get, ask, go });
 await enter((me) => onEvent("session", me));
 open({ onEvent });
+// The team is there first; what else there is to see comes after it.
+import("./views.js");
+import("./chaos.js");
 import("./keep.js");

@@ -215,13 +215,13 @@ class ConfigurationTests(SynchronousTestCase):
         """The laptop serves the page over the yard, and has neither agent nor driver."""
         web = {"host": "127.0.0.1", "port": 8080, "yard": "127.0.0.1:7400", "code": "quiet-otter"}
         self.assertEqual(self.tables["vaio"]["web"], web)
-        self.assertEqual(set(self.tables["vaio"]), {"node", "web"})
+        self.assertEqual(set(self.tables["vaio"]), {"node", "web", "faults"})
 
     def test_page_has_a_reserve(self) -> None:
         """A second web node serves the page of the same yard at a port of its own, with the same code."""
         self.assertEqual(self.tables["pi"]["web"], {**self.tables["vaio"]["web"], "port": 8081})
         self.assertEqual(
-            (self.tables["pi"]["node"]["roles"], set(self.tables["pi"])), (["edge", "web"], {"node", "web"})
+            (self.tables["pi"]["node"]["roles"], set(self.tables["pi"])), (["edge", "web"], {"node", "web", "faults"})
         )
 
 

@@ -1,0 +1,98 @@
+"""Foul: a network whose one node can be cut off, made deaf or mute, or given bad weather while it runs.
+
+It goes around any other ``Network``: what the switchboard does between nodes in one process, this does at the port of
+a real one.  As it was made it changes nothing.
+"""
+
+from __future__ import annotations
+
+import random
+from collections import Counter
+from collections.abc import Callable
+
+from twisted.internet.interfaces import IReactorTime
+
+from middleware.entangled.network.network import Address, Network, Receiver
+from middleware.entangled.network.switchboard import CALM
+
+
+class FoulNetwork:
+    """``network``, as it is for a node that fails.
+
+    ``weather`` is met by each datagram that goes out and by each that comes in, so a question and its answer meet it
+    twice.  ``is_deaf``: nothing comes in; ``is_mute``: nothing goes out.  ``eaten`` counts the datagrams that were
+    silenced, lost and duplicated.
+    """
+
+    def __init__(self, network: Network, clock: IReactorTime, rng: random.Random) -> None:
+        self.weather = CALM
+        self.is_deaf = False
+        self.is_mute = False
+        self.eaten: Counter[str] = Counter()
+        self._network = network
+        self._clock = clock
+        self._rng = rng
+        self._receiver: Receiver | None = None
+
+    @property
+    def address(self) -> Address:
+        """The node's own address."""
+        return self._network.address
+
+    def listen(self, receiver: Receiver) -> None:
+        """Open the port and hand on what gets through; raises ``PortInUse`` where another holds it."""
+        self._network.listen(self._came)
+        self._receiver = receiver
+
+    def send(self, datagram: bytes, to: Address) -> None:
+        """Send what gets through."""
+        if self.is_mute:
+            self.eaten["silenced"] += 1
+        elif self.weather is CALM:
+            self._network.send(datagram, to)
+        else:
+            self._suffer(self._sent, datagram, to)
+
+    def close(self) -> None:
+        """Close the port, what is on its way is lost; may be called twice."""
+        self._receiver = None
+        self._network.close()
+
+    def _came(self, datagram: bytes, source: Address) -> None:
+        if self.is_deaf:
+            self.eaten["silenced"] += 1
+        elif self.weather is CALM:
+            self._heard(datagram, source)
+        else:
+            self._suffer(self._heard, datagram, source)
+
+    def _suffer(self, go_on: Receiver, datagram: bytes, address: Address) -> None:
+        weather, rng = self.weather, self._rng
+        if weather.loss and rng.random() < weather.loss:
+            self.eaten["lost"] += 1
+            return
+        copies = 1
+        if weather.duplicate and rng.random() < weather.duplicate:
+            self.eaten["duplicated"] += 1
+            copies = 2
+        for _ in range(copies):
+            delay = weather.delay_s
+            if weather.jitter_s:
+                delay = max(0.0, delay + rng.uniform(-weather.jitter_s, weather.jitter_s))
+            if weather.reorder and rng.random() < weather.reorder:
+                delay += weather.delay_s + 0.001
+            self._after(delay, lambda: go_on(datagram, address))
+
+    def _after(self, delay: float, act: Callable[[], None]) -> None:
+        if delay > 0.0:
+            self._clock.callLater(delay, act)
+        else:
+            act()
+
+    def _sent(self, datagram: bytes, to: Address) -> None:
+        if self._receiver is not None and not self.is_mute:
+            self._network.send(datagram, to)
+
+    def _heard(self, datagram: bytes, source: Address) -> None:
+        if self._receiver is not None and not self.is_deaf:
+            self._receiver(datagram, source)

@@ -1,0 +1,74 @@
+"""Fault: what a node can be made to suffer on purpose; words and bounds of page, command and node.  Pure.
+
+A fault that is let loose heals by itself: a device that is cut off would not hear that it is over.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from middleware.errors import BadFault
+from middleware.value import is_number
+
+CAUSE, ASKED = "device.fault", "device.faults"
+"""Methods of a node that allows faults: cause one, and say what can be caused and what goes on."""
+MIN_S, MAX_S, USUAL_S = 0.1, 600.0, 15.0
+
+
+@dataclass(frozen=True)
+class Kind:
+    """One sort of fault.
+
+    ``is_lost``: who acts under it must be replaced.  ``amount`` is what is usual where a fault of this kind has an
+    amount (``unit`` says so), ``least`` and ``most`` bound it; ``means`` says what the amount is.
+    """
+
+    about: str
+    is_lost: bool = False
+    amount: float = 0.0
+    least: float = 0.0
+    most: float = 0.0
+    unit: str = ""
+    means: str = ""
+
+
+KINDS: Mapping[str, Kind] = {
+    "kill": Kind("its process ends at once (SIGKILL); who watches over it starts it again", is_lost=True),
+    "freeze": Kind("its process stands still (SIGSTOP), and then goes on", is_lost=True),
+    "radio": Kind("nothing passes between it and the others", is_lost=True),
+    "one-way": Kind("it hears the others, and they do not hear it", is_lost=True),
+    "delay": Kind("whatever it sends or hears comes late", False, 0.3, 0.0, 5.0, "s", "late by"),
+    "loss": Kind("a share of what it sends or hears is lost", False, 0.2, 0.0, 1.0, "of 1", "share lost"),
+    "skew": Kind("its wall clock is wrong; nothing may come of it", False, 3600.0, -1e6, 1e6, "s", "ahead by"),
+    "battery": Kind("its battery reads low; below 0.05 it gives its task back", True, 0.03, 0.0, 1.0, "of 1", "charge"),
+}
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A fault that somebody wants: ``kind`` is one of ``KINDS``, for ``seconds``."""
+
+    kind: str
+    seconds: float = USUAL_S
+    amount: float = 0.0
+
+
+def fault_of(kind: object, seconds: object = None, amount: object = None) -> Fault:
+    """The fault that foreign words mean; None stands for what is usual.  Raises ``BadFault``."""
+    if not isinstance(kind, str) or kind not in KINDS:
+        raise BadFault("kind", f"there is no fault {str(kind)[:40]!r}", f"choose one of {', '.join(KINDS)}")
+    rule = KINDS[kind]
+    lasts = _number("seconds", USUAL_S if seconds is None else seconds, MIN_S, MAX_S, "s")
+    if not rule.unit:
+        if amount is not None and amount != 0:
+            raise BadFault("amount", f"a fault of the kind {kind} has none", "leave it out")
+        return Fault(kind, lasts)
+    much = _number("amount", rule.amount if amount is None else amount, rule.least, rule.most, rule.unit)
+    return Fault(kind, lasts, much)
+
+
+def _number(field: str, value: object, least: float, most: float, unit: str) -> float:
+    if not is_number(value) or not least <= value <= most:  # type: ignore[operator]
+        raise BadFault(field, f"{str(value)[:40]} is no lawful number", f"give {least:g} to {most:g} {unit}")
+    return float(value)  # type: ignore[arg-type]

@@ -1,0 +1,154 @@
+"""Havoc: a scenario carried out on a stage, with a clock for each takeover.
+
+The stage is a running team (``swarm chaos``) or one in memory, on a turned clock; the same happens on both.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Protocol
+
+from middleware.fault import KINDS, Fault
+from middleware.presence import Device
+from middleware.takeover import TARGET_S, Takeover, acting
+from swarmnode.scenario import ANY, WHO_ACTS, Scenario
+
+LOOK_S = 0.05
+PATIENCE_S = 60.0
+"""Seconds for which one waits until somebody acts, or a device is there."""
+SETTLED_S = 6.0
+"""Seconds after a fault that nobody takes over from, in which the others may end the task."""
+BODILESS = {"bootstrap", "web"}
+
+
+class NobodyThere(Exception):
+    """The device that is to fail is not there; ``str()`` is one line for a person."""
+
+
+class Stage(Protocol):
+    """Where faults are caused; ``seconds`` is its clock."""
+
+    def seconds(self) -> float:
+        """The time."""
+
+    def wait(self, seconds: float) -> None:
+        """Let so much time pass."""
+
+    def devices(self) -> list[Device]:
+        """Who is there, in the order of joining."""
+
+    def assign(self, task: str) -> str:
+        """Publish a task of the catalogue; returns its id."""
+
+    def cause(self, device: Device, fault: Fault) -> None:
+        """Let the device suffer the fault; returns when it has taken it."""
+
+    def is_over(self, task_id: str) -> bool:
+        """Whether the task has ended."""
+
+
+@dataclass
+class Loss:
+    """One fault of a device, and the clock beside it; ``is_ended``: its task ended before another took over."""
+
+    device: str
+    fault: Fault
+    clock: Takeover
+    to: str = ""
+    is_ended: bool = False
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether who suffers this cannot go on with a task."""
+        return KINDS[self.fault.kind].is_lost
+
+    @property
+    def held(self) -> bool:
+        """Whether another took over in time, where one had to."""
+        if self.clock.seconds is not None:
+            return self.clock.seconds <= TARGET_S
+        must = self.is_lost and self.fault.seconds > TARGET_S
+        return not (self.clock.task and must) or self.is_ended
+
+    def __str__(self) -> str:
+        what = f"{self.device}: {self.fault.kind}"
+        if not self.clock.task:
+            return f"{what}, was at no task"
+        if self.clock.seconds is not None:
+            late = "" if self.held else f", later than {TARGET_S:g} s"
+            return f"{what}, {self.to} took over {self.clock.task} after {self.clock.seconds:.2f} s{late}"
+        if self.is_ended:
+            return f"{what}, {self.clock.task} ended before another took over"
+        return f"{what}, nobody took over {self.clock.task}" if not self.held else f"{what}, nobody had to take over"
+
+
+def play(scenario: Scenario, seed: int, stage: Stage, say: Callable[[str], None]) -> list[Loss]:
+    """Carry the scenario out, say each loss when it is settled; raises ``NobodyThere``."""
+    dice = random.Random(seed)
+    losses: list[Loss] = []
+    if scenario.task:
+        say(f"assigned {scenario.task} as {stage.assign(scenario.task)}")
+    began = stage.seconds()
+    for step in scenario.steps:
+        while stage.seconds() < began + step.at:
+            _look(stage, losses, say)
+        device = _device(stage, step.device, dice, losses, say)
+        task = acting(stage.devices()).get(device.uuid, "")
+        stage.cause(device, step.fault)
+        now = stage.seconds()
+        lasts = "" if step.fault.kind == "kill" else f" for {step.fault.seconds:g} s"
+        say(f"{device.name}: {step.fault.kind}{lasts}")
+        losses.append(Loss(device.name, step.fault, Takeover(device.uuid, task, now, now + step.fault.seconds)))
+    while any(_is_open(loss, stage.seconds()) for loss in losses):
+        _look(stage, losses, say)
+    for loss in losses:
+        if loss.clock.seconds is None:
+            loss.is_ended = bool(loss.clock.task) and stage.is_over(loss.clock.task)
+            say(str(loss))
+    return losses
+
+
+def _is_open(loss: Loss, now: float) -> bool:
+    return loss.clock.is_open(now) and (loss.is_lost or now < loss.clock.until) and not _is_hopeless(loss, now)
+
+
+def _is_hopeless(loss: Loss, now: float) -> bool:
+    # A killed process has no end of its fault to wait for, and a long one need not be sat out.
+    return now > loss.clock.began + max(SETTLED_S, min(loss.fault.seconds, 3 * SETTLED_S))
+
+
+def _look(stage: Stage, losses: Iterable[Loss], say: Callable[[str], None]) -> None:
+    stage.wait(LOOK_S)
+    devices = stage.devices()
+    acts, names = acting(devices), {device.uuid: device.name for device in devices}
+    for loss in losses:
+        if loss.clock.look(acts, stage.seconds()):
+            loss.to = names[loss.clock.to]
+            say(str(loss))
+
+
+def _device(
+    stage: Stage, wanted: str, dice: random.Random, losses: Iterable[Loss], say: Callable[[str], None]
+) -> Device:
+    end = stage.seconds() + PATIENCE_S
+    while stage.seconds() <= end:
+        if found := _meant(stage, wanted, losses):
+            return dice.choice(found) if wanted == ANY else found[0]
+        _look(stage, losses, say)
+    names = ", ".join(device.name for device in stage.devices()) or "nobody"
+    what = "acts" if wanted == WHO_ACTS else "could be any" if wanted == ANY else f"is called {wanted}"
+    raise NobodyThere(f"no device {what} for {PATIENCE_S:g} s; there are {names}")
+
+
+def _meant(stage: Stage, wanted: str, losses: Iterable[Loss]) -> list[Device]:
+    here = stage.devices()
+    if wanted == ANY:
+        return sorted((each for each in here if not BODILESS & set(each.roles)), key=lambda device: device.name)
+    if wanted != WHO_ACTS:
+        return [device for device in here if device.name == wanted]
+    # Who is cut off still says that it acts: the next one is meant.
+    lost = {loss.clock.lost for loss in losses if loss.is_lost and stage.seconds() < loss.clock.until}
+    acts = acting(here)
+    return [device for device in here if device.uuid in acts and device.uuid not in lost]

@@ -1,0 +1,65 @@
+"""Tests of ``drivers.drained``: a robot whose battery reads low on purpose."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from drivers.drained import DrainedDriver
+from drivers.driver import Permit
+from drivers.reading import Observation
+from drivers.sim.driver import SimDriver
+from drivers.sim.link import MemoryConnector
+from middleware.entangled.clock import HeapClock
+
+
+class _Robot(SimDriver):
+    """A robot that is at once seen as the test says."""
+
+    def __init__(self) -> None:
+        super().__init__({"robot": "dog1"}, MemoryConnector(HeapClock(), lambda *_: None), HeapClock())  # type: ignore
+        self.shown = Observation(1.0, 1.0, {"power.level": 0.8, "odom.x": 2.0})
+        self.heard: Any = None
+
+    def observe(self) -> Observation:
+        return self.shown
+
+    def subscribe(self, seen: Any) -> Any:
+        self.heard = seen
+        return lambda: None
+
+    def act(self, action: Any, permit: Permit) -> Any:
+        return action
+
+
+class DrainedTests(SynchronousTestCase):
+    def test_only_the_battery_reads_low(self) -> None:
+        """A drained robot tells of less charge, and of all else as before; healed, of the charge that it has."""
+        robot = _Robot()
+        driver = DrainedDriver(robot)
+        seen: list[Any] = []
+        driver.subscribe(seen.append)
+        for level, told in ((None, 0.8), (0.03, 0.03), (0.9, 0.8), (None, 0.8)):
+            driver.level = level
+            observed = driver.observe()
+            assert observed is not None
+            robot.heard(robot.shown)
+            self.assertEqual(dict(observed.values), {"power.level": told, "odom.x": 2.0})
+            self.assertEqual(seen[-1], observed)
+
+    def test_robot_without_a_gauge(self) -> None:
+        """A robot that tells of no charge is left as it is."""
+        robot = _Robot()
+        robot.shown = Observation(1.0, 1.0, {"odom.x": 2.0})
+        driver = DrainedDriver(robot)
+        driver.level = 0.01
+        self.assertIs(driver.observe(), robot.shown)
+
+    def test_all_else_is_the_robot(self) -> None:
+        """What it is, its state, its token and its motion are those of the robot."""
+        robot = _Robot()
+        driver = DrainedDriver(robot)
+        self.assertIs(driver.description, robot.description)
+        self.assertEqual((driver.state, driver.token), (robot.state, robot.token))
+        self.assertEqual(driver.act({"base.vx": 0.1}, Permit(1, 2.0)), {"base.vx": 0.1})

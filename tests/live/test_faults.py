@@ -1,0 +1,82 @@
+"""Faults on the page in a real browser: who may let a device fail does so by touch and by keyboard."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from tests.live import test_page
+from tests.live.test_page import DESK, MISSING, PHONE
+
+TABLET = {"viewport": {"width": 820, "height": 1180}, "has_touch": True}
+
+
+class FaultPageTests(SynchronousTestCase):
+    if MISSING:
+        skip = f"FAULTS ARE NOT TESTED IN A BROWSER: missing {'; '.join(MISSING)}"
+
+    def setUp(self) -> None:
+        self.host = test_page.PageTests()
+        self.host.setUp()
+        self.addCleanup(self.host.doCleanups)
+
+    def opened(self, screen: dict[str, Any], scheme: str = "light") -> Any:
+        """The page with dog2 open, and its faults there."""
+        page = self.host.opened(screen, scheme)
+        page.set_default_timeout(20000)
+        page.evaluate("location.hash = 'device/' + '02'.repeat(16)")
+        page.locator(".chaos button").first.wait_for()
+        return page
+
+    def test_let_it_fail(self) -> None:
+        """A tap lets a device fail for the seconds that were said; its clock runs there and on the list of all."""
+        page = self.opened(PHONE)
+        page.locator("#f-seconds").fill("30")
+        page.get_by_role("button", name="Cut radio").tap()
+        page.get_by_role("status").filter(has_text="Cut radio: for 30 s, then it heals.").wait_for()
+        clock = page.locator("#place-device .fault[data-clock=runs] strong")
+        first = clock.inner_text()
+        self.assertIn("no takeover yet: ", first)
+        page.wait_for_function("before => document.querySelector('.fault strong').textContent !== before", arg=first)
+        page.get_by_role("button", name="Close").tap()
+        page.locator("#place-devices .fault", has_text="Cut radio").wait_for()
+        page.context.close()
+
+    def test_by_keyboard(self) -> None:
+        """With the keyboard alone: Tab reaches each button, Enter lets the device fail, no seconds let nothing."""
+        page = self.opened(DESK)
+        page.locator("#f-seconds").focus()
+        page.keyboard.press("Tab")
+        page.keyboard.press("Tab")
+        self.assertEqual(page.evaluate("document.activeElement.textContent"), "Freeze")
+        page.keyboard.press("Enter")
+        page.get_by_role("status").filter(has_text="Freeze: for 15 s, then it heals.").wait_for()
+        self.assertEqual(page.evaluate("document.activeElement.textContent"), "Freeze")
+        page.locator("#f-seconds").fill("")
+        page.locator("#f-seconds").press("Tab")
+        page.keyboard.press("Enter")
+        page.wait_for_timeout(300)
+        self.assertEqual(page.locator("#place-device .fault").count(), 1)
+
+    def test_be_accessible(self) -> None:
+        """On phone, tablet and desk, light and dark, axe finds nothing, and no button is small or cut off."""
+        from axe_playwright_python.sync_playwright import Axe
+
+        for screen in (PHONE, TABLET, DESK):
+            for scheme in ("light", "dark"):
+                page = self.opened(screen, scheme)
+                if screen is PHONE and scheme == "light":
+                    page.get_by_role("button", name="Lose 20 %").tap()
+                page.locator("#place-device .fault").first.wait_for()
+                found = Axe().run(page).response["violations"]
+                self.assertEqual([(each["id"], each["nodes"][0]["html"]) for each in found], [])
+                self.assertLessEqual(page.evaluate("document.documentElement.scrollWidth - innerWidth"), 0)
+                small = page.evaluate(
+                    "[...document.querySelectorAll('.chaos button, #f-seconds')]"
+                    ".filter(e => e.offsetHeight < 44 || e.offsetWidth < 44 || e.scrollWidth > e.clientWidth + 1)"
+                    ".map(e => e.outerHTML)"
+                )
+                self.assertEqual(small, [])
+                self.assertEqual(self.host.faults, [])
+                page.context.close()

@@ -1,0 +1,37 @@
+"""Tests of ``swarmnode.plug`` with real processes: one that freezes itself goes on, one that kills itself is gone."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+from twisted.trial.unittest import SynchronousTestCase
+
+ROOT = Path(__file__).parents[2]
+FREEZE = """
+import time
+from swarmnode.plug import ProcessPlug
+began = time.monotonic()
+ProcessPlug().freeze(0.5)
+print(time.monotonic() - began)
+"""
+KILL = "from swarmnode.plug import ProcessPlug; print('here', flush=True); ProcessPlug().kill(); print('still here')"
+
+
+class PlugTests(SynchronousTestCase):
+    def run_program(self, program: str) -> subprocess.CompletedProcess[str]:
+        """Run it in a process of its own."""
+        return subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=60)
+
+    def test_freeze(self) -> None:
+        """Nothing runs while it is frozen, and it goes on by itself after its seconds."""
+        child = self.run_program(FREEZE)
+        self.assertEqual(child.returncode, 0, child.stderr)
+        self.assertGreater(float(child.stdout), 0.45)
+
+    def test_kill(self) -> None:
+        """It dies by SIGKILL, and says nothing any more."""
+        child = self.run_program(KILL)
+        self.assertEqual((child.returncode, child.stdout), (-signal.SIGKILL, "here\n"))

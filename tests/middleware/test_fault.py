@@ -1,0 +1,65 @@
+"""Tests of ``middleware.fault`` and ``middleware.takeover``: lawful faults, and the clock beside them."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.errors import BadFault
+from middleware.fault import KINDS, Fault, fault_of
+from middleware.presence import EXECUTING, SEARCHING, Device
+from middleware.takeover import WATCHED_S, Takeover, acting
+
+
+class FaultTests(SynchronousTestCase):
+    def test_usual(self) -> None:
+        """Of each kind there is a usual fault, and its own amount is lawful."""
+        for kind, rule in KINDS.items():
+            self.assertEqual(fault_of(kind), Fault(kind, 15.0, rule.amount))
+        self.assertEqual(fault_of("loss", 3, 0.5), Fault("loss", 3.0, 0.5))
+        self.assertEqual(fault_of("kill", None, 0), Fault("kill"))
+
+    def test_unlawful(self) -> None:
+        """What is no fault is refused by the name of the field, whatever comes over the wire."""
+        wrong: list[tuple[tuple[Any, ...], str]] = [
+            (("fly",), "kind"),
+            ((None,), "kind"),
+            (([],), "kind"),
+            (("loss", 0), "seconds"),
+            (("loss", 601), "seconds"),
+            (("loss", "15"), "seconds"),
+            (("loss", math.nan), "seconds"),
+            (("loss", 5, 1.1), "amount"),
+            (("delay", 5, True), "amount"),
+            (("radio", 5, 0.5), "amount"),
+        ]
+        for words, field in wrong:
+            error = self.assertRaises(BadFault, fault_of, *words)
+            self.assertEqual(error.field, field, words)
+            self.assertNotIn("\n", str(error))
+
+
+class TakeoverTests(SynchronousTestCase):
+    def test_time_the_first_other(self) -> None:
+        """The clock stops at the first other device that acts on the same task, and not again."""
+        clock = Takeover("a", "t1", 10.0, 14.0)
+        clock.look({"a": "t1", "b": "t2"}, 10.5)
+        self.assertIsNone(clock.seconds)
+        clock.look({"a": "t1", "b": "t1"}, 11.5)
+        clock.look({"c": "t1"}, 13.0)
+        self.assertEqual((clock.seconds, clock.to), (1.5, "b"))
+
+    def test_end(self) -> None:
+        """It does not run where nothing was acted upon, and no longer than a while after the fault."""
+        self.assertFalse(Takeover("a", "", 10.0, 14.0).is_open(10.1))
+        clock = Takeover("a", "t1", 10.0, 14.0)
+        self.assertTrue(clock.is_open(14.0))
+        clock.look({"b": "t1"}, 14.0 + WATCHED_S)
+        self.assertIsNone(clock.seconds)
+
+    def test_acting(self) -> None:
+        """Who executes a task acts; who searches for it does not."""
+        devices = [Device("a", "dog1", task="t", status=EXECUTING), Device("b", "dog2", task="t", status=SEARCHING)]
+        self.assertEqual(acting(devices), {"a": "t"})

@@ -1,0 +1,135 @@
+"""Tests of ``swarmnode.chaos``, ``havoc`` and ``scenario``: what a person reads who lets devices fail."""
+
+from __future__ import annotations
+
+import io
+import os
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.entangled.control.place import made
+from middleware.errors import BadSetting
+from middleware.fault import Fault
+from swarmnode.chaos import main
+from swarmnode.rehearsal import VirtualTeam
+from swarmnode.scenario import loaded, scenario_of
+from tests.swarmnode.shell import Shell
+
+SCENARIOS = Path(__file__).parents[2] / "examples" / "scenarios"
+
+
+class ChaosTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        # Trial's own folders are deeper than the path of a socket may be.
+        self.folder = Path(tempfile.mkdtemp())
+        self.addCleanup(shutil.rmtree, self.folder)
+        self.patch(os, "environ", {**os.environ, "XDG_RUNTIME_DIR": str(self.folder)})
+
+    def team(self, faults: bool = True) -> None:
+        """A team, and a shell beside its laptop."""
+        made("vaio").touch()
+        self.virtual = VirtualTeam(4, faults=faults)
+        self.addCleanup(self.virtual.stop)
+        self.virtual.clock.advance(2.0)
+        self.shell = Shell(self.virtual, self.virtual.services["vaio"].assembly.node.entangled)
+
+    def chaos(self, line: str) -> tuple[int, str]:
+        """Exit code and output of ``swarm chaos LINE``, on the team's clock."""
+        clock = self.virtual.clock
+
+        def command(words: list[str], out: Any, ask: Any) -> int:
+            return main(words, out, ask, clock.seconds, clock.advance)
+
+        return self.shell.run(command, line.split())
+
+    def test_one_fault(self) -> None:
+        """Who acts is cut off by a word; the line says who took over and after how long, and the exit code is 0."""
+        self.team()
+        self.virtual.desk.assign("turn-around")
+        code, output = self.chaos("executing radio --seconds 4")
+        first, second = output.splitlines()
+        self.assertRegex(first, r"^dog\d: radio for 4 s$")
+        self.assertRegex(second, r"^dog\d: radio, dog\d took over [0-9a-f]{12} after [12]\.\d\d s$")
+        self.assertEqual((code, self.shell.said), (0, ""))
+
+    def test_list(self) -> None:
+        """``list`` has a line for each device with what it can suffer."""
+        self.team()
+        code, output = self.chaos("list")
+        self.assertEqual(code, 0)
+        self.assertIn("dog1        kill, freeze, radio, one-way, delay, loss, skew, battery\n", output)
+
+    def test_not_allowed(self) -> None:
+        """Devices that allow no faults say what to write into their settings."""
+        self.team(faults=False)
+        code, output = self.chaos("dog1 loss")
+        self.assertEqual((code, output), (1, ""))
+        self.assertIn('dog1: it allows no faults; write "allow = true" below [faults]', self.shell.said)
+
+    def test_wrong_words(self) -> None:
+        """A kind, a number and a device that there are not are one line each, which says what to give."""
+        self.team()
+        for line, code, said in (
+            ("dog1 fly", 2, "there is no fault 'fly'; choose one of kill, freeze"),
+            ("dog1 loss --amount 2", 2, "amount: 2.0 is no lawful number; give 0 to 1"),
+            ("cat1 loss", 1, "no device is called cat1 for 60 s; there are vaio, dog1, dog2, dog3"),
+            ("run nowhere.toml", 2, "nowhere.toml: cannot be read"),
+        ):
+            self.assertEqual(self.chaos(line)[0], code, line)
+            self.assertIn(said, self.shell.said)
+
+    def rehearsed(self, name: str, *words: str) -> list[str]:
+        """The lines of a rehearsed scenario, which held."""
+        output = io.StringIO()
+        code = main(["run", str(SCENARIOS / name), "--rehearse", *words], output)
+        self.assertEqual(code, 0, output.getvalue())
+        return output.getvalue().splitlines()
+
+    def test_same_seed_same_run(self) -> None:
+        """Rehearsed twice a scenario gives the same lines and the same digest; another seed gives another run."""
+        first = self.rehearsed("takeover.toml")
+        self.assertEqual(sum("took over" in line for line in first), 2)
+        self.assertEqual(self.rehearsed("takeover.toml"), first)
+        self.assertNotEqual(self.rehearsed("takeover.toml", "--seed", "8")[-1], first[-1])
+
+    def test_bad_day(self) -> None:
+        """With loss and a wrong clock in the team, a mute and a frozen device are still replaced in time."""
+        lines = self.rehearsed("bad-day.toml")
+        self.assertEqual(sum("took over" in line for line in lines), 2)
+
+
+class ScenarioTests(SynchronousTestCase):
+    def test_examples(self) -> None:
+        """Each scenario among the examples is lawful, and its steps are in the order of their time."""
+        files = sorted(SCENARIOS.glob("*.toml"))
+        self.assertGreater(len(files), 1)
+        for file in files:
+            steps = loaded(file).steps
+            self.assertEqual([step.at for step in steps], sorted(step.at for step in steps))
+
+    def test_short(self) -> None:
+        """What is left out is usual: at once, whoever acts, for fifteen seconds."""
+        (step,) = scenario_of({"fault": [{"kind": "radio"}]}, "x").steps
+        self.assertEqual((step.at, step.device, step.fault), (0.0, "executing", Fault("radio")))
+
+    def test_wrong(self) -> None:
+        """What is unlawful is refused by file and key."""
+        wrong: list[tuple[dict[str, Any], str]] = [
+            ({}, "[[fault]]"),
+            ({"fault": []}, "[[fault]]"),
+            ({"fault": [{"kind": "fly"}]}, "[[fault]] 1 kind"),
+            ({"fault": [{"kind": "loss"}, {"kind": "loss", "at": -1}]}, "[[fault]] 2 at"),
+            ({"fault": [{"kind": "loss", "device": 5}]}, "[[fault]] 1 device"),
+            ({"fault": [{"kind": "loss", "amount": 7}]}, "[[fault]] 1 amount"),
+            ({"fault": [{"kind": "loss", "who": "dog1"}]}, "[[fault]] 1 who"),
+            ({"fault": [{"kind": "loss"}], "seed": -1}, "seed"),
+            ({"fault": [{"kind": "loss"}], "task": 5}, "task"),
+            ({"faults": []}, "faults"),
+        ]
+        for content, key in wrong:
+            error = self.assertRaises(BadSetting, scenario_of, content, "day.toml")
+            self.assertEqual((error.file, error.key), ("day.toml", key))

@@ -1,0 +1,133 @@
+"""Tests of ``swarmnode.frailty``: faults on purpose reach a device, change what they say, and heal by themselves."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.fault import ASKED, CAUSE, KINDS, Fault
+from middleware.presence import devices_of
+from middleware.takeover import TARGET_S, Takeover, acting
+from swarmnode.asker import Refusal
+from swarmnode.rehearsal import VirtualTeam
+from swarmnode.rehearsed import RehearsedStage
+
+
+class FrailtyTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.stage = RehearsedStage(3)
+        self.addCleanup(self.stage.stop)
+
+    def named(self, name: str) -> Any:
+        """The device of that name."""
+        return next(device for device in self.stage.devices() if device.name == name)
+
+    def asked(self, name: str) -> dict[str, Any]:
+        """What a device says of its faults."""
+        told: dict[str, Any] = self.stage._called(self.named(name), ASKED)
+        return told
+
+    def turn(self) -> tuple[Any, str]:
+        """Who acts on a task, a moment after it began, and the task."""
+        task = self.stage.assign("turn-around")
+        for _ in range(100):
+            self.stage.wait(0.05)
+            acts = acting(self.stage.devices())
+            if acts:
+                self.stage.wait(0.4)
+                return next(each for each in self.stage.devices() if each.uuid in acts), task
+        self.fail("nobody ever acted")
+
+    def takeover(self, fault: Fault) -> Takeover:
+        """Who acts suffers the fault; the clock when another took over, or when it may not any more."""
+        lost, task = self.turn()
+        self.stage.cause(lost, fault)
+        now = self.stage.seconds()
+        clock = Takeover(lost.uuid, task, now, now + fault.seconds)
+        while clock.is_open(self.stage.seconds()) and not self.stage.is_over(task):
+            self.stage.wait(0.05)
+            clock.look(acting(self.stage.devices()), self.stage.seconds())
+        return clock
+
+    def test_takeover(self) -> None:
+        """Whoever acts and is killed, frozen, cut off, made mute or drained is replaced within two seconds."""
+        for kind in ("kill", "freeze", "radio", "one-way", "battery"):
+            self.assertTrue(KINDS[kind].is_lost)
+            clock = self.takeover(Fault(kind, 4.0, KINDS[kind].amount))
+            assert clock.seconds is not None, kind
+            self.assertLessEqual(clock.seconds, TARGET_S, kind)
+            self.stage.wait(25.0)  # all are back
+            self.assertEqual(len(self.stage.devices()), 4, kind)
+
+    def test_skew_changes_nothing(self) -> None:
+        """Who acts with a clock that is a day wrong ends its task itself; only what it tells people has that time."""
+        clock = self.takeover(Fault("skew", 30.0, 86400.0))
+        self.assertIsNone(clock.seconds)
+        self.stage.wait(1.0)
+        device = next(each for each in self.stage.devices() if each.uuid == clock.lost)
+        self.assertGreater(device.messages[-1][0], 86400.0)
+
+    def test_heal(self) -> None:
+        """A fault ends by itself after its seconds; one that is caused anew goes on for its own; others go on."""
+        dog = self.named("dog1")
+        self.stage.cause(dog, Fault("delay", 2.0, 0.05))
+        self.stage.cause(dog, Fault("loss", 20.0, 0.01))
+        self.stage.wait(1.5)
+        self.stage.cause(dog, Fault("delay", 3.0, 0.1))
+        self.stage.wait(1.0)
+        active = {kind: (left, amount) for kind, left, amount in self.asked("dog1")["active"]}
+        self.assertEqual(active["delay"][1], 0.1)
+        self.assertTrue(1.0 < active["delay"][0] < 2.5, active)
+        self.stage.wait(2.5)
+        self.assertEqual([kind for kind, _, _ in self.asked("dog1")["active"]], ["loss"])
+
+    def test_cut_off_and_back(self) -> None:
+        """A device without radio is missed by the team, and is there again after the fault."""
+        self.stage.cause(self.named("dog2"), Fault("radio", 4.0))
+        self.stage.wait(3.0)
+        self.assertEqual([device.name for device in self.stage.devices()], ["vaio", "dog1", "dog3"])
+        self.stage.wait(5.0)
+        self.assertIn("dog2", [device.name for device in self.stage.devices()])
+
+    def test_battery_of_an_idle_dog(self) -> None:
+        """A drained dog does not bid; it does again when its battery is itself."""
+        for name in ("dog1", "dog2"):
+            self.stage.cause(self.named(name), Fault("battery", 3.0, 0.02))
+        self.stage.wait(0.1)
+        lost, _ = self.turn()
+        self.assertEqual(lost.name, "dog3")
+        self.stage.wait(12.0)
+        for name in ("dog2", "dog3"):
+            self.stage.cause(self.named(name), Fault("battery", 3.0, 0.02))
+        self.stage.wait(0.1)
+        self.assertEqual(self.turn()[0].name, "dog1")
+
+    def test_what_can_be_suffered(self) -> None:
+        """A laptop has no battery that could be drained; a fault that a device cannot suffer is refused in words."""
+        self.assertEqual(self.asked("vaio")["kinds"], [kind for kind in KINDS if kind != "battery"])
+        self.assertEqual(self.asked("dog1")["kinds"], list(KINDS))
+        error = self.assertRaises(Refusal, self.stage.cause, self.named("vaio"), Fault("battery", 5.0, 0.01))
+        self.assertIn("cannot suffer battery; choose one of kill, freeze", str(error))
+        error = self.assertRaises(Refusal, self.stage.cause, self.named("dog1"), Fault("radio", 1e9))
+        self.assertIn("seconds", str(error))
+        error = self.assertRaises(Refusal, self.stage.assign, "fly")
+        self.assertIn("turn-around", str(error))
+
+
+class ForbiddenTests(SynchronousTestCase):
+    def test_nothing_where_not_allowed(self) -> None:
+        """A node whose settings do not allow faults has no such method, and its network is its own."""
+        team = VirtualTeam(3, dogs=("dog1",))
+        self.addCleanup(team.stop)
+        node = team.services["vaio"].assembly.node
+        watch = node.watch_devices(lambda records: None)
+        team.clock.advance(2.0)
+        contact = next(node.contact_of(r) for device, r in devices_of(watch.records) if device.name == "dog1")
+        assert contact is not None
+        work = node.entangled.call(contact, CAUSE, "radio", 5.0, None, changes=True)
+        problems: list[str] = []
+        work.addErrback(lambda failure: problems.append(failure.getErrorMessage()))
+        team.clock.advance(4.0)
+        self.assertEqual(len(problems), 1)
+        self.assertEqual(len(devices_of(watch.records)), 2)

@@ -1,0 +1,168 @@
+"""Tests of ``webnode.mischief`` and its routes: faults that a visitor causes, and the clock beside them."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.fault import KINDS
+from swarmnode.rehearsal import VirtualTeam
+from webnode.app import create_app
+from webnode.board import Board, MemoryChronicle, MemoryFaults, OpenSessions
+from webnode.desk import MemoryDesk
+from webnode.errors import Refusal
+from webnode.mischief import TOLD_S, Mischief, faults
+from webnode.state import state_of
+
+
+class MischiefTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.team = VirtualTeam(4, faults=True)
+        self.addCleanup(self.team.stop)
+        self.node = self.team.services["vaio"].assembly.node
+        self.mischief = Mischief(self.node, self.team.clock.seconds)
+        self.team.clock.advance(2.0)
+
+    def uuid(self, name: str) -> str:
+        """The uuid of a device."""
+        return self.team.services[name].assembly.node.uuid
+
+    def cause(self, uuid: str, kind: str, seconds: float = 4.0, amount: float | None = None) -> Any:
+        """The outcome of an order within two seconds: None, or the refusal."""
+        came: list[Any] = []
+        self.mischief.cause(uuid, kind, seconds, amount).addCallbacks(came.append, lambda f: came.append(f.value))
+        for _ in range(40):
+            if came:
+                break
+            self.team.clock.advance(0.05)
+        return came[0]
+
+    def acting(self) -> str:
+        """The uuid of who acts."""
+        for _ in range(200):
+            self.team.clock.advance(0.05)
+            for device in self.team.state()["devices"]:
+                if device["status"] == "EXECUTING":
+                    return str(device["uuid"])
+        self.fail("nobody ever acted")
+
+    def test_learn_what_can_fail(self) -> None:
+        """Each device is asked what it can suffer; of one that never came nothing is known."""
+        self.assertEqual(list(self.mischief.kinds(self.uuid("dog1"))), list(KINDS))
+        self.assertNotIn("battery", self.mischief.kinds(self.uuid("vaio")))
+        self.assertEqual(list(self.mischief.kinds("00" * 20)), [])
+        self.assertIsNone(self.cause(self.uuid("dog1"), "kill"))
+        self.team.clock.advance(5.0)
+        self.assertEqual(list(self.mischief.kinds(self.uuid("dog1"))), list(KINDS))
+        self.assertEqual(self.cause(self.uuid("dog1"), "loss").problem, "it has left the network")
+        self.team.clock.advance(20.0)
+        self.assertIsNone(self.cause(self.uuid("dog1"), "loss"))
+
+    def test_takeover_clock(self) -> None:
+        """Who acts is cut off: the clock runs, stops when another acts, below two seconds, and names who."""
+        self.team.desk.assign("turn-around")
+        lost = self.acting()
+        self.assertIsNone(self.cause(lost, "radio"))
+        self.team.clock.advance(0.5)
+        (row,) = self.mischief.active()
+        self.assertEqual((row["uuid"], row["kind"], row["takeover_s"], row["watched"]), (lost, "radio", None, True))
+        self.team.clock.advance(2.0)
+        (row,) = self.mischief.active()
+        self.assertLess(float(str(row["takeover_s"])), 2.0)
+        self.assertIn(row["to"], {"dog1", "dog2", "dog3"} - {row["name"]})
+        self.assertTrue(0.0 < float(str(row["left_s"])) < 2.0)
+        self.team.clock.advance(4.0 + TOLD_S)
+        self.assertEqual(self.mischief.active(), [])
+
+    def test_idle_device(self) -> None:
+        """Where the device was at no task, no clock runs."""
+        self.assertIsNone(self.cause(self.uuid("dog2"), "loss", 4.0, 0.3))
+        (row,) = self.mischief.active()
+        self.assertEqual((row["task"], row["watched"], row["amount"]), ("", False, 0.3))
+
+    def test_refuse(self) -> None:
+        """An amount out of bounds is 400, what a device cannot suffer 409, one that is gone 409, a silent one 504."""
+        dog = self.uuid("dog3")
+        for uuid, kind, amount, status, field in (
+            (dog, "loss", 7.0, 400, "amount"),
+            (dog, "radio", 0.5, 400, "amount"),
+            (self.uuid("vaio"), "battery", None, 409, "kind"),
+            ("00" * 20, "loss", None, 409, "device"),
+        ):
+            refusal = self.cause(uuid, kind, 4.0, amount)
+            assert isinstance(refusal, Refusal), kind
+            self.assertEqual((refusal.status, refusal.field), (status, field))
+        self.team.silence("dog3")
+        refusal = self.cause(dog, "loss")
+        self.assertEqual((refusal.status, refusal.problem), (504, "dog3 does not answer"))
+        self.assertEqual(self.mischief.active(), [])
+
+    def test_only_where_allowed(self) -> None:
+        """A web node whose own settings do not allow faults offers none; devices that do not allow them say so."""
+
+        class Bare:
+            settings = self.team.services["vaio"].settings
+
+        self.assertTrue(Bare.settings.faults.allow)
+        plain = VirtualTeam(4, dogs=("dog1",))
+        self.addCleanup(plain.stop)
+        Bare.settings = plain.services["vaio"].settings
+        self.assertIsNone(faults(Bare()))  # type: ignore[arg-type]
+        mischief = Mischief(plain.services["vaio"].assembly.node, plain.clock.seconds)
+        plain.clock.advance(2.0)
+        dog = plain.services["dog1"].assembly.node.uuid
+        self.assertEqual(list(mischief.kinds(dog)), [])
+        refusal = self.failureResultOf(mischief.cause(dog, "kill", 4.0, None), Refusal).value
+        self.assertIn("allow = true", refusal.remedy)
+
+
+class RouteTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.faults: MemoryFaults | None = MemoryFaults("kill", "loss")
+        self.chronicle = MemoryChronicle()
+        self.open(self.faults)
+
+    def open(self, faults: MemoryFaults | None) -> None:
+        """Serve a dog, with these faults."""
+        state = state_of([{"uuid": "01", "name": "dog1", "joined": 1}], [], {}, node="vaio")
+        board = Board(MemoryDesk(), OpenSessions(), chronicle=self.chronicle, faults=faults)
+        app = create_app(lambda: state, board, wall=lambda: 1e9)
+        app.logger.setLevel(logging.CRITICAL + 1)
+        self.client = app.test_client()
+
+    def test_cause_and_tell(self) -> None:
+        """A fault is taken with 202, told to the chronicle, and listed with what can be caused where."""
+        answer = self.client.post("/api/v1/devices/01/faults", json={"kind": "loss", "amount": 0.3})
+        self.assertEqual((answer.status_code, answer.get_json()), (202, {"id": "01", "kind": "loss", "seconds": 15.0}))
+        assert self.faults is not None
+        self.assertEqual(self.faults.caused, [("01", "loss", 15.0, 0.3)])
+        self.assertEqual(self.chronicle.faults, [("01", "loss", 1e9)])
+        told = self.client.get("/api/v1/faults").get_json()
+        self.assertEqual(told["can"], {"01": ["kill", "loss"]})
+        self.assertEqual([kind["kind"] for kind in told["kinds"]], list(KINDS))
+        self.assertEqual([row["kind"] for row in told["active"]], ["loss"])
+
+    def test_refuse(self) -> None:
+        """What is unlawful is refused by its field, and reaches nobody."""
+        for path, body, code, field in (
+            ("01", {}, 400, "kind"),
+            ("01", {"kind": "fly"}, 400, "kind"),
+            ("01", {"kind": "loss", "seconds": 0}, 400, "seconds"),
+            ("01", {"kind": "loss", "seconds": 601}, 400, "seconds"),
+            ("01", {"kind": "loss", "amount": "much"}, 400, "amount"),
+            ("02", {"kind": "loss"}, 404, "device"),
+        ):
+            answer = self.client.post(f"/api/v1/devices/{path}/faults", json=body)
+            self.assertEqual((answer.status_code, answer.get_json()["error"]["field"]), (code, field), body)
+        assert self.faults is not None
+        self.assertEqual(self.faults.caused, [])
+
+    def test_node_without_faults(self) -> None:
+        """A node that causes none lists none, and says what to write into its settings."""
+        self.open(None)
+        self.assertEqual(self.client.get("/api/v1/faults").get_json(), {"kinds": [], "can": {}, "active": []})
+        answer = self.client.post("/api/v1/devices/01/faults", json={"kind": "kill"})
+        self.assertEqual(answer.status_code, 409)
+        self.assertIn("allow = true", answer.get_json()["error"]["remedy"])
