@@ -36,6 +36,10 @@ class ActionPageTests(SynchronousTestCase):
         page.locator(".device").nth(2).wait_for()
         return page
 
+    def look(self, page: Any, view: str) -> None:
+        """Look at another view, which a phone shows alone."""
+        page.evaluate(f"location.hash = {view!r}")
+
     def told(self, page: Any, words: str) -> None:
         """Wait until the page says so."""
         page.locator("#line", has_text=words).wait_for()
@@ -58,11 +62,10 @@ class ActionPageTests(SynchronousTestCase):
         page.get_by_role("button", name="Let it go on").tap()
         self.told(page, "The team goes on.")
         page.locator(".halted").wait_for(state="hidden")
-        for view in ("Tasks", "More", "Devices"):
-            page.get_by_role("link", name=view, exact=True).tap()
-            self.assertEqual(page.locator(".stop").bounding_box(), corner)
-        page.mouse.wheel(0, 400)
+        self.look(page, "tasks")
+        page.locator("#assign").scroll_into_view_if_needed()
         self.assertEqual(page.locator(".stop").bounding_box(), corner)
+        self.look(page, "devices")
         page.locator(".device").first.tap()
         page.locator("dialog[open] .stop").wait_for()
         self.assertEqual(page.locator(".stop").bounding_box(), corner)
@@ -89,7 +92,7 @@ class ActionPageTests(SynchronousTestCase):
     def test_ask_before_assigning(self) -> None:
         """Who could take the chosen task and who not, and why, stands below it before it is assigned."""
         page = self.opened(PHONE)
-        page.get_by_role("link", name="Tasks", exact=True).tap()
+        self.look(page, "tasks")
         page.locator(".preview [data-can=can]", has_text="dog1, dog2 (now: Patrol the yard)").wait_for()
         self.assertIn("dog3: no gripper, no lift", page.locator(".preview").inner_text())
         page.locator("#task").select_option("patrol")
@@ -133,6 +136,7 @@ class ActionPageTests(SynchronousTestCase):
         """A finger on a robot or the target takes it along, and scrolls nothing meanwhile; a tap turns a robot."""
         page = self.opened(PHONE)
         page.locator(".dog .grip").nth(2).wait_for(state="attached")
+        self.look(page, "map")
         page.locator("#map").scroll_into_view_if_needed()
         box = page.locator(".floor").bounding_box()
         touch = page.context.new_cdp_session(page)
@@ -173,8 +177,8 @@ class ActionPageTests(SynchronousTestCase):
         name = page.get_by_label("A line about the device")
         name.fill("lame")
         page.keyboard.press("Enter")
-        answer = page.locator("#place-device .hint")
-        page.locator("#place-device .hint", has_text="The device has taken it").wait_for()
+        answer = page.locator(".settings + .hint")
+        page.locator(".settings + .hint", has_text="The device has taken it").wait_for()
         self.assertEqual(name.input_value(), "lame")
         page.get_by_role("button", name="Save settings").tap()
         self.assertEqual(answer.inner_text(), "Nothing was changed.")
@@ -186,7 +190,7 @@ class ActionPageTests(SynchronousTestCase):
         self.assertFalse(page.get_by_label("How long the others believe").evaluate("e => e.checkValidity()"))
         page.locator("#d-close").tap()
         page.locator(".device").nth(1).tap()
-        page.locator("#place-device .hint", has_text="no settings that can be changed").wait_for()
+        page.locator(".settings + .hint", has_text="no settings that can be changed").wait_for()
         self.assertEqual(self.faults, [])
 
     def test_be_accessible(self) -> None:
