@@ -23,7 +23,8 @@ class Dispatch:
 
     def carry_out(self, route: Route, ask: Ask) -> Deferred[Any]:
         """The answer; one that was given to the same id from the same visitor is given again."""
-        if route.method == "GET":
+        # What a viewer may ask changes nothing, whatever its method.
+        if route.method == "GET" or route.role == "viewer":
             return self._called(route, ask)
         # Whoever has not signed in is nobody in particular: what one was answered is not another's to hear.
         if not ask.id or route.role == "anyone":

@@ -22,8 +22,9 @@ STREAMS = ("/events", "/shot/{uuid}")
 # Whoever asks it is signed out, and so is every question after it.
 SIGNING_OUT = "delete_session"
 CHECKS = ("not_a_server_error", "status_code_conformance", "content_type_conformance", "response_schema_conformance")
-KNOWN = {"uuid": ["01" * 16, "03" * 16, "99"], "task_id": ["t1", "t9"]}
-"""Names of things that are there, and of one that is not: by chance alone none would be found."""
+KNOWN = {"uuid": ["01" * 16, "02" * 16, "99"], "task_id": ["t1", "t9"]}
+"""Names of things that are there, and of one that is not: by chance alone none would be found.  The third dog answers
+nobody, which is told with 504: no fault of the page."""
 LIMIT_S = 170
 
 

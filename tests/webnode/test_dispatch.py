@@ -7,7 +7,7 @@ from typing import Any
 from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
-from webnode.board import Board, OpenSessions, Visitor
+from webnode.board import Board, OpenSessions, Role, Visitor
 from webnode.desk import MemoryDesk
 from webnode.dispatch import REMEMBERED, Dispatch
 from webnode.errors import Refusal
@@ -28,9 +28,14 @@ class DispatchTests(SynchronousTestCase):
         return self.told
 
     def asked(
-        self, id: str = "", method: Any = "POST", who: str = "ann", path: str = "/things/{uuid}"
+        self,
+        id: str = "",
+        method: Any = "POST",
+        who: str = "ann",
+        path: str = "/things/{uuid}",
+        role: Role = "operator",
     ) -> Deferred[Any]:
-        route = Route(method, path, "", "operator", self.answer, status=202)
+        route = Route(method, path, "", role, self.answer, status=202)
         visitor = Visitor(who, "operator", who)
         return self.dispatch.carry_out(route, Ask({"uuid": "01", "x": 5}, visitor, self.board, {}, id, "10.0.0.9"))
 
@@ -69,6 +74,7 @@ class DispatchTests(SynchronousTestCase):
         self.successResultOf(self.asked("a"))
         self.successResultOf(self.asked("a"))
         self.successResultOf(self.asked(method="GET"))
+        self.successResultOf(self.asked(role="viewer"))
         self.told = Refusal("device", "it left", "wait", 409)
         self.failureResultOf(self.asked(), Refusal)
         self.told = Deferred()

@@ -54,7 +54,14 @@ ROUTES = (
         node,
         gives="node, api, name, sign_in, pages (node, url, is_secure, is_self), has",
     ),
-    Route("GET", "/sw.js", "What keeps the page in the browser when its node is gone", "anyone", worker),
+    Route(
+        "GET",
+        "/sw.js",
+        "What keeps the page in the browser when its node is gone",
+        "anyone",
+        worker,
+        gives="text/javascript",
+    ),
     Route(
         "GET", f"{API}/state", "Everything that the page shows", "viewer", state, gives="node, devices, tasks, groups"
     ),
