@@ -176,6 +176,8 @@ class PageTests(SynchronousTestCase):
             beside = ["place-groups"] if name == "tasks" else []
             self.assertEqual(sorted(page.evaluate(shown)), sorted([f"place-{name}", *beside]))
             self.assertEqual(page.locator("#views [aria-current=page]").count(), len(ways) == 1)
+            page.wait_for_timeout(100)
+            self.assertEqual(page.evaluate("scrollY"), 0, name)
         page.go_back()
         page.locator("body[data-view=events]").wait_for()
         page.locator("#views a").nth(2).focus()

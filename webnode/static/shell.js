@@ -81,7 +81,6 @@ function look() {
   }
   if (VIEWS.includes(name)) {
     lookAt(name);
-    // The lists have these names, too, and a browser would go to where they begin.
     if (NARROW.matches) scrollTo(0, 0);
     else at(`place-${name}`)?.scrollIntoView();
   } else if (!name || !document.body.dataset.view) lookAt(VIEWS[0]);
