@@ -90,18 +90,17 @@ class FrailtyTests(SynchronousTestCase):
         self.stage.wait(5.0)
         self.assertIn("dog2", [device.name for device in self.stage.devices()])
 
-    def test_battery_of_an_idle_dog(self) -> None:
-        """A drained dog does not bid; it does again when its battery is itself."""
-        for name in ("dog1", "dog2"):
-            self.stage.cause(self.named(name), Fault("battery", 3.0, 0.02))
+    def test_battery_of_idle_dogs(self) -> None:
+        """Drained dogs do not go, though nobody else is there; one goes when they are charged."""
+        for name in ("dog1", "dog2", "dog3"):
+            self.stage.cause(self.named(name), Fault("battery", 4.0, 0.02))
         self.stage.wait(0.1)
-        lost, _ = self.turn()
-        self.assertEqual(lost.name, "dog3")
-        self.stage.wait(12.0)
-        for name in ("dog2", "dog3"):
-            self.stage.cause(self.named(name), Fault("battery", 3.0, 0.02))
-        self.stage.wait(0.1)
-        self.assertEqual(self.turn()[0].name, "dog1")
+        self.stage.assign("turn-around")
+        for _ in range(30):
+            self.stage.wait(0.1)
+            self.assertEqual(acting(self.stage.devices()), {})
+        self.stage.wait(3.0)
+        self.assertEqual(len(acting(self.stage.devices())), 1)
 
     def test_what_can_be_suffered(self) -> None:
         """A laptop has no battery that could be drained; a fault that a device cannot suffer is refused in words."""
