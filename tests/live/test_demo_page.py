@@ -88,6 +88,11 @@ class DemonstrationPageTests(SynchronousTestCase):
         page.locator(".device").nth(3).wait_for()
         return page
 
+    def look(self, page: Any, view: str) -> None:
+        """Go to a view, as the bar of a phone does."""
+        page.evaluate(f"location.hash = '{view}'")
+        page.locator(f"body[data-view={view}]").wait_for()
+
     def assert_sound(self, page: Any, when: str) -> None:
         """Axe finds nothing, and nothing is wider than the screen or cut off in its own box."""
         from axe_playwright_python.sync_playwright import Axe
@@ -114,11 +119,14 @@ class DemonstrationPageTests(SynchronousTestCase):
         self.assert_sound(page, "idle")
         page.get_by_role("button", name="Run Demo").tap()
         page.locator(".device[data-state=EXECUTING]").first.wait_for(timeout=45_000)
+        self.look(page, "groups")
         page.locator(".point[data-agree=true]").wait_for()
         self.assert_sound(page, "executing")
+        self.look(page, "tasks")
         page.locator("#tasks li", has_text="completed").wait_for(timeout=45_000)
         self.assertIn("Done by dog", page.locator("#tasks li").first.inner_text())
 
+        self.look(page, "devices")
         page.locator(".device", has_text="dog2").tap()
         page.locator("dialog[open]").wait_for()
         self.assertIn("camera", page.locator("#d-capabilities").inner_text())
@@ -134,6 +142,7 @@ class DemonstrationPageTests(SynchronousTestCase):
         self.assert_sound(page, "a dog is gone")
         page.locator(".device[data-state=IDLE]", has_text="dog2").wait_for()
 
+        self.look(page, "map")
         page.get_by_role("button", name="Take away").tap()
         page.locator("#place", has_text="No target").wait_for()
         page.get_by_role("button", name="Place target").tap()
@@ -184,4 +193,5 @@ class DemonstrationPageTests(SynchronousTestCase):
         self.assert_sound(page, "stopped")
         page.get_by_role("button", name="Let it go on").tap()
         page.locator(".halted").wait_for(state="hidden")
+        self.look(page, "tasks")
         page.locator("#tasks li", has_text="completed").first.wait_for(timeout=60_000)

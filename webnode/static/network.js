@@ -64,7 +64,7 @@ export function make(root, { model }) {
     element("p", { class: "hint", id: "network-line", role: "status" }),
     drawn("svg", { id: "graph", viewBox: `0 0 ${SIDE} ${SIDE}`, role: "img", "aria-label": "Who knows whom; the table has the same in numbers" }),
     element("div", { class: "wide", tabindex: 0, role: "region", "aria-label": "Round trips" }, element("table", { id: "ties" })),
-    element("ul", { id: "traffic" }), element("h3", { id: "no-lookups" }), element("ol", { id: "lookups", class: "plain" }));
+    element("ul", { id: "traffic" }), element("h3", { id: "no-lookups" }, "Newest lookups"), element("ol", { id: "lookups", class: "plain" }));
 
   async function turn() {
     clearTimeout(timer);
