@@ -77,8 +77,8 @@ class Agent(Service):
     def _seen(self, seen: Observation) -> None:
         if seen.frame is not None:
             self._node.streams.offer(CAMERA, seen.frame.seq, seen.frame.data)
-        if self._body.is_empty:
-            return  # it would be offered again what it has just given back
+        if self._body.is_empty or not self._node.halt.is_known:
+            return  # what it offered now it could not do at once, and others would count on it
         for engagement in self._having_body():
             if not engagement.is_over:
                 engagement.look(seen)

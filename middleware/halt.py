@@ -63,13 +63,13 @@ class Halt:
         self._entangled = entangled
         self._obeying: list[Callable[[], str]] = []
         self._watch: Watch | None = None
-        self._is_known = True
+        self.is_known = True
         self._is_asking = False
 
     @property
     def is_on(self) -> bool:
         """Whether what acts is to stand: the team is halted, or this node came just now and was not told yet."""
-        return self.word.is_on or not self._is_known
+        return self.word.is_on or not self.is_known
 
     @property
     def records(self) -> list[Record]:
@@ -87,10 +87,10 @@ class Halt:
 
     def learn(self) -> None:
         """Follow the words, and stand until the network has said which one holds; call it again until it has."""
-        if self._entangled is None or self._is_asking or (self._watch is not None and self._is_known):
+        if self._entangled is None or self._is_asking or (self._watch is not None and self.is_known):
             return
         self.follow()
-        self._is_known, self._is_asking = False, True
+        self.is_known, self._is_asking = False, True
         self._entangled.get(HALT).addCallbacks(self._learnt, self._unlearnt)
 
     def take(self, word: Word) -> str:
@@ -156,7 +156,7 @@ class Halt:
             self.take(word)
 
     def _learnt(self, records: list[Record]) -> None:
-        self._is_known, self._is_asking = True, False
+        self.is_known, self._is_asking = True, False
         self.take(word_of(records))
 
     def _unlearnt(self, failure: Any) -> None:

@@ -259,7 +259,10 @@ class Lessee:
     def _wait(self, asked: Round) -> None:
         """Claim when the lease may be free; look again in a third of a ttl at any rate, for a push may be lost."""
         is_outbid = any(reply.kind == OUTBID for reply in asked.replies.values())
-        wait = self._turn() if self._is_freed else asked.free_in() + self._stagger()
+        free_in = asked.free_in()
+        if is_outbid and free_in == math.inf:
+            free_in = 0.0  # the others were not heard; with a higher ballot they are
+        wait = self._turn() if self._is_freed else free_in + self._stagger()
         pause = self._rng.uniform(*(BACK_OFF if is_outbid else JITTER))
         # A healthy holder renews well before: what runs out that soon is claimed in time, without a look before.
         self._only_looks = wait > SOON * self._poll_period()

@@ -310,7 +310,7 @@ class Node:
         self.reached = lambda uuids: ()
         self.council = lambda task: Council()
         self.has_vacancy = lambda task, council: False
-        self.halt = SimpleNamespace(watch=lambda obey: None, learn=lambda: None, is_on=False)
+        self.halt = SimpleNamespace(watch=lambda obey: None, learn=lambda: None, is_on=False, is_known=True)
         self.deployed: Deployed = {}
         self.strategies = Strategies()
         self.groups: dict[str, list[tuple[Any, Any]]] = {}
