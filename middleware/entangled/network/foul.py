@@ -67,20 +67,10 @@ class FoulNetwork:
             self._suffer(self._heard, datagram, source)
 
     def _suffer(self, go_on: Receiver, datagram: bytes, address: Address) -> None:
-        weather, rng = self.weather, self._rng
-        if weather.loss and rng.random() < weather.loss:
-            self.eaten["lost"] += 1
-            return
-        copies = 1
-        if weather.duplicate and rng.random() < weather.duplicate:
-            self.eaten["duplicated"] += 1
-            copies = 2
-        for _ in range(copies):
-            delay = weather.delay_s
-            if weather.jitter_s:
-                delay = max(0.0, delay + rng.uniform(-weather.jitter_s, weather.jitter_s))
-            if weather.reorder and rng.random() < weather.reorder:
-                delay += weather.delay_s + 0.001
+        delays = self.weather.delays(self._rng)
+        if len(delays) != 1:
+            self.eaten["duplicated" if delays else "lost"] += 1
+        for delay in delays:
             self._after(delay, lambda: go_on(datagram, address))
 
     def _after(self, delay: float, act: Callable[[], None]) -> None:

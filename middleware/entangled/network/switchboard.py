@@ -35,6 +35,21 @@ class Weather:
     duplicate: float = 0.0
     reorder: float = 0.0
 
+    def delays(self, rng: random.Random) -> list[float]:
+        """The seconds that each copy of one datagram takes: none where it is lost, two where it is duplicated."""
+        if self.loss and rng.random() < self.loss:
+            return []
+        copies = 2 if self.duplicate and rng.random() < self.duplicate else 1
+        return [self._delay(rng) for _ in range(copies)]
+
+    def _delay(self, rng: random.Random) -> float:
+        delay = self.delay_s
+        if self.jitter_s:
+            delay = max(0.0, delay + rng.uniform(-self.jitter_s, self.jitter_s))
+        if self.reorder and rng.random() < self.reorder:
+            delay += self.delay_s + 0.001
+        return delay
+
 
 CALM = Weather()
 
@@ -160,20 +175,10 @@ class Switchboard:
         if weather is CALM:
             self._clock.callLater(0.0, self._deliver, source, to, datagram)
             return
-        rng = self._rng
-        if weather.loss and rng.random() < weather.loss:
-            self.counters["lost"] += 1
-            return
-        copies = 1
-        if weather.duplicate and rng.random() < weather.duplicate:
-            self.counters["duplicated"] += 1
-            copies = 2
-        for _ in range(copies):
-            delay = weather.delay_s
-            if weather.jitter_s:
-                delay = max(0.0, delay + rng.uniform(-weather.jitter_s, weather.jitter_s))
-            if weather.reorder and rng.random() < weather.reorder:
-                delay += weather.delay_s + 0.001
+        delays = weather.delays(self._rng)
+        if len(delays) != 1:
+            self.counters["duplicated" if delays else "lost"] += 1
+        for delay in delays:
             self._clock.callLater(delay, self._deliver, source, to, datagram)
 
     def _deliver(self, source: Address, to: Address, datagram: bytes) -> None:
