@@ -16,13 +16,14 @@ from webnode.errors import Refusal
 class Desk(Protocol):
     """An operator's wishes; the outcome is seen in the state, not in the answer."""
 
-    def run_demo(self) -> Any:
+    def run_demo(self, task_id: str = "") -> Any:
         """Assign the demonstration's task; returns its id."""
 
-    def assign(self, name: str, tolerates: int = 1, group: str = "") -> Any:
+    def assign(self, name: str, tolerates: int = 1, group: str = "", task_id: str = "") -> Any:
         """Assign a predefined task; ``tolerates`` members of its council may be lost at once.
 
-        Tasks of one ``group`` are divided together.
+        Tasks of one ``group`` are divided together.  ``task_id`` is what its id is to be, else any: one id is one task,
+        wherever in the team it is asked for again.
 
         Returns its id, or ``{"id", "able": [names], "refused": {name: [reasons]}}``.
         """
@@ -81,15 +82,17 @@ class MemoryDesk:
         self.previews: dict[str, dict[str, Any]] = {}
         self.ground: dict[str, Any] | None = dict(yard) if yard is not None else None
 
-    def run_demo(self) -> str:
-        """Return ``demo-N``."""
-        return self._noted("demo")
+    def run_demo(self, task_id: str = "") -> str:
+        """Return ``demo-N``, or the id that it is to have."""
+        noted = self._noted("demo")
+        return task_id or noted
 
-    def assign(self, name: str, tolerates: int = 1, group: str = "") -> dict[str, Any]:
-        """Return ``assign-N``; nobody is able, nobody is refused."""
+    def assign(self, name: str, tolerates: int = 1, group: str = "", task_id: str = "") -> dict[str, Any]:
+        """Return ``assign-N``, or the id that it is to have; nobody is able, nobody is refused."""
         if name not in [task["name"] for task in self.tasks]:
             raise Refusal("name", f"there is no task {name!r}", "choose one of /api/v1/catalogue", 404)
-        return {"id": self._noted("assign", name), "able": [], "refused": {}}
+        noted = self._noted("assign", name)
+        return {"id": task_id or noted, "able": [], "refused": {}}
 
     def preview(self, name: str) -> dict[str, Any]:
         """Return what is in ``previews``, else that nobody is able and nobody refused."""

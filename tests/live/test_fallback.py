@@ -100,6 +100,23 @@ class FallbackTests(SynchronousTestCase):
         self.page.locator("#line", has_text="The demo runs").wait_for()
         self.served("pi")
 
+    def test_new_task_is_asked_for_again(self) -> None:
+        """A task that is asked of a node which is frozen is asked of the other, by the same name for the wish."""
+        self.opened()
+        keys: list[str] = []
+
+        def note(request: Any) -> None:
+            if request.method == "POST" and request.url.endswith("/api/v1/tasks"):
+                keys.append(request.headers["idempotency-key"])
+
+        self.page.on("request", note)
+        os.kill(self.pid(0), signal.SIGSTOP)
+        with self.page.expect_response(f"{self.webs[1].url}api/v1/tasks") as answered:
+            self.page.locator("#assign button").click()
+        self.assertEqual(answered.value.status, 202)
+        self.served("pi")
+        self.assertEqual((len(keys), len(set(keys))), (2, 1))
+
     def test_open_while_the_node_is_gone(self) -> None:
         """Where the browser keeps the page, it opens at the address of a node that is gone, and finds the other."""
         self.opened()

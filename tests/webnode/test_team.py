@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from operator import itemgetter
 from typing import Any
 
 from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
+from agents.catalogue import DEMO, TASKS
+from middleware.tasks import TASKS as ALL_TASKS
 from swarmnode.rehearsal import VirtualTeam
 from webnode.errors import Refusal
-from webnode.team import PATIENCE, PLACING
+from webnode.team import ASKING, PATIENCE, PLACING, TeamDesk
 
 
 class TeamDeskTests(SynchronousTestCase):
@@ -119,3 +123,43 @@ class TeamDeskTests(SynchronousTestCase):
         refusal = self.refusal(self.desk.move_robot("dog2", 1.0, 1.0, 0.5), 0.1)
         self.assertEqual((refusal.field, refusal.status), ("dog2", 409))
         self.assertIn("dog1 stands at", refusal.problem)
+
+
+class RepeatedWishTests(SynchronousTestCase):
+    """One wish, asked of two web nodes."""
+
+    def setUp(self) -> None:
+        self.team = VirtualTeam(3, dogs=("dog1", "dog2"), others=("pi",))
+        self.addCleanup(self.team.stop)
+        self.desk = self.team.desk
+        self.reserve = TeamDesk(self.team.services["pi"].assembly.node, TASKS, DEMO)
+        self.team.clock.advance(1.0)
+
+    def test_wish_that_is_repeated_elsewhere(self) -> None:
+        """What another web node made of the same wish while this one heard nothing is not made again by this one."""
+        wishes: list[Callable[[TeamDesk], Any]] = [
+            lambda desk: desk.assign("find-red-target", 2, "yard", task_id="a1").addCallback(itemgetter("id")),
+            lambda desk: desk.run_demo("b2"),
+        ]
+        owner = self.team.services["vaio"].assembly.node.entangled.contact.public
+        for wish, task_id in zip(wishes, ("a1", "b2"), strict=True):
+            self.team.silence("pi")
+            first = wish(self.desk)
+            self.team.clock.advance(1.0)
+            self.team.board.heal()
+            self.assertNotIn(task_id, [record.name for record in self.reserve.read(ALL_TASKS)])
+            again = wish(self.reserve)
+            self.team.clock.advance(ASKING)
+            self.assertEqual((self.successResultOf(first), self.successResultOf(again)), (task_id, task_id))
+            owners = [record.owner for record in self.desk.read(ALL_TASKS) if record.name == task_id]
+            self.assertEqual(owners, [owner])
+        statuses = sorted(task["status"] for task in self.team.state()["tasks"])
+        self.assertEqual(statuses, ["ASSIGNED", "CANCELLED"])
+
+    def test_wish_that_the_first_node_died_of(self) -> None:
+        """The node that was asked first is dead and had done nothing: the next one does it, soon enough to say so."""
+        self.team.kill("vaio")
+        wish = self.reserve.assign("turn-around", task_id="a1")
+        self.team.clock.advance(ASKING + 0.1)
+        self.assertEqual(self.successResultOf(wish)["id"], "a1")
+        self.assertEqual([r.name for r in self.reserve.read(ALL_TASKS)], ["a1"])

@@ -48,8 +48,8 @@ async function fly(address, options) {
   }
 }
 
-// A node does once what has one id, so that it can be asked again.  Another node knows nothing of that: there only
-// what may be done twice is repeated, which a new task is not.
+// A node does once what has one id, so that it can be asked again; the id of a new task is made of it, so that a task
+// that is asked for again at another node is the same one.
 async function call(method, path, body) {
   const order = method !== "GET";
   const signed = token() ? { Authorization: `Bearer ${token()}` } : {};
@@ -60,12 +60,12 @@ async function call(method, path, body) {
   };
   const end = performance.now() + PATIENCE;
   let answer;
-  for (let asked = here; !answer;) {
+  while (!answer) {
     try {
       answer = await fly(here + API + path, options);
     } catch {
       await Promise.race([find(), pause(Math.max(0, end - performance.now()))]);
-      if (performance.now() >= end || (asked !== here && method === "POST" && path === "tasks")) {
+      if (performance.now() >= end) {
         throw new Error(`The node does not answer. ${order ? "Nothing may have been done; look" : "Look"} at the state, then try again.`);
       }
       await pause(50);
