@@ -34,8 +34,8 @@ from webnode.camera import FrameSource
 from webnode.channel import CappedRequest, limited
 from webnode.errors import PortTaken, Refusal
 from webnode.fallback import urls_at
-from webnode.guard import headers, refusal, token_of
-from webnode.live import Events, Shots
+from webnode.guard import headers, refusal
+from webnode.live import Events, Shots, shown
 from webnode.resource import JsonResource, Refused
 from webnode.route import Route, guarded
 from webnode.routes.table import TABLE
@@ -172,10 +172,8 @@ class Root(Resource):
             return Refused(problem)
         if method == "OPTIONS":
             return _Preflight()
-        ticket: bytes = (request.args or {}).get(b"ticket", [b""])[0]
-        token = token_of(request.getHeader("authorization") or "", ticket.decode("ascii", "replace"))
         try:
-            guarded(role, self._board.sessions.visitor(token, self._wall()))
+            guarded(role, self._board.sessions.visitor(shown(request), self._wall()))
         except Refusal as no:
             return Refused(no)
         return resource
@@ -313,6 +311,7 @@ def web_service(
 ) -> WebService:
     """The whole web node from what the front door has; ``wall`` is the unix time in seconds."""
     app = create_app(read, board, caller(reactor), hosts, wall, table)
-    events = Events(read, reactor, wall, board.desk.yard, board.fallbacks.here, board.chronicle)
+    desk, here = board.desk, board.fallbacks.here
+    events = Events(read, reactor, wall, desk.yard, here, board.chronicle, sessions=board.sessions)
     shots = Shots(frames, reactor)
     return WebService(reactor, host, port, app, events, shots, Files(), board, wall, hosts, doors, table)

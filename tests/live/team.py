@@ -4,7 +4,7 @@
 line; whoever has signed in at one is signed in at the next.  Lines on its input change the team: ``gone NAME``, ``back
 NAME``, ``status NAME STATUS``, ``freeze SECONDS`` (the whole process stands), ``name NAME`` (of the node that serves),
 ``pages NODE=URL ...`` (the web nodes, itself first), ``strange FILE`` (devices and tasks whose words are those of that
-JSON list); it ends when its input does.
+JSON list), ``session SECONDS`` (that one is signed in for at a time); it ends when its input does.
 """
 
 from __future__ import annotations
@@ -249,6 +249,7 @@ class Orders(LineReceiver):
     def __init__(self, team: Team, web: WebService, board: Board, pages: list[Page]) -> None:
         self._team = team
         self._web = web
+        assert isinstance(board.sessions, SignedSessions)
         self._sessions = board.sessions
         self._pages = pages
 
@@ -273,6 +274,8 @@ class Orders(LineReceiver):
             self._pages[:] = [Page(node, url, is_self=place == 0) for place, (node, url) in enumerate(named)]
         elif verb == "freeze":
             time.sleep(float(rest[0]))
+        elif verb == "session":
+            self._sessions.signed_s = float(rest[0])
         elif verb == "strange":
             self._team.be_strange(json.loads(Path(rest[0]).read_text(encoding="utf-8")))
         self.sendLine(line)

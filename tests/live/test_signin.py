@@ -135,3 +135,25 @@ class SigningInTests(SynchronousTestCase):
         page.locator("#signin-code").fill(self.team.code, timeout=15_000)
         page.keyboard.press("Enter")
         self.is_in(page)
+
+    def test_stay_for_days(self) -> None:
+        """A page that is left open has its session renewed before it runs out, again and again, and stays live."""
+        # The page is told an hour before.
+        self.team.order("session 3603")
+        page = self.opened(DESK, f"#code={self.team.code}")
+        self.is_in(page)
+        first = page.evaluate("JSON.parse(localStorage['swarm-session']).token")
+        held = first
+        for _ in range(2):
+            page.wait_for_function("held => JSON.parse(localStorage['swarm-session']).token !== held", arg=held)
+            held = page.evaluate("JSON.parse(localStorage['swarm-session']).token")
+        self.assertNotEqual(page.locator("#link").get_attribute("data-link"), "lost")
+        self.team.order("status dog3 IDLE")
+        page.locator(".device[data-state=IDLE]", has_text="dog3").wait_for()
+        # Signing out ends what was there before as well.
+        page.get_by_role("button", name="Sign out").click()
+        page.locator("#signin-code").wait_for()
+        for token in (first, held):
+            path, headers = f"{self.team.url}api/v1/session", {"Authorization": f"Bearer {token}"}
+            self.assertEqual(page.request.get(path, headers=headers).json()["role"], "anyone")
+        self.assertEqual(self.faults, [])

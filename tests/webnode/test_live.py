@@ -11,11 +11,11 @@ from twisted.trial.unittest import SynchronousTestCase
 from twisted.web.resource import Resource
 
 from tests.webnode.browser import Connection, site_of
-from webnode.board import Entry, MemoryChronicle, Page
+from webnode.board import Entry, MemoryChronicle, OpenSessions, Page, Visitor
 from webnode.camera import MemoryFrames, OnFrame
 from webnode.errors import Refusal
 from webnode.journal import KEPT
-from webnode.live import MAX_VIEWERS, MAX_WAITING, Events, Shots
+from webnode.live import LEAD_S, MAX_VIEWERS, MAX_WAITING, Events, Shots
 
 MORE = "x" * 999
 """What makes a state longer than a few changes."""
@@ -108,6 +108,34 @@ class EventsTests(SynchronousTestCase):
         whole = ("state", {"resync": True, "n": 2, "more": MORE})
         self.assertIn(whole, events_in(self.connected("?since=other-3").taken()))
         watcher.leave()
+
+    def test_end_with_the_session(self) -> None:
+        """A stream is told an hour before its session runs out, once, where that can be put off; then it ends."""
+        whos = {"short": (10.0, 10.0), "long": (LEAD_S + 5.0, 2e9), "open": (2e9, 2e9)}
+
+        class Sessions(OpenSessions):
+            def visitor(self, token: str, now: float) -> Visitor:
+                until, limit = whos[token]
+                is_in = now - 1e9 < until
+                return Visitor("ann", "viewer", "a1", 1e9 + until, 1e9 + limit) if is_in else Visitor()
+
+        wall = lambda: 1e9 + self.clock.seconds()  # noqa: E731
+        self.events = Events(self.read, self.clock, wall, sessions=Sessions())
+        root = Resource()
+        root.putChild(b"events", self.events)
+        self.site = site_of(root, self.clock)
+        pages = {name: self.connected(f"?ticket={name}") for name in whos}
+        self.clock.pump([0.1] * 80)
+        tickets = {
+            name: [data for event, data in events_in(page.taken()) if event == "ticket"] for name, page in pages.items()
+        }
+        self.assertEqual(tickets, {"short": [], "long": [{"until": 1e9 + LEAD_S + 5.0}], "open": []})
+        self.assertEqual(self.events.viewers, 3)
+        self.clock.pump([0.1] * 30)
+        self.assertEqual(self.events.viewers, 2)
+        whos["open"] = (0.0, 0.0)  # signed out
+        self.clock.pump([0.1] * 12)
+        self.assertEqual(self.events.viewers, 1)
 
     def test_tell_pages(self) -> None:
         """A web node that joins the team is told to every page that is open."""
