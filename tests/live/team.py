@@ -4,7 +4,8 @@
 line; whoever has signed in at one is signed in at the next.  Lines on its input change the team: ``gone NAME``, ``back
 NAME``, ``status NAME STATUS``, ``freeze SECONDS`` (the whole process stands), ``name NAME`` (of the node that serves),
 ``pages NODE=URL ...`` (the web nodes, itself first), ``strange FILE`` (devices and tasks whose words are those of that
-JSON list), ``session SECONDS`` (that one is signed in for at a time); it ends when its input does.
+JSON list), ``session SECONDS`` (that one is signed in for at a time), ``place NAME KEY=NUMBER ...`` (where it says that
+it is), ``outdoors`` (without a yard); it ends when its input does.
 """
 
 from __future__ import annotations
@@ -249,8 +250,8 @@ class Orders(LineReceiver):
     def __init__(self, team: Team, web: WebService, board: Board, pages: list[Page]) -> None:
         self._team = team
         self._web = web
-        assert isinstance(board.sessions, SignedSessions)
-        self._sessions = board.sessions
+        assert isinstance(board.sessions, SignedSessions) and isinstance(board.desk, MemoryDesk)
+        self._sessions, self._desk = board.sessions, board.desk
         self._pages = pages
 
     def connectionMade(self) -> None:
@@ -274,6 +275,11 @@ class Orders(LineReceiver):
             self._pages[:] = [Page(node, url, is_self=place == 0) for place, (node, url) in enumerate(named)]
         elif verb == "freeze":
             time.sleep(float(rest[0]))
+        elif verb == "place":
+            numbers = {key: float(number) for key, _, number in (each.partition("=") for each in rest[1:])}
+            next(each for each in self._team.devices if each["name"] == rest[0])["position"] = numbers
+        elif verb == "outdoors":
+            self._desk.ground = None
         elif verb == "session":
             self._sessions.signed_s = float(rest[0])
         elif verb == "strange":
