@@ -31,11 +31,12 @@ class Desk(Protocol):
     def catalogue(self) -> Sequence[Mapping[str, Any]]:
         """The predefined tasks: ``{"name", "title", "requirements"}`` each."""
 
-    def preview(self, name: str) -> Any:
+    def preview(self, name: str, group: str = "") -> Any:
         """Who could take a predefined task, of whom nothing is asked.
 
-        ``{"able": [{"uuid", "name", "busy"}], "refused": {name: [reasons]}, "likely": name | None}``; ``busy`` is the
-        task that a device has now, ``likely`` who would take it by what is known already.
+        ``{"able": [{"uuid", "name", "busy"}], "refused": {name: [reasons]}, "likely": name | None, "together": [{"id",
+        "title"}]}``; ``busy`` is the task that a device has now, ``likely`` who would take it by what is known already,
+        ``together`` the open tasks that it would be divided together with, as one of ``group``.
         """
 
     def cancel(self, task_id: str) -> Any:
@@ -80,6 +81,7 @@ class MemoryDesk:
         self.asked: list[tuple[Any, ...]] = []
         self.tasks = list(catalogue)
         self.previews: dict[str, dict[str, Any]] = {}
+        self.together: dict[str, list[dict[str, Any]]] = {}
         self.ground: dict[str, Any] | None = dict(yard) if yard is not None else None
 
     def run_demo(self, task_id: str = "") -> str:
@@ -94,11 +96,12 @@ class MemoryDesk:
         noted = self._noted("assign", name)
         return {"id": task_id or noted, "able": [], "refused": {}}
 
-    def preview(self, name: str) -> dict[str, Any]:
+    def preview(self, name: str, group: str = "") -> dict[str, Any]:
         """Return what is in ``previews``, else that nobody is able and nobody refused."""
         if name not in [task["name"] for task in self.tasks]:
             raise Refusal("name", f"there is no task {name!r}", "choose one of /api/v1/catalogue", 404)
-        return self.previews.get(name, {"able": [], "refused": {}, "likely": None})
+        told = self.previews.get(name, {"able": [], "refused": {}, "likely": None})
+        return {**told, "together": self.together.get(group, [])}
 
     def catalogue(self) -> list[Mapping[str, Any]]:
         """Return what the desk was made with."""

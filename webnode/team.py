@@ -24,6 +24,7 @@ from webnode.ledger import refused_by
 
 PLACING = 5.0
 """Seconds between Run Demo and the target's appearance: it is placed while the robots search (thesis, section 5)."""
+NEAREST = Task.strategy
 DIVIDED = "group_optimal"
 """The strategy of a task of a group whose catalogue entry says the nearest, which is for one task."""
 PATIENCE = 1.5
@@ -123,19 +124,15 @@ class TeamDesk:
         Those of one ``group`` are divided together.  Where ``task_id`` says what its id is to be, the answer is a
         Deferred, and a task that is there already, made by another web node for the same wish, is not made again.
         """
-        template = self._template(name)
-        if group:
-            strategy = DIVIDED if template.strategy == Task.strategy else template.strategy
-            template = replace(template, group=group, strategy=strategy)
-        template = replace(template, tolerates=tolerates)
+        template = replace(self._template(name, group), tolerates=tolerates)
         if task_id:
             found = self._found(task_id)
             return found.addCallback(lambda task: self._told(task) if task else self._published(template, task_id))
         return self._published(template, self._fresh_id())
 
-    def preview(self, name: str) -> dict[str, Any]:
+    def preview(self, name: str, group: str = "") -> dict[str, Any]:
         """Who could take a predefined task and who not, and why; nothing is asked of anybody."""
-        task = self._template(name)
+        task = self._template(name, group)
         devices = [device for device, _ in devices_of(self._devices.records)]
         refused = refused_by(task, devices)
         titles = {task_id: each.title for task_id, each in tasks_of(self._tasks.records).items()}
@@ -143,7 +140,14 @@ class TeamDesk:
         rows = [
             {"uuid": d.uuid, "name": d.name, "busy": titles.get(d.task, "another task" * bool(d.task))} for d in able
         ]
-        return {"able": rows, "refused": refused, "likely": self._likely(task, [device.uuid for device in able])}
+        likely = self._likely(task, [device.uuid for device in able])
+        # As the agents divide them: those of one group that want the same of a device, by the same strategy.
+        together = [
+            {"id": other.task_id, "title": other.title}
+            for other in self._open_tasks()
+            if group and (other.group, other.strategy, other.requirements) == (group, task.strategy, task.requirements)
+        ]
+        return {"able": rows, "refused": refused, "likely": likely, "together": together}
 
     def cancel(self, task_id: str) -> None:
         """Record that the task is cancelled; whoever is at it stops."""
@@ -260,12 +264,14 @@ class TeamDesk:
         refused = refused_by(task, devices)
         return {"id": task.task_id, "able": [d.name for d in devices if d.name not in refused], "refused": refused}
 
-    def _template(self, name: str) -> Task:
+    def _template(self, name: str, group: str = "") -> Task:
         template = self._predefined.get(name)
         if template is None:
             known = ", ".join(sorted(self._predefined))
             raise Refusal("name", f"there is no predefined task {name!r}", f"choose one of {known}", 404)
-        return template
+        if not group:
+            return template
+        return replace(template, group=group, strategy=DIVIDED if template.strategy == NEAREST else template.strategy)
 
     def _likely(self, task: Task, able: Sequence[str]) -> str | None:
         """Who of ``able`` would be the nearest by what is reported to open tasks of that kind; None: nobody knows."""

@@ -56,6 +56,32 @@ class ActionPageTests(PageCase):
         page.locator("#task").select_option("patrol")
         page.locator(".preview [data-can=nobody]", has_text="No device here can take it").wait_for()
 
+    def test_assign_to_a_group(self) -> None:
+        """By touch and by keyboard a task is put into a group, after its preview has said what it is divided with."""
+        for screen, type_on in ((PHONE, False), (DESK, True)):
+            page = self.opened(screen)
+            self.view(page, "tasks")
+            page.locator(".preview li").first.wait_for()
+            self.assertEqual(page.locator(".preview [data-can=with]").count(), 0)
+            self.assertIn("divided together", page.locator("label[for=group]").inner_text())
+            if type_on:
+                self.tab_to(page, "#group")
+                page.keyboard.type("yard")
+            else:
+                page.locator("#group").tap()
+                page.locator("#group").fill("yard")
+            page.locator("[data-can=with]", has_text="together with: Find and touch the red target.").wait_for()
+            with page.expect_request(lambda asked: asked.method == "POST" and asked.url.endswith("/tasks")) as asked:
+                if type_on:
+                    page.keyboard.press("Enter")
+                else:
+                    page.get_by_role("button", name="Assign").tap()
+            self.assertEqual(asked.value.post_data_json, {"name": "search", "group": "yard"})
+            self.told(page, "Assigned")
+            page.locator("#group").fill("elsewhere")
+            page.locator("[data-can=with]", has_text="nothing yet; it begins the group elsewhere").wait_for()
+            self.sound(page)
+
     def test_lift_a_robot(self) -> None:
         """A robot is dragged elsewhere, moved by the arrow keys and turned by a click or Enter; the target stays."""
         page = self.opened(DESK)

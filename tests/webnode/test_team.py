@@ -89,6 +89,20 @@ class TeamDeskTests(SynchronousTestCase):
         self.assertEqual(self.team.state()["tasks"], [])
         self.assertEqual(self.assertRaises(Refusal, self.desk.preview, "fly").status, 404)
 
+    def test_preview_of_a_group(self) -> None:
+        """A task of a group would be divided with the open ones of it that want the same, and with no others."""
+        wishes = [("turn-around", "yard"), ("find-red-target", "yard"), ("turn-around", "attic"), ("turn-around", "")]
+        ids = [self.desk.assign(name, group=group)["id"] for name, group in wishes]
+        self.team.clock.advance(1.0)
+        first = self.team.state()["tasks"]
+        title = next(row["title"] for row in first if row["id"] == ids[0])
+        self.assertEqual(self.desk.preview("turn-around", "yard")["together"], [{"id": ids[0], "title": title}])
+        self.assertEqual(self.desk.preview("turn-around", "cellar")["together"], [])
+        self.assertEqual(self.desk.preview("turn-around")["together"], [])
+        self.desk.cancel(ids[0])
+        self.team.clock.advance(1.0)
+        self.assertEqual(self.desk.preview("turn-around", "yard")["together"], [])
+
     def test_preview_by_what_is_reported(self) -> None:
         """While the same task is under way, its reports say who is busy with it and who is the nearest."""
         self.team.run_demo()

@@ -56,7 +56,7 @@ def _named(answer: Any) -> Json:
 
 def preview(ask: Ask) -> Any:
     """Who could take one."""
-    return ask.board.desk.preview(ask.given["name"])
+    return ask.board.desk.preview(ask.given["name"], ask.given["group"])
 
 
 def _order(wish: Callable[[Ask], Callable[[str], Any]]) -> Answer:
@@ -71,6 +71,7 @@ def _order(wish: Callable[[Ask], Callable[[str], Any]]) -> Answer:
 
 
 NAME = Field("name", "text", "its name in the catalogue", most=64)
+GROUP = Field("group", "text", "tasks of one group are divided together", most=64, default="", is_required=False)
 ROUTES = (
     Route("GET", f"{API}/tasks", "The tasks, the newest first", "viewer", tasks, gives="a list of tasks"),
     Route(
@@ -107,7 +108,7 @@ ROUTES = (
                 default=1,
                 is_required=False,
             ),
-            Field("group", "text", "tasks of one group are divided together", most=64, default="", is_required=False),
+            GROUP,
         ),
         gives="id, able, refused (why, by name)",
         status=202,
@@ -118,8 +119,9 @@ ROUTES = (
         "Who could take a predefined task and who not, and why; nothing is assigned",
         "viewer",
         preview,
-        (NAME,),
-        gives="able (uuid, name, busy: its task now), refused (why, by name), likely (a name, or null)",
+        (NAME, GROUP),
+        gives="able (uuid, name, busy: its task now), refused (why, by name), likely (a name, or null), "
+        "together (id, title: what the group divides it with)",
     ),
     Route(
         "POST",
