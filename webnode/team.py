@@ -19,6 +19,7 @@ from middleware.order import PAUSE, RESUME, Order
 from middleware.presence import DEVICES, Device, devices_of
 from middleware.tasks import CANCELLED, TASKS, Result, Task, group_key, member_of, outcome_of, tasks_of
 from middleware.verdict import verdicts_key
+from webnode.camera import OnFrame
 from webnode.errors import Refusal
 from webnode.ledger import refused_by
 
@@ -88,7 +89,7 @@ class TeamDesk:
         watches = (*self._groups.values(), *self._reasons.values())
         return next((watch.records for watch in watches if watch.key == key), [])
 
-    def watch(self, uuid: str, on_frame: Callable[[int, bytes], None]) -> Callable[[], None]:
+    def watch(self, uuid: str, on_frame: OnFrame) -> Callable[[], None]:
         """Look through the camera of the device ``uuid`` until what is returned is called."""
         record = self._record_of(uuid)
         contact = None if record is None else self._node.contact_of(record)

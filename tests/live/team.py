@@ -211,7 +211,7 @@ class Team:
             picture = np.full((160, 208, 3), (205, 214, 220), np.uint8)
             picture[70:] = HUES[f"dog{1 + (number - 1) % 3}"]
             cv2.circle(picture, ((seq * 3 + 60 * number) % 240 - 16, 96), 8 + 6 * number, (44, 52, 212), -1)
-            on_frame(seq, cv2.imencode(".jpg", picture)[1].tobytes())
+            on_frame(seq, cv2.imencode(".jpg", picture)[1].tobytes(), 0.0)
             reactor.callLater(1 / 15, shoot)
 
         def stop() -> None:

@@ -293,11 +293,11 @@ class ShotsTests(SynchronousTestCase):
         """Who is behind gets the newest picture at once, never those between, and how old it is."""
         self.asked()
         for seq in (1, 2, 3):
-            self.frames.show("ab", seq, JPEG + b"%d" % seq)
+            self.frames.show("ab", seq, JPEG + b"%d" % seq, 0.5)
         self.clock.advance(0.25)
         data = self.asked("1").taken()
         self.assertIn(b"X-Seq: 3", data)
-        self.assertIn(b"X-Age: 0.250", data)
+        self.assertIn(b"X-Age: 0.750", data)
         self.assertEqual(self.asked("3").taken(), b"")
 
     def test_take_a_lower_number_for_new(self) -> None:
@@ -319,7 +319,7 @@ class ShotsTests(SynchronousTestCase):
         self.asked()
         self.clock.advance(5)
         page = self.asked()
-        self.frames.watched["ab"](1, JPEG)
+        self.frames.watched["ab"](1, JPEG, 0.0)
         self.assertIn(b" 200 ", page.taken())
         self.assertEqual(self.frames.opened, 2)
 
@@ -388,7 +388,7 @@ class ShotsTests(SynchronousTestCase):
         self.asked()
         late = self.frames.watched["ab"]
         self.shots.close()
-        late(1, JPEG)
+        late(1, JPEG, 0.0)
         self.assertEqual((self.clock.getDelayedCalls(), self.shots.watched), ([], []))
 
     def test_close(self) -> None:

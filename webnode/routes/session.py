@@ -72,7 +72,7 @@ ROUTES = (
         "PUT",
         f"{API}/session",
         "Go on being signed in: another token for the session of the one that is sent, which stays good for its time",
-        "anyone",
+        "viewer",
         renew,
         gives="token, ticket, role, until (unix seconds)",
     ),
