@@ -224,12 +224,14 @@ class SwarmNode(Service):
 
         Raises ``UnknownStrategy`` where there is no strategy of the name that it gives.
         """
+        from middleware.commitment.vacancy import odd
+
         if not is_deployed(task.strategy):  # those are the business of the nodes that have them
             place_of(task.strategy)
         key = group_key(task.task_id)
         nearest = await self.entangled.find_node(key)
-        council = closest([*nearest, self.entangled.contact], key, self._seats(task))
-        task = replace(task, council=tuple(council))
+        council = odd(closest([*nearest, self.entangled.contact], key, self._seats(task)))
+        task = replace(task, council=council)
         await self.entangled.put(TASKS, task.task_id, task.packed(), "team")
         return task
 
