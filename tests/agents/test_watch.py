@@ -13,7 +13,7 @@ from twisted.trial.unittest import SynchronousTestCase
 import agents
 from agents.context import Context
 from agents.watch import FRESH, MEMORY, SETTLE, WatchTarget
-from drivers.reading import Observation, Value
+from drivers.reading import Action, Observation, Value
 from tests.agents.test_search import Walk
 
 TICK = 0.1
@@ -130,9 +130,13 @@ class DogTests(SynchronousTestCase):
         assert cost is not None
         self.assertLess(abs(cost - walk.distance()), 0.15)
         before = walk.distance()
-        ticks = 0
-        while walk.live(lambda now: watch.execute(Context(now, is_resumed=ticks > 0))) is not None:
-            ticks += 1
-            self.assertLess(ticks, 60)
+        contexts = [Context(0.0, is_resumed=False)]
+
+        def execute(now: float) -> Action | None:
+            contexts.append(Context(now, is_resumed=len(contexts) > 1))
+            return watch.execute(contexts[-1])
+
+        while walk.live(execute) is not None:
+            self.assertLess(len(contexts), 60)
         self.assertLess(abs(walk.distance() - before), 0.05)
         self.assertGreater(walk.now, 3.0)
