@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import threading
@@ -20,6 +21,7 @@ from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
+from benchmarks.demo import family
 from tests.live.test_page import CHROMIUM, DESK, FLAGS, MISSING, PHONE, TABLET, Team
 
 FAKE = ("--use-fake-device-for-media-stream", "--use-fake-ui-for-media-stream")
@@ -202,12 +204,13 @@ class DemonstrationPhoneTests(Browser):
 
     def setUp(self) -> None:
         log, run_dir = Path(self.mktemp()), Path(self.mktemp()).absolute()
-        command = [sys.executable, "-m", "sim.demo", "--run-dir", str(run_dir)]
+        command = [sys.executable, "-m", "sim.demo", "--run-dir", str(run_dir), "--web-port", "0"]
         with log.open("w", encoding="utf-8") as errors:
             root = Path(__file__).parents[2]
             demo = subprocess.Popen(command, cwd=root, stdout=subprocess.PIPE, stderr=errors, text=True)
         self.addCleanup(demo.wait, 20)
         self.addCleanup(demo.terminate)
+        self.pid = demo.pid
         assert demo.stdout is not None
         scheme = os.environ.get("PHONE_SCHEME", "http")
         for line in demo.stdout:
@@ -258,8 +261,8 @@ class DemonstrationPhoneTests(Browser):
                 error.close()
         self.fail("there is no place for the target")
 
-    def test_wins_and_is_taken_over(self) -> None:
-        """One tap joins; the phone sees the target, bids, wins and shows it all; its tab closes, and a dog goes on."""
+    def joined(self) -> Any:
+        """The page of a phone that takes part as anna, with the target before its camera."""
         invitation = self.api("invitations", {"role": "phone", "name": "visitor"})["token"]
         page = self.page(self.browser(), f"{self.url}#code={invitation}")
         page.evaluate("location.hash = 'phone'")
@@ -268,6 +271,11 @@ class DemonstrationPhoneTests(Browser):
         page.get_by_role("button", name="Take part", exact=True).tap()
         page.locator(".phone", has_text="Target at about 0.2").wait_for()
         self.until(lambda: "anna" in self.devices(), 10.0, page)
+        return page
+
+    def test_wins_and_is_taken_over(self) -> None:
+        """One tap joins; the phone sees the target, bids, wins and shows it all; its tab closes, and a dog goes on."""
+        page = self.joined()
         anna = self.devices()["anna"]
         self.assertEqual((anna["kind"], "camera" in anna["capabilities"]), ("phone", True))
         self.assertNotIn("base2d", anna["capabilities"])
@@ -301,4 +309,22 @@ class DemonstrationPhoneTests(Browser):
         )
         self.assertLess(took, TAKEOVER_S * stretch())
         self.assertNotIn("EXECUTING", [self.statuses().get("anna", "GONE")])
+        self.assertEqual(self.faults, [])
+
+    def test_go_on_at_another_web_node(self) -> None:
+        """The web node dies with its phones in it: the phone goes on through the other as the same device, and wins."""
+        page = self.joined()
+        page.locator("#reserve", has_text="pi").wait_for()
+        before = self.devices()["anna"]
+        os.kill(next(pid for pid, name in family(self.pid).items() if name == "vaio"), signal.SIGKILL)
+        page.locator("#node", has_text="pi").wait_for()
+        self.url = page.evaluate("import('/static/link.js').then(({ base }) => base())") + "/"
+        self.until(lambda: self.devices().get("anna", before)["address"] != before["address"], 15.0 * stretch(), page)
+        page.locator(".phone .said", has_text="Nothing to do").wait_for()
+        after = self.devices()["anna"]
+        self.assertEqual((after["uuid"], after["joined"]), (before["uuid"], before["joined"]))
+        self.assertIsNone(after["gone"])
+        self.place_target()
+        self.api("tasks", {"name": "watch-target"})
+        page.locator(".phone .said", has_text="You have the task").wait_for(timeout=60_000)
         self.assertEqual(self.faults, [])

@@ -54,7 +54,7 @@ function seen(sight) {
   return `Target at about ${sight.distance.toFixed(2)} m${side}.`;
 }
 
-export function make(root, { model }) {
+export function make(root, { model, go }) {
   const phone = kept();
   let eye = null;
   let ticket = null;
@@ -68,10 +68,11 @@ export function make(root, { model }) {
   const name = element("input", { id: "phone-name", maxlength: 40, autocomplete: "off", required: "" });
   const place = element("input", { id: "phone-place", type: "checkbox" });
   const start = element("button", { class: "primary" }, "Take part");
+  const no = element("button", { type: "button" }, "Not now");
   const form = element("form", {},
     element("p", {}, "Your phone becomes a device of the team. It sees with its camera, bids for tasks that need no legs, and is asked to point at things."),
     element("label", { for: "phone-name" }, "What it is called"), name,
-    element("label", { class: "choice", for: "phone-place" }, place, " Tell the team where it is"), start,
+    element("label", { class: "choice", for: "phone-place" }, place, " Tell the team where it is"), element("div", { class: "row" }, start, no),
     element("p", { class: "hint" }, "Pictures go to the team while this page is in sight, and are kept by nobody."));
   const canvas = element("canvas", { width: 208, height: 156, role: "img", "aria-label": "What this phone shows the team" });
   const ring = drawn("rect", { rx: 3 });
@@ -191,6 +192,7 @@ export function make(root, { model }) {
     keep(phone);
     begin();
   });
+  no.addEventListener("click", () => go(""));
   stop.addEventListener("click", () => leave("off", "This phone takes no part any more."));
   // A page that nobody sees has no camera worth the name: it leaves, and comes back by itself.
   const hidden = () => {
