@@ -27,7 +27,7 @@ from tests.live.test_page import CHROMIUM, DESK, FLAGS, MISSING, PHONE, TABLET, 
 FAKE = ("--use-fake-device-for-media-stream", "--use-fake-ui-for-media-stream")
 MORE = tuple(os.environ.get("PHONE_FLAGS", "").split())
 TAKEOVER_S = 2.0
-PLACES = ((0.3, 2.1), (2.7, 2.1), (1.5, 2.1), (0.3, 0.3), (2.7, 0.3))
+PLACES = ((0.3, 2.1), (2.7, 2.1), (0.3, 0.3), (2.7, 0.3))
 SIGHTS = """async (pictures) => {
   const { sighted } = await import("/static/sight.js");
   const found = [];
