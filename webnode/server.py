@@ -176,9 +176,12 @@ class Root(Resource):
         ticket: bytes = (request.args or {}).get(b"ticket", [b""])[0]
         token = token_of(request.getHeader("authorization") or "", ticket.decode("ascii", "replace"))
         try:
-            guarded(role, self._board.sessions.visitor(token, self._wall()))
+            who = self._board.sessions.visitor(token, self._wall())
+            guarded(role, who)
         except Refusal as no:
             return Refused(no)
+        if isinstance(request, CappedRequest):
+            request.who = who
         return resource
 
 

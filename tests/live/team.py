@@ -33,6 +33,7 @@ from webnode.board import (
     MemoryFallbacks,
     MemoryFaults,
     MemoryHalts,
+    MemoryPhones,
     MemorySurvey,
     MemoryTuning,
     Page,
@@ -292,7 +293,7 @@ def board(team: Team) -> Board:
     tuning = MemoryTuning({able[0]["uuid"]: KNOBS})
     survey = MemorySurvey(network(), {f"0{n}" * 16: inventory() for n in (1, 2)})
     parts: dict[str, Any] = {"halts": team.halts, "tuning": tuning, "survey": survey, "chronicle": TeamChronicle()}
-    parts["faults"] = MemoryFaults(*KINDS)
+    parts["faults"], parts["phones"] = MemoryFaults(*KINDS), MemoryPhones()
     return Board(desk, sessions, MemoryAudit(time.time), limits=AddressLimits(), **parts)
 
 

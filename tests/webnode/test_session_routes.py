@@ -91,5 +91,5 @@ class SessionRouteTests(SynchronousTestCase):
             self.client.get("/api/v1/session", headers=viewer).get_json(), {"name": "Ada", "role": "viewer"}
         )
         self.assertEqual(self.client.post("/api/v1/invitations", json=body, headers=viewer).status_code, 403)
-        for wrong in ({"role": "phone"}, {"role": "viewer", "seconds": 0}, {}):
+        for wrong in ({"role": "anyone"}, {"role": "viewer", "seconds": 0}, {}):
             self.assertEqual(self.client.post("/api/v1/invitations", json=wrong, headers=bearer).status_code, 400)

@@ -68,7 +68,7 @@ ROUTES = (
         "operator",
         invite,
         (
-            Field("role", "choice", "what it lets do", choices=("viewer", "operator")),
+            Field("role", "choice", "what it lets do", choices=("viewer", "phone", "operator")),
             Field("name", "text", "who it is for", most=40, is_required=False, default="guest"),
             Field(
                 "seconds",
