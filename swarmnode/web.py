@@ -118,6 +118,7 @@ def web_page(settings: Settings, seams: Seams, reactor: Any, node: SwarmNode) ->
         board.fallbacks.here,
         board.chronicle,
         lambda: (desk.version, board.halts is not None and board.halts.is_halted()),
+        board.sessions,
     )
     shots, address = Shots(desk, reactor), settings.web
     web = WebService(

@@ -8,6 +8,7 @@ any.
 
 from __future__ import annotations
 
+import math
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -26,11 +27,18 @@ AUDITED = 200
 
 @dataclass(frozen=True)
 class Visitor:
-    """Who asks; ``token_id`` names what it signed in with, and is no secret."""
+    """Who asks; ``token_id`` names what it signed in with, and is no secret.
+
+    It is let in ``until`` then (unix seconds), which it may have put off, no further than to ``limit``, unless it shows
+    a ticket.
+    """
 
     name: str = ""
     role: Role = "anyone"
     token_id: str = ""
+    until: float = math.inf
+    limit: float = math.inf
+    is_ticket: bool = False
 
 
 @dataclass(frozen=True)
@@ -62,8 +70,11 @@ class Sessions(Protocol):
     def token(self, name: str, role: Role, now: float, seconds: float) -> Token:
         """A token for somebody who need not sign in."""
 
-    def revoke(self, token_id: str) -> None:
-        """Let in nobody with this token any more."""
+    def renewed(self, who: Visitor, now: float) -> Token:
+        """Another token for the same session, good for longer; raises ``Refusal`` 401 for anyone and for a ticket."""
+
+    def revoke(self, token_id: str, until: float = math.inf) -> None:
+        """Let in nobody with this token any more, nor with one that was made of it; it runs out ``until`` then."""
 
 
 class OpenSessions:
@@ -83,7 +94,11 @@ class OpenSessions:
         """Return one that says nothing."""
         return Token("open", "open", role, now + seconds)
 
-    def revoke(self, token_id: str) -> None:
+    def renewed(self, who: Visitor, now: float) -> Token:
+        """Return one that says nothing."""
+        return self.token(who.name, who.role, now, 86400.0)
+
+    def revoke(self, token_id: str, until: float = math.inf) -> None:
         """Do nothing."""
 
 

@@ -35,8 +35,8 @@ from webnode.camera import FrameSource
 from webnode.channel import CappedRequest, limited
 from webnode.errors import PortTaken, Refusal
 from webnode.fallback import urls_at
-from webnode.guard import headers, refusal, token_of
-from webnode.live import Events, Shots
+from webnode.guard import headers, refusal
+from webnode.live import Events, Shots, shown
 from webnode.resource import JsonResource, Refused
 from webnode.route import Route, guarded
 from webnode.routes.table import TABLE
@@ -173,10 +173,8 @@ class Root(Resource):
             return Refused(problem)
         if method == "OPTIONS":
             return _Preflight()
-        ticket: bytes = (request.args or {}).get(b"ticket", [b""])[0]
-        token = token_of(request.getHeader("authorization") or "", ticket.decode("ascii", "replace"))
         try:
-            who = self._board.sessions.visitor(token, self._wall())
+            who = self._board.sessions.visitor(shown(request), self._wall())
             guarded(role, who)
         except Refusal as no:
             return Refused(no)
@@ -318,6 +316,7 @@ def web_service(
 ) -> WebService:
     """The whole web node from what the front door has; ``wall`` is the unix time in seconds."""
     app = create_app(read, board, caller(reactor), hosts, wall, table)
-    events = Events(read, reactor, wall, board.desk.yard, board.fallbacks.here, board.chronicle)
+    desk, here = board.desk, board.fallbacks.here
+    events = Events(read, reactor, wall, desk.yard, here, board.chronicle, sessions=board.sessions)
     shots = Shots(frames, reactor)
     return WebService(reactor, host, port, app, events, shots, Files(), board, wall, hosts, doors, table)

@@ -4,7 +4,8 @@
 line; whoever has signed in at one is signed in at the next.  Lines on its input change the team: ``gone NAME``, ``back
 NAME``, ``status NAME STATUS``, ``freeze SECONDS`` (the whole process stands), ``name NAME`` (of the node that serves),
 ``pages NODE=URL ...`` (the web nodes, itself first), ``strange FILE`` (devices and tasks whose words are those of that
-JSON list); it ends when its input does.
+JSON list), ``session SECONDS`` (that one is signed in for at a time), ``place NAME KEY=NUMBER ...`` (where it says that
+it is), ``outdoors`` (without a yard); it ends when its input does.
 """
 
 from __future__ import annotations
@@ -211,7 +212,7 @@ class Team:
             picture = np.full((160, 208, 3), (205, 214, 220), np.uint8)
             picture[70:] = HUES[f"dog{1 + (number - 1) % 3}"]
             cv2.circle(picture, ((seq * 3 + 60 * number) % 240 - 16, 96), 8 + 6 * number, (44, 52, 212), -1)
-            on_frame(seq, cv2.imencode(".jpg", picture)[1].tobytes())
+            on_frame(seq, cv2.imencode(".jpg", picture)[1].tobytes(), 0.0)
             reactor.callLater(1 / 15, shoot)
 
         def stop() -> None:
@@ -250,7 +251,8 @@ class Orders(LineReceiver):
     def __init__(self, team: Team, web: WebService, board: Board, pages: list[Page]) -> None:
         self._team = team
         self._web = web
-        self._sessions = board.sessions
+        assert isinstance(board.sessions, SignedSessions) and isinstance(board.desk, MemoryDesk)
+        self._sessions, self._desk = board.sessions, board.desk
         self._pages = pages
 
     def connectionMade(self) -> None:
@@ -274,6 +276,13 @@ class Orders(LineReceiver):
             self._pages[:] = [Page(node, url, is_self=place == 0) for place, (node, url) in enumerate(named)]
         elif verb == "freeze":
             time.sleep(float(rest[0]))
+        elif verb == "place":
+            numbers = {key: float(number) for key, _, number in (each.partition("=") for each in rest[1:])}
+            next(each for each in self._team.devices if each["name"] == rest[0])["position"] = numbers
+        elif verb == "outdoors":
+            self._desk.ground = None
+        elif verb == "session":
+            self._sessions.signed_s = float(rest[0])
         elif verb == "strange":
             self._team.be_strange(json.loads(Path(rest[0]).read_text(encoding="utf-8")))
         self.sendLine(line)
@@ -289,6 +298,7 @@ def board(team: Team) -> Board:
     desk = MemoryDesk(CATALOGUE, YARD)
     able = [{"uuid": f"{n:02x}" * 16, "name": f"dog{n}", "busy": "Patrol the yard" * (n == 2)} for n in (1, 2)]
     desk.previews["search"] = {"able": able, "refused": {"dog3": ["no gripper", "no lift"]}, "likely": None}
+    desk.together["yard"] = [{"id": "t1", "title": "Find and touch the red target"}]
     sessions = SignedSessions(b"a team of the tests", "quiet-otter", PASSWORD, random.Random(), checked)
     tuning = MemoryTuning({able[0]["uuid"]: KNOBS})
     survey = MemorySurvey(network(), {f"0{n}" * 16: inventory() for n in (1, 2)})

@@ -75,3 +75,6 @@ export function span(seconds) {
   if (s < 3600) return `${Math.floor(s / 60)} min`;
   return s < 86400 ? `${Math.floor(s / 3600)} h` : `${Math.floor(s / 86400)} d`;
 }
+
+// How long a device is here, or gone.
+export const sojourn = ({ gone, since }, now) => (gone === null ? `here ${span(now - since)}` : `gone ${span(now - gone)}`);

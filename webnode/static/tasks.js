@@ -14,7 +14,7 @@ function showTasks(tasks) {
     words(item.querySelector("b"), task.title);
     state(item.querySelector(".badge"), task.status);
     const result = task.result ? `Done by ${task.result.by} in ${task.result.took.toFixed(1)} s. ` : "";
-    words(item.querySelector(".note"), result + task.note);
+    words(item.querySelector(".note"), (task.group && `Group ${task.group}. `) + result + task.note);
     why(item.querySelector(".why"), task.why);
     const [button, rest] = item.querySelectorAll("button");
     button.hidden = rest.hidden = ENDED.includes(task.status);
@@ -82,7 +82,8 @@ function startTasks() {
   at("assign").addEventListener("submit", (event) => {
     event.preventDefault();
     if (!at("task").value) return say("There is no predefined task to assign.");
-    wish("Assigning", "tasks", { body: { name: at("task").value }, done: outcome });
+    const group = at("group").value.trim();
+    wish("Assigning", "tasks", { body: { name: at("task").value, ...(group && { group }) }, done: outcome });
   });
   at("demo").addEventListener("click", async () => {
     at("demo").disabled = true;
