@@ -29,6 +29,8 @@ from webnode.state import State
 
 BEAT_S = 0.2
 PACE_S = 0.1
+SPARED = 4
+"""Of a team of thousands the state takes long to make: it is made again after so many times as long at the earliest."""
 CHECK_S = 1.0
 """How often it is looked whether who hears a stream is still signed in."""
 LEAD_S = 3600.0
@@ -120,6 +122,7 @@ class Events(JsonResource):
         self._checked_at = 0.0
         self._known: object = None
         self._read_at = -IDLE_S
+        self._took = 0.0
         self._journal = Journal(f"{int(1000 * wall()):x}")
         self._whole = (0, "")
         self._viewers: list[Viewer] = []
@@ -211,13 +214,17 @@ class Events(JsonResource):
 
     def _look(self) -> None:
         """Take the state, where it may have changed."""
-        now, version = self._clock.seconds(), None if self._version is None else self._version()
+        now = self._clock.seconds()
+        if now - self._read_at < SPARED * self._took:
+            return
+        version = None if self._version is None else self._version()
         if version is not None and version == self._known and now - self._read_at < IDLE_S:
             return
         self._known, self._read_at = version, now
         with_state = self._sound("state", lambda: self._journal.take(self._read()))
         if with_state:
             self._chronicle.saw(self._journal.state, self._wall())
+        self._took = self._clock.seconds() - now
 
     def _missed(self, viewer: Viewer, is_again: bool) -> str:
         """What a viewer was not told of the state, as changes or whole, whichever is less, and of the chronicle."""

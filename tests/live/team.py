@@ -5,7 +5,8 @@ line; whoever has signed in at one is signed in at the next.  Lines on its input
 NAME``, ``status NAME STATUS``, ``freeze SECONDS`` (the whole process stands), ``name NAME`` (of the node that serves),
 ``pages NODE=URL ...`` (the web nodes, itself first), ``strange FILE`` (devices and tasks whose words are those of that
 JSON list), ``session SECONDS`` (that one is signed in for at a time), ``place NAME KEY=NUMBER ...`` (where it says that
-it is), ``outdoors`` (without a yard); it ends when its input does.
+it is), ``outdoors`` (without a yard), ``crowd COUNT`` (so many devices, three of them with cameras); it ends when its
+input does.
 """
 
 from __future__ import annotations
@@ -125,6 +126,8 @@ class Team:
         self.node = "vaio"
         self.halts = MemoryHalts(*(f"{n:02x}" * 16 for n in (1, 2, 3)))
         self.batch = 0
+        self.version = 0
+        self._made: tuple[object, State] = (None, {})
         self._departed = Departed()
         self.tasks = [
             {
@@ -147,7 +150,13 @@ class Team:
         ]
 
     def read(self) -> State:
-        """The state as it is now."""
+        """The state as it is now; made once a second, or when something was ordered."""
+        now = self.version, int(time.time()), self.halts.is_halted()
+        if self._made[0] != now:
+            self._made = now, self._state()
+        return self._made[1]
+
+    def _state(self) -> State:
         here = [each for each in self.devices if each["name"] not in self.away]
         costs = {"dog1": 1.04, "dog2": 0.62, "dog3": 1.37}
         task = self.tasks[0]["id"]
@@ -162,6 +171,7 @@ class Team:
                 "why": "the nearest of three" if each["name"] == "dog2" else "",
             }
             for each in here
+            if each["task"]
         ]
         gone = self._departed.of(here, time.time())
         state = state_of(here, self.tasks, {str(task): members}, departed=gone, node=self.node)
@@ -197,6 +207,14 @@ class Team:
             self.tasks.append({**task, "note": said, "strategy": said, "why": told, "requirements": {said: {}}})
         YARD["dogs"] = [{**YARD["dogs"][0], "name": said} for said in words[:20]]
         self._departed = Departed()
+
+    def be_many(self, count: int) -> None:
+        """More dogs, up to ``count``, most of which only listen."""
+        now = time.time()
+        for number in range(len(self.devices) + 1, count + 1):
+            more = {"name": f"unit{number}", "uuid": f"{number:032x}", "joined": number, "kind": "turtlebot"}
+            able = {"base2d": {"max_speed": 0.2}, **({"gripper": {"width": 0.1}} if number % 50 == 0 else {})}
+            self.devices.append({**dog(number % 250, "IDLE", "", now), **more, "capabilities": able})
 
     def watch(self, uuid: str, on_frame: OnFrame) -> Any:
         """Pictures of a floor, a wall and a red ball that rolls, 15 a second."""
@@ -279,12 +297,15 @@ class Orders(LineReceiver):
         elif verb == "place":
             numbers = {key: float(number) for key, _, number in (each.partition("=") for each in rest[1:])}
             next(each for each in self._team.devices if each["name"] == rest[0])["position"] = numbers
+        elif verb == "crowd":
+            self._team.be_many(int(rest[0]))
         elif verb == "outdoors":
             self._desk.ground = None
         elif verb == "session":
             self._sessions.signed_s = float(rest[0])
         elif verb == "strange":
             self._team.be_strange(json.loads(Path(rest[0]).read_text(encoding="utf-8")))
+        self._team.version += 1
         self.sendLine(line)
 
     def connectionLost(self, reason: Any = None) -> None:

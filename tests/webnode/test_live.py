@@ -84,6 +84,29 @@ class EventsTests(SynchronousTestCase):
         self.assertEqual({name for name, _ in told}, {"beat"})
         self.assertIn(len(told), (9, 10, 11))
 
+    def test_spare_the_node_of_a_large_team(self) -> None:
+        """Where it takes a quarter of a second to make the state, that is done once a second, and no change is lost."""
+        read = self.read
+
+        def slow() -> dict[str, Any]:
+            self.clock.rightNow += 0.25
+            return read()
+
+        self.events = Events(slow, self.clock, self.clock.seconds)
+        root = Resource()
+        root.putChild(b"events", self.events)
+        self.site = site_of(root, self.clock)
+        page = self.connected()
+        page.taken()
+        before, began = self.reads, self.clock.seconds()
+        while self.clock.seconds() < began + 10.0:
+            self.state["n"] += 1
+            self.clock.advance(0.1)
+        self.assertIn(self.reads - before, (8, 9, 10))
+        self.clock.pump([0.1] * 30)
+        told = [data["n"] for name, data in events_in(page.taken()) if name == "change"]
+        self.assertEqual(told[-1], self.state["n"])
+
     def test_tell_programs_whole_states(self) -> None:
         """A program that asks for whole states gets one at each change, and need not put changes together."""
         program = self.connected("?whole=1")

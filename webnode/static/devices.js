@@ -1,50 +1,79 @@
-// Devices: the list in the order of joining.
+// Devices: the list in the order of joining, and of many of them those that are looked for.
 import { at, attribute, badge, element, keyed, sojourn, state, words } from "./element.js";
 import { delivery, say, wish } from "./desk.js";
 import { panel } from "./panel.js";
 import { go } from "./shell.js";
 
+const FEW = 20;
+const MANY = 100;
+const items = new Map();
 let devices = [];
 let now = 0;
+let told = 0;
+
+const described = ({ name, kind, status, objective, capabilities }) =>
+  [name, kind, status, objective, ...Object.keys(capabilities)].join(" ").toLowerCase();
 
 function showDevices(list) {
   devices = list;
-  const here = list.filter((device) => device.gone === null).length;
-  words(at("count"), list.length ? String(here) : "");
+  at("filter").hidden = list.length <= FEW;
+  at("place-devices").classList.toggle("many", list.length > MANY);
   at("no-devices").hidden = list.length > 0;
-  keyed(at("devices"), list, (device) => device.uuid, row, update);
+  if (items.size > list.length) {
+    const known = new Set(list.map(({ uuid }) => uuid));
+    for (const uuid of items.keys()) if (!known.has(uuid)) items.delete(uuid);
+  }
+  showFound();
 }
 
+// Those that have each word of the filter somewhere.
+function showFound() {
+  const asked = at("filter").hidden ? [] : at("filter").value.toLowerCase().split(" ").filter(Boolean);
+  const found = asked.length ? devices.filter((device) => asked.every((word) => described(device).includes(word))) : devices;
+  const here = devices.filter((device) => device.gone === null).length;
+  words(at("count"), !devices.length ? "" : asked.length ? `${found.length} of ${devices.length}` : String(here));
+  at("not-found").hidden = !asked.length || found.length > 0;
+  keyed(at("devices"), found, (device) => device.uuid, row, update);
+}
+
+// Ages are told in seconds, so they are looked at no more often.
 function tellTime(moment) {
   now = moment;
-  for (const child of at("devices").children) {
-    const device = devices.find((each) => each.uuid === child.dataset.key);
-    if (device) words(child.querySelector(".age"), sojourn(device, now));
-  }
+  if (Math.abs(now - told) < 1) return;
+  told = now;
+  for (const { age, device } of items.values()) words(age, sojourn(device, now));
 }
 
 function row(device) {
+  const age = element("span", { class: "age" });
   const button = element(
     "button", { class: "device", "aria-haspopup": "dialog" },
-    element("b"), badge(), element("span", { class: "kind" }), element("span", { class: "age" }), element("span", { class: "objective" }));
+    element("b"), badge(), element("span", { class: "kind" }), age, element("span", { class: "objective" }));
   let pointer = "mouse";
   button.addEventListener("pointerdown", (event) => { pointer = event.pointerType; });
   // A tap or Enter opens at once; with a mouse one click only marks, as the double click is what opens.
   button.addEventListener("click", (event) => { if (event.detail === 0 || pointer !== "mouse") go(`device/${device.uuid}`); });
   button.addEventListener("dblclick", () => go(`device/${device.uuid}`));
-  return element("li", {}, button);
+  const item = element("li", {}, button);
+  items.set(device.uuid, { age, device: null });
+  return item;
 }
 
+// Of a thousand devices few are other than before: the row of one that is the same is left alone.
 function update(item, device) {
+  const shown = items.get(device.uuid);
+  if (shown.device === device) return;
+  shown.device = device;
   attribute(item.firstChild, "data-state", device.status);
   words(item.querySelector("b"), device.name);
   words(item.querySelector(".kind"), device.kind);
   state(item.querySelector(".badge"), device.status);
   words(item.querySelector(".objective"), device.objective || "no task");
-  words(item.querySelector(".age"), sojourn(device, now));
+  words(shown.age, sojourn(device, now));
 }
 
 function startDevices() {
+  at("filter").addEventListener("input", showFound);
   at("announce").addEventListener("submit", async (event) => {
     event.preventDefault();
     const body = { text: at("announce-text").value };

@@ -7,6 +7,7 @@ import { whereabouts } from "./whereabouts.js";
 const LEAST = 2;
 const MARGIN = 36;
 const FOOT = 24;
+const PAUSE = 1000;
 const NAMED = 40;
 const METRES = 111_320;
 const isMetres = ({ position }) => "x" in position;
@@ -63,15 +64,18 @@ panel({
     root.append(map, hint, list);
     let placed = [];
     let known = "";
+    let due = 0;
     // Drawn in pixels, so that words are as large as elsewhere: anew where it is wider, or is seen at last.
     const size = new ResizeObserver(() => refresh());
     size.observe(root);
 
     function refresh() {
       const now = JSON.stringify([root.clientWidth, ...placed.map(({ uuid, name, status, position }) => [uuid, name, status, position])]);
-      if (!placed.length || !root.clientWidth || now === known) return;
+      if (!placed.length || !root.clientWidth || now === known || due) return;
       known = now;
       draw();
+      // Many of them are drawn now and then: somebody may be typing.
+      if (placed.length > NAMED) due = setTimeout(() => { due = 0; refresh(); }, PAUSE);
     }
 
     function draw() {
@@ -129,7 +133,10 @@ panel({
         if (!model.yard) section.hidden = !placed.length;
         refresh();
       },
-      close: () => size.disconnect(),
+      close() {
+        clearTimeout(due);
+        size.disconnect();
+      },
     };
   },
 });

@@ -1,17 +1,17 @@
 // Preview: below the choice of a task, who could take it and who not, and why, before anything is assigned.
-import { at, element, keyed } from "./element.js";
+import { alike, at, element, keyed, several } from "./element.js";
 import { ask } from "./link.js";
 
 const PAUSE = 400;
 const NOBODY = { able: [], refused: {}, likely: null, together: [] };
 
 function lines({ able, refused, likely, together }, group) {
-  const could = able.map(({ name, busy }) => (busy ? `${name} (now: ${busy})` : name)).join(", ");
+  const could = several(able.map(({ name, busy }) => (busy ? `${name} (now: ${busy})` : name)));
   const who = likely ? `${likely} is the nearest by what is reported now.` : "Which of them is decided once they have looked.";
   const yes = able.length ? [["can", `${could}. ${able.length > 1 ? who : ""}`.trim()]] : [["nobody", "No device here can take it."]];
   const others = together.map(({ title }) => title).join(", ");
   const divided = group ? [["with", others ? `${others}.` : `nothing yet; it begins the group ${group}.`]] : [];
-  return [...yes, ...divided, ...Object.entries(refused).map(([name, why]) => ["cannot", `${name}: ${[].concat(why).join(", ")}`])];
+  return [...yes, ...divided, ...alike(refused).map(([names, why]) => ["cannot", `${several(names)}: ${why}`])];
 }
 
 const SAID = { can: "Can take it: ", cannot: "Cannot: ", nobody: "", with: "Divided together with: " };

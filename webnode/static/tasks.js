@@ -1,5 +1,5 @@
 // Tasks: choosing a predefined one, seeing what became of each, and taking it back.
-import { at, attribute, badge, element, keyed, state, words } from "./element.js";
+import { alike, at, attribute, badge, element, keyed, several, state, words } from "./element.js";
 import { say, wish } from "./desk.js";
 import { ask, get } from "./link.js";
 import { panel } from "./panel.js";
@@ -64,8 +64,8 @@ function why(box, epochs) {
 }
 
 function outcome({ able = [], refused = {} }) {
-  const no = Object.entries(refused).map(([name, reasons]) => `${name} cannot: ${[].concat(reasons).join(", ")}`);
-  const yes = able.length ? [`Assigned to ${able.join(", ")}`] : no.length ? ["Nobody can take it"] : ["Assigned"];
+  const no = alike(refused).map(([names, why]) => `${several(names)} cannot: ${why}`);
+  const yes = able.length ? [`Assigned to ${several(able)}`] : no.length ? ["Nobody can take it"] : ["Assigned"];
   return `${[...yes, ...no].join(". ")}.`;
 }
 
