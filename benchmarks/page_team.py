@@ -21,6 +21,7 @@ from middleware.entangled.clock import use_monotonic_time
 from middleware.node import CAMERA
 from middleware.settings import Settings
 from swarmnode.service import NodeService
+from swarmnode.warmth import STARTED_S, warmed_up
 from swarmnode.web import web_page
 from swarmnode.world import real_seams
 
@@ -101,6 +102,7 @@ def main(arguments: list[str]) -> None:
     for service in services:
         reactor.callWhenRunning(service.startService)
         reactor.addSystemEventTrigger("before", "shutdown", service.stopService)
+    reactor.callLater(STARTED_S, warmed_up)
     reactor.callWhenRunning(lambda: StandardIO(Orders(reactor, {"is": arguments[0]}, late), reactor=reactor))
     reactor.run()
 

@@ -20,6 +20,7 @@ from twisted.application.service import Service
 from twisted.internet.defer import Deferred, gatherResults, maybeDeferred
 from twisted.internet.error import CannotListenError
 from twisted.internet.interfaces import IListeningPort
+from twisted.internet.threads import deferToThreadPool
 from twisted.python.failure import Failure
 from twisted.python.threadpool import ThreadPool
 from twisted.web.http import CACHED, Request
@@ -294,12 +295,13 @@ class WebService(Service):
         super().stopService()
         if self._listening is None:
             return None
-        closed = gatherResults([maybeDeferred(port.stopListening) for port in (self._listening, *self._open)])
+        closed: list[Deferred[Any]] = [maybeDeferred(port.stopListening) for port in (self._listening, *self._open)]
         self._listening, self._open = None, []
         self._events.close()
         self._shots.close()
-        self._pool.stop()
-        return closed.addCallback(lambda _: None)
+        # Waits for the workers, which at that moment may wait for the reactor to take their answer: not on its thread.
+        closed.append(deferToThreadPool(self._reactor, self._reactor.getThreadPool(), self._pool.stop))
+        return gatherResults(closed).addCallback(lambda _: None)
 
 
 def web_service(

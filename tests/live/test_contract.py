@@ -30,9 +30,7 @@ LIMIT_S = 170
 
 class ContractTests(SynchronousTestCase):
     if MISSING:
-        skip = (
-            f"THE API IS NOT TESTED AGAINST ITS DOCUMENT: missing {', '.join(MISSING)} (pip install -e '.[contract]')"
-        )
+        skip = f"THE API IS NOT TESTED AGAINST ITS DOCUMENT: missing {', '.join(MISSING)} (make contract)"
 
     def setUp(self) -> None:
         self.team = Team()
