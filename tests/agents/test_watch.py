@@ -13,7 +13,7 @@ from twisted.trial.unittest import SynchronousTestCase
 import agents
 from agents.context import Context
 from agents.watch import FRESH, MEMORY, SETTLE, WatchTarget
-from drivers.reading import Action, Observation, Value
+from drivers.reading import Action, Frame, Observation, Value
 from tests.agents.test_search import Walk
 
 TICK = 0.1
@@ -140,3 +140,17 @@ class DogTests(SynchronousTestCase):
             self.assertLess(len(contexts), 60)
         self.assertLess(abs(walk.distance() - before), 0.05)
         self.assertGreater(walk.now, 3.0)
+
+    def test_watches_with_a_camera_alone(self) -> None:
+        """A camera on a wall, which has no motors and says nothing of a target, sees it too, and is told no motion."""
+        walk = Walk()
+        watch = WatchTarget({}, random.Random(1))
+        walk.world.place_target(1.2, 1.2)
+        for n in range(10):
+            frame = Frame(n, 208, 160, walk.camera.jpeg(walk.dog), n * TICK)
+            self.assertEqual(watch.search(n * TICK), {})
+            watch.look(Observation(n * TICK, n * TICK, {}, frame=frame), n * TICK)
+        cost = watch.cost
+        assert cost is not None
+        self.assertLess(abs(cost - walk.distance()), 0.1)
+        self.assertEqual(watch.search(1.0), {})

@@ -179,18 +179,30 @@ class GatewayTests(SynchronousTestCase):
         self.assertEqual(seed_of(b"a" * 32, b"1" * 32), seed_of(b"a" * 32, b"1" * 32))
 
     def test_comes_back_while_it_leaves(self) -> None:
-        """A phone whose tab was hidden for a moment is there again, once, and not twice."""
+        """A phone that is still giving back its task when it comes again waits for that, and is there once."""
         phone = Phone(self, self.gateways["vaio"])
-        self.live(1.0)
+        self.sees = {"target.bearing": 0.0, "target.distance": 0.05}
+        self.team.desk.assign("watch-target")
+        self.until(lambda: self.device(phone.uuid).get("status") == "EXECUTING", 40.0)
         phone.at.leave(phone.uuid)
         phone.at.leave(phone.uuid)
         self.phones.clear()
         came = [phone.at.join(b"s" * 32, "anna", CAN) for _ in range(2)]
+        self.assertNoResult(came[0])
         self.team.clock.advance(0.3)
         self.assertEqual([self.successResultOf(each) for each in came], [phone.uuid] * 2)
         self.phones.append(phone)
-        self.live(1.5)
-        self.assertEqual(self.device(phone.uuid)["status"], "IDLE")
+        self.until(lambda: self.device(phone.uuid).get("status") == "EXECUTING", 40.0)
+
+    def test_leaves_with_its_web_node(self) -> None:
+        """A web node that is shut lets its phones go politely: they are no devices any more when it says that it is."""
+        phones = [Phone(self, self.gateways["vaio"], bytes([n]) * 32, f"p{n}") for n in (1, 2)]
+        self.live(1.0)
+        self.phones.clear()
+        self.successResultOf(self.gateways["vaio"].close())
+        self.team.clock.advance(0.3)
+        told = [self.device(phone.uuid).get("status", "GONE") for phone in phones]
+        self.assertEqual(told, ["GONE", "GONE"])
 
     def test_names_are_of_one_device_each(self) -> None:
         """Where a dog or another phone has the name, the phone gets one like it; its own name it keeps."""
