@@ -8,10 +8,12 @@ const PAUSE = 3000;
 let checking = false;
 let told = () => {};
 
-// The code of a link is used once and taken out of the address, so that it is in no bookmark and no screenshot.
+// The code of a link is used once and taken out of the address, so that it is in no bookmark and no screenshot; what
+// stands behind it is the view that the link leads to.
 function codeOfLink() {
-  const code = /^#code=(.+)$/.exec(location.hash)?.[1];
+  const [, code, view] = /^#code=([^/]+)(?:\/(.+))?$/.exec(location.hash) ?? [];
   if (code) history.replaceState(null, "", location.pathname + location.search);
+  if (view) location.hash = view;
   return code ? decodeURIComponent(code) : "";
 }
 
@@ -45,9 +47,9 @@ async function check(trouble = "") {
 }
 
 async function invite(line) {
-  const { token: code } = await ask("POST", "invitations", { role: "viewer" });
+  const { token: code, link } = await ask("POST", "invitations", { role: "viewer" });
   line.hidden = false;
-  line.value = `${location.origin}/#code=${code}`;
+  line.value = link ?? `${location.origin}/#code=${code}`;
   line.select();
 }
 
