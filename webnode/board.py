@@ -476,6 +476,41 @@ class MemoryPhones:
         return succeed(None)
 
 
+class Invites(Protocol):
+    """What somebody else needs to come to the page."""
+
+    authority: bytes
+    """The certificate of the authority that a browser has to trust, as PEM; empty where there is no TLS."""
+    fingerprint: str
+    """What a person compares it by."""
+
+    def urls(self) -> list[str]:
+        """Where this node serves the page, the best for others first."""
+
+    def drawn(self, text: str) -> Deferred[str]:
+        """A QR code of ``text`` as an SVG; empty where none can be drawn."""
+
+
+class MemoryInvites:
+    """Pages that it was made with, and drawings that only say of what they are."""
+
+    def __init__(self, *urls: str, authority: bytes = b"", fingerprint: str = "") -> None:
+        self.pages = list(urls)
+        self.authority = authority
+        self.fingerprint = fingerprint
+
+    def urls(self) -> list[str]:
+        """Return them."""
+        return self.pages
+
+    def drawn(self, text: str) -> Deferred[str]:
+        """Return an empty picture with ``text`` for its title, or nothing where there is none."""
+        if not text:
+            return succeed("")
+        title = text.replace("&", "&amp;").replace("<", "&lt;")
+        return succeed(f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 9 9"><title>{title}</title></svg>')
+
+
 @dataclass
 class Board:
     """All of it; who may come in is always said, the rest is the twin in memory, or None for what a node may lack."""
@@ -491,10 +526,11 @@ class Board:
     halts: Halts | None = None
     faults: Faults | None = None
     phones: Phones | None = None
+    invites: Invites | None = None
 
     @property
     def has(self) -> list[str]:
         """What this node has beyond what every web node has, for the page."""
-        parts = ("survey", "tuning", "halts", "faults", "phones")
+        parts = ("survey", "tuning", "halts", "faults", "phones", "invites")
         yard = ["yard"] if self.desk.yard() is not None else []
         return yard + [name for name in parts if getattr(self, name) is not None]

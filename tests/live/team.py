@@ -43,6 +43,7 @@ from webnode.board import (
 from webnode.camera import OnFrame
 from webnode.chronicle import TeamChronicle
 from webnode.desk import MemoryDesk
+from webnode.invite import TeamInvites
 from webnode.limits import AddressLimits
 from webnode.password import hashed, is_password
 from webnode.server import WebService, web_service
@@ -372,6 +373,8 @@ def main() -> None:
     pages = MemoryFallbacks()
     served = replace(board(team), fallbacks=pages)
     web = web_service(reactor, "127.0.0.1", port, team.read, served, team, time.time)
+    pages_here = ["http://192.168.0.7:8080", "https://192.168.0.7:8443", f"http://127.0.0.1:{port}"]
+    served.invites = TeamInvites(lambda: pages_here, b"PEM", "AB:CD:" * 10, reactor, reactor.getThreadPool())
     web.startService()
     reactor.addSystemEventTrigger("before", "shutdown", web.stopService)
     reactor.callWhenRunning(lambda: StandardIO(Orders(team, web, served, pages.pages)))
