@@ -9,6 +9,7 @@ REAL   ?= 0
 HEADLESS ?=
 WEB_HOST ?= 127.0.0.1
 WEB_PORT ?=
+TLS    ?=
 NODES  ?= 8,32
 SECONDS ?= 5
 JOBS   ?= $(shell nproc 2>/dev/null || echo 1)
@@ -23,13 +24,14 @@ RUNTIME := $(VENV)/.stamp-runtime
 DEV     := $(VENV)/.stamp-dev
 BROWSER := $(VENV)/.stamp-browser
 BENCH   := $(VENV)/.stamp-bench
+CONTRACT := $(VENV)/contract
 
-.PHONY: help demo test trials check format cov live schedules browser \
+.PHONY: help demo test trials check format cov live contract schedules browser \
     bench-demo bench-page bench-dht bench-consensus bench-takeover api dist clean
 
 help:
 	@echo 'make demo [HEADLESS=1] [SEED=1]       three dogs, a red target and the page; HEADLESS: both experiments, then exit'
-	@echo '          [WEB_HOST=0.0.0.0] [WEB_PORT=8080]   whom the page is open to, and where'
+	@echo '          [WEB_HOST=0.0.0.0] [WEB_PORT=8080] [TLS=1]   whom the page is open to, and where; TLS: on this machine alone, too'
 	@echo 'make test                             every test'
 	@echo 'make trials [N=20] [SEED=1] [REAL=3]  both experiments N times in memory, and REAL times as processes'
 	@echo 'make check                            format, lint, types, and the rules of the house'
@@ -37,6 +39,7 @@ help:
 	@echo 'make cov                              the tests with coverage of lines and branches'
 	@echo 'make schedules [N=2000] [SEED=1]      so many random schedules of faults, and the invariants of the library'
 	@echo 'make live                             only the tests with real sockets and processes'
+	@echo 'make contract                         the API against its own document: every route, asked in every way'
 	@echo 'make browser                          only the tests of the page in Chromium'
 	@echo 'make bench-demo                       what the demonstration costs: memory, datagrams, seconds'
 	@echo 'make bench-page                       the page under load: streams, cameras, dribblers, requests, a slow line'
@@ -48,7 +51,7 @@ help:
 	@echo 'make clean                            remove what the above left behind, the environment included'
 
 demo: $(RUNTIME)
-	@exec $(PY) -m sim.demo --seed $(SEED) $(if $(filter-out 0,$(HEADLESS)),--headless) \
+	@exec $(PY) -m sim.demo --seed $(SEED) $(if $(filter-out 0,$(HEADLESS)),--headless) $(if $(filter-out 0,$(TLS)),--tls) \
 	    --web-host $(WEB_HOST) $(if $(WEB_PORT),--web-port $(WEB_PORT))
 
 # One worker for each processor.
@@ -77,6 +80,9 @@ schedules: $(DEV)
 
 live: $(DEV)
 	$(PY) -m twisted.trial tests.live
+
+contract: $(CONTRACT)/.stamp
+	$(CONTRACT)/bin/python -m twisted.trial tests.live.test_contract
 
 browser: $(BROWSER)
 	$(PY) -m twisted.trial tests.live.test_page
@@ -150,3 +156,10 @@ $(BENCH): setup.cfg pyproject.toml | $(PY)
 	@$(PIP) 'setuptools>=77'
 	@$(INSTALL) '.[all,bench]'
 	@touch $@ $(RUNTIME)
+
+# Its tool brings a test runner of its own along, so it has an environment of its own.
+$(CONTRACT)/.stamp: setup.cfg pyproject.toml | $(PY)
+	@$(PYTHON) -m venv $(CONTRACT)
+	@$(subst $(PY),$(CONTRACT)/bin/python,$(PIP)) 'setuptools>=77'
+	@$(subst $(PY),$(CONTRACT)/bin/python,$(INSTALL)) '.[all,contract]'
+	@touch $@

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import ctypes
-import gc
 import sys
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from functools import partial
 from typing import NoReturn
 
@@ -21,7 +18,9 @@ from middleware.errors import BadSetting, MissingExtra, SwarmError, UnknownAgent
 from middleware.node import SwarmNode
 from middleware.settings import COMMAND_LINE, Settings
 from swarmnode.assembly import FAULTS
+from swarmnode.ballast import drop_tls
 from swarmnode.service import NodeService
+from swarmnode.warmth import STARTED_S, warmed_up
 from swarmnode.web import web_page, with_code
 from swarmnode.world import control_socket, real_seams, resolved
 from webnode.errors import PortTaken
@@ -37,8 +36,6 @@ KEYS: Sequence[tuple[type[Exception], str]] = (
     (MissingExtra, "[node] roles"),
 )
 """Which setting to look at for which fault."""
-SETTLED = 3.0
-"""Seconds after which a node has started and joined."""
 
 
 class Options(usage.Options):
@@ -62,6 +59,8 @@ class Options(usage.Options):
         ["driver-kind", "d", None, "driver of its robot"],
         ["web-host", None, None, "address of the page"],
         ["web-port", None, None, "TCP port of the page"],
+        ["web-tls", None, None, "auto: the page over TLS as well"],
+        ["web-tls-port", None, None, "TCP port of the page over TLS"],
         ["web-yard", None, None, "yard that the page's map shows, as HOST:PORT"],
     ]
     settings: Settings
@@ -79,6 +78,9 @@ class Options(usage.Options):
             self.settings = settings.with_flags(**flags)
         except SwarmError as error:
             _refuse(error)
+        # Here at the latest, as the reactor comes next.
+        if not ("web" in self.settings.node.roles and self.settings.web.tls):
+            drop_tls()
 
 
 def makeService(options: Options) -> IService:
@@ -93,17 +95,10 @@ def makeService(options: Options) -> IService:
         if "web" in settings.node.roles:
             settings = with_code(settings, seams.rng)
             fronts.append(partial(web_page, settings, seams, reactor))
-        reactor.callLater(SETTLED, _give_back)
+        reactor.callLater(STARTED_S, warmed_up)
         return _Checked(settings, seams, fronts)
     except FAULTS as error:
         _refuse(told(error, settings.origin))
-
-
-def _give_back() -> None:
-    """Hand back what only starting needed: glibc keeps it for later, and a small device has other uses for it."""
-    gc.collect()
-    with suppress(OSError, AttributeError):
-        ctypes.CDLL(None).malloc_trim(0)
 
 
 class _Checked(NodeService):

@@ -426,13 +426,89 @@ class Phones(Protocol):
     """Phones that take part as devices, with this node as their way into the team."""
 
     def join(self, secret: bytes, name: str, can: Mapping[str, Any]) -> Deferred[str]:
-        """Let a phone take part; returns its uuid, which is the same for the same secret at every web node."""
+        """Let a phone take part; fires with its uuid, which is the same for the same secret at every web node.
+
+        ``can`` is what it has: ``width`` and ``height`` of its pictures in pixels, and whether it tells ``orientation``
+        and ``position``.  Fails with ``Refusal`` 409 or 429 where it may not, 503 where that cannot be.
+        """
 
     def look(self, uuid: str, jpeg: bytes, values: Mapping[str, float]) -> Wanted:
-        """Take what it sees and measures."""
+        """Take what it sees and measures; raises ``Refusal`` 404 where it takes no part here, 429 too often."""
 
     def leave(self, uuid: str) -> None:
-        """Let it go."""
+        """Let it go; one that is not here has gone already."""
+
+    def close(self) -> Deferred[Any]:
+        """Let all of them go; fires when they have."""
+
+
+class MemoryPhones:
+    """Phones that are only counted: ``here`` maps each uuid to its name, ``looks`` are (uuid, bytes, values)."""
+
+    def __init__(self, most: int = 8) -> None:
+        self.here: dict[str, str] = {}
+        self.looks: list[tuple[str, bytes, Mapping[str, float]]] = []
+        self.can: Mapping[str, Any] = {}
+        self._most = most
+
+    def join(self, secret: bytes, name: str, can: Mapping[str, Any]) -> Deferred[str]:
+        """Count it; its uuid is the end of its secret."""
+        uuid = secret[-20:].hex()
+        if uuid not in self.here and len(self.here) >= self._most:
+            return fail(Refusal("phone", "too many take part", "wait until one leaves", 409))
+        self.here[uuid], self.can = name, can
+        return succeed(uuid)
+
+    def look(self, uuid: str, jpeg: bytes, values: Mapping[str, float]) -> Wanted:
+        """Keep it."""
+        if uuid not in self.here:
+            raise Refusal("uuid", "this phone takes no part here", "join by POST /api/v1/phones", 404)
+        self.looks.append((uuid, jpeg, values))
+        return Wanted(10.0, "Look for the red target: turn slowly.")
+
+    def leave(self, uuid: str) -> None:
+        """Forget it."""
+        self.here.pop(uuid, None)
+
+    def close(self) -> Deferred[Any]:
+        """Forget all."""
+        self.here.clear()
+        return succeed(None)
+
+
+class Invites(Protocol):
+    """What somebody else needs to come to the page."""
+
+    authority: bytes
+    """The certificate of the authority that a browser has to trust, as PEM; empty where there is no TLS."""
+    fingerprint: str
+    """What a person compares it by."""
+
+    def urls(self) -> list[str]:
+        """Where this node serves the page, the best for others first."""
+
+    def drawn(self, text: str) -> Deferred[str]:
+        """A QR code of ``text`` as an SVG; empty where none can be drawn."""
+
+
+class MemoryInvites:
+    """Pages that it was made with, and drawings that only say of what they are."""
+
+    def __init__(self, *urls: str, authority: bytes = b"", fingerprint: str = "") -> None:
+        self.pages = list(urls)
+        self.authority = authority
+        self.fingerprint = fingerprint
+
+    def urls(self) -> list[str]:
+        """Return them."""
+        return self.pages
+
+    def drawn(self, text: str) -> Deferred[str]:
+        """Return an empty picture with ``text`` for its title, or nothing where there is none."""
+        if not text:
+            return succeed("")
+        title = text.replace("&", "&amp;").replace("<", "&lt;")
+        return succeed(f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 9 9"><title>{title}</title></svg>')
 
 
 @dataclass
@@ -450,10 +526,11 @@ class Board:
     halts: Halts | None = None
     faults: Faults | None = None
     phones: Phones | None = None
+    invites: Invites | None = None
 
     @property
     def has(self) -> list[str]:
         """What this node has beyond what every web node has, for the page."""
-        parts = ("survey", "tuning", "halts", "faults", "phones")
+        parts = ("survey", "tuning", "halts", "faults", "phones", "invites")
         yard = ["yard"] if self.desk.yard() is not None else []
         return yard + [name for name in parts if getattr(self, name) is not None]

@@ -14,6 +14,7 @@ from typing import Any
 
 from twisted.internet.interfaces import IDelayedCall, IPushProducer, IReactorTime
 from twisted.logger import Logger
+from twisted.protocols.policies import ProtocolWrapper
 from twisted.web.http import Request
 from twisted.web.resource import Resource
 from twisted.web.server import NOT_DONE_YET
@@ -78,6 +79,9 @@ class Viewer:
     def narrow(self) -> None:
         """Let little wait between this node and a slow client."""
         transport: Any = getattr(self.request.channel, "transport", None)
+        if isinstance(transport, ProtocolWrapper):
+            # Over TLS the socket lies one floor below.
+            transport = transport.transport
         handle = transport.getHandle() if hasattr(transport, "getHandle") else None
         if isinstance(handle, socket.socket):
             transport.bufferSize = SENT_AHEAD

@@ -20,6 +20,7 @@ from twisted.application.service import Service
 from twisted.internet.defer import Deferred, gatherResults, maybeDeferred
 from twisted.internet.error import CannotListenError
 from twisted.internet.interfaces import IListeningPort
+from twisted.internet.threads import deferToThreadPool
 from twisted.python.failure import Failure
 from twisted.python.threadpool import ThreadPool
 from twisted.web.http import CACHED, Request
@@ -173,9 +174,12 @@ class Root(Resource):
         if method == "OPTIONS":
             return _Preflight()
         try:
-            guarded(role, self._board.sessions.visitor(shown(request), self._wall()))
+            who = self._board.sessions.visitor(shown(request), self._wall())
+            guarded(role, who)
         except Refusal as no:
             return Refused(no)
+        if isinstance(request, CappedRequest):
+            request.who = who
         return resource
 
 
@@ -200,6 +204,18 @@ def _role_of(path: str, table: Sequence[Route]) -> Role:
     """The role that the native route at ``path``, or below it, wants; one that no route names is for operators."""
     roles = [route.role for route in table if route.answer is None and f"{route.path}/".startswith(f"{path}/")]
     return roles[0] if roles else "operator"
+
+
+def listening(reactor: Any, host: str, port: int, factory: Any, setting: str) -> IListeningPort:
+    """A TCP port that is open for ``factory``; raises ``PortTaken``, which says what to do about ``setting``."""
+    try:
+        opened: IListeningPort = reactor.listenTCP(port, factory, interface=host)
+    except CannotListenError as error:
+        why = getattr(error.socketError, "strerror", None) or str(error.socketError)
+        is_foreign = getattr(error.socketError, "errno", None) == errno.EADDRNOTAVAIL
+        remedy = "give host an address of this machine" if is_foreign else f"choose another {setting}, or 0"
+        raise PortTaken(f"the page cannot be served on {host or '*'}:{port} ({why}); {remedy}") from error
+    return opened
 
 
 class QuietSite(Site):
@@ -263,23 +279,27 @@ class WebService(Service):
             self._wanted if self._listening is None else int(getattr(self._listening.getHost(), "port", self._wanted))
         )
 
+    @property
+    def secure_port(self) -> int:
+        """The first of the further ports; 0 where there is none, or none yet."""
+        return next((int(getattr(door.getHost(), "port", 0)) for door in self._open), 0)
+
     def urls(self, names: Collection[str]) -> list[str]:
         """Where others find the page; ``names`` are the machine's, for a page that is served at every address."""
-        secure = [int(getattr(door.getHost(), "port", 0)) for door in self._open]
-        doors = [url for port in secure for url in urls_at(self._host, port, names, is_secure=True)]
+        doors = urls_at(self._host, self.secure_port, names, is_secure=True) if self.secure_port else []
         return [*urls_at(self._host, self.port, names), *doors]
 
     def startService(self) -> None:
         """Open the port, then the workers."""
+        self._listening = listening(self._reactor, self._host, self._wanted, self.site, "port")
         try:
-            self._listening = self._reactor.listenTCP(self._wanted, self.site, interface=self._host)
-        except CannotListenError as error:
-            why = getattr(error.socketError, "strerror", None) or str(error.socketError)
-            where = f"{self._host or '*'}:{self._wanted}"
-            is_foreign = getattr(error.socketError, "errno", None) == errno.EADDRNOTAVAIL
-            remedy = "give host an address of this machine" if is_foreign else "choose another port, or 0"
-            raise PortTaken(f"the page cannot be served on {where} ({why}); {remedy}") from error
-        self._open = [door(self.site) for door in self._doors]
+            for door in self._doors:
+                self._open.append(door(self.site))
+        except PortTaken:
+            for port in (self._listening, *self._open):
+                port.stopListening()
+            self._listening, self._open = None, []
+            raise
         self._pool.start()
         self._events.open()
         super().startService()
@@ -289,12 +309,13 @@ class WebService(Service):
         super().stopService()
         if self._listening is None:
             return None
-        closed = gatherResults([maybeDeferred(port.stopListening) for port in (self._listening, *self._open)])
+        closed: list[Deferred[Any]] = [maybeDeferred(port.stopListening) for port in (self._listening, *self._open)]
         self._listening, self._open = None, []
         self._events.close()
         self._shots.close()
-        self._pool.stop()
-        return closed.addCallback(lambda _: None)
+        # Waits for the workers, which at that moment may wait for the reactor to take their answer: not on its thread.
+        closed.append(deferToThreadPool(self._reactor, self._reactor.getThreadPool(), self._pool.stop))
+        return gatherResults(closed).addCallback(lambda _: None)
 
 
 def web_service(

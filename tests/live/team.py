@@ -35,6 +35,7 @@ from webnode.board import (
     MemoryFallbacks,
     MemoryFaults,
     MemoryHalts,
+    MemoryPhones,
     MemorySurvey,
     MemoryTuning,
     Page,
@@ -42,6 +43,7 @@ from webnode.board import (
 from webnode.camera import OnFrame
 from webnode.chronicle import TeamChronicle
 from webnode.desk import MemoryDesk
+from webnode.invite import TeamInvites
 from webnode.limits import AddressLimits
 from webnode.password import hashed, is_password
 from webnode.server import WebService, web_service
@@ -323,7 +325,7 @@ def board(team: Team) -> Board:
     tuning = MemoryTuning({able[0]["uuid"]: KNOBS})
     survey = MemorySurvey(network(), {f"0{n}" * 16: inventory() for n in (1, 2)})
     parts: dict[str, Any] = {"halts": team.halts, "tuning": tuning, "survey": survey, "chronicle": TeamChronicle()}
-    parts["faults"] = MemoryFaults(*KINDS)
+    parts["faults"], parts["phones"] = MemoryFaults(*KINDS), MemoryPhones()
     return Board(desk, sessions, MemoryAudit(time.time), limits=AddressLimits(), **parts)
 
 
@@ -371,6 +373,8 @@ def main() -> None:
     pages = MemoryFallbacks()
     served = replace(board(team), fallbacks=pages)
     web = web_service(reactor, "127.0.0.1", port, team.read, served, team, time.time)
+    pages_here = ["http://192.168.0.7:8080", "https://192.168.0.7:8443", f"http://127.0.0.1:{port}"]
+    served.invites = TeamInvites(lambda: pages_here, b"PEM", "AB:CD:" * 10, reactor, reactor.getThreadPool())
     web.startService()
     reactor.addSystemEventTrigger("before", "shutdown", web.stopService)
     reactor.callWhenRunning(lambda: StandardIO(Orders(team, web, served, pages.pages)))

@@ -28,9 +28,7 @@ LIMIT_S = 170
 
 class ContractTests(TeamCase):
     if MISSING:
-        skip = (
-            f"THE API IS NOT TESTED AGAINST ITS DOCUMENT: missing {', '.join(MISSING)} (pip install -e '.[contract]')"
-        )
+        skip = f"THE API IS NOT TESTED AGAINST ITS DOCUMENT: missing {', '.join(MISSING)} (make contract)"
 
     def test_keep_to_the_document(self) -> None:
         """No route answers anything that its document does not say, and none with a 5xx, whatever is sent."""

@@ -157,6 +157,3 @@ class DemonstrationFallbackTests(DemonstrationCase):
         """The web node is frozen instead: the page goes on within three seconds, and another dog finishes as well."""
         web = self.lost_on_the_way(signal.SIGSTOP, FREEZE_S)
         os.kill(web, signal.SIGCONT)
-
-    # Seen since the views were merged: the dog that was struck had finished before.  Not understood yet.
-    test_experiment_2_and_a_freeze.todo = "the dog on its way is at times done when it is struck"  # type: ignore[attr-defined]

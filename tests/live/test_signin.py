@@ -88,9 +88,13 @@ class SigningInTests(PageCase):
         self.assertEqual(viewer.get_by_text("Who changed what").count(), 0)
 
     def invitation(self, page: Any) -> str:
-        page.get_by_role("button", name="Invite a viewer").click()
-        page.locator(".session [role=status]", has_text="for a day").wait_for()
-        return str(page.locator(".session input").input_value()).partition("#code=")[2]
+        page.get_by_role("button", name="Invite").click()
+        page.locator("#i-kind").select_option("viewer")
+        page.locator("#invite", has_text="may look").wait_for()
+        link = str(page.locator("#i-link").input_value())
+        page.get_by_role("button", name="Close").click()
+        page.locator("#invite").wait_for(state="detached")
+        return link.partition("#code=")[2]
 
     def test_ask_again_when_the_session_ends(self) -> None:
         """When the node no longer knows the session, the page asks, and goes on where it was."""

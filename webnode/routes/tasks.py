@@ -10,7 +10,7 @@ from twisted.internet.defer import maybeDeferred
 
 from webnode.errors import Refusal
 from webnode.field import Json
-from webnode.route import API, Answer, Ask, Field, Route
+from webnode.route import API, Ask, Field, Route
 
 TASK = Field("task_id", "text", "the task", "path", most=64)
 
@@ -59,7 +59,9 @@ def preview(ask: Ask) -> Any:
     return ask.board.desk.preview(ask.given["name"], ask.given["group"])
 
 
-def _order(wish: Callable[[Ask], Callable[[str], Any]]) -> Answer:
+def _order(word: str, about: str, wish: Callable[[Ask], Callable[[str], Any]]) -> Route:
+    """The route that orders ``word`` of a task that is there."""
+
     def answer(ask: Ask) -> Json:
         task_id = ask.given["task_id"]
         if task_id not in [task["id"] for task in ask.state["tasks"]]:
@@ -67,7 +69,8 @@ def _order(wish: Callable[[Ask], Callable[[str], Any]]) -> Answer:
         wish(ask)(task_id)
         return {"id": task_id}
 
-    return answer
+    path = f"{API}/tasks/{{task_id}}/{word}"
+    return Route("POST", path, about, "operator", answer, (TASK,), gives="id", status=202)
 
 
 NAME = Field("name", "text", "its name in the catalogue", most=64)
@@ -123,34 +126,7 @@ ROUTES = (
         gives="able (uuid, name, busy: its task now), refused (why, by name), likely (a name, or null), "
         "together (id, title: what the group divides it with)",
     ),
-    Route(
-        "POST",
-        f"{API}/tasks/{{task_id}}/cancel",
-        "End a task; nobody is granted it any more",
-        "operator",
-        _order(lambda ask: ask.board.desk.cancel),
-        (TASK,),
-        gives="id",
-        status=202,
-    ),
-    Route(
-        "POST",
-        f"{API}/tasks/{{task_id}}/pause",
-        "Let a task rest; its devices stop and are free for others",
-        "operator",
-        _order(lambda ask: ask.board.desk.pause),
-        (TASK,),
-        gives="id",
-        status=202,
-    ),
-    Route(
-        "POST",
-        f"{API}/tasks/{{task_id}}/resume",
-        "Let a task go on from where it was",
-        "operator",
-        _order(lambda ask: ask.board.desk.resume),
-        (TASK,),
-        gives="id",
-        status=202,
-    ),
+    _order("cancel", "End a task; nobody is granted it any more", lambda ask: ask.board.desk.cancel),
+    _order("pause", "Let a task rest; its devices stop and are free for others", lambda ask: ask.board.desk.pause),
+    _order("resume", "Let a task go on from where it was", lambda ask: ask.board.desk.resume),
 )

@@ -18,6 +18,8 @@ let orders = 0;
 // Where the page is served from now: the origin of every address.
 export const base = () => here;
 
+export const where = (path) => here + API + path;
+
 const pause = (ms) => new Promise((done) => setTimeout(done, ms));
 
 // Look for a node that answers until there is one; whoever calls meanwhile waits for the same.
@@ -37,7 +39,8 @@ function find() {
   return finding;
 }
 
-async function fly(address, options) {
+// One question, once; whoever asks it knows what to make of no answer.
+export async function fly(address, options) {
   const flight = new AbortController();
   const deadline = setTimeout(() => flight.abort(), PATIENCE);
   flying.add(flight);
@@ -63,7 +66,7 @@ async function call(method, path, body) {
   let answer;
   while (!answer) {
     try {
-      answer = await fly(here + API + path, options);
+      answer = await fly(where(path), options);
     } catch {
       await Promise.race([find(), pause(Math.max(0, end - performance.now()))]);
       if (performance.now() >= end) {
