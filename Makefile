@@ -24,8 +24,9 @@ RUNTIME := $(VENV)/.stamp-runtime
 DEV     := $(VENV)/.stamp-dev
 BROWSER := $(VENV)/.stamp-browser
 BENCH   := $(VENV)/.stamp-bench
+CONTRACT := $(VENV)/contract
 
-.PHONY: help demo test trials check format cov live schedules browser \
+.PHONY: help demo test trials check format cov live contract schedules browser \
     bench-demo bench-page bench-dht bench-consensus bench-takeover api dist clean
 
 help:
@@ -38,6 +39,7 @@ help:
 	@echo 'make cov                              the tests with coverage of lines and branches'
 	@echo 'make schedules [N=2000] [SEED=1]      so many random schedules of faults, and the invariants of the library'
 	@echo 'make live                             only the tests with real sockets and processes'
+	@echo 'make contract                         the API against its own document: every route, asked in every way'
 	@echo 'make browser                          only the tests of the page in Chromium'
 	@echo 'make bench-demo                       what the demonstration costs: memory, datagrams, seconds'
 	@echo 'make bench-page                       the page under load: streams, cameras, dribblers, requests, a slow line'
@@ -78,6 +80,9 @@ schedules: $(DEV)
 
 live: $(DEV)
 	$(PY) -m twisted.trial tests.live
+
+contract: $(CONTRACT)/.stamp
+	$(CONTRACT)/bin/python -m twisted.trial tests.live.test_contract
 
 browser: $(BROWSER)
 	$(PY) -m twisted.trial tests.live.test_page
@@ -151,3 +156,10 @@ $(BENCH): setup.cfg pyproject.toml | $(PY)
 	@$(PIP) 'setuptools>=77'
 	@$(INSTALL) '.[all,bench]'
 	@touch $@ $(RUNTIME)
+
+# Its tool brings a test runner of its own along, so it has an environment of its own.
+$(CONTRACT)/.stamp: setup.cfg pyproject.toml | $(PY)
+	@$(PYTHON) -m venv $(CONTRACT)
+	@$(subst $(PY),$(CONTRACT)/bin/python,$(PIP)) 'setuptools>=77'
+	@$(subst $(PY),$(CONTRACT)/bin/python,$(INSTALL)) '.[all,contract]'
+	@touch $@

@@ -19,6 +19,7 @@ from middleware.tasks import Task
 KINDS = {
     "find-target": "agents.search:SearchAndApproach",
     "turn-around": "agents.turn:TurnAround",
+    "watch-target": "agents.watch:WatchTarget",
 }
 ENTRY_POINTS = "swarm_node.behaviours"
 VISION = ("cv2", "numpy")

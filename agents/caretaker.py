@@ -43,16 +43,16 @@ class Caretaker:
         self._visit_at = now + VISIT
         lessee = engagement.lessee if engagement.is_acting else None
         council = self._visited() if lessee is None else lessee.council
-        if now >= self._look_at and self._node.has_vacancy(engagement.task, council):
+        if now >= self._look_at and self._node.councils.has_vacancy(engagement.task, council):
             self._look_at = now + AGAIN
-            following = Deferred.fromCoroutine(self._node.successors(engagement.task, council))
+            following = Deferred.fromCoroutine(self._node.councils.successors(engagement.task, council))
             following.addCallback(self._found, council).addErrback(_nobody)
 
     def _visited(self) -> Council:
         """The council that nobody asks for a lease, asked whether it is there."""
         task = self._engagement.task
         if self._council is None:
-            self._council = self._node.council(task)
+            self._council = self._node.councils.of(task)
         self._council.learn(task.configuration, task.council)
         self._council.visit()
         return self._council

@@ -29,6 +29,17 @@ TASKS = {
         waiting_period=1.0,
         stop_time=STOP,
     ),
+    # Whatever sees can do it: a dog turns by itself, a phone is turned by its visitor.
+    "watch-target": Task(
+        task_id="",
+        kind="watch-target",
+        title="Keep the red target in view",
+        requirements={"camera": {}},
+        parameters={"seconds": 20.0, "target_radius": 0.08, "target_height": 0.22},
+        waiting_period=8.0,
+        stall_limit=12.0,
+        stop_time=STOP,
+    ),
     "fetch-the-ball": Task(
         task_id="",
         kind="fetch",

@@ -136,6 +136,10 @@ class SearchAndApproach:
         """The share of the way that is done, from where the dog stood by; None where it did not, or sees nothing."""
         return None if self._target is None or not self._way else max(0.0, 1.0 - self._gap / self._way)
 
+    def is_in_view(self, now: float) -> bool:
+        """Whether the newest sighting still counts as seeing the target."""
+        return now - self._seen_at <= FRESH
+
     # -- acting -----------------------------------------------------------------------------------------------------
 
     def search(self, now: float) -> Action:
@@ -147,7 +151,7 @@ class SearchAndApproach:
         if self._target is None:
             return self.search(now)
         self._way = self._gap
-        is_facing = abs(self._bearing) < FACING and now - self._seen_at <= FRESH
+        is_facing = abs(self._bearing) < FACING and self.is_in_view(now)
         return self._circling.step(self._pose, self._target, self.angle, self._ahead, is_facing) or self._face()
 
     def take_post(self, post: Post) -> None:
@@ -166,7 +170,7 @@ class SearchAndApproach:
         turn = clipped(TURN_GAIN * bearing, TURN_SPEED)
         if gap <= STOP_AT and abs(bearing) < 4 * FACING:
             # Arriving at a memory is no arrival: the target must be before the eyes, or the dog waits until it forgets.
-            self._done_for = self._done_for + 1 if now - self._seen_at <= FRESH else 0
+            self._done_for = self._done_for + 1 if self.is_in_view(now) else 0
             return None if self._done_for >= SETTLE else {**STAND, "base.wz": turn}
         self._done_for = 0
         if abs(bearing) > TURN_FIRST:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 Factory = Callable[[Mapping[str, object], str, IReactorTime, "Connector | None"], Driver]
 Describe = Callable[[Mapping[str, object], str], Description]
 
-KINDS = {"sim": "drivers.sim.maker"}
+KINDS = {"phone": "drivers.phone.maker", "sim": "drivers.sim.maker"}
 """Kind to the module that has ``made(options, name, clock, connector)`` and ``description(options, name)``."""
 
 

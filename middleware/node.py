@@ -25,7 +25,6 @@ from middleware.entangled.data.store import Store
 from middleware.entangled.errors import EntangledError, NotRunning, Refused, WeatherError
 from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact, unpacked
-from middleware.entangled.kademlia.distance import closest
 from middleware.entangled.network.network import Address, Network
 from middleware.entangled.node import EntangledNode
 from middleware.entangled.record import Record
@@ -40,8 +39,7 @@ from middleware.tasks import ORDER, RESULT, TASKS, Result, Task, group_key, task
 from middleware.value import bounded
 
 if TYPE_CHECKING:
-    from middleware.commitment.council import Council
-    from middleware.commitment.desk import Desk
+    from middleware.commitment.councils import Councils
     from middleware.commitment.lessee import Lessee
     from middleware.consensus.guard import Guard
     from middleware.consensus.selection import Strategies
@@ -51,12 +49,8 @@ if TYPE_CHECKING:
     from middleware.dissemination.party import OnSummary
     from middleware.verdict import Verdict
 
-LARGE = 50
-"""Members from which on a council has five instead of three."""
 CAMERA = "camera"
 LEASE_VERBS = ("prepare", "propose", "release", "close", "change", "install", "freed")
-SILENT = 10.0
-"""Seconds of silence after which another takes the seat of a council member."""
 LOOK_AGAIN = 0.3
 """Seconds after which a newcomer looks whether others took the same place in the order of joining."""
 LOOKS = 10
@@ -226,10 +220,7 @@ class SwarmNode(Service):
         """
         if not is_deployed(task.strategy):  # those are the business of the nodes that have them
             place_of(task.strategy)
-        key = group_key(task.task_id)
-        nearest = await self.entangled.find_node(key)
-        council = closest([*nearest, self.entangled.contact], key, self._seats(task))
-        task = replace(task, council=tuple(council))
+        task = replace(task, council=await self.councils.nearest(task))
         await self.entangled.put(TASKS, task.task_id, task.packed(), "team")
         return task
 
@@ -276,7 +267,7 @@ class SwarmNode(Service):
         """
         written = self.conclude(task.task_id, result)
         with suppress(EntangledError):
-            await self.council(task).close()
+            await self.councils.of(task).close()
         return await written
 
     def strategy(self, name: str) -> Guard:
@@ -300,33 +291,7 @@ class SwarmNode(Service):
 
         ``floor`` is the highest token that the node's own device has obeyed, so that a new token is always higher.
         """
-        # Imported by the first who has something to claim: a node without a robot is spared the memory.
-        from middleware.commitment.lessee import Lessee
-
-        lessee = Lessee(self.council(task, floor), self.clock, self.rng, changed, task.stop_time)
-        self._desk.enter(lessee)
-        return lessee
-
-    def has_vacancy(self, task: Task, council: Council) -> bool:
-        """Whether a seat of ``council`` is empty, or was never taken for want of nodes."""
-        return 0 < len(council.members) < self._seats(task) or bool(council.silent(SILENT))
-
-    async def successors(self, task: Task, council: Council) -> tuple[Contact, ...] | None:
-        """Who should be the council of ``task`` from now on: those of it that are there, and the closest of the others.
-
-        None where there is nobody who would make it better.  Fails with ``EntangledError`` where nobody answers.
-        """
-        from middleware.commitment.vacancy import filled
-
-        key, silent = group_key(task.task_id), council.silent(SILENT)
-        gone = {member.node_id for member in silent}
-        nearest = [node for node in await self.entangled.find_node(key) if node.node_id not in gone]
-        candidates = closest([*nearest, self.entangled.contact], key, len(nearest) + 1)
-        return filled(council.members, silent, candidates, self._seats(task))
-
-    def _seats(self, task: Task) -> int:
-        tolerates = max(task.tolerates, 2 if len(self.entangled.overlay.contacts()) >= LARGE else 1)
-        return 2 * tolerates + 1
+        return self.councils.lessee(task, changed, floor)
 
     async def _record(self, task: Task) -> None:
         """Have the record of ``task`` name its present council, unless it names that or a newer one already."""
@@ -334,30 +299,16 @@ class SwarmNode(Service):
         if known is None or known.configuration < task.configuration:
             await self.entangled.put(TASKS, task.task_id, task.packed(), "team")
 
-    def council(self, task: Task, floor: int = 0) -> Council:
-        """The council of ``task``, asked in this node's name; what is claimed lies above the token ``floor``."""
-        from middleware.commitment.council import Council
-
-        ttl = float(task.lease_ttl)
-
-        def ask(member: Contact, method: str, arguments: tuple[Any, ...]) -> Deferred[Any]:
-            return self._desk.ask(self.entangled.contact, member, method, arguments, ttl / 3)
-
-        def moved() -> None:
-            named = replace(task, council=council.members, configuration=council.configuration)
-            self._quietly(Deferred.fromCoroutine(self._record(named)))
-
-        pinned = task.task_id, self.uuid, ttl, task.council
-        council = Council(*pinned, ask, self.clock, self.rng, task.configuration, floor, moved)
-        return council
-
     @cached_property
-    def _desk(self) -> Desk:
-        """Where this node sits in the councils of tasks."""
+    def councils(self) -> Councils:
+        """The councils of the team's tasks: where this node sits in them, and how it asks them."""
         # Imported by the first who calls it to one: a node that is in none is spared the memory.
-        from middleware.commitment.desk import Desk
+        from middleware.commitment.councils import Councils
 
-        return Desk(self.entangled.endpoint, self.store, self.clock, self._born_at)
+        def moved(task: Task) -> None:
+            self._quietly(Deferred.fromCoroutine(self._record(task)))
+
+        return Councils(self.entangled, self.store, self.clock, self.rng, self._born_at, moved)
 
     @cached_property
     def _strategies(self) -> Strategies:
@@ -385,7 +336,7 @@ class SwarmNode(Service):
     # -- what peers ask ---------------------------------------------------------------------------------------------
 
     def _answer_lease(self, method: str, peer: Contact, *arguments: Any) -> object:
-        return self._desk.answer(method, peer, arguments)
+        return self.councils.desk.answer(method, peer, arguments)
 
     def _answer_offer(
         self, peer: Contact, auction: list[object], bids: list[object], age_ms: int, is_shared: bool

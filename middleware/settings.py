@@ -97,9 +97,6 @@ class AgentSettings:
     module: str = field(default="", metadata=setting.pattern(r"([A-Za-z_]\w*([.:][A-Za-z_]\w*)*)?", 'such as "search"'))
     """The agent's module, by its name or its dotted path; none where empty."""
 
-    options: Mapping[str, object] = field(default_factory=dict, metadata=setting.table())
-    """Handed on to the agent as they stand."""
-
 
 @dataclass(frozen=True)
 class DriverSettings:

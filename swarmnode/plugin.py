@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import ctypes
-import gc
 import sys
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from functools import partial
 from typing import NoReturn
 
@@ -23,6 +20,7 @@ from middleware.settings import COMMAND_LINE, Settings
 from swarmnode.assembly import FAULTS
 from swarmnode.ballast import drop_tls
 from swarmnode.service import NodeService
+from swarmnode.warmth import STARTED_S, warmed_up
 from swarmnode.web import web_page, with_code
 from swarmnode.world import control_socket, real_seams, resolved
 from webnode.errors import PortTaken
@@ -38,8 +36,6 @@ KEYS: Sequence[tuple[type[Exception], str]] = (
     (MissingExtra, "[node] roles"),
 )
 """Which setting to look at for which fault."""
-SETTLED = 3.0
-"""Seconds after which a node has started and joined."""
 
 
 class Options(usage.Options):
@@ -99,17 +95,10 @@ def makeService(options: Options) -> IService:
         if "web" in settings.node.roles:
             settings = with_code(settings, seams.rng)
             fronts.append(partial(web_page, settings, seams, reactor))
-        reactor.callLater(SETTLED, _give_back)
+        reactor.callLater(STARTED_S, warmed_up)
         return _Checked(settings, seams, fronts)
     except FAULTS as error:
         _refuse(told(error, settings.origin))
-
-
-def _give_back() -> None:
-    """Hand back what only starting needed: glibc keeps it for later, and a small device has other uses for it."""
-    gc.collect()
-    with suppress(OSError, AttributeError):
-        ctypes.CDLL(None).malloc_trim(0)
 
 
 class _Checked(NodeService):

@@ -8,25 +8,32 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from twisted.application.service import IService, MultiService, Service
+from twisted.internet.defer import gatherResults, maybeDeferred
 
 from middleware.entangled.data.sqlite import read_records
 from middleware.errors import BadSetting, MissingExtra
 from middleware.node import SwarmNode
 from middleware.settings import IN_MEMORY, Settings
-from swarmnode.gateway import gateway
 from swarmnode.invitation import invited
 from swarmnode.seams import Seams
 
+if TYPE_CHECKING:
+    from webnode.board import Phones
+
 
 class _Page(MultiService):
-    """The page, its line to the yard where there is one, and what says where it is: to its user and to the team."""
+    """The page, its line to the yard where there is one, and what says where it is: to its user and to the team.
 
-    def __init__(self, web: Service, operator: Any, tell: Callable[[], None]) -> None:
+    ``phones`` take part through it, and leave with it.
+    """
+
+    def __init__(self, web: Service, operator: Any, tell: Callable[[], None], phones: Phones) -> None:
         super().__init__()
         self._operator = operator
+        self._phones = phones
         self._tell = tell
         web.setServiceParent(self)
 
@@ -39,7 +46,8 @@ class _Page(MultiService):
     def stopService(self) -> Any:
         if self._operator is not None:
             self._operator.disconnect()
-        return super().stopService()
+        left = self._phones.close()
+        return gatherResults([left, maybeDeferred(super().stopService)])
 
 
 def with_code(settings: Settings, rng: random.Random) -> Settings:
@@ -55,6 +63,7 @@ def web_page(settings: Settings, seams: Seams, reactor: Any, node: SwarmNode) ->
     from agents.catalogue import DEMO, TASKS
 
     try:
+        from swarmnode.gateway import gateway
         from webnode.app import create_app
         from webnode.audit import audit
         from webnode.board import Board
@@ -102,7 +111,7 @@ def web_page(settings: Settings, seams: Seams, reactor: Any, node: SwarmNode) ->
         tuning(ground),
         halts(ground),
         faults(ground),
-        gateway(settings, seams, reactor, node),
+        phones := gateway(ground),
         invites,
     )
     name = settings.node.name
@@ -119,6 +128,7 @@ def web_page(settings: Settings, seams: Seams, reactor: Any, node: SwarmNode) ->
         board.fallbacks.here,
         board.chronicle,
         lambda: (desk.version, board.halts is not None and board.halts.is_halted()),
+        board.sessions,
     )
     shots, address = Shots(desk, reactor), settings.web
     doors = [] if tls is None else [tls.open]
@@ -128,7 +138,7 @@ def web_page(settings: Settings, seams: Seams, reactor: Any, node: SwarmNode) ->
         invited(name, address.host, lambda: web.port, board.sessions.code, web.secure_port)
         board.fallbacks.serves(web.urls(_names()))
 
-    return _Page(web, operator, tell)
+    return _Page(web, operator, tell, phones)
 
 
 def _doorway(settings: Settings) -> Callable[..., Any]:

@@ -9,6 +9,8 @@ from pathlib import Path
 from twisted.trial.unittest import SynchronousTestCase
 
 from agents import body, engagement, loop
+from agents.catalogue import TASKS
+from drivers.phone import driver, option
 from drivers.registry import describe
 from middleware import fault, halt, takeover
 from middleware.commitment import ballot, lessee
@@ -20,9 +22,10 @@ from middleware.entangled.kademlia import membership, roster
 from middleware.entangled.replication import handover, pusher, replica, subscriber
 from middleware.entangled.space import shelf, template
 from middleware.settings import Settings
-from webnode import channel, limits, live, team
+from swarmnode import gateway
+from webnode import channel, jpeg, limits, live, team
 from webnode.board import AUDITED
-from webnode.routes import orders
+from webnode.routes import orders, phones
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), ROOT / "benchmarks" / "README.md"]
@@ -54,6 +57,16 @@ FIGURES: Sequence[tuple[str, str]] = (
     ("faults", f"below {body.EMPTY:g} its agent takes its report back"),
     ("library", f"After about {membership.SILENCE + roster.STRUCK_S:g} s the absent are struck"),
     ("library", f"A request has at most {port.MAX_REQUEST:,} bytes, a node {port.MAX_CONNECTIONS} connections"),
+    ("phone", f"says nothing for {gateway.SILENCE_S:g} s has gone as well"),
+    ("phone", f"from {driver.STALE_S:g} s on it counts as silent"),
+    ("phone", f"| {gateway.MOST}: each is a node"),
+    ("phone", f"| {option.FPS:g} a second wanted while it has a task, {gateway.IDLE_FPS:g} else"),
+    ("phone", f"more than {gateway.LOOKS_S:g} a second ({gateway.LOOKS:g} at once)"),
+    ("phone", f"at most {jpeg.MOST_SIDE} pixels a side"),
+    ("phone", f"no others, {phones.TICKET_S / 3600:g} hours"),
+    ("phone", f"{option.LENS_DEG:g} degrees across the longer side"),
+    ("phone", f"keeps it in view for {TASKS['watch-target'].parameters['seconds']:g} s in all"),
+    ("phone", f"in view for {TASKS['watch-target'].stall_limit:g} s gives the task to another"),
     ("protocol", f"gone on without it for {roster.STRUCK_S:g} s, or for {roster.COUNTED_S:g} s"),
     ("protocol", f"out of touch with a majority for {handover.OUT_OF_TOUCH:g} s"),
     ("protocol", f"Pages hold about {replica.PAGE_BYTES:,} bytes"),

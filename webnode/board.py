@@ -8,6 +8,7 @@ any.
 
 from __future__ import annotations
 
+import math
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -26,11 +27,18 @@ AUDITED = 200
 
 @dataclass(frozen=True)
 class Visitor:
-    """Who asks; ``token_id`` names what it signed in with, and is no secret."""
+    """Who asks; ``token_id`` names what it signed in with, and is no secret.
+
+    It is let in ``until`` then (unix seconds), which it may have put off, no further than to ``limit``, unless it shows
+    a ticket.
+    """
 
     name: str = ""
     role: Role = "anyone"
     token_id: str = ""
+    until: float = math.inf
+    limit: float = math.inf
+    is_ticket: bool = False
 
 
 @dataclass(frozen=True)
@@ -62,8 +70,11 @@ class Sessions(Protocol):
     def token(self, name: str, role: Role, now: float, seconds: float) -> Token:
         """A token for somebody who need not sign in."""
 
-    def revoke(self, token_id: str) -> None:
-        """Let in nobody with this token any more."""
+    def renewed(self, who: Visitor, now: float) -> Token:
+        """Another token for the same session, good for longer; raises ``Refusal`` 401 for anyone and for a ticket."""
+
+    def revoke(self, token_id: str, until: float = math.inf) -> None:
+        """Let in nobody with this token any more, nor with one that was made of it; it runs out ``until`` then."""
 
 
 class OpenSessions:
@@ -83,7 +94,11 @@ class OpenSessions:
         """Return one that says nothing."""
         return Token("open", "open", role, now + seconds)
 
-    def revoke(self, token_id: str) -> None:
+    def renewed(self, who: Visitor, now: float) -> Token:
+        """Return one that says nothing."""
+        return self.token(who.name, who.role, now, 86400.0)
+
+    def revoke(self, token_id: str, until: float = math.inf) -> None:
         """Do nothing."""
 
 
@@ -411,13 +426,54 @@ class Phones(Protocol):
     """Phones that take part as devices, with this node as their way into the team."""
 
     def join(self, secret: bytes, name: str, can: Mapping[str, Any]) -> Deferred[str]:
-        """Let a phone take part; returns its uuid, which is the same for the same secret at every web node."""
+        """Let a phone take part; fires with its uuid, which is the same for the same secret at every web node.
+
+        ``can`` is what it has: ``width`` and ``height`` of its pictures in pixels, and whether it tells ``orientation``
+        and ``position``.  Fails with ``Refusal`` 409 or 429 where it may not, 503 where that cannot be.
+        """
 
     def look(self, uuid: str, jpeg: bytes, values: Mapping[str, float]) -> Wanted:
-        """Take what it sees and measures."""
+        """Take what it sees and measures; raises ``Refusal`` 404 where it takes no part here, 429 too often."""
 
     def leave(self, uuid: str) -> None:
-        """Let it go."""
+        """Let it go; one that is not here has gone already."""
+
+    def close(self) -> Deferred[Any]:
+        """Let all of them go; fires when they have."""
+
+
+class MemoryPhones:
+    """Phones that are only counted: ``here`` maps each uuid to its name, ``looks`` are (uuid, bytes, values)."""
+
+    def __init__(self, most: int = 8) -> None:
+        self.here: dict[str, str] = {}
+        self.looks: list[tuple[str, bytes, Mapping[str, float]]] = []
+        self.can: Mapping[str, Any] = {}
+        self._most = most
+
+    def join(self, secret: bytes, name: str, can: Mapping[str, Any]) -> Deferred[str]:
+        """Count it; its uuid is the end of its secret."""
+        uuid = secret[-20:].hex()
+        if uuid not in self.here and len(self.here) >= self._most:
+            return fail(Refusal("phone", "too many take part", "wait until one leaves", 409))
+        self.here[uuid], self.can = name, can
+        return succeed(uuid)
+
+    def look(self, uuid: str, jpeg: bytes, values: Mapping[str, float]) -> Wanted:
+        """Keep it."""
+        if uuid not in self.here:
+            raise Refusal("uuid", "this phone takes no part here", "join by POST /api/v1/phones", 404)
+        self.looks.append((uuid, jpeg, values))
+        return Wanted(10.0, "Look for the red target: turn slowly.")
+
+    def leave(self, uuid: str) -> None:
+        """Forget it."""
+        self.here.pop(uuid, None)
+
+    def close(self) -> Deferred[Any]:
+        """Forget all."""
+        self.here.clear()
+        return succeed(None)
 
 
 class Invites(Protocol):

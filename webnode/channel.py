@@ -15,7 +15,7 @@ from twisted.web.http import HTTPChannel
 from twisted.web.server import Request as SiteRequest
 from twisted.web.server import Site
 
-from webnode.board import Kept, Limits
+from webnode.board import Kept, Limits, Visitor
 from webnode.errors import Refusal
 from webnode.guard import HEADERS, MAX_BODY
 
@@ -49,8 +49,12 @@ def raw(refusal: Refusal) -> bytes:
 
 
 class CappedRequest(SiteRequest):
-    """A request whose body is never kept beyond ``guard.MAX_BODY``: answered with 413 and cut off."""
+    """A request whose body is never kept beyond ``guard.MAX_BODY``: answered with 413 and cut off.
 
+    ``who`` asks, where a native resource is asked.
+    """
+
+    who = Visitor()
     _taken = 0
     _cut = False
 

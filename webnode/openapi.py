@@ -74,7 +74,10 @@ def _operation(route: Route) -> dict[str, Any]:
     }
     if route.method == "GET":
         return operation
-    operation["parameters"] += [_mark(not body), _key()]
+    if route.answer is not None:
+        operation["parameters"] += [_mark(not body), _key()]
+    if route.takes:
+        operation["requestBody"] = {"required": True, "content": {route.takes: {}}}
     if body:
         schema = {
             "type": "object",
@@ -90,7 +93,7 @@ def _answer(route: Route) -> dict[str, Any]:
     """What is given: a media type where ``gives`` is one, else words about JSON."""
     if re.fullmatch(r"\w+/[\w.+-]+", route.gives):
         return {"description": route.about, "content": {route.gives: {}}}
-    if route.answer is None:
+    if route.answer is None and route.method == "GET":
         return {"description": route.about}
     return {"description": route.gives or "nothing more", "content": _json({"type": ["object", "array"]})}
 

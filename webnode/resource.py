@@ -22,7 +22,7 @@ class JsonResource(Resource):
 
     def render(self, request: Request) -> int | bytes:
         """Answer with one of ``methods``."""
-        is_there = hasattr(self, "render_GET") or request.method not in (b"GET", b"HEAD")
+        is_there = self.isLeaf or hasattr(self, "render_GET") or request.method not in (b"GET", b"HEAD")
         if not is_there or (self.isLeaf and getattr(request, "postpath", None)):
             refusal = Refusal(path_of(request), "not found", "look at docs/web.md for what can be asked", 404)
             return answer(request, refusal)

@@ -23,7 +23,7 @@ MAX_ENTRIES = 64
 MAX_TEXT = 300
 ALLOWED: Mapping[Role, tuple[Role, ...]] = {
     "anyone": ("anyone", "viewer", "operator", "phone"),
-    "viewer": ("viewer", "operator"),
+    "viewer": ("viewer", "operator", "phone"),
     "operator": ("operator",),
     "phone": ("phone", "operator"),
 }
@@ -87,7 +87,7 @@ class Route:
     """One line of the API.
 
     ``answer`` None: the route is not Flask's but a Twisted resource's, made by ``native`` or by the front door.
-    ``limit_s`` is for answers that may take longer than the others.
+    ``limit_s`` is for answers that may take longer than the others; ``takes`` is the media type of a native body.
     """
 
     method: Literal["GET", "POST", "PUT", "DELETE"]
@@ -100,6 +100,7 @@ class Route:
     status: int = 200
     native: Native | None = None
     limit_s: float | None = None
+    takes: str = ""
 
     @property
     def name(self) -> str:

@@ -20,6 +20,7 @@ from twisted.application.service import Service
 from twisted.internet.defer import Deferred, gatherResults, maybeDeferred
 from twisted.internet.error import CannotListenError
 from twisted.internet.interfaces import IListeningPort
+from twisted.internet.threads import deferToThreadPool
 from twisted.python.failure import Failure
 from twisted.python.threadpool import ThreadPool
 from twisted.web.http import CACHED, Request
@@ -34,8 +35,8 @@ from webnode.camera import FrameSource
 from webnode.channel import CappedRequest, limited
 from webnode.errors import PortTaken, Refusal
 from webnode.fallback import urls_at
-from webnode.guard import headers, refusal, token_of
-from webnode.live import Events, Shots
+from webnode.guard import headers, refusal
+from webnode.live import Events, Shots, shown
 from webnode.resource import JsonResource, Refused
 from webnode.route import Route, guarded
 from webnode.routes.table import TABLE
@@ -172,12 +173,13 @@ class Root(Resource):
             return Refused(problem)
         if method == "OPTIONS":
             return _Preflight()
-        ticket: bytes = (request.args or {}).get(b"ticket", [b""])[0]
-        token = token_of(request.getHeader("authorization") or "", ticket.decode("ascii", "replace"))
         try:
-            guarded(role, self._board.sessions.visitor(token, self._wall()))
+            who = self._board.sessions.visitor(shown(request), self._wall())
+            guarded(role, who)
         except Refusal as no:
             return Refused(no)
+        if isinstance(request, CappedRequest):
+            request.who = who
         return resource
 
 
@@ -307,12 +309,13 @@ class WebService(Service):
         super().stopService()
         if self._listening is None:
             return None
-        closed = gatherResults([maybeDeferred(port.stopListening) for port in (self._listening, *self._open)])
+        closed: list[Deferred[Any]] = [maybeDeferred(port.stopListening) for port in (self._listening, *self._open)]
         self._listening, self._open = None, []
         self._events.close()
         self._shots.close()
-        self._pool.stop()
-        return closed.addCallback(lambda _: None)
+        # Waits for the workers, which at that moment may wait for the reactor to take their answer: not on its thread.
+        closed.append(deferToThreadPool(self._reactor, self._reactor.getThreadPool(), self._pool.stop))
+        return gatherResults(closed).addCallback(lambda _: None)
 
 
 def web_service(
@@ -329,6 +332,7 @@ def web_service(
 ) -> WebService:
     """The whole web node from what the front door has; ``wall`` is the unix time in seconds."""
     app = create_app(read, board, caller(reactor), hosts, wall, table)
-    events = Events(read, reactor, wall, board.desk.yard, board.fallbacks.here, board.chronicle)
+    desk, here = board.desk, board.fallbacks.here
+    events = Events(read, reactor, wall, desk.yard, here, board.chronicle, sessions=board.sessions)
     shots = Shots(frames, reactor)
     return WebService(reactor, host, port, app, events, shots, Files(), board, wall, hosts, doors, table)

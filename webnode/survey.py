@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from twisted.internet.defer import Deferred, succeed
+from twisted.internet.defer import Deferred, DeferredList, maybeDeferred, succeed
 
 from middleware.entangled.errors import EntangledError, Refused
 from middleware.entangled.record import Record
@@ -65,36 +65,23 @@ class TeamSurvey:
     # -- inside -----------------------------------------------------------------------------------------------------
 
     def _ask_all(self) -> None:
-        pairs = sorted(devices_of(self._devices()), key=lambda pair: (pair[0].joined, pair[0].uuid))[:MAX_ASKED]
-        names = {device.uuid: device.name for device, _ in devices_of(self._devices())}
-        views: dict[str, Json] = {}
-        silent: list[Json] = []
-        left = len(pairs)
+        pairs = devices_of(self._devices())
+        names = {device.uuid: device.name for device, _ in pairs}
+        pairs = pairs[:MAX_ASKED]
         self._waiting = []
 
-        def came(outcome: Any, uuid: str) -> None:
-            nonlocal left
-            if isinstance(outcome, dict):
-                views[uuid] = _network_view(outcome, names)
-            else:
-                silent.append(uuid)
-            left -= 1
-            if left == 0:
-                ended()
-
-        def ended() -> None:
+        def ended(outcomes: list[tuple[bool, Any]]) -> None:
             # In the order of joining, whoever was quicker.
-            ordered: dict[str, Json] = {device.uuid: views[device.uuid] for device, _ in pairs if device.uuid in views}
-            self._network = {"devices": ordered, "silent": silent}
+            told = [(device.uuid, outcome) for (device, _), (_, outcome) in zip(pairs, outcomes, strict=True)]
+            views = {uuid: _network_view(outcome, names) for uuid, outcome in told if isinstance(outcome, dict)}
+            self._network = {"devices": views, "silent": [uuid for uuid, _ in told if uuid not in views]}
             self._asked_at = self._node.clock.seconds()
             waiting, self._waiting = self._waiting or [], None
             for waiter in waiting:
                 waiter.callback(self._network)
 
-        if not pairs:
-            ended()
-        for device, record in pairs:
-            self._ask(device, record, NETWORK).addBoth(came, device.uuid)
+        asked = [maybeDeferred(self._ask, device, record, NETWORK) for device, record in pairs]
+        DeferredList(asked, consumeErrors=True).addCallback(ended)
 
     def _ask(self, device: Device, record: Record, method: str) -> Deferred[Any]:
         if device.uuid == self._node.uuid:

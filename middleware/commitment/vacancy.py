@@ -20,10 +20,15 @@ def filled(
     here = [member for member in members if member.node_id not in gone]
     others = [one for one in candidates if one.node_id not in seated]
     following = (*here, *others)[: max(size, len(here))]
-    following = following[: len(following) - 1 + len(following) % 2]  # an even one can lose no more than one less
+    following = odd(following)
     if _spare(len(following), len(following)) <= _spare(len(here), len(members)):
         return None
-    return tuple(following)
+    return following
+
+
+def odd(members: Sequence[Contact]) -> tuple[Contact, ...]:
+    """So many of the first ``members`` that their number is odd: of four no more may be lost than of three."""
+    return tuple(members[: len(members) - 1 + len(members) % 2])
 
 
 def _spare(here: int, size: int) -> int:

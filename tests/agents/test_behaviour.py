@@ -30,7 +30,7 @@ class BehaviourTests(SynchronousTestCase):
         """A kind that nobody knows is refused with the list of those there are."""
         self.assertEqual(
             self.refusal(replace(TASK, kind="fetch")),
-            "no behaviour for a task of kind 'fetch'; there are find-target, turn-around",
+            "no behaviour for a task of kind 'fetch'; there are find-target, turn-around, watch-target",
         )
 
     def test_kind_from_the_wire_is_never_imported(self) -> None:

@@ -10,8 +10,8 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from agents.caretaker import AGAIN, VISIT
 from agents.catalogue import task_named
+from middleware.commitment.councils import SILENT
 from middleware.entangled.record import Record
-from middleware.node import SILENT
 from middleware.order import PAUSE, RESUME, Order
 from middleware.tasks import COMPLETED, TASKS, Task, outcome_of, tasks_of
 from swarmnode.rehearsal import VirtualTeam

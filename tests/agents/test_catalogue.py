@@ -30,6 +30,13 @@ class CatalogueTests(SynchronousTestCase):
         self.assertEqual(refusals(capabilities, TASKS["turn-around"].requirements), [])
         self.assertEqual(refusals(capabilities, TASKS["fetch-the-ball"].requirements), ["has no gripper"])
 
+    def test_phone_can_watch_and_no_more(self) -> None:
+        """A phone may keep the target in view, as a dog may; for what walks it lacks the legs."""
+        phone, dog = describe("phone", {}).capabilities, describe("sim", {}, "dog1").capabilities
+        self.assertEqual([refusals(each, TASKS["watch-target"].requirements) for each in (phone, dog)], [[], []])
+        self.assertIn("has no base2d", refusals(phone, TASKS[DEMO].requirements))
+        self.assertIn("has no base2d", refusals(phone, TASKS["turn-around"].requirements))
+
     def test_doable_tasks_have_a_behaviour(self) -> None:
         """What a dog of the yard can do there is a behaviour for."""
         capabilities = describe("sim", {}, "dog1").capabilities
@@ -39,4 +46,4 @@ class CatalogueTests(SynchronousTestCase):
     def test_unknown_name_lists_the_known(self) -> None:
         """A task that is not predefined is refused with those that are."""
         error = self.assertRaises(UnknownTask, task_named, "dance", "t1", 0.0)
-        self.assertIn("'dance'; there are fetch-the-ball, find-red-target, turn-around", str(error))
+        self.assertIn("'dance'; there are fetch-the-ball, find-red-target, turn-around, watch-target", str(error))

@@ -1,4 +1,4 @@
-"""What every driver must do; the tests of each driver mix this in."""
+"""What every driver must do, and what one that moves must do besides; the tests of each driver mix one of them in."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ else:
 STATES = {"idle", "connecting", "ready", "stale", "stopped", "closed"}
 
 
-class DriverContract(_Case):
-    """Conformance tests; whoever mixes them in says how a driver is made and how time passes."""
+class SensingContract(_Case):
+    """Conformance tests of any driver; whoever mixes them in says how one is made and how time passes."""
 
     def make_driver(self) -> Driver:
-        """A fresh driver that is not connected, of a robot that has ``base.vx``."""
+        """A fresh driver that is not connected."""
         raise NotImplementedError
 
     def pass_time(self, seconds: float) -> None:
@@ -30,14 +30,6 @@ class DriverContract(_Case):
 
     def now(self) -> float:
         """The driver's clock."""
-        raise NotImplementedError
-
-    def true_speed(self) -> float:
-        """How fast the robot really moves, in m/s."""
-        raise NotImplementedError
-
-    def cut_link(self) -> None:
-        """Break the link as a lost network does; it can be opened again."""
         raise NotImplementedError
 
     def ready(self) -> Driver:
@@ -75,6 +67,60 @@ class DriverContract(_Case):
         self.assertEqual(self.successResultOf(connected), driver.description)
         self.assertEqual(driver.state, "ready")
         self.assertIsNotNone(driver.observe())
+
+    def test_tells_subscribers_until_they_leave(self) -> None:
+        """Subscribers get each observation, in order of time, whatever another subscriber does, until they leave."""
+        driver = self.ready()
+        seen: list[Observation] = []
+
+        def faulty(_observation: Observation) -> None:
+            raise ValueError("not mine")
+
+        end_faulty = driver.subscribe(faulty)
+        end = driver.subscribe(seen.append)
+        self.pass_time(0.3)
+        end_faulty()
+        end()
+        end()
+        count = len(seen)
+        self.assertGreater(count, 3)
+        self.assertEqual(len(self.flushLoggedErrors(ValueError)), count)
+        self.assertEqual(seen, sorted(seen, key=lambda one: (one.t_host, one.t_robot)))
+        self.pass_time(0.3)
+        self.assertEqual(len(seen), count)
+
+    def test_counts(self) -> None:
+        """Diagnostics are numbers, and say how old the newest observation is."""
+        driver = self.ready()
+        numbers = driver.diagnostics()
+        self.assertGreater(numbers["frames"], 0)
+        self.assertEqual(numbers["bad_frames"], 0)
+        self.assertLess(numbers["age"], 0.2)
+        self.assertIn(driver.state, STATES)
+
+    def test_ends_for_good_and_twice(self) -> None:
+        """Disconnect may be called twice and in any state; after it there is no way back."""
+        idle = self.make_driver()
+        self.successResultOf(idle.disconnect())
+        self.assertEqual(idle.state, "closed")
+        driver = self.ready()
+        self.failureResultOf(driver.connect(), DriverError)
+        self.successResultOf(driver.disconnect())
+        self.successResultOf(driver.disconnect())
+        self.assertEqual(driver.state, "closed")
+        self.failureResultOf(driver.connect(), DriverError)
+
+
+class DriverContract(SensingContract):
+    """Conformance tests of a driver whose robot moves, and has ``base.vx``."""
+
+    def true_speed(self) -> float:
+        """How fast the robot really moves, in m/s."""
+        raise NotImplementedError
+
+    def cut_link(self) -> None:
+        """Break the link as a lost network does; it can be opened again."""
+        raise NotImplementedError
 
     def test_refuses_motion_before_it_is_enabled(self) -> None:
         """Motors are off after connect: motion raises NotEnabled, and the robot stays where it is."""
@@ -184,33 +230,3 @@ class DriverContract(_Case):
         self.assertLess(self.true_speed(), 0.01)
         driver.act({"base.vx": 0.1}, self.permit())
         self.assertEqual(driver.diagnostics()["reconnects"], 1.0)
-
-    def test_tells_subscribers_until_they_leave(self) -> None:
-        """Subscribers get each observation, in order of time, whatever another subscriber does, until they leave."""
-        driver = self.ready()
-        seen: list[Observation] = []
-
-        def faulty(_observation: Observation) -> None:
-            raise ValueError("not mine")
-
-        end_faulty = driver.subscribe(faulty)
-        end = driver.subscribe(seen.append)
-        self.pass_time(0.3)
-        end_faulty()
-        end()
-        end()
-        count = len(seen)
-        self.assertGreater(count, 3)
-        self.assertEqual(len(self.flushLoggedErrors(ValueError)), count)
-        self.assertEqual(seen, sorted(seen, key=lambda one: (one.t_host, one.t_robot)))
-        self.pass_time(0.3)
-        self.assertEqual(len(seen), count)
-
-    def test_counts(self) -> None:
-        """Diagnostics are numbers, and say how old the newest observation is."""
-        driver = self.ready()
-        numbers = driver.diagnostics()
-        self.assertGreater(numbers["frames"], 0)
-        self.assertEqual(numbers["bad_frames"], 0)
-        self.assertLess(numbers["age"], 0.2)
-        self.assertIn(driver.state, STATES)

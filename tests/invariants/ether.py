@@ -308,8 +308,7 @@ class Node:
         )
         self.entangled = SimpleNamespace(get=self._get)
         self.reached = lambda uuids: ()
-        self.council = lambda task: Council()
-        self.has_vacancy = lambda task, council: False
+        self.councils = SimpleNamespace(of=lambda task: Council(), has_vacancy=lambda task, council: False)
         self.halt = SimpleNamespace(watch=lambda obey: None, learn=lambda: None, is_on=False, is_known=True)
         self.deployed: Deployed = {}
         self.strategies = Strategies()

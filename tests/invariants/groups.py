@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from agents.state import State
-from middleware.tasks import Task
 from tests.invariants.tasks import Tasks
 
 
@@ -15,21 +16,8 @@ class Groups(Tasks):
         rng = self.rng
         strategy = ("group_optimal", "cbba", "nearest")[self.n % 3]
         for _ in range(rng.choice([1, 2, 3])):
-            name = f"t{len(self.tasks)}"
-            self.tasks[name] = Task(
-                name,
-                "walk",
-                name,
-                parameters={"target": rng.choice([-4.0, 0.0, 4.0])},
-                strategy=strategy,
-                waiting_period=1.0,
-                created=self.clock.seconds(),
-                priority=rng.choice([0, 0, 5]),
-                preemptible=rng.random() < 0.5,
-                deadline=rng.choice([0.0, 0.0, 0.0, 6.0]),
-                group=rng.choice(["g", "g", "g", ""]),
-            )
-            self.ether.submit(self.tasks[name])
+            task = self.any_task()
+            self.enter(replace(task, strategy=strategy, group=rng.choice(["g", "g", "g", ""])))
 
     def watch(self) -> None:
         """Look at every agent, and on how many tasks it acts or may act."""

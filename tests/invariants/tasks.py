@@ -135,9 +135,18 @@ class Tasks:
 
     def submit(self) -> None:
         """A task of any kind of task."""
+        self.enter(self.any_task())
+
+    def enter(self, task: Task) -> None:
+        """Make ``task`` one of the schedule's."""
+        self.tasks[task.task_id] = task
+        self.ether.submit(task)
+
+    def any_task(self) -> Task:
+        """The next task: of any place, priority and deadline."""
         rng = self.rng
         name = f"t{len(self.tasks)}"
-        self.tasks[name] = Task(
+        return Task(
             name,
             "walk",
             name,
@@ -148,7 +157,6 @@ class Tasks:
             preemptible=rng.random() < 0.5,
             deadline=rng.choice([0.0, 0.0, 0.0, 6.0]),
         )
-        self.ether.submit(self.tasks[name])
 
     def heal(self) -> None:
         """The end of all faults; whoever is away comes back."""

@@ -10,10 +10,10 @@ import ssl
 from importlib.util import find_spec
 from typing import Any
 
+from tests.live.page import CHROMIUM, DESK, FLAGS
+from tests.live.page import MISSING as NO_BROWSER
 from tests.live.test_bad_input import LiveTests
 from tests.live.test_https import CODE, SecureNode, asked
-from tests.live.test_page import CHROMIUM, DESK, FLAGS
-from tests.live.test_page import MISSING as NO_BROWSER
 
 MISSING = [*NO_BROWSER, *(name for name in ("OpenSSL", "cryptography") if find_spec(name) is None)]
 FOUND_S = 30.0

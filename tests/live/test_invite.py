@@ -7,7 +7,7 @@ from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from tests.live.test_page import CHROMIUM, DESK, FLAGS, MISSING, PHONE, TABLET, Team
+from tests.live.page import CHROMIUM, DESK, FLAGS, MISSING, PHONE, TABLET, Team
 
 ABSENT = [*MISSING, *([] if find_spec("segno") else ["the Python package segno"])]
 PHONES = """async () => {

@@ -10,7 +10,9 @@ from benchmarks.takeover.cause import Cause, Trial
 from benchmarks.takeover.judge import Judge
 from benchmarks.takeover.rehearsed import trial
 from benchmarks.takeover.report import drawn, table
+from middleware.presence import EXECUTING
 from middleware.tasks import COMPLETED, Result
+from swarmnode.rehearsal import VirtualTeam
 
 
 class TakeoverTests(SynchronousTestCase):
@@ -40,6 +42,34 @@ class TakeoverTests(SynchronousTestCase):
     def test_polite_leave(self) -> None:
         """A node that leaves in order is replaced."""
         self.take_over(Cause.POLITE_LEAVE, 2)
+
+    def test_dog_and_page_at_once(self) -> None:
+        """The demonstration's dog on its way and the node that serves the page are lost at once: another dog goes on.
+
+        In both of these runs a council of three would have had the two among its members.
+        """
+        for seed in (6, 7):
+            team = VirtualTeam(seed, others=("pi",))
+            self.addCleanup(team.stop)
+            team.run_demo()
+            first = self.moving_for_it(team, "")
+            for gone in (first, VirtualTeam.BOOTSTRAP):
+                team.kill(gone)
+            began = team.clock.seconds()
+            self.assertNotEqual(self.moving_for_it(team, first), first)
+            self.assertLess(team.clock.seconds() - began, 3.0, seed)
+
+    def moving_for_it(self, team: VirtualTeam, besides: str) -> str:
+        """The dog that has a lease and moves, as soon as one other than ``besides`` does."""
+        for _ in range(1200):
+            team.clock.advance(0.05)
+            for name in team.DOGS:
+                agent = team.services[name].assembly.agent
+                engagement = getattr(agent, "engagement", None)
+                is_acting = engagement is not None and engagement.me.status == EXECUTING
+                if name != besides and is_acting and team.yard.world.dogs[name].is_moving:
+                    return name
+        self.fail("no dog goes")
 
 
 class JudgeTests(SynchronousTestCase):

@@ -95,7 +95,9 @@ class RefusalTests(SynchronousTestCase):
     def test_refuse_unknown_driver(self) -> None:
         """A kind of robot that there is no driver for is refused with those that there are."""
         path = self.file('[node]\nname = "a"\n[driver]\nkind = "simm"\n')
-        self.assert_says(self.refusal("--config", path, is_made=True), path, "[driver]", "'simm'", "known are sim")
+        self.assert_says(
+            self.refusal("--config", path, is_made=True), path, "[driver]", "'simm'", "known are phone, sim"
+        )
 
     def test_refuse_wrong_driver_option(self) -> None:
         """A driver's option with a wrong value is refused with the option and what to write."""

@@ -13,6 +13,7 @@ from webnode.board import (
     MemoryChronicle,
     MemoryFallbacks,
     MemoryHalts,
+    MemoryPhones,
     MemoryTuning,
     NoLimits,
     OpenSessions,
@@ -55,6 +56,21 @@ class TwinTests(SynchronousTestCase):
         self.assertEqual([page.node for page in fallbacks.here()], ["02"])
         self.assertTrue(fallbacks.lets_in("http://10.0.0.2:8080"))
         self.assertFalse(fallbacks.lets_in("http://10.0.0.2:8081"))
+
+    def test_phones_in_memory_are_counted(self) -> None:
+        """The twin of the gateway knows a phone by its secret, takes looks of those that are here, and so many."""
+        phones = MemoryPhones(most=1)
+        uuid = self.successResultOf(phones.join(b"1" * 32, "anna", {}))
+        self.assertEqual(self.successResultOf(phones.join(b"1" * 32, "anna", {})), uuid)
+        self.failureResultOf(phones.join(b"2" * 32, "ben", {}), Refusal)
+        self.assertGreater(phones.look(uuid, b"jpeg", {"target.distance": 1.0}).fps, 0.0)
+        self.assertEqual(phones.looks, [(uuid, b"jpeg", {"target.distance": 1.0})])
+        phones.leave(uuid)
+        phones.leave(uuid)
+        self.assertEqual(self.assertRaises(Refusal, phones.look, uuid, b"jpeg", {}).status, 404)
+        self.successResultOf(phones.join(b"2" * 32, "ben", {}))
+        self.successResultOf(phones.close())
+        self.assertEqual(phones.here, {})
 
     def test_team_in_memory_obeys(self) -> None:
         """The twin of the stop has all its devices stand and go on, and knows which was said last."""

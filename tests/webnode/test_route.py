@@ -86,7 +86,7 @@ class CheckedTests(SynchronousTestCase):
 
 class GuardedTests(SynchronousTestCase):
     def test_let_in_by_role(self) -> None:
-        """An operator may do all, a viewer look, a phone what phones do; who is nobody is told to sign in."""
+        """An operator may do all, a viewer look, a phone that and what phones do; who is nobody is told to sign in."""
         for wanted, lawful in ALLOWED.items():
             for role in ALLOWED:
                 if role in lawful:

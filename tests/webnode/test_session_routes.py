@@ -49,6 +49,18 @@ class SessionRouteTests(SynchronousTestCase):
             self.assertEqual(self.client.post("/api/v1/demo", json={}, headers=bearer).status_code, 401)
             self.assertEqual(self.client.get(f"/api/v1/state?{ticket}").status_code, 401)
 
+    def test_renew(self) -> None:
+        """A session is renewed by its token; signing out with the old one ends what was made of it as well."""
+        told = self.signed(code="quiet-otter")
+        bearer = {**self.bearer(told["token"]), "X-Swarm": "1"}
+        anew = self.client.put("/api/v1/session", headers=bearer)
+        self.assertEqual((anew.status_code, anew.get_json()["role"]), (200, "operator"))
+        for wrong in ({"X-Swarm": "1"}, {**self.bearer(told["ticket"]), "X-Swarm": "1"}):
+            self.assertEqual(self.client.put("/api/v1/session", headers=wrong).status_code, 401)
+        self.client.delete("/api/v1/session", headers=bearer)
+        headers = self.bearer(anew.get_json()["token"])
+        self.assertEqual(self.client.get("/api/v1/session", headers=headers).get_json()["role"], "anyone")
+
     def test_be_nobody_without(self) -> None:
         """Whoever has not signed in is anyone, who may look at nothing and order nothing."""
         self.assertEqual(self.client.get("/api/v1/session").get_json(), {"name": "", "role": "anyone"})

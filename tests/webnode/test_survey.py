@@ -73,6 +73,13 @@ class SurveyTests(FleetCase):
         told: Any = self.successResultOf(waiting)
         self.assertEqual((list(told["devices"]), told["silent"]), (self.dogs[:2], self.dogs[2:]))
 
+    def test_go_on_beside_one_without_an_address(self) -> None:
+        """A device that says no address is named as silent, and the others are shown all the same."""
+        self.team.nodes[2].presence.change(address="nowhere")
+        self.team.run(1)
+        told = self.network()
+        self.assertEqual((list(told["devices"]), told["silent"]), (self.dogs[:2], self.dogs[2:]))
+
     def test_believe_nothing_unlawful(self) -> None:
         """Answers of the wrong shape become empty ones."""
         for told in ({"contacts": [3, {"uuid": 5}, {"uuid": "ab", "rtt_ms": "x"}], "lookups": 7, "sent": []}, "no", {}):

@@ -1,7 +1,209 @@
-"""Routes of phones that take part as devices."""
+"""Routes of phones that take part as devices: joining, what they see, leaving.
+
+What a phone sees comes ten times a second, and passes none of the workers that pages wait for.
+"""
 
 from __future__ import annotations
 
-from webnode.route import Route
+import json
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
 
-ROUTES: tuple[Route, ...] = ()
+from twisted.internet.defer import Deferred
+from twisted.web.http import Request
+
+from webnode.board import Board, Visitor
+from webnode.errors import Refusal
+from webnode.field import Json
+from webnode.jpeg import MOST_SIDE, size_of
+from webnode.resource import JsonResource, answer
+from webnode.route import API, Ask, Field, Route
+
+SECRET = 32
+"""Bytes of a phone's own secret, in twice as many hexadecimal digits."""
+TICKET_S = 12 * 3600.0
+BOUND = "phone/"
+"""Begins the name that a ticket is made out to; the phone's uuid follows, and nobody else's looks does it let in."""
+MAX_VALUES = 1000
+FPS = 10.0
+
+
+@dataclass(frozen=True)
+class Measure:
+    """A value that a look may carry."""
+
+    least: float
+    most: float
+    unit: str
+
+
+MEASURES: Mapping[str, Measure] = {
+    "target.bearing": Measure(-math.pi, math.pi, "rad"),
+    "target.distance": Measure(0.0, 100.0, "m"),
+    "orientation.yaw": Measure(0.0, math.tau, "rad"),
+    "orientation.pitch": Measure(-math.pi, math.pi, "rad"),
+    "orientation.roll": Measure(-math.pi, math.pi, "rad"),
+    "position.lat": Measure(-90.0, 90.0, "deg"),
+    "position.lon": Measure(-180.0, 180.0, "deg"),
+    "position.accuracy": Measure(0.0, 1e6, "m"),
+}
+TOGETHER = (("target.bearing", "target.distance"), ("position.lat", "position.lon"))
+"""Neither says anything without the other."""
+
+
+def join(ask: Ask) -> Deferred[Json]:
+    """Let a phone take part."""
+    if ask.board.phones is None:
+        raise Refusal("phone", "this node takes no phones", "look at another web node", 409)
+    if ask.who.name.startswith(BOUND):
+        raise Refusal("ticket", "it is good for one phone's looks alone", "sign in, and join with that", 403)
+    given = ask.given
+    secret, name = given["secret"], given["name"]
+    if not re.fullmatch(rf"[0-9a-fA-F]{{{2 * SECRET}}}", secret):
+        raise Refusal("secret", "it is no secret of a phone", f"give {2 * SECRET} hexadecimal digits, always the same")
+    if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
+        raise Refusal("name", "a device is not called so", "give 1 to 40 letters, digits, _ or -")
+    can = {key: given[key] for key in ("width", "height", "orientation", "position")}
+
+    def joined(uuid: str) -> Json:
+        token = ask.board.sessions.token(f"{BOUND}{uuid}", "phone", ask.now, TICKET_S)
+        return {"uuid": uuid, "ticket": token.ticket, "until": token.until, "fps": FPS}
+
+    return ask.board.phones.join(bytes.fromhex(secret), name, can).addCallback(joined)
+
+
+def values_of(text: str) -> dict[str, float]:
+    """What was measured with a picture; raises ``Refusal``."""
+    try:
+        found = json.loads(text or "{}") if len(text) <= MAX_VALUES else None
+    except (ValueError, RecursionError):
+        found = None
+    if not isinstance(found, dict):
+        raise Refusal("values", "it is no JSON object", 'give something like {"target.bearing": 0.1}')
+    for name, value in found.items():
+        measure = MEASURES.get(name)
+        if measure is None:
+            raise Refusal("values", f"{name[:40]!r} is no measure", f"give some of {', '.join(MEASURES)}")
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not is_number or not measure.least <= value <= measure.most:
+            bounds = f"{measure.least:.4g} to {measure.most:.4g} {measure.unit}"
+            raise Refusal("values", f"{name} is out of range", f"give a number from {bounds}")
+    for pair in TOGETHER:
+        if len([name for name in pair if name in found]) == 1:
+            raise Refusal("values", f"{' and '.join(pair)} go together", "give both, or neither")
+    return {name: float(value) for name, value in found.items()}
+
+
+class _OfPhone(JsonResource):
+    """What a phone sends of itself, by its own ticket, or an operator in its name."""
+
+    isLeaf = True
+    methods = (b"POST",)
+
+    def __init__(self, board: Board) -> None:
+        super().__init__()
+        self._board = board
+
+    def render_POST(self, request: Request) -> bytes:
+        uuid = request.prepath[-2].decode("ascii", "replace")  # type: ignore[attr-defined]
+        who: Visitor = getattr(request, "who", Visitor())
+        try:
+            if self._board.phones is None:
+                raise Refusal("phone", "this node takes no phones", "look at another web node", 409)
+            if who.role == "phone" and who.name != f"{BOUND}{uuid}":
+                raise Refusal("ticket", "it is another phone's", f"join by POST {API}/phones", 403)
+            told = self.taken(uuid, who, request)
+        except Refusal as refusal:
+            return answer(request, refusal)
+        request.setHeader("Content-Type", "application/json")
+        request.setHeader("Cache-Control", "no-store")
+        return json.dumps(told).encode()
+
+    def taken(self, uuid: str, who: Visitor, request: Request) -> Json:
+        """Do it; returns what is answered."""
+        raise NotImplementedError
+
+
+class Look(_OfPhone):
+    """``POST phones/<uuid>/look?values=``: one picture, and what was measured with it."""
+
+    def taken(self, uuid: str, who: Visitor, request: Request) -> Json:
+        """Hand it on."""
+        assert self._board.phones is not None
+        given: bytes = (request.args or {}).get(b"values", [b""])[0]
+        values = values_of(given.decode("utf-8", "replace"))
+        body = request.content.read() if request.content is not None else b""
+        if size_of(body) is None:
+            problem = "it is no JPEG picture that is used here" if body else "it is missing or empty"
+            raise Refusal("body", problem, f"send a whole JPEG of at most {MOST_SIDE} pixels a side")
+        wanted = self._board.phones.look(uuid, body, values)
+        return {"fps": wanted.fps, "say": wanted.say}
+
+
+class Leave(_OfPhone):
+    """``POST phones/<uuid>/leave``: the last word of a page that is closed or hidden."""
+
+    def taken(self, uuid: str, who: Visitor, request: Request) -> Json:
+        """Let it go."""
+        assert self._board.phones is not None
+        self._board.phones.leave(uuid)
+        source = str(getattr(request.getClientAddress(), "host", ""))
+        self._board.audit.note(who, source, f"POST {API}/phones/{{uuid}}/leave", uuid[:64], "200")
+        return {}
+
+
+UUID = Field("uuid", "text", "the phone", "path", most=64)
+ROUTES = (
+    Route(
+        "POST",
+        f"{API}/phones",
+        "Let a phone take part as a device, with this node as its way into the team; again, where it does already",
+        "phone",
+        join,
+        (
+            Field("secret", "text", "its own, as hexadecimal digits: one secret is one device", most=2 * SECRET),
+            Field("name", "text", "what people call it: letters, digits, _ or -", most=40),
+            Field("width", "whole", "of its pictures", least=16, most=MOST_SIDE, unit="pixels"),
+            Field("height", "whole", "of its pictures", least=16, most=MOST_SIDE, unit="pixels"),
+            Field("orientation", "flag", "whether it tells how it is held", default=False, is_required=False),
+            Field("position", "flag", "whether it tells where it is", default=False, is_required=False),
+        ),
+        gives="uuid, ticket (for its looks and no others, in the query), until (unix seconds), fps",
+        limit_s=4.5,
+    ),
+    Route(
+        "POST",
+        f"{API}/phones/{{uuid}}/look",
+        "A picture that the phone took, and what it measured with it",
+        "phone",
+        None,
+        (
+            UUID,
+            Field(
+                "values",
+                "text",
+                "what was measured, as a JSON object: "
+                + ", ".join(f"{name} ({measure.unit})" for name, measure in MEASURES.items()),
+                "query",
+                least=0,
+                most=MAX_VALUES,
+                is_required=False,
+                default="",
+            ),
+        ),
+        gives="fps (so many a second are wanted), say (words for who holds it)",
+        native=lambda board, reactor: Look(board),
+        takes="image/jpeg",
+    ),
+    Route(
+        "POST",
+        f"{API}/phones/{{uuid}}/leave",
+        "Let the phone go",
+        "phone",
+        None,
+        (UUID,),
+        native=lambda board, reactor: Leave(board),
+    ),
+)

@@ -13,6 +13,7 @@ from webnode.errors import Refusal
 from webnode.fallback import is_loopback
 from webnode.field import Json
 from webnode.route import API, Ask, Content, Field, Route
+from webnode.session import SIGNED_S
 
 INVITED_S = 86400.0
 MAX_INVITED_S = 366 * 86400.0
@@ -35,8 +36,15 @@ def session(ask: Ask) -> Json:
 def sign_out(ask: Ask) -> Json:
     """Let in nobody with this token any more."""
     if ask.who.token_id:
-        ask.board.sessions.revoke(ask.who.token_id)
+        # What was renewed elsewhere, a moment ago, ends with it.
+        until = min(ask.who.limit, max(ask.who.until, ask.now + SIGNED_S))
+        ask.board.sessions.revoke(ask.who.token_id, until)
     return {}
+
+
+def renew(ask: Ask) -> Json:
+    """Another token for who asks."""
+    return _told(ask.board.sessions.renewed(ask.who, ask.now))
 
 
 def invite(ask: Ask) -> Any:
@@ -104,7 +112,15 @@ ROUTES = (
         limit_s=4.5,
     ),
     Route("GET", f"{API}/session", "Who asks: anyone, until signed in", "anyone", session, gives="name, role"),
-    Route("DELETE", f"{API}/session", "Sign out: the token and its ticket let in nobody more", "anyone", sign_out),
+    Route(
+        "PUT",
+        f"{API}/session",
+        "Go on being signed in: another token for the session of the one that is sent, which stays good for its time",
+        "viewer",
+        renew,
+        gives="token, ticket, role, until (unix seconds)",
+    ),
+    Route("DELETE", f"{API}/session", "Sign out, at every web node of the team", "anyone", sign_out),
     Route(
         "POST",
         f"{API}/invitations",

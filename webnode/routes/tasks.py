@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from hashlib import blake2s
 from typing import Any
+
+from twisted.internet.defer import maybeDeferred
 
 from webnode.errors import Refusal
 from webnode.field import Json
-from webnode.route import API, Answer, Ask, Field, Route
+from webnode.route import API, Ask, Field, Route
 
 TASK = Field("task_id", "text", "the task", "path", most=64)
 
@@ -23,23 +26,42 @@ def catalogue(ask: Ask) -> Json:
     return [dict(task) for task in ask.board.desk.catalogue()]
 
 
-def demo(ask: Ask) -> Json:
+def demo(ask: Ask) -> Any:
     """Run the demonstration."""
-    return {"id": ask.board.desk.run_demo()}
+    return maybeDeferred(ask.board.desk.run_demo, _id(ask, "demo")).addCallback(_named)
 
 
 def assign(ask: Ask) -> Any:
     """Assign one; the answer may be its id alone."""
-    answer = ask.board.desk.assign(ask.given["name"], ask.given["tolerates"], ask.given["group"])
-    return answer if isinstance(answer, dict) else {"id": answer}
+    given = ask.given["name"], ask.given["tolerates"], ask.given["group"]
+    return maybeDeferred(ask.board.desk.assign, *given, _id(ask, "task")).addCallback(_named)
+
+
+def _id(ask: Ask, what: str) -> str:
+    """The id of the task that this wish makes; any where its visitor gave it no name.
+
+    It is the same at every web node: a page whose node died before it answered asks the next one, and only the task's
+    own name tells that one whether the wish is new.
+    """
+    if not ask.id:
+        return ""
+    wish = "\n".join((what, ask.who.token_id, ask.id))
+    return blake2s(wish.encode(), digest_size=6).hexdigest()
+
+
+def _named(answer: Any) -> Json:
+    told: Json = answer if isinstance(answer, dict) else {"id": answer}
+    return told
 
 
 def preview(ask: Ask) -> Any:
     """Who could take one."""
-    return ask.board.desk.preview(ask.given["name"])
+    return ask.board.desk.preview(ask.given["name"], ask.given["group"])
 
 
-def _order(wish: Callable[[Ask], Callable[[str], Any]]) -> Answer:
+def _order(word: str, about: str, wish: Callable[[Ask], Callable[[str], Any]]) -> Route:
+    """The route that orders ``word`` of a task that is there."""
+
     def answer(ask: Ask) -> Json:
         task_id = ask.given["task_id"]
         if task_id not in [task["id"] for task in ask.state["tasks"]]:
@@ -47,10 +69,12 @@ def _order(wish: Callable[[Ask], Callable[[str], Any]]) -> Answer:
         wish(ask)(task_id)
         return {"id": task_id}
 
-    return answer
+    path = f"{API}/tasks/{{task_id}}/{word}"
+    return Route("POST", path, about, "operator", answer, (TASK,), gives="id", status=202)
 
 
 NAME = Field("name", "text", "its name in the catalogue", most=64)
+GROUP = Field("group", "text", "tasks of one group are divided together", most=64, default="", is_required=False)
 ROUTES = (
     Route("GET", f"{API}/tasks", "The tasks, the newest first", "viewer", tasks, gives="a list of tasks"),
     Route(
@@ -87,7 +111,7 @@ ROUTES = (
                 default=1,
                 is_required=False,
             ),
-            Field("group", "text", "tasks of one group are divided together", most=64, default="", is_required=False),
+            GROUP,
         ),
         gives="id, able, refused (why, by name)",
         status=202,
@@ -98,37 +122,11 @@ ROUTES = (
         "Who could take a predefined task and who not, and why; nothing is assigned",
         "viewer",
         preview,
-        (NAME,),
-        gives="able (uuid, name, busy: its task now), refused (why, by name), likely (a name, or null)",
+        (NAME, GROUP),
+        gives="able (uuid, name, busy: its task now), refused (why, by name), likely (a name, or null), "
+        "together (id, title: what the group divides it with)",
     ),
-    Route(
-        "POST",
-        f"{API}/tasks/{{task_id}}/cancel",
-        "End a task; nobody is granted it any more",
-        "operator",
-        _order(lambda ask: ask.board.desk.cancel),
-        (TASK,),
-        gives="id",
-        status=202,
-    ),
-    Route(
-        "POST",
-        f"{API}/tasks/{{task_id}}/pause",
-        "Let a task rest; its devices stop and are free for others",
-        "operator",
-        _order(lambda ask: ask.board.desk.pause),
-        (TASK,),
-        gives="id",
-        status=202,
-    ),
-    Route(
-        "POST",
-        f"{API}/tasks/{{task_id}}/resume",
-        "Let a task go on from where it was",
-        "operator",
-        _order(lambda ask: ask.board.desk.resume),
-        (TASK,),
-        gives="id",
-        status=202,
-    ),
+    _order("cancel", "End a task; nobody is granted it any more", lambda ask: ask.board.desk.cancel),
+    _order("pause", "Let a task rest; its devices stop and are free for others", lambda ask: ask.board.desk.pause),
+    _order("resume", "Let a task go on from where it was", lambda ask: ask.board.desk.resume),
 )

@@ -2,12 +2,13 @@
 import { at } from "./element.js";
 import { panels } from "./panel.js";
 
-const RANKS = ["anyone", "viewer", "operator"];
+// A phone looks as a viewer does.
+const RANKS = { anyone: 0, viewer: 1, phone: 1, operator: 2 };
 const shown = new Map();
 let shared = {};
 let looked = "";
 // On a phone one of these is looked at at a time, and the bar below leads to them; on a wall ?view=cameras is all.
-const VIEWS = ["devices", "tasks", "cameras", "map", "groups", "network", "events", "more"];
+const VIEWS = ["devices", "tasks", "cameras", "map", "groups", "network", "events", "phone", "more"];
 const NARROW = matchMedia("(max-width: 43.99rem)");
 const only = new URLSearchParams(location.search).get("view");
 
@@ -41,7 +42,7 @@ function lookAt(name) {
 
 function wanted({ place, needs = {} }) {
   const { me, has } = shared.model;
-  const mayLook = RANKS.indexOf(me.role) >= RANKS.indexOf(needs.role ?? "anyone");
+  const mayLook = RANKS[me.role] >= RANKS[needs.role ?? "anyone"];
   return at(`place-${place}`) && mayLook && (!needs.has || has.includes(needs.has));
 }
 

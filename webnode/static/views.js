@@ -15,7 +15,9 @@ function kept() {
 }
 
 // What is looked at less often, and how the page looks.
-function more(root) {
+function more(root, { go }) {
+  const phone = element("button", {}, "Take part with this device");
+  phone.onclick = () => go("phone");
   const choice = element("select", { id: "theme" }, ...Object.entries(THEMES).map(([value, name]) => element("option", { value }, name)));
   choice.value = kept() in THEMES ? kept() : "light dark";
   const apply = () => { document.documentElement.style.colorScheme = choice.value; };
@@ -31,11 +33,28 @@ function more(root) {
   root.append(
     element("nav", { class: "further", "aria-label": "More views" },
       ...Object.entries(MORE).map(([place, name]) => element("a", { href: `#${place}` }, name))),
-    element("div", { class: "row" }, element("label", { for: "theme" }, "Colours"), choice));
+    element("p", { class: "row" }, phone), element("div", { class: "row" }, element("label", { for: "theme" }, "Colours"), choice));
+  return { update({ has }) { phone.hidden = !has.includes("phones"); } };
 }
 
+// What a phone needs to take part comes when its visitor asks for it.
+function phone(root, tools) {
+  const acts = {
+    async show() {
+      root.hidden = false;
+      delete acts.show;
+      const { make } = await import("./phone.js");
+      Object.assign(acts, make(root, tools));
+    },
+  };
+  return acts;
+}
+
+document.querySelector("main").before(element("section", { class: "phone", id: "place-phone", "aria-labelledby": "h-phone", hidden: "" },
+  element("h2", { id: "h-phone" }, "This phone")));
 panel({ place: "more", order: 30, title: "More", make: more });
 
+panel({ place: "phone", title: "This phone", needs: { role: "viewer", has: "phones" }, make: phone });
 panel({ place: "events", title: "Events", load: () => import("./events.js") });
 panel({ place: "network", order: 10, title: "Network", needs: { has: "survey" }, load: () => import("./network.js") });
 panel({ place: "device", order: 10, title: "Stores", needs: { has: "survey" }, load: () => import("./inventory.js") });

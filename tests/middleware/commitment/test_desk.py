@@ -83,7 +83,7 @@ class DeskTests(FleetCase):
         fleet = self.swarm(4)
         stores = [SlowStore() for _ in range(4)]
         for node, store in zip(fleet.nodes, stores, strict=True):
-            node._desk._store = store
+            node.councils.desk._store = store
         fleet.run(TASK.lease_ttl)
         task = self.done(fleet, Deferred.fromCoroutine(fleet.nodes[0].submit(TASK)), 1.0)
         for store in stores:

@@ -1,0 +1,56 @@
+"""Options of the kind "phone": what its browser said that the phone has, checked."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from drivers.errors import UsageError
+from drivers.reading import Description
+
+LENS_DEG = 65.0
+"""Across the longer side of the picture.  No browser tells it; those of phones are from 60 to 75."""
+LEAST_SIDE, MOST_SIDE = 16, 640
+"""Pixels of a side of a picture."""
+FPS = 10.0
+"""Pictures a second that a phone is asked for while it has a task."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """The pictures' size in pixels, and whether the phone tells how it is held and where it is."""
+
+    width: int = 208
+    height: int = 156
+    orientation: bool = False
+    position: bool = False
+
+
+def checked(table: Mapping[str, object]) -> Options:
+    """The options in ``table``; raises ``UsageError`` that names the key and what to write instead."""
+    known = ("width", "height", "orientation", "position")
+    for key, value in table.items():
+        if key not in known:
+            raise UsageError(f'driver "phone": unknown option {key!r}; known are {", ".join(known)}')
+        if key in ("width", "height"):
+            if type(value) is not int or not LEAST_SIDE <= value <= MOST_SIDE:
+                raise _fault(key, value, f"pixels from {LEAST_SIDE} to {MOST_SIDE}, as in {key} = 208")
+        elif not isinstance(value, bool):
+            raise _fault(key, value, "true or false")
+    return Options(**table)  # type: ignore[arg-type]
+
+
+def described(options: Options) -> Description:
+    """What the phone is; it has no motor, so there is nothing that it can be told to do."""
+    lens = "fov_h_deg" if options.width >= options.height else "fov_v_deg"
+    camera = {"width": options.width, "height": options.height, "fps": FPS, lens: LENS_DEG}
+    capabilities: dict[str, Mapping[str, float | str]] = {"camera": camera}
+    if options.orientation:
+        capabilities["orientation"] = {}
+    if options.position:
+        capabilities["position"] = {}
+    return Description("phone", "a phone's browser", capabilities, {}, 0.08, {"camera": FPS})
+
+
+def _fault(key: str, value: object, remedy: str) -> UsageError:
+    return UsageError(f'driver "phone": option {key} is {value!r}, but must be {remedy}')

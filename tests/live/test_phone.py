@@ -1,0 +1,330 @@
+"""A phone in Chromium, with a fake camera, in the real demonstration: joins, finds the target, wins, is taken over.
+
+``SCHEME`` and ``FLAGS`` may be others in the environment (``PHONE_SCHEME``, ``PHONE_FLAGS``): over https, for one, with
+the flag that trusts the certificate.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from benchmarks.demo import family
+from tests.live.page import CHROMIUM, DESK, FLAGS, MISSING, PHONE, TABLET, Team
+
+FAKE = ("--use-fake-device-for-media-stream", "--use-fake-ui-for-media-stream")
+MORE = tuple(os.environ.get("PHONE_FLAGS", "").split())
+TAKEOVER_S = 2.0
+PLACES = ((0.3, 2.1), (2.7, 2.1), (0.3, 0.3), (2.7, 0.3))
+SIGHTS = """async (pictures) => {
+  const { sighted } = await import("/static/sight.js");
+  const found = [];
+  for (const picture of pictures) {
+    const image = await createImageBitmap(new Blob([Uint8Array.from(atob(picture), (each) => each.charCodeAt(0))]));
+    const canvas = new OffscreenCanvas(image.width, image.height).getContext("2d");
+    canvas.drawImage(image, 0, 0);
+    const { data } = canvas.getImageData(0, 0, image.width, image.height);
+    const seen = sighted(data, image.width, image.height, { radius: 0.08, height: 0.22 }, 56.9 * Math.PI / 180);
+    found.push(seen && [seen.bearing, seen.distance]);
+  }
+  return found;
+}"""
+HIDE = """(hidden) => {
+  Object.defineProperty(document, "hidden", { value: hidden, configurable: true });
+  document.dispatchEvent(new Event("visibilitychange"));
+}"""
+
+
+def film(path: Path, disc: int = 66) -> Path:
+    """A film for the fake camera, 320 x 240: a red disc, so many of 104 pixels across, that trembles a little."""
+    import cv2
+    import numpy as np
+
+    with path.open("wb") as file:
+        for n in range(30):
+            picture = np.full((240, 320, 3), (190, 200, 205), np.uint8)
+            picture[150:] = (90, 120, 130)
+            if disc:
+                cv2.circle(picture, (160 + n % 3, 120), round(disc / 104 * 320 / 2), (40, 40, 210), -1)
+            file.write(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes())
+    return path
+
+
+def stretch() -> float:
+    """How much longer all takes here, as the machine has more to do than it has cores; 1 where it has not."""
+    return max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
+
+
+class Browser(SynchronousTestCase):
+    if MISSING:
+        skip = f"THE PHONE IS NOT TESTED IN A BROWSER: missing {'; '.join(MISSING)}"
+
+    def browser(self, disc: int = 66, *flags: str) -> Any:
+        """Chromium whose camera shows the film."""
+        from playwright.sync_api import sync_playwright
+
+        shown = f"--use-file-for-fake-video-capture={film(Path(self.mktemp()).with_suffix('.mjpeg').absolute(), disc)}"
+        play = sync_playwright().start()
+        self.addCleanup(play.stop)
+        browser = play.chromium.launch(executable_path=CHROMIUM, args=[*FLAGS, *MORE, shown, *(flags or FAKE)])
+        self.addCleanup(browser.close)
+        self.faults: list[str] = []
+        return browser
+
+    def page(self, browser: Any, address: str, screen: Any = PHONE, **more: Any) -> Any:
+        page = browser.new_context(**screen, **more).new_page()
+        page.set_default_timeout(20_000)
+        page.on("pageerror", lambda error: self.faults.append(str(error)))
+        page.goto(address)
+        page.locator("#link[data-link=live]").wait_for()
+        return page
+
+    def assert_sound(self, page: Any, when: str) -> None:
+        """Axe finds nothing, and nothing is wider than the screen."""
+        from axe_playwright_python.sync_playwright import Axe
+
+        found = Axe().run(page).response["violations"]
+        self.assertEqual([(each["id"], each["nodes"][0]["html"]) for each in found], [], when)
+        self.assertLessEqual(page.evaluate("document.documentElement.scrollWidth - innerWidth"), 0, when)
+        self.assertEqual(self.faults, [], when)
+
+
+class PhoneViewTests(Browser):
+    """The view of a phone, over the twin of a gateway."""
+
+    def setUp(self) -> None:
+        self.team = Team()
+        self.addCleanup(self.team.stop)
+
+    def opened(self, browser: Any, screen: Any = PHONE, base: str = "", **more: Any) -> Any:
+        page = self.page(browser, f"{base or self.team.url}#code={self.team.code}", screen, **more)
+        page.evaluate("location.hash = 'phone'")
+        page.get_by_role("button", name="Take part", exact=True).wait_for()
+        return page
+
+    def test_take_part_and_stop(self) -> None:
+        """By touch and by keyboard alone, on three screens: it shows what it sees and what it is asked, and stops."""
+        browser = self.browser()
+        for screen in (PHONE, TABLET, DESK):
+            for colours in ("light", "dark"):
+                page = self.opened(browser, screen, color_scheme=colours)
+                self.assert_sound(page, f"before, {colours}")
+                button = page.get_by_role("button", name="Take part", exact=True)
+                if screen.get("has_touch"):
+                    button.tap()
+                else:
+                    page.locator("#phone-name").focus()
+                    page.keyboard.press("Enter")
+                page.locator(".phone .said", has_text="Look for the red target").wait_for()
+                page.locator(".phone", has_text="Target at about 0.2").wait_for()
+                self.assert_sound(page, f"taking part, {colours}")
+                page.get_by_role("button", name="Stop taking part").click()
+                page.locator(".phone .trouble", has_text="takes no part any more").wait_for()
+                self.assert_sound(page, f"after, {colours}")
+                page.context.close()
+
+    def test_leave_while_hidden(self) -> None:
+        """Out of sight it leaves and lets the camera go; in sight again it comes back by itself, as the same phone."""
+        page = self.opened(self.browser())
+        page.get_by_role("button", name="Take part", exact=True).tap()
+        page.locator(".phone .said", has_text="Look for the red target").wait_for()
+        secret = page.evaluate("localStorage.getItem('swarm.phone')")
+        page.evaluate(HIDE, True)
+        page.locator(".phone .trouble", has_text="Left, as this page was out of sight").wait_for()
+        with page.expect_request("**/api/v1/phones") as joined:
+            page.evaluate(HIDE, False)
+        page.locator(".phone .said", has_text="Look for the red target").wait_for()
+        self.assertEqual(json.loads(joined.value.post_data)["secret"], json.loads(secret)["secret"])
+        self.assertEqual(self.faults, [])
+
+    def test_say_why_not(self) -> None:
+        """A refused camera, a page that is not secure and a visitor who only looks: each is told what to do."""
+        refusing = self.browser(
+            66, "--use-fake-device-for-media-stream", "--host-resolver-rules=MAP vaio.local 127.0.0.1"
+        )
+        page = self.opened(refusing)
+        page.get_by_role("button", name="Take part", exact=True).tap()
+        page.locator(".phone .trouble", has_text="The camera was refused. Allow it").wait_for()
+        self.assert_sound(page, "refused")
+        page = self.opened(refusing, base=f"http://vaio.local:{self.team.port}/")
+        page.locator(".phone .trouble", has_text="https pages alone").wait_for()
+        self.assertTrue(page.get_by_role("button", name="Take part", exact=True).is_disabled())
+        viewer = self.invited("viewer")
+        page = self.page(refusing, f"{self.team.url}#code={viewer}")
+        page.evaluate("location.hash = 'phone'")
+        page.locator(".phone .trouble", has_text="Ask an operator for an invitation").wait_for()
+
+    def invited(self, role: str) -> str:
+        body = json.dumps({"role": role}).encode()
+        headers = {"Content-Type": "application/json", "Authorization": f"Bearer {self.team.token}"}
+        asked = urllib.request.Request(f"{self.team.url}api/v1/invitations", body, headers)
+        with urllib.request.urlopen(asked, timeout=5) as answer:
+            return str(json.load(answer)["token"])
+
+    def test_see_as_robots_do(self) -> None:
+        """In the pictures of the yard's camera the page finds the target where the robots find it, or neither does."""
+        import base64
+
+        from agents.vision import Size, find_target
+        from tests.agents.test_search import Walk
+
+        pictures = []
+        for x, y in ((0.75, 1.2), (0.9, 1.3), (1.2, 1.1), (1.6, 1.5), (2.0, 0.9), (2.4, 1.3), (1.0, 1.48), (0.2, 0.2)):
+            walk = Walk()
+            walk.world.place_target(x, y)
+            pictures.append(walk.camera.jpeg(walk.dog))
+        pictures.append(Walk().camera.jpeg(Walk().dog))
+        page = self.opened(self.browser())
+        found = page.evaluate(SIGHTS, [base64.b64encode(picture).decode() for picture in pictures])
+        count = 0
+        for picture, here in zip(pictures, found, strict=True):
+            there = find_target(picture, Size(0.08, 0.22))
+            self.assertEqual(here is None, there is None)
+            if there is not None:
+                count += 1
+                self.assertLess(abs(here[0] - there.bearing), 0.01)
+                self.assertLess(abs(here[1] / there.distance - 1), 0.05)
+        self.assertGreater(count, 5)
+
+
+class DemonstrationPhoneTests(Browser):
+    """The team of the demonstration, six processes, and a visitor's phone."""
+
+    def setUp(self) -> None:
+        log, run_dir = Path(self.mktemp()), Path(self.mktemp()).absolute()
+        command = [sys.executable, "-m", "sim.demo", "--run-dir", str(run_dir), "--web-port", "0"]
+        with log.open("w", encoding="utf-8") as errors:
+            root = Path(__file__).parents[2]
+            demo = subprocess.Popen(command, cwd=root, stdout=subprocess.PIPE, stderr=errors, text=True)
+        self.addCleanup(demo.wait, 20)
+        self.addCleanup(demo.terminate)
+        self.pid = demo.pid
+        assert demo.stdout is not None
+        scheme = os.environ.get("PHONE_SCHEME", "http")
+        for line in demo.stdout:
+            # The page's address for people; where it is served over https, that stands in the line as well.
+            address = next((word for word in line.split() if word.startswith(f"{scheme}://")), "")
+            if "#code=" in address:
+                break
+        else:
+            self.fail(log.read_text(encoding="utf-8"))
+        threading.Thread(target=demo.stdout.read, daemon=True).start()
+        self.url, _, code = address.partition("#code=")
+        self.token = ""
+        self.token = self.api("session", {"code": code})["token"]
+
+    def api(self, path: str, body: Any = None) -> Any:
+        headers = {"Content-Type": "application/json", "Authorization": f"Bearer {self.token}"}
+        data = None if body is None else json.dumps(body).encode()
+        with urllib.request.urlopen(
+            urllib.request.Request(f"{self.url}api/v1/{path}", data, headers), timeout=5
+        ) as answer:
+            return json.load(answer)
+
+    def devices(self) -> dict[str, Any]:
+        return {each["name"]: each for each in self.api("devices")}
+
+    def until(self, is_so: Callable[[], Any], within: float, page: Any = None) -> float:
+        """Wait until it is so; the seconds that it took."""
+        began = time.monotonic()
+        while not is_so():
+            if time.monotonic() - began > within:
+                told = {name: (each["status"], each["messages"]) for name, each in self.devices().items()}
+                self.fail(f"{told} {[task['note'] for task in self.api('tasks')]}")
+            if page is None:
+                time.sleep(0.03)
+            else:
+                page.wait_for_timeout(100)
+        return time.monotonic() - began
+
+    def statuses(self) -> dict[str, str]:
+        return {name: each["status"] for name, each in self.devices().items()}
+
+    def place_target(self) -> None:
+        for x, y in PLACES:
+            try:
+                self.api("target", {"x": x, "y": y})
+                return
+            except urllib.error.HTTPError as error:
+                error.close()
+        self.fail("there is no place for the target")
+
+    def joined(self) -> Any:
+        """The page of a phone that takes part as anna, with the target before its camera."""
+        invitation = self.api("invitations", {"role": "phone", "name": "visitor"})["token"]
+        page = self.page(self.browser(), f"{self.url}#code={invitation}")
+        page.evaluate("location.hash = 'phone'")
+        self.until(lambda: {"dog1", "dog2", "dog3"} <= set(self.devices()), 30.0, page)
+        page.locator("#phone-name").fill("anna")
+        page.get_by_role("button", name="Take part", exact=True).tap()
+        page.locator(".phone", has_text="Target at about 0.2").wait_for()
+        self.until(lambda: "anna" in self.devices(), 10.0, page)
+        return page
+
+    def test_wins_and_is_taken_over(self) -> None:
+        """One tap joins; the phone sees the target, bids, wins and shows it all; its tab closes, and a dog goes on."""
+        page = self.joined()
+        anna = self.devices()["anna"]
+        self.assertEqual((anna["kind"], "camera" in anna["capabilities"]), ("phone", True))
+        self.assertNotIn("base2d", anna["capabilities"])
+
+        self.place_target()
+        self.api("tasks", {"name": "watch-target"})
+        page.locator(".phone .said", has_text="You have the task").wait_for(timeout=60_000)
+        self.assertEqual(self.statuses()["anna"], "EXECUTING")
+        self.assert_sound(page, "executing")
+        page.evaluate("location.hash = 'cameras'")
+        page.locator("figure[data-camera=live]", has_text="anna").wait_for()
+        reds = page.evaluate(
+            "() => { const canvas = [...document.querySelectorAll('figure')].find(f => f.textContent.includes('anna'))"
+            ".querySelector('canvas'); return [...canvas.getContext('2d').getImageData(canvas.width / 2,"
+            " canvas.height / 2, 1, 1).data]; }"
+        )
+        self.assertTrue(reds[0] > 150 and reds[1] < 110, reds)
+
+        def dog_waits() -> bool:
+            if self.api("tasks")[0]["status"] == "COMPLETED":
+                # On a slow machine the dogs look for longer than the phone has to.
+                self.api("tasks", {"name": "watch-target"})
+            found = self.statuses()
+            waits = any(status == "WAITING" for name, status in found.items() if name.startswith("dog"))
+            return waits and found["anna"] == "EXECUTING"
+
+        self.until(dog_waits, 90.0, page)
+        page.close()
+        took = self.until(
+            lambda: any(s == "EXECUTING" for n, s in self.statuses().items() if n.startswith("dog")), 10.0 * stretch()
+        )
+        self.assertLess(took, TAKEOVER_S * stretch())
+        self.assertNotIn("EXECUTING", [self.statuses().get("anna", "GONE")])
+        self.assertEqual(self.faults, [])
+
+    def test_go_on_at_another_web_node(self) -> None:
+        """The web node dies with its phones in it: the phone goes on through the other as the same device, and wins."""
+        page = self.joined()
+        page.locator("#reserve", has_text="pi").wait_for()
+        before = self.devices()["anna"]
+        os.kill(next(pid for pid, name in family(self.pid).items() if name == "vaio"), signal.SIGKILL)
+        page.locator("#node", has_text="pi").wait_for()
+        self.url = page.evaluate("import('/static/link.js').then(({ base }) => base())") + "/"
+        self.until(lambda: self.devices().get("anna", before)["address"] != before["address"], 15.0 * stretch(), page)
+        page.locator(".phone .said", has_text="Nothing to do").wait_for()
+        after = self.devices()["anna"]
+        self.assertEqual((after["uuid"], after["joined"]), (before["uuid"], before["joined"]))
+        self.assertIsNone(after["gone"])
+        self.place_target()
+        self.api("tasks", {"name": "watch-target"})
+        page.locator(".phone .said", has_text="You have the task").wait_for(timeout=60_000)
+        self.assertEqual(self.faults, [])

@@ -1,0 +1,286 @@
+"""Tests of ``swarmnode.gateway``: phones as nodes of a team on one turned clock."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Mapping
+from functools import partial
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.entangled.data.memory import MemoryStore
+from middleware.presence import DEVICES, devices_of
+from swarmnode.bucket import Bucket
+from swarmnode.gateway import FIRST_S, LOOKS, MOST, SILENCE_S, Gateway, seed_of
+from swarmnode.rehearsal import VirtualTeam
+from swarmnode.seams import Seams
+from tests.webnode.picture import jpeg
+from webnode.errors import Refusal
+from webnode.jpeg import MOST_SIDE
+
+STEP = 0.1
+CAN = {"width": 208, "height": 156, "orientation": False, "position": True}
+
+
+class Phone:
+    """A visitor's phone at one gateway, which looks while time passes."""
+
+    def __init__(self, case: GatewayTests, at: Gateway, secret: bytes = b"s" * 32, name: str = "anna") -> None:
+        self.case = case
+        self.at = at
+        self.said = ""
+        self.fps = 0.0
+        self.looks = True
+        self.uuid: str = case.successResultOf(at.join(secret, name, CAN))
+        case.phones.append(self)
+
+    def look(self, values: Mapping[str, float]) -> None:
+        wanted = self.at.look(self.uuid, jpeg(), values)
+        self.said, self.fps = wanted.say, wanted.fps
+
+
+class GatewayTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.team = VirtualTeam(3, dogs=("dog1", "dog2"), others=("pi",))
+        self.addCleanup(self.team.stop)
+        self.phones: list[Phone] = []
+        self.port = 7100
+        self.gateways = {name: self.gateway(name) for name in ("vaio", "pi")}
+        self.sees: Mapping[str, float] = {}
+
+    def tearDown(self) -> None:
+        for gateway in self.gateways.values():
+            gateway.close()
+        self.team.clock.advance(0.5)
+
+    def gateway(self, name: str) -> Gateway:
+        service = self.team.services[name]
+
+        def seams() -> Seams:
+            self.port += 1
+            network = partial(self.team.board.network, "127.0.0.1", self.port)
+            store = MemoryStore(epoch=self.port.to_bytes(8, "big"))
+            clock = self.team.clock
+            return Seams(clock, network, store, random.Random(self.port), clock.seconds)
+
+        desk = self.team.desk
+        return Gateway(
+            service.settings, service.assembly.node, seams, lambda: [d for d, _ in devices_of(desk.read(DEVICES))]
+        )
+
+    def live(self, seconds: float) -> None:
+        """Let time pass, in which phones look ten times a second."""
+        for _ in range(round(seconds / STEP)):
+            self.team.clock.advance(STEP)
+            for phone in self.phones:
+                if phone.looks:
+                    phone.look(self.sees)
+
+    def device(self, uuid: str) -> dict[str, object]:
+        found = [each for each in self.team.state()["devices"] if each["uuid"] == uuid]
+        return dict(found[0]) if found else {}
+
+    def test_is_a_device_like_any_other(self) -> None:
+        """A phone that joins is a device with its own address, its camera, and a place; idle until there is a task."""
+        phone = Phone(self, self.gateways["vaio"])
+        self.sees = {"position.lat": 52.123456789, "position.lon": 13.0, "position.accuracy": 12.4}
+        self.live(1.5)
+        device = self.device(phone.uuid)
+        self.assertEqual((device["name"], device["kind"], device["status"]), ("anna", "phone", "IDLE"))
+        self.assertEqual(sorted(device["capabilities"]), ["camera", "position"])  # type: ignore[call-overload]
+        self.assertNotEqual(device["address"], self.device(self.team.services["vaio"].assembly.node.uuid)["address"])
+        told = next(d for d, _ in devices_of(self.team.desk.read(DEVICES)) if d.uuid == phone.uuid)
+        self.assertEqual(told.position, {"lat": 52.12346, "lon": 13.0, "accuracy": 12.0})
+        self.assertEqual((phone.said, phone.fps), ("Nothing to do at the moment.", 5.0))
+
+    def test_shows_what_it_sees(self) -> None:
+        """Whoever watches its camera gets the very picture that it sent, and sends nothing while nobody does."""
+        phone = Phone(self, self.gateways["vaio"])
+        self.live(1.0)
+        seen: list[bytes] = []
+        stop = self.team.desk.watch(phone.uuid, lambda seq, picture, age: seen.append(picture))
+        self.live(1.0)
+        stop()
+        self.assertGreater(len(seen), 4)
+        self.assertEqual(set(seen), {jpeg()})
+
+    def test_wins_and_is_taken_over(self) -> None:
+        """The phone is the nearest and has the task; when it leaves, a dog that sees the target goes on at once."""
+        phone = Phone(self, self.gateways["vaio"])
+        self.team.yard.world.place_target(1.5, 1.2)
+        self.sees = {"target.bearing": 0.0, "target.distance": 0.05}
+        self.live(1.0)
+        self.team.desk.assign("watch-target")
+        self.until(lambda: self.device(phone.uuid)["status"] == "EXECUTING", 40.0)
+        self.assertEqual((phone.said, phone.fps), ("You have the task: keep the target in view.", 10.0))
+        self.sees = {}
+        self.live(0.3)
+        self.assertIn("out of sight", phone.said)
+        self.sees = {"target.bearing": 0.0, "target.distance": 0.05}
+        self.until(self.dog_waits, 30.0)
+        phone.at.leave(phone.uuid)
+        self.phones.clear()
+        began = self.team.clock.seconds()
+        self.until(self.dog_acts, 2.0)
+        self.assertLess(self.team.clock.seconds() - began, 1.0)
+        self.until(lambda: self.team.state()["tasks"][0]["status"] == "COMPLETED", 60.0)
+
+    def test_silence_is_leaving(self) -> None:
+        """A phone that falls silent has left after a second, and another has its task within two."""
+        phone = Phone(self, self.gateways["vaio"])
+        self.team.yard.world.place_target(1.5, 1.2)
+        self.sees = {"target.bearing": 0.0, "target.distance": 0.05}
+        self.team.desk.assign("watch-target")
+        self.until(lambda: self.device(phone.uuid).get("status") == "EXECUTING" and self.dog_waits(), 40.0)
+        phone.looks = False
+        began = self.team.clock.seconds()
+        self.until(self.dog_acts, 2.0)
+        self.live(SILENCE_S)
+        refusal = self.assertRaises(Refusal, phone.look, {})
+        self.assertEqual(refusal.status, 404)
+        self.assertLess(self.team.clock.seconds() - began, 2.0 + SILENCE_S)
+
+    def test_first_look_may_take_longer(self) -> None:
+        """Who has joined may be asked for the camera first; who never looks is let go all the same."""
+        phone = Phone(self, self.gateways["vaio"])
+        phone.looks = False
+        self.live(FIRST_S - 0.2)
+        phone.look({})
+        self.live(SILENCE_S + 0.2)
+        self.assertEqual(self.assertRaises(Refusal, phone.look, {}).status, 404)
+
+    def test_is_the_same_device_elsewhere(self) -> None:
+        """When its web node dies, the phone goes on through another: one device with the same uuid, place and name."""
+        phone = Phone(self, self.gateways["vaio"])
+        self.live(1.5)
+        before = self.device(phone.uuid)
+        # The web node dies, and with it all that it did for its phones.
+        lost = self.gateways.pop("vaio")
+        for each in lost._phones.values():
+            each._node.vanish()
+            each._agent.stopService()
+            assert each._timer is not None
+            each._timer.cancel()
+        self.phones.clear()
+        again = Phone(self, self.gateways["pi"])
+        self.assertEqual(again.uuid, phone.uuid)
+        self.live(2.5)
+        after = self.device(phone.uuid)
+        for key in ("name", "joined", "status"):
+            self.assertEqual(after[key], before[key])
+        self.assertIsNone(after["gone"])
+        names = [each["name"] for each in self.team.state()["devices"]]
+        self.assertEqual(names.count("anna"), 1)
+
+    def test_identity_is_of_team_and_phone(self) -> None:
+        """Neither another phone nor another team makes the same identity."""
+        seeds = {seed_of(team, phone) for team in (b"a" * 32, b"b" * 32) for phone in (b"1" * 32, b"2" * 32)}
+        self.assertEqual(len(seeds), 4)
+        self.assertEqual(seed_of(b"a" * 32, b"1" * 32), seed_of(b"a" * 32, b"1" * 32))
+
+    def test_comes_back_while_it_leaves(self) -> None:
+        """A phone that is still giving back its task when it comes again waits for that, and is there once."""
+        phone = Phone(self, self.gateways["vaio"])
+        self.sees = {"target.bearing": 0.0, "target.distance": 0.05}
+        self.team.desk.assign("watch-target")
+        self.until(lambda: self.device(phone.uuid).get("status") == "EXECUTING", 40.0)
+        phone.at.leave(phone.uuid)
+        phone.at.leave(phone.uuid)
+        self.phones.clear()
+        came = [phone.at.join(b"s" * 32, "anna", CAN) for _ in range(2)]
+        self.assertNoResult(came[0])
+        self.team.clock.advance(0.3)
+        self.assertEqual([self.successResultOf(each) for each in came], [phone.uuid] * 2)
+        self.phones.append(phone)
+        self.until(lambda: self.device(phone.uuid).get("status") == "EXECUTING", 40.0)
+
+    def test_leaves_with_its_web_node(self) -> None:
+        """A web node that is shut lets its phones go politely: they are no devices any more when it says that it is."""
+        phones = [Phone(self, self.gateways["vaio"], bytes([n]) * 32, f"p{n}") for n in (1, 2)]
+        self.live(1.0)
+        self.phones.clear()
+        self.successResultOf(self.gateways["vaio"].close())
+        self.team.clock.advance(0.3)
+        told = [self.device(phone.uuid).get("status", "GONE") for phone in phones]
+        self.assertEqual(told, ["GONE", "GONE"])
+
+    def test_names_are_of_one_device_each(self) -> None:
+        """Where a dog or another phone has the name, the phone gets one like it; its own name it keeps."""
+        first = Phone(self, self.gateways["vaio"], b"1" * 32, "dog1")
+        second = Phone(self, self.gateways["vaio"], b"2" * 32, "anna")
+        third = Phone(self, self.gateways["vaio"], b"3" * 32, "anna")
+        self.live(1.5)
+        told = [self.device(each.uuid)["name"] for each in (first, second, third)]
+        self.assertEqual(told, [f"dog1-{first.uuid[:4]}", "anna", f"anna-{third.uuid[:4]}"])
+
+    def test_takes_so_many(self) -> None:
+        """The ninth phone is told that there is no room, until one leaves; who is here may join again."""
+        gateway = self.gateways["vaio"]
+        phones = [Phone(self, gateway, bytes([n]) * 32, f"p{n}") for n in range(MOST)]
+        refusal = self.failureResultOf(gateway.join(b"x" * 32, "late", CAN), Refusal).value
+        self.assertEqual(refusal.status, 409)
+        self.assertEqual(self.successResultOf(gateway.join(bytes([0]) * 32, "p0", CAN)), phones[0].uuid)
+        gateway.leave(phones[0].uuid)
+        self.assertEqual(self.failureResultOf(gateway.join(b"x" * 32, "late", CAN), Refusal).value.status, 429)
+        self.phones.pop(0)
+        self.live(2.0)
+        self.assertTrue(self.successResultOf(gateway.join(b"x" * 32, "late", CAN)))
+
+    def test_sent_away_stays_away(self) -> None:
+        """An operator takes a phone off the network for a while, as any device; until then it may not come back."""
+        phone = Phone(self, self.gateways["vaio"])
+        self.live(1.0)
+        self.team.desk.disconnect(phone.uuid, 3.0)
+        self.phones.clear()
+        self.live(0.5)
+        refusal = self.failureResultOf(phone.at.join(b"s" * 32, "anna", CAN), Refusal).value
+        self.assertEqual((refusal.status, refusal.problem), (409, "an operator sent it away"))
+        self.live(3.0)
+        self.successResultOf(phone.at.join(b"s" * 32, "anna", CAN))
+
+    def test_refuses_what_is_no_look(self) -> None:
+        """No picture, too large a picture, too many pictures, and pictures of a stranger are refused by status."""
+        phone = Phone(self, self.gateways["vaio"])
+        for body in (b"", b"GIF89a", jpeg()[:-2], jpeg(MOST_SIDE + 1, 10), jpeg(0, 10)):
+            self.assertEqual(self.assertRaises(Refusal, phone.at.look, phone.uuid, body, {}).status, 400)
+        self.assertEqual(self.assertRaises(Refusal, phone.at.look, "0" * 40, jpeg(), {}).status, 404)
+        for _ in range(round(LOOKS)):
+            phone.look({})
+        self.assertEqual(self.assertRaises(Refusal, phone.look, {}).status, 429)
+        self.team.clock.advance(STEP)
+        phone.look({})
+
+    def test_says_that_the_team_stands(self) -> None:
+        """While the team is stopped the phone says so."""
+        phone = Phone(self, self.gateways["vaio"])
+        self.live(1.0)
+        node = self.team.services["vaio"].assembly.node
+        node.halt.order(True, "test", node.entangled.overlay.contacts())
+        self.live(0.5)
+        self.assertEqual(phone.said, "The team is stopped. Wait.")
+
+    def until(self, is_so: object, limit: float) -> None:
+        """Let time pass until it is so."""
+        assert callable(is_so)
+        for _ in range(round(limit / STEP)):
+            if is_so():
+                return
+            self.live(STEP)
+        self.fail(str([(d["name"], d["status"], d["messages"]) for d in self.team.state()["devices"]]))
+
+    def dog_waits(self) -> bool:
+        return "WAITING" in self.dogs()
+
+    def dog_acts(self) -> bool:
+        return "EXECUTING" in self.dogs()
+
+    def dogs(self) -> list[str]:
+        return [each["status"] for each in self.team.state()["devices"] if each["name"].startswith("dog")]
+
+
+class BucketTests(SynchronousTestCase):
+    def test_so_many_at_once_and_so_many_a_second(self) -> None:
+        """A burst goes through, then what time has brought; a clock that was set back brings nothing."""
+        bucket = Bucket(3.0, 2.0)
+        self.assertEqual([bucket.take(10.0) for _ in range(4)], [True, True, True, False])
+        self.assertEqual([bucket.take(10.5), bucket.take(10.5), bucket.take(5.0)], [True, False, False])

@@ -1,0 +1,95 @@
+// The eye: a phone's camera, the picture that the team gets of it, and what the phone measures with each.
+import { sighted } from "./sight.js";
+
+const SIDE = 208;
+const SIGHT_SIDE = 104;
+const SIGHT_MS = 200;
+const QUALITY = 0.6;
+const RAD = Math.PI / 180;
+
+// What a browser says, in words for people, and what to do about it.
+const REFUSALS = {
+  NotAllowedError: "The camera was refused. Allow it for this page (beside the address, or in the browser's settings), then try again.",
+  NotFoundError: "No camera was found. Connect one, or take another phone.",
+  NotReadableError: "The camera is used by something else. Close that, then try again.",
+  OverconstrainedError: "The camera gives no such picture. Take another phone.",
+  AbortError: "The camera did not start. Try again.",
+};
+export const why = ({ name, message }) => REFUSALS[name] ?? `The camera did not start: ${message || name}. Try again.`;
+
+// iOS asks who holds the phone, and only in answer to a tap; others tell without being asked.
+async function orientation() {
+  const { requestPermission } = globalThis.DeviceOrientationEvent ?? {};
+  if (!requestPermission) return "DeviceOrientationEvent" in globalThis;
+  return (await requestPermission.call(DeviceOrientationEvent).catch(() => "denied")) === "granted";
+}
+
+const between = (value, least, most) => Math.min(most, Math.max(least, value));
+
+// Open the camera; `canvas` becomes what the team sees.  Throws what the browser throws.
+export async function opened(canvas, tellsPlace) {
+  // Both in the same tap: a permission that is asked for later is not asked for at all.
+  const turns = orientation();
+  const wanted = { facingMode: "environment", width: { ideal: 640 }, height: { ideal: 480 }, frameRate: { ideal: 15 } };
+  const stream = await navigator.mediaDevices.getUserMedia({ video: wanted, audio: false });
+  const video = Object.assign(document.createElement("video"), { srcObject: stream, muted: true, playsInline: true });
+  const small = document.createElement("canvas");
+  const held = {};
+  let sight = null;
+  let sightAt = -SIGHT_MS;
+  let place = 0;
+
+  const onTurn = ({ alpha, beta, gamma }) => {
+    if (alpha === null || beta === null || gamma === null) return;
+    held["orientation.yaw"] = between(alpha * RAD, 0, 2 * Math.PI);
+    held["orientation.pitch"] = between(beta * RAD, -Math.PI, Math.PI);
+    held["orientation.roll"] = between(gamma * RAD, -Math.PI, Math.PI);
+  };
+  const hasOrientation = await turns;
+  if (hasOrientation) addEventListener("deviceorientation", onTurn);
+  if (tellsPlace) {
+    place = navigator.geolocation?.watchPosition(({ coords }) => {
+      held["position.lat"] = coords.latitude;
+      held["position.lon"] = coords.longitude;
+      held["position.accuracy"] = between(coords.accuracy, 0, 1e6);
+    }, () => {});
+  }
+
+  function scaled(to, side) {
+    const scale = side / Math.max(video.videoWidth, video.videoHeight, 1);
+    const [width, height] = [video.videoWidth, video.videoHeight].map((each) => Math.max(16, Math.round(each * scale)));
+    if (to.width !== width || to.height !== height) Object.assign(to, { width, height });
+    const pen = to.getContext("2d", { willReadFrequently: to === small });
+    pen.drawImage(video, 0, 0, width, height);
+    return pen;
+  }
+
+  function find(now) {
+    if (now - sightAt < SIGHT_MS) return;
+    sightAt = now;
+    const { data } = scaled(small, SIGHT_SIDE).getImageData(0, 0, small.width, small.height);
+    sight = sighted(data, small.width, small.height);
+  }
+
+  // Some phones start a video only when it is played, and give its size only then.
+  await video.play();
+  scaled(canvas, SIDE);
+
+  return {
+    has: { orientation: hasOrientation, position: tellsPlace && "geolocation" in navigator },
+    // What is seen now: the picture as bytes, what was measured, and the sighting with its box in shares of the picture.
+    async look() {
+      find(performance.now());
+      scaled(canvas, SIDE);
+      const blob = await new Promise((done) => canvas.toBlob(done, "image/jpeg", QUALITY));
+      const values = { ...held, ...(sight && { "target.bearing": sight.bearing, "target.distance": sight.distance }) };
+      return { picture: await blob.arrayBuffer(), values, sight, of: { width: small.width, height: small.height } };
+    },
+    close() {
+      for (const track of stream.getTracks()) track.stop();
+      video.srcObject = null;
+      removeEventListener("deviceorientation", onTurn);
+      if (place) navigator.geolocation.clearWatch(place);
+    },
+  };
+}

@@ -1,0 +1,225 @@
+// This phone: takes part in the team as a device, for as long as its visitor holds it and looks at the page.
+import { attribute, badge, drawn, element, state, words } from "./element.js";
+import { opened, why } from "./eye.js";
+import { ask, fly, where } from "./link.js";
+
+const KEPT = "swarm.phone";
+const AGAIN = 300;
+const LATER = 2000;
+const NONE = "Nothing can be seen.";
+const REMEDY = "Browsers give the camera to https pages alone, and to pages of this machine.";
+
+// Its secret makes it the same device after a reload, and at each web node of the team.
+function kept() {
+  try {
+    const found = JSON.parse(localStorage.getItem(KEPT)) ?? {};
+    if (/^[0-9a-f]{64}$/.test(found.secret)) return found;
+  } catch {
+    // What cannot be read is not there.
+  }
+  const bytes = crypto.getRandomValues(new Uint8Array(32));
+  const secret = [...bytes].map((byte) => byte.toString(16).padStart(2, "0")).join("");
+  return { secret, name: `phone-${secret.slice(0, 4)}` };
+}
+
+function keep(phone) {
+  try {
+    localStorage.setItem(KEPT, JSON.stringify(phone));
+  } catch {
+    // Where nothing may be kept, it is another device after a reload.
+  }
+}
+
+// By a ticket, and bare of headers: so no browser asks another node first whether it may ask.
+const of = (path, query) => where(`${path}?${new URLSearchParams(query)}`);
+
+const pause = (ms) => new Promise((done) => setTimeout(done, Math.max(0, ms)));
+const asName = (text) => text.normalize("NFKD").replace(/[^\w-]+/g, "-").replace(/^-+|-+$/g, "").slice(0, 40);
+
+// What stands in the way of the camera, whoever asks; "" where nothing does.
+function hindrance({ me, pages }) {
+  if (!isSecureContext) {
+    const secure = pages.find((page) => page.is_secure)?.url;
+    return `${REMEDY} ${secure ? `Open ${secure} and take part there.` : "This node serves no https page: set tls = \"auto\" below [web] of its settings."}`;
+  }
+  if (!navigator.mediaDevices?.getUserMedia) return `This browser has no camera to offer. ${REMEDY}`;
+  if (me.role === "viewer") return "You are signed in to look. Ask an operator for an invitation with which a phone may take part.";
+  return "";
+}
+
+function seen(sight) {
+  if (!sight) return "No red target in view.";
+  const degrees = Math.round(sight.bearing * 180 / Math.PI);
+  const side = degrees > 1 ? `, ${degrees}° left` : degrees < -1 ? `, ${-degrees}° right` : ", straight ahead";
+  return `Target at about ${sight.distance.toFixed(2)} m${side}.`;
+}
+
+export function make(root, { model, go }) {
+  const phone = kept();
+  let eye = null;
+  let ticket = null;
+  let stage = "off";
+  let run = 0;
+  let lock = null;
+
+  if (!document.querySelector("link[href='/static/phone.css']")) {
+    document.head.append(element("link", { rel: "stylesheet", href: "/static/phone.css" }));
+  }
+  const name = element("input", { id: "phone-name", maxlength: 40, autocomplete: "off", required: "" });
+  const place = element("input", { id: "phone-place", type: "checkbox" });
+  const start = element("button", { class: "primary" }, "Take part");
+  const no = element("button", { type: "button" }, "Not now");
+  const form = element("form", {},
+    element("p", {}, "Your phone becomes a device of the team. It sees with its camera, bids for tasks that need no legs, and is asked to point at things."),
+    element("label", { for: "phone-name" }, "What it is called"), name,
+    element("label", { class: "choice", for: "phone-place" }, place, " Tell the team where it is"), element("div", { class: "row" }, start, no),
+    element("p", { class: "hint" }, "Pictures go to the team while this page is in sight, and are kept by nobody."));
+  const canvas = element("canvas", { width: 208, height: 156, role: "img", "aria-label": "What this phone shows the team" });
+  const ring = drawn("rect", { rx: 3 });
+  const overlay = drawn("svg", { "aria-hidden": "true" }, ring);
+  const said = element("p", { class: "said", role: "status" });
+  const status = badge();
+  const as = element("b");
+  const task = element("span", { class: "hint" });
+  const progress = element("progress", { max: 1, "aria-label": "Share of the task that is done" });
+  const sightLine = element("p", { class: "hint" });
+  const stop = element("button", { class: "danger", type: "button" }, "Stop taking part");
+  const on = element("div", { class: "on" }, element("div", { class: "preview" }, canvas, overlay),
+    element("div", {}, said, element("p", { class: "row as" }, as, status), task, progress, sightLine, stop));
+  const trouble = element("p", { class: "trouble", role: "alert" });
+  root.append(form, trouble, on);
+  name.value = phone.name;
+
+  function show(next, line = "") {
+    stage = next;
+    form.hidden = stage === "on" || stage === "away";
+    on.hidden = !form.hidden;
+    start.disabled = stage === "asking" || hindrance(model) !== "";
+    words(trouble, line || (stage === "off" ? hindrance(model) : ""));
+  }
+
+  // What the phone is in the team's eyes.
+  function tell() {
+    const device = model.devices.get(ticket?.uuid);
+    words(as, device?.name ?? phone.name);
+    if (device) state(status, device.status);
+    status.hidden = !device;
+    words(task, device?.objective ?? "");
+    task.hidden = !device?.objective;
+    const mine = model.groups.get(device?.task)?.members.find(({ uuid }) => uuid === device.uuid);
+    progress.hidden = device?.status !== "EXECUTING";
+    progress.value = mine?.progress ?? 0;
+  }
+
+  function draw({ sight, of }) {
+    attribute(overlay, "viewBox", `0 0 ${of.width} ${of.height}`);
+    ring.setAttribute("visibility", sight ? "visible" : "hidden");
+    if (sight) for (const [key, value] of Object.entries({ x: sight.box.left - 2, y: sight.box.top - 2, width: sight.box.width + 4, height: sight.box.height + 4 })) ring.setAttribute(key, value);
+    words(sightLine, seen(sight));
+  }
+
+  const wake = async () => { lock = await navigator.wakeLock?.request("screen").catch(() => null); };
+
+  async function join() {
+    const { secret } = phone;
+    ticket = await ask("POST", "phones", { secret, name: phone.name, width: canvas.width, height: canvas.height, ...eye.has });
+  }
+
+  // One picture in flight, never a queue; a node that is lost is waited for, and another takes the phone as it is.
+  async function looks(mine) {
+    let fps = 10;
+    while (run === mine) {
+      const began = performance.now();
+      const look = await eye.look();
+      if (run !== mine) return;
+      draw(look);
+      try {
+        ticket ?? await join();
+        const answer = await fly(of(`phones/${ticket.uuid}/look`, { ticket: ticket.ticket, values: JSON.stringify(look.values) }), { method: "POST", body: look.picture });
+        if (run !== mine) return;
+        const told = await answer.json();
+        if (answer.ok) {
+          fps = told.fps;
+          words(said, told.say);
+          words(trouble, "");
+        } else if ([401, 403, 404].includes(answer.status)) ticket = null;
+        else await pause(AGAIN);
+      } catch (error) {
+        if (run !== mine) return;
+        // What the node said is for people; what the network said is not.
+        words(trouble, error.status ? `${error.message} It is tried again.` : "The node does not answer. It is tried again.");
+        await pause(error.status ? LATER : AGAIN);
+      }
+      tell();
+      await pause(1000 / fps - (performance.now() - began));
+    }
+  }
+
+  // Its node is told in the very last moment, too: then another takes the task over at once.
+  function leave(next, line = "") {
+    run += 1;
+    if (ticket) navigator.sendBeacon(of(`phones/${ticket.uuid}/leave`, { ticket: ticket.ticket }));
+    ticket = null;
+    eye?.close();
+    eye = null;
+    lock?.release().catch(() => {});
+    lock = null;
+    show(next, line);
+  }
+
+  async function begin(line = "") {
+    const mine = run += 1;
+    show("asking", "Allow the camera, if the browser asks.");
+    try {
+      const found = await opened(canvas, place.checked);
+      if (run !== mine) return found.close();
+      eye = found;
+    } catch (error) {
+      if (run === mine) show("off", why(error));
+      return;
+    }
+    words(said, "Joining the team");
+    words(sightLine, NONE);
+    show("on", line);
+    wake();
+    looks(mine);
+  }
+
+  form.addEventListener("submit", (event) => {
+    event.preventDefault();
+    phone.name = asName(name.value) || phone.name;
+    name.value = phone.name;
+    keep(phone);
+    begin();
+  });
+  no.addEventListener("click", () => go(""));
+  stop.addEventListener("click", () => leave("off", "This phone takes no part any more."));
+  // A page that nobody sees has no camera worth the name: it leaves, and comes back by itself.
+  const hidden = () => {
+    if (stage === "on") leave("away", "Left, as this page was out of sight.");
+  };
+  const turned = () => {
+    if (document.hidden) hidden();
+    else if (stage === "away") begin("It left while this page was out of sight, and is back.");
+  };
+  document.addEventListener("visibilitychange", turned);
+  addEventListener("pagehide", hidden);
+  addEventListener("pageshow", turned);
+  show("off");
+
+  return {
+    show: () => { root.hidden = false; },
+    // Who goes to look at something else still takes part.
+    hide: () => { root.hidden = on.hidden; },
+    update(_, event) {
+      if (stage === "off" && event !== "beat") show("off", trouble.textContent && !hindrance(model) ? trouble.textContent : "");
+      if (stage === "on") tell();
+    },
+    close() {
+      leave("off");
+      document.removeEventListener("visibilitychange", turned);
+      removeEventListener("pagehide", hidden);
+      removeEventListener("pageshow", turned);
+    },
+  };
+}
