@@ -34,7 +34,7 @@ function more(root, { go }) {
     element("nav", { class: "further", "aria-label": "More views" },
       ...Object.entries(MORE).map(([place, name]) => element("a", { href: `#${place}` }, name))),
     element("p", { class: "row" }, phone), element("div", { class: "row" }, element("label", { for: "theme" }, "Colours"), choice));
-  return { update({ has }) { phone.hidden = !has.includes("phones"); } };
+  return { update({ has, me }) { phone.hidden = !has.includes("phones") || me.role === "viewer"; } };
 }
 
 // What a phone needs to take part comes when its visitor asks for it.
