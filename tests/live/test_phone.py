@@ -1,7 +1,7 @@
 """A phone in Chromium, with a fake camera, in the real demonstration: joins, finds the target, wins, is taken over.
 
-``SCHEME`` and ``FLAGS`` may be others in the environment (``PHONE_SCHEME``, ``PHONE_FLAGS``): over https, for one, with
-the flag that trusts the certificate.
+The demonstration's page is asked over https where the environment says so: ``PHONE_SCHEME=https``, and in
+``PHONE_FLAGS`` what has Chromium trust the certificate (``--ignore-certificate-errors``, for one).
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import ssl
 import subprocess
 import sys
 import threading
@@ -205,6 +206,9 @@ class DemonstrationPhoneTests(Browser):
     def setUp(self) -> None:
         log, run_dir = Path(self.mktemp()), Path(self.mktemp()).absolute()
         command = [sys.executable, "-m", "sim.demo", "--run-dir", str(run_dir), "--web-port", "0"]
+        scheme = os.environ.get("PHONE_SCHEME", "http")
+        # Only a page for phones, which come by the network, is served over https.
+        command += ["--web-host", "0.0.0.0"] if scheme == "https" else []
         with log.open("w", encoding="utf-8") as errors:
             root = Path(__file__).parents[2]
             demo = subprocess.Popen(command, cwd=root, stdout=subprocess.PIPE, stderr=errors, text=True)
@@ -212,25 +216,27 @@ class DemonstrationPhoneTests(Browser):
         self.addCleanup(demo.terminate)
         self.pid = demo.pid
         assert demo.stdout is not None
-        scheme = os.environ.get("PHONE_SCHEME", "http")
         for line in demo.stdout:
-            # The page's address for people; where it is served over https, that stands in the line as well.
+            # The page's addresses are the first that is said to people, that over TLS the second.
             address = next((word for word in line.split() if word.startswith(f"{scheme}://")), "")
             if "#code=" in address:
                 break
+            self.assertFalse(line.startswith("If the node that serves"), f"the page is not served over {scheme}")
         else:
             self.fail(log.read_text(encoding="utf-8"))
         threading.Thread(target=demo.stdout.read, daemon=True).start()
         self.url, _, code = address.partition("#code=")
+        # Whether a browser may trust the certificate is shown elsewhere; here it is only the way to the camera.
+        self.trust = ssl.create_default_context()
+        self.trust.check_hostname, self.trust.verify_mode = False, ssl.CERT_NONE
         self.token = ""
         self.token = self.api("session", {"code": code})["token"]
 
     def api(self, path: str, body: Any = None) -> Any:
         headers = {"Content-Type": "application/json", "Authorization": f"Bearer {self.token}"}
         data = None if body is None else json.dumps(body).encode()
-        with urllib.request.urlopen(
-            urllib.request.Request(f"{self.url}api/v1/{path}", data, headers), timeout=5
-        ) as answer:
+        asked = urllib.request.Request(f"{self.url}api/v1/{path}", data, headers)
+        with urllib.request.urlopen(asked, timeout=5, context=self.trust) as answer:
             return json.load(answer)
 
     def devices(self) -> dict[str, Any]:
@@ -242,7 +248,8 @@ class DemonstrationPhoneTests(Browser):
         while not is_so():
             if time.monotonic() - began > within:
                 told = {name: (each["status"], each["messages"]) for name, each in self.devices().items()}
-                self.fail(f"{told} {[task['note'] for task in self.api('tasks')]}")
+                seen = "" if page is None else page.locator(".phone").text_content()
+                self.fail(f"{told} {[(task['status'], task['note']) for task in self.api('tasks')]} {seen}")
             if page is None:
                 time.sleep(0.03)
             else:
@@ -251,6 +258,11 @@ class DemonstrationPhoneTests(Browser):
 
     def statuses(self) -> dict[str, str]:
         return {name: each["status"] for name, each in self.devices().items()}
+
+    def has_task(self, page: Any) -> bool:
+        """Whether the phone has the task, by its own page and by the team's."""
+        said = page.locator(".phone .said").text_content()
+        return "You have the task" in said and self.statuses().get("anna") == "EXECUTING"
 
     def place_target(self) -> None:
         for x, y in PLACES:
@@ -282,8 +294,7 @@ class DemonstrationPhoneTests(Browser):
 
         self.place_target()
         self.api("tasks", {"name": "watch-target"})
-        page.locator(".phone .said", has_text="You have the task").wait_for(timeout=60_000)
-        self.assertEqual(self.statuses()["anna"], "EXECUTING")
+        self.until(lambda: self.has_task(page), 60.0 * stretch(), page)
         self.assert_sound(page, "executing")
         page.evaluate("location.hash = 'cameras'")
         page.locator("figure[data-camera=live]", has_text="anna").wait_for()
@@ -326,5 +337,5 @@ class DemonstrationPhoneTests(Browser):
         self.assertIsNone(after["gone"])
         self.place_target()
         self.api("tasks", {"name": "watch-target"})
-        page.locator(".phone .said", has_text="You have the task").wait_for(timeout=60_000)
+        self.until(lambda: self.has_task(page), 60.0 * stretch(), page)
         self.assertEqual(self.faults, [])
