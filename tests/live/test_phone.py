@@ -146,6 +146,7 @@ class PhoneViewTests(Browser):
         page.locator(".phone .trouble", has_text="Left, as this page was out of sight").wait_for()
         with page.expect_request("**/api/v1/phones") as joined:
             page.evaluate(HIDE, False)
+        page.locator(".phone .trouble", has_text="It left while this page was out of sight, and is back").wait_for()
         page.locator(".phone .said", has_text="Look for the red target").wait_for()
         self.assertEqual(json.loads(joined.value.post_data)["secret"], json.loads(secret)["secret"])
         self.assertEqual(self.faults, [])
@@ -236,7 +237,7 @@ class DemonstrationPhoneTests(Browser):
         headers = {"Content-Type": "application/json", "Authorization": f"Bearer {self.token}"}
         data = None if body is None else json.dumps(body).encode()
         asked = urllib.request.Request(f"{self.url}api/v1/{path}", data, headers)
-        with urllib.request.urlopen(asked, timeout=5, context=self.trust) as answer:
+        with urllib.request.urlopen(asked, timeout=20, context=self.trust) as answer:
             return json.load(answer)
 
     def devices(self) -> dict[str, Any]:
