@@ -111,7 +111,9 @@ class PhoneViewTests(Browser):
 
     def opened(self, browser: Any, screen: Any = PHONE, base: str = "", **more: Any) -> Any:
         page = self.page(browser, f"{base or self.team.url}#code={self.team.code}", screen, **more)
-        page.evaluate("location.hash = 'phone'")
+        if screen is PHONE:
+            page.locator("#views a", has_text="More").tap()
+        page.get_by_role("button", name="Take part with this device").press("Enter")
         page.get_by_role("button", name="Take part", exact=True).wait_for()
         return page
 
