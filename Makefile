@@ -9,6 +9,7 @@ REAL   ?= 0
 HEADLESS ?=
 WEB_HOST ?= 127.0.0.1
 WEB_PORT ?=
+TLS    ?=
 NODES  ?= 8,32
 SECONDS ?= 5
 JOBS   ?= $(shell nproc 2>/dev/null || echo 1)
@@ -30,7 +31,7 @@ CONTRACT := $(VENV)/contract
 
 help:
 	@echo 'make demo [HEADLESS=1] [SEED=1]       three dogs, a red target and the page; HEADLESS: both experiments, then exit'
-	@echo '          [WEB_HOST=0.0.0.0] [WEB_PORT=8080]   whom the page is open to, and where'
+	@echo '          [WEB_HOST=0.0.0.0] [WEB_PORT=8080] [TLS=1]   whom the page is open to, and where; TLS: on this machine alone, too'
 	@echo 'make test                             every test'
 	@echo 'make trials [N=20] [SEED=1] [REAL=3]  both experiments N times in memory, and REAL times as processes'
 	@echo 'make check                            format, lint, types, and the rules of the house'
@@ -50,7 +51,7 @@ help:
 	@echo 'make clean                            remove what the above left behind, the environment included'
 
 demo: $(RUNTIME)
-	@exec $(PY) -m sim.demo --seed $(SEED) $(if $(filter-out 0,$(HEADLESS)),--headless) \
+	@exec $(PY) -m sim.demo --seed $(SEED) $(if $(filter-out 0,$(HEADLESS)),--headless) $(if $(filter-out 0,$(TLS)),--tls) \
 	    --web-host $(WEB_HOST) $(if $(WEB_PORT),--web-port $(WEB_PORT))
 
 # One worker for each processor.

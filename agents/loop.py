@@ -76,7 +76,9 @@ class Agent(Service):
 
     def _seen(self, seen: Observation) -> None:
         if seen.frame is not None:
-            self._node.streams.offer(CAMERA, seen.frame.seq, seen.frame.data)
+            # In the robot's seconds until it was heard, in those of this clock since then.
+            age = max(0.0, seen.t_robot - seen.frame.t_robot) + self._clock.seconds() - seen.t_host
+            self._node.streams.offer(CAMERA, seen.frame.seq, seen.frame.data, age)
         if self._body.is_empty or not self._node.halt.is_known:
             return  # what it offered now it could not do at once, and others would count on it
         for engagement in self._having_body():

@@ -20,6 +20,7 @@ from twisted.protocols.basic import LineReceiver
 from middleware.entangled.clock import use_monotonic_time
 from middleware.node import CAMERA
 from middleware.settings import Settings
+from swarmnode.ballast import drop_tls
 from swarmnode.service import NodeService
 from swarmnode.warmth import STARTED_S, warmed_up
 from swarmnode.web import web_page
@@ -80,6 +81,7 @@ class Orders(LineReceiver):
 def main(arguments: list[str]) -> None:
     """Be the web node, or the robots."""
     use_monotonic_time()
+    drop_tls()
     from twisted.internet import reactor as made
 
     reactor: Any = made

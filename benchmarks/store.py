@@ -139,6 +139,9 @@ def _look(path: str, safe: int, kill: int, seen: Kills) -> None:
 
 def serve(path: str) -> None:
     """Start a whole node on the store ``path``; print when it serves, how many rows it holds, and its memory."""
+    from swarmnode.ballast import drop_tls
+
+    drop_tls()
     from twisted.internet import reactor
 
     from middleware.settings import Settings

@@ -2,7 +2,8 @@
 
 A viewer opens a channel at a publisher and keeps it open by asking again; the publisher sends each frame in a few
 datagrams that nobody acknowledges.  A frame that misses a part is dropped, and a late one too: there is never a
-backlog.  Nothing is sent while nobody looks.
+backlog.  Nothing is sent while nobody looks.  A frame carries its age, so that a viewer knows how old it is without
+knowing the publisher's clock.
 """
 
 from __future__ import annotations
@@ -25,25 +26,29 @@ PATIENCE = 1.0
 """Seconds without a newer frame after which an older number is believed: the publisher began anew."""
 MAX_CHANNEL = 32
 
-OnFrame = Callable[[int, bytes], None]
+MAX_AGE = 600.0
+OnFrame = Callable[[int, bytes, float], None]
+"""Called with number, frame and age in seconds."""
 
 
 @dataclass
 class _Assembly:
-    """The parts of the newest frame of one channel; ``at`` is when its first part came."""
+    """The parts of the newest frame of one channel; ``at`` is when its first part came, ``age`` how old it was then."""
 
     sequence: int = -1
     count: int = 0
     at: float = 0.0
+    age: float = 0.0
     parts: dict[int, bytes] = field(default_factory=dict)
     is_done: bool = False
 
-    def add(self, sequence: int, number: int, count: int, part: bytes, now: float) -> bytes | None:
+    def add(self, sequence: int, number: int, count: int, part: bytes, age: float, now: float) -> bytes | None:
         """Take in one part; the whole frame where it was the last one missing."""
         if sequence < self.sequence and now - self.at <= PATIENCE:
             return None
         if sequence != self.sequence or count != self.count:
-            self.sequence, self.count, self.at, self.parts, self.is_done = sequence, count, now, {}, False
+            self.sequence, self.count, self.parts, self.is_done = sequence, count, {}, False
+            self.at, self.age = now, age
         self.parts[number] = part
         if self.is_done or len(self.parts) < count:
             return None
@@ -74,16 +79,20 @@ class Streams:
             self._viewers.pop(channel, None)
         return bool(viewers)
 
-    def offer(self, channel: str, sequence: int, frame: bytes) -> None:
-        """Send ``frame`` to whoever looks at ``channel``; frames of over ``MAX_PARTS`` parts are not sent."""
+    def offer(self, channel: str, sequence: int, frame: bytes, age: float = 0.0) -> None:
+        """Send ``frame``, taken ``age`` seconds ago, to whoever looks at ``channel``.
+
+        Frames of over ``MAX_PARTS`` parts are not sent.
+        """
         if not self.is_wanted(channel):
             return
         parts = [frame[i : i + PART_BYTES] for i in range(0, len(frame), PART_BYTES)]
         if len(parts) > MAX_PARTS:
             return
+        age_ms = round(1000 * min(max(age, 0.0), MAX_AGE))
         for viewer, _ in self._viewers[channel].values():
             for number, part in enumerate(parts):
-                self._endpoint.tell(viewer, "stream.part", channel, sequence, number, len(parts), part)
+                self._endpoint.tell(viewer, "stream.part", channel, sequence, number, len(parts), part, age_ms)
 
     def _answer_open(self, peer: Contact, channel: str) -> bool:
         if len(channel) > MAX_CHANNEL:
@@ -100,7 +109,10 @@ class Streams:
     # -- viewer -----------------------------------------------------------------------------------------------------
 
     def look(self, publisher: Contact, channel: str, on_frame: OnFrame) -> Callable[[], None]:
-        """Call ``on_frame(sequence, frame)`` at each whole new frame until what is returned is called."""
+        """Call ``on_frame(sequence, frame, age)`` at each whole new frame until what is returned is called.
+
+        ``age`` is in seconds since it was taken: as the publisher says, and half a round trip, where one was measured.
+        """
         place = (publisher.node_id, channel)
         look = self._looks.get(place)
         if look is None:
@@ -124,14 +136,20 @@ class Streams:
         self._looks.clear()
         self._viewers.clear()
 
-    def _answer_part(self, peer: Contact, channel: str, sequence: int, number: int, count: int, part: bytes) -> None:
+    def _answer_part(
+        self, peer: Contact, channel: str, sequence: int, number: int, count: int, part: bytes, age_ms: int = 0
+    ) -> None:
         look = self._looks.get((peer.node_id, channel))
         if look is None or not 0 <= number < count <= MAX_PARTS or len(part) > PART_BYTES:
             return
-        frame = look.assembly.add(sequence, number, count, part, self._clock.seconds())
+        if not 0 <= age_ms <= 1000 * MAX_AGE:
+            return
+        now, assembly = self._clock.seconds(), look.assembly
+        frame = assembly.add(sequence, number, count, part, age_ms / 1000, now)
         if frame is not None:
+            age = assembly.age + now - assembly.at + (self._endpoint.round_trip(peer) or 0.0) / 2
             for on_frame in list(look.watchers):
-                on_frame(sequence, frame)
+                on_frame(sequence, frame, age)
 
 
 class _Look:

@@ -47,6 +47,8 @@ def main(arguments: list[str] | None = None, output: TextIO = sys.stdout, errors
     ReactorBase.seconds = staticmethod(
         partial(time.clock_gettime, time.CLOCK_BOOTTIME) if hasattr(time, "CLOCK_BOOTTIME") else time.monotonic
     )
+    # Twisted would load pyOpenSSL where it is installed (13 MiB); the yard speaks no TLS.
+    sys.modules.setdefault("OpenSSL", None)  # type: ignore[arg-type]
     from twisted.internet import reactor as running
 
     reactor: Any = running

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from importlib.util import find_spec
 
 from middleware.errors import MissingExtra
+from swarmnode.ballast import drop_tls
 
 OURS = ("agents", "drivers", "middleware", "sim", "swarmnode", "webnode")
 # A verb whose module is not here is not offered.
@@ -47,6 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         lines = "".join(f"  {name:9}{purpose}\n" for name, purpose in about.items())
         sys.stdout.write(f"usage: swarm VERB [options]\n\n{lines}\nswarm VERB --help says more.\n")
         return 0
+    drop_tls()
     try:
         module = importlib.import_module(works[verb][0])
     except ModuleNotFoundError as error:

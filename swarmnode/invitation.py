@@ -24,12 +24,16 @@ _log = Logger()
 
 @dataclass(frozen=True)
 class Invitation:
-    """The page of the node ``name``: ``pid`` is the node's process, ``code`` is empty where nobody needs to sign in."""
+    """The page of the node ``name``: ``pid`` is the node's process, ``code`` is empty where nobody needs to sign in.
+
+    ``secure`` is the page's address over TLS, empty where there is none.
+    """
 
     name: str
     url: str
     code: str
     pid: int
+    secure: str = ""
 
     @property
     def link(self) -> str:
@@ -37,17 +41,19 @@ class Invitation:
         return f"{self.url}#code={self.code}" if self.code else self.url
 
 
-def url_of(host: str, port: int) -> str:
+def url_of(host: str, port: int, scheme: str = "http") -> str:
     """The address of a page, for a browser of this machine."""
     here = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
-    return f"http://[{here}]:{port}/" if ":" in here else f"http://{here}:{port}/"
+    return f"{scheme}://[{here}]:{port}/" if ":" in here else f"{scheme}://{here}:{port}/"
 
 
-def invited(name: str, host: str, port: Callable[[], int], code: str) -> None:
+def invited(name: str, host: str, port: Callable[[], int], code: str, secure_port: int = 0) -> None:
     """Say in the log where the page is, and leave the note; where none can be left, the log says why."""
-    invitation = Invitation(name, url_of(host, port()), code, os.getpid())
+    secure = url_of(host, secure_port, "https") if secure_port else ""
+    invitation = Invitation(name, url_of(host, port()), code, os.getpid(), secure)
     how = f"; sign in with the code {code}, or open {invitation.link}" if code else "; whoever opens it is an operator"
-    _log.info("the page is at {url}{how}", url=invitation.url, how=how)
+    also = f", and over TLS at {secure}" if secure else ""
+    _log.info("the page is at {url}{also}{how}", url=invitation.url, also=also, how=how)
     try:
         path = made(name).with_suffix(ENDING)
         fresh = path.with_suffix(f"{ENDING}.new")

@@ -18,6 +18,7 @@ from middleware.errors import BadSetting, MissingExtra, SwarmError, UnknownAgent
 from middleware.node import SwarmNode
 from middleware.settings import COMMAND_LINE, Settings
 from swarmnode.assembly import FAULTS
+from swarmnode.ballast import drop_tls
 from swarmnode.service import NodeService
 from swarmnode.warmth import STARTED_S, warmed_up
 from swarmnode.web import web_page, with_code
@@ -58,6 +59,8 @@ class Options(usage.Options):
         ["driver-kind", "d", None, "driver of its robot"],
         ["web-host", None, None, "address of the page"],
         ["web-port", None, None, "TCP port of the page"],
+        ["web-tls", None, None, "auto: the page over TLS as well"],
+        ["web-tls-port", None, None, "TCP port of the page over TLS"],
         ["web-yard", None, None, "yard that the page's map shows, as HOST:PORT"],
     ]
     settings: Settings
@@ -75,6 +78,9 @@ class Options(usage.Options):
             self.settings = settings.with_flags(**flags)
         except SwarmError as error:
             _refuse(error)
+        # Here at the latest, as the reactor comes next.
+        if not ("web" in self.settings.node.roles and self.settings.web.tls):
+            drop_tls()
 
 
 def makeService(options: Options) -> IService:

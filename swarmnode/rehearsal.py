@@ -114,7 +114,7 @@ class VirtualTeam:
 
     def run_demo(self) -> str:
         """Press the Run Demo button; returns the task's id."""
-        return self.desk.run_demo()
+        return str(self.desk.run_demo())
 
     def state(self) -> dict[str, Any]:
         """What the page shows now."""

@@ -14,7 +14,7 @@ from twisted.application.service import IService, MultiService, Service
 from twisted.internet.defer import gatherResults, maybeDeferred
 
 from middleware.entangled.data.sqlite import read_records
-from middleware.errors import MissingExtra
+from middleware.errors import BadSetting, MissingExtra
 from middleware.node import SwarmNode
 from middleware.settings import IN_MEMORY, Settings
 from swarmnode.invitation import invited
@@ -67,11 +67,11 @@ def web_page(settings: Settings, seams: Seams, reactor: Any, node: SwarmNode) ->
         from webnode.app import create_app
         from webnode.audit import audit
         from webnode.board import Board
-        from webnode.certificate import doors
         from webnode.chronicle import chronicle
         from webnode.fallback import fallbacks
         from webnode.ground import Ground
         from webnode.halting import halts
+        from webnode.invite import TeamInvites
         from webnode.ledger import Glance, state_from
         from webnode.limits import limits
         from webnode.live import Events, Shots
@@ -84,6 +84,7 @@ def web_page(settings: Settings, seams: Seams, reactor: Any, node: SwarmNode) ->
         from webnode.tuner import tuning
     except ModuleNotFoundError as error:
         raise MissingExtra("the web role", "web") from error
+    door = _doorway(settings) if settings.web.tls else None
     from drivers.sim.link import TcpConnector
     from drivers.sim.operator import YardOperator
 
@@ -91,6 +92,14 @@ def web_page(settings: Settings, seams: Seams, reactor: Any, node: SwarmNode) ->
     operator = None if yard is None else YardOperator(TcpConnector(), reactor, yard.host, yard.port)
     desk = TeamDesk(node, TASKS, DEMO, operator)
     ground = Ground(settings, node, desk, reactor, seams.wall, seams.rng)
+    tls = None if door is None else door(ground, _names)
+    invites = TeamInvites(
+        lambda: web.urls(_names()),
+        b"" if tls is None else tls.signer.pem,
+        "" if tls is None else tls.signer.fingerprint,
+        reactor,
+        reactor.getThreadPool(),
+    )
     board = Board(
         desk,
         sessions(ground),
@@ -103,6 +112,7 @@ def web_page(settings: Settings, seams: Seams, reactor: Any, node: SwarmNode) ->
         halts(ground),
         faults(ground),
         phones := gateway(ground),
+        invites,
     )
     name = settings.node.name
     # A memory of the departed each: the file lags what is watched by a commit, and one would doubt the other.
@@ -118,17 +128,29 @@ def web_page(settings: Settings, seams: Seams, reactor: Any, node: SwarmNode) ->
         board.fallbacks.here,
         board.chronicle,
         lambda: (desk.version, board.halts is not None and board.halts.is_halted()),
+        board.sessions,
     )
     shots, address = Shots(desk, reactor), settings.web
-    web = WebService(
-        reactor, address.host, address.port, app, events, shots, Files(), board, seams.wall, doors=doors(ground)
-    )
+    doors = [] if tls is None else [tls.open]
+    web = WebService(reactor, address.host, address.port, app, events, shots, Files(), board, seams.wall, doors=doors)
 
     def tell() -> None:
-        invited(name, address.host, lambda: web.port, board.sessions.code)
+        invited(name, address.host, lambda: web.port, board.sessions.code, web.secure_port)
         board.fallbacks.serves(web.urls(_names()))
 
     return _Page(web, operator, tell, phones)
+
+
+def _doorway(settings: Settings) -> Callable[..., Any]:
+    """What makes the page's port over TLS; raises ``BadSetting`` where its libraries are missing."""
+    try:
+        from webnode.tls import door
+    except ModuleNotFoundError as error:
+        library = (error.name or "").split(".")[0]
+        problem = f"is {settings.web.tls!r}, and the library {library} is not installed"
+        remedy = "install it by: pip install 'swarm-node[tls]', or leave tls out"
+        raise BadSetting(settings.origin, "[web] tls", problem, remedy) from error
+    return door
 
 
 def _names() -> Sequence[str]:

@@ -41,5 +41,6 @@ def main(
             out.write(json.dumps(asdict(each) | {"link": each.link}) + "\n")
         else:
             code = f"code {each.code}, or open {each.link}" if each.code else "no sign-in; whoever opens it may do all"
-            out.write(printable(f"{each.name}: {each.url}  {code}") + "\n")
+            also = f" and {each.secure}" if each.secure else ""
+            out.write(printable(f"{each.name}: {each.url}{also}  {code}") + "\n")
     return 0

@@ -130,7 +130,10 @@ WORLD = ("time", "socket", "threading", "asyncio", "selectors", "subprocess", "s
 GUARDED = ("middleware", "agents", "drivers")
 
 ON_DEMAND = ("middleware.deployment", "middleware.explanation", "middleware.verdict")
-HEAVY = ("flask", "jinja2", "segno", "prometheus_client", "cv2", "numpy", "pymunk", "serial", "playwright")
+HEAVY = (
+    *("flask", "jinja2", "segno", "prometheus_client", "OpenSSL", "cryptography"),
+    *("cv2", "numpy", "pymunk", "serial", "playwright"),
+)
 
 
 def _files() -> dict[str, Path]:

@@ -8,6 +8,7 @@ any.
 
 from __future__ import annotations
 
+import math
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -26,11 +27,18 @@ AUDITED = 200
 
 @dataclass(frozen=True)
 class Visitor:
-    """Who asks; ``token_id`` names what it signed in with, and is no secret."""
+    """Who asks; ``token_id`` names what it signed in with, and is no secret.
+
+    It is let in ``until`` then (unix seconds), which it may have put off, no further than to ``limit``, unless it shows
+    a ticket.
+    """
 
     name: str = ""
     role: Role = "anyone"
     token_id: str = ""
+    until: float = math.inf
+    limit: float = math.inf
+    is_ticket: bool = False
 
 
 @dataclass(frozen=True)
@@ -62,8 +70,11 @@ class Sessions(Protocol):
     def token(self, name: str, role: Role, now: float, seconds: float) -> Token:
         """A token for somebody who need not sign in."""
 
-    def revoke(self, token_id: str) -> None:
-        """Let in nobody with this token any more."""
+    def renewed(self, who: Visitor, now: float) -> Token:
+        """Another token for the same session, good for longer; raises ``Refusal`` 401 for anyone and for a ticket."""
+
+    def revoke(self, token_id: str, until: float = math.inf) -> None:
+        """Let in nobody with this token any more, nor with one that was made of it; it runs out ``until`` then."""
 
 
 class OpenSessions:
@@ -83,7 +94,11 @@ class OpenSessions:
         """Return one that says nothing."""
         return Token("open", "open", role, now + seconds)
 
-    def revoke(self, token_id: str) -> None:
+    def renewed(self, who: Visitor, now: float) -> Token:
+        """Return one that says nothing."""
+        return self.token(who.name, who.role, now, 86400.0)
+
+    def revoke(self, token_id: str, until: float = math.inf) -> None:
         """Do nothing."""
 
 
@@ -461,6 +476,41 @@ class MemoryPhones:
         return succeed(None)
 
 
+class Invites(Protocol):
+    """What somebody else needs to come to the page."""
+
+    authority: bytes
+    """The certificate of the authority that a browser has to trust, as PEM; empty where there is no TLS."""
+    fingerprint: str
+    """What a person compares it by."""
+
+    def urls(self) -> list[str]:
+        """Where this node serves the page, the best for others first."""
+
+    def drawn(self, text: str) -> Deferred[str]:
+        """A QR code of ``text`` as an SVG; empty where none can be drawn."""
+
+
+class MemoryInvites:
+    """Pages that it was made with, and drawings that only say of what they are."""
+
+    def __init__(self, *urls: str, authority: bytes = b"", fingerprint: str = "") -> None:
+        self.pages = list(urls)
+        self.authority = authority
+        self.fingerprint = fingerprint
+
+    def urls(self) -> list[str]:
+        """Return them."""
+        return self.pages
+
+    def drawn(self, text: str) -> Deferred[str]:
+        """Return an empty picture with ``text`` for its title, or nothing where there is none."""
+        if not text:
+            return succeed("")
+        title = text.replace("&", "&amp;").replace("<", "&lt;")
+        return succeed(f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 9 9"><title>{title}</title></svg>')
+
+
 @dataclass
 class Board:
     """All of it; who may come in is always said, the rest is the twin in memory, or None for what a node may lack."""
@@ -476,10 +526,11 @@ class Board:
     halts: Halts | None = None
     faults: Faults | None = None
     phones: Phones | None = None
+    invites: Invites | None = None
 
     @property
     def has(self) -> list[str]:
         """What this node has beyond what every web node has, for the page."""
-        parts = ("survey", "tuning", "halts", "faults", "phones")
+        parts = ("survey", "tuning", "halts", "faults", "phones", "invites")
         yard = ["yard"] if self.desk.yard() is not None else []
         return yard + [name for name in parts if getattr(self, name) is not None]

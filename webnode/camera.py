@@ -14,7 +14,7 @@ POLL_S = 5.0
 LINGER_S = 2.0
 MAX_FRAME = 1 << 20
 
-OnFrame = Callable[[int, bytes], None]
+OnFrame = Callable[[int, bytes, float], None]
 Question = tuple[Request, bytes, IDelayedCall]
 
 
@@ -22,8 +22,9 @@ class FrameSource(Protocol):
     """Where camera pictures come from; the stream to a robot's node exists only while somebody looks."""
 
     def watch(self, uuid: str, on_frame: OnFrame) -> Callable[[], None]:
-        """Call ``on_frame(seq, jpeg)`` for each new picture of a device until what is returned is called.
+        """Call ``on_frame(seq, jpeg, age)`` for each new picture of a device until what is returned is called.
 
+        ``age`` is in seconds, since it was taken.
         Raises ``Refusal`` where the device has no camera or is not there.
         """
 
@@ -41,10 +42,10 @@ class MemoryFrames:
         self.opened += 1
         return lambda: self.watched.pop(uuid, None) and None
 
-    def show(self, uuid: str, seq: int, jpeg: bytes) -> None:
+    def show(self, uuid: str, seq: int, jpeg: bytes, age: float = 0.0) -> None:
         """Hand over one picture, if somebody watches."""
         if uuid in self.watched:
-            self.watched[uuid](seq, jpeg)
+            self.watched[uuid](seq, jpeg, age)
 
 
 class Camera:
@@ -60,6 +61,7 @@ class Camera:
         self._on_end = on_end
         self._opened_at = clock.seconds()
         self._newest: tuple[int, bytes, float] | None = None
+        self._came_at = -POLL_S
         self._linger: IDelayedCall | None = None
         self._ended = False
         self.waiting: list[Question] = []
@@ -81,11 +83,12 @@ class Camera:
         self.waiting.append(entry)
         request.notifyFinish().addErrback(lambda _: self._forget(entry))
 
-    def on_frame(self, seq: int, jpeg: bytes) -> None:
-        """Take the next picture; what is no JPEG, far too large or comes after the end is dropped."""
+    def on_frame(self, seq: int, jpeg: bytes, age: float) -> None:
+        """Take the next picture, taken ``age`` seconds ago; no JPEG, a far too large or a late one is dropped."""
         if self._ended or not jpeg.startswith(b"\xff\xd8") or len(jpeg) > MAX_FRAME:
             return
-        self._newest = (seq, jpeg, self._clock.seconds())
+        now = self._clock.seconds()
+        self._newest, self._came_at = (seq, jpeg, now - age), now
         waiting, self.waiting = self.waiting, []
         for request, _, deadline in waiting:
             deadline.cancel()
@@ -113,8 +116,7 @@ class Camera:
 
     def _give_up(self, entry: Question) -> None:
         self._release(entry)
-        newest_at = -POLL_S if self._newest is None else self._newest[2]
-        if self._clock.seconds() - max(newest_at, self._opened_at) < POLL_S:
+        if self._clock.seconds() - max(self._came_at, self._opened_at) < POLL_S:
             return
         self._stop_upstream()
         self._stop_upstream = lambda: None

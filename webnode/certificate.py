@@ -1,19 +1,238 @@
-"""Certificate: the page over TLS."""
+"""Certificate: the team's authority, and what it signs for a web node, so that the page can be served over TLS.  Pure.
+
+Each web node makes the authority by itself from the team's secret, byte for byte the same: who trusts it once trusts
+the page of every web node of the team.  It can vouch for addresses and names of a local network and for nothing else:
+who comes to know the secret cannot pass for a site of the internet before the phones that trust it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import hashlib
+import ipaddress
+import random
+from collections.abc import Collection
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
 
-from twisted.logger import Logger
+from cryptography import x509
+from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.hashes import SHA256
+from cryptography.hazmat.primitives.serialization import (
+    Encoding,
+    NoEncryption,
+    PrivateFormat,
+    PublicFormat,
+    load_pem_private_key,
+)
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from webnode.ground import Ground
-from webnode.server import Door
+PERSON = b"swarm-page-tls"
+ORDER = 0xFFFFFFFF00000000FFFFFFFFFFFFFFFFBCE6FAADA7179E84F3B9CAC2FC632551
+"""How many points the group of P-256 has; a private key is a number below it."""
+FROM, UNTIL = datetime(2025, 1, 1, tzinfo=UTC), datetime(2049, 12, 31, tzinfo=UTC)
+"""When the authority is valid: said here, as it must be the same at every node, whatever its clock says."""
+LASTS = timedelta(days=365)
+"""Of a node's certificate; phones take none that lasts longer than 825 days."""
+EARLIER = timedelta(days=2)
+"""A node's certificate is valid from so long ago, as clocks differ."""
+LEFT = timedelta(days=30)
+"""With less than this to come a new one is made."""
+NETWORKS = (
+    *("10.0.0.0/8", "172.16.0.0/12", "192.168.0.0/16", "100.64.0.0/10", "169.254.0.0/16", "127.0.0.0/8"),
+    *("fc00::/7", "fe80::/10", "::1/128"),
+)
+DOMAINS = ("localhost", "local", "lan", "internal", "home.arpa")
+MOST = 32
+"""Names in one certificate."""
 
-_log = Logger()
+
+@dataclass(frozen=True)
+class Authority:
+    """What signs for the web nodes of a team."""
+
+    key: ec.EllipticCurvePrivateKey
+    certificate: x509.Certificate
+
+    @property
+    def pem(self) -> bytes:
+        """The certificate, which everybody may have."""
+        return bytes(self.certificate.public_bytes(Encoding.PEM))
+
+    @property
+    def fingerprint(self) -> str:
+        """What a person compares: the SHA-256 hash of the certificate, as phones show it."""
+        return bytes(self.certificate.fingerprint(SHA256())).hex(":").upper()
 
 
-def doors(ground: Ground) -> Sequence[Door]:
-    """The further ports of the page; none, as it is served without TLS so far."""
-    if ground.settings.web.tls:
-        _log.warn("[web] tls: the page is served without TLS")
-    return ()
+def authority(secret: bytes) -> Authority:
+    """The authority of the team that has this secret."""
+    key = _key(secret, b"authority")
+    # A phone lists authorities by name: those of two teams should be told apart.
+    mark = hashlib.blake2s(_point(key), digest_size=3).hexdigest()
+    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, f"Swarm team {mark}")])
+    constraints = x509.NameConstraints(
+        [
+            *(x509.DNSName(domain) for domain in DOMAINS),
+            *(x509.IPAddress(ipaddress.ip_network(network)) for network in NETWORKS),
+        ],
+        None,
+    )
+    made = (
+        _begun(name, name, key, int.from_bytes(hashlib.blake2b(_point(key), digest_size=15).digest()), FROM, UNTIL)
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .add_extension(_usage(signs_certificates=True), critical=True)
+        .add_extension(constraints, critical=True)
+    )
+    return Authority(key, made.sign(key, SHA256(), ecdsa_deterministic=True))
+
+
+@dataclass(frozen=True)
+class Leaf:
+    """A node's own certificate and its key."""
+
+    key: ec.EllipticCurvePrivateKey
+    certificate: x509.Certificate
+
+    @property
+    def pem(self) -> bytes:
+        """Both, to be kept where nobody else reads them."""
+        private = self.key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
+        return bytes(private + self.certificate.public_bytes(Encoding.PEM))
+
+    def flaw(self, signer: Authority, names: Collection[str], now: float) -> str:
+        """Why it cannot serve the page at ``names`` at the unix time ``now``; empty where it can."""
+        certificate, moment = self.certificate, _moment(now)
+        if _point(self.key) != certificate.public_key().public_bytes(Encoding.X962, PublicFormat.UncompressedPoint):
+            return "its key is another one's"
+        try:
+            certificate.verify_directly_issued_by(signer.certificate)
+        except (InvalidSignature, ValueError, TypeError):
+            return "the authority of another team signed it"
+        if moment < certificate.not_valid_before_utc:
+            return "it is not valid yet"
+        if moment > certificate.not_valid_after_utc - LEFT:
+            return "it runs out"
+        missing = [name for name in nameable(names) if name not in self.names]
+        return f"it lacks {', '.join(missing)}" if missing else ""
+
+    @property
+    def names(self) -> list[str]:
+        """The addresses and names for which it stands."""
+        try:
+            found = self.certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+        except x509.ExtensionNotFound:
+            return []
+        return [str(name.value) for name in found]
+
+
+def read(pem: bytes) -> Leaf:
+    """The leaf whose ``pem`` this is; raises ``ValueError`` where it is none."""
+    try:
+        key = load_pem_private_key(pem, None)
+        certificate = x509.load_pem_x509_certificate(pem)
+    except (ValueError, TypeError, UnsupportedAlgorithm) as error:
+        raise ValueError("it holds no certificate with its key") from error
+    if not isinstance(key, ec.EllipticCurvePrivateKey) or not isinstance(
+        certificate.public_key(), ec.EllipticCurvePublicKey
+    ):
+        raise ValueError("its key is of another kind")
+    return Leaf(key, certificate)
+
+
+def leaf(signer: Authority, title: str, names: Collection[str], now: float, rng: random.Random) -> Leaf:
+    """A certificate for the node that people call ``title``, for those of ``names`` that may be in one."""
+    key = _key(rng.randbytes(32), b"leaf")
+    subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, title)])
+    since = min(max(_moment(now) - EARLIER, FROM), UNTIL - LASTS)
+    serial = int.from_bytes(rng.randbytes(15)) or 1
+    made = (
+        _begun(subject, signer.certificate.subject, key, serial, since, since + LASTS, signer)
+        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+        .add_extension(_usage(signs_certificates=False), critical=True)
+        .add_extension(x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH]), critical=False)
+        .add_extension(x509.SubjectAlternativeName([_named(name) for name in nameable(names)]), critical=False)
+    )
+    return Leaf(key, made.sign(signer.key, SHA256(), ecdsa_deterministic=True))
+
+
+def nameable(names: Collection[str]) -> list[str]:
+    """Those of ``names`` for which the authority may sign, addresses as they are usually written; never none."""
+    usual = (plain(name) for name in ("localhost", "127.0.0.1", "::1", *names))
+    return list(dict.fromkeys(name for name in usual if name))[:MOST]
+
+
+def plain(name: str) -> str:
+    """The usual way to write an address or name; empty for one for which the authority must not sign."""
+    try:
+        address = ipaddress.ip_address(name)
+    except ValueError:
+        lower = name.rstrip(".").lower()
+        labels = lower.split(".")
+        is_lawful = all(0 < len(label) < 64 and label.replace("-", "").isalnum() for label in labels)
+        is_ours = is_lawful and lower.isascii() and len(lower) < 254
+        return lower if is_ours and any(lower == end or lower.endswith(f".{end}") for end in DOMAINS) else ""
+    if isinstance(address, ipaddress.IPv6Address):
+        address = address.ipv4_mapped or address
+    # A zone such as fe80::1%eth0 means something on one machine alone.
+    fits = any(address in ipaddress.ip_network(network) for network in NETWORKS) and "%" not in str(address)
+    return str(address) if fits else ""
+
+
+def _named(name: str) -> x509.GeneralName:
+    try:
+        return x509.IPAddress(ipaddress.ip_address(name))
+    except ValueError:
+        return x509.DNSName(name)
+
+
+def _key(secret: bytes, use: bytes) -> ec.EllipticCurvePrivateKey:
+    """The private key that belongs to a secret; 64 bytes are hashed, so that each key is as likely as any other."""
+    number = int.from_bytes(hashlib.blake2b(secret, digest_size=64, key=use, person=PERSON).digest())
+    return ec.derive_private_key(1 + number % (ORDER - 1), ec.SECP256R1())
+
+
+def _point(key: ec.EllipticCurvePrivateKey) -> bytes:
+    return bytes(key.public_key().public_bytes(Encoding.X962, PublicFormat.UncompressedPoint))
+
+
+def _moment(now: float) -> datetime:
+    """A unix time as cryptography has it; a clock that is far off is at the nearest moment that can be written."""
+    try:
+        return min(max(datetime.fromtimestamp(now, UTC), FROM), UNTIL)
+    except (ValueError, OverflowError, OSError):
+        return FROM
+
+
+def _begun(
+    subject: x509.Name,
+    issuer: x509.Name,
+    key: ec.EllipticCurvePrivateKey,
+    serial: int,
+    since: datetime,
+    until: datetime,
+    signer: Authority | None = None,
+) -> x509.CertificateBuilder:
+    public = key.public_key()
+    signing = public if signer is None else signer.key.public_key()
+    return (
+        x509.CertificateBuilder(issuer, subject, public, serial)
+        .not_valid_before(since.replace(microsecond=0))
+        .not_valid_after(until.replace(microsecond=0))
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(public), critical=False)
+        .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(signing), critical=False)
+    )
+
+
+def _usage(signs_certificates: bool) -> x509.KeyUsage:
+    return x509.KeyUsage(
+        digital_signature=not signs_certificates,
+        key_cert_sign=signs_certificates,
+        crl_sign=signs_certificates,
+        content_commitment=False,
+        key_encipherment=False,
+        data_encipherment=False,
+        key_agreement=False,
+        encipher_only=False,
+        decipher_only=False,
+    )

@@ -16,13 +16,14 @@ from webnode.errors import Refusal
 class Desk(Protocol):
     """An operator's wishes; the outcome is seen in the state, not in the answer."""
 
-    def run_demo(self) -> Any:
+    def run_demo(self, task_id: str = "") -> Any:
         """Assign the demonstration's task; returns its id."""
 
-    def assign(self, name: str, tolerates: int = 1, group: str = "") -> Any:
+    def assign(self, name: str, tolerates: int = 1, group: str = "", task_id: str = "") -> Any:
         """Assign a predefined task; ``tolerates`` members of its council may be lost at once.
 
-        Tasks of one ``group`` are divided together.
+        Tasks of one ``group`` are divided together.  ``task_id`` is what its id is to be, else any: one id is one task,
+        wherever in the team it is asked for again.
 
         Returns its id, or ``{"id", "able": [names], "refused": {name: [reasons]}}``.
         """
@@ -30,11 +31,12 @@ class Desk(Protocol):
     def catalogue(self) -> Sequence[Mapping[str, Any]]:
         """The predefined tasks: ``{"name", "title", "requirements"}`` each."""
 
-    def preview(self, name: str) -> Any:
+    def preview(self, name: str, group: str = "") -> Any:
         """Who could take a predefined task, of whom nothing is asked.
 
-        ``{"able": [{"uuid", "name", "busy"}], "refused": {name: [reasons]}, "likely": name | None}``; ``busy`` is the
-        task that a device has now, ``likely`` who would take it by what is known already.
+        ``{"able": [{"uuid", "name", "busy"}], "refused": {name: [reasons]}, "likely": name | None, "together": [{"id",
+        "title"}]}``; ``busy`` is the task that a device has now, ``likely`` who would take it by what is known already,
+        ``together`` the open tasks that it would be divided together with, as one of ``group``.
         """
 
     def cancel(self, task_id: str) -> Any:
@@ -79,23 +81,27 @@ class MemoryDesk:
         self.asked: list[tuple[Any, ...]] = []
         self.tasks = list(catalogue)
         self.previews: dict[str, dict[str, Any]] = {}
+        self.together: dict[str, list[dict[str, Any]]] = {}
         self.ground: dict[str, Any] | None = dict(yard) if yard is not None else None
 
-    def run_demo(self) -> str:
-        """Return ``demo-N``."""
-        return self._noted("demo")
+    def run_demo(self, task_id: str = "") -> str:
+        """Return ``demo-N``, or the id that it is to have."""
+        noted = self._noted("demo")
+        return task_id or noted
 
-    def assign(self, name: str, tolerates: int = 1, group: str = "") -> dict[str, Any]:
-        """Return ``assign-N``; nobody is able, nobody is refused."""
+    def assign(self, name: str, tolerates: int = 1, group: str = "", task_id: str = "") -> dict[str, Any]:
+        """Return ``assign-N``, or the id that it is to have; nobody is able, nobody is refused."""
         if name not in [task["name"] for task in self.tasks]:
             raise Refusal("name", f"there is no task {name!r}", "choose one of /api/v1/catalogue", 404)
-        return {"id": self._noted("assign", name), "able": [], "refused": {}}
+        noted = self._noted("assign", name)
+        return {"id": task_id or noted, "able": [], "refused": {}}
 
-    def preview(self, name: str) -> dict[str, Any]:
+    def preview(self, name: str, group: str = "") -> dict[str, Any]:
         """Return what is in ``previews``, else that nobody is able and nobody refused."""
         if name not in [task["name"] for task in self.tasks]:
             raise Refusal("name", f"there is no task {name!r}", "choose one of /api/v1/catalogue", 404)
-        return self.previews.get(name, {"able": [], "refused": {}, "likely": None})
+        told = self.previews.get(name, {"able": [], "refused": {}, "likely": None})
+        return {**told, "together": self.together.get(group, [])}
 
     def catalogue(self) -> list[Mapping[str, Any]]:
         """Return what the desk was made with."""

@@ -14,20 +14,28 @@ from typing import Any
 
 from twisted.internet.interfaces import IDelayedCall, IPushProducer, IReactorTime
 from twisted.logger import Logger
+from twisted.protocols.policies import ProtocolWrapper
 from twisted.web.http import Request
 from twisted.web.resource import Resource
 from twisted.web.server import NOT_DONE_YET
 from zope.interface import implementer
 
-from webnode.board import Chronicle, MemoryChronicle, Page
+from webnode.board import Chronicle, MemoryChronicle, OpenSessions, Page, Sessions
 from webnode.camera import Camera, FrameSource
 from webnode.errors import Refusal
+from webnode.guard import token_of
 from webnode.journal import Journal, dumped
 from webnode.resource import JsonResource, answer
 from webnode.state import State
 
 BEAT_S = 0.2
 PACE_S = 0.1
+SPARED = 4
+"""Of a team of thousands the state takes long to make: it is made again after so many times as long at the earliest."""
+CHECK_S = 1.0
+"""How often it is looked whether who hears a stream is still signed in."""
+LEAD_S = 3600.0
+"""So long before a session runs out the page is told, so that it can have it renewed."""
 IDLE_S = 1.0
 """How often the state is looked at when nobody does: for the chronicle, and because the departed are forgotten."""
 MAX_VIEWERS = 256
@@ -45,8 +53,10 @@ class Viewer:
     ``heard`` is the number of the last change that it was told, ``entry`` that of the chronicle.
     """
 
-    def __init__(self, request: Request, is_whole: bool = False, heard: int = 0) -> None:
+    def __init__(self, request: Request, is_whole: bool = False, heard: int = 0, ticket: str = "") -> None:
         self.request = request
+        self.ticket = ticket
+        self.is_renewing = False
         self.is_whole = is_whole
         self.heard = heard
         self.entry = 0
@@ -69,6 +79,9 @@ class Viewer:
     def narrow(self) -> None:
         """Let little wait between this node and a slow client."""
         transport: Any = getattr(self.request.channel, "transport", None)
+        if isinstance(transport, ProtocolWrapper):
+            # Over TLS the socket lies one floor below.
+            transport = transport.transport
         handle = transport.getHandle() if hasattr(transport, "getHandle") else None
         if isinstance(handle, socket.socket):
             transport.bufferSize = SENT_AHEAD
@@ -80,9 +93,10 @@ class Events(JsonResource):
 
     Events are ``state`` (``state.state_of``, with ``resync``: whether it replaces changes that were missed), ``change``
     (``journal.Change``), ``yard`` (the overhead snapshot, or null), ``pages`` (where the team serves the page),
-    ``event`` (entries of the chronicle) and ``beat`` (``now`` in unix seconds, ``skipped``: how often this slow client
-    was put off).  ``since``, or the header ``Last-Event-ID``, is the last id that was heard: what came after it is
-    told, where it is still kept and less than the whole state.  With ``whole`` each change is a ``state``.
+    ``event`` (entries of the chronicle), ``ticket`` (the session runs out ``until`` then, and can be renewed) and
+    ``beat`` (``now`` in unix seconds, ``skipped``: how often this slow client was put off).  ``since``, or the header
+    ``Last-Event-ID``, is the last id that was heard: what came after it is told, where it is still kept and less than
+    the whole state.  With ``whole`` each change is a ``state``.  A stream ends with its session.
 
     ``version`` is asked instead of reading the state again: while it is the same nothing has changed.
     """
@@ -99,6 +113,7 @@ class Events(JsonResource):
         pages: Callable[[], Iterable[Page]] = lambda: (),
         chronicle: Chronicle | None = None,
         version: Callable[[], object] | None = None,
+        sessions: Sessions | None = None,
     ) -> None:
         super().__init__()
         self._read = read
@@ -107,8 +122,11 @@ class Events(JsonResource):
         self._newest: dict[str, Callable[[], Any]] = {"yard": yard, "pages": lambda: [asdict(page) for page in pages()]}
         self._chronicle = MemoryChronicle() if chronicle is None else chronicle
         self._version = version
+        self._sessions = OpenSessions() if sessions is None else sessions
+        self._checked_at = 0.0
         self._known: object = None
         self._read_at = -IDLE_S
+        self._took = 0.0
         self._journal = Journal(f"{int(1000 * wall()):x}")
         self._whole = (0, "")
         self._viewers: list[Viewer] = []
@@ -135,7 +153,8 @@ class Events(JsonResource):
         request.setHeader("Cache-Control", "no-store")
         request.setHeader("X-Accel-Buffering", "no")
         since = request.getHeader("last-event-id") or _argument(request, b"since")
-        viewer = Viewer(request, _argument(request, b"whole") in ("1", "true"), self._journal.number(since))
+        is_whole = _argument(request, b"whole") in ("1", "true")
+        viewer = Viewer(request, is_whole, self._journal.number(since), shown(request))
         self._viewers.append(viewer)
         request.notifyFinish().addBoth(lambda _: self._close(viewer))
         viewer.narrow()
@@ -152,8 +171,7 @@ class Events(JsonResource):
         """End every stream."""
         self._is_open = False
         for viewer in list(self._viewers):
-            viewer.request.unregisterProducer()
-            viewer.request.finish()
+            self._end(viewer)
         self._schedule(None)
 
     def _schedule(self, seconds: float | None) -> None:
@@ -169,7 +187,12 @@ class Events(JsonResource):
         news, is_beat = self._news(), self._clock.seconds() >= self._beat_at
         if is_beat:
             self._beat_at = self._clock.seconds() + BEAT_S - PACE_S / 2
+        is_checked = self._clock.seconds() >= self._checked_at
+        if is_checked:
+            self._checked_at = self._clock.seconds() + CHECK_S
         for viewer in list(self._viewers):
+            if is_checked and not self._may_stay(viewer):
+                continue
             if viewer.paused:
                 viewer.skipped += viewer.heard < self._journal.n
                 continue
@@ -177,15 +200,35 @@ class Events(JsonResource):
             if words:
                 viewer.request.write(words.encode())
 
+    def _may_stay(self, viewer: Viewer) -> bool:
+        """End the stream of who is signed in no more; tell who will be so soon, and may have it put off."""
+        now = self._wall()
+        who = self._sessions.visitor(viewer.ticket, now)
+        if who.role == "anyone":
+            self._end(viewer)
+            return False
+        if not viewer.is_renewing and not viewer.paused and who.until - now < LEAD_S and who.until < who.limit:
+            viewer.is_renewing = True
+            viewer.request.write(_event("ticket", dumped({"until": who.until})).encode())
+        return True
+
+    def _end(self, viewer: Viewer) -> None:
+        viewer.request.unregisterProducer()
+        viewer.request.finish()
+
     def _look(self) -> None:
         """Take the state, where it may have changed."""
-        now, version = self._clock.seconds(), None if self._version is None else self._version()
+        now = self._clock.seconds()
+        if now - self._read_at < SPARED * self._took:
+            return
+        version = None if self._version is None else self._version()
         if version is not None and version == self._known and now - self._read_at < IDLE_S:
             return
         self._known, self._read_at = version, now
         with_state = self._sound("state", lambda: self._journal.take(self._read()))
         if with_state:
             self._chronicle.saw(self._journal.state, self._wall())
+        self._took = self._clock.seconds() - now
 
     def _missed(self, viewer: Viewer, is_again: bool) -> str:
         """What a viewer was not told of the state, as changes or whole, whichever is less, and of the chronicle."""
@@ -249,6 +292,12 @@ def _read_out(source: Callable[[], Any]) -> str:
 
 def _event(event: str, words: str) -> str:
     return f"event: {event}\ndata: {words}\n\n"
+
+
+def shown(request: Request) -> str:
+    """The token or ticket that a request shows."""
+    tickets: list[bytes] = (request.args or {}).get(b"ticket", [b""])
+    return token_of(request.getHeader("authorization") or "", tickets[0].decode("ascii", "replace"))
 
 
 def _argument(request: Request, name: bytes) -> str:

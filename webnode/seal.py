@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 from webnode.board import Role
 
 ROLES: tuple[Role, ...] = ("viewer", "operator", "phone")
-VERSION = 1
-HEAD, ID, MAC = 7, 8, 16
+VERSION = 2
+HEAD, ID, MAC = 12, 8, 16
 MAX_NAME = 64
 MAX_TEXT = 4 * (HEAD + ID + 4 * MAX_NAME + MAC)
 PERSON = b"swarmweb"
@@ -24,13 +24,17 @@ PERSON = b"swarmweb"
 
 @dataclass(frozen=True)
 class Claim:
-    """What a token says; ``until`` is whole unix seconds, ``is_ticket`` that it was made for the query of a GET."""
+    """What a token says; ``is_ticket`` that it was made for the query of a GET.
+
+    ``until`` is whole unix seconds, and so is ``limit``, beyond which no token follows this one.
+    """
 
     id: str
     name: str
     role: Role
     until: int
     is_ticket: bool = False
+    limit: int = 0
 
     @property
     def ticket(self) -> Claim:
@@ -46,7 +50,8 @@ class Seal:
 
     def text(self, claim: Claim) -> str:
         """The token; letters, digits, ``-`` and ``_``."""
-        head = bytes((VERSION, ROLES.index(claim.role) << 1 | claim.is_ticket)) + claim.until.to_bytes(5, "big")
+        head = bytes((VERSION, ROLES.index(claim.role) << 1 | claim.is_ticket))
+        head += claim.until.to_bytes(5, "big") + claim.limit.to_bytes(5, "big")
         payload = head + bytes.fromhex(claim.id) + claim.name[:MAX_NAME].encode()
         return base64.urlsafe_b64encode(payload + self._mac(payload)).decode().rstrip("=")
 
@@ -63,8 +68,8 @@ class Seal:
             name = payload[HEAD + ID :].decode()
         except (ValueError, IndexError, binascii.Error):
             return None
-        until = int.from_bytes(payload[2:HEAD], "big")
-        return Claim(payload[HEAD : HEAD + ID].hex(), name, role, until, bool(payload[1] & 1))
+        until, limit = (int.from_bytes(payload[at : at + 5], "big") for at in (2, 7))
+        return Claim(payload[HEAD : HEAD + ID].hex(), name, role, until, bool(payload[1] & 1), limit)
 
     def _mac(self, payload: bytes) -> bytes:
         return hashlib.blake2s(payload, key=self._key, digest_size=MAC, person=PERSON).digest()

@@ -35,8 +35,8 @@ from webnode.camera import FrameSource
 from webnode.channel import CappedRequest, limited
 from webnode.errors import PortTaken, Refusal
 from webnode.fallback import urls_at
-from webnode.guard import headers, refusal, token_of
-from webnode.live import Events, Shots
+from webnode.guard import headers, refusal
+from webnode.live import Events, Shots, shown
 from webnode.resource import JsonResource, Refused
 from webnode.route import Route, guarded
 from webnode.routes.table import TABLE
@@ -173,10 +173,8 @@ class Root(Resource):
             return Refused(problem)
         if method == "OPTIONS":
             return _Preflight()
-        ticket: bytes = (request.args or {}).get(b"ticket", [b""])[0]
-        token = token_of(request.getHeader("authorization") or "", ticket.decode("ascii", "replace"))
         try:
-            who = self._board.sessions.visitor(token, self._wall())
+            who = self._board.sessions.visitor(shown(request), self._wall())
             guarded(role, who)
         except Refusal as no:
             return Refused(no)
@@ -206,6 +204,18 @@ def _role_of(path: str, table: Sequence[Route]) -> Role:
     """The role that the native route at ``path``, or below it, wants; one that no route names is for operators."""
     roles = [route.role for route in table if route.answer is None and f"{route.path}/".startswith(f"{path}/")]
     return roles[0] if roles else "operator"
+
+
+def listening(reactor: Any, host: str, port: int, factory: Any, setting: str) -> IListeningPort:
+    """A TCP port that is open for ``factory``; raises ``PortTaken``, which says what to do about ``setting``."""
+    try:
+        opened: IListeningPort = reactor.listenTCP(port, factory, interface=host)
+    except CannotListenError as error:
+        why = getattr(error.socketError, "strerror", None) or str(error.socketError)
+        is_foreign = getattr(error.socketError, "errno", None) == errno.EADDRNOTAVAIL
+        remedy = "give host an address of this machine" if is_foreign else f"choose another {setting}, or 0"
+        raise PortTaken(f"the page cannot be served on {host or '*'}:{port} ({why}); {remedy}") from error
+    return opened
 
 
 class QuietSite(Site):
@@ -269,23 +279,27 @@ class WebService(Service):
             self._wanted if self._listening is None else int(getattr(self._listening.getHost(), "port", self._wanted))
         )
 
+    @property
+    def secure_port(self) -> int:
+        """The first of the further ports; 0 where there is none, or none yet."""
+        return next((int(getattr(door.getHost(), "port", 0)) for door in self._open), 0)
+
     def urls(self, names: Collection[str]) -> list[str]:
         """Where others find the page; ``names`` are the machine's, for a page that is served at every address."""
-        secure = [int(getattr(door.getHost(), "port", 0)) for door in self._open]
-        doors = [url for port in secure for url in urls_at(self._host, port, names, is_secure=True)]
+        doors = urls_at(self._host, self.secure_port, names, is_secure=True) if self.secure_port else []
         return [*urls_at(self._host, self.port, names), *doors]
 
     def startService(self) -> None:
         """Open the port, then the workers."""
+        self._listening = listening(self._reactor, self._host, self._wanted, self.site, "port")
         try:
-            self._listening = self._reactor.listenTCP(self._wanted, self.site, interface=self._host)
-        except CannotListenError as error:
-            why = getattr(error.socketError, "strerror", None) or str(error.socketError)
-            where = f"{self._host or '*'}:{self._wanted}"
-            is_foreign = getattr(error.socketError, "errno", None) == errno.EADDRNOTAVAIL
-            remedy = "give host an address of this machine" if is_foreign else "choose another port, or 0"
-            raise PortTaken(f"the page cannot be served on {where} ({why}); {remedy}") from error
-        self._open = [door(self.site) for door in self._doors]
+            for door in self._doors:
+                self._open.append(door(self.site))
+        except PortTaken:
+            for port in (self._listening, *self._open):
+                port.stopListening()
+            self._listening, self._open = None, []
+            raise
         self._pool.start()
         self._events.open()
         super().startService()
@@ -318,6 +332,7 @@ def web_service(
 ) -> WebService:
     """The whole web node from what the front door has; ``wall`` is the unix time in seconds."""
     app = create_app(read, board, caller(reactor), hosts, wall, table)
-    events = Events(read, reactor, wall, board.desk.yard, board.fallbacks.here, board.chronicle)
+    desk, here = board.desk, board.fallbacks.here
+    events = Events(read, reactor, wall, desk.yard, here, board.chronicle, sessions=board.sessions)
     shots = Shots(frames, reactor)
     return WebService(reactor, host, port, app, events, shots, Files(), board, wall, hosts, doors, table)

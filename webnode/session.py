@@ -20,16 +20,18 @@ from webnode.delay import Delays
 from webnode.errors import Refusal
 from webnode.ground import Ground
 from webnode.password import is_password, read
+from webnode.revocation import ID_BYTES, MemoryRevocations, Revocations, TeamRevocations
 from webnode.seal import Claim, Seal
 
 SIGNED_S = 12 * 3600.0
-"""How long one is signed in."""
+"""How long one is signed in, unless the page has it renewed."""
+MAX_SIGNED_S = 30 * 86400.0
+"""How long a session lasts at most, however often it is renewed."""
 LETTERS = "abcdefghjkmnpqrstuvwxyz"
 """Of these is a code that the node makes: none looks like another, or like a digit."""
 AT_ONCE, WAITING = 2, 1
 """Passwords that are checked at the same time, and those that may wait for it: each holds one of the page's four
 workers, and whoever guesses must not hold them all."""
-REVOKED = 4096
 
 Check = Callable[[str, str], Deferred[bool]]
 """Whether a hash is that of a password, worked out beside the reactor's thread."""
@@ -42,17 +44,28 @@ class SignedSessions:
 
     ``code`` lets in operators; so does the password whose hash is ``password``, where there is one.  A token of a
     visitor who is let in can be given as a code, too, and is good for the same role until the same moment: that is an
-    invitation.  ``revoke`` is remembered here alone, until the token would have run out.
+    invitation.  ``revoked`` are the sessions that were ended; one holds for ``signed_s``, and as long again when it is
+    renewed.
     """
 
-    def __init__(self, secret: bytes, code: str, password: str, rng: random.Random, check: Check) -> None:
+    def __init__(
+        self,
+        secret: bytes,
+        code: str,
+        password: str,
+        rng: random.Random,
+        check: Check,
+        revoked: Revocations | None = None,
+        signed_s: float = SIGNED_S,
+    ) -> None:
         self.code = code
         self._seal = Seal(secret)
         self._password = password
         self._rng = rng
         self._check = check
         self._delays = Delays()
-        self._revoked: dict[str, float] = {}
+        self._revoked = MemoryRevocations() if revoked is None else revoked
+        self.signed_s = signed_s
         self._gate = DeferredSemaphore(AT_ONCE)
 
     def sign_in(self, proof: str, source: str, now: float) -> Deferred[Token]:
@@ -63,9 +76,9 @@ class SignedSessions:
         self._delays.tried(source, now)
         invited = self._claim(proof.strip(), now)
         if invited is not None and not invited.is_ticket:
-            return succeed(self._held(source, invited.name, invited.role, now, invited.until - now))
+            return succeed(self._held(source, invited.name, invited.role, now, invited.until))
         if hmac.compare_digest(_plain(proof), _plain(self.code)):
-            return succeed(self._held(source, "operator", "operator", now, SIGNED_S))
+            return succeed(self._held(source, "operator", "operator", now, now + MAX_SIGNED_S))
         if not self._password:
             return fail(_wrong())
         if len(self._gate.waiting) >= WAITING:
@@ -74,33 +87,46 @@ class SignedSessions:
         def judged(is_right: bool) -> Token:
             if not is_right:
                 raise _wrong()
-            return self._held(source, "operator", "operator", now, SIGNED_S)
+            return self._held(source, "operator", "operator", now, now + MAX_SIGNED_S)
 
         return self._gate.run(self._check, self._password, proof).addCallback(judged)
 
     def visitor(self, token: str, now: float) -> Visitor:
         """Who shows this token or ticket; on any thread."""
         claim = self._claim(token, now)
-        return Visitor() if claim is None else Visitor(claim.name, claim.role, claim.id)
+        if claim is None:
+            return Visitor()
+        return Visitor(claim.name, claim.role, claim.id, claim.until, max(claim.until, claim.limit), claim.is_ticket)
 
     def token(self, name: str, role: Role, now: float, seconds: float) -> Token:
         """A token for somebody who need not sign in."""
-        claim = Claim(self._rng.randbytes(8).hex(), name, role, int(now + seconds))
-        return Token(self._seal.text(claim), self._seal.text(claim.ticket), role, float(claim.until))
+        return self._sealed(self._fresh_id(), name, role, now + seconds, now + seconds)
 
-    def revoke(self, token_id: str) -> None:
-        """Let in nobody with this token any more, at this node."""
-        if len(self._revoked) >= REVOKED:
-            self._revoked.pop(next(iter(self._revoked)))
-        self._revoked[token_id] = 0.0
+    def renewed(self, who: Visitor, now: float) -> Token:
+        """Another token for the same session; one that is revoked ends both."""
+        if who.role == "anyone" or who.is_ticket:
+            problem = "a ticket is not enough" if who.is_ticket else "nobody is signed in"
+            raise Refusal("Authorization", problem, "send the token, as 'Bearer TOKEN', or sign in", 401)
+        return self._sealed(who.token_id, who.name, who.role, now + self.signed_s, who.limit)
+
+    def revoke(self, token_id: str, until: float = math.inf) -> None:
+        """Let in nobody with this token any more, at any web node of the team."""
+        self._revoked.add(token_id, until)
 
     def _claim(self, token: str, now: float) -> Claim | None:
         claim = self._seal.claim(token)
-        return claim if claim is not None and now < claim.until and claim.id not in self._revoked else None
+        return claim if claim is not None and now < claim.until and not self._revoked.has(claim.id) else None
 
-    def _held(self, source: str, name: str, role: Role, now: float, seconds: float) -> Token:
+    def _held(self, source: str, name: str, role: Role, now: float, limit: float) -> Token:
         self._delays.held(source)
-        return self.token(name, role, now, min(seconds, SIGNED_S))
+        return self._sealed(self._fresh_id(), name, role, now + self.signed_s, limit)
+
+    def _fresh_id(self) -> str:
+        return self._rng.randbytes(ID_BYTES).hex()
+
+    def _sealed(self, token_id: str, name: str, role: Role, until: float, limit: float) -> Token:
+        claim = Claim(token_id, name, role, int(min(until, limit)), limit=int(limit))
+        return Token(self._seal.text(claim), self._seal.text(claim.ticket), role, float(claim.until))
 
 
 def sessions(ground: Ground) -> Sessions:
@@ -126,7 +152,8 @@ def sessions(ground: Ground) -> Sessions:
     def check(text: str, password: str) -> Deferred[Any]:
         return deferToThreadPool(ground.reactor, ground.reactor.getThreadPool(), is_password, text, password)
 
-    return SignedSessions(secret, web.code or made(ground.rng), web.password, ground.rng, check)
+    revoked = TeamRevocations(ground.node)
+    return SignedSessions(secret, web.code or made(ground.rng), web.password, ground.rng, check, revoked)
 
 
 def made(rng: random.Random) -> str:

@@ -22,6 +22,8 @@ UNKNOWN = "UNKNOWN"
 GONE = "GONE"
 REMEMBERED_S = 60.0
 MESSAGES = 5
+FARTHEST = 1e6
+"""No device is farther from the origin of its frame, in metres."""
 
 
 def state_of(
@@ -77,6 +79,7 @@ def device_view(fields: Fields) -> State:
         "messages": _messages(fields.get("messages")),
         "network": {text(key): number(value) for key, value in network.items()} if isinstance(network, Mapping) else {},
         "deployed": {text(key): text(value, limit=64) for key, value in deployed.items()},
+        "position": _position(fields.get("position")),
         "gone": None,
     }
 
@@ -207,6 +210,19 @@ def _ruling_view(fields: Fields) -> State:
         "reported": count(fields["reported"]),
         "rows": list(rows.values()),
     }
+
+
+def _position(value: object) -> State | None:
+    """Where a device says that it is: metres in its yard, or on the globe; None where it says neither."""
+    said = value if isinstance(value, Mapping) else {}
+    x, y, heading, lat, lon, accuracy = (
+        number(said.get(key), math.nan) for key in ("x", "y", "heading", "lat", "lon", "accuracy")
+    )
+    if abs(x) <= FARTHEST and abs(y) <= FARTHEST:
+        return {"x": x, "y": y, "heading": None if math.isnan(heading) else heading}
+    if abs(lat) <= 90.0 and abs(lon) <= 180.0:
+        return {"lat": lat, "lon": lon, "accuracy": accuracy if accuracy >= 0.0 else None}
+    return None
 
 
 def _status(value: object, lawful: Sequence[str]) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Protocol
 
@@ -19,15 +19,19 @@ from middleware.order import PAUSE, RESUME, Order
 from middleware.presence import DEVICES, Device, devices_of
 from middleware.tasks import CANCELLED, TASKS, Result, Task, group_key, member_of, outcome_of, tasks_of
 from middleware.verdict import verdicts_key
+from webnode.camera import OnFrame
 from webnode.errors import Refusal
 from webnode.ledger import refused_by
 
 PLACING = 5.0
 """Seconds between Run Demo and the target's appearance: it is placed while the robots search (thesis, section 5)."""
+NEAREST = Task.strategy
 DIVIDED = "group_optimal"
 """The strategy of a task of a group whose catalogue entry says the nearest, which is for one task."""
 PATIENCE = 1.5
 """Seconds that a device has to answer an order: less than the page's own patience, so that its visitor is told why."""
+ASKING = 1.0
+"""Seconds that the team has to say whether a task is there already."""
 
 
 class YardHand(Protocol):
@@ -85,7 +89,7 @@ class TeamDesk:
         watches = (*self._groups.values(), *self._reasons.values())
         return next((watch.records for watch in watches if watch.key == key), [])
 
-    def watch(self, uuid: str, on_frame: Callable[[int, bytes], None]) -> Callable[[], None]:
+    def watch(self, uuid: str, on_frame: OnFrame) -> Callable[[], None]:
         """Look through the camera of the device ``uuid`` until what is returned is called."""
         record = self._record_of(uuid)
         contact = None if record is None else self._node.contact_of(record)
@@ -106,36 +110,30 @@ class TeamDesk:
 
     # -- what is wished ---------------------------------------------------------------------------------------------
 
-    def run_demo(self) -> str:
-        """Assign the demonstration's task; where there is a yard, the target is placed while the robots search."""
-        for task in self._open_tasks():
-            self.cancel(task.task_id)
-        if self._yard is not None:
-            self._quietly(self._yard.clear_target())
-            # By the yard itself: this node may be gone by then.
-            self._quietly(self._yard.place_target_later(PLACING))
-        # Who acts may be lost together with the node that serves the page.
-        return str(self.assign(self._demo, tolerates=2)["id"])
+    def run_demo(self, task_id: str = "") -> Any:
+        """Assign the demonstration's task; where there is a yard, the target is placed while the robots search.
 
-    def assign(self, name: str, tolerates: int = 1, group: str = "") -> dict[str, Any]:
+        Returns its id; fires with it, where ``task_id`` says what it is to be, and does nothing if it is there.
+        """
+        if task_id:
+            return self._found(task_id).addCallback(lambda task: task_id if task else self._demonstrated(task_id))
+        return self._demonstrated(self._fresh_id())
+
+    def assign(self, name: str, tolerates: int = 1, group: str = "", task_id: str = "") -> Any:
         """Publish a predefined task; the devices that can do it take it up by themselves.
 
-        Those of one ``group`` are divided together.
+        Those of one ``group`` are divided together.  Where ``task_id`` says what its id is to be, the answer is a
+        Deferred, and a task that is there already, made by another web node for the same wish, is not made again.
         """
-        template = self._template(name)
-        task_id = self._node.rng.randbytes(6).hex()
-        task = replace(template, task_id=task_id, created=self._node.wall(), tolerates=tolerates)
-        if group:
-            strategy = DIVIDED if task.strategy == Task.strategy else task.strategy
-            task = replace(task, group=group, strategy=strategy)
-        devices = [device for device, _ in devices_of(self._devices.records)]
-        refused = refused_by(task, devices)
-        self._quietly(Deferred.fromCoroutine(self._node.submit(task)))
-        return {"id": task_id, "able": [d.name for d in devices if d.name not in refused], "refused": refused}
+        template = replace(self._template(name, group), tolerates=tolerates)
+        if task_id:
+            found = self._found(task_id)
+            return found.addCallback(lambda task: self._told(task) if task else self._published(template, task_id))
+        return self._published(template, self._fresh_id())
 
-    def preview(self, name: str) -> dict[str, Any]:
+    def preview(self, name: str, group: str = "") -> dict[str, Any]:
         """Who could take a predefined task and who not, and why; nothing is asked of anybody."""
-        task = self._template(name)
+        task = self._template(name, group)
         devices = [device for device, _ in devices_of(self._devices.records)]
         refused = refused_by(task, devices)
         titles = {task_id: each.title for task_id, each in tasks_of(self._tasks.records).items()}
@@ -143,7 +141,14 @@ class TeamDesk:
         rows = [
             {"uuid": d.uuid, "name": d.name, "busy": titles.get(d.task, "another task" * bool(d.task))} for d in able
         ]
-        return {"able": rows, "refused": refused, "likely": self._likely(task, [device.uuid for device in able])}
+        likely = self._likely(task, [device.uuid for device in able])
+        # As the agents divide them: those of one group that want the same of a device, by the same strategy.
+        together = [
+            {"id": other.task_id, "title": other.title}
+            for other in self._open_tasks()
+            if group and (other.group, other.strategy, other.requirements) == (group, task.strategy, task.requirements)
+        ]
+        return {"able": rows, "refused": refused, "likely": likely, "together": together}
 
     def cancel(self, task_id: str) -> None:
         """Record that the task is cancelled; whoever is at it stops."""
@@ -219,12 +224,57 @@ class TeamDesk:
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
-    def _template(self, name: str) -> Task:
+    def _fresh_id(self) -> str:
+        return self._node.rng.randbytes(6).hex()
+
+    def _found(self, task_id: str) -> Deferred[Task | None]:
+        """The task of that id, as the team knows it; None where there is none.
+
+        The team is asked, as what another web node did in its last moment, or while this one was frozen, need not
+        have come here; what is known here counts where nobody answers in time.
+        """
+        found: Deferred[Task | None] = Deferred()
+
+        def tell(records: Iterable[Record]) -> None:
+            if not found.called:
+                found.callback(tasks_of([*self._tasks.records, *records]).get(task_id))
+
+        if task_id in tasks_of(self._tasks.records):
+            tell(())
+            return found
+        cancel = self._node.later(ASKING, tell, ())
+        self._node.entangled.get(TASKS).addErrback(_unknown).addCallback(tell).addBoth(lambda _: cancel())
+        return found
+
+    def _demonstrated(self, task_id: str) -> str:
+        for task in self._open_tasks():
+            self.cancel(task.task_id)
+        if self._yard is not None:
+            self._quietly(self._yard.clear_target())
+            # By the yard itself: this node may be gone by then.
+            self._quietly(self._yard.place_target_later(PLACING))
+        # Who acts may be lost together with the node that serves the page.
+        template = replace(self._template(self._demo), tolerates=2)
+        return str(self._published(template, task_id)["id"])
+
+    def _published(self, template: Task, task_id: str) -> dict[str, Any]:
+        task = replace(template, task_id=task_id, created=self._node.wall())
+        self._quietly(Deferred.fromCoroutine(self._node.submit(task)))
+        return self._told(task)
+
+    def _told(self, task: Task) -> dict[str, Any]:
+        devices = [device for device, _ in devices_of(self._devices.records)]
+        refused = refused_by(task, devices)
+        return {"id": task.task_id, "able": [d.name for d in devices if d.name not in refused], "refused": refused}
+
+    def _template(self, name: str, group: str = "") -> Task:
         template = self._predefined.get(name)
         if template is None:
             known = ", ".join(sorted(self._predefined))
             raise Refusal("name", f"there is no predefined task {name!r}", f"choose one of {known}", 404)
-        return template
+        if not group:
+            return template
+        return replace(template, group=group, strategy=DIVIDED if template.strategy == NEAREST else template.strategy)
 
     def _likely(self, task: Task, able: Sequence[str]) -> str | None:
         """Who of ``able`` would be the nearest by what is reported to open tasks of that kind; None: nobody knows."""
@@ -296,6 +346,11 @@ class TeamDesk:
                 self._log.warn("a wish was not granted: {error}", error=failure.getErrorMessage())
 
         work.addErrback(ended)
+
+
+def _unknown(failure: Any) -> list[Record]:
+    failure.trap(EntangledError)
+    return []
 
 
 def _refused(failure: Any, what: str = "target") -> None:

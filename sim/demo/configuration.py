@@ -34,6 +34,8 @@ class Plan:
     """What operators sign in to the page with."""
     reserve_port: int
     """Where the second web node serves the page, for when the first is lost."""
+    tls_ports: tuple[int, int] = (0, 0)
+    """Where each of the two serves it over TLS; 0: nowhere."""
 
     def file(self, name: str) -> Path:
         """The configuration file of the node ``name``."""
@@ -43,7 +45,11 @@ class Plan:
         """The configuration of every node: the laptop that lets others in, the other web node, then the dogs."""
         laptop = self._node(BOOTSTRAP, "laptop", "Bootstrap node and web node", ["bootstrap", "edge", "web"])
         reserve = self._node(RESERVE, "computer", "Web node for when the other is lost", ["edge", "web"])
-        webs = {BOOTSTRAP: self._web(laptop, self.web_port), RESERVE: self._web(reserve, self.reserve_port)}
+        ports = zip((self.web_port, self.reserve_port), self.tls_ports, strict=True)
+        webs = {
+            name: self._web(node, *each)
+            for (name, node), each in zip(((BOOTSTRAP, laptop), (RESERVE, reserve)), ports, strict=True)
+        }
         return {**webs, **{name: self._dog(name) for name in DOGS}}
 
     def _node(self, name: str, kind: str, description: str, roles: list[str]) -> Table:
@@ -59,10 +65,11 @@ class Plan:
             "roles": roles,
         }
 
-    def _web(self, node: Table, port: int) -> str:
+    def _web(self, node: Table, port: int, tls_port: int) -> str:
         yard = f"{LOOPBACK}:{self.yard_port}"
         web = {"host": self.web_host, "port": port, "yard": yard, "code": self.code}
-        return toml({"node": node, "web": web, "faults": FAULTS})
+        tls = {"tls": "auto", "tls_port": tls_port} if tls_port else {}
+        return toml({"node": node, "web": {**web, **tls}, "faults": FAULTS})
 
     def _dog(self, name: str) -> str:
         options = {"host": LOOPBACK, "port": self.yard_port, "robot": name, "camera_fps": 15}

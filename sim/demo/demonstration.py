@@ -26,7 +26,7 @@ from sim.demo.configuration import DOGS, LOOPBACK, Plan
 from sim.demo.experiment import Experiment, report, table
 from sim.demo.port import PortBusy
 from sim.demo.processes import Team
-from sim.demo.stage import WEB_PORT, Trouble, arranged, fresh
+from sim.demo.stage import WEB_PORT, Trouble, arranged, fresh, has_tls
 from sim.demo.story import present, told
 from sim.demo.visitor import PageError, Visitor
 
@@ -51,6 +51,9 @@ class Demonstration:
         host = LOOPBACK if plan.web_host == "0.0.0.0" else plan.web_host
         self._visitor = Visitor(reactor, host, plan.web_port, self._on_state, plan.code)
         self.address = f"http://{host}:{plan.web_port}/#code={plan.code}"
+        tls = plan.tls_ports[0]
+        self.secure = f"https://{host}:{tls}/#code={plan.code}" if tls else ""
+        """The same over TLS, empty where there is none."""
 
     async def start(self) -> None:
         """Start everything and wait until the page lists the three dogs."""
@@ -149,6 +152,7 @@ def _arguments(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument(
         "--web-port", type=_port, default=None, help=f"port of the page (default {WEB_PORT}, or a free one)"
     )
+    parser.add_argument("--tls", action="store_true", help="serve the page over TLS on this machine alone, too")
     parser.add_argument("--run-dir", type=Path, default=Path("run"), help="logs, stores and configurations go there")
     parser.add_argument("--report", type=Path, default=None, help="with --headless: write the verdict there as JSON")
     wishes = parser.parse_args(arguments)
@@ -173,7 +177,11 @@ async def _run(reactor: Any, wishes: argparse.Namespace) -> None:
     try:
         with fresh(wishes.run_dir.absolute()):
             folder = wishes.run_dir.absolute()
-            plan = arranged(folder, wishes.web_host, wishes.web_port, not wishes.headless, _say)
+            # On this machine alone a browser trusts http; TLS would only weigh.
+            with_tls = wishes.tls or (has_tls() and not wishes.headless and wishes.web_host != LOOPBACK)
+            if wishes.tls and not has_tls():
+                raise Trouble("--tls wants libraries that are missing; install them by: pip install 'swarm-node[tls]'")
+            plan = arranged(folder, wishes.web_host, wishes.web_port, not wishes.headless, _say, with_tls)
             demonstration = Demonstration(reactor, plan, wishes.seed, _say)
             reactor.addSystemEventTrigger("before", "shutdown", demonstration.stop)
             try:
@@ -197,12 +205,18 @@ async def _run(reactor: Any, wishes: argparse.Namespace) -> None:
 
 def _invite(demonstration: Demonstration, plan: Plan) -> None:
     _say(f"The page: {demonstration.address}   (logs: {plan.run_dir}; end with Ctrl-C)")
+    if demonstration.secure:
+        _say(f"Over TLS: {demonstration.secure}   (a browser warns until it trusts the team: docs/https.md)")
     _say("If the node that serves it is lost, the page goes on at another: end the process of vaio, and see.")
     if plan.web_host == LOOPBACK:
-        _say("For a phone or tablet in the same network: make demo WEB_HOST=0.0.0.0")
+        _say("For a phone or tablet in the same network, then over TLS as well: make demo WEB_HOST=0.0.0.0")
     else:
-        _say(f"In the same network: http://{os.uname().nodename}.local:{plan.web_port}, or this machine's address;")
-        _say(f"the code to sign in with: {plan.code}")
+        here, tls = os.uname().nodename, plan.tls_ports[0]
+        also = f", https://{here}.local:{tls} (which the camera of a phone wants)" if tls else ""
+        _say(f"In the same network: http://{here}.local:{plan.web_port}{also}, or this machine's address;")
+        _say(f"the code to sign in with: {plan.code}.  For a phone there is a code to scan: Invite, on the page")
+        if not tls:
+            _say("The camera of a phone wants https, which is missing here: pip install 'swarm-node[tls]'")
 
 
 def main(arguments: Sequence[str] = tuple(sys.argv[1:])) -> None:

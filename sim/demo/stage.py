@@ -6,13 +6,14 @@ import fcntl
 import secrets
 import shutil
 from collections.abc import Callable
+from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import TextIO
 
 from sim.demo import port
 from sim.demo.configuration import BOOTSTRAP, DOGS, LOOPBACK, RESERVE, Plan
 
-WEB_PORT, NODE_PORT, YARD_PORT = 8080, 7000, 7400
+WEB_PORT, TLS_PORT, NODE_PORT, YARD_PORT = 8080, 8443, 7000, 7400
 MARK = ".swarm-demo"
 LETTERS = "abcdefghjkmnpqrstuvwxyz"
 """Of these is the code to sign in with: none looks like another, or like a digit."""
@@ -50,11 +51,23 @@ def fresh(run_dir: Path) -> TextIO:
     return lock
 
 
-def arranged(run_dir: Path, web_host: str, web_port: int | None, usual: bool, say: Callable[[str], None]) -> Plan:
+def has_tls() -> bool:
+    """Whether nodes of this installation can serve the page over TLS; looks past what this process leaves out."""
+    return all(PathFinder.find_spec(name) is not None for name in ("OpenSSL", "cryptography"))
+
+
+def arranged(
+    run_dir: Path,
+    web_host: str,
+    web_port: int | None,
+    usual: bool,
+    say: Callable[[str], None],
+    with_tls: bool = False,
+) -> Plan:
     """A plan on ports that are free; a usual port that had to give way is said.
 
     ``usual``: try the usual ports first, for people who look at them; without it all ports are any free ones, so that
-    several demonstrations can start at the same moment.
+    several demonstrations can start at the same moment.  ``with_tls``: the page is served over TLS as well.
     """
     try:
         port.free("tcp", web_host, 1)
@@ -66,14 +79,21 @@ def arranged(run_dir: Path, web_host: str, web_port: int | None, usual: bool, sa
     else:
         web = port.preferred("tcp", web_host, WEB_PORT if usual else 0)
     reserve = port.preferred("tcp", web_host, web + 1 if usual and web < 65535 else 0)
+    tls = (0, 0)
+    if with_tls:
+        # Nobody holds the ports of the page yet, so that they look free.
+        wish = TLS_PORT if usual and not {TLS_PORT, TLS_PORT + 1} & {web, reserve} else 0
+        first = port.preferred("tcp", web_host, wish)
+        tls = (first, port.preferred("tcp", web_host, first + 1 if first == wish else 0))
     yard = port.preferred("tcp", LOOPBACK, YARD_PORT if usual else 0)
     node, *others = port.free("udp", LOOPBACK, 2 + len(DOGS))
     if usual:
         node = port.preferred("udp", LOOPBACK, NODE_PORT)
-        wanted = (("the page", web_port or WEB_PORT, web), ("the yard", YARD_PORT, yard), ("vaio", NODE_PORT, node))
+        wanted = [("the page", web_port or WEB_PORT, web), ("the yard", YARD_PORT, yard), ("vaio", NODE_PORT, node)]
+        wanted += [("the page over TLS", TLS_PORT, tls[0])] if with_tls else []
         for what, wish, got in wanted:
             if wish != got:
                 say(f"port {wish} is busy; {what} uses {got}")
     nodes = {BOOTSTRAP: node, **dict(zip((RESERVE, *DOGS), others, strict=True))}
     code = "".join(secrets.choice(LETTERS) for _ in range(8))
-    return Plan(run_dir, secrets.token_hex(32), web_host, web, yard, nodes, f"{code[:4]}-{code[4:]}", reserve)
+    return Plan(run_dir, secrets.token_hex(32), web_host, web, yard, nodes, f"{code[:4]}-{code[4:]}", reserve, tls)

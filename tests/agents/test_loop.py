@@ -12,7 +12,7 @@ from twisted.trial.unittest import SynchronousTestCase
 from agents.loop import Agent
 from drivers.driver import Permit
 from drivers.errors import NotEnabled
-from drivers.reading import Action
+from drivers.reading import Action, Frame, Observation
 from middleware.commitment.lessee import Lease
 from middleware.errors import UnknownStrategy
 from middleware.tasks import TASKS, Task
@@ -45,6 +45,20 @@ class LoopTests(SynchronousTestCase):
     def lines(self, name: str) -> list[str]:
         """The messages of a device."""
         return [text for _, text in self.device(name)["messages"]]
+
+    def test_age_of_a_picture(self) -> None:
+        """A picture is as old as its robot and its own clock say together, wherever it is looked at."""
+        agent = self.team.services["dog1"].assembly.agent
+        assert isinstance(agent, Agent)
+        ages: list[float] = []
+        uuid = self.team.services["dog1"].assembly.node.uuid
+        self.team.desk.watch(uuid, lambda seq, jpeg, age: ages.append(age) if jpeg == b"seen" else None)
+        self.team.clock.advance(0.2)
+        frame = Frame(900, 1, 1, b"seen", 4.7)
+        agent._seen(Observation(self.team.clock.seconds() - 0.2, 5.0, {}, {}, frame))
+        self.team.clock.advance(0.05)
+        (age,) = ages
+        self.assertLess(abs(age - 0.5), 0.01)
 
     def test_no_command_before_the_motors_are_on(self) -> None:
         """An agent whose task comes while its robot wakes up waits: not one command is refused by the robot."""

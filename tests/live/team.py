@@ -4,7 +4,9 @@
 line; whoever has signed in at one is signed in at the next.  Lines on its input change the team: ``gone NAME``, ``back
 NAME``, ``status NAME STATUS``, ``freeze SECONDS`` (the whole process stands), ``name NAME`` (of the node that serves),
 ``pages NODE=URL ...`` (the web nodes, itself first), ``strange FILE`` (devices and tasks whose words are those of that
-JSON list); it ends when its input does.
+JSON list), ``session SECONDS`` (that one is signed in for at a time), ``place NAME KEY=NUMBER ...`` (where it says that
+it is), ``outdoors`` (without a yard), ``crowd COUNT`` (so many devices, three of them with cameras); it ends when its
+input does.
 """
 
 from __future__ import annotations
@@ -41,6 +43,7 @@ from webnode.board import (
 from webnode.camera import OnFrame
 from webnode.chronicle import TeamChronicle
 from webnode.desk import MemoryDesk
+from webnode.invite import TeamInvites
 from webnode.limits import AddressLimits
 from webnode.password import hashed, is_password
 from webnode.server import WebService, web_service
@@ -124,6 +127,8 @@ class Team:
         self.node = "vaio"
         self.halts = MemoryHalts(*(f"{n:02x}" * 16 for n in (1, 2, 3)))
         self.batch = 0
+        self.version = 0
+        self._made: tuple[object, State] = (None, {})
         self._departed = Departed()
         self.tasks = [
             {
@@ -146,7 +151,13 @@ class Team:
         ]
 
     def read(self) -> State:
-        """The state as it is now."""
+        """The state as it is now; made once a second, or when something was ordered."""
+        now = self.version, int(time.time()), self.halts.is_halted()
+        if self._made[0] != now:
+            self._made = now, self._state()
+        return self._made[1]
+
+    def _state(self) -> State:
         here = [each for each in self.devices if each["name"] not in self.away]
         costs = {"dog1": 1.04, "dog2": 0.62, "dog3": 1.37}
         task = self.tasks[0]["id"]
@@ -161,6 +172,7 @@ class Team:
                 "why": "the nearest of three" if each["name"] == "dog2" else "",
             }
             for each in here
+            if each["task"]
         ]
         gone = self._departed.of(here, time.time())
         state = state_of(here, self.tasks, {str(task): members}, departed=gone, node=self.node)
@@ -197,6 +209,14 @@ class Team:
         YARD["dogs"] = [{**YARD["dogs"][0], "name": said} for said in words[:20]]
         self._departed = Departed()
 
+    def be_many(self, count: int) -> None:
+        """More dogs, up to ``count``, most of which only listen."""
+        now = time.time()
+        for number in range(len(self.devices) + 1, count + 1):
+            more = {"name": f"unit{number}", "uuid": f"{number:032x}", "joined": number, "kind": "turtlebot"}
+            able = {"base2d": {"max_speed": 0.2}, **({"gripper": {"width": 0.1}} if number % 50 == 0 else {})}
+            self.devices.append({**dog(number % 250, "IDLE", "", now), **more, "capabilities": able})
+
     def watch(self, uuid: str, on_frame: OnFrame) -> Any:
         """Pictures of a floor, a wall and a red ball that rolls, 15 a second."""
         number = int(uuid[:2], 16)
@@ -211,7 +231,7 @@ class Team:
             picture = np.full((160, 208, 3), (205, 214, 220), np.uint8)
             picture[70:] = HUES[f"dog{1 + (number - 1) % 3}"]
             cv2.circle(picture, ((seq * 3 + 60 * number) % 240 - 16, 96), 8 + 6 * number, (44, 52, 212), -1)
-            on_frame(seq, cv2.imencode(".jpg", picture)[1].tobytes())
+            on_frame(seq, cv2.imencode(".jpg", picture)[1].tobytes(), 0.0)
             reactor.callLater(1 / 15, shoot)
 
         def stop() -> None:
@@ -250,7 +270,8 @@ class Orders(LineReceiver):
     def __init__(self, team: Team, web: WebService, board: Board, pages: list[Page]) -> None:
         self._team = team
         self._web = web
-        self._sessions = board.sessions
+        assert isinstance(board.sessions, SignedSessions) and isinstance(board.desk, MemoryDesk)
+        self._sessions, self._desk = board.sessions, board.desk
         self._pages = pages
 
     def connectionMade(self) -> None:
@@ -274,8 +295,18 @@ class Orders(LineReceiver):
             self._pages[:] = [Page(node, url, is_self=place == 0) for place, (node, url) in enumerate(named)]
         elif verb == "freeze":
             time.sleep(float(rest[0]))
+        elif verb == "place":
+            numbers = {key: float(number) for key, _, number in (each.partition("=") for each in rest[1:])}
+            next(each for each in self._team.devices if each["name"] == rest[0])["position"] = numbers
+        elif verb == "crowd":
+            self._team.be_many(int(rest[0]))
+        elif verb == "outdoors":
+            self._desk.ground = None
+        elif verb == "session":
+            self._sessions.signed_s = float(rest[0])
         elif verb == "strange":
             self._team.be_strange(json.loads(Path(rest[0]).read_text(encoding="utf-8")))
+        self._team.version += 1
         self.sendLine(line)
 
     def connectionLost(self, reason: Any = None) -> None:
@@ -289,6 +320,7 @@ def board(team: Team) -> Board:
     desk = MemoryDesk(CATALOGUE, YARD)
     able = [{"uuid": f"{n:02x}" * 16, "name": f"dog{n}", "busy": "Patrol the yard" * (n == 2)} for n in (1, 2)]
     desk.previews["search"] = {"able": able, "refused": {"dog3": ["no gripper", "no lift"]}, "likely": None}
+    desk.together["yard"] = [{"id": "t1", "title": "Find and touch the red target"}]
     sessions = SignedSessions(b"a team of the tests", "quiet-otter", PASSWORD, random.Random(), checked)
     tuning = MemoryTuning({able[0]["uuid"]: KNOBS})
     survey = MemorySurvey(network(), {f"0{n}" * 16: inventory() for n in (1, 2)})
@@ -341,6 +373,8 @@ def main() -> None:
     pages = MemoryFallbacks()
     served = replace(board(team), fallbacks=pages)
     web = web_service(reactor, "127.0.0.1", port, team.read, served, team, time.time)
+    pages_here = ["http://192.168.0.7:8080", "https://192.168.0.7:8443", f"http://127.0.0.1:{port}"]
+    served.invites = TeamInvites(lambda: pages_here, b"PEM", "AB:CD:" * 10, reactor, reactor.getThreadPool())
     web.startService()
     reactor.addSystemEventTrigger("before", "shutdown", web.stopService)
     reactor.callWhenRunning(lambda: StandardIO(Orders(team, web, served, pages.pages)))

@@ -3,54 +3,12 @@
 from __future__ import annotations
 
 import re
-from typing import Any
 
-from twisted.trial.unittest import SynchronousTestCase
-
-from tests.live.test_page import CHROMIUM, DESK, FLAGS, MISSING, PHONE, Team
+from tests.live.page import DESK, PHONE, PageCase
 
 
-class ActionPageTests(SynchronousTestCase):
+class ActionPageTests(PageCase):
     timeout = 170
-    if MISSING:
-        skip = f"needs {', '.join(MISSING)}"
-
-    def setUp(self) -> None:
-        from playwright.sync_api import sync_playwright
-
-        self.team = Team()
-        self.addCleanup(self.team.stop)
-        running = sync_playwright().start()
-        self.addCleanup(running.stop)
-        self.browser = running.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        self.addCleanup(self.browser.close)
-        self.faults: list[str] = []
-
-    def opened(self, screen: dict[str, Any], scheme: Any = "light") -> Any:
-        """The page, when it shows the team."""
-        page = self.browser.new_context(**screen, color_scheme=scheme, reduced_motion="reduce").new_page()
-        page.set_default_timeout(20000)
-        page.on("pageerror", lambda error: self.faults.append(str(error)))
-        page.goto(f"{self.team.url}#code={self.team.code}")
-        page.locator("#link[data-link=live]").wait_for()
-        page.locator(".device").nth(2).wait_for()
-        return page
-
-    def look(self, page: Any, view: str) -> None:
-        """Look at another view, which a phone shows alone."""
-        page.evaluate(f"location.hash = {view!r}")
-
-    def told(self, page: Any, words: str) -> None:
-        """Wait until the page says so."""
-        page.locator("#line", has_text=words).wait_for()
-
-    def tab_to(self, page: Any, what: str) -> None:
-        """Go there by the Tab key alone."""
-        for _ in range(60):
-            if page.evaluate(f"document.activeElement.matches({what!r})"):
-                return
-            page.keyboard.press("Tab")
-        self.fail(f"no way to {what} by keyboard")
 
     def test_stop_from_everywhere(self) -> None:
         """One touch stops the team, wherever the page is scrolled and before an open device; another lets it go on."""
@@ -62,10 +20,10 @@ class ActionPageTests(SynchronousTestCase):
         page.get_by_role("button", name="Let it go on").tap()
         self.told(page, "The team goes on.")
         page.locator(".halted").wait_for(state="hidden")
-        self.look(page, "tasks")
+        self.view(page, "tasks")
         page.locator("#assign").scroll_into_view_if_needed()
         self.assertEqual(page.locator(".stop").bounding_box(), corner)
-        self.look(page, "devices")
+        self.view(page, "devices")
         page.locator(".device").first.tap()
         page.locator("dialog[open] .stop").wait_for()
         self.assertEqual(page.locator(".stop").bounding_box(), corner)
@@ -92,11 +50,37 @@ class ActionPageTests(SynchronousTestCase):
     def test_ask_before_assigning(self) -> None:
         """Who could take the chosen task and who not, and why, stands below it before it is assigned."""
         page = self.opened(PHONE)
-        self.look(page, "tasks")
+        self.view(page, "tasks")
         page.locator(".preview [data-can=can]", has_text="dog1, dog2 (now: Patrol the yard)").wait_for()
         self.assertIn("dog3: no gripper, no lift", page.locator(".preview").inner_text())
         page.locator("#task").select_option("patrol")
         page.locator(".preview [data-can=nobody]", has_text="No device here can take it").wait_for()
+
+    def test_assign_to_a_group(self) -> None:
+        """By touch and by keyboard a task is put into a group, after its preview has said what it is divided with."""
+        for screen, type_on in ((PHONE, False), (DESK, True)):
+            page = self.opened(screen)
+            self.view(page, "tasks")
+            page.locator(".preview li").first.wait_for()
+            self.assertEqual(page.locator(".preview [data-can=with]").count(), 0)
+            self.assertIn("divided together", page.locator("label[for=group]").inner_text())
+            if type_on:
+                self.tab_to(page, "#group")
+                page.keyboard.type("yard")
+            else:
+                page.locator("#group").tap()
+                page.locator("#group").fill("yard")
+            page.locator("[data-can=with]", has_text="together with: Find and touch the red target.").wait_for()
+            with page.expect_request(lambda asked: asked.method == "POST" and asked.url.endswith("/tasks")) as asked:
+                if type_on:
+                    page.keyboard.press("Enter")
+                else:
+                    page.get_by_role("button", name="Assign").tap()
+            self.assertEqual(asked.value.post_data_json, {"name": "search", "group": "yard"})
+            self.told(page, "Assigned")
+            page.locator("#group").fill("elsewhere")
+            page.locator("[data-can=with]", has_text="nothing yet; it begins the group elsewhere").wait_for()
+            self.sound(page)
 
     def test_lift_a_robot(self) -> None:
         """A robot is dragged elsewhere, moved by the arrow keys and turned by a click or Enter; the target stays."""
@@ -136,7 +120,7 @@ class ActionPageTests(SynchronousTestCase):
         """A finger on a robot or the target takes it along, and scrolls nothing meanwhile; a tap turns a robot."""
         page = self.opened(PHONE)
         page.locator(".dog .grip").nth(2).wait_for(state="attached")
-        self.look(page, "map")
+        self.view(page, "map")
         page.locator("#map").scroll_into_view_if_needed()
         box = page.locator(".floor").bounding_box()
         touch = page.context.new_cdp_session(page)
@@ -195,20 +179,15 @@ class ActionPageTests(SynchronousTestCase):
 
     def test_be_accessible(self) -> None:
         """Stopped, on phone and desk, light and dark, axe finds nothing and nothing is cut off or too small."""
-        from axe_playwright_python.sync_playwright import Axe
-
         for screen in (PHONE, DESK):
             for scheme in ("light", "dark"):
                 page = self.opened(screen, scheme)
                 page.locator(".preview li").first.wait_for(state="attached")
                 page.locator(".stop").click()
                 page.locator(".halted").wait_for()
-                found = Axe().run(page).response["violations"]
-                self.assertEqual([(each["id"], each["nodes"][0]["html"]) for each in found], [])
+                self.sound(page)
                 page.locator(".device").first.focus()
                 page.keyboard.press("Enter")
                 page.locator("dialog[open] .knob").first.wait_for()
-                found = Axe().run(page).response["violations"]
-                self.assertEqual([(each["id"], each["nodes"][0]["html"]) for each in found], [])
-                self.assertLessEqual(page.evaluate("document.documentElement.scrollWidth - innerWidth"), 0)
+                self.sound(page)
                 page.context.close()

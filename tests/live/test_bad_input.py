@@ -118,7 +118,7 @@ class BadInputTests(LiveTests):
     def test_unknown_driver(self) -> None:
         """An unknown kind of robot: file, key, those there are."""
         path = self.file('[node]\nname = "a"\n[driver]\nkind = "simm"\n')
-        self.assert_says(self.refused("--config", path), path, "[driver]", "known are sim")
+        self.assert_says(self.refused("--config", path), path, "[driver]", "known are phone, sim")
 
     def test_name_without_address(self) -> None:
         """A known node whose name nobody can resolve: file, key, what to write."""

@@ -12,9 +12,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from twisted.trial.unittest import SynchronousTestCase
-
-from tests.live.test_page import Team
+from tests.live.page import TeamCase
 
 MISSING = [name for name in ("schemathesis", "flask", "cv2") if find_spec(name) is None]
 # Streams, which do not end, and long polls, which take five seconds, have tests of their own.
@@ -28,13 +26,9 @@ nobody, which is told with 504: no fault of the page."""
 LIMIT_S = 170
 
 
-class ContractTests(SynchronousTestCase):
+class ContractTests(TeamCase):
     if MISSING:
         skip = f"THE API IS NOT TESTED AGAINST ITS DOCUMENT: missing {', '.join(MISSING)} (make contract)"
-
-    def setUp(self) -> None:
-        self.team = Team()
-        self.addCleanup(lambda: self.team.stop())
 
     def test_keep_to_the_document(self) -> None:
         """No route answers anything that its document does not say, and none with a 5xx, whatever is sent."""

@@ -2,17 +2,10 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
-import threading
-import urllib.request
-from pathlib import Path
 from typing import Any
 
-from twisted.trial.unittest import SynchronousTestCase
-
-from tests.live.test_page import CHROMIUM, DESK, FLAGS, MISSING, PHONE
+from tests.live.demonstration import DemonstrationCase
+from tests.live.page import DESK, PHONE
 
 SMALL = """index => {
   const seen = document.querySelectorAll("#cameras canvas")[index];
@@ -46,53 +39,7 @@ STANDING = 1500.0
 """Milliseconds in which all stand: 200 to brake; the view from above is 200 old, and more on a busy machine."""
 
 
-class DemonstrationPageTests(SynchronousTestCase):
-    if MISSING:
-        skip = f"THE DEMONSTRATION IS NOT TESTED IN A BROWSER: missing {'; '.join(MISSING)}"
-
-    def setUp(self) -> None:
-        from playwright.sync_api import sync_playwright
-
-        log, run_dir = Path(self.mktemp()), Path(self.mktemp()).absolute()
-        command = [sys.executable, "-m", "sim.demo", "--run-dir", str(run_dir)]
-        with log.open("w", encoding="utf-8") as errors:
-            root = Path(__file__).parents[2]
-            demo = subprocess.Popen(command, cwd=root, stdout=subprocess.PIPE, stderr=errors, text=True)
-        self.addCleanup(demo.wait, 20)
-        self.addCleanup(demo.terminate)
-        assert demo.stdout is not None
-        said = []
-        for line in demo.stdout:
-            said.append(line)
-            if line.startswith("The page: "):
-                break
-        else:
-            self.fail("".join(said) + log.read_text(encoding="utf-8"))
-        threading.Thread(target=demo.stdout.read, daemon=True).start()
-        self.invitation = said[-1].split()[2]
-        self.url, _, code = self.invitation.partition("#code=")
-        self.token = ""
-        self.token = self.api("api/v1/session", json.dumps({"code": code}).encode())["token"]
-        play = sync_playwright().start()
-        self.addCleanup(play.stop)
-        self.browser = play.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        self.addCleanup(self.browser.close)
-        self.faults: list[str] = []
-
-    def opened(self, screen: dict[str, Any]) -> Any:
-        page = self.browser.new_context(**screen).new_page()
-        page.set_default_timeout(30_000)
-        page.on("pageerror", lambda error: self.faults.append(str(error)))
-        page.goto(self.invitation)
-        page.locator("#link[data-link=live]").wait_for()
-        page.locator(".device").nth(3).wait_for()
-        return page
-
-    def look(self, page: Any, view: str) -> None:
-        """Go to a view, as the bar of a phone does."""
-        page.evaluate(f"location.hash = '{view}'")
-        page.locator(f"body[data-view={view}]").wait_for()
-
+class DemonstrationPageTests(DemonstrationCase):
     def assert_sound(self, page: Any, when: str) -> None:
         """Axe finds nothing, and nothing is wider than the screen or cut off in its own box."""
         from axe_playwright_python.sync_playwright import Axe
@@ -107,26 +54,20 @@ class DemonstrationPageTests(SynchronousTestCase):
         self.assertEqual(cut, [], when)
         self.assertEqual(self.faults, [], when)
 
-    def api(self, path: str, body: bytes | None = None) -> Any:
-        headers = {"Content-Type": "application/json", "Authorization": f"Bearer {self.token}"}
-        asked = urllib.request.Request(self.url + path, body, headers)
-        with urllib.request.urlopen(asked, timeout=5) as answer:
-            return json.load(answer)
-
     def test_be_driven_by_taps(self) -> None:
         """On a phone, by taps alone: Run Demo, open a device, write to it, take it off the network, move the target."""
         page = self.opened(PHONE)
         self.assert_sound(page, "idle")
         page.get_by_role("button", name="Run Demo").tap()
         page.locator(".device[data-state=EXECUTING]").first.wait_for(timeout=45_000)
-        self.look(page, "groups")
+        self.view(page, "groups")
         page.locator(".point[data-agree=true]").wait_for()
         self.assert_sound(page, "executing")
-        self.look(page, "tasks")
+        self.view(page, "tasks")
         page.locator("#tasks li", has_text="completed").wait_for(timeout=45_000)
         self.assertIn("Done by dog", page.locator("#tasks li").first.inner_text())
 
-        self.look(page, "devices")
+        self.view(page, "devices")
         page.locator(".device", has_text="dog2").tap()
         page.locator("dialog[open]").wait_for()
         self.assertIn("camera", page.locator("#d-capabilities").inner_text())
@@ -142,7 +83,7 @@ class DemonstrationPageTests(SynchronousTestCase):
         self.assert_sound(page, "a dog is gone")
         page.locator(".device[data-state=IDLE]", has_text="dog2").wait_for()
 
-        self.look(page, "map")
+        self.view(page, "map")
         page.get_by_role("button", name="Take away").tap()
         page.locator("#place", has_text="No target").wait_for()
         page.get_by_role("button", name="Place target").tap()
@@ -162,7 +103,7 @@ class DemonstrationPageTests(SynchronousTestCase):
     def test_be_looked_at_from_a_desk(self) -> None:
         """On a desk: devices in the order of joining, three cameras whose views move as the dogs search, the map."""
         page = self.opened(DESK)
-        devices = self.api("api/v1/devices")
+        devices = self.demo.api("api/v1/devices")
         self.assertEqual(page.locator(".device b").all_inner_texts(), [device["name"] for device in devices])
         joined = [device["joined"] for device in devices]
         self.assertEqual(joined, sorted(joined))
@@ -193,5 +134,5 @@ class DemonstrationPageTests(SynchronousTestCase):
         self.assert_sound(page, "stopped")
         page.get_by_role("button", name="Let it go on").tap()
         page.locator(".halted").wait_for(state="hidden")
-        self.look(page, "tasks")
+        self.view(page, "tasks")
         page.locator("#tasks li", has_text="completed").first.wait_for(timeout=60_000)

@@ -4,46 +4,28 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
-import sys
-import threading
 import time
-from pathlib import Path
 from typing import Any
 
-from twisted.trial.unittest import SynchronousTestCase
-
 from benchmarks.demo import family
-from tests.live.test_page import CHROMIUM, DESK, FLAGS, MISSING, Team
+from tests.live.demonstration import DemonstrationCase
+from tests.live.page import DESK, BrowserCase, Team
 
 NAMES = ("vaio", "pi")
 CRASH_S, FREEZE_S = 2.0, 3.0
 CAMERAS = "figure[data-camera=live]"
 
 
-class FallbackTests(SynchronousTestCase):
-    if MISSING:
-        skip = f"THE PAGE IS NOT TESTED IN A BROWSER: missing {'; '.join(MISSING)}"
-
+class FallbackTests(BrowserCase):
     def setUp(self) -> None:
-        from playwright.sync_api import sync_playwright
-
+        super().setUp()
         self.webs = [Team() for _ in NAMES]
         urls = [f"{name}={web.url[:-1]}" for name, web in zip(NAMES, self.webs, strict=True)]
         for name, web, pages in zip(NAMES, self.webs, (urls, urls[::-1]), strict=True):
             self.addCleanup(web.stop)
             web.order(f"name {name}")
             web.order(f"pages {' '.join(pages)}")
-        play = sync_playwright().start()
-        self.addCleanup(play.stop)
-        self.browser = play.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        self.addCleanup(self.browser.close)
-        screen: dict[str, Any] = DESK
-        context = self.browser.new_context(**screen)
-        self.page = context.new_page()
-        self.page.set_default_timeout(8000)
-        self.faults: list[str] = []
-        self.page.on("pageerror", lambda error: self.faults.append(str(error)))
+        self.page = self.tab(DESK)
 
     def tearDown(self) -> None:
         self.assertEqual(self.faults, [])
@@ -100,6 +82,23 @@ class FallbackTests(SynchronousTestCase):
         self.page.locator("#line", has_text="The demo runs").wait_for()
         self.served("pi")
 
+    def test_new_task_is_asked_for_again(self) -> None:
+        """A task that is asked of a node which is frozen is asked of the other, by the same name for the wish."""
+        self.opened()
+        keys: list[str] = []
+
+        def note(request: Any) -> None:
+            if request.method == "POST" and request.url.endswith("/api/v1/tasks"):
+                keys.append(request.headers["idempotency-key"])
+
+        self.page.on("request", note)
+        os.kill(self.pid(0), signal.SIGSTOP)
+        with self.page.expect_response(f"{self.webs[1].url}api/v1/tasks") as answered:
+            self.page.locator("#assign button").click()
+        self.assertEqual(answered.value.status, 202)
+        self.served("pi")
+        self.assertEqual((len(keys), len(set(keys))), (2, 1))
+
     def test_open_while_the_node_is_gone(self) -> None:
         """Where the browser keeps the page, it opens at the address of a node that is gone, and finds the other."""
         self.opened()
@@ -119,36 +118,10 @@ def stretch() -> float:
     return max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
 
 
-class DemonstrationFallbackTests(SynchronousTestCase):
+class DemonstrationFallbackTests(DemonstrationCase):
     """Experiment 2 of the thesis with the real team, and its web node lost on top."""
 
-    if MISSING:
-        skip = f"THE DEMONSTRATION IS NOT TESTED IN A BROWSER: missing {'; '.join(MISSING)}"
-
-    def setUp(self) -> None:
-        from playwright.sync_api import sync_playwright
-
-        log, run_dir = Path(self.mktemp()), Path(self.mktemp()).absolute()
-        command = [sys.executable, "-m", "sim.demo", "--run-dir", str(run_dir), "--web-port", "0"]
-        with log.open("w", encoding="utf-8") as errors:
-            root = Path(__file__).parents[2]
-            self.demo = subprocess.Popen(command, cwd=root, stdout=subprocess.PIPE, stderr=errors, text=True)
-        self.addCleanup(self.demo.wait, 20)
-        self.addCleanup(self.demo.terminate)
-        assert self.demo.stdout is not None
-        said = []
-        for line in self.demo.stdout:
-            said.append(line)
-            if line.startswith("The page: "):
-                break
-        else:
-            self.fail("".join(said) + log.read_text(encoding="utf-8"))
-        threading.Thread(target=self.demo.stdout.read, daemon=True).start()
-        self.url = said[-1].split()[2]
-        play = sync_playwright().start()
-        self.addCleanup(play.stop)
-        self.browser = play.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        self.addCleanup(self.browser.close)
+    options = ("--web-port", "0")
 
     def strike(self, name: str, how: signal.Signals) -> int:
         pid = next(pid for pid, each in family(self.demo.pid).items() if each == name)
@@ -157,10 +130,7 @@ class DemonstrationFallbackTests(SynchronousTestCase):
 
     def lost_on_the_way(self, how: signal.Signals, limit_s: float) -> int:
         """The dog on its way and the page's node are lost at once; returns the process id of the latter."""
-        screen: dict[str, Any] = DESK
-        page = self.browser.new_context(**screen).new_page()
-        page.set_default_timeout(15_000)
-        page.goto(self.url)
+        page = self.opened(DESK)
         page.locator("#reserve", has_text="pi").wait_for()
         page.get_by_role("button", name="Run Demo").click()
         going = page.locator(".device[data-state=EXECUTING] b")

@@ -4,27 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-from twisted.trial.unittest import SynchronousTestCase
-
-from tests.live import test_page
-from tests.live.test_page import DESK, MISSING, PHONE
-
-TABLET = {"viewport": {"width": 820, "height": 1180}, "has_touch": True}
+from tests.live.page import DESK, PHONE, TABLET, PageCase
 
 
-class FaultPageTests(SynchronousTestCase):
-    if MISSING:
-        skip = f"FAULTS ARE NOT TESTED IN A BROWSER: missing {'; '.join(MISSING)}"
-
-    def setUp(self) -> None:
-        self.host = test_page.PageTests()
-        self.host.setUp()
-        self.addCleanup(self.host.doCleanups)
-
-    def opened(self, screen: dict[str, Any], scheme: str = "light") -> Any:
+class FaultPageTests(PageCase):
+    def opened(self, screen: dict[str, Any], scheme: Any = "light") -> Any:
         """The page with dog2 open, and its faults there."""
-        page = self.host.opened(screen, scheme)
-        page.set_default_timeout(20000)
+        page = super().opened(screen, scheme)
         page.evaluate("location.hash = 'device/' + '02'.repeat(16)")
         page.locator(".chaos button").first.wait_for()
         return page
@@ -61,22 +47,11 @@ class FaultPageTests(SynchronousTestCase):
 
     def test_be_accessible(self) -> None:
         """On phone, tablet and desk, light and dark, axe finds nothing, and no button is small or cut off."""
-        from axe_playwright_python.sync_playwright import Axe
-
         for screen in (PHONE, TABLET, DESK):
             for scheme in ("light", "dark"):
                 page = self.opened(screen, scheme)
                 if screen is PHONE and scheme == "light":
                     page.get_by_role("button", name="Lose 20 %").tap()
                 page.locator("#place-device .fault").first.wait_for()
-                found = Axe().run(page).response["violations"]
-                self.assertEqual([(each["id"], each["nodes"][0]["html"]) for each in found], [])
-                self.assertLessEqual(page.evaluate("document.documentElement.scrollWidth - innerWidth"), 0)
-                small = page.evaluate(
-                    "[...document.querySelectorAll('.chaos button, #f-seconds')]"
-                    ".filter(e => e.offsetHeight < 44 || e.offsetWidth < 44 || e.scrollWidth > e.clientWidth + 1)"
-                    ".map(e => e.outerHTML)"
-                )
-                self.assertEqual(small, [])
-                self.assertEqual(self.host.faults, [])
+                self.sound(page)
                 page.context.close()

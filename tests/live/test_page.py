@@ -2,25 +2,11 @@
 
 from __future__ import annotations
 
-import shutil
-import subprocess
-import sys
 import time
-from importlib.util import find_spec
-from pathlib import Path
 from typing import Any
 
-from twisted.trial.unittest import SynchronousTestCase
+from tests.live.page import DESK, PHONE, TABLET, VIEWS, PageCase, Team
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-FLAGS = [
-    *("--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"),
-    *("--disable-component-update", "--disable-sync", "--disable-dev-shm-usage"),
-]
-PHONE = {"viewport": {"width": 412, "height": 839}, "has_touch": True}
-TABLET = {"viewport": {"width": 820, "height": 1180}, "has_touch": True}
-DESK = {"viewport": {"width": 1280, "height": 800}}
-VIEWS = ("tasks", "cameras", "map", "groups", "network", "events", "more", "devices")
 PANELS = """async () => {
   const { panel } = await import("/static/panel.js");
   const { model } = await import("/static/model.js");
@@ -40,90 +26,14 @@ PANELS = """async () => {
   } });
 }"""
 """Two panels that a node with faults shows to operators; one fails at each state."""
-MISSING = [
-    *(() if CHROMIUM else ("the program chromium (apt-get install chromium)",)),
-    *(
-        f"the Python package {name} (pip install -e '.[browser]')"
-        for name in ("playwright", "axe_playwright_python", "cv2", "flask")
-        if find_spec(name) is None
-    ),
-]
 
 
-class Team:
-    """The page's server as a child process; ``order`` changes what it shows."""
-
-    def __init__(self, port: int = 0) -> None:
-        root = Path(__file__).parents[2]
-        command = [sys.executable, "-m", "tests.live.team", str(port)]
-        self._process = subprocess.Popen(command, cwd=root, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-        found, self.code, self.token, self.ticket = self._line().split()
-        self.port = int(found)
-        self.url = f"http://127.0.0.1:{self.port}/"
-        self.pid = self._process.pid
-
-    def _line(self) -> str:
-        assert self._process.stdout is not None
-        return self._process.stdout.readline()
-
-    def order(self, words: str) -> None:
-        """Give an order; ``freeze`` is not waited for."""
-        assert self._process.stdin is not None
-        self._process.stdin.write(words + "\n")
-        self._process.stdin.flush()
-        if not words.startswith("freeze"):
-            self._line()
-
-    def stop(self) -> None:
-        """End it at once."""
-        self._process.kill()
-        self._process.communicate()
-
-
-class PageTests(SynchronousTestCase):
-    if MISSING:
-        skip = f"THE PAGE IS NOT TESTED IN A BROWSER: missing {'; '.join(MISSING)}"
-
-    def setUp(self) -> None:
-        from playwright.sync_api import sync_playwright
-
-        self.team = Team()
-        self.addCleanup(lambda: self.team.stop())
-        play = sync_playwright().start()
-        self.addCleanup(play.stop)
-        self.browser = play.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        self.addCleanup(self.browser.close)
-
-    def opened(self, screen: dict[str, Any], scheme: Any = "light") -> Any:
-        context = self.browser.new_context(**screen, color_scheme=scheme, reduced_motion="reduce")
-        self.addCleanup(context.close)
-        page = context.new_page()
-        page.set_default_timeout(8000)
-        self.asked: list[str] = []
-        self.faults: list[str] = []
-        page.on("request", lambda request: self.asked.append(request.url))
-        page.on("pageerror", lambda error: self.faults.append(str(error)))
-        page.on("console", lambda words: self.faults.append(words.text) if words.type == "error" else None)
-        page.goto(f"{self.team.url}#code={self.team.code}")
-        page.locator("#link[data-link=live]").wait_for()
-        page.locator(".device").nth(2).wait_for()
-        return page
-
-    def told(self, page: Any, words: str) -> None:
-        page.locator("#line", has_text=words).wait_for()
-
-    def view(self, page: Any, name: str) -> None:
-        """Look at a view, as a link to it does."""
-        page.evaluate(f"location.hash = {name!r}")
-        page.locator(f"body[data-view={name}]").wait_for()
-
+class PageTests(PageCase):
     def names(self, page: Any) -> list[str]:
         return list(page.locator(".device b").all_inner_texts())
 
     def test_be_accessible(self) -> None:
         """On each screen, in each view and a device, light and dark, axe finds nothing, nothing is cut off or small."""
-        from axe_playwright_python.sync_playwright import Axe
-
         for screen in (PHONE, TABLET, DESK):
             for scheme in ("light", "dark"):
                 page = self.opened(screen, scheme)
@@ -132,28 +42,14 @@ class PageTests(SynchronousTestCase):
                     self.view(page, view)
                     if view == "network":
                         page.locator("#ties td").first.wait_for()
-                    self.sound(page, Axe())
+                    self.sound(page)
                 self.view(page, "devices")
                 page.locator(".device").first.focus()
                 page.keyboard.press("Enter")
                 page.locator("dialog[open] tr").first.wait_for()
-                self.sound(page, Axe())
+                self.sound(page)
                 page.context.close()
         self.assertEqual([url for url in self.asked if not url.startswith(self.team.url)], [])
-
-    def sound(self, page: Any, axe: Any) -> None:
-        """What stands there now has no fault."""
-        where = page.evaluate("`${innerWidth} ${location.hash}`")
-        found = axe.run(page).response["violations"]
-        self.assertEqual([(each["id"], each["nodes"][0]["html"]) for each in found], [], where)
-        self.assertLessEqual(page.evaluate("document.documentElement.scrollWidth - innerWidth"), 0, where)
-        small = page.evaluate(
-            "[...document.querySelectorAll('button, input, select, nav a')].filter(e => e.offsetParent)"
-            ".filter(e => e.offsetHeight < 44 || e.offsetWidth < 44"
-            " || (e.tagName !== 'INPUT' && e.scrollWidth > e.clientWidth + 1))"
-            ".map(e => e.outerHTML)"
-        )
-        self.assertEqual((small, self.faults), ([], []), where)
 
     def test_reach_each_view(self) -> None:
         """On a phone each view is at most two taps away and alone; keys, back and links lead there as well."""

@@ -23,7 +23,7 @@ from typing import Any
 from twisted.trial.unittest import SynchronousTestCase
 
 from benchmarks.demo import family
-from tests.live.test_page import CHROMIUM, DESK, FLAGS, MISSING, PHONE, TABLET, Team
+from tests.live.page import CHROMIUM, DESK, FLAGS, MISSING, PHONE, TABLET, Team
 
 FAKE = ("--use-fake-device-for-media-stream", "--use-fake-ui-for-media-stream")
 MORE = tuple(os.environ.get("PHONE_FLAGS", "").split())

@@ -12,9 +12,7 @@ from email.message import Message
 from importlib.util import find_spec
 from typing import Any, get_args
 
-from twisted.trial.unittest import SynchronousTestCase
-
-from tests.live.test_page import Team
+from tests.live.page import TeamCase
 from webnode.board import Role
 from webnode.guard import HEADERS
 from webnode.route import ALLOWED, Route
@@ -33,13 +31,12 @@ def path_of(route: Route) -> str:
     return re.sub(r"\{(\w+)\}", lambda found: NAMES.get(found[1], "x"), route.path)
 
 
-class SafetyTests(SynchronousTestCase):
+class SafetyTests(TeamCase):
     if MISSING:
         skip = f"THE SAFETY OF THE PAGE IS NOT TESTED: missing {', '.join(MISSING)}"
 
     def setUp(self) -> None:
-        self.team = Team()
-        self.addCleanup(lambda: self.team.stop())
+        super().setUp()
         self._seal = Seal(b"a team of the tests")
         self._number = 0
 

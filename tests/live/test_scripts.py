@@ -6,9 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from twisted.trial.unittest import SynchronousTestCase
-
-from tests.live.test_page import CHROMIUM, DESK, FLAGS, MISSING, Team
+from tests.live.page import DESK, PageCase
 
 BARE = (
     *("<script>ran()</script>", "<script src=//evil.example/x.js></script>", "<img src=x onerror=ran()>"),
@@ -65,27 +63,12 @@ addEventListener("securitypolicyviolation", ({ effectiveDirective }) => violatio
 """
 
 
-class ScriptTests(SynchronousTestCase):
-    if MISSING:
-        skip = f"FOREIGN WORDS ARE NOT TESTED IN A BROWSER: missing {'; '.join(MISSING)}"
-
+class ScriptTests(PageCase):
     def setUp(self) -> None:
-        from playwright.sync_api import sync_playwright
-
-        self.team = Team()
-        self.addCleanup(lambda: self.team.stop())
-        play = sync_playwright().start()
-        self.addCleanup(play.stop)
-        browser: Any = play.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        self.addCleanup(browser.close)
-        self.page = browser.new_context(**DESK).new_page()
-        self.page.set_default_timeout(20_000)
+        super().setUp()
+        self.page = self.tab(DESK)
         self.dialogs: list[str] = []
-        self.asked: list[str] = []
-        self.faults: list[str] = []
         self.page.on("dialog", self.on_dialog)
-        self.page.on("request", lambda request: self.asked.append(request.url))
-        self.page.on("pageerror", lambda error: self.faults.append(str(error)))
         self.page.add_init_script(WATCH)
 
     def on_dialog(self, dialog: Any) -> None:

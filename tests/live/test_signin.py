@@ -4,50 +4,22 @@ from __future__ import annotations
 
 from typing import Any
 
-from twisted.trial.unittest import SynchronousTestCase
-
-from tests.live.test_page import CHROMIUM, DESK, FLAGS, MISSING, PHONE, Team
+from tests.live.page import DESK, PHONE, PageCase
 
 
-class SigningInTests(SynchronousTestCase):
-    if MISSING:
-        skip = f"SIGNING IN IS NOT TESTED IN A BROWSER: missing {'; '.join(MISSING)}"
-
-    def setUp(self) -> None:
-        from playwright.sync_api import sync_playwright
-
-        self.team = Team()
-        self.addCleanup(lambda: self.team.stop())
-        play = sync_playwright().start()
-        self.addCleanup(play.stop)
-        self.browser = play.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        self.addCleanup(self.browser.close)
-
-    def opened(self, screen: dict[str, Any], fragment: str = "", scheme: Any = "light") -> Any:
-        context = self.browser.new_context(**screen, color_scheme=scheme, reduced_motion="reduce")
-        self.addCleanup(context.close)
-        page = context.new_page()
-        page.set_default_timeout(8000)
-        self.faults: list[str] = []
-        page.on("pageerror", lambda error: self.faults.append(str(error)))
+class SigningInTests(PageCase):
+    def at_door(self, screen: dict[str, Any], fragment: str = "", scheme: Any = "light") -> Any:
+        """A page of somebody who comes by that link."""
+        page = self.tab(screen, scheme)
         page.goto(self.team.url + fragment)
         return page
-
-    def is_in(self, page: Any) -> None:
-        page.locator("#link[data-link=live]").wait_for()
-        page.locator(".device").nth(2).wait_for()
-
-    def see(self, page: Any, view: str) -> None:
-        """Look at a view; a phone shows one at a time."""
-        page.evaluate(f"location.hash = '{view}'")
-        page.locator(f"body[data-view={view}]").wait_for()
 
     def test_sign_in_by_hand(self) -> None:
         """Without a session the page shows nothing of the team and asks; wrong is told, Escape leads nowhere."""
         from axe_playwright_python.sync_playwright import Axe
 
         for screen, scheme in ((PHONE, "light"), (DESK, "dark")):
-            page = self.opened(screen, scheme=scheme)
+            page = self.at_door(screen, scheme=scheme)
             page.locator("#signin-code").wait_for()
             self.assertEqual(page.locator(".device").count(), 0)
             self.assertEqual(Axe().run(page).response["violations"], [])
@@ -62,16 +34,15 @@ class SigningInTests(SynchronousTestCase):
             self.assertEqual(page.locator("#signin-code").get_attribute("type"), "text")
             page.locator("#signin-code").fill("correct horse")
             page.get_by_role("button", name="Sign in").click()
-            self.is_in(page)
+            self.live(page)
             self.assertEqual(self.faults, [])
 
     def test_stay_signed_in(self) -> None:
         """A link with the code signs in at once and leaves no trace of it; so it stays, until one signs out."""
-        page = self.opened(DESK, f"#code={self.team.code}")
-        self.is_in(page)
+        page = self.opened(DESK)
         self.assertNotIn("code", page.url)
         page.reload()
-        self.is_in(page)
+        self.live(page)
         page.get_by_role("button", name="Sign out").click()
         page.locator("#signin-code").wait_for()
         page.reload()
@@ -80,15 +51,14 @@ class SigningInTests(SynchronousTestCase):
 
     def test_look_as_a_viewer(self) -> None:
         """An operator's invitation makes a viewer, who sees all and is offered nothing that it may not do."""
-        page = self.opened(DESK, f"#code={self.team.code}")
-        self.is_in(page)
-        viewer = self.opened(PHONE, f"#code={self.invitation(page)}")
-        self.is_in(viewer)
-        self.see(viewer, "more")
+        page = self.opened(DESK)
+        viewer = self.at_door(PHONE, f"#code={self.invitation(page)}")
+        self.live(viewer)
+        self.view(viewer, "more")
         viewer.locator(".session", has_text="viewer").wait_for()
         offered = [button.inner_text() for button in viewer.locator("button:not(.device):visible").all()]
         self.assertEqual(offered, ["Sign out"])
-        self.see(viewer, "cameras")
+        self.view(viewer, "cameras")
         viewer.locator("#cameras").scroll_into_view_if_needed()
         viewer.locator("figure[data-camera=live]").first.wait_for()
         told = viewer.evaluate(
@@ -102,11 +72,10 @@ class SigningInTests(SynchronousTestCase):
         from axe_playwright_python.sync_playwright import Axe
 
         for screen, scheme in ((PHONE, "dark"), (DESK, "light")):
-            page = self.opened(screen, f"#code={self.team.code}", scheme)
-            self.is_in(page)
+            page = self.opened(screen, scheme)
             page.get_by_role("button", name="Run Demo").click()
             page.locator("#line", has_text="The demo runs").wait_for()
-            self.see(page, "more")
+            self.view(page, "more")
             page.get_by_text("Who changed what").focus()
             page.keyboard.press("Enter")
             page.locator(".audit li", has_text="POST demo").first.wait_for()
@@ -114,19 +83,22 @@ class SigningInTests(SynchronousTestCase):
             page.get_by_role("button", name="Look again").click()
             self.assertEqual(Axe().run(page).response["violations"], [])
             self.assertLessEqual(page.evaluate("document.documentElement.scrollWidth - innerWidth"), 0)
-        viewer = self.opened(DESK, f"#code={self.invitation(page)}")
-        self.is_in(viewer)
+        viewer = self.at_door(DESK, f"#code={self.invitation(page)}")
+        self.live(viewer)
         self.assertEqual(viewer.get_by_text("Who changed what").count(), 0)
 
     def invitation(self, page: Any) -> str:
-        page.get_by_role("button", name="Invite a viewer").click()
-        page.locator(".session [role=status]", has_text="for a day").wait_for()
-        return str(page.locator(".session input").input_value()).partition("#code=")[2]
+        page.get_by_role("button", name="Invite").click()
+        page.locator("#i-kind").select_option("viewer")
+        page.locator("#invite", has_text="may look").wait_for()
+        link = str(page.locator("#i-link").input_value())
+        page.get_by_role("button", name="Close").click()
+        page.locator("#invite").wait_for(state="detached")
+        return link.partition("#code=")[2]
 
     def test_ask_again_when_the_session_ends(self) -> None:
         """When the node no longer knows the session, the page asks, and goes on where it was."""
-        page = self.opened(DESK, f"#code={self.team.code}")
-        self.is_in(page)
+        page = self.opened(DESK)
         page.evaluate(
             "fetch('/api/v1/session', {method: 'DELETE', headers: {'X-Swarm': '1', Authorization: 'Bearer ' + "
             "JSON.parse(localStorage['swarm-session']).token}})"
@@ -134,4 +106,25 @@ class SigningInTests(SynchronousTestCase):
         self.team.order("freeze 3")
         page.locator("#signin-code").fill(self.team.code, timeout=15_000)
         page.keyboard.press("Enter")
-        self.is_in(page)
+        self.live(page)
+
+    def test_stay_for_days(self) -> None:
+        """A page that is left open has its session renewed before it runs out, again and again, and stays live."""
+        # The page is told an hour before.
+        self.team.order("session 3603")
+        page = self.opened(DESK)
+        first = page.evaluate("JSON.parse(localStorage['swarm-session']).token")
+        held = first
+        for _ in range(2):
+            page.wait_for_function("held => JSON.parse(localStorage['swarm-session']).token !== held", arg=held)
+            held = page.evaluate("JSON.parse(localStorage['swarm-session']).token")
+        self.assertNotEqual(page.locator("#link").get_attribute("data-link"), "lost")
+        self.team.order("status dog3 IDLE")
+        page.locator(".device[data-state=IDLE]", has_text="dog3").wait_for()
+        # Signing out ends what was there before as well.
+        page.get_by_role("button", name="Sign out").click()
+        page.locator("#signin-code").wait_for()
+        for token in (first, held):
+            path, headers = f"{self.team.url}api/v1/session", {"Authorization": f"Bearer {token}"}
+            self.assertEqual(page.request.get(path, headers=headers).json()["role"], "anyone")
+        self.assertEqual(self.faults, [])

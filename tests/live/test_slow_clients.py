@@ -8,9 +8,7 @@ import socket
 import time
 from importlib.util import find_spec
 
-from twisted.trial.unittest import SynchronousTestCase
-
-from tests.live.test_page import Team
+from tests.live.page import TeamCase
 
 MISSING = [name for name in ("flask", "cv2") if find_spec(name) is None]
 CLOSED_S = 20.0
@@ -71,13 +69,12 @@ class Crowd:
         self._selector.close()
 
 
-class SlowClientTests(SynchronousTestCase):
+class SlowClientTests(TeamCase):
     if MISSING:
         skip = f"SLOW CLIENTS ARE NOT TESTED: missing {', '.join(MISSING)}"
 
     def setUp(self) -> None:
-        self.team = Team()
-        self.addCleanup(lambda: self.team.stop())
+        super().setUp()
         self.crowd = Crowd(self.team.port)
         self.addCleanup(lambda: self.crowd.leave())
 

@@ -27,6 +27,7 @@ class StreamsTests(SynchronousTestCase):
         self.publisher, self.viewer = (streams for _, streams in self.ends)
         self.to_publisher, self.to_viewer = (Contact(Identity(bytes([n]) * 32).public, self.at(n)) for n in (1, 2))
         self.frames: list[tuple[int, bytes]] = []
+        self.ages: list[float] = []
 
     def at(self, n: int) -> Address:
         """Where the n-th end listens."""
@@ -45,19 +46,20 @@ class StreamsTests(SynchronousTestCase):
             streams.stop()
             endpoint.stop()
 
-    def see(self, sequence: int, frame: bytes) -> None:
+    def see(self, sequence: int, frame: bytes, age: float) -> None:
         """Take note of a frame."""
         self.frames.append((sequence, frame))
+        self.ages.append(age)
 
-    def part(self, sequence: int, number: int, count: int, part: bytes) -> None:
+    def part(self, sequence: int, number: int, count: int, part: bytes, age_ms: int = 0) -> None:
         """One part arrives."""
-        self.viewer._answer_part(self.to_publisher, CAMERA, sequence, number, count, part)
+        self.viewer._answer_part(self.to_publisher, CAMERA, sequence, number, count, part, age_ms)
 
     def test_frames_arrive_whole(self) -> None:
         """A frame of many parts arrives as it was, at every watcher, until each of them stops."""
         others: list[int] = []
         stop = self.viewer.look(self.to_publisher, CAMERA, self.see)
-        stop_other = self.viewer.look(self.to_publisher, CAMERA, lambda sequence, frame: others.append(sequence))
+        stop_other = self.viewer.look(self.to_publisher, CAMERA, lambda sequence, frame, age: others.append(sequence))
         self.clock.advance(0.1)
         frame = random.Random(1).randbytes(5 * PART_BYTES + 7)
         self.publisher.offer(CAMERA, 1, frame)
@@ -68,6 +70,19 @@ class StreamsTests(SynchronousTestCase):
         self.clock.advance(0.1)
         stop_other()
         self.assertEqual((self.frames, others), ([(1, frame)], [1, 2]))
+
+    def test_age_counts_from_the_camera(self) -> None:
+        """A frame's age is what it was when it was sent, and its time on the way, though no clock is compared."""
+        self.viewer.look(self.to_publisher, CAMERA, self.see)
+        self.clock.advance(0.1)
+        self.publisher.offer(CAMERA, 1, bytes(2 * PART_BYTES), 0.25)
+        self.clock.advance(0.1)
+        (age,) = self.ages
+        self.assertLess(abs(age - 0.251), 0.0005)
+        self.part(2, 0, 2, b"a", 500)
+        self.clock.advance(0.3)
+        self.part(2, 1, 2, b"b", 500)
+        self.assertLess(abs(self.ages[1] - 0.801), 0.0005)
 
     def test_nothing_is_sent_unseen(self) -> None:
         """While nobody looks nothing is sent, and soon after the last look ended neither."""
@@ -109,6 +124,8 @@ class StreamsTests(SynchronousTestCase):
         for number, count in ((0, 0), (-1, 1), (1, 1), (0, MAX_PARTS + 1)):
             self.part(2, number, count, b"x")
         self.part(2, 0, 1, bytes(PART_BYTES + 1))
+        for age_ms in (-1, 600_001, 2**70):
+            self.part(2, 0, 1, b"x", age_ms)
         self.viewer._answer_part(self.to_viewer, CAMERA, 1, 0, 1, b"a stranger's")
         self.viewer._answer_part(self.to_publisher, "other", 1, 0, 1, b"x")
         self.assertEqual(self.frames, [])

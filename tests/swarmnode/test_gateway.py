@@ -98,7 +98,7 @@ class GatewayTests(SynchronousTestCase):
         phone = Phone(self, self.gateways["vaio"])
         self.live(1.0)
         seen: list[bytes] = []
-        stop = self.team.desk.watch(phone.uuid, lambda seq, picture: seen.append(picture))
+        stop = self.team.desk.watch(phone.uuid, lambda seq, picture, age: seen.append(picture))
         self.live(1.0)
         stop()
         self.assertGreater(len(seen), 4)

@@ -29,6 +29,8 @@ class InvitationTests(SynchronousTestCase):
         for code in ("quiet-otter", "loud-otter"):
             invited("vaio", "0.0.0.0", lambda: 8080, code)
         self.assertEqual(invitations(), [Invitation("vaio", "http://127.0.0.1:8080/", "loud-otter", os.getpid())])
+        invited("vaio", "0.0.0.0", lambda: 8080, "quiet-otter", 8443)
+        self.assertEqual(invitations()[0].secure, "https://127.0.0.1:8443/")
         (note,) = (self.where / "swarm-node").iterdir()
         self.assertEqual(stat.S_IMODE(note.stat().st_mode), 0o600)
 
@@ -64,6 +66,8 @@ class WebCodeTests(SynchronousTestCase):
         self.assertIn("vaio: http://127.0.0.1:8080/  code quiet-otter, or open", out)
         self.assertIn("http://127.0.0.1:8080/#code=quiet-otter", out)
         self.assertEqual(json.loads(self.asked("--json")[1])["code"], "quiet-otter")
+        secure = Invitation("a", "http://127.0.0.1:1/", "quiet-otter", 1, "https://127.0.0.1:2/")
+        self.assertIn("a: http://127.0.0.1:1/ and https://127.0.0.1:2/  code", self.asked(here=[secure])[1])
         self.assertIn("no sign-in", self.asked(here=[Invitation("a", "http://127.0.0.1:1/", "", 1)])[1])
 
     def test_tell_that_there_is_none(self) -> None:

@@ -95,7 +95,9 @@ class RefusalTests(SynchronousTestCase):
     def test_refuse_unknown_driver(self) -> None:
         """A kind of robot that there is no driver for is refused with those that there are."""
         path = self.file('[node]\nname = "a"\n[driver]\nkind = "simm"\n')
-        self.assert_says(self.refusal("--config", path, is_made=True), path, "[driver]", "'simm'", "known are sim")
+        self.assert_says(
+            self.refusal("--config", path, is_made=True), path, "[driver]", "'simm'", "known are phone, sim"
+        )
 
     def test_refuse_wrong_driver_option(self) -> None:
         """A driver's option with a wrong value is refused with the option and what to write."""
@@ -164,7 +166,7 @@ class OptionsTests(SynchronousTestCase):
         values = {
             "name": "a", "kind": "k", "host": "127.0.0.1", "port": "0", "known-nodes": "10.0.0.1:1",
             "store": "s.sqlite", "team-key": "t", "roles": "edge", "agent-module": "search", "driver-kind": "sim",
-            "web-host": "127.0.0.1", "web-port": "0", "web-yard": "10.0.0.1:1",
+            "web-host": "127.0.0.1", "web-port": "0", "web-tls": "auto", "web-tls-port": "0", "web-yard": "10.0.0.1:1",
         }  # fmt: skip
         self.assertEqual(set(values), {str(row[0]) for row in Options.optParameters} - {"config"})
         Options().parseOptions([word for name, value in values.items() for word in (f"--{name}", value)])

@@ -3,17 +3,38 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 
 from twisted.internet import reactor
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.errors import MissingExtra
+from middleware.errors import BadSetting, MissingExtra
 from swarmnode.plugin import told
 from swarmnode.web import web_page
 from tests.swarmnode.team import World
 
 
 class WebRoleTests(SynchronousTestCase):
+    def test_tls_without_its_libraries_names_the_extra(self) -> None:
+        """Where the libraries of TLS are missing, asking for it is refused with the command that installs them."""
+        loaded = [name for name in sys.modules if name == "webnode.tls" or name.split(".")[0] == "OpenSSL"]
+        hidden = {name: sys.modules.pop(name) for name in loaded}
+
+        def restore() -> None:
+            sys.modules.pop("OpenSSL")
+            sys.modules.update(hidden)
+
+        sys.modules["OpenSSL"] = None  # type: ignore[assignment]
+        self.addCleanup(restore)
+        world = World()
+        service = world.service("a", 7000)
+        settings = replace(service.settings, web=replace(service.settings.web, tls="auto"))
+        error = self.assertRaises(
+            BadSetting, web_page, settings, world.seams("a", 7000), reactor, service.assembly.node
+        )
+        for words in ("[web] tls", "the library OpenSSL is not installed", "pip install 'swarm-node[tls]'"):
+            self.assertIn(words, str(error))
+
     def test_web_role_without_flask_names_the_extra(self) -> None:
         """Where Flask is not installed the web role is refused with the command that installs it."""
         hidden = {

@@ -62,9 +62,8 @@ class ActionTests(SynchronousTestCase):
         """Who would take a task can be asked by who only looks; a task that is not there is named."""
         preview = {"able": [{"uuid": "01", "name": "dog1", "busy": ""}], "refused": {"vaio": ["no camera"]}}
         self.desk.previews["search"] = {**preview, "likely": None}
-        self.assertEqual(
-            self.ask("POST", "tasks/preview", {"name": "search"}, "viewer"), (200, {**preview, "likely": None})
-        )
+        told = {**preview, "likely": None, "together": []}
+        self.assertEqual(self.ask("POST", "tasks/preview", {"name": "search"}, "viewer"), (200, told))
         status, answer = self.ask("POST", "tasks/preview", {"name": "fly"}, "viewer")
         self.assertEqual((status, answer["error"]["field"]), (404, "name"))
         self.assertEqual(self.desk.asked, [])

@@ -100,7 +100,7 @@ class AppTests(SynchronousTestCase):
     def test_tell_who_can(self) -> None:
         """Assigning answers the id, who is able, and who was refused and why."""
         answer = {"id": "t2", "able": ["dog1"], "refused": {"dog2": ["no camera"]}}
-        self.desk.assign = lambda name, tolerates=1, group="": {**answer, "for": tolerates}  # type: ignore[method-assign]
+        self.desk.assign = lambda name, tolerates=1, group="", task_id="": {**answer, "for": tolerates}  # type: ignore
         told = self.client.post("/api/v1/tasks", json={"name": "search"}).get_json()
         self.assertEqual(told, {**answer, "for": 1})
         told = self.client.post("/api/v1/tasks", json={"name": "search", "tolerates": 3}).get_json()
@@ -112,7 +112,21 @@ class AppTests(SynchronousTestCase):
         self.desk.assign = lambda *wish: asked.append(wish) or {"id": "t"}  # type: ignore
         for body, code in (({"group": "yard"}, 202), ({}, 202), ({"group": "x" * 65}, 400), ({"group": 5}, 400)):
             self.assertEqual(self.client.post("/api/v1/tasks", json={"name": "search", **body}).status_code, code)
-        self.assertEqual(asked, [("search", 1, "yard"), ("search", 1, "")])
+        self.assertEqual(asked, [("search", 1, "yard", ""), ("search", 1, "", "")])
+
+    def test_id_of_a_named_wish(self) -> None:
+        """A wish that its visitor named makes a task whose id every web node derives alike, and no other wish has."""
+        other = self.client_of(lambda: self.state)
+
+        def asked(client: FlaskClient, path: str, key: str) -> str:
+            body = {"name": "search"} if path == "tasks" else {}
+            answer = client.post(f"/api/v1/{path}", json=body, headers={"Idempotency-Key": key})
+            return str(answer.get_json()["id"])
+
+        wishes = [(path, key) for path in ("tasks", "demo") for key in ("a-1", "a-2")]
+        ids = [asked(self.client, path, key) for path, key in wishes]
+        self.assertEqual(len(set(ids)), 4)
+        self.assertEqual([asked(other, path, key) for path, key in wishes], ids)
 
     def test_refuse(self) -> None:
         """Every unlawful wish gets its code and an error with field, problem and remedy, and reaches nobody."""
@@ -182,9 +196,9 @@ class AppTests(SynchronousTestCase):
 
     def test_do_once_what_is_asked_twice(self) -> None:
         """An order that is repeated with its id is given once; an id that is no name is refused."""
-        for _ in range(2):
-            answer = self.client.post("/api/v1/demo", json={}, headers={"Idempotency-Key": "a1"})
-            self.assertEqual((answer.status_code, answer.get_json()), (202, {"id": "demo-1"}))
+        answers = [self.client.post("/api/v1/demo", json={}, headers={"Idempotency-Key": "a1"}) for _ in range(2)]
+        self.assertEqual([answer.status_code for answer in answers], [202, 202])
+        self.assertEqual(answers[0].get_json(), answers[1].get_json())
         self.assertEqual(self.desk.asked, [("demo",)])
         bad = self.client.post("/api/v1/demo", json={}, headers={"Idempotency-Key": "x" * 65})
         self.assertEqual((bad.status_code, bad.get_json()["error"]["field"]), (400, "Idempotency-Key"))

@@ -11,11 +11,11 @@ from twisted.trial.unittest import SynchronousTestCase
 from twisted.web.resource import Resource
 
 from tests.webnode.browser import Connection, site_of
-from webnode.board import Entry, MemoryChronicle, Page
+from webnode.board import Entry, MemoryChronicle, OpenSessions, Page, Visitor
 from webnode.camera import MemoryFrames, OnFrame
 from webnode.errors import Refusal
 from webnode.journal import KEPT
-from webnode.live import MAX_VIEWERS, MAX_WAITING, Events, Shots
+from webnode.live import LEAD_S, MAX_VIEWERS, MAX_WAITING, Events, Shots
 
 MORE = "x" * 999
 """What makes a state longer than a few changes."""
@@ -84,6 +84,29 @@ class EventsTests(SynchronousTestCase):
         self.assertEqual({name for name, _ in told}, {"beat"})
         self.assertIn(len(told), (9, 10, 11))
 
+    def test_spare_the_node_of_a_large_team(self) -> None:
+        """Where it takes a quarter of a second to make the state, that is done once a second, and no change is lost."""
+        read = self.read
+
+        def slow() -> dict[str, Any]:
+            self.clock.rightNow += 0.25
+            return read()
+
+        self.events = Events(slow, self.clock, self.clock.seconds)
+        root = Resource()
+        root.putChild(b"events", self.events)
+        self.site = site_of(root, self.clock)
+        page = self.connected()
+        page.taken()
+        before, began = self.reads, self.clock.seconds()
+        while self.clock.seconds() < began + 10.0:
+            self.state["n"] += 1
+            self.clock.advance(0.1)
+        self.assertIn(self.reads - before, (8, 9, 10))
+        self.clock.pump([0.1] * 30)
+        told = [data["n"] for name, data in events_in(page.taken()) if name == "change"]
+        self.assertEqual(told[-1], self.state["n"])
+
     def test_tell_programs_whole_states(self) -> None:
         """A program that asks for whole states gets one at each change, and need not put changes together."""
         program = self.connected("?whole=1")
@@ -108,6 +131,34 @@ class EventsTests(SynchronousTestCase):
         whole = ("state", {"resync": True, "n": 2, "more": MORE})
         self.assertIn(whole, events_in(self.connected("?since=other-3").taken()))
         watcher.leave()
+
+    def test_end_with_the_session(self) -> None:
+        """A stream is told an hour before its session runs out, once, where that can be put off; then it ends."""
+        whos = {"short": (10.0, 10.0), "long": (LEAD_S + 5.0, 2e9), "open": (2e9, 2e9)}
+
+        class Sessions(OpenSessions):
+            def visitor(self, token: str, now: float) -> Visitor:
+                until, limit = whos[token]
+                is_in = now - 1e9 < until
+                return Visitor("ann", "viewer", "a1", 1e9 + until, 1e9 + limit) if is_in else Visitor()
+
+        wall = lambda: 1e9 + self.clock.seconds()  # noqa: E731
+        self.events = Events(self.read, self.clock, wall, sessions=Sessions())
+        root = Resource()
+        root.putChild(b"events", self.events)
+        self.site = site_of(root, self.clock)
+        pages = {name: self.connected(f"?ticket={name}") for name in whos}
+        self.clock.pump([0.1] * 80)
+        tickets = {
+            name: [data for event, data in events_in(page.taken()) if event == "ticket"] for name, page in pages.items()
+        }
+        self.assertEqual(tickets, {"short": [], "long": [{"until": 1e9 + LEAD_S + 5.0}], "open": []})
+        self.assertEqual(self.events.viewers, 3)
+        self.clock.pump([0.1] * 30)
+        self.assertEqual(self.events.viewers, 2)
+        whos["open"] = (0.0, 0.0)  # signed out
+        self.clock.pump([0.1] * 12)
+        self.assertEqual(self.events.viewers, 1)
 
     def test_tell_pages(self) -> None:
         """A web node that joins the team is told to every page that is open."""
@@ -265,11 +316,11 @@ class ShotsTests(SynchronousTestCase):
         """Who is behind gets the newest picture at once, never those between, and how old it is."""
         self.asked()
         for seq in (1, 2, 3):
-            self.frames.show("ab", seq, JPEG + b"%d" % seq)
+            self.frames.show("ab", seq, JPEG + b"%d" % seq, 0.5)
         self.clock.advance(0.25)
         data = self.asked("1").taken()
         self.assertIn(b"X-Seq: 3", data)
-        self.assertIn(b"X-Age: 0.250", data)
+        self.assertIn(b"X-Age: 0.750", data)
         self.assertEqual(self.asked("3").taken(), b"")
 
     def test_take_a_lower_number_for_new(self) -> None:
@@ -291,7 +342,7 @@ class ShotsTests(SynchronousTestCase):
         self.asked()
         self.clock.advance(5)
         page = self.asked()
-        self.frames.watched["ab"](1, JPEG)
+        self.frames.watched["ab"](1, JPEG, 0.0)
         self.assertIn(b" 200 ", page.taken())
         self.assertEqual(self.frames.opened, 2)
 
@@ -360,7 +411,7 @@ class ShotsTests(SynchronousTestCase):
         self.asked()
         late = self.frames.watched["ab"]
         self.shots.close()
-        late(1, JPEG)
+        late(1, JPEG, 0.0)
         self.assertEqual((self.clock.getDelayedCalls(), self.shots.watched), ([], []))
 
     def test_close(self) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any, cast
 
 from twisted.internet.defer import Deferred, succeed
@@ -15,7 +16,7 @@ from webnode.board import OpenSessions, Token, Visitor
 from webnode.errors import Refusal
 from webnode.ground import Ground
 from webnode.password import hashed, is_password
-from webnode.session import AT_ONCE, SIGNED_S, WAITING, SignedSessions, made, sessions
+from webnode.session import AT_ONCE, MAX_SIGNED_S, SIGNED_S, WAITING, SignedSessions, made, sessions
 
 HASH = hashed("correct horse", bytes(16), 4)
 HOME = "127.0.0.1"
@@ -120,12 +121,37 @@ class SignedSessionsTests(SynchronousTestCase):
             self.assertEqual(self.sessions.visitor(text, 1.0), Visitor())
         self.assertEqual(self.sessions.visitor(other.text, 1.0).role, "operator")
 
+    def test_renew(self) -> None:
+        """A token can be had anew while it is good, up to thirty days after signing in, and is the same session."""
+        token, now = self.signed(), 0.0
+        while token.until < MAX_SIGNED_S:
+            now = token.until - 1.0
+            token = self.sessions.renewed(self.sessions.visitor(token.text, now), now)
+            self.assertEqual(token.until, min(now + SIGNED_S, MAX_SIGNED_S))
+        who = self.sessions.visitor(token.text, now)
+        self.assertEqual(self.sessions.renewed(who, now + 5.0).until, MAX_SIGNED_S)
+        self.sessions.revoke(who.token_id, who.until)
+        self.assertEqual(self.sessions.visitor(self.signed(now=now).text, now).role, "operator")
+        self.assertEqual(self.sessions.visitor(token.text, now), Visitor())
+
+    def test_renew_no_further_than_invited(self) -> None:
+        """A guest stays until the invitation ends; a ticket, which is seen by more, and nobody renew nothing."""
+        invitation = self.sessions.token("guest", "viewer", 0.0, SIGNED_S + 10.0)
+        token = self.signed(invitation.text, 1.0)
+        self.assertEqual(token.until, SIGNED_S + 1.0)
+        self.assertEqual(self.sessions.renewed(self.sessions.visitor(token.text, 9.0), 9.0).until, SIGNED_S + 9.0)
+        self.assertEqual(self.sessions.renewed(self.sessions.visitor(token.text, 99.0), 99.0).until, SIGNED_S + 10.0)
+        for text in (token.ticket, ""):
+            refusal = self.assertRaises(Refusal, self.sessions.renewed, self.sessions.visitor(text, 9.0), 9.0)
+            self.assertEqual((refusal.field, refusal.status), ("Authorization", 401))
+
 
 class FactoryTests(SynchronousTestCase):
     def ground(self, **web: object) -> Ground:
         settings = Settings.from_mapping({"node": {"name": "vaio", "team_key": "x" * 20}, "web": web}, "vaio.toml")
         nothing = cast(Any, None)
-        return Ground(settings, nothing, nothing, nothing, lambda: 0.0, random.Random(1))
+        node = cast(Any, SimpleNamespace(entangled=SimpleNamespace(watch=lambda *what, **how: None)))
+        return Ground(settings, node, nothing, nothing, lambda: 0.0, random.Random(1))
 
     def test_have_the_code_of_the_settings(self) -> None:
         """The code is that of the settings; where there is none, one is made that cannot be misread."""

@@ -9,7 +9,7 @@ from twisted.internet.defer import succeed
 from twisted.trial.unittest import SynchronousTestCase
 
 from webnode.app import create_app
-from webnode.board import Board, MemoryAudit
+from webnode.board import Board, MemoryAudit, MemoryInvites
 from webnode.desk import MemoryDesk
 from webnode.password import hashed, is_password
 from webnode.session import SignedSessions
@@ -23,8 +23,8 @@ class SessionRouteTests(SynchronousTestCase):
         sessions = SignedSessions(b"the team's secret", "quiet-otter", password, random.Random(1), check)
         self.audit = MemoryAudit()
         state = state_of([], [], {}, node="vaio")
-        board = Board(MemoryDesk(), sessions, self.audit)
-        self.client = create_app(lambda: state, board, wall=lambda: 1000.0).test_client()
+        self.board = Board(MemoryDesk(), sessions, self.audit)
+        self.client = create_app(lambda: state, self.board, wall=lambda: 1000.0).test_client()
 
     def signed(self, **body: str) -> dict[str, Any]:
         answer = self.client.post("/api/v1/session", json=body)
@@ -48,6 +48,18 @@ class SessionRouteTests(SynchronousTestCase):
             self.assertEqual(self.client.delete("/api/v1/session", headers={**bearer, "X-Swarm": "1"}).status_code, 200)
             self.assertEqual(self.client.post("/api/v1/demo", json={}, headers=bearer).status_code, 401)
             self.assertEqual(self.client.get(f"/api/v1/state?{ticket}").status_code, 401)
+
+    def test_renew(self) -> None:
+        """A session is renewed by its token; signing out with the old one ends what was made of it as well."""
+        told = self.signed(code="quiet-otter")
+        bearer = {**self.bearer(told["token"]), "X-Swarm": "1"}
+        anew = self.client.put("/api/v1/session", headers=bearer)
+        self.assertEqual((anew.status_code, anew.get_json()["role"]), (200, "operator"))
+        for wrong in ({"X-Swarm": "1"}, {**self.bearer(told["ticket"]), "X-Swarm": "1"}):
+            self.assertEqual(self.client.put("/api/v1/session", headers=wrong).status_code, 401)
+        self.client.delete("/api/v1/session", headers=bearer)
+        headers = self.bearer(anew.get_json()["token"])
+        self.assertEqual(self.client.get("/api/v1/session", headers=headers).get_json()["role"], "anyone")
 
     def test_be_nobody_without(self) -> None:
         """Whoever has not signed in is anyone, who may look at nothing and order nothing."""
@@ -93,3 +105,38 @@ class SessionRouteTests(SynchronousTestCase):
         self.assertEqual(self.client.post("/api/v1/invitations", json=body, headers=viewer).status_code, 403)
         for wrong in ({"role": "anyone"}, {"role": "viewer", "seconds": 0}, {}):
             self.assertEqual(self.client.post("/api/v1/invitations", json=wrong, headers=bearer).status_code, 400)
+
+    def test_invite_by_a_link(self) -> None:
+        """An invitation comes with a link to the first page that others reach, one for a phone leads to its view."""
+        bearer = self.bearer(self.signed(code="quiet-otter")["token"])
+        self.board.invites = MemoryInvites("https://10.0.0.7:8443", "http://10.0.0.7:8080", "http://127.0.0.1:8080")
+
+        def invited(**body: Any) -> dict[str, Any]:
+            return dict(self.client.post("/api/v1/invitations", json=body, headers=bearer).get_json())
+
+        viewer, phone = invited(role="viewer"), invited(role="phone", draw=True)
+        self.assertEqual(viewer["link"], f"https://10.0.0.7:8443/#code={viewer['token']}")
+        self.assertEqual(phone["link"], f"https://10.0.0.7:8443/#code={phone['token']}/phone")
+        self.assertEqual((viewer["reaches"], viewer["is_secure"]), ("network", True))
+        self.assertNotIn("code", viewer)
+        self.assertIn(phone["link"], phone["code"])
+        self.assertEqual((phone["certificate"], phone["certificate_code"]), ("", ""))
+        here = invited(role="viewer", page="http://127.0.0.1:8080")
+        self.assertEqual((here["reaches"], here["is_secure"]), ("machine", False))
+        self.assertTrue(here["link"].startswith("http://127.0.0.1:8080/#code="))
+        self.assertEqual(self.signed(code=phone["token"])["role"], "phone")
+        refused = invited(role="viewer", page="http://10.0.0.8:8080")
+        self.assertEqual(refused["error"]["field"], "page")
+        self.assertIn("http://10.0.0.7:8080", refused["error"]["remedy"])
+
+    def test_give_the_authority(self) -> None:
+        """Anyone gets the certificate to trust, and is led to it without TLS; where there is none that is said."""
+        missing = self.client.get("/api/v1/ca.crt")
+        self.assertEqual((missing.status_code, missing.get_json()["error"]["field"]), (404, "certificate"))
+        pages = ("https://10.0.0.7:8443", "http://10.0.0.7:8080")
+        self.board.invites = MemoryInvites(*pages, authority=b"PEM", fingerprint="AB:CD")
+        answer = self.client.get("/api/v1/ca.crt")
+        self.assertEqual((answer.data, answer.content_type), (b"PEM", "application/x-x509-ca-cert"))
+        bearer = self.bearer(self.signed(code="quiet-otter")["token"])
+        told = self.client.post("/api/v1/invitations", json={"role": "viewer"}, headers=bearer).get_json()
+        self.assertEqual((told["certificate"], told["fingerprint"]), ("http://10.0.0.7:8080/api/v1/ca.crt", "AB:CD"))

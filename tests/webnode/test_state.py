@@ -39,6 +39,19 @@ class StateTests(SynchronousTestCase):
         views = state_of([device(1, task="t1"), device(2, task="t9"), device(3)], tasks, {})["devices"]
         self.assertEqual([view["objective"] for view in views], ["Find it", "t9", ""])
 
+    def test_tell_where_devices_are(self) -> None:
+        """A position is metres in a yard or a place on the globe; what is neither is none."""
+        for said, told in (
+            ({"x": 1, "y": -2.5, "heading": 0.5}, {"x": 1.0, "y": -2.5, "heading": 0.5}),
+            ({"x": 1, "y": 2}, {"x": 1.0, "y": 2.0, "heading": None}),
+            ({"lat": -90, "lon": 180, "accuracy": 0}, {"lat": -90.0, "lon": 180.0, "accuracy": 0.0}),
+            ({"lat": 1, "lon": 2, "accuracy": -1}, {"lat": 1.0, "lon": 2.0, "accuracy": None}),
+            *(({"x": x, "y": 1}, None) for x in ("1", None, float("nan"), float("inf"), 1e7, 10**400, True)),
+            *((said, None) for said in ({}, None, [1, 2], {"y": 1}, {"lat": 91, "lon": 0}, {"lat": 0, "lon": 181})),
+        ):
+            (view,) = state_of([device(1, position=said)], [], {})["devices"]
+            self.assertEqual(view["position"], told, said)
+
     def test_list_newest_task_first(self) -> None:
         """Tasks stand newest first, and a result keeps who and how long."""
         result = {"by": "dog2", "took": 41.5}

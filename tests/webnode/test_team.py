@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from operator import itemgetter
 from typing import Any
 
 from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
+from agents.catalogue import DEMO, TASKS
+from middleware.tasks import TASKS as ALL_TASKS
 from swarmnode.rehearsal import VirtualTeam
 from webnode.errors import Refusal
-from webnode.team import PATIENCE, PLACING
+from webnode.team import ASKING, PATIENCE, PLACING, TeamDesk
 
 
 class TeamDeskTests(SynchronousTestCase):
@@ -85,6 +89,20 @@ class TeamDeskTests(SynchronousTestCase):
         self.assertEqual(self.team.state()["tasks"], [])
         self.assertEqual(self.assertRaises(Refusal, self.desk.preview, "fly").status, 404)
 
+    def test_preview_of_a_group(self) -> None:
+        """A task of a group would be divided with the open ones of it that want the same, and with no others."""
+        wishes = [("turn-around", "yard"), ("find-red-target", "yard"), ("turn-around", "attic"), ("turn-around", "")]
+        ids = [self.desk.assign(name, group=group)["id"] for name, group in wishes]
+        self.team.clock.advance(1.0)
+        first = self.team.state()["tasks"]
+        title = next(row["title"] for row in first if row["id"] == ids[0])
+        self.assertEqual(self.desk.preview("turn-around", "yard")["together"], [{"id": ids[0], "title": title}])
+        self.assertEqual(self.desk.preview("turn-around", "cellar")["together"], [])
+        self.assertEqual(self.desk.preview("turn-around")["together"], [])
+        self.desk.cancel(ids[0])
+        self.team.clock.advance(1.0)
+        self.assertEqual(self.desk.preview("turn-around", "yard")["together"], [])
+
     def test_preview_by_what_is_reported(self) -> None:
         """While the same task is under way, its reports say who is busy with it and who is the nearest."""
         self.team.run_demo()
@@ -119,3 +137,43 @@ class TeamDeskTests(SynchronousTestCase):
         refusal = self.refusal(self.desk.move_robot("dog2", 1.0, 1.0, 0.5), 0.1)
         self.assertEqual((refusal.field, refusal.status), ("dog2", 409))
         self.assertIn("dog1 stands at", refusal.problem)
+
+
+class RepeatedWishTests(SynchronousTestCase):
+    """One wish, asked of two web nodes."""
+
+    def setUp(self) -> None:
+        self.team = VirtualTeam(3, dogs=("dog1", "dog2"), others=("pi",))
+        self.addCleanup(self.team.stop)
+        self.desk = self.team.desk
+        self.reserve = TeamDesk(self.team.services["pi"].assembly.node, TASKS, DEMO)
+        self.team.clock.advance(1.0)
+
+    def test_wish_that_is_repeated_elsewhere(self) -> None:
+        """What another web node made of the same wish while this one heard nothing is not made again by this one."""
+        wishes: list[Callable[[TeamDesk], Any]] = [
+            lambda desk: desk.assign("find-red-target", 2, "yard", task_id="a1").addCallback(itemgetter("id")),
+            lambda desk: desk.run_demo("b2"),
+        ]
+        owner = self.team.services["vaio"].assembly.node.entangled.contact.public
+        for wish, task_id in zip(wishes, ("a1", "b2"), strict=True):
+            self.team.silence("pi")
+            first = wish(self.desk)
+            self.team.clock.advance(1.0)
+            self.team.board.heal()
+            self.assertNotIn(task_id, [record.name for record in self.reserve.read(ALL_TASKS)])
+            again = wish(self.reserve)
+            self.team.clock.advance(ASKING)
+            self.assertEqual((self.successResultOf(first), self.successResultOf(again)), (task_id, task_id))
+            owners = [record.owner for record in self.desk.read(ALL_TASKS) if record.name == task_id]
+            self.assertEqual(owners, [owner])
+        statuses = sorted(task["status"] for task in self.team.state()["tasks"])
+        self.assertEqual(statuses, ["ASSIGNED", "CANCELLED"])
+
+    def test_wish_that_the_first_node_died_of(self) -> None:
+        """The node that was asked first is dead and had done nothing: the next one does it, soon enough to say so."""
+        self.team.kill("vaio")
+        wish = self.reserve.assign("turn-around", task_id="a1")
+        self.team.clock.advance(ASKING + 0.1)
+        self.assertEqual(self.successResultOf(wish)["id"], "a1")
+        self.assertEqual([r.name for r in self.reserve.read(ALL_TASKS)], ["a1"])

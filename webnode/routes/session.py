@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
-from twisted.internet.defer import Deferred
+from functools import partial
+from typing import Any
+from urllib.parse import urlsplit
 
-from webnode.board import Token
+from twisted.internet.defer import Deferred, gatherResults
+
+from webnode.board import Invites, Token
 from webnode.errors import Refusal
+from webnode.fallback import is_loopback
 from webnode.field import Json
-from webnode.route import API, Ask, Field, Route
+from webnode.route import API, Ask, Content, Field, Route
+from webnode.session import SIGNED_S
 
 INVITED_S = 86400.0
 MAX_INVITED_S = 366 * 86400.0
@@ -30,14 +36,60 @@ def session(ask: Ask) -> Json:
 def sign_out(ask: Ask) -> Json:
     """Let in nobody with this token any more."""
     if ask.who.token_id:
-        ask.board.sessions.revoke(ask.who.token_id)
+        # What was renewed elsewhere, a moment ago, ends with it.
+        until = min(ask.who.limit, max(ask.who.until, ask.now + SIGNED_S))
+        ask.board.sessions.revoke(ask.who.token_id, until)
     return {}
 
 
-def invite(ask: Ask) -> Json:
-    """A token for somebody else."""
-    given = ask.given
-    return _told(ask.board.sessions.token(given["name"], given["role"], ask.now, given["seconds"]))
+def renew(ask: Ask) -> Json:
+    """Another token for who asks."""
+    return _told(ask.board.sessions.renewed(ask.who, ask.now))
+
+
+def invite(ask: Ask) -> Any:
+    """A token for somebody else, and the link by which a person comes with it."""
+    given, invites = ask.given, ask.board.invites
+    urls = [] if invites is None else invites.urls()
+    if given["page"] and given["page"] not in urls:
+        raise Refusal("page", "this node does not serve it", f"choose one of {', '.join(urls) or 'none'}")
+    token = ask.board.sessions.token(given["name"], given["role"], ask.now, given["seconds"])
+    if invites is None or not urls:
+        return _told(token)
+    url = given["page"] or urls[0]
+    link = f"{url}/#code={token.text}" + ("/phone" if token.role == "phone" else "")
+    told: dict[str, Json] = {**_told(token), "link": link, **_reach(url), **_authority(invites, urls)}
+    told["pages"] = [*urls]
+    if not given["draw"]:
+        return told
+    drawn = gatherResults([invites.drawn(text) for text in (link, str(told["certificate"]))], consumeErrors=True)
+    return drawn.addCallback(partial(_with_codes, told))
+
+
+def authority(ask: Ask) -> Content:
+    """The certificate that a browser has to trust, for whoever comes: it is no secret."""
+    pem = b"" if ask.board.invites is None else ask.board.invites.authority
+    if not pem:
+        raise Refusal("certificate", "the page is not served over TLS", "set tls = 'auto' below [web]", 404)
+    return Content(pem, "application/x-x509-ca-cert")
+
+
+def _with_codes(told: dict[str, Json], codes: list[str]) -> Json:
+    return {**told, "code": codes[0], "certificate_code": codes[1]}
+
+
+def _reach(url: str) -> dict[str, Json]:
+    """Who can open a page at ``url``, and whether a browser gives it the camera."""
+    is_here = is_loopback(urlsplit(url).hostname or "")
+    return {"is_secure": url.startswith("https:"), "reaches": "machine" if is_here else "network"}
+
+
+def _authority(invites: Invites, urls: list[str]) -> dict[str, Json]:
+    """Where the authority is to be had: without TLS, as who lacks it is warned of the other way."""
+    if not invites.authority:
+        return {"certificate": "", "fingerprint": ""}
+    plain = next((url for url in urls if url.startswith("http:")), urls[0])
+    return {"certificate": f"{plain}{API}/ca.crt", "fingerprint": invites.fingerprint}
 
 
 def _told(token: Token) -> dict[str, Json]:
@@ -60,11 +112,19 @@ ROUTES = (
         limit_s=4.5,
     ),
     Route("GET", f"{API}/session", "Who asks: anyone, until signed in", "anyone", session, gives="name, role"),
-    Route("DELETE", f"{API}/session", "Sign out: the token and its ticket let in nobody more", "anyone", sign_out),
+    Route(
+        "PUT",
+        f"{API}/session",
+        "Go on being signed in: another token for the session of the one that is sent, which stays good for its time",
+        "viewer",
+        renew,
+        gives="token, ticket, role, until (unix seconds)",
+    ),
+    Route("DELETE", f"{API}/session", "Sign out, at every web node of the team", "anyone", sign_out),
     Route(
         "POST",
         f"{API}/invitations",
-        "A token for somebody else, who signs in with it as a code, or for a program, which uses it as it is",
+        "A token for somebody else: a link for a person, who signs in by it, or for a program, which uses it as it is",
         "operator",
         invite,
         (
@@ -80,7 +140,18 @@ ROUTES = (
                 is_required=False,
                 unit="s",
             ),
+            Field("page", "text", "at which of this node's pages", least=0, is_required=False, default=""),
+            Field("draw", "flag", "as QR codes, too", is_required=False, default=False),
         ),
-        gives="token, ticket, role, until (unix seconds)",
+        gives="token, ticket, role, until (unix seconds), link, reaches (network, or this machine), is_secure, pages, "
+        "certificate (URL), fingerprint, code (SVG), certificate_code",
+    ),
+    Route(
+        "GET",
+        f"{API}/ca.crt",
+        "The team's authority, which a browser has to trust to open the page over TLS without a warning",
+        "anyone",
+        authority,
+        gives="application/x-x509-ca-cert",
     ),
 )

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from hashlib import blake2s
 from typing import Any
+
+from twisted.internet.defer import maybeDeferred
 
 from webnode.errors import Refusal
 from webnode.field import Json
@@ -23,20 +26,37 @@ def catalogue(ask: Ask) -> Json:
     return [dict(task) for task in ask.board.desk.catalogue()]
 
 
-def demo(ask: Ask) -> Json:
+def demo(ask: Ask) -> Any:
     """Run the demonstration."""
-    return {"id": ask.board.desk.run_demo()}
+    return maybeDeferred(ask.board.desk.run_demo, _id(ask, "demo")).addCallback(_named)
 
 
 def assign(ask: Ask) -> Any:
     """Assign one; the answer may be its id alone."""
-    answer = ask.board.desk.assign(ask.given["name"], ask.given["tolerates"], ask.given["group"])
-    return answer if isinstance(answer, dict) else {"id": answer}
+    given = ask.given["name"], ask.given["tolerates"], ask.given["group"]
+    return maybeDeferred(ask.board.desk.assign, *given, _id(ask, "task")).addCallback(_named)
+
+
+def _id(ask: Ask, what: str) -> str:
+    """The id of the task that this wish makes; any where its visitor gave it no name.
+
+    It is the same at every web node: a page whose node died before it answered asks the next one, and only the task's
+    own name tells that one whether the wish is new.
+    """
+    if not ask.id:
+        return ""
+    wish = "\n".join((what, ask.who.token_id, ask.id))
+    return blake2s(wish.encode(), digest_size=6).hexdigest()
+
+
+def _named(answer: Any) -> Json:
+    told: Json = answer if isinstance(answer, dict) else {"id": answer}
+    return told
 
 
 def preview(ask: Ask) -> Any:
     """Who could take one."""
-    return ask.board.desk.preview(ask.given["name"])
+    return ask.board.desk.preview(ask.given["name"], ask.given["group"])
 
 
 def _order(word: str, about: str, wish: Callable[[Ask], Callable[[str], Any]]) -> Route:
@@ -54,6 +74,7 @@ def _order(word: str, about: str, wish: Callable[[Ask], Callable[[str], Any]]) -
 
 
 NAME = Field("name", "text", "its name in the catalogue", most=64)
+GROUP = Field("group", "text", "tasks of one group are divided together", most=64, default="", is_required=False)
 ROUTES = (
     Route("GET", f"{API}/tasks", "The tasks, the newest first", "viewer", tasks, gives="a list of tasks"),
     Route(
@@ -90,7 +111,7 @@ ROUTES = (
                 default=1,
                 is_required=False,
             ),
-            Field("group", "text", "tasks of one group are divided together", most=64, default="", is_required=False),
+            GROUP,
         ),
         gives="id, able, refused (why, by name)",
         status=202,
@@ -101,8 +122,9 @@ ROUTES = (
         "Who could take a predefined task and who not, and why; nothing is assigned",
         "viewer",
         preview,
-        (NAME,),
-        gives="able (uuid, name, busy: its task now), refused (why, by name), likely (a name, or null)",
+        (NAME, GROUP),
+        gives="able (uuid, name, busy: its task now), refused (why, by name), likely (a name, or null), "
+        "together (id, title: what the group divides it with)",
     ),
     _order("cancel", "End a task; nobody is granted it any more", lambda ask: ask.board.desk.cancel),
     _order("pause", "Let a task rest; its devices stop and are free for others", lambda ask: ask.board.desk.pause),

@@ -4,6 +4,11 @@ import { frames } from "./link.js";
 import { panel } from "./panel.js";
 
 const cameras = new Map();
+const figures = new WeakMap();
+// One looks for all: which figures are in sight.
+const sight = new IntersectionObserver((entries) => {
+  for (const { target, isIntersecting } of entries) figures.get(target)?.seen(isIntersecting);
+});
 
 class Camera {
   constructor(uuid) {
@@ -20,8 +25,14 @@ class Camera {
     this.name = element("b");
     this.told = element("span", { class: "age" });
     this.figure = element("figure", { "data-camera": "wait" }, this.canvas, element("figcaption", {}, this.name, this.told));
-    this.watch = new IntersectionObserver(([entry]) => { this.visible = entry.isIntersecting; this.turn(); });
-    this.watch.observe(this.figure);
+    figures.set(this.figure, this);
+    sight.observe(this.figure);
+  }
+
+  seen(visible) {
+    this.visible = visible;
+    this.turn();
+    this.tell();
   }
 
   get wanted() {
@@ -82,7 +93,7 @@ class Camera {
 
   close() {
     this.closed = true;
-    this.watch.disconnect();
+    sight.unobserve(this.figure);
     this.flight?.abort();
   }
 }
@@ -116,7 +127,7 @@ panel({
   title: "Cameras",
   make() {
     document.addEventListener("visibilitychange", () => cameras.forEach((camera) => camera.turn()));
-    setInterval(() => cameras.forEach((camera) => camera.tell()), 250);
+    setInterval(() => cameras.forEach((camera) => { if (camera.visible) camera.tell(); }), 250);
     return {
       update(model, event) {
         if (event === "state") showCameras([...model.devices.values()]);

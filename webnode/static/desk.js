@@ -1,5 +1,5 @@
 // The desk: an operator's wishes on their way to the node, and the one line that says what came of them.
-import { at, words } from "./element.js";
+import { alike, at, several, words } from "./element.js";
 import { ask } from "./link.js";
 
 export function say(text) {
@@ -8,8 +8,8 @@ export function say(text) {
 
 // Who has a message, and who has not, and why.
 export function delivery({ delivered = [], failed = {} }) {
-  const no = Object.entries(failed).map(([name, why]) => ` ${name} has it not: ${why}.`).join("");
-  const yes = delivered.length ? ` to ${delivered.join(", ")}` : "";
+  const no = alike(failed).map(([names, why]) => ` ${several(names)} ${names.length > 1 ? "have" : "has"} it not: ${why}.`).join("");
+  const yes = delivered.length ? ` to ${several(delivered)}` : "";
   return no && !yes ? `Nobody has the message.${no}` : `Message sent${yes}.${no}`;
 }
 

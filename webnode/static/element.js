@@ -69,9 +69,28 @@ export function state(node, status) {
   words(node.lastChild, status.toLowerCase());
 }
 
+// The first of them, and how many more there are.
+export function several(names, most = 8) {
+  const more = names.length - most;
+  return more > 1 ? `${names.slice(0, most).join(", ")} and ${more} more` : names.join(", ");
+}
+
+// Who has the same reasons, with them: [names, reasons] each.
+export function alike(refused) {
+  const found = new Map();
+  for (const [name, reasons] of Object.entries(refused)) {
+    const why = [].concat(reasons).join(", ");
+    found.set(why, [...(found.get(why) ?? []), name]);
+  }
+  return [...found].map(([why, names]) => [names, why]);
+}
+
 export function span(seconds) {
   const s = Math.max(0, Math.round(seconds));
   if (s < 60) return `${s} s`;
   if (s < 3600) return `${Math.floor(s / 60)} min`;
   return s < 86400 ? `${Math.floor(s / 3600)} h` : `${Math.floor(s / 86400)} d`;
 }
+
+// How long a device is here, or gone.
+export const sojourn = ({ gone, since }, now) => (gone === null ? `here ${span(now - since)}` : `gone ${span(now - gone)}`);

@@ -4,12 +4,14 @@ import { wish } from "./desk.js";
 import { panel } from "./panel.js";
 
 const STANDS = "stands";
+const MOST = 8;
 const IDLE = ["has no robot", "goes on", STANDS];
 
 // What came of it: how many stand, and by name whoever says something else.
 function outcome(devices, { halted, devices: told }) {
   const name = (uuid) => devices.get(uuid)?.name ?? uuid.slice(0, 8);
-  const odd = Object.entries(told).filter(([, said]) => !IDLE.includes(said)).map(([uuid, said]) => ` ${name(uuid)} ${said}.`);
+  const strange = Object.entries(told).filter(([, said]) => !IDLE.includes(said)).map(([uuid, said]) => ` ${name(uuid)} ${said}.`);
+  const odd = strange.length > MOST ? [...strange.slice(0, MOST), ` And so on: ${strange.length} in all.`] : strange;
   const count = Object.values(told).filter((said) => said === STANDS).length;
   return `${halted ? `Stopped: ${count} ${count === 1 ? "robot stands" : "robots stand"}.` : "The team goes on."}${odd.join("")}`;
 }

@@ -1,5 +1,5 @@
 // The header: to which node the page is connected, and in one line what was done and what changed.
-import { at, attribute, words } from "./element.js";
+import { at, attribute, several, words } from "./element.js";
 import { say } from "./desk.js";
 import { panel } from "./panel.js";
 
@@ -31,7 +31,7 @@ function tellNews({ devices, tasks }, ...news) {
     if (before && before !== task.status) news.push(`${task.title}: ${task.status.toLowerCase()}`);
   }
   statuses = new Map([...devices, ...tasks].map(([key, each]) => [key, each.status]));
-  if (news.length) say(`${news.join(", ")}.`);
+  if (news.length) say(`${several(news)}.`);
 }
 
 // Which node serves, and which others could.

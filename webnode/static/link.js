@@ -1,14 +1,15 @@
 // The link: the one line from the page to its team; nobody else fetches anything.  When the node that serves is lost
 // it goes on with another one, and what was asked meanwhile is asked there.
 import { race, remember } from "./reserve.js";
-import { ticket, token } from "./session.js";
+import { keep, ticket, token } from "./session.js";
 import { stream } from "./stream.js";
 
 const API = "/api/v1/";
 const PATIENCE = 5000;
 const PAUSE = 300;
+const RENEWED = 4 * 3600_000;
 const VIEWER = Math.random().toString(36).slice(2, 12);
-const NAMES = ["state", "change", "yard", "event", "pages", "beat"];
+const NAMES = ["state", "change", "yard", "event", "pages", "ticket", "beat"];
 const flying = new Set();
 let here = location.origin;
 let finding = null;
@@ -51,8 +52,8 @@ export async function fly(address, options) {
   }
 }
 
-// A node does once what has one id, so that it can be asked again.  Another node knows nothing of that: there only
-// what may be done twice is repeated, which a new task is not.
+// A node does once what has one id, so that it can be asked again; the id of a new task is made of it, so that a task
+// that is asked for again at another node is the same one.
 async function call(method, path, body) {
   const order = method !== "GET";
   const signed = token() ? { Authorization: `Bearer ${token()}` } : {};
@@ -63,12 +64,12 @@ async function call(method, path, body) {
   };
   const end = performance.now() + PATIENCE;
   let answer;
-  for (let asked = here; !answer;) {
+  while (!answer) {
     try {
       answer = await fly(where(path), options);
     } catch {
       await Promise.race([find(), pause(Math.max(0, end - performance.now()))]);
-      if (performance.now() >= end || (asked !== here && method === "POST" && path === "tasks")) {
+      if (performance.now() >= end) {
         throw new Error(`The node does not answer. ${order ? "Nothing may have been done; look" : "Look"} at the state, then try again.`);
       }
       await pause(50);
@@ -104,6 +105,7 @@ export function open({ onEvent }) {
       last = id;
       losses = 0;
       if (name === "pages") remember(data);
+      if (name === "ticket") renew();
       onEvent("link", "live");
       onEvent(name, data);
     },
@@ -115,11 +117,16 @@ export function open({ onEvent }) {
     },
   });
 
+  // A page that is left open for days stays signed in; the stream is opened anew, as its address holds the old ticket.
+  const renew = () => token() && ask("PUT", "session").then((session) => { keep(session); look(); }, () => {});
+
   function look() {
     if (document.hidden) line.close();
     else line.open();
   }
 
   document.addEventListener("visibilitychange", look);
+  // One that is not looked at hears nothing, and cannot be told that it is time.
+  setInterval(() => { if (document.hidden) renew(); }, RENEWED);
   look();
 }

@@ -11,18 +11,19 @@ import { model, take } from "./model.js";
 import { go, start, tell } from "./shell.js";
 
 // What few need is loaded when it is there.
-const LATER = {
-  yard: { is: () => model.yard, load: () => import("./map.js") },
-  state: { is: () => [...model.devices.values()].some(({ capabilities }) => capabilities.camera), load: () => import("./cameras.js") },
-};
+const some = (what) => [...model.devices.values()].some(what);
+const LATER = [
+  { on: "yard", is: () => model.yard, load: () => import("./map.js") },
+  { on: "state", is: () => some(({ capabilities }) => capabilities.camera), load: () => import("./cameras.js") },
+  { on: "state", is: () => some(({ position }) => position), load: () => import("./positions.js") },
+];
 
 function onEvent(event, data) {
   if (event === "link" && data === model.link) return;
   take(event, data);
   // Panels read the model: to them a change is a state like any other.
   const told = event === "change" ? "state" : event;
-  const later = LATER[told];
-  if (later?.is()) later.loaded ??= later.load().then(() => tell(told));
+  for (const later of LATER) if (later.on === told && later.is()) later.loaded ??= later.load().then(() => tell(told));
   tell(told);
   // Another node may have other parts.
   if (event === "link" && data === "live") get("node").then(({ has }) => onEvent("has", has), () => {});

@@ -4,6 +4,7 @@ const PATIENCE = 800;
 const LEAD = 150;
 const KEPT = "swarm.pages";
 const isLoopback = (url) => /^https?:\/\/(127\.|localhost[:/]|localhost$|\[::1\])/.test(url);
+const isSecure = (url) => url.startsWith("https:");
 let pages = kept();
 
 // What was heard before counts for a page that the browser kept while its own node is gone.
@@ -24,10 +25,10 @@ export function remember(told) {
   }
 }
 
-// A page of this machine is meant for this machine alone, and no page over TLS may ask one without.
+// No page over TLS goes on with one without, and a page of this machine is meant for this machine alone.
 function reachable({ url }) {
-  if (isLoopback(url)) return isLoopback(location.origin);
-  return url.startsWith("https:") || location.protocol === "http:";
+  if (isSecure(location.origin) && !isSecure(url)) return false;
+  return !isLoopback(url) || isLoopback(location.origin);
 }
 
 // A node that is frozen still takes connections: only a full answer counts.

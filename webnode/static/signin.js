@@ -8,10 +8,12 @@ const PAUSE = 3000;
 let checking = false;
 let told = () => {};
 
-// The code of a link is used once and taken out of the address, so that it is in no bookmark and no screenshot.
+// The code of a link is used once and taken out of the address, so that it is in no bookmark and no screenshot; what
+// stands behind it is the view that the link leads to.
 function codeOfLink() {
-  const code = /^#code=(.+)$/.exec(location.hash)?.[1];
+  const [, code, view] = /^#code=([^/]+)(?:\/(.+))?$/.exec(location.hash) ?? [];
   if (code) history.replaceState(null, "", location.pathname + location.search);
+  if (view) location.hash = view;
   return code ? decodeURIComponent(code) : "";
 }
 
@@ -44,35 +46,31 @@ async function check(trouble = "") {
   told(me);
 }
 
-async function invite(line) {
-  const { token: code } = await ask("POST", "invitations", { role: "viewer" });
-  line.hidden = false;
-  line.value = `${location.origin}/#code=${code}`;
-  line.select();
-}
-
 panel({
   place: "more",
   order: 90,
   title: "Session",
   needs: { role: "viewer" },
-  make(root) {
+  make(root, { model }) {
     const who = element("p", { class: "hint" });
     const out = element("button", {}, "Sign out");
-    const more = element("button", { class: "operators" }, "Invite a viewer");
-    const address = element("input", { readonly: "", hidden: "", "aria-label": "Link for a viewer, good for a day" });
+    const more = element("button", { class: "operators" }, "Invite …");
     const trouble = element("p", { role: "status" });
     out.onclick = async () => {
       await ask("DELETE", "session").catch(() => null);
       forget();
       location.reload();
     };
-    more.onclick = () => invite(address).then(() => words(trouble, "Whoever has this link may look for a day."), (error) => words(trouble, error.message));
+    // What an invitation is made of is fetched when somebody invites.
+    more.onclick = () => {
+      words(trouble, "");
+      import("./invite.js").then(({ open }) => open(model)).catch((error) => words(trouble, error.message));
+    };
     let link = "wait";
     // A stream that ends may have ended because the session did.
     const timer = setInterval(() => { if (link === "lost" && !checking) check(); }, PAUSE);
     root.className = "session";
-    root.append(who, element("div", { class: "row" }, more, out), address, trouble);
+    root.append(who, element("div", { class: "row" }, more, out), trouble);
     return {
       update(model) {
         link = model.link;

@@ -1,5 +1,5 @@
 // Tasks: choosing a predefined one, seeing what became of each, and taking it back.
-import { at, attribute, badge, element, keyed, state, words } from "./element.js";
+import { alike, at, attribute, badge, element, keyed, several, state, words } from "./element.js";
 import { say, wish } from "./desk.js";
 import { ask, get } from "./link.js";
 import { panel } from "./panel.js";
@@ -14,7 +14,7 @@ function showTasks(tasks) {
     words(item.querySelector("b"), task.title);
     state(item.querySelector(".badge"), task.status);
     const result = task.result ? `Done by ${task.result.by} in ${task.result.took.toFixed(1)} s. ` : "";
-    words(item.querySelector(".note"), result + task.note);
+    words(item.querySelector(".note"), (task.group && `Group ${task.group}. `) + result + task.note);
     why(item.querySelector(".why"), task.why);
     const [button, rest] = item.querySelectorAll("button");
     button.hidden = rest.hidden = ENDED.includes(task.status);
@@ -64,8 +64,8 @@ function why(box, epochs) {
 }
 
 function outcome({ able = [], refused = {} }) {
-  const no = Object.entries(refused).map(([name, reasons]) => `${name} cannot: ${[].concat(reasons).join(", ")}`);
-  const yes = able.length ? [`Assigned to ${able.join(", ")}`] : no.length ? ["Nobody can take it"] : ["Assigned"];
+  const no = alike(refused).map(([names, why]) => `${several(names)} cannot: ${why}`);
+  const yes = able.length ? [`Assigned to ${several(able)}`] : no.length ? ["Nobody can take it"] : ["Assigned"];
   return `${[...yes, ...no].join(". ")}.`;
 }
 
@@ -82,7 +82,8 @@ function startTasks() {
   at("assign").addEventListener("submit", (event) => {
     event.preventDefault();
     if (!at("task").value) return say("There is no predefined task to assign.");
-    wish("Assigning", "tasks", { body: { name: at("task").value }, done: outcome });
+    const group = at("group").value.trim();
+    wish("Assigning", "tasks", { body: { name: at("task").value, ...(group && { group }) }, done: outcome });
   });
   at("demo").addEventListener("click", async () => {
     at("demo").disabled = true;

@@ -6,12 +6,13 @@ import contextlib
 import io
 import socket
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from sim.demo import port
+from sim.demo import port, stage
 from sim.demo.configuration import DOGS, Plan
 from sim.demo.demonstration import main
 from sim.demo.experiment import LIMIT_S, Experiment, report, table, to_target
@@ -224,6 +225,14 @@ class ConfigurationTests(SynchronousTestCase):
             (self.tables["pi"]["node"]["roles"], set(self.tables["pi"])), (["edge", "web"], {"node", "web", "faults"})
         )
 
+    def test_page_over_tls(self) -> None:
+        """Where it was planned, each web node serves the page over TLS at a port of its own, and no dog does."""
+        texts = replace(self.plan, tls_ports=(8443, 8444)).texts()
+        tables = {name: tomllib.loads(text) for name, text in texts.items()}
+        self.assertEqual(tables["vaio"]["web"], {**self.tables["vaio"]["web"], "tls": "auto", "tls_port": 8443})
+        self.assertEqual(tables["pi"]["web"]["tls_port"], 8444)
+        self.assertEqual(tables["dog1"], self.tables["dog1"])
+
 
 class EventStreamTests(SynchronousTestCase):
     """Server-sent events come out of bytes."""
@@ -250,6 +259,14 @@ class StageTests(SynchronousTestCase):
 
     def setUp(self) -> None:
         self.folder = Path(self.mktemp())
+
+    def test_ports_of_one_plan_differ(self) -> None:
+        """A port of the page that was asked for is not given to the page over TLS as well."""
+        (wanted,) = port.free("tcp", "127.0.0.1", 1)
+        self.patch(stage, "TLS_PORT", wanted)
+        plan = arranged(self.folder, "127.0.0.1", wanted, True, lambda line: None, True)
+        ports = [plan.web_port, plan.reserve_port, *plan.tls_ports, plan.yard_port]
+        self.assertEqual((plan.web_port, len(set(ports))), (wanted, 5))
 
     def test_foreign_folder_is_refused(self) -> None:
         """A folder with somebody's file in it is refused and left as it is."""

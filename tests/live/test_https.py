@@ -1,0 +1,159 @@
+"""Real web nodes that serve the page over TLS, asked by a client that trusts the team's authority and nothing else."""
+
+from __future__ import annotations
+
+import json
+import socket
+import ssl
+import subprocess
+import time
+import urllib.error
+import urllib.request
+from importlib.util import find_spec
+from typing import Any
+
+from sim.demo import port
+from tests.live.test_bad_input import PATIENCE_S, LiveTests
+
+MISSING = [name for name in ("flask", "OpenSSL", "cryptography") if find_spec(name) is None]
+DRIBBLED_S = 20.0
+"""Within 12 s where the machine has nothing else to do."""
+CODE = "quiet-otter"
+
+
+class SecureNode:
+    """A web node in a process of its own, with the page at ``plain`` and at ``secure``."""
+
+    def __init__(self, test: LiveTests, name: str, known: str = "", key: str = "of these tests") -> None:
+        http, https = port.free("tcp", "127.0.0.1", 2)
+        (udp,) = port.free("udp", "127.0.0.1", 1)
+        path = test.folder / f"{name}.toml"
+        path.write_text(
+            f'[node]\nname = "{name}"\nport = {udp}\nroles = ["web"]\nstore = "{name}.sqlite"\nteam_key = "{key}"\n'
+            f"known_nodes = {json.dumps([known] if known else [])}\n"
+            f'[web]\nport = {http}\ntls = "auto"\ntls_port = {https}\ncode = "{CODE}"\n',
+            encoding="utf-8",
+        )
+        self.address = f"127.0.0.1:{udp}"
+        self.plain, self.secure = f"http://127.0.0.1:{http}", f"https://127.0.0.1:{https}"
+        self.port = https
+        self.process: subprocess.Popen[str] = test.start("--config", str(path))
+        test.addCleanup(self.process.communicate)
+        test.addCleanup(self.process.kill)
+        end = time.monotonic() + PATIENCE_S
+        while True:
+            try:
+                self.authority = asked(f"{self.plain}/api/v1/ca.crt").decode()
+                break
+            except OSError:
+                test.assertIsNone(self.process.poll(), "the node has ended")
+                test.assertLess(time.monotonic(), end, "the node does not answer")
+                time.sleep(0.1)
+
+
+def asked(url: str, trust: ssl.SSLContext | None = None, body: object = None, token: str = "") -> bytes:
+    """The body of an answer."""
+    data = None if body is None else json.dumps(body).encode()
+    headers = {"Content-Type": "application/json", **({"Authorization": f"Bearer {token}"} if token else {})}
+    with urllib.request.urlopen(urllib.request.Request(url, data, headers), timeout=10, context=trust) as answer:
+        content: bytes = answer.read()
+    return content
+
+
+class HttpsTests(LiveTests):
+    if MISSING:
+        skip = f"THE PAGE OVER TLS IS NOT TESTED: missing {', '.join(MISSING)} (pip install 'swarm-node[tls]')"
+
+    def trusting(self, node: SecureNode, **versions: Any) -> ssl.SSLContext:
+        """What trusts the authority of the node's team, and checks the address."""
+        trust = ssl.create_default_context(cadata=node.authority)
+        for name, version in versions.items():
+            setattr(trust, name, version)
+        return trust
+
+    def test_serve_all_of_the_page(self) -> None:
+        """Page, scripts, API and stream come over TLS 1.2 or newer to who trusts the team, and to nobody else."""
+        node = SecureNode(self, "vaio")
+        trust = self.trusting(node)
+        self.assertIn(b"<title>Swarm</title>", asked(node.secure, trust))
+        self.assertIn(b"import", asked(f"{node.secure}/static/page.js", trust))
+        session = json.loads(asked(f"{node.secure}/api/v1/session", trust, {"code": CODE}))
+        state = json.loads(asked(f"{node.secure}/api/v1/state", trust, token=session["token"]))
+        self.assertEqual([device["name"] for device in state["devices"]], ["vaio"])
+        pages = json.loads(asked(f"{node.plain}/api/v1/node"))["pages"]
+        self.assertEqual(
+            {(page["url"], page["is_secure"]) for page in pages}, {(node.plain, False), (node.secure, True)}
+        )
+        stream = urllib.request.urlopen(
+            f"{node.secure}/events?whole=1&ticket={session['ticket']}", timeout=10, context=trust
+        )
+        self.addCleanup(stream.close)
+        heard = b""
+        while b"event: beat" not in heard:
+            heard += stream.readline()
+        self.assertIn(b'"vaio"', heard)
+        self.assertNotIn("Strict-Transport-Security", stream.headers)
+        self.assertIn("default-src 'self'", stream.headers["Content-Security-Policy"])
+        error = self.assertRaises(urllib.error.URLError, asked, node.secure, ssl.create_default_context())
+        self.assertIn("CERTIFICATE_VERIFY_FAILED", str(error))
+        old = self.trusting(node, minimum_version=ssl.TLSVersion.TLSv1, maximum_version=ssl.TLSVersion.TLSv1_1)
+        self.assertRaises(urllib.error.URLError, asked, node.secure, old)
+        self.assertIn(b"vaio", asked(node.secure, self.trusting(node, maximum_version=ssl.TLSVersion.TLSv1_2)))
+
+    def test_keep_the_guard(self) -> None:
+        """What is refused at the plain port is refused at the other: a foreign host or site, no session, too much."""
+        node = SecureNode(self, "vaio")
+        trust = self.trusting(node)
+        for path, headers, body, status in (
+            ("/api/v1/state", {}, None, 401),
+            ("/api/v1/node", {"Host": "evil.example.org"}, None, 403),
+            ("/api/v1/demo", {"Origin": "https://evil.example.org", "X-Swarm": "1"}, b"{}", 403),
+            ("/api/v1/demo", {"X-Swarm": "1"}, bytes(70_000), 413),
+        ):
+            request = urllib.request.Request(node.secure + path, body, headers)
+            error = self.assertRaises(
+                urllib.error.HTTPError, urllib.request.urlopen, request, timeout=10, context=trust
+            )
+            told = json.loads(error.read())
+            self.assertEqual((error.code, set(told["error"])), (status, {"field", "problem", "remedy"}))
+
+    def test_trust_the_team_once(self) -> None:
+        """Who trusts the authority of one web node trusts the other one; a node that starts again is the same."""
+        first, second = SecureNode(self, "vaio"), SecureNode(self, "pi")
+        self.assertEqual(first.authority, second.authority)
+        self.assertIn(b"pi", asked(second.secure, self.trusting(first)))
+        stranger = SecureNode(self, "stranger", key="of another team")
+        self.assertRaises(urllib.error.URLError, asked, stranger.secure, self.trusting(first))
+        before = ssl.get_server_certificate(("127.0.0.1", first.port))
+        first.process.terminate()
+        first.process.communicate()
+        again = SecureNode(self, "vaio")
+        self.assertEqual(ssl.get_server_certificate(("127.0.0.1", again.port)), before)
+
+    def test_let_go_who_dribbles_a_handshake(self) -> None:
+        """Forty that dribble a handshake, say nothing or speak no TLS are closed in time; others are served."""
+        node = SecureNode(self, "vaio")
+        began = time.monotonic()
+        slow = [socket.create_connection(("127.0.0.1", node.port), 5.0) for _ in range(40)]
+        for client in slow:
+            self.addCleanup(client.close)
+            client.setblocking(False)
+        slow[0].send(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+        left = set(slow)
+        for n in range(int(DRIBBLED_S)):
+            for client in list(left):
+                try:
+                    if client is not slow[1]:
+                        client.send(b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03"[n : n + 1] or b"x")
+                    if client.recv(100) == b"":
+                        left.discard(client)
+                except BlockingIOError:
+                    continue
+                except OSError:
+                    left.discard(client)
+            if not left:
+                break
+            self.assertIn(b"Swarm", asked(node.secure, self.trusting(node)))
+            time.sleep(1.0)
+        self.assertEqual(left, set())
+        self.assertLess(time.monotonic() - began, DRIBBLED_S)

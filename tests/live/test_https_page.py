@@ -1,0 +1,67 @@
+"""The page over TLS in a real browser that trusts the team's certificates: a secure context, which stays one."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import signal
+import ssl
+from importlib.util import find_spec
+from typing import Any
+
+from tests.live.page import CHROMIUM, DESK, FLAGS
+from tests.live.page import MISSING as NO_BROWSER
+from tests.live.test_bad_input import LiveTests
+from tests.live.test_https import CODE, SecureNode, asked
+
+MISSING = [*NO_BROWSER, *(name for name in ("OpenSSL", "cryptography") if find_spec(name) is None)]
+FOUND_S = 30.0
+"""For two nodes to know each other's pages, on a busy machine."""
+MOVED_S = 15.0
+"""Within 2 s where the machine has nothing else to do."""
+
+
+def pin(port: int) -> str:
+    """What Chromium is told to trust: the hash of the public key of the certificate that is served there."""
+    from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
+    from cryptography.x509 import load_pem_x509_certificate
+
+    served = load_pem_x509_certificate(ssl.get_server_certificate(("127.0.0.1", port)).encode())
+    key = served.public_key().public_bytes(Encoding.DER, PublicFormat.SubjectPublicKeyInfo)
+    return base64.b64encode(hashlib.sha256(key).digest()).decode()
+
+
+class HttpsPageTests(LiveTests):
+    if MISSING:
+        skip = f"THE PAGE OVER TLS IS NOT TESTED IN A BROWSER: missing {'; '.join(MISSING)}"
+
+    def test_stay_secure_when_the_node_is_lost(self) -> None:
+        """The page has camera and service worker within reach, and goes on at another node's https, never at http."""
+        from playwright.sync_api import sync_playwright
+
+        first = SecureNode(self, "vaio")
+        second = SecureNode(self, "pi", first.address)
+        play: Any = sync_playwright().start()
+        self.addCleanup(play.stop)
+        pins = ",".join(pin(node.port) for node in (first, second))
+        browser = play.chromium.launch(
+            executable_path=CHROMIUM, args=[*FLAGS, f"--ignore-certificate-errors-spki-list={pins}"]
+        )
+        self.addCleanup(browser.close)
+        page = browser.new_context(**DESK).new_page()
+        page.set_default_timeout(1000 * FOUND_S)
+        wanted: list[str] = []
+        page.on("request", lambda request: wanted.append(request.url))
+        page.goto(f"{first.secure}/#code={CODE}")
+        page.locator("#link[data-link=live]").wait_for()
+        self.assertTrue(page.evaluate("isSecureContext && !!navigator.mediaDevices?.getUserMedia"))
+        self.assertTrue(page.evaluate("navigator.serviceWorker.ready.then(({ active }) => !!active)"))
+        page.locator("#reserve", has_text="pi in reserve").wait_for()
+        told = json.loads(asked(f"{first.plain}/api/v1/node"))["pages"]
+        self.assertEqual({each["url"] for each in told}, {first.plain, first.secure, second.plain, second.secure})
+        first.process.send_signal(signal.SIGKILL)
+        page.locator("#node", has_text="pi").wait_for(timeout=1000 * MOVED_S)
+        page.locator("#link[data-link=live]").wait_for(timeout=1000 * MOVED_S)
+        self.assertTrue(any(url.startswith(f"{second.secure}/events") for url in wanted))
+        self.assertEqual([url for url in wanted if url.startswith("http:")], [])

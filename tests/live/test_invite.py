@@ -1,0 +1,129 @@
+"""Inviting in a real browser: the code that a phone's camera reads, the text beside it, and what is said of https."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from typing import Any
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from tests.live.page import CHROMIUM, DESK, FLAGS, MISSING, PHONE, TABLET, Team
+
+ABSENT = [*MISSING, *([] if find_spec("segno") else ["the Python package segno"])]
+PHONES = """async () => {
+  const { model } = await import("/static/model.js");
+  while (!model.has.includes("invites")) await new Promise((done) => setTimeout(done, 20));
+  model.has = [...model.has, "phones"];
+}"""
+"""The page's node takes phones."""
+
+
+class InviteTests(SynchronousTestCase):
+    if ABSENT:
+        skip = f"INVITING IS NOT TESTED IN A BROWSER: missing {'; '.join(ABSENT)}"
+
+    def setUp(self) -> None:
+        from playwright.sync_api import sync_playwright
+
+        self.team = Team()
+        self.addCleanup(lambda: self.team.stop())
+        play: Any = sync_playwright().start()
+        self.addCleanup(play.stop)
+        self.browser = play.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        self.addCleanup(self.browser.close)
+
+    def opened(self, screen: dict[str, Any], scheme: Any = "light", fragment: str = "") -> Any:
+        context = self.browser.new_context(**screen, color_scheme=scheme, reduced_motion="reduce")
+        self.addCleanup(context.close)
+        page = context.new_page()
+        page.set_default_timeout(8000)
+        self.faults: list[str] = []
+        page.on("pageerror", lambda error: self.faults.append(str(error)))
+        page.on("console", lambda words: self.faults.append(words.text) if words.type == "error" else None)
+        page.goto(f"{self.team.url}{fragment or f'#code={self.team.code}'}")
+        page.locator("#link[data-link=live]").wait_for()
+        return page
+
+    def invite(self, page: Any) -> None:
+        """Open the dialog by keyboard alone."""
+        page.locator(".device").nth(2).wait_for(state="attached")
+        page.evaluate(PHONES)
+        page.evaluate("location.hash = 'more'")
+        page.get_by_role("button", name="Invite").focus()
+        page.keyboard.press("Enter")
+        page.locator("#invite[open]").wait_for()
+
+    def read(self, page: Any, number: int = 0) -> str:
+        """What a camera reads off the screen."""
+        import cv2
+        import numpy as np
+
+        shot = page.locator("#invite .code").nth(number).screenshot()
+        picture: Any = cv2.imdecode(np.frombuffer(shot, np.uint8), 1)
+        return str(cv2.QRCodeDetector().detectAndDecode(picture)[0])
+
+    def test_read_the_code(self) -> None:
+        """On each screen, light and dark, the code says what the text says; axe finds nothing, nothing is small."""
+        from axe_playwright_python.sync_playwright import Axe
+
+        for screen in (PHONE, TABLET, DESK):
+            for scheme in ("light", "dark"):
+                page = self.opened(screen, scheme)
+                self.invite(page)
+                link = page.locator("#i-link").input_value()
+                self.assertTrue(link.startswith("https://192.168.0.7:8443/#code=") and link.endswith("/phone"), link)
+                self.assertEqual(self.read(page), link)
+                self.assertEqual(self.read(page, 1), "http://192.168.0.7:8080/api/v1/ca.crt")
+                page.locator("#invite summary").first.click()
+                found = Axe().run(page).response["violations"]
+                self.assertEqual([(each["id"], each["nodes"][0]["html"]) for each in found], [])
+                self.assertLessEqual(page.evaluate("document.documentElement.scrollWidth - innerWidth"), 0)
+                small = page.evaluate(
+                    "[...document.querySelectorAll('#invite :is(button, select, input, summary)')]"
+                    ".filter((each) => each.getBoundingClientRect().height < 44).map((each) => each.outerHTML)"
+                )
+                self.assertEqual(small, [])
+                self.assertEqual(self.faults, [])
+                page.context.close()
+
+    def test_say_what_is_missing(self) -> None:
+        """By http the camera is said to be out of reach; an address of this machine is no address for a phone."""
+        page = self.opened(PHONE)
+        self.invite(page)
+        self.assertFalse(page.get_by_text("no browser gives a page the camera").is_visible())
+        page.locator("#i-page").select_option("http://192.168.0.7:8080")
+        page.get_by_text("no browser gives a page the camera").wait_for()
+        self.assertTrue(self.read(page).startswith("http://192.168.0.7:8080/#code="))
+        page.locator("#i-kind").select_option("viewer")
+        page.locator("#invite", has_text="may look").wait_for()
+        self.assertFalse(page.get_by_text("no browser gives a page the camera").is_visible())
+        page.locator("#i-page").select_option(index=2)
+        page.get_by_text("WEB_HOST=0.0.0.0").wait_for()
+        self.assertFalse(page.locator("#invite .code").first.is_visible())
+        self.assertTrue(page.locator("#i-link").input_value().startswith("http://127.0.0.1:"))
+
+    def test_lead_to_the_phone(self) -> None:
+        """The link of a phone signs it in as one, leads to its view, and leaves no token in the address."""
+        page = self.opened(DESK)
+        self.invite(page)
+        link = page.locator("#i-link").input_value()
+        page.get_by_role("button", name="Copy").first.click()
+        page.locator("#invite [role=status]", has_text="op").wait_for()
+        # What is held down in an emergency works before the dialog, and after it.
+        page.get_by_role("button", name="Stop").click()
+        page.locator("body[data-halted=true]").wait_for()
+        page.keyboard.press("Escape")
+        page.locator("#invite").wait_for(state="detached")
+        self.assertTrue(page.get_by_role("button", name="Stop").is_visible())
+        page.goto("about:blank")
+        context = self.browser.new_context(**PHONE)
+        self.addCleanup(context.close)
+        phone = context.new_page()
+        phone.goto(f"{self.team.url}#{link.partition('#')[2]}")
+        phone.wait_for_function("location.hash === '#phone'")
+        self.assertNotIn("code", phone.url)
+        role = phone.evaluate(
+            "fetch('/api/v1/session', {headers: {Authorization: 'Bearer ' + "
+            "JSON.parse(localStorage['swarm-session']).token}}).then(answer => answer.json())"
+        )
+        self.assertEqual(role["role"], "phone")

@@ -1,0 +1,71 @@
+"""Where devices say that they are, on a page without a yard."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from tests.live.page import DESK, PHONE, TABLET, PageCase
+
+BOX = "e => { const b = e.getBoundingClientRect(); return [b.x + b.width / 2, b.y + b.height / 2]; }"
+
+
+class PositionTests(PageCase):
+    def centre(self, page: Any, name: str) -> list[float]:
+        """Where a device is drawn, in pixels."""
+        return list(page.locator(f".spot[aria-label^={name}] .dot").evaluate(BOX))
+
+    def test_draw_to_scale(self) -> None:
+        """Metres are drawn to one scale, y upwards, with a bar that says how long it is; a tap opens the device."""
+        self.team.order("outdoors")
+        for place in ("dog1 x=0 y=0 heading=0", "dog2 x=30 y=0 heading=1.5708", "dog3 x=0 y=12 heading=0"):
+            self.team.order(f"place {place}")
+        page = self.opened(PHONE)
+        page.get_by_role("link", name="Map", exact=True).tap()
+        page.locator("#spots .spot").nth(2).wait_for()
+        one, two, three = (self.centre(page, f"dog{n}") for n in (1, 2, 3))
+        metre = (two[0] - one[0]) / 30
+        self.assertLess(abs(one[1] - three[1] - (12 * metre)), 2)
+        self.assertLess(abs(one[1] - (two[1])), 1)
+        self.assertEqual(page.locator(".scale text").text_content(), "10 m")
+        bar = page.locator(".scale path").evaluate("e => e.getBoundingClientRect().width")
+        self.assertLess(abs(bar - (10 * metre)), 4)
+        self.assertIn("30.00, 0.00 m, looking along 90°", page.locator(".places").inner_text())
+        self.assertEqual(page.locator("#map:visible, #put:visible, #place:visible").count(), 0)
+        self.team.order("place dog3 x=0 y=6 heading=0")
+        page.locator(".spot[aria-label*='0.00, 6.00 m']").wait_for()
+        self.assertLess(abs(self.centre(page, "dog1")[1] - self.centre(page, "dog3")[1] - (6 * metre)), 2)
+        page.locator(".spot[aria-label^=dog3] .reach").tap()
+        page.locator("#d-name", has_text="dog3").wait_for()
+
+    def test_draw_by_the_globe(self) -> None:
+        """Latitude and longitude are drawn north up with what they are good to; another frame is listed and said."""
+        self.team.order("outdoors")
+        self.team.order("place dog1 lat=48.1371 lon=11.5754 accuracy=8")
+        self.team.order("place dog2 lat=48.1372 lon=11.5757 accuracy=25")
+        self.team.order("place dog3 x=1 y=1 heading=0")
+        for screen, scheme in ((PHONE, "light"), (TABLET, "dark"), (DESK, "light")):
+            page = self.opened(screen, scheme)
+            self.view(page, "map")
+            page.locator("#spots .spot").nth(1).wait_for()
+            one, two = self.centre(page, "dog1"), self.centre(page, "dog2")
+            # 22.3 m to the east and 11.1 m to the north.
+            self.assertLess(abs((two[0] - one[0]) / (one[1] - two[1]) - (22.3 / 11.13)), 0.1)
+            self.assertIn("north is up. 1 more is reported in another frame", page.locator("#place-map").inner_text())
+            self.assertIn("48.13710°, 11.57540°, to 8.0 m", page.locator(".places").inner_text())
+            self.assertIn("dog3 1.00, 1.00 m", page.locator(".places").inner_text())
+            self.tab_to(page, ".spot[aria-label^=dog2]")
+            page.keyboard.press("Enter")
+            page.locator("#d-name", has_text="dog2").wait_for()
+            page.keyboard.press("Escape")
+            page.locator("dialog[open]").wait_for(state="hidden")
+            self.sound(page)
+
+    def test_leave_it_to_the_yard(self) -> None:
+        """Where there is a yard it is shown, whatever devices report."""
+        self.team.order("place dog1 x=1 y=1 heading=0")
+        page = self.opened(DESK)
+        page.locator("#map .dog").nth(2).wait_for()
+        page.wait_for_function("performance.getEntriesByType('resource').some(e => e.name.endsWith('positions.js'))")
+        page.locator("#put").wait_for()
+        self.assertFalse(page.locator("#spots").is_visible())
+        self.assertEqual(page.locator("#h-yard").inner_text(), "Yard")

@@ -1,0 +1,62 @@
+"""Tests of ``swarmnode.ballast``: processes that speak no TLS leave pyOpenSSL alone, though it is installed."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from twisted.trial.unittest import SynchronousTestCase
+
+ROOT = Path(__file__).resolve().parents[2]
+LOADED = "pyOpenSSL is loaded"
+NODE = """
+import sys
+from twisted.scripts.twistd import ServerOptions
+options = ServerOptions()
+options.parseOptions(["-n", "swarm-node", "--name", "a", *sys.argv[1:]])
+options.subOptions
+from twisted.internet import reactor
+"""
+
+
+class BallastTests(SynchronousTestCase):
+    def said(self, *words: str) -> str:
+        """What Python prints with these words, where a pyOpenSSL is installed that says so when it is loaded."""
+        folder = Path(self.mktemp()) / "OpenSSL"
+        folder.mkdir(parents=True)
+        text = f"print({LOADED!r})\nraise ImportError('it is none')\n"
+        (folder / "__init__.py").write_text(text, encoding="utf-8")
+        path = os.pathsep.join((str(folder.parent.resolve()), str(ROOT)))
+        child = subprocess.run(
+            [sys.executable, *words],
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
+            timeout=60,
+            env={**os.environ, "PYTHONPATH": path},
+        )
+        return child.stdout + child.stderr
+
+    def test_load_nothing_for_plain_nodes(self) -> None:
+        """A node without TLS has a reactor without pyOpenSSL, also if it serves the page."""
+        for roles in ("edge", "edge,web"):
+            told = self.said("-c", NODE, "--roles", roles)
+            self.assertEqual(told, "", roles)
+
+    def test_load_it_for_tls(self) -> None:
+        """A node that serves the page over TLS gets it."""
+        self.assertIn(LOADED, self.said("-c", NODE, "--roles", "web", "--web-tls", "auto"))
+
+    def test_load_nothing_for_commands(self) -> None:
+        """The demonstration, the yard and the other commands have none, by either name."""
+        nowhere = ("--host", "203.0.113.1")
+        for words in (("-m", "sim.demo", "--help"), ("-m", "sim.server", *nowhere)):
+            told = self.said(*words)
+            self.assertNotIn(LOADED, told)
+            self.assertNotIn("Traceback", told)
+        for verb in (("demo", "--help"), ("trials", "--help"), ("yard", *nowhere)):
+            told = self.said("-c", f"from swarmnode.command import main; main({list(verb)!r})")
+            self.assertNotIn(LOADED, told)
+            self.assertNotIn("Traceback", told)

@@ -1,0 +1,142 @@
+"""Tests of ``webnode.certificate``: one authority for the team, which vouches for the local network alone."""
+
+from __future__ import annotations
+
+import ipaddress
+import random
+from datetime import UTC, datetime, timedelta
+from importlib.util import find_spec
+from typing import Any
+
+from twisted.trial.unittest import SynchronousTestCase
+
+MISSING = find_spec("cryptography") is None
+if not MISSING:
+    from cryptography import x509
+    from cryptography.hazmat.primitives.asymmetric import rsa
+    from cryptography.hazmat.primitives.hashes import SHA256
+    from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
+    from cryptography.x509.verification import PolicyBuilder, Store, VerificationError
+
+    from webnode.certificate import LASTS, LEFT, Authority, Leaf, authority, leaf, nameable, read
+
+SKIP = "CERTIFICATES ARE NOT TESTED: missing cryptography (pip install 'swarm-node[tls]')"
+NOW = datetime(2026, 11, 22, tzinfo=UTC).timestamp()
+DAY = 86400.0
+SECRET = bytes(range(32))
+
+
+class AuthorityTests(SynchronousTestCase):
+    if MISSING:
+        skip = SKIP
+
+    def test_be_the_same_at_every_node(self) -> None:
+        """One secret gives one authority, byte for byte and for good; another secret another one, by another name."""
+        first, second, other = authority(SECRET), authority(SECRET), authority(bytes(32))
+        self.assertEqual(first.pem, second.pem)
+        self.assertTrue(first.fingerprint.startswith("A6:BA:20:80:5C:67"), first.fingerprint)
+        self.assertNotEqual(other.fingerprint, first.fingerprint)
+        self.assertNotEqual(other.certificate.subject, first.certificate.subject)
+
+    def test_vouch_for_the_local_network_alone(self) -> None:
+        """What it signs is believed of private addresses and local names, and of no site of the internet."""
+        signer = authority(SECRET)
+        for name in ("192.168.0.7", "10.1.2.3", "127.0.0.1", "fd00::7", "vaio.local", "vaio.home.arpa", "localhost"):
+            self.assertTrue(self.is_believed(signer, leaf(signer, "vaio", [name], NOW, random.Random(1)), name), name)
+        for name in ("example.org", "local.example.org", "8.8.8.8", "2001:db8::7"):
+            self.assertFalse(self.is_believed(signer, forged(signer, name), name), name)
+            self.assertNotIn(name, nameable([name]))
+
+    def is_believed(self, signer: Authority, made: Leaf, name: str) -> bool:
+        """Whether a strict client that trusts the authority takes the leaf for ``name``."""
+        try:
+            wanted: Any = x509.IPAddress(ipaddress.ip_address(name))
+        except ValueError:
+            wanted = x509.DNSName(name)
+        moment = datetime.fromtimestamp(NOW, UTC)
+        verifier = PolicyBuilder().store(Store([signer.certificate])).time(moment).build_server_verifier(wanted)
+        try:
+            verifier.verify(made.certificate, [])
+        except VerificationError:
+            return False
+        return True
+
+
+class LeafTests(SynchronousTestCase):
+    if MISSING:
+        skip = SKIP
+
+    def setUp(self) -> None:
+        self.signer = authority(SECRET)
+        self.names = ["192.168.0.7", "vaio.local"]
+        self.leaf = leaf(self.signer, "vaio", self.names, NOW, random.Random(1))
+
+    def flaw(self, now: float = NOW, names: list[str] | None = None) -> str:
+        return self.leaf.flaw(self.signer, self.names if names is None else names, now)
+
+    def test_serve_for_a_year_less_a_month(self) -> None:
+        """It is good now and until a month before it ends; then, or before it is valid, it says so."""
+        self.assertEqual(self.flaw(), "")
+        self.assertEqual(self.flaw(NOW + (LASTS - LEFT).total_seconds() - 3 * DAY), "")
+        self.assertEqual(self.flaw(NOW + (LASTS - LEFT).total_seconds()), "it runs out")
+        self.assertEqual(self.flaw(NOW - 3 * DAY), "it is not valid yet")
+        lasts = self.leaf.certificate.not_valid_after_utc - self.leaf.certificate.not_valid_before_utc
+        self.assertEqual(lasts, timedelta(days=365))
+
+    def test_name_what_it_lacks(self) -> None:
+        """An address that it lacks is named; one for which nothing can be signed is not missed."""
+        self.assertEqual(self.flaw(names=["192.168.0.8"]), "it lacks 192.168.0.8")
+        self.assertEqual(self.flaw(names=["8.8.8.8", "example.org", "fe80::1%eth0", "", "a b.local", "-"]), "")
+        self.assertEqual(self.flaw(names=["::ffff:192.168.0.7", "VAIO.local.", "127.0.0.1", "localhost"]), "")
+
+    def test_tell_a_foreign_one(self) -> None:
+        """One that another team's authority signed, or whose key is another one's, is not taken."""
+        self.assertIn("another team", self.leaf.flaw(authority(bytes(32)), self.names, NOW))
+        other = leaf(self.signer, "vaio", self.names, NOW, random.Random(2))
+        self.assertIn("key", Leaf(other.key, self.leaf.certificate).flaw(self.signer, self.names, NOW))
+
+    def test_bear_any_clock(self) -> None:
+        """A clock that is decades off makes a lawful certificate all the same; it is renewed when the clock is set."""
+        for now in (0.0, -1e12, 9e9, 1e300):
+            made = leaf(self.signer, "pi", [], now, random.Random(1))
+            self.assertLess(made.certificate.not_valid_before_utc, made.certificate.not_valid_after_utc)
+            self.assertNotEqual(made.flaw(self.signer, [], NOW), "")
+
+    def test_read_what_was_kept(self) -> None:
+        """What is written is read again; what is cut, empty, of another kind or no text at all is refused."""
+        again = read(self.leaf.pem)
+        self.assertEqual((again.names, again.pem), (self.leaf.names, self.leaf.pem))
+        key = rsa.generate_private_key(65537, 2048)
+        foreign = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
+        certificate = self.leaf.certificate.public_bytes(Encoding.PEM)
+        for pem in (
+            b"",
+            b"\xff\x00" * 50,
+            self.leaf.pem[:-40],
+            self.leaf.pem[:200],
+            certificate,
+            foreign + certificate,
+        ):
+            self.assertRaises(ValueError, read, pem)
+
+
+def forged(signer: Authority, name: str) -> Leaf:
+    """What somebody who knows the secret would sign for a name that is not the team's."""
+    made = leaf(signer, "vaio", [], NOW, random.Random(1))
+    try:
+        wanted: Any = x509.IPAddress(ipaddress.ip_address(name))
+    except ValueError:
+        wanted = x509.DNSName(name)
+    builder = x509.CertificateBuilder(
+        signer.certificate.subject,
+        made.certificate.subject,
+        made.key.public_key(),
+        7,
+        made.certificate.not_valid_before_utc,
+        made.certificate.not_valid_after_utc,
+    )
+    for extension in made.certificate.extensions:
+        is_names = isinstance(extension.value, x509.SubjectAlternativeName)
+        value = x509.SubjectAlternativeName([wanted]) if is_names else extension.value
+        builder = builder.add_extension(value, extension.critical)
+    return Leaf(made.key, builder.sign(signer.key, SHA256()))

@@ -1,0 +1,54 @@
+"""Tests of ``webnode.invite``: where others find the page, and the code that says so."""
+
+from __future__ import annotations
+
+import re
+import sys
+from importlib.util import find_spec
+from typing import Any
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from webnode.invite import MARGIN, TeamInvites, best_first, code
+
+LINK = "https://192.168.0.7:8443/#code=AQUAagJ8oCVYkDIF5Q4LZ3Vlc3TsjPp7rFj9hsoSg2xWYr0E/phone"
+
+
+class InviteTests(SynchronousTestCase):
+    def test_offer_the_best_first(self) -> None:
+        """Pages that others reach come before those of this machine, and of each kind those over TLS before others."""
+        here, plain, name = "https://127.0.0.1:8443", "http://192.168.0.7:8080", "https://vaio.local:8443"
+        self.assertEqual(best_first([here, plain, name, plain]), [name, plain, here])
+        anything: Any = None
+        self.assertEqual(TeamInvites(lambda: [here, plain], b"", "", anything, anything).urls(), [plain, here])
+
+    def test_draw_what_a_camera_reads(self) -> None:
+        """The code of a link is read again out of its drawing, which has a margin and no style of its own."""
+        import cv2
+        import numpy as np
+
+        drawing = code(LINK)
+        self.assertNotIn("style", drawing)
+        (size,) = re.findall(r'viewBox="0 0 (\d+) \1"', drawing)
+        picture = np.full((int(size), int(size)), 255, np.uint8)
+        x = y = 0.0
+        for verb, step, fall in re.findall(r"([Mmh])(-?[\d.]+)(?: (-?[\d.]+))?", drawing.split(' d="')[1]):
+            if verb == "h":
+                picture[int(y), int(x) : int(x + float(step))] = 0
+                x += float(step)
+            else:
+                x, y = (float(step), float(fall)) if verb == "M" else (x + float(step), y + float(fall))
+        self.assertTrue((picture[:MARGIN] == 255).all())
+        large = np.kron(picture, np.ones((8, 8), np.uint8))
+        self.assertEqual(cv2.QRCodeDetector().detectAndDecode(large)[0], LINK)
+
+    if missing := [name for name in ("cv2", "segno") if find_spec(name) is None]:
+        test_draw_what_a_camera_reads.skip = f"NO CODE IS READ: missing {missing}"  # type: ignore[attr-defined]
+
+    def test_draw_nothing_where_it_cannot(self) -> None:
+        """Of nothing nothing is drawn, nor where the library is missing: the link in words is enough."""
+        self.assertEqual(code(""), "")
+        self.addCleanup(sys.modules.update, {"segno": sys.modules["segno"]} if "segno" in sys.modules else {})
+        self.addCleanup(sys.modules.pop, "segno", None)
+        sys.modules["segno"] = None  # type: ignore[assignment]
+        self.assertEqual(code(LINK), "")

@@ -1,0 +1,51 @@
+"""Tests of ``webnode.keyfile``: a private key lies where nobody else reads it, or is not used."""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from webnode.keyfile import Unsafe, keep, kept
+
+
+class KeyfileTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        folder = Path(self.mktemp())
+        folder.mkdir()
+        self.path = folder / "node.sqlite.tls"
+
+    def refusal(self) -> str:
+        return str(self.assertRaises(Unsafe, kept, self.path))
+
+    def test_keep_for_the_user_alone(self) -> None:
+        """What is kept is read again, also over an older one, and by nobody else, whatever the umask is."""
+        self.addCleanup(os.umask, os.umask(0))
+        self.assertIsNone(kept(self.path))
+        for content in (b"first", b"second"):
+            keep(self.path, content)
+            self.assertEqual(kept(self.path), content)
+            self.assertEqual(stat.S_IMODE(self.path.stat().st_mode), 0o600)
+        self.assertEqual([each.name for each in self.path.parent.iterdir()], [self.path.name])
+
+    def test_refuse_what_others_may_read(self) -> None:
+        """One that the group or the world may read or write is refused, with its mode."""
+        keep(self.path, b"secret")
+        for mode in (0o640, 0o604, 0o620, 0o602):
+            self.path.chmod(mode)
+            self.assertIn(f"mode {mode:o}", self.refusal())
+
+    def test_refuse_what_is_no_file(self) -> None:
+        """A link, a folder and a pipe are refused and never waited for."""
+        other = self.path.with_name("other")
+        keep(other, b"secret")
+        self.path.symlink_to(other)
+        self.assertIn("cannot be read", self.refusal())
+        self.path.unlink()
+        os.mkfifo(self.path, 0o600)
+        self.assertIn("no plain file", self.refusal())
+        self.path.unlink()
+        self.path.mkdir(0o700)
+        self.assertIn("no plain file", self.refusal())

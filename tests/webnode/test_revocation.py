@@ -1,0 +1,80 @@
+"""Tests of ``webnode.revocation``: who signs out at one web node is signed out at all."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import replace
+from typing import Any
+
+import msgpack
+from twisted.internet.defer import succeed
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.entangled.record import Record
+from swarmnode.rehearsal import VirtualTeam
+from webnode.board import Visitor
+from webnode.revocation import MOST, REMEMBERED, REVOKED, SLOT, MemoryRevocations, TeamRevocations, revoked_in
+from webnode.session import SignedSessions
+
+
+class TeamRevocationsTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.team = VirtualTeam(5, dogs=("dog1",), others=("pi", "nuc"))
+        self.addCleanup(self.team.stop)
+        self.vaio, self.pi = self.known("vaio"), self.known("pi")
+
+    def known(self, name: str) -> TeamRevocations:
+        return TeamRevocations(self.team.services[name].assembly.node)
+
+    def test_hold_at_every_web_node(self) -> None:
+        """A token that is revoked at one web node lets in nobody at another, nor at one that starts when both died."""
+
+        def at(revoked: TeamRevocations) -> SignedSessions:
+            return SignedSessions(b"the team's secret", "quiet-otter", "", random.Random(1), check, revoked)
+
+        check = lambda text, word: succeed(False)  # noqa: E731
+        vaio, pi, now = at(self.vaio), at(self.pi), self.team.clock.seconds()
+        token = self.successResultOf(vaio.sign_in("quiet-otter", "10.0.0.9", now))
+        self.assertEqual(pi.visitor(token.ticket, now).role, "viewer")
+        vaio.revoke(vaio.visitor(token.text, now).token_id, token.until)
+        self.assertEqual(vaio.visitor(token.text, now), Visitor())
+        self.team.clock.advance(0.5)
+        for text in (token.text, token.ticket):
+            self.assertEqual(pi.visitor(text, now), Visitor())
+        self.team.kill("vaio")
+        self.team.kill("pi")
+        self.team.clock.advance(2.0)
+        late = at(self.known("nuc"))
+        self.team.clock.advance(1.0)
+        self.assertEqual(late.visitor(token.text, now), Visitor())
+
+    def test_stay_small(self) -> None:
+        """However many sign out, the record fits a datagram and holds the newest, and old ones are forgotten."""
+        now = self.team.clock.seconds()
+        self.vaio.add("ee" * 8, now + 1.0)
+        self.team.clock.advance(2.0)
+        for number in range(3 * MOST):
+            self.vaio.add(f"{number:016x}", now + 1e9)
+        self.team.clock.advance(1.0)
+        self.assertTrue(self.pi.has(f"{3 * MOST - 1:016x}"))
+        late = self.known("nuc")
+        self.team.clock.advance(1.0)
+        self.assertEqual([late.has(f"{number:016x}") for number in (2 * MOST - 1, 2 * MOST)], [False, True])
+        self.assertFalse(self.vaio.has("ee" * 8))
+
+    def test_believe_lawful_records_only(self) -> None:
+        """A record that is no list of sessions ends none, whatever stands in it."""
+        good = Record(REVOKED, SLOT, bytes(32), 1, "team", 60.0, msgpack.packb({bytes(8): 5}))
+        self.assertEqual(revoked_in(good), {"00" * 8: 5.0})
+        bad: list[Any] = [[], {"ab": 5}, {bytes(7): 5}, {bytes(8): "x"}, {bytes(8): float("nan")}, {bytes(8): True}, 7]
+        for content in bad:
+            self.assertEqual(revoked_in(replace(good, value=msgpack.packb(content))), {}, content)
+        for record in (replace(good, value=None), replace(good, value=b"\xc1"), replace(good, name="other")):
+            self.assertEqual(revoked_in(record), {})
+
+    def test_remember_so_many(self) -> None:
+        """The twin in memory forgets the oldest, too."""
+        twin = MemoryRevocations()
+        for number in range(REMEMBERED + 1):
+            twin.add(str(number), 1.0)
+        self.assertEqual([twin.has(each) for each in ("0", "1", str(REMEMBERED), "x")], [False, True, True, False])

@@ -1,0 +1,295 @@
+"""Tests of ``webnode.tls``: the page's second port, its certificate, and who dribbles a handshake."""
+
+from __future__ import annotations
+
+import os
+import random
+import ssl
+import stat
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from twisted.internet.address import IPv4Address
+from twisted.internet.error import CannotListenError
+from twisted.internet.task import Clock
+from twisted.internet.testing import MemoryReactorClock, StringTransport
+from twisted.logger import capturedLogs, formatEvent
+from twisted.trial.unittest import SynchronousTestCase
+from twisted.web.resource import Resource
+from twisted.web.static import Data
+
+from tests.webnode.browser import Connection, site_of
+from webnode.channel import CLOSE_S, HEAD_S
+from webnode.errors import PortTaken
+from webnode.limits import AddressLimits
+
+MISSING = [name for name in ("OpenSSL", "cryptography") if find_spec(name) is None]
+if not MISSING:
+    from middleware.errors import BadSetting
+    from middleware.settings import Settings
+    from webnode.certificate import authority, read
+    from webnode.ground import Ground
+    from webnode.tls import Certified, TlsDoor, door
+
+SKIP = f"TLS IS NOT TESTED: missing {', '.join(MISSING)} (pip install 'swarm-node[tls]')"
+NOW = 1.8e9
+NO_CHECK_TIME = 0x200000
+"""X509_V_FLAG_NO_CHECK_TIME of OpenSSL: the client's clock is the machine's, the certificate's is the test's."""
+DAY = 86400.0
+
+
+class CertifiedTests(SynchronousTestCase):
+    if MISSING:
+        skip = SKIP
+
+    def setUp(self) -> None:
+        folder = Path(self.mktemp())
+        folder.mkdir()
+        self.path = folder / "a.sqlite.tls"
+        self.signer = authority(b"1" * 32)
+        self.names = ["192.168.0.7"]
+        self.now = NOW
+
+    def certified(self, seed: int = 1) -> tuple[Certified, str]:
+        """What a node has after its start, and what it says."""
+        with capturedLogs() as said:
+            made = Certified(self.signer, "a", self.path, lambda: self.names, lambda: self.now, random.Random(seed))
+        return made, "\n".join(formatEvent(each) for each in said)
+
+    def served(self, certified: Certified) -> list[str]:
+        """The names for which it stands when the next visitor has connected."""
+        certified.serverConnectionForTLS(None)
+        return certified.names
+
+    def test_make_it_once(self) -> None:
+        """The first start makes a certificate for the node's user alone; the next one uses it."""
+        _, said = self.certified()
+        self.assertIn("there is none yet", said)
+        pem = self.path.read_bytes()
+        self.assertEqual(stat.S_IMODE(self.path.stat().st_mode), 0o600)
+        self.assertEqual(set(read(pem).names), {"localhost", "127.0.0.1", "::1", "192.168.0.7"})
+        self.assertEqual(self.certified(2)[1], "")
+        self.assertEqual(self.path.read_bytes(), pem)
+
+    def test_make_it_anew(self) -> None:
+        """One that others may read, is cut, foreign, old or for another address is made anew, which is said."""
+
+        def cut() -> None:
+            self.path.write_bytes(self.path.read_bytes()[:300])
+
+        def moved() -> None:
+            self.names = ["192.168.0.8"]
+
+        def sworn() -> None:
+            self.signer = authority(b"2" * 32)
+
+        def aged() -> None:
+            self.now += 340 * DAY
+
+        faults: list[tuple[Any, str]] = [
+            (lambda: self.path.chmod(0o644), "others may read"),
+            (cut, "no certificate with its key"),
+            (lambda: self.path.write_bytes(b""), "no certificate with its key"),
+            (moved, "it lacks 192.168.0.8"),
+            (sworn, "another team"),
+            (aged, "it runs out"),
+        ]
+        for seed, (fault, words) in enumerate(faults):
+            self.certified(seed)
+            before = read(self.path.read_bytes()).certificate.serial_number
+            fault()
+            _, said = self.certified(100 + seed)
+            self.assertIn(words, said)
+            self.assertIn("is made anew", said)
+            self.assertNotEqual(read(self.path.read_bytes()).certificate.serial_number, before)
+            self.assertEqual(stat.S_IMODE(self.path.stat().st_mode), 0o600)
+
+    def test_go_on_without_a_place(self) -> None:
+        """Where it cannot be kept it serves all the same, and the log says why the next start makes another."""
+        self.path = self.path.parent / "nowhere" / "a.tls"
+        certified, said = self.certified()
+        self.assertIn("cannot be kept", said)
+        self.assertIn("192.168.0.7", self.served(certified))
+
+    def test_follow_the_machine(self) -> None:
+        """A node that runs renews it: for an address that came later, for one that was dialled, when it runs out."""
+        certified, _ = self.certified()
+        self.names = ["10.0.0.5"]
+        self.assertNotIn("10.0.0.5", certified.names)
+        self.assertIn("10.0.0.5", self.served(certified))
+        certified.reached("172.16.0.9")
+        self.assertIn("172.16.0.9", self.served(certified))
+        certified.reached("8.8.8.8")
+        before = self.path.read_bytes()
+        self.served(certified)
+        self.assertEqual(self.path.read_bytes(), before)
+        self.now += 340 * DAY
+        self.served(certified)
+        self.assertNotEqual(self.path.read_bytes(), before)
+
+    def test_look_once_a_minute(self) -> None:
+        """A hundred visitors of one minute do not make the node look for its addresses a hundred times."""
+        certified, _ = self.certified()
+        looks: list[int] = []
+        certified._names = lambda: looks.append(1) or self.names  # type: ignore[func-returns-value]
+        for _ in range(100):
+            self.now += 0.5
+            certified.serverConnectionForTLS(None)
+        self.assertEqual(len(looks), 1)
+        self.now -= 3600.0
+        certified.serverConnectionForTLS(None)
+        self.assertEqual(len(looks), 2)
+
+
+class DoorTests(SynchronousTestCase):
+    if MISSING:
+        skip = SKIP
+
+    def setUp(self) -> None:
+        self.folder = Path(self.mktemp()).resolve()
+        self.folder.mkdir()
+
+    def door(self, team_key: str = "of a test", store: str = "a.sqlite") -> TlsDoor:
+        node = {"name": "a", "team_key": team_key, "roles": ["web"], "store": store}
+        settings = Settings.from_mapping({"node": node, "web": {"tls": "auto"}}, str(self.folder / "a.toml"))
+        anything: Any = None
+        return door(
+            Ground(settings, anything, anything, Clock(), lambda: NOW, random.Random(1)), lambda: ["192.168.0.7"]
+        )
+
+    def test_share_the_team_s_authority(self) -> None:
+        """Nodes of one team have one authority, of which nothing is kept; those of another have another."""
+        self.assertEqual(self.door(store="a.sqlite").signer.pem, self.door(store="b.sqlite").signer.pem)
+        self.assertNotEqual(self.door("of another team").signer.pem, self.door().signer.pem)
+        self.assertEqual(sorted(os.listdir(self.folder)), ["a.sqlite.tls", "b.sqlite.tls"])
+
+    def test_have_one_of_its_own(self) -> None:
+        """With the default key, which everybody knows, the node has an authority of its own, keeps it and says so."""
+        with capturedLogs() as said:
+            first = self.door("swarm")
+        self.assertIn("team_key is no secret", "\n".join(formatEvent(each) for each in said))
+        self.assertEqual(self.door("swarm").signer.pem, first.signer.pem)
+        self.assertEqual(stat.S_IMODE((self.folder / "a.sqlite.ca").stat().st_mode), 0o600)
+        self.assertNotEqual(
+            first.signer.pem, authority(Settings.from_mapping({"node": {"name": "a"}}, "").node.team_secret).pem
+        )
+
+    def test_keep_nothing_in_memory(self) -> None:
+        """A node that stores nothing leaves no file behind."""
+        self.door("swarm", ":memory:")
+        self.assertEqual(os.listdir(self.folder), [])
+
+    def test_refuse_an_unsafe_authority(self) -> None:
+        """An authority that others may read, or that is cut, is refused in one line: phones trust it."""
+        self.door("swarm")
+        path = self.folder / "a.sqlite.ca"
+        path.chmod(0o644)
+        line = str(self.assertRaises(BadSetting, self.door, "swarm"))
+        for words in ("a.toml", "[web] tls", str(path), "mode 644", "chmod 600"):
+            self.assertIn(words, line)
+        path.chmod(0o600)
+        path.write_bytes(b"short")
+        self.assertIn("5 bytes", str(self.assertRaises(BadSetting, self.door, "swarm")))
+
+    def test_tell_of_a_taken_port(self) -> None:
+        """A port that is held is told with the setting that names it."""
+
+        class Taken(MemoryReactorClock):
+            def listenTCP(self, port: int, *others: Any, **more: Any) -> Any:  # noqa: N802
+                raise CannotListenError("", port, OSError(98, "Address already in use"))
+
+        entrance = self.door()
+        entrance._reactor = Taken()
+        words = str(self.assertRaises(PortTaken, entrance.open, site_of(Data(b"hi", "text/plain"), Clock())))
+        self.assertIn("127.0.0.1:8443", words)
+        self.assertIn("choose another tls_port", words)
+
+
+class Line(StringTransport):
+    """A transport of TCP."""
+
+    def setTcpNoDelay(self, enabled: bool) -> None:  # noqa: N802
+        """Do nothing."""
+
+
+class HandshakeTests(SynchronousTestCase):
+    """A real TLS client against the port, on a turned clock and without a socket."""
+
+    if MISSING:
+        skip = SKIP
+
+    def setUp(self) -> None:
+        self.signer = authority(b"1" * 32)
+        self.reactor = MemoryReactorClock()
+        certified = Certified(self.signer, "a", None, lambda: ["10.0.0.9"], lambda: NOW, random.Random(1))
+        self.limits = AddressLimits()
+        root = Resource()
+        root.putChild(b"page", Data(b"hello", "text/plain"))
+        self.site: Any = site_of(root, self.reactor, self.limits)
+        TlsDoor(self.reactor, "127.0.0.1", 8443, self.signer, certified).open(self.site)
+        self.connections = self.reactor.tcpServers[0][1]
+
+    def connected(self) -> Connection:
+        """A connection on which nothing was said."""
+        connection = Connection.__new__(Connection)
+        local = IPv4Address("TCP", "10.0.0.9", 8443)
+        connection.transport = Line(hostAddress=local, peerAddress=IPv4Address("TCP", "10.0.0.1", 54321))
+        connection.protocol = self.connections.buildProtocol(connection.transport.getPeer())
+        connection.protocol.makeConnection(connection.transport)
+        return connection
+
+    def client(self, **versions: ssl.TLSVersion) -> tuple[ssl.SSLObject, ssl.MemoryBIO, ssl.MemoryBIO]:
+        """A client that trusts the authority and checks the address."""
+        context = ssl.create_default_context(cadata=self.signer.pem.decode())
+        context.maximum_version = versions.get("newest", ssl.TLSVersion.MAXIMUM_SUPPORTED)
+        context.minimum_version = ssl.TLSVersion.MINIMUM_SUPPORTED
+        context.verify_flags |= NO_CHECK_TIME
+        incoming, outgoing = ssl.MemoryBIO(), ssl.MemoryBIO()
+        return context.wrap_bio(incoming, outgoing, server_hostname="10.0.0.9"), incoming, outgoing
+
+    def test_answer_over_tls(self) -> None:
+        """A client that trusts the authority gets the page, by HTTP/1.1, under TLS 1.2 and 1.3."""
+        for newest in (ssl.TLSVersion.TLSv1_2, ssl.TLSVersion.TLSv1_3):
+            self.assertIn(b"hello", self.asked(newest))
+
+    def test_refuse_old_tls(self) -> None:
+        """TLS 1.1 is not spoken."""
+        self.assertRaises(ssl.SSLError, self.asked, ssl.TLSVersion.TLSv1_1)
+
+    def asked(self, newest: ssl.TLSVersion) -> bytes:
+        """What is answered to one request."""
+        connection = self.connected()
+        client, incoming, outgoing = self.client(newest=newest)
+        is_asked = False
+        for _ in range(10):
+            try:
+                if not is_asked:
+                    client.do_handshake()
+                    client.write(b"GET /page HTTP/1.1\r\nHost: 10.0.0.9\r\nConnection: close\r\n\r\n")
+                    is_asked = True
+                answer: bytes = client.read()
+            except ssl.SSLWantReadError:
+                connection.send(outgoing.read())
+                self.reactor.advance(0.0)
+                self.reactor.advance(0.0)
+                incoming.write(connection.taken())
+            else:
+                return answer
+        return b""
+
+    def test_let_go_who_dribbles_a_handshake(self) -> None:
+        """Whoever says nothing, or a handshake byte by byte, is closed in time, and nothing is left of it."""
+        client, _, outgoing = self.client()
+        self.assertRaises(ssl.SSLWantReadError, client.do_handshake)
+        hello = outgoing.read()
+        silent, dribbler = self.connected(), self.connected()
+        for second in range(int(HEAD_S + CLOSE_S) + 1):
+            if not dribbler.transport.disconnecting and not dribbler.transport.disconnected:
+                dribbler.send(hello[second : second + 1])
+            self.reactor.advance(1.0)
+        for connection in (silent, dribbler):
+            self.assertTrue(connection.transport.disconnected or connection.transport.disconnecting)
+            connection.leave()
+        self.assertEqual(self.limits.total("open"), 0)
+        self.assertEqual([call for call in self.reactor.getDelayedCalls() if call.getTime() > 60], [])

@@ -1,0 +1,142 @@
+// Positions: where there is no yard, the devices that say where they are, drawn to the scale of the room that they take.
+import { at, attribute, drawn, element, keyed, words } from "./element.js";
+import { panel } from "./panel.js";
+import { go } from "./shell.js";
+import { whereabouts } from "./whereabouts.js";
+
+const LEAST = 2;
+const MARGIN = 36;
+const FOOT = 24;
+const PAUSE = 1000;
+const NAMED = 40;
+const METRES = 111_320;
+const isMetres = ({ position }) => "x" in position;
+
+// Metres of each that can be drawn with the others: a yard's own frame, or east and north of the first by the globe.
+// What more devices use is drawn; x of the globe shrinks towards the poles.
+function frame(placed) {
+  const local = placed.filter(isMetres);
+  if (2 * local.length >= placed.length) return local.map((device) => ({ device, ...device.position }));
+  const drawn = placed.filter((device) => !isMetres(device));
+  const [first] = drawn;
+  const shrink = Math.cos((first.position.lat * Math.PI) / 180);
+  return drawn.map((device) => {
+    const { lat, lon, accuracy } = device.position;
+    const east = ((lon - first.position.lon + 540) % 360) - 180;
+    return { device, x: east * METRES * shrink, y: (lat - first.position.lat) * METRES, accuracy };
+  });
+}
+
+// The whole of 1, 2 or 5 times a power of ten that is not longer than that.
+function round(metres) {
+  const power = 10 ** Math.floor(Math.log10(metres));
+  return [5, 2, 1].find((n) => n * power <= metres) * power;
+}
+
+const length = (metres) => (metres >= 1000 ? `${metres / 1000} km` : metres >= 1 ? `${metres} m` : `${Math.round(metres * 100)} cm`);
+
+function shape({ uuid }) {
+  const show = (event) => {
+    if (event.type === "keydown" && event.key !== "Enter") return;
+    go(`device/${uuid}`);
+  };
+  const made = drawn("g", { class: "spot", role: "button", tabindex: 0 },
+    drawn("circle", { class: "blur" }), drawn("circle", { class: "reach", r: 22 }), drawn("path", { class: "way", d: "M9 -7 22 0 9 7z" }),
+    drawn("circle", { class: "dot", r: 8 }), drawn("text", { y: 24 }));
+  made.addEventListener("click", show);
+  made.addEventListener("keydown", show);
+  return made;
+}
+
+document.head.append(element("link", { rel: "stylesheet", href: "/static/positions.css" }));
+
+panel({
+  place: "map",
+  order: 5,
+  title: "Map",
+  make(root) {
+    const map = drawn("svg", { id: "spots", role: "group", "aria-label": "Map of the positions that devices report" });
+    const bar = drawn("g", { class: "scale" }, drawn("path"), drawn("text", { y: -8 }));
+    const spots = drawn("g");
+    const list = element("ul", { class: "plain places" });
+    const hint = element("p", { class: "hint" });
+    map.append(drawn("rect", { class: "floor", rx: 6 }), bar, spots);
+    root.append(map, hint, list);
+    let placed = [];
+    let known = "";
+    let due = 0;
+    // Drawn in pixels, so that words are as large as elsewhere: anew where it is wider, or is seen at last.
+    const size = new ResizeObserver(() => refresh());
+    size.observe(root);
+
+    function refresh() {
+      const now = JSON.stringify([root.clientWidth, ...placed.map(({ uuid, name, status, position }) => [uuid, name, status, position])]);
+      if (!placed.length || !root.clientWidth || now === known || due) return;
+      known = now;
+      draw();
+      // Many of them are drawn now and then: somebody may be typing.
+      if (placed.length > NAMED) due = setTimeout(() => { due = 0; refresh(); }, PAUSE);
+    }
+
+    function draw() {
+      const found = frame(placed);
+      const width = root.clientWidth;
+      const range = (key, room) => {
+        const seen = found.map((each) => [each[key], Math.min(each.accuracy ?? 0, room)]);
+        return [Math.min(...seen.map(([at, blur]) => at - blur)), Math.max(...seen.map(([at, blur]) => at + blur))];
+      };
+      // A place that is hardly known must not make all others one dot.
+      const room = Math.max(LEAST, ...["x", "y"].map((key) => range(key, 0)).map(([from, to]) => to - from));
+      const [west, east] = range("x", room);
+      const [south, north] = range("y", room);
+      // As high as it takes, not higher than wide.
+      const scale = Math.min((width - 2 * MARGIN) / Math.max(east - west, LEAST), (width - 2 * MARGIN) / Math.max(north - south, LEAST));
+      const height = Math.max((north - south) * scale, 120) + 2 * MARGIN + FOOT;
+      const place = ({ x, y }) => [width / 2 + (x - (west + east) / 2) * scale, (height - FOOT) / 2 - (y - (south + north) / 2) * scale];
+      attribute(map, "viewBox", `0 0 ${width} ${height.toFixed(0)}`);
+      attribute(map.firstChild, "width", width);
+      attribute(map.firstChild, "height", height.toFixed(0));
+      keyed(spots, found, ({ device }) => device.uuid, ({ device }) => shape(device), (spot, each) => {
+        const { device, heading, accuracy } = each;
+        attribute(spot, "transform", `translate(${place(each).map((n) => n.toFixed(1)).join(" ")})`);
+        attribute(spot, "data-state", device.status);
+        attribute(spot, "aria-label", `${device.name} at ${whereabouts(device.position)}`);
+        attribute(spot.querySelector(".blur"), "r", Math.min((accuracy ?? 0) * scale, width).toFixed(1));
+        const way = spot.querySelector(".way");
+        attribute(way, "display", Number.isFinite(heading) ? "inline" : "none");
+        if (Number.isFinite(heading)) attribute(way, "transform", `rotate(${((-heading * 180) / Math.PI).toFixed(1)})`);
+        words(spot.lastChild, found.length > NAMED ? "" : device.name);
+      });
+      const metres = round((width / 3) / scale);
+      attribute(bar, "transform", `translate(14 ${(height - 12).toFixed(0)})`);
+      attribute(bar.firstChild, "d", `M0 -5V0H${(metres * scale).toFixed(1)}V-5`);
+      words(bar.lastChild, length(metres));
+      const isLocal = isMetres(found[0].device);
+      const others = placed.length - found.length;
+      words(hint, `${isLocal ? "In metres, as the devices report it." : "By latitude and longitude, as the devices report it; north is up."}${
+        others ? ` ${others} more ${others > 1 ? "are" : "is"} reported in another frame, and only listed.` : ""}`);
+      keyed(list, placed.slice(0, NAMED), (device) => device.uuid, () => element("li", {}, element("b"), " ", element("span")), (item, device) => {
+        words(item.firstChild, device.name);
+        words(item.lastChild, whereabouts(device.position));
+      });
+    }
+
+    return {
+      update(model, event) {
+        if (event !== "state" && event !== "yard" && event !== "") return;
+        placed = model.yard ? [] : [...model.devices.values()].filter((device) => device.position);
+        const section = at("place-map");
+        section.classList.toggle("reported", !model.yard);
+        root.hidden = !placed.length;
+        words(at("h-yard"), model.yard ? "Yard" : "Map");
+        words(document.querySelector("#views [href='#map']"), model.yard ? "Yard" : "Map");
+        if (!model.yard) section.hidden = !placed.length;
+        refresh();
+      },
+      close() {
+        clearTimeout(due);
+        size.disconnect();
+      },
+    };
+  },
+});

@@ -1,0 +1,214 @@
+"""TLS: a second port for the page, under a certificate that the node makes, keeps and renews by itself.
+
+The same site answers at both ports, with the same deadlines: they run from the connection on, so that whoever dribbles
+its handshake is let go as well.  Imported only where it is wanted, as it loads pyOpenSSL.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable, Collection
+from pathlib import Path
+from typing import Any
+
+from OpenSSL.crypto import X509, PKey
+from OpenSSL.SSL import Connection
+from twisted.internet.interfaces import IListeningPort, IOpenSSLServerConnectionCreator
+from twisted.internet.ssl import CertificateOptions, TLSVersion
+from twisted.logger import Logger
+from twisted.protocols.tls import BufferingTLSTransport, TLSMemoryBIOFactory
+from twisted.web.server import Site
+from zope.interface import implementer
+
+from middleware.errors import BadSetting
+from middleware.settings import IN_MEMORY, NodeSettings
+from webnode.certificate import Authority, Leaf, authority, leaf, nameable, plain, read
+from webnode.ground import Ground
+from webnode.keyfile import Unsafe, keep, kept
+from webnode.server import listening
+
+LEAF, AUTHORITY = ".tls", ".ca"
+"""Beside the node's store: its certificate with the key, and the secret of an authority of its own."""
+LOOK_S = 60.0
+"""So often, at most, is it asked whether the certificate will still do, when somebody connects."""
+SECRET = 32
+MOST_REACHED = 8
+
+Names = Callable[[], Collection[str]]
+"""What others in the network call this machine now: addresses and names."""
+
+_log = Logger()
+
+
+@implementer(IOpenSSLServerConnectionCreator)
+class Certified:
+    """The certificate under which connections are made: from the file, or a new one.
+
+    ``path`` None: it is forgotten when the node ends.  ``wall`` is unix time, ``names`` the machine's.
+    """
+
+    def __init__(
+        self,
+        signer: Authority,
+        title: str,
+        path: Path | None,
+        names: Names,
+        wall: Callable[[], float],
+        rng: random.Random,
+    ) -> None:
+        self._signer = signer
+        self._title = title
+        self._path = path
+        self._names = names
+        self._wall = wall
+        self._rng = rng
+        self._reached: list[str] = []
+        self._looked = 0.0
+        self._leaf = self._found() or self._made("there is none yet")
+        self._options: Any = None
+
+    @property
+    def names(self) -> list[str]:
+        """The addresses and names for which it stands."""
+        return self._leaf.names
+
+    def reached(self, host: str) -> None:
+        """Somebody came by this address of the machine, which is to be in the certificate."""
+        for name in nameable([host]):
+            if name not in self._leaf.names:
+                self._reached = [*self._reached, name][-MOST_REACHED:]
+                self._looked = 0.0
+
+    def serverConnectionForTLS(self, protocol: object) -> Connection:  # noqa: N802
+        """The next connection."""
+        now = self._wall()
+        # A clock that was set, backwards too, is a reason to look again.
+        if not 0.0 <= now - self._looked < LOOK_S:
+            self._looked = now
+            flaw = self._leaf.flaw(self._signer, self._wanted(), now)
+            if flaw:
+                self._leaf, self._options = self._made(flaw), None
+        if self._options is None:
+            self._options = CertificateOptions(
+                privateKey=PKey.from_cryptography_key(self._leaf.key),
+                certificate=X509.from_cryptography(self._leaf.certificate),
+                raiseMinimumTo=TLSVersion.TLSv1_2,
+            )
+        return Connection(self._options.getContext(), None)
+
+    def _wanted(self) -> list[str]:
+        return [*self._reached, *self._names()]
+
+    def _found(self) -> Leaf | None:
+        """The certificate of the file, where it still serves."""
+        if self._path is None:
+            return None
+        try:
+            pem = kept(self._path)
+            if pem is None:
+                return None
+            found = read(pem)
+            flaw = found.flaw(self._signer, self._wanted(), self._wall())
+        except (Unsafe, ValueError) as error:
+            flaw = str(error)
+        if not flaw:
+            return found
+        _log.warn("the certificate in {path} is made anew: {flaw}", path=str(self._path), flaw=flaw)
+        return None
+
+    def _made(self, why: str) -> Leaf:
+        """A new one, in the file as well."""
+        made = leaf(self._signer, self._title, self._wanted(), self._wall(), self._rng)
+        _log.info("a certificate for {names} is made: {why}", names=", ".join(made.names), why=why)
+        foreign = [name for name in self._wanted() if name and not plain(name)]
+        if foreign:
+            words = "{names}: not of a local network, so not in the certificate; open the page by another name"
+            _log.warn(words, names=", ".join(foreign))
+        if self._path is not None:
+            try:
+                keep(self._path, made.pem)
+            except OSError as error:
+                _log.warn(
+                    "the certificate cannot be kept in {path} ({error}): the next start makes another",
+                    path=str(self._path),
+                    error=error,
+                )
+        return made
+
+
+class _Connection(BufferingTLSTransport):
+    factory: Any
+
+    def makeConnection(self, transport: Any) -> None:  # noqa: N802
+        # Whatever address the visitor has dialled: the certificate should name it.
+        self.factory.certified.reached(str(getattr(transport.getHost(), "host", "")))
+        super().makeConnection(transport)
+
+
+class _Connections(TLSMemoryBIOFactory):
+    protocol = _Connection
+    noisy = False
+
+    def __init__(self, certified: Certified, site: Site, clock: Any) -> None:
+        super().__init__(certified, False, site, clock)
+        self.certified = certified
+
+
+class TlsDoor:
+    """The port; ``signer`` is the authority that a visitor's browser should trust."""
+
+    def __init__(self, reactor: Any, host: str, port: int, signer: Authority, certified: Certified) -> None:
+        self.signer = signer
+        self._reactor = reactor
+        self._host = host
+        self._port = port
+        self._certified = certified
+
+    def open(self, site: Site) -> IListeningPort:
+        """Open it for ``site``; raises ``PortTaken``."""
+        connections = _Connections(self._certified, site, self._reactor)
+        return listening(self._reactor, self._host, self._port, connections, "tls_port")
+
+
+def door(ground: Ground, names: Names) -> TlsDoor:
+    """The page's port over TLS; raises ``BadSetting`` where a file with a key in it cannot be used."""
+    web, node = ground.settings.web, ground.settings.node
+    store = None if node.store == IN_MEMORY else node.store
+    if node.team_key == NodeSettings.team_key:
+        secret = _own(store, ground)
+        _log.warn(
+            "[node] team_key is no secret: this node signs its certificate with an authority of its own,"
+            " which phones trust for this node alone"
+        )
+    else:
+        secret = node.team_secret
+    signer = authority(secret)
+    path = None if store is None else Path(f"{store}{LEAF}")
+    certified = Certified(signer, node.name, path, names, ground.wall, ground.rng)
+    _log.info("phones that trust the authority {fingerprint} trust the page", fingerprint=signer.fingerprint)
+    return TlsDoor(ground.reactor, web.host, web.tls_port, signer, certified)
+
+
+def _own(store: str | None, ground: Ground) -> bytes:
+    """The secret of an authority that is no team's, kept for as long as the store."""
+    if store is None:
+        return ground.rng.randbytes(SECRET)
+    path = Path(f"{store}{AUTHORITY}")
+    try:
+        secret = kept(path)
+        if secret is not None and len(secret) != SECRET:
+            raise Unsafe(f"it holds {len(secret)} bytes, and no secret of {SECRET}")
+    except Unsafe as error:
+        # Who made another one in silence would leave phones that trust this one before a warning.
+        problem = f"the authority in {path} cannot be used: {error}"
+        remedy = (
+            "mend it if nobody else can have read it (chmod 600), or delete it: phones then have to trust a new one"
+        )
+        raise BadSetting(ground.settings.origin, "[web] tls", problem, remedy) from error
+    if secret is None:
+        secret = ground.rng.randbytes(SECRET)
+        try:
+            keep(path, secret)
+        except OSError as error:
+            _log.warn("the authority cannot be kept in {path} ({error})", path=str(path), error=error)
+    return secret
