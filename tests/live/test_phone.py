@@ -279,8 +279,7 @@ class DemonstrationPhoneTests(Browser):
     def joined(self) -> Any:
         """The page of a phone that takes part as anna, with the target before its camera."""
         invitation = self.api("invitations", {"role": "phone", "name": "visitor"})["token"]
-        page = self.page(self.browser(), f"{self.url}#code={invitation}")
-        page.evaluate("location.hash = 'phone'")
+        page = self.page(self.browser(), f"{self.url}#code={invitation}/phone")
         self.until(lambda: {"dog1", "dog2", "dog3"} <= set(self.devices()), 30.0, page)
         page.locator("#phone-name").fill("anna")
         page.get_by_role("button", name="Take part", exact=True).tap()
