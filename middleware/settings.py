@@ -123,7 +123,8 @@ class WebSettings:
     """Where the simulated yard takes its operator's commands, as ``"host:port"``; none where empty."""
 
     tls: str = field(default="", metadata=setting.one_of(("", "auto")))
-    """``auto``: the page is also served over TLS, with a certificate that the node makes.  Empty: not."""
+    """``auto``: the page is also served over TLS, with a certificate that the node makes (extra ``tls``; 13 MiB more).
+    Empty: not, and a phone gives such a page no camera."""
 
     tls_port: int = field(default=8443, metadata=setting.port())
     """The TCP port of the page over TLS; 0 takes any free one."""

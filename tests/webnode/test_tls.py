@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 import random
+import socket
 import ssl
 import stat
 from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 from twisted.internet.address import IPv4Address
@@ -23,6 +25,7 @@ from tests.webnode.browser import Connection, site_of
 from webnode.channel import CLOSE_S, HEAD_S
 from webnode.errors import PortTaken
 from webnode.limits import AddressLimits
+from webnode.live import SENT_AHEAD, SYSTEM_AHEAD, Viewer
 
 MISSING = [name for name in ("OpenSSL", "cryptography") if find_spec(name) is None]
 if not MISSING:
@@ -277,6 +280,18 @@ class HandshakeTests(SynchronousTestCase):
             else:
                 return answer
         return b""
+
+    def test_let_little_wait_for_a_slow_reader(self) -> None:
+        """A stream over TLS is as short in this machine as a plain one: its socket lies below the TLS."""
+        connection = self.connected()
+        with socket.socket() as below:
+            connection.transport.getHandle = lambda: below  # type: ignore[attr-defined]
+            request: Any = SimpleNamespace(channel=SimpleNamespace(transport=connection.protocol))
+            Viewer(request).narrow()
+            # Linux keeps twice what it is asked for.
+            self.assertLessEqual(below.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF), 2 * SYSTEM_AHEAD)
+        self.assertEqual(connection.transport.bufferSize, SENT_AHEAD)  # type: ignore[attr-defined]
+        connection.leave()
 
     def test_let_go_who_dribbles_a_handshake(self) -> None:
         """Whoever says nothing, or a handshake byte by byte, is closed in time, and nothing is left of it."""

@@ -26,13 +26,15 @@ async function orientation() {
 
 const between = (value, least, most) => Math.min(most, Math.max(least, value));
 
-// Open the camera; `canvas` becomes what the team sees.  Throws what the browser throws.
-export async function opened(canvas, tellsPlace) {
+// Open the camera; `canvas` becomes what the team sees; `lost` is called when the camera is taken away.  Throws what the
+// browser throws.
+export async function opened(canvas, tellsPlace, lost) {
   // Both in the same tap: a permission that is asked for later is not asked for at all.
   const turns = orientation();
   const wanted = { facingMode: "environment", width: { ideal: 640 }, height: { ideal: 480 }, frameRate: { ideal: 15 } };
   const stream = await navigator.mediaDevices.getUserMedia({ video: wanted, audio: false });
   const video = Object.assign(document.createElement("video"), { srcObject: stream, muted: true, playsInline: true });
+  for (const track of stream.getTracks()) track.addEventListener("ended", lost);
   const small = document.createElement("canvas");
   const held = {};
   let sight = null;
@@ -71,17 +73,14 @@ export async function opened(canvas, tellsPlace) {
     sight = sighted(data, small.width, small.height);
   }
 
-  // Some phones start a video only when it is played, and give its size only then.
-  await video.play();
-  scaled(canvas, SIDE);
-
-  return {
+  const eye = {
     has: { orientation: hasOrientation, position: tellsPlace && "geolocation" in navigator },
     // What is seen now: the picture as bytes, what was measured, and the sighting with its box in shares of the picture.
     async look() {
       find(performance.now());
       scaled(canvas, SIDE);
       const blob = await new Promise((done) => canvas.toBlob(done, "image/jpeg", QUALITY));
+      if (!blob) throw new Error("no picture");
       const values = { ...held, ...(sight && { "target.bearing": sight.bearing, "target.distance": sight.distance }) };
       return { picture: await blob.arrayBuffer(), values, sight, of: { width: small.width, height: small.height } };
     },
@@ -92,4 +91,13 @@ export async function opened(canvas, tellsPlace) {
       if (place) navigator.geolocation.clearWatch(place);
     },
   };
+  try {
+    // Some phones start a video only when it is played, and give its size only then.
+    await video.play();
+  } catch (fault) {
+    eye.close();
+    throw fault;
+  }
+  scaled(canvas, SIDE);
+  return eye;
 }

@@ -6,6 +6,7 @@ import { ask, fly, where } from "./link.js";
 const KEPT = "swarm.phone";
 const AGAIN = 300;
 const LATER = 2000;
+const READ = 8000;
 const NONE = "Nothing can be seen.";
 const REMEDY = "Browsers give the camera to https pages alone, and to pages of this machine.";
 
@@ -120,32 +121,41 @@ export function make(root, { model, go }) {
 
   const wake = async () => { lock = await navigator.wakeLock?.request("screen").catch(() => null); };
 
-  async function join() {
+  const goodbye = ({ uuid, ticket: proof }) => navigator.sendBeacon(of(`phones/${uuid}/leave`, { ticket: proof }));
+
+  async function join(mine) {
     const { secret } = phone;
-    ticket = await ask("POST", "phones", { secret, name: phone.name, width: canvas.width, height: canvas.height, ...eye.has });
+    const told = await ask("POST", "phones", { secret, name: phone.name, width: canvas.width, height: canvas.height, ...eye.has });
+    if (run === mine) ticket = told;
+    else goodbye(told);
   }
 
   // One picture in flight, never a queue; a node that is lost is waited for, and another takes the phone as it is.
   async function looks(mine) {
     let fps = 10;
+    let failing = false;
     while (run === mine) {
       const began = performance.now();
-      const look = await eye.look();
-      if (run !== mine) return;
-      draw(look);
       try {
-        ticket ?? await join();
-        const answer = await fly(of(`phones/${ticket.uuid}/look`, { ticket: ticket.ticket, values: JSON.stringify(look.values) }), { method: "POST", body: look.picture });
+        const look = await eye.look();
         if (run !== mine) return;
+        draw(look);
+        if (!ticket) await join(mine);
+        if (run !== mine) return;
+        const query = { ticket: ticket.ticket, values: JSON.stringify(look.values) };
+        const answer = await fly(of(`phones/${ticket.uuid}/look`, query), { method: "POST", body: look.picture });
         const told = await answer.json();
+        if (run !== mine) return;
         if (answer.ok) {
           fps = told.fps;
           words(said, told.say);
-          words(trouble, "");
+          if (failing) words(trouble, "");
+          failing = false;
         } else if ([401, 403, 404].includes(answer.status)) ticket = null;
         else await pause(AGAIN);
       } catch (error) {
         if (run !== mine) return;
+        failing = true;
         // What the node said is for people; what the network said is not.
         words(trouble, error.status ? `${error.message} It is tried again.` : "The node does not answer. It is tried again.");
         await pause(error.status ? LATER : AGAIN);
@@ -158,7 +168,7 @@ export function make(root, { model, go }) {
   // Its node is told in the very last moment, too: then another takes the task over at once.
   function leave(next, line = "") {
     run += 1;
-    if (ticket) navigator.sendBeacon(of(`phones/${ticket.uuid}/leave`, { ticket: ticket.ticket }));
+    if (ticket) goodbye(ticket);
     ticket = null;
     eye?.close();
     eye = null;
@@ -171,7 +181,9 @@ export function make(root, { model, go }) {
     const mine = run += 1;
     show("asking", "Allow the camera, if the browser asks.");
     try {
-      const found = await opened(canvas, place.checked);
+      const found = await opened(canvas, place.checked, () => {
+        if (run === mine) leave("off", "The camera stopped: something else took it, or it was taken away. Take part again.");
+      });
       if (run !== mine) return found.close();
       eye = found;
     } catch (error) {
@@ -181,6 +193,7 @@ export function make(root, { model, go }) {
     words(said, "Joining the team");
     words(sightLine, NONE);
     show("on", line);
+    setTimeout(() => { if (trouble.textContent === line) words(trouble, ""); }, READ);
     wake();
     looks(mine);
   }

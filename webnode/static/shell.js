@@ -3,7 +3,7 @@ import { at } from "./element.js";
 import { panels } from "./panel.js";
 
 // A phone looks as a viewer does.
-const RANKS = { anyone: 0, viewer: 1, phone: 1, operator: 2 };
+const RANKS = { anyone: 0, viewer: 1, phone: 2, operator: 3 };
 const shown = new Map();
 let shared = {};
 let looked = "";

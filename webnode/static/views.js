@@ -15,9 +15,7 @@ function kept() {
 }
 
 // What is looked at less often, and how the page looks.
-function more(root, { go }) {
-  const phone = element("button", {}, "Take part with this device");
-  phone.onclick = () => go("phone");
+function more(root) {
   const choice = element("select", { id: "theme" }, ...Object.entries(THEMES).map(([value, name]) => element("option", { value }, name)));
   choice.value = kept() in THEMES ? kept() : "light dark";
   const apply = () => { document.documentElement.style.colorScheme = choice.value; };
@@ -33,8 +31,7 @@ function more(root, { go }) {
   root.append(
     element("nav", { class: "further", "aria-label": "More views" },
       ...Object.entries(MORE).map(([place, name]) => element("a", { href: `#${place}` }, name))),
-    element("p", { class: "row" }, phone), element("div", { class: "row" }, element("label", { for: "theme" }, "Colours"), choice));
-  return { update({ has }) { phone.hidden = !has.includes("phones"); } };
+    element("div", { class: "row" }, element("label", { for: "theme" }, "Colours"), choice));
 }
 
 // What a phone needs to take part comes when its visitor asks for it.
@@ -54,6 +51,11 @@ document.querySelector("main").before(element("section", { class: "phone", id: "
   element("h2", { id: "h-phone" }, "This phone")));
 panel({ place: "more", order: 30, title: "More", make: more });
 
+panel({ place: "more", order: 35, title: "Take part", needs: { role: "phone", has: "phones" }, make(root, { go }) {
+  const button = element("button", {}, "Take part with this device");
+  button.onclick = () => go("phone");
+  root.append(element("p", { class: "row" }, button));
+} });
 panel({ place: "phone", title: "This phone", needs: { role: "viewer", has: "phones" }, make: phone });
 panel({ place: "events", title: "Events", load: () => import("./events.js") });
 panel({ place: "network", order: 10, title: "Network", needs: { has: "survey" }, load: () => import("./network.js") });
