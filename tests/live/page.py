@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import shutil
+import ssl
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -35,6 +38,16 @@ SMALL = """[...document.querySelectorAll('button, input, select, nav a')].filter
         || (e.tagName !== 'INPUT' && e.scrollWidth > e.clientWidth + 1))
     .map(e => e.outerHTML)"""
 """What a finger does not hit, or is cut off."""
+
+
+def pin(port: int) -> str:
+    """What Chromium is told to trust: the hash of the public key of the certificate that is served there."""
+    from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
+    from cryptography.x509 import load_pem_x509_certificate
+
+    served = load_pem_x509_certificate(ssl.get_server_certificate(("127.0.0.1", port)).encode())
+    key = served.public_key().public_bytes(Encoding.DER, PublicFormat.SubjectPublicKeyInfo)
+    return base64.b64encode(hashlib.sha256(key).digest()).decode()
 
 
 class Team:

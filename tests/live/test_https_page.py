@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import base64
-import hashlib
 import json
 import signal
 import ssl
 from importlib.util import find_spec
 from typing import Any
 
-from tests.live.page import CHROMIUM, DESK, FLAGS, PHONE
+from tests.live.page import CHROMIUM, DESK, FLAGS, PHONE, pin
 from tests.live.page import MISSING as NO_BROWSER
 from tests.live.test_bad_input import LiveTests
 from tests.live.test_https import CODE, SecureNode, asked
@@ -21,16 +19,6 @@ FOUND_S = 30.0
 """For two nodes to know each other's pages, on a busy machine."""
 MOVED_S = 15.0
 """Within 2 s where the machine has nothing else to do."""
-
-
-def pin(port: int) -> str:
-    """What Chromium is told to trust: the hash of the public key of the certificate that is served there."""
-    from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
-    from cryptography.x509 import load_pem_x509_certificate
-
-    served = load_pem_x509_certificate(ssl.get_server_certificate(("127.0.0.1", port)).encode())
-    key = served.public_key().public_bytes(Encoding.DER, PublicFormat.SubjectPublicKeyInfo)
-    return base64.b64encode(hashlib.sha256(key).digest()).decode()
 
 
 class HttpsPageTests(LiveTests):

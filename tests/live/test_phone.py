@@ -1,7 +1,6 @@
 """A phone in Chromium, with a fake camera, in the real demonstration: joins, finds the target, wins, is taken over.
 
-The demonstration's page is asked over https where the environment says so: ``PHONE_SCHEME=https``, and in
-``PHONE_FLAGS`` what has Chromium trust the certificate (``--ignore-certificate-errors``, for one).
+The demonstration's page is asked over https, as a phone has to, where the libraries of the extra ``tls`` are there.
 """
 
 from __future__ import annotations
@@ -17,16 +16,17 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
 from benchmarks.demo import family
-from tests.live.page import CHROMIUM, DESK, FLAGS, MISSING, PHONE, TABLET, Team
+from tests.live.page import CHROMIUM, DESK, FLAGS, MISSING, PHONE, TABLET, Team, pin
 
 FAKE = ("--use-fake-device-for-media-stream", "--use-fake-ui-for-media-stream")
-MORE = tuple(os.environ.get("PHONE_FLAGS", "").split())
+IS_SECURE = all(find_spec(name) for name in ("OpenSSL", "cryptography"))
 TAKEOVER_S = 2.0
 PLACES = ((0.3, 2.1), (2.7, 2.1), (0.3, 0.3), (2.7, 0.3))
 SIGHTS = """async (pictures) => {
@@ -79,7 +79,7 @@ class Browser(SynchronousTestCase):
         shown = f"--use-file-for-fake-video-capture={film(Path(self.mktemp()).with_suffix('.mjpeg').absolute(), disc)}"
         play = sync_playwright().start()
         self.addCleanup(play.stop)
-        browser = play.chromium.launch(executable_path=CHROMIUM, args=[*FLAGS, *MORE, shown, *(flags or FAKE)])
+        browser = play.chromium.launch(executable_path=CHROMIUM, args=[*FLAGS, shown, *(flags or FAKE)])
         self.addCleanup(browser.close)
         self.faults: list[str] = []
         return browser
@@ -209,9 +209,8 @@ class DemonstrationPhoneTests(Browser):
     def setUp(self) -> None:
         log, run_dir = Path(self.mktemp()), Path(self.mktemp()).absolute()
         command = [sys.executable, "-m", "sim.demo", "--run-dir", str(run_dir), "--web-port", "0"]
-        scheme = os.environ.get("PHONE_SCHEME", "http")
-        # Only a page for phones, which come by the network, is served over https.
-        command += ["--web-host", "0.0.0.0"] if scheme == "https" else []
+        scheme = "https" if IS_SECURE else "http"
+        command += ["--tls"] if IS_SECURE else []
         with log.open("w", encoding="utf-8") as errors:
             root = Path(__file__).parents[2]
             demo = subprocess.Popen(command, cwd=root, stdout=subprocess.PIPE, stderr=errors, text=True)
@@ -241,6 +240,11 @@ class DemonstrationPhoneTests(Browser):
         asked = urllib.request.Request(f"{self.url}api/v1/{path}", data, headers)
         with urllib.request.urlopen(asked, timeout=20, context=self.trust) as answer:
             return json.load(answer)
+
+    def pins(self) -> str:
+        """What Chromium is to trust of both web nodes."""
+        secure = [page["url"] for page in self.api("node")["pages"] if page["is_secure"]]
+        return ",".join(pin(int(url.rpartition(":")[2])) for url in secure)
 
     def devices(self) -> dict[str, Any]:
         return {each["name"]: each for each in self.api("devices")}
@@ -279,8 +283,10 @@ class DemonstrationPhoneTests(Browser):
     def joined(self) -> Any:
         """The page of a phone that takes part as anna, with the target before its camera."""
         invitation = self.api("invitations", {"role": "phone", "name": "visitor"})["token"]
-        page = self.page(self.browser(), f"{self.url}#code={invitation}/phone")
-        self.until(lambda: {"dog1", "dog2", "dog3"} <= set(self.devices()), 30.0, page)
+        self.until(lambda: {"dog1", "dog2", "dog3"} <= set(self.devices()), 30.0 * stretch())
+        self.until(lambda: len(self.api("node")["pages"]) == (4 if IS_SECURE else 2), 30.0 * stretch())
+        browser = self.browser(66, *FAKE, f"--ignore-certificate-errors-spki-list={self.pins()}")
+        page = self.page(browser, f"{self.url}#code={invitation}/phone")
         page.locator("#phone-name").fill("anna")
         page.get_by_role("button", name="Take part", exact=True).tap()
         page.locator(".phone", has_text="Target at about 0.2").wait_for()
