@@ -35,6 +35,8 @@ from middleware.verdict import Verdict
 
 HEIRS = 2
 """So many of those that wait are ready to take over at once: each asks the council now and then."""
+INSISTING = 1.0
+"""Seconds after which who is to act, and is not let, says so again: whoever acts may think that it has given up."""
 SEARCH_TTL = 0.5
 """Seconds for which a motion that needs no lease (to look around) is allowed at a time."""
 
@@ -84,6 +86,7 @@ class Engagement:
         self._heirs: tuple[str, ...] = ()
         self._successors: tuple[Contact, ...] = ()
         self._rests_until = 0.0
+        self._insists_at = 0.0
         self._reporter = Reporter(behaviour, clock, reads_of(strategy))
         self._behaviour = behaviour
         self._execution = Execution(behaviour, task.stall_limit)
@@ -289,7 +292,7 @@ class Engagement:
         lease = self.lessee.lease
         if lease is None:
             if not self._stop(State.FENCED):
-                self._place(decision)
+                self._claim(decision, now)
             return self._stand_by(decision, now)
         if self.course.state is not State.EXECUTING:
             self._place(decision)
@@ -302,6 +305,17 @@ class Engagement:
             self._finish(COMPLETED)
             return Deed(STAND, self._permit(lease))
         return Deed(turn.action, self._permit(lease))
+
+    def _claim(self, decision: Decision, now: float) -> None:
+        was = self.course.state
+        self._place(decision)
+        if self.course.state is not State.CLAIMING:
+            return
+        if was is not State.CLAIMING:
+            self._insists_at = now + INSISTING
+        elif now >= self._insists_at:
+            self._insists_at = now + INSISTING
+            self._publish(again=True)
 
     def _stand_by(self, decision: Decision, now: float) -> Deed:
         post = self._formation.close_up(self.me, self._conference.others(now), decision.assigned)

@@ -247,6 +247,34 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual((self.council.is_wanted, self.council.places), (False, [0, 1]))
         self.assertEqual(self.events, [])
 
+    def test_who_is_not_let_insists(self) -> None:
+        """Who is to act, and has no lease, says so again each second; nobody can take it for one that gave up."""
+        self.hear(self.report(2, 2.0))
+        self.see(1.0)
+        self.step()
+        told = len(self.told)
+        for _ in range(50):
+            self.clock.advance(0.05)
+            self.step()
+        again = self.told[told - 1 :]
+        self.assertEqual([member.serial - again[0].serial for member in again], [0, 1, 2])
+        self.assertEqual({(member.cost, member.assigned) for member in again}, {(1.0, ME.node_id.hex())})
+
+    def test_who_was_passed_over_is_let_again(self) -> None:
+        """Who got the lease while it stood by gives way to the better one as soon as that says anything."""
+        better = self.report(2, 0.5)
+        self.hear(better)
+        self.see(1.0)
+        self.step()
+        self.council.grant(5)
+        self.assertEqual(self.step().action, GO)
+        for _ in range(5):
+            self.clock.advance(0.05)
+            self.assertEqual(self.step().action, GO)
+        self.hear(replace(better, serial=1))
+        self.assertEqual(self.step().action, HOLD)
+        self.assertEqual(self.events, ["halted", "released"])
+
     def test_lease_that_comes_too_late_is_given_back(self) -> None:
         """Who stopped because its lease ran out gives back the next one, where another should act meanwhile."""
         self.acting()
