@@ -150,7 +150,10 @@ def _arguments(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--seed", type=int, default=1, help="seed of the yard (default 1)")
     parser.add_argument("--web-host", default=LOOPBACK, help="address of the page; 0.0.0.0 opens it to the network")
     parser.add_argument(
-        "--web-port", type=_port, default=None, help=f"port of the page (default {WEB_PORT}, or a free one)"
+        "--web-port",
+        type=_port,
+        default=None,
+        help=f"port of the page (default {WEB_PORT}, or a free one; 0: all ports are free ones, for several at once)",
     )
     parser.add_argument("--tls", action="store_true", help="serve the page over TLS on this machine alone, too")
     parser.add_argument("--run-dir", type=Path, default=Path("run"), help="logs, stores and configurations go there")
@@ -181,7 +184,8 @@ async def _run(reactor: Any, wishes: argparse.Namespace) -> None:
             with_tls = wishes.tls or (has_tls() and not wishes.headless and wishes.web_host != LOOPBACK)
             if wishes.tls and not has_tls():
                 raise Trouble("--tls wants libraries that are missing; install them by: pip install 'swarm-node[tls]'")
-            plan = arranged(folder, wishes.web_host, wishes.web_port, not wishes.headless, _say, with_tls)
+            is_usual = not wishes.headless and wishes.web_port != 0
+            plan = arranged(folder, wishes.web_host, wishes.web_port, is_usual, _say, with_tls)
             demonstration = Demonstration(reactor, plan, wishes.seed, _say)
             reactor.addSystemEventTrigger("before", "shutdown", demonstration.stop)
             try:

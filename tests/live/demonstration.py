@@ -20,7 +20,7 @@ class Demonstration:
 
     def __init__(self, log: Path, *options: str) -> None:
         with log.open("w", encoding="utf-8") as errors:
-            command = [sys.executable, "-m", "sim.demo", *options]
+            command = [sys.executable, "-m", "sim.demo", "--web-port", "0", *options]
             root = Path(__file__).parents[2]
             self._process = subprocess.Popen(command, cwd=root, stdout=subprocess.PIPE, stderr=errors, text=True)
         self.pid = self._process.pid
