@@ -23,7 +23,7 @@ function onEvent(event, data) {
   take(event, data);
   // Panels read the model: to them a change is a state like any other.
   const told = event === "change" ? "state" : event;
-  for (const later of LATER) if (later.on === told && later.is()) later.loaded ??= later.load().then(() => tell(told));
+  for (const later of LATER) if (later.on === told && later.is()) later.loaded ??= later.load().then(() => tell(told), () => { later.loaded = null; });
   tell(told);
   // Another node may have other parts.
   if (event === "link" && data === "live") get("node").then(({ has }) => onEvent("has", has), () => {});

@@ -2,6 +2,7 @@
 import { at } from "./element.js";
 import { panels } from "./panel.js";
 
+const AGAIN = 3000;
 // A phone looks as a viewer does.
 const RANKS = { anyone: 0, viewer: 1, phone: 2, operator: 3 };
 const shown = new Map();
@@ -55,7 +56,14 @@ async function open(panel) {
     root.dataset.order = panel.order;
     place.insertBefore(root, [...place.children].find((other) => Number(other.dataset.order) > panel.order) ?? null);
   }
-  const make = panel.make ?? (await panel.load()).make;
+  let { make } = panel;
+  try {
+    make ??= (await panel.load()).make;
+  } catch {
+    // Its node is gone, or too busy to send it: it is tried again.
+    setTimeout(() => shown.get(panel) === entry && close(entry), AGAIN);
+    return;
+  }
   if (shown.get(panel) !== entry) return;
   entry.acts = make(root, shared) ?? {};
   entry.acts.update?.(shared.model, "");
