@@ -54,7 +54,7 @@ function startDevice() {
   const line = (text) => words(at("d-answer"), text);
   const dialog = at("place-device");
   at("d-close").addEventListener("click", () => dialog.close());
-  dialog.addEventListener("close", () => { if (open) back(); });
+  dialog.addEventListener("close", () => { if (location.hash === `#device/${open}`) back(); });
   dialog.addEventListener("click", (event) => { if (event.target === dialog) dialog.close(); });
   at("d-message").addEventListener("submit", async (event) => {
     event.preventDefault();

@@ -1,4 +1,5 @@
 // The page: every panel that there is, one stream in, and the model that all of them read.
+import "./theme.js";
 import "./header.js";
 import "./halt.js";
 import "./devices.js";

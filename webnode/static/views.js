@@ -1,33 +1,25 @@
 // Views: what leads to the further ones, and the panels that are loaded only where the node can fill them.
 import { element } from "./element.js";
 import { panel } from "./panel.js";
+import { KEPT, theme } from "./theme.js";
 
-const MORE = { groups: "Consensus", network: "Network", events: "Events" };
 const THEMES = { "light dark": "As the system", light: "Light", dark: "Dark" };
-const KEPT = "swarm.theme";
+const MORE = { groups: "Consensus", network: "Network", events: "Events" };
 
-function kept() {
+function choose(theme) {
+  document.documentElement.style.colorScheme = theme;
   try {
-    return localStorage.getItem(KEPT);
+    localStorage.setItem(KEPT, theme);
   } catch {
-    return null;
+    // A browser that keeps nothing asks the system again.
   }
 }
 
 // What is looked at less often, and how the page looks.
 function more(root) {
   const choice = element("select", { id: "theme" }, ...Object.entries(THEMES).map(([value, name]) => element("option", { value }, name)));
-  choice.value = kept() in THEMES ? kept() : "light dark";
-  const apply = () => { document.documentElement.style.colorScheme = choice.value; };
-  choice.addEventListener("change", () => {
-    apply();
-    try {
-      localStorage.setItem(KEPT, choice.value);
-    } catch {
-      // A browser that keeps nothing asks the system again.
-    }
-  });
-  apply();
+  choice.value = theme();
+  choice.addEventListener("change", () => choose(choice.value));
   root.append(
     element("nav", { class: "further", "aria-label": "More views" },
       ...Object.entries(MORE).map(([place, name]) => element("a", { href: `#${place}` }, name))),
