@@ -4,6 +4,8 @@ PYTHON ?= python3
 VENV   := .venv
 PY     := $(VENV)/bin/python
 SEED   ?= 1
+ROBOT  ?= aibo
+LOSE   ?= node
 N      ?= 20
 REAL   ?= 0
 HEADLESS ?=
@@ -15,6 +17,10 @@ SECONDS ?= 5
 JOBS   ?= $(shell nproc 2>/dev/null || echo 1)
 PEERS  ?=
 QUICK  ?=
+DOCS   ?=
+LOG    ?=
+SCHEDULER ?=
+NAT    ?=
 
 # Wheels only: nothing is ever compiled here.  Our own tree is installed without a build sandbox,
 # so that a second run needs no network.
@@ -26,11 +32,15 @@ BROWSER := $(VENV)/.stamp-browser
 BENCH   := $(VENV)/.stamp-bench
 CONTRACT := $(VENV)/contract
 
-.PHONY: help demo test trials check format cov live contract schedules browser \
-    bench-demo bench-page bench-dht bench-consensus bench-takeover api dist clean
+.PHONY: help demo test trials check format cov live contract schedules bugs slice browser \
+    live-nat bench-demo bench-page bench-dht bench-consensus bench-takeover bench-flood bench-robots bench-crowd \
+    bench-scale api dist clean
 
 help:
-	@echo 'make demo [HEADLESS=1] [SEED=1]       three dogs, a red target and the page; HEADLESS: both experiments, then exit'
+	@echo 'make demo [HEADLESS=1] [SEED=1]       three robots, a red target and the page; HEADLESS: both experiments, then exit'
+	@echo '          [ROBOT=aibo|bittle|create2|mixed|rosbridge|sim]   what the three are; mixed: an AIBO, a Create 2, a Bittle'
+	@echo '          [LOSE=node|link]                             what experiment 2 takes: the node, or the link to its robot'
+	@echo '          [NAT=1]   across an internet of network namespaces: two robots behind routers of their own'
 	@echo '          [WEB_HOST=0.0.0.0] [WEB_PORT=8080] [TLS=1]   whom the page is open to, and where; TLS: on this machine alone, too'
 	@echo 'make test                             every test'
 	@echo 'make trials [N=20] [SEED=1] [REAL=3]  both experiments N times in memory, and REAL times as processes'
@@ -38,7 +48,12 @@ help:
 	@echo 'make format                           write the format that "make check" asks for'
 	@echo 'make cov                              the tests with coverage of lines and branches'
 	@echo 'make schedules [N=2000] [SEED=1]      so many random schedules of faults, and the invariants of the library'
+	@echo '          [LOG=docs/scale/schedules.jsonl]   log them, and leave out those that are logged'
+	@echo '          [SCHEDULER=tcp://HOST:8786]        on the machines that wait there: dask scheduler, dask worker'
+	@echo 'make bugs                             each of the seeded bugs in turn, until a schedule shows it'
+	@echo 'make slice                            a thousand simulated nodes, a tenth of which are killed'
 	@echo 'make live                             only the tests with real sockets and processes'
+	@echo 'make live-nat [N=5]                   real nodes behind every pair of routers, in network namespaces: who reaches whom'
 	@echo 'make contract                         the API against its own document: every route, asked in every way'
 	@echo 'make browser                          only the tests of the page in Chromium'
 	@echo 'make bench-demo                       what the demonstration costs: memory, datagrams, seconds'
@@ -46,12 +61,16 @@ help:
 	@echo 'make bench-dht [NODES=8,32] [SECONDS=5] [PEERS=..]   the peer-to-peer library beside others of its kind'
 	@echo 'make bench-takeover [N=200] [REAL=20]   seconds to take over, for each way to lose who acts'
 	@echo 'make bench-consensus [QUICK=1]        every strategy over the same missions: cost, messages, time to agree'
+	@echo 'make bench-flood                      20,000 forged datagrams a second at a node, while two call each other'
+	@echo 'make bench-robots                     three AIBOs driven at once: frames, pictures, command to wheel, memory'
+	@echo 'make bench-crowd [QUICK=1]            a yard for many: 3 to 10,000 robots, and a hundred agents attached; QUICK: no agents'
+	@echo 'make bench-scale [NODES=3,10,30]      teams of 3 to 10,000 nodes, simulated: hops, bytes, memory, seconds; resumable'
 	@echo 'make api                              the reference of every class, from the docstrings, in build/api'
 	@echo 'make dist                             sdist and wheel, installed into a fresh environment and asked for help'
 	@echo 'make clean                            remove what the above left behind, the environment included'
 
 demo: $(RUNTIME)
-	@exec $(PY) -m sim.demo --seed $(SEED) $(if $(filter-out 0,$(HEADLESS)),--headless) $(if $(filter-out 0,$(TLS)),--tls) \
+	@exec $(PY) -m $(if $(filter-out 0,$(NAT)),benchmarks.nat.demo,sim.demo) --seed $(SEED) --robot $(ROBOT) --lose $(LOSE) $(if $(filter-out 0,$(HEADLESS)),--headless) $(if $(filter-out 0,$(TLS)),--tls) \
 	    --web-host $(WEB_HOST) $(if $(WEB_PORT),--web-port $(WEB_PORT))
 
 # One worker for each processor.
@@ -76,10 +95,22 @@ cov: $(DEV)
 	$(PY) -m coverage report
 
 schedules: $(DEV)
-	$(PY) -m tests.invariants --schedules $(if $(filter file,$(origin N)),2000,$(N)) --seed $(SEED)
+	$(PY) -m tests.invariants --schedules $(if $(filter file,$(origin N)),2000,$(N)) --seed $(SEED) --jobs $(JOBS) \
+	    $(if $(LOG),--log $(LOG) --resume) $(if $(SCHEDULER),--scheduler $(SCHEDULER))
+
+# A thousand nodes, a tenth of which are killed.
+slice: $(RUNTIME)
+	$(VENV)/bin/sim run --scenario slice --seed $(SEED)
+
+bugs: $(DEV)
+	$(PY) -m tests.invariants --bugs --jobs $(JOBS) $(if $(SCHEDULER),--scheduler $(SCHEDULER))
 
 live: $(DEV)
 	$(PY) -m twisted.trial tests.live
+
+# Wants root, or namespaces for users, and says so.
+live-nat: $(RUNTIME)
+	$(PY) -m benchmarks.nat --count $(if $(filter file,$(origin N)),5,$(N)) $(if $(filter-out 0,$(DOCS)),--docs)
 
 contract: $(CONTRACT)/.stamp
 	$(CONTRACT)/bin/python -m twisted.trial tests.live.test_contract
@@ -108,6 +139,21 @@ bench-consensus: $(BENCH)
 	@mkdir -p build
 	$(PY) -m benchmarks.consensus $(if $(filter-out 0,$(QUICK)),--quick) \
 	    --out build/bench-consensus.json --plot build/bench-consensus.svg
+
+bench-robots: $(RUNTIME)
+	$(PY) -m benchmarks.robots
+
+bench-crowd: $(RUNTIME)
+	@mkdir -p build
+	$(PY) -m benchmarks.crowd $(if $(filter-out 0,$(QUICK)),--agents 0) --out build/bench-crowd.json
+
+# Sizes that stand in docs/scale/scale.json already are not measured again.
+bench-scale: $(RUNTIME)
+	$(VENV)/bin/sim scale $(if $(filter file,$(origin NODES)),,--nodes $(NODES)) --seed $(SEED) --out docs/scale
+
+bench-flood: $(RUNTIME)
+	@mkdir -p build
+	$(PY) -m benchmarks.flood --out build/bench-flood.json
 
 api: $(DEV)
 	$(PIP) 'pydoctor>=25.10,<26'

@@ -11,6 +11,8 @@ import random
 from typing import Protocol
 
 from agents.context import Context
+from agents.means import STAND as STAND
+from agents.means import Means
 from drivers.reading import Action, Observation
 from middleware.deployed import BEHAVIOUR, Deployed, is_deployed, maker_of
 from middleware.errors import MissingExtra, UnknownTask
@@ -23,7 +25,6 @@ KINDS = {
 }
 ENTRY_POINTS = "swarm_node.behaviours"
 VISION = ("cv2", "numpy")
-STAND = {"base.vx": 0.0, "base.vy": 0.0, "base.wz": 0.0}
 
 
 class Behaviour(Protocol):
@@ -31,9 +32,10 @@ class Behaviour(Protocol):
 
     A behaviour may also have: ``is_safe``, whether the task may change hands now (usually it always may);
     ``progress``, the share that is done, 0 to 1; ``valid_for``, the seconds for which its cost counts (usually as long
-    as its node lives); ``angle`` and ``take_post``, see ``agents.formation``.  For strategies that go by it: ``value``,
-    the number or the place that it has to offer (a tuple; metres), ``choice``, the option that it is for, the
-    ``weight`` of both, and ``electorate``, the weight of all that may vote.
+    as its node lives); ``angle`` and ``take_post``, see ``agents.formation``; ``embody``, which is given what the
+    body can do before the first look, see ``agents.means``.  For strategies that go by it: ``value``, the number or the
+    place that it has to offer (a tuple; metres), ``choice``, the option that it is for, the ``weight`` of both, and
+    ``electorate``, the weight of all that may vote.
     """
 
     def look(self, seen: Observation, now: float) -> None:
@@ -53,17 +55,26 @@ class Behaviour(Protocol):
         """What to do next to get it done; None when it is done."""
 
 
-def behaviour_for(task: Task, rng: random.Random, deployed: Deployed | None = None) -> Behaviour:
+def behaviour_for(
+    task: Task, rng: random.Random, deployed: Deployed | None = None, means: Means | None = None
+) -> Behaviour:
     """The behaviour for ``task.kind``: a built-in one, or an entry point of ``swarm_node.behaviours``.
 
-    ``deployed:x`` is the module ``x`` that an operator pushed, among those in ``deployed``.
+    ``deployed:x`` is the module ``x`` that an operator pushed, among those in ``deployed``.  Where there are ``means``
+    the behaviour is told what its body can do.
 
     A task comes from the wire, so its kind is looked up among what is installed here and never imported as it stands.
     Raises ``UnknownTask``, which names those there are or says what is wrong with the task's parameters, and
     ``MissingExtra`` where the behaviour's libraries are not installed.
     """
-    if is_deployed(task.kind):
-        return _deployed(task, rng, deployed or {})
+    made = _deployed(task, rng, deployed or {}) if is_deployed(task.kind) else _installed(task, rng)
+    embody = getattr(made, "embody", None)
+    if means is not None and embody is not None:
+        embody(means)
+    return made
+
+
+def _installed(task: Task, rng: random.Random) -> Behaviour:
     target = KINDS.get(task.kind)
     if target is None:
         from importlib.metadata import entry_points  # heavy, and most nodes never come here

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -11,6 +12,7 @@ from twisted.internet.task import deferLater
 from twisted.logger import Logger
 
 from agents.engagement import Deed
+from agents.means import Means
 from drivers.driver import Driver
 from drivers.errors import DriverError, LinkError, StaleCommand, UsageError
 from drivers.reading import Observation
@@ -35,12 +37,14 @@ class Body:
         missing: Callable[[str], None],
     ) -> None:
         self.driver = driver
+        self.means = Means(driver.description)
         self.is_awake = False
         self._clock = clock
         self._seen = seen
         self._missing = missing
         self._is_running = False
         self._answered_at = clock.seconds()
+        self._ends_at = -math.inf
         self._unsubscribe: Callable[[], None] | None = None
 
     def start(self) -> None:
@@ -64,12 +68,17 @@ class Body:
         return isinstance(charge, float | int) and charge < EMPTY
 
     @property
+    def is_off(self) -> bool:
+        """Whether the robot's own switch keeps its motors off, as far as it says."""
+        seen = self.driver.observe()
+        return seen is not None and seen.values.get("estop.engaged") is True
+
+    @property
     def answers(self) -> bool:
         """Whether the robot answers with its motors on and some charge left, or did so a moment ago."""
-        seen = self.driver.observe()
         if self.is_empty:
             return False
-        has_motors = seen is None or seen.values.get("estop.engaged") is not True
+        has_motors = not self.is_off
         now = self._clock.seconds()
         if self.is_awake and has_motors and self.driver.state == "ready":
             self._answered_at = now
@@ -80,7 +89,9 @@ class Body:
         if self.driver.state != "ready":
             return True
         try:
-            self.driver.act(deed.action, deed.permit)
+            action = self.means.fitted(deed.action)
+            self._ends_at = deed.permit.deadline
+            self.means.did(action, self.driver.act(action, deed.permit))
         except UsageError as error:
             self.driver.stop()
             self._log.debug("the body refused: {error}", error=error)
@@ -88,6 +99,16 @@ class Body:
         except DriverError as error:
             self._log.info("the body does not answer: {error}", error=error)
         return True
+
+    def halt(self) -> float:
+        """Stand still; returns for how many seconds it may still move where it does not hear that: as its permit says.
+
+        A robot that knows no permits moves for as long as its own timer lets it (docs/robots/stopping.md).
+        """
+        self.driver.stop()
+        if not self.driver.description.limits or self.driver.state in ("ready", "stopped"):
+            return 0.0
+        return max(0.0, self._ends_at - self._clock.seconds())
 
     async def _wake(self) -> None:
         """Have the body connected and its motors on; a link that goes away in between is tried again."""

@@ -1,20 +1,20 @@
 """Circling: walk around a target at the distance kept, in legs that the rangers look ahead on; pure.
 
-A robot sees and ranges only ahead.  So it turns along the circle, walks a short chord while the way is open, and turns
-back to look at the target before the next one.
+A robot sees and ranges only ahead, and one without a ranger stays where it is.  So it turns along the circle, walks a
+short chord while the way is open, and turns back to look at the target before the next one.
 """
 
 from __future__ import annotations
 
 import math
 
-from agents.behaviour import STAND
-from agents.exploration import AIMED, CLEARANCE, TURN_GAIN, TURN_SPEED, WALK, Pose, clipped
+from agents.exploration import AIMED, CLEARANCE, TURN_GAIN, Pose, clipped
 from agents.formation import CLOSE
+from agents.means import Means
 from drivers.reading import Action
 
 LONGEST = 0.45
-"""Metres of a chord: three seconds' walk, in which the target is out of sight."""
+"""Metres of a chord: three seconds' walk of an ERS-7, in which the target is out of sight."""
 NEAREST = 0.45
 """Who stands nearer to the target than this stays: it would be in the way."""
 
@@ -22,7 +22,8 @@ NEAREST = 0.45
 class Circling:
     """One robot's way to its post around the target."""
 
-    def __init__(self) -> None:
+    def __init__(self, means: Means | None = None) -> None:
+        self.means = Means() if means is None else means
         self._post: float | None = None
         self._is_blocked = False
         self._heading: float | None = None
@@ -52,15 +53,15 @@ class Circling:
         assert self._heading is not None
         off = math.remainder(self._heading - pose[2], math.tau)
         if self._leg_from is None:
-            if abs(off) > AIMED:
-                return {**STAND, "base.wz": clipped(TURN_GAIN * off, TURN_SPEED)}
+            if abs(off) > max(AIMED, self.means.aim):
+                return self.means.spin(clipped(TURN_GAIN * off, self.means.look_turn))
             self._leg_from = pose[:2]
         if not math.isnan(ahead) and ahead < CLEARANCE:
             self._is_blocked = True  # a wall, or another robot: this is as near to the post as can be
             return self.rest()
         if math.dist(self._leg_from, pose[:2]) >= self._leg:
             return self.rest()
-        return {**STAND, "base.vx": WALK, "base.wz": clipped(TURN_GAIN * off, TURN_SPEED)}
+        return self.means.go(self.means.walk, clipped(TURN_GAIN * off, self.means.look_turn))
 
     def rest(self) -> Action | None:
         """End the leg; the target is looked at next."""
@@ -69,7 +70,7 @@ class Circling:
 
     def _begins(self, pose: Pose, target: tuple[float, float], angle: float | None, is_facing: bool) -> bool:
         """Whether a leg begins here, and which."""
-        if self._post is None or angle is None or self._is_blocked or not is_facing:
+        if self._post is None or angle is None or self._is_blocked or not is_facing or not self.means.ranges:
             return False
         way = math.remainder(self._post - angle, math.tau)
         radius = math.dist(pose[:2], target)

@@ -15,12 +15,13 @@ from twisted.internet.defer import Deferred, succeed
 from twisted.internet.interfaces import IReactorTime
 
 from agents.account import Account
-from agents.behaviour import STAND, Behaviour
+from agents.behaviour import Behaviour
 from agents.conference import Conference
 from agents.decision import Decision
 from agents.division import Division
 from agents.execution import Execution
 from agents.formation import Formation
+from agents.means import STAND
 from agents.report import Reporter
 from agents.state import Course, State
 from drivers.driver import Permit
@@ -30,6 +31,7 @@ from middleware.consensus.strategy import ConsensusAlgorithm, reads_of
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.kademlia.contact import Contact
 from middleware.order import PAUSE, Order
+from middleware.presence import EXECUTING
 from middleware.tasks import COMPLETED, FAILED, Member, Result, Task
 from middleware.verdict import Verdict
 
@@ -53,9 +55,10 @@ class Engagement:
     """One agent at one task.
 
     ``tell`` publishes this agent's report; ``conclude`` records the outcome; ``say`` writes a line for people; ``halt``
-    stops the body now; ``token`` is the highest token that the body has obeyed so far; ``age`` is how old the task was
-    when the agent took it up.  With a ``lessee`` the agent has its body for this task, without one it only listens; and
-    where ``is_lent`` says that another task of its group has the body, it reports and decides all the same.
+    stops the body now, and says for how many seconds it may still move because it does not hear that; ``token`` is the
+    highest token that the body has obeyed so far; ``age`` is how old the task was when the agent took it up.  With a
+    ``lessee`` the agent has its body for this task, without one it only listens; and where ``is_lent`` says that
+    another task of its group has the body, it reports and decides all the same.
     ``justify`` is told why, at each decision; ``reached`` knows how the agents of some uuids are reached.
     """
 
@@ -70,7 +73,7 @@ class Engagement:
         tell: Callable[[Member], None],
         conclude: Callable[[Result], None],
         say: Callable[[str], None],
-        halt: Callable[[], object],
+        halt: Callable[[], float],
         age: float = 0.0,
     ) -> None:
         self.task = task
@@ -87,6 +90,7 @@ class Engagement:
         self._successors: tuple[Contact, ...] = ()
         self._rests_until = 0.0
         self._insists_at = 0.0
+        self._stands_at = 0.0
         self._reporter = Reporter(behaviour, clock, reads_of(strategy))
         self._behaviour = behaviour
         self._execution = Execution(behaviour, task.stall_limit)
@@ -194,10 +198,10 @@ class Engagement:
             self._publish(again=True, **news)
 
     def lose_body(self) -> None:
-        """Take the report back: the body does not answer, so another has to act.  The next look reports again."""
-        if self.me.cost is not None and not self.is_over:
+        """Take the report back: the body does not answer, so nobody waits for it.  The next look reports again."""
+        if self.me.available and not self.is_over:
             self._say("has lost its robot")
-            self._publish(cost=None)
+            self._publish(cost=None, available=False)
 
     # -- what goes out ----------------------------------------------------------------------------------------------
 
@@ -233,7 +237,7 @@ class Engagement:
             return self._act(decision, now)
         self._yield()
         self._place(decision)
-        self._line_up()
+        self._line_up(decision)
         return self._stand_by(decision, now)
 
     def fence(self) -> None:
@@ -259,7 +263,7 @@ class Engagement:
         self.lessee, self.is_lent = None, True
 
     def abandon(self) -> Deferred[object]:
-        """Leave the task (the caller has stopped the body): give the lease back, for good where the task is done.
+        """Leave the task: stop the body where it acts, and give the lease back, for good where the task is done.
 
         Fires when the council knows.
         """
@@ -267,7 +271,8 @@ class Engagement:
             return succeed(None)
         if self._concluding and self.result is not None:
             return self.lessee.end()
-        return self.lessee.release(self.reached(self._heirs))
+        self._stop(State.RELEASING)
+        return self.lessee.release(self.reached(self._heirs), self._rest)
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
@@ -379,11 +384,13 @@ class Engagement:
         if self.is_acting or (self.lessee is not None and self.lessee.lease is not None):
             self._give_back()
 
-    def _line_up(self) -> None:
-        """Be ready to take over at once, where few are before this agent."""
+    def _line_up(self, decision: Decision) -> None:
+        """Be ready to take over at once, where few are before this agent; who acts now is not one of these."""
         assert self.lessee is not None
         if self.course.state is State.WAITING and 0 < self.course.rank <= HEIRS:
-            self.lessee.stand_by(self.course.rank)
+            others = self._conference.others(self._clock.seconds())
+            is_acting = any(member.uuid == decision.assigned and member.status == EXECUTING for member in others)
+            self.lessee.stand_by(self.course.rank + (not is_acting))
         else:
             self.lessee.release()
 
@@ -392,15 +399,20 @@ class Engagement:
         if self._stop(State.RELEASING):
             self._say("gives the task back")
         if self.lessee is not None:
-            self.lessee.release()
+            self.lessee.release(rest=self._rest)
 
     def _stop(self, state: State) -> bool:
         """Stop the body where it acts, which leads to ``state``; whether it did."""
         if self.course.state is not State.EXECUTING:
             return False
-        self._halt()
+        self._stands_at = self._clock.seconds() + self._halt()
         self.course.go(state)
         return True
+
+    @property
+    def _rest(self) -> float:
+        """Seconds for which the body may still move though it was stopped."""
+        return max(0.0, self._stands_at - self._clock.seconds())
 
     def _rest_aside(self, why: str) -> None:
         """Have no body for this task; who is to be asked for a report is another."""

@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 from twisted.logger import Logger
 
 from agents.context import Context
+from agents.means import Means
 from drivers.reading import Action, Observation
 
 T = TypeVar("T")
@@ -36,6 +37,10 @@ class Guarded:
         self._inner = inner
         self._stand = stand
         self.has_failed = False
+
+    def embody(self, means: Means) -> None:
+        """Tell it what its body can do, where it wants to know."""
+        self._asked(lambda: getattr(self._inner, "embody", lambda _: None)(means), None)
 
     def look(self, seen: Observation, now: float) -> None:
         """Take in what the body senses now."""

@@ -79,7 +79,7 @@ class Agent(Service):
             # In the robot's seconds until it was heard, in those of this clock since then.
             age = max(0.0, seen.t_robot - seen.frame.t_robot) + self._clock.seconds() - seen.t_host
             self._node.streams.offer(CAMERA, seen.frame.seq, seen.frame.data, age)
-        if self._body.is_empty or not self._node.halt.is_known:
+        if self._body.is_empty or self._body.is_off or not self._node.halt.is_known:
             return  # what it offered now it could not do at once, and others would count on it
         for engagement in self._having_body():
             if not engagement.is_over:
@@ -174,12 +174,12 @@ class Agent(Service):
 
     def _engage(self, task: Task) -> None:
         try:
-            behaviour = behaviour_for(task, self._rng, self._node.deployed)
+            behaviour = behaviour_for(task, self._rng, self._node.deployed, self._body.means)
             strategy = self._node.strategy(task.strategy)
         except SwarmError as error:
             self._docket.bury(task.task_id, self._clock.seconds())
             return self._say(str(error))
-        stop = self._body.driver.stop
+        stop = self._body.halt
         part = Part(task, self._node, behaviour, strategy, self._clock, self._token, self._told, stop)
         self._parts[task.task_id] = part
         self._say(f"assigned: {task.title}")

@@ -35,7 +35,7 @@ class Part:
         clock: IReactorTime,
         token: int,
         told: Callable[[Part, Member], None],
-        halt: Callable[[], object],
+        halt: Callable[[], float],
     ) -> None:
         self.is_left = False
         self._node = node

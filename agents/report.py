@@ -46,6 +46,7 @@ class Reporter:
         news: dict[str, Any] = {}
         if _is_news(cost, known.cost, is_acting):
             news["cost"] = cost
+        if news or not known.available:
             news["available"] = True
         valid_for = _number(getattr(self._behaviour, "valid_for", 0.0)) or 0.0
         if valid_for != known.valid_for:

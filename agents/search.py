@@ -1,7 +1,8 @@
 """SearchAndApproach: turn until the target is seen, face it, tell how far it is, and walk up to it (thesis, section 5).
 
-Distance comes from the infrared ranger once the dog faces the target, cross-checked with the size in the picture: a
-ranger that reads something else (a dog in between, a wall behind) is not believed.
+Distance comes from a ranger that looks ahead once the robot faces the target, cross-checked with the size in the
+picture: a ranger that reads something else (a dog in between, a wall behind) is not believed.  Without a ranger it is
+the picture's, and a bump into the target is an arrival as well.
 """
 
 from __future__ import annotations
@@ -9,34 +10,37 @@ from __future__ import annotations
 import math
 import random
 from collections.abc import Mapping
+from dataclasses import replace
 
-from agents.behaviour import STAND
 from agents.circling import Circling
 from agents.context import Context
-from agents.exploration import TURN_GAIN, TURN_SPEED, WALK, Exploration, Pose, clipped
+from agents.detour import Detour
+from agents.exploration import TURN_GAIN, Exploration, Pose, clipped
 from agents.formation import Post
+from agents.means import FAR, LIT, NEAR, STAND, Means, is_bumped, is_lit
 from agents.vision import Sighting, Size, find_target
 from drivers.reading import Action, Observation
 
-FACING = math.radians(3.0)
-CAMERA_AHEAD = 0.10
-"""Metres from the robot's centre to its camera."""
+AT_IT = math.radians(12.0)
+"""Whoever stands before the target looks at it at least so well."""
 TURN_FIRST = math.radians(25)
 IN_THE_WAY = 0.30
 SIDESTEP, CREEP = 0.10, 0.04
-STOP_AT = 0.12
-"""Metres left between the head and the target when the task is done: near, and not touching."""
+TOUCHING = 0.30
+"""Who faces a target that seems no farther away and bumps into something bumped into the target."""
+TIGHT = 3.0
+"""Who turns on a circle only, and has the target aside within so many of its radii, walks back first."""
 MEMORY = 4.0
 """Seconds for which a target out of sight is still believed to be where it was: another dog may only be passing by."""
-FRESH = 0.5
-"""Seconds since the newest sighting that still count as seeing the target."""
 DISAGREEMENT = 0.25
 SETTLE = 3
+STRIDE, STUCK = 0.02, 1.5
+"""Who walks, and comes no farther than that (metres) in so many seconds, stands against something."""
 MAX_SIZE = 5.0
 
 
 class SearchAndApproach:
-    """One dog and one red target; ``parameters`` may give ``target_radius`` and ``target_height`` in metres."""
+    """One robot and one red target; ``parameters`` may give ``target_radius`` and ``target_height`` in metres."""
 
     def __init__(self, parameters: Mapping[str, float | str], rng: random.Random) -> None:
         self._radius = _metres(parameters, "target_radius", 0.08)
@@ -51,9 +55,18 @@ class SearchAndApproach:
         self._has_pose = False
         self._distances: list[float] = []
         self._done_for = 0
-        self._circling = Circling()
+        self._means = Means()
+        self._circling = Circling(self._means)
+        self._detour = Detour(self._means)
+        self._is_lit = self._is_bumped = self._was_bumped = self._has_arrived = False
+        self._moved: tuple[Pose, float] = (0.0, 0.0, 0.0), -math.inf
+        self._asked_at = -math.inf
         self._way = 0.0
         self._north: float | None = None
+
+    def embody(self, means: Means) -> None:
+        """Look and walk as this body can."""
+        self._means = self._exploration.means = self._circling.means = self._detour.means = means
 
     # -- observing --------------------------------------------------------------------------------------------------
 
@@ -64,15 +77,16 @@ class SearchAndApproach:
         # Odometry counts from wherever the robot was switched on: the first pose is no turn.
         before = self._pose if self._has_pose else (x, y, yaw)
         self._pose, self._has_pose = (x, y, yaw), True
-        for name in ("near", "far"):
+        for name in FAR:
             self._ranges[name] = float(values.get(f"range.{name}", math.nan))
+        self._is_lit, self._is_bumped = is_lit(values), is_bumped(values)
         heading = values.get("compass.heading")
         self._north = None if heading is None else math.remainder(float(heading) - yaw, math.tau)
         self._exploration.saw(self._pose, math.remainder(yaw - before[2], math.tau), self._ahead)
         if seen.frame is not None and seen.frame.seq != self._frame:
             self._frame = seen.frame.seq
-            self._saw(find_target(seen.frame.data, self._size), now)
-        if self._circling.is_walking:
+            self._saw(find_target(seen.frame.data, self._size, self._means.lens), now)
+        if self._circling.is_walking or self._detour.is_on(now):
             self._looked_at = now  # it looks elsewhere, and the target stays where it is
         if now - self._looked_at > MEMORY:
             self._forget()
@@ -83,14 +97,17 @@ class SearchAndApproach:
         self._seen_at = self._looked_at = now
         # Where it stands in the robot's own odometry: between pictures the body turns and walks, the target does not.
         x, y, yaw = self._pose
-        reach, towards = sighting.distance + CAMERA_AHEAD, yaw + sighting.bearing
+        if sighting.is_filling and self._target is not None and not self._means.ranges:
+            # It is nearer than the picture can tell: what was known before, and the way since, say how near.
+            sighting = replace(sighting, distance=min(sighting.distance, self._distance))
+        reach, towards = sighting.distance + self._means.ahead, yaw + sighting.bearing
         self._target = (x + reach * math.cos(towards), y + reach * math.sin(towards))
-        if abs(sighting.bearing) < FACING:
+        if abs(sighting.bearing) < self._means.aim:
             self._distances = [*self._distances, self._measured(sighting)][-9:]
 
     def _measured(self, sighting: Sighting) -> float:
         """Metres from the head: the ranger's where it agrees with the picture, else the picture's."""
-        for name in ("near", "far"):
+        for name in FAR:
             ranged = self._ranges[name] + self._radius
             if abs(ranged - sighting.distance) < DISAGREEMENT * sighting.distance:
                 return ranged
@@ -112,7 +129,7 @@ class SearchAndApproach:
     def _distance(self) -> float:
         """Metres from the camera to the target's axis."""
         assert self._target is not None
-        return max(0.0, math.dist(self._pose[:2], self._target) - CAMERA_AHEAD)
+        return max(0.0, math.dist(self._pose[:2], self._target) - self._means.ahead)
 
     @property
     def cost(self) -> float | None:
@@ -138,20 +155,25 @@ class SearchAndApproach:
 
     def is_in_view(self, now: float) -> bool:
         """Whether the newest sighting still counts as seeing the target."""
-        return now - self._seen_at <= FRESH
+        return now - self._seen_at <= self._means.fresh
 
     # -- acting -----------------------------------------------------------------------------------------------------
 
     def search(self, now: float) -> Action:
         """Look around and walk to new places; something seen, face it."""
-        return self._exploration.step(self._pose, self._ahead) if self._target is None else self._face()
+        if self._target is not None:
+            self._detour.end()
+            return self._face()
+        self._feel(now)
+        return self._dodge(now) or self._exploration.step(self._pose, self._ahead)
 
     def hold(self, now: float) -> Action:
         """Stand at the post and keep facing the target, ready to take over."""
         if self._target is None:
             return self.search(now)
+        self._detour.end()
         self._way = self._gap
-        is_facing = abs(self._bearing) < FACING and self.is_in_view(now)
+        is_facing = abs(self._bearing) < self._means.aim and self.is_in_view(now)
         return self._circling.step(self._pose, self._target, self.angle, self._ahead, is_facing) or self._face()
 
     def take_post(self, post: Post) -> None:
@@ -166,36 +188,72 @@ class SearchAndApproach:
         self._circling.rest()
         if self._target is None:
             return self.search(now)
+        self._feel(now)
         bearing, gap = self._bearing, self._gap
-        turn = clipped(TURN_GAIN * bearing, TURN_SPEED)
-        if gap <= STOP_AT and abs(bearing) < 4 * FACING:
+        means = self._means
+        turn = clipped(TURN_GAIN * bearing, means.look_turn)
+        is_facing = abs(bearing) < AT_IT
+        self._has_arrived = is_facing and gap <= TOUCHING and (self._is_bumped or self._has_arrived)
+        if self._has_arrived or (gap <= means.stop_at and is_facing):
             # Arriving at a memory is no arrival: the target must be before the eyes, or the dog waits until it forgets.
             self._done_for = self._done_for + 1 if self.is_in_view(now) else 0
-            return None if self._done_for >= SETTLE else {**STAND, "base.wz": turn}
+            self._detour.end()
+            is_enough = self._has_arrived or (means.is_coarse and abs(bearing) < means.aim)
+            return None if self._done_for >= SETTLE else STAND if is_enough else means.spin(turn)
         self._done_for = 0
+        round_it = self._dodge(now)
+        if round_it is not None:
+            return round_it
         if abs(bearing) > TURN_FIRST:
-            return {**STAND, "base.wz": turn}
+            if math.dist(self._pose[:2], self._target) < TIGHT * means.circle:
+                return means.go(-CREEP)  # nearer than it can turn to
+            return means.spin(turn)
         if self._ahead < IN_THE_WAY and self._ahead + self._radius < self._distance * (1 - DISAGREEMENT) - 0.05:
-            # Something stands between: step aside, keep the eyes on the target.
-            return {**STAND, "base.vy": self._side * SIDESTEP, "base.wz": turn}
-        return {**STAND, "base.vx": clipped(max(CREEP, gap - STOP_AT), WALK), "base.wz": turn}
+            # Something stands between: step aside, keep the eyes on the target; or go round it.
+            if means.strafes:
+                return {**STAND, "base.vy": self._side * SIDESTEP, "base.wz": turn}
+            self._detour.begin(self._pose, self._side, now, has_touched=False)
+            return self._dodge(now) or STAND
+        return means.go(clipped(max(CREEP, gap - means.stop_at), means.walk), turn)
 
     @property
     def _gap(self) -> float:
         """Metres between the head and the surface of the target."""
         believed = max(0.0, self._distance - self._radius)
-        near = self._ranges.get("near", math.nan)
-        is_it = abs(self._bearing) < 4 * FACING and abs(near - believed) < 0.12
-        return near if is_it else believed
+        for name in NEAR:
+            near = self._ranges.get(name, math.nan)
+            if abs(self._bearing) < AT_IT and abs(near - believed) < 0.12:
+                # The ranger of another robot may sit behind its camera: then the picture knows better.
+                return near if name == "near" else min(near, believed)
+        return believed
+
+    def _feel(self, now: float) -> None:
+        """Count it as a bump where a body that ranges nothing walks, and comes nowhere."""
+        is_walking = self._means.is_walking and not self._means.ranges and now - self._asked_at < STUCK / 2
+        self._asked_at = now
+        if not is_walking or math.dist(self._moved[0][:2], self._pose[:2]) > STRIDE:
+            self._moved = self._pose, now
+        self._is_bumped = self._is_bumped or now - self._moved[1] > STUCK
+
+    def _dodge(self, now: float) -> Action | None:
+        """The way round what was touched just now, or before; None where there is nothing to go round."""
+        if self._is_bumped and not self._was_bumped:
+            self._detour.begin(self._pose, self._side, now, has_touched=True)
+            if self._target is None:
+                self._exploration.bumped(self._pose)
+        self._was_bumped = self._is_bumped
+        return self._detour.step(self._pose, self._ahead, now)
 
     def _face(self) -> Action:
-        bearing = self._bearing
-        return STAND if abs(bearing) < FACING * 0.7 else {**STAND, "base.wz": clipped(TURN_GAIN * bearing, TURN_SPEED)}
+        bearing, means = self._bearing, self._means
+        is_facing = abs(bearing) < means.aim * 0.7
+        return STAND if is_facing else means.spin(clipped(TURN_GAIN * bearing, means.look_turn))
 
     @property
     def _ahead(self) -> float:
         """Metres to whatever is straight ahead; NaN where nothing is within reach."""
-        return min((r for r in self._ranges.values() if not math.isnan(r)), default=math.nan)
+        lit = [LIT] if self._is_lit else []
+        return min((r for r in (*self._ranges.values(), *lit) if not math.isnan(r)), default=math.nan)
 
 
 def _metres(parameters: Mapping[str, float | str], name: str, usual: float) -> float:

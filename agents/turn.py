@@ -6,8 +6,9 @@ import math
 import random
 from collections.abc import Mapping
 
-from agents.behaviour import STAND
 from agents.context import Context
+from agents.exploration import clipped
+from agents.means import STAND, Means
 from drivers.reading import Action, Observation
 
 SPEED = 1.2
@@ -21,10 +22,15 @@ class TurnAround:
         self._turns = float(parameters.get("turns", 1.0))
         if not 0.0 <= self._turns <= MAX_TURNS:
             raise ValueError(f"turns must be 0 to {MAX_TURNS:g}, is {self._turns:g}")
+        self._means = Means()
         self._charge: float | None = None
         self._yaw: float | None = None
         self._turned = 0.0
         self._acting = False
+
+    def embody(self, means: Means) -> None:
+        """Turn as this body can."""
+        self._means = means
 
     def look(self, seen: Observation, now: float) -> None:
         """Take in the charge and the heading."""
@@ -58,4 +64,5 @@ class TurnAround:
         if not context.is_resumed:
             self._yaw = None  # what the body did meanwhile was not for this task
         self._acting = True
-        return None if self._turned >= self._turns * math.tau else {**STAND, "base.wz": SPEED}
+        is_done = self._turned >= self._turns * math.tau
+        return None if is_done else self._means.spin(clipped(SPEED, self._means.turn))

@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from agents.means import VIEW
+
 cv2.setNumThreads(1)
 
-FIELD_OF_VIEW = math.radians(56.9), math.radians(45.2)
-"""Across and up, of the ERS-7's camera."""
 RED_LOW, RED_HIGH = (20, 165, 40), (240, 255, 135)
 GREY = 128.0
 BLUR = 2
@@ -36,16 +36,21 @@ class Size:
 class Sighting:
     """The target in one picture: ``bearing`` in radians (left positive), ``distance`` in metres from camera to axis.
 
-    ``is_whole`` is false where the blob is cut off by the picture's edge or partly hidden, so that its size says less.
+    ``is_whole`` is false where the blob is cut off by the picture's edge or partly hidden, so that its size says less;
+    where ``is_filling`` it goes from edge to edge, and all that is known is that the target is nearer than that.
     """
 
     bearing: float
     distance: float
     is_whole: bool
+    is_filling: bool = False
 
 
-def find_target(jpeg: bytes, size: Size) -> Sighting | None:
-    """The largest red blob of a JPEG picture, or None; bytes that are no picture count as nothing seen."""
+def find_target(jpeg: bytes, size: Size, lens: tuple[float, float | None] = VIEW) -> Sighting | None:
+    """The largest red blob of a JPEG picture, or None; bytes that are no picture count as nothing seen.
+
+    ``lens`` is what the picture shows across and up, in radians; up None: its pixels are square.
+    """
     # OpenCV raises where there is no byte at all, and gives None for all other bytes that are no picture.
     picture = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR) if jpeg else None
     if picture is None:
@@ -59,7 +64,8 @@ def find_target(jpeg: bytes, size: Size) -> Sighting | None:
     if area < MIN_AREA:
         return None
     rows, columns = colours.shape[:2]
-    focal_x, focal_y = (n / 2 / math.tan(f / 2) for n, f in zip((columns, rows), FIELD_OF_VIEW, strict=True))
+    focal_x = columns / 2 / math.tan(lens[0] / 2)
+    focal_y = focal_x if lens[1] is None else rows / 2 / math.tan(lens[1] / 2)
     bearing = math.atan2(columns / 2 - (float(centres[best][0]) + 0.5), focal_x)
     around = slice(max(0, top - BLUR), top + height + BLUR), slice(max(0, left - BLUR), left + width + BLUR)
     across, up = _extent(colours[around][:, :, 1].astype(np.float32))
@@ -68,7 +74,8 @@ def find_target(jpeg: bytes, size: Size) -> Sighting | None:
     is_whole = left > 0 and left + width < columns and abs(by_width / by_height - 1) < SAME_SHAPE
     # What hides a part of it makes it look smaller, never larger: the nearer of the two is the better witness.
     distance = by_width if is_whole else min(by_width, by_height)
-    return Sighting(bearing, distance / max(math.cos(bearing), 0.5), is_whole)
+    is_filling = left == 0 and width == columns
+    return Sighting(bearing, distance / max(math.cos(bearing), 0.5), is_whole, is_filling)
 
 
 def _extent(redness: npt.NDArray[np.float32]) -> tuple[float, float]:

@@ -15,6 +15,7 @@ from typing import Protocol
 from twisted.logger import Logger
 
 from agents.context import Context
+from agents.means import Means
 from drivers.reading import Action, Observation
 
 BEARING, DISTANCE = "target.bearing", "target.distance"
@@ -64,8 +65,13 @@ class WatchTarget:
         self._rng = rng
         self._finder: Finder | None = None
         self._has_motors = False
+        self._means: Means | None = None
         self._watched = 0.0
         self._looked_at: float | None = None
+
+    def embody(self, means: Means) -> None:
+        """Look and turn as this body can."""
+        self._means = means
 
     def look(self, seen: Observation, now: float) -> None:
         """Take in what the body senses; its first observation says what sort of body it is."""
@@ -111,7 +117,10 @@ class WatchTarget:
             _log.warn("nothing can be seen here ({error}): pip install 'swarm-node[vision]'", error=error)
             return Told()
         size = {key: value for key, value in self._parameters.items() if key.startswith("target_")}
-        return SearchAndApproach(size, self._rng)
+        finder = SearchAndApproach(size, self._rng)
+        if self._means is not None:
+            finder.embody(self._means)
+        return finder
 
 
 class Told:

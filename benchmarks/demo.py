@@ -10,6 +10,7 @@ import argparse
 import http.client
 import json
 import os
+import random
 import re
 import signal
 import subprocess
@@ -23,6 +24,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
+
+from middleware.admission import operator as operators
+from middleware.admission.membership import MembershipFile, made
 
 START_S = 60.0
 TASK_S = 120.0
@@ -195,10 +199,12 @@ def plain_node(run_dir: Path) -> Iterator[int]:
     """A dog's node without agent and camera in the team of ``run_dir``: its process id."""
     dog = tomllib.loads((run_dir / "dog1.toml").read_text())["node"]
     known = json.dumps(dog["known_nodes"])
-    file = run_dir / "plain.toml"
-    file.touch(mode=0o600)
+    file, path = run_dir / "plain.toml", run_dir / "plain.membership"
+    secret = MembershipFile(Path(dog["membership"])).membership.secrets[0][1]
+    operator = operators.load(run_dir / "operator.key")
+    made(path, operator.founded("plain", ("device",), time.time(), random.SystemRandom(), secret))
     file.write_text(
-        f'[node]\nname = "plain"\nteam_key = "{dog["team_key"]}"\nknown_nodes = {known}\nstore = "plain.sqlite"\n'
+        f'[node]\nname = "plain"\nmembership = "{path.name}"\nknown_nodes = {known}\nstore = "plain.sqlite"\n'
         '[driver]\nkind = "sim"\noptions = { robot = "dog1", camera = false }\n'
     )
     twistd = str(Path(sys.executable).parent / "twistd")

@@ -27,7 +27,7 @@ from middleware.entangled.network.switchboard import Switchboard, Weather
 from middleware.entangled.node import EntangledNode
 from middleware.entangled.record import Record
 from middleware.entangled.space.claim import Claim
-from middleware.entangled.space.decree import Kind, reply_unpacked
+from middleware.entangled.space.decree import Kind, Reply, reply_unpacked
 from middleware.entangled.space.posting import Place, Posted, place_unpacked, posting
 from middleware.entangled.space.seat import Seat
 from middleware.entangled.space.template import ANY, Tuple
@@ -56,21 +56,40 @@ class Witness:
             self.posted[said.place] = said
 
     def attend(self, seat: Seat, expose: Callable[..., object], member: bytes) -> None:
-        """Look over the shoulder of the council member ``member`` as it confirms takes."""
+        """Look over the shoulder of the council member ``member`` as it confirms takes, and tells what it accepted."""
         confirm: Callable[..., Any] = seat.answer_confirm
+        claim: Callable[..., Any] = seat.answer_claim
+
+        def told(key: bytes, places: list[object], answers: list[object]) -> list[tuple[Place, Reply]]:
+            pairs = [(place_unpacked(key, p), reply_unpacked(a)) for p, a in zip(places, answers, strict=True)]
+            return [(place, reply) for place, reply in pairs if place is not None and reply is not None]
 
         def confirmed(peer: Contact, key: bytes, places: list[object], incarnation: bytes, *ballot: Any) -> Any:
             def noted(answers: list[object]) -> list[object]:
-                for fields, answer in zip(places, answers, strict=True):
-                    place, reply = place_unpacked(key, fields), reply_unpacked(answer)
-                    if place is not None and reply is not None and reply.kind is Kind.ACCEPTED:
-                        self.bids[place][ballot].add(member)
+                for place, reply in told(key, places, answers):
+                    if reply.kind is Kind.ACCEPTED:
+                        self.accepted(place, ballot, member)
                 return answers
 
             return maybeDeferred(confirm, peer, key, places, incarnation, *ballot).addCallback(noted)
 
-        seat.answer_confirm = confirmed  # type: ignore[method-assign, assignment]
+        def claimed(peer: Contact, key: bytes, places: list[object], *rest: Any) -> Any:
+            def noted(answers: list[object]) -> list[object]:
+                # One whose disk was full when it accepted could not say so, and tells it with the next it can write.
+                for place, reply in told(key, places, answers):
+                    if reply.accepted is not None and reply.value is not None:
+                        self.accepted(place, (*reply.accepted, reply.value), member)
+                return answers
+
+            return maybeDeferred(claim, peer, key, places, *rest).addCallback(noted)
+
+        seat.answer_confirm, seat.answer_claim = confirmed, claimed  # type: ignore[method-assign, assignment]
         expose("decree.confirm", confirmed, changes=True)
+        expose("decree.claim", claimed, changes=True)
+
+    def accepted(self, place: Place, ballot: tuple[int, bytes, bytes], member: bytes) -> None:
+        """Take note of what a member of the council accepted."""
+        self.bids[place][ballot].add(member)
 
     def takers(self, place: Place) -> set[bytes]:
         """Everybody for whom a majority of the council ever accepted a take; more than one is a violation."""

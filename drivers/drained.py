@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 from twisted.internet.defer import Deferred
 
 from drivers.driver import Driver, Permit
-from drivers.reading import Action, Description, Observation
+from drivers.reading import Action, Description, Observation, Value
 
 POWER = "power.level"
 
@@ -67,6 +67,10 @@ class DrainedDriver:
     def subscribe(self, seen: Callable[[Observation], None]) -> Callable[[], None]:
         """Call ``seen`` at each observation, drained."""
         return self._driver.subscribe(lambda observation: seen(self._drained(observation)))
+
+    def invoke(self, name: str, **arguments: float | str) -> Deferred[Mapping[str, Value]]:
+        """Have the robot do it."""
+        return self._driver.invoke(name, **arguments)
 
     def diagnostics(self) -> dict[str, float]:
         """Counters of the robot."""

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 from twisted.internet.defer import Deferred
 
-from drivers.reading import Action, Description, Observation
+from drivers.reading import Action, Description, Observation, Value
 
 MAX_FPS = 30.0
 
@@ -82,6 +82,12 @@ class Driver(Protocol):
 
     def subscribe(self, seen: Callable[[Observation], None]) -> Callable[[], None]:
         """Call ``seen`` at each observation; call what is returned to end that."""
+
+    def invoke(self, name: str, **arguments: float | str) -> Deferred[Mapping[str, Value]]:
+        """Have the robot do one of ``description.skills``; fires with what it tells of that when it is done.
+
+        Fails with ``Unsupported`` for another name or a wrong argument, with ``LinkLost`` or ``NoReply``.
+        """
 
     def diagnostics(self) -> dict[str, float]:
         """Counters: frames, bad frames, bytes, reconnects, age of the newest observation in seconds.

@@ -51,7 +51,7 @@ class Description:
 
     ``capabilities`` maps a capability name (``base2d``, ``ranger``, ``camera``, ``imu``, ``odometry``, ``power``) to
     its properties (numbers or text; ``ranger`` has ``max`` in metres, ``camera`` has ``width``, ``height``, ``fps``);
-    ``limits`` maps each action key to its lowest and highest value.
+    ``limits`` maps each action key to its lowest and highest value; ``skills`` are the names that ``invoke`` knows.
     """
 
     kind: str
@@ -60,3 +60,4 @@ class Description:
     limits: Mapping[str, tuple[float, float]]
     radius: float
     rates: Mapping[str, float] = field(default_factory=dict)
+    skills: tuple[str, ...] = ()

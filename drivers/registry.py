@@ -1,8 +1,13 @@
-"""Registry: the kind of a robot to its driver, imported only when that kind is asked for."""
+"""Registry: the kind of a robot to its driver, imported only when that kind is asked for.
+
+A kind is built in, an entry point of ``swarm_node.drivers``, or the place of a class, ``module:name``.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import partial
 from importlib import import_module
 from typing import TYPE_CHECKING, cast
 
@@ -13,18 +18,31 @@ from drivers.errors import UsageError
 from drivers.reading import Description
 
 if TYPE_CHECKING:
-    from drivers.sim.link import Connector
+    from drivers.link import Connector
 
 Factory = Callable[[Mapping[str, object], str, IReactorTime, "Connector | None"], Driver]
 Describe = Callable[[Mapping[str, object], str], Description]
+Parts = Sequence[tuple[str, Mapping[str, object]]]
+"""Kind and options of each part that rides on a robot and only senses."""
 
-KINDS = {"phone": "drivers.phone.maker", "sim": "drivers.sim.maker"}
+KINDS = {
+    "aibo": "drivers.aibo.maker",
+    "bittle": "drivers.bittle.maker",
+    "camera": "drivers.camera.maker",
+    "compass": "drivers.compass.maker",
+    "create2": "drivers.create2.maker",
+    "phone": "drivers.phone.maker",
+    "rosbridge": "drivers.rosbridge.maker",
+    "sim": "drivers.sim.maker",
+}
 """Kind to the module that has ``made(options, name, clock, connector)`` and ``description(options, name)``."""
 
 
 def kinds() -> list[str]:
-    """The kinds of robot that there are drivers for."""
-    return sorted(KINDS)
+    """The kinds of robot that there are drivers for, those of other distributions as well; none is imported."""
+    from drivers.foreign import places
+
+    return sorted({*KINDS, *places()})
 
 
 def driver_for(
@@ -33,22 +51,57 @@ def driver_for(
     name: str,
     clock: IReactorTime,
     connector: Connector | None = None,
+    parts: Parts = (),
 ) -> Driver:
-    """A driver of ``kind`` that is not connected yet.
+    """A driver of ``kind`` that is not connected yet, with the senses of ``parts``.
 
     ``name`` is the device's and says which robot is meant where the options do not; ``connector`` opens the
     links, real TCP on the running reactor where it is None.  Raises ``UsageError`` with one line for an unknown
     kind or a wrong option.
     """
-    return cast(Factory, _found(kind, "made"))(options, name, clock, connector)
+    main = cast(Factory, _found(kind, "made"))(options, name, clock, connector)
+    if not parts:
+        return main
+    from drivers.joined import joined  # a robot without parts is spared it
+
+    made = []
+    for number, (part, table) in enumerate(parts, 1):
+        with _naming(number):
+            made.append(cast(Factory, _found(part, "made"))(table, f"{name}'s {part}", clock, connector))
+    return joined(main, made, name)
 
 
-def describe(kind: str, options: Mapping[str, object], name: str = "robot") -> Description:
-    """What a robot of ``kind`` is, without making a driver; raises as ``driver_for`` does."""
-    return cast(Describe, _found(kind, "description"))(options, name)
+def describe(kind: str, options: Mapping[str, object], name: str = "robot", parts: Parts = ()) -> Description:
+    """What a robot of ``kind`` with ``parts`` is, without making a driver; raises as ``driver_for`` does."""
+    main = cast(Describe, _found(kind, "description"))(options, name)
+    if not parts:
+        return main
+    from drivers.joined import described
+
+    made = []
+    for number, (part, table) in enumerate(parts, 1):
+        with _naming(number):
+            made.append(cast(Describe, _found(part, "description"))(table, name))
+    return described(main, made)
+
+
+@contextmanager
+def _naming(number: int) -> Iterator[None]:
+    """What is wrong with a part says with which."""
+    try:
+        yield
+    except UsageError as error:
+        raise UsageError(f"part {number}: {error}") from None
 
 
 def _found(kind: str, attribute: str) -> object:
-    if kind not in KINDS:
-        raise UsageError(f"no driver for robots of kind {kind!r}; known are {', '.join(kinds())}")
-    return getattr(import_module(KINDS[kind]), attribute)
+    if kind in KINDS:
+        return getattr(import_module(KINDS[kind]), attribute)
+    from drivers.foreign import description_of, maker, places  # most nodes never come here
+
+    place = kind if ":" in kind else places().get(kind)
+    if place is None:
+        remedy = "of your own: module:Class"
+        raise UsageError(f"no driver for robots of kind {kind!r}; known are {', '.join(kinds())}; {remedy}")
+    make = maker(kind, place)
+    return make if attribute == "made" else partial(description_of, make)

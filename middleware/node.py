@@ -20,25 +20,32 @@ from twisted.logger import Logger
 
 from middleware.consensus.strategy import place_of
 from middleware.deployed import Deployed, is_deployed
+from middleware.directory import Directory, Matches, Page
 from middleware.entangled.background import Background
 from middleware.entangled.data.store import Store
 from middleware.entangled.errors import EntangledError, NotRunning, Refused, WeatherError
 from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact, unpacked
+from middleware.entangled.network.multicast import Multicast
 from middleware.entangled.network.network import Address, Network
 from middleware.entangled.node import EntangledNode
-from middleware.entangled.record import Record
+from middleware.entangled.record import Record, Slot
 from middleware.entangled.replication.owner import Stored
 from middleware.entangled.replication.watch import Changed, Watch
+from middleware.entangled.wire.door import OPEN, Door
 from middleware.errors import UnknownStrategy
+from middleware.following import Following
 from middleware.group import Group, Heard
 from middleware.halt import Halt
-from middleware.presence import DEVICES, Device, Presence, devices_of
+from middleware.listing import Listing
+from middleware.prefix import LONGEST
+from middleware.presence import Device, Presence, devices_of
 from middleware.streams import Streams
-from middleware.tasks import ORDER, RESULT, TASKS, Result, Task, group_key, tasks_of
+from middleware.tasks import MEMBER, ORDER, RESULT, TASKS, Result, Task, group_key, tasks_of
 from middleware.value import bounded
 
 if TYPE_CHECKING:
+    from middleware.admission.team import Team
     from middleware.commitment.councils import Councils
     from middleware.commitment.lessee import Lessee
     from middleware.consensus.guard import Guard
@@ -47,6 +54,7 @@ if TYPE_CHECKING:
     from middleware.dissemination.bidding import Bidding
     from middleware.dissemination.dissemination import Dissemination
     from middleware.dissemination.party import OnSummary
+    from middleware.gauge import Gauge
     from middleware.verdict import Verdict
 
 CAMERA = "camera"
@@ -55,12 +63,15 @@ LOOK_AGAIN = 0.3
 """Seconds after which a newcomer looks whether others took the same place in the order of joining."""
 LOOKS = 10
 COUNTING = 2.0
-"""Seconds between two looks at the node's own network figures."""
+"""Seconds between two looks at the node's own network figures; in a large team they are told once a minute."""
+REVIEWING = 10.0
+"""Seconds between two looks at the size of the team."""
 
 
 class SwarmNode(Service):
     """One node of a team.
 
+    ``team`` is the closed team whose ``door`` the node has, None in an open one; it starts and stops with the node.
     ``device`` is what the node says of itself; ``wall`` gives seconds of the wall clock, for people only.  ``deployed``
     is what operators pushed and its owner allowed; ``halt`` says whether the whole team is to stand.
     ``later(seconds, call, ...)`` is a timer that ends with the node.
@@ -80,23 +91,28 @@ class SwarmNode(Service):
         rng: random.Random,
         wall: Callable[[], float],
         lease: float = 1.0,
+        door: Door = OPEN,
+        lan: Multicast | None = None,
     ) -> None:
         self.clock = clock
         self.rng = rng
         self.wall = wall
         self.store = store
-        self.entangled = EntangledNode(identity, team_key, network, store, clock, rng, lease, wall)
+        self.entangled = EntangledNode(identity, team_key, network, store, clock, rng, lease, wall, door, lan)
         self.uuid = identity.node_id.hex()
         self._chores = Background(clock)
         self.later = self._chores.later
+        self.team: Team | None = None
         self.deployed: Deployed = {}
         self.halt = Halt()
+        self.directory = Directory(self.entangled, self._chores, self._quietly)
         self.presence = Presence(device, self._announce, self._chores.later)
         self.streams = Streams(self.entangled.endpoint, clock)
         self.joined: Deferred[None] = Deferred()
         self._known = list(known_nodes)
         self._network = network
         self._born_at = clock.seconds()
+        self._counted_at = self._reviewed_at = float("-inf")
         self._on_message: Callable[[str], None] = lambda text: None
         self._on_disconnect: Callable[[float], None] = lambda seconds: None
         expose = self.entangled.endpoint.expose
@@ -115,6 +131,8 @@ class SwarmNode(Service):
         """Open the port, join the network through the known nodes, and appear among the devices."""
         super().startService()
         self.entangled.start()
+        if self.team is not None:
+            self.team.start()
         Deferred.fromCoroutine(self._join()).addErrback(self._not_joined)
 
     def stopService(self) -> None:
@@ -130,6 +148,8 @@ class SwarmNode(Service):
         self.streams.stop()
         if "dissemination" in self.__dict__:
             self.dissemination.stop()
+        if self.team is not None:
+            self.team.stop()
         leave()
         if "_strategies" in self.__dict__:
             self._strategies.stop()
@@ -138,8 +158,11 @@ class SwarmNode(Service):
     async def _join(self) -> None:
         await self.entangled.join(self._known)
         others = await self._others()
+        depth = await self.directory.arrive()
+        if depth:  # those seen so far stand elsewhere
+            others = await self._others()
         kept = [d.joined for d in others if d.uuid == self.uuid]
-        self.presence.device = self._addressed(self.presence.device)
+        self.presence.device = replace(self._addressed(self.presence.device), depth=depth)
         self.presence.appear(kept[0] if kept else _next_place(others))
         device = self.presence.device
         self._log.info("{name} joined as number {joined}", name=device.name, joined=device.joined)
@@ -149,8 +172,14 @@ class SwarmNode(Service):
         await self._step_behind()
 
     def _count(self) -> None:
-        """Say how this node stands in the network (the page's network data)."""
-        entangled = self.entangled
+        """Say how this node stands in the network (the page's network data), and where in the directory."""
+        entangled, now = self.entangled, self.clock.seconds()
+        if now - self._reviewed_at >= REVIEWING:
+            self._reviewed_at = now
+            self.presence.change(depth=self.directory.review())
+        if self.directory.depth and now - self._counted_at < LONGEST:
+            return
+        self._counted_at = now
         dropped = sum(entangled.endpoint.counters.values())
         contacts, records = len(entangled.overlay.table), len(self.store)
         self.presence.change(network={"contacts": contacts, "records": records, "dropped": dropped})
@@ -168,10 +197,10 @@ class SwarmNode(Service):
                 return
 
     async def _others(self) -> list[Device]:
-        """The devices that are here, as soon as anybody can tell."""
+        """The devices that are here, in a large team those around this one, as soon as anybody can tell."""
         while True:
             try:
-                return [device for device, _ in devices_of(await self.entangled.get(DEVICES))]
+                return [device for device, _ in devices_of(await self.directory.around())]
             except NotRunning:
                 raise
             except EntangledError as error:
@@ -187,17 +216,31 @@ class SwarmNode(Service):
 
     # -- devices ----------------------------------------------------------------------------------------------------
 
-    def watch_devices(self, changed: Changed, keep: bool = False) -> Watch:
-        """Follow who is here; ``devices_of`` reads the records, and ``keep`` leaves them in the store as well."""
-        return self.entangled.watch(DEVICES, changed, keep)
+    def watch_devices(self, changed: Changed, keep: bool = False) -> Following:
+        """Follow who is here; ``devices_of`` reads the records, and ``keep`` leaves them in the store as well.
+
+        In a large team that is for those who need all of them: it takes a round of reads, and none are kept.
+        """
+        return Following(self.directory, changed, keep)
+
+    def list_devices(self) -> Deferred[Listing]:
+        """All devices that are here now; the list knows whether it is complete.  Never fails."""
+        return Deferred.fromCoroutine(self.directory.listed())
+
+    def some_devices(
+        self, count: int, matches: Matches = lambda device: True, after: bytes | None = None
+    ) -> Deferred[Page]:
+        """Some of the devices, where a page has no room for all; see ``Directory.some``.  Never fails."""
+        return Deferred.fromCoroutine(self.directory.some(count, matches, after))
 
     def contact_of(self, record: Record) -> Contact | None:
-        """How to reach the device that wrote ``record``."""
+        """How to reach the device that wrote ``record``: where it is seen, which may be elsewhere than it says."""
         pair = next(iter(devices_of([record])), None)
         if pair is None:
             return None
         host, _, port = pair[0].address.rpartition(":")
-        return unpacked([record.owner, host, int(port)]) if port.isascii() and port.isdigit() else None
+        said = unpacked([record.owner, host, int(port)]) if port.isascii() and port.isdigit() else None
+        return said and (self.entangled.overlay.known(said.node_id) or said)
 
     def reached(self, uuids: Sequence[str]) -> list[Contact]:
         """How to reach those of the devices that this node has met."""
@@ -311,6 +354,14 @@ class SwarmNode(Service):
         return Councils(self.entangled, self.store, self.clock, self.rng, self._born_at, moved)
 
     @cached_property
+    def gauge(self) -> Gauge:
+        """How good the ways to this node's peers are."""
+        # Imported by the first who wants to know.
+        from middleware.gauge import Gauge
+
+        return Gauge(self.entangled, self.clock, self._chores.fork, self._chores.later)
+
+    @cached_property
     def _strategies(self) -> Strategies:
         """What decides on this node who should act."""
         # Imported by the first who decides, or carries a bid: a node that does neither is spared the memory.
@@ -330,7 +381,10 @@ class SwarmNode(Service):
         def size() -> int:
             return team_size(entangled.identity.node_id, entangled.overlay.contacts())
 
-        around = Surroundings(lambda: entangled.contact, entangled.overlay.contacts, size, self.strategy)
+        def may_bid(key: bytes, public: bytes) -> bool:
+            return entangled.replica.may_store(Slot(key, public, MEMBER))
+
+        around = Surroundings(lambda: entangled.contact, entangled.overlay.contacts, size, self.strategy, may_bid)
         return Dissemination(entangled.identity, entangled.endpoint, around, self.clock, self.rng)
 
     # -- what peers ask ---------------------------------------------------------------------------------------------
@@ -366,8 +420,9 @@ class SwarmNode(Service):
     # -- inside -----------------------------------------------------------------------------------------------------
 
     def _announce(self, value: bytes) -> None:
-        def put() -> Deferred[Stored]:
-            return self.entangled.put(DEVICES, self.presence.device.name, bounded(value), "leased")
+        def put() -> Deferred[Any]:
+            device = self.presence.device
+            return self.directory.announce(device.name, bounded(value), device.depth)
 
         self._quietly(maybeDeferred(put))
 

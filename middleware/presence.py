@@ -20,6 +20,8 @@ from middleware.value import MAX_VALUE, are_capabilities, is_number, is_whole, m
 DEVICES = hashed_key("devices")
 IDLE, ASSIGNED, SEARCHING, WAITING, EXECUTING, DONE = "IDLE", "ASSIGNED", "SEARCHING", "WAITING", "EXECUTING", "DONE"
 STATUSES = (IDLE, ASSIGNED, SEARCHING, WAITING, EXECUTING, DONE)
+MAX_DEPTH = 16
+"""The directory is split no further: 2**16 places are enough for a million devices."""
 MESSAGES_KEPT = 5
 MESSAGE_CHARACTERS = 70
 
@@ -34,7 +36,9 @@ class Device:
     for people; ``messages`` are its newest (time, text) lines; ``deployed`` maps each module that was pushed to
     the version and digest that it runs, or says that it was refused; ``pages`` are the URLs at which it serves the
     page; ``position`` is where it says that it is: ``x`` and ``y`` in metres and ``heading`` in radians in the yard's
-    frame, or ``lat`` and ``lon`` in degrees with ``accuracy`` in metres.
+    frame, or ``lat`` and ``lon`` in degrees with ``accuracy`` in metres; ``laptop`` and ``agent`` are what people call
+    the computer that its node runs on and the agent that acts for it (thesis, Table 5.1); ``depth`` is how far the
+    directory is split where it stands (``middleware.prefix``).
     """
 
     uuid: str
@@ -53,6 +57,9 @@ class Device:
     deployed: Mapping[str, str] = field(default_factory=dict)
     pages: tuple[str, ...] = ()
     position: Mapping[str, float] = field(default_factory=dict)
+    laptop: str = ""
+    agent: str = ""
+    depth: int = 0
 
     def with_message(self, now: float, text: str) -> Device:
         """This device with one more line; the oldest goes when there are more than ``MESSAGES_KEPT``."""
@@ -64,8 +71,8 @@ class Device:
         device = self
         while True:
             content = asdict(device)
-            # Most devices have neither, and each byte of a record is sent again and again.
-            for name in ("pages", "position"):
+            # Most devices have none of them, and each byte of a record is sent again and again.
+            for name in ("pages", "position", "laptop", "agent", "depth"):
                 if not content[name]:
                     del content[name]
             value = bytes(msgpack.packb(content))
@@ -94,10 +101,13 @@ def device_of(record: Record) -> Device | None:
     except (TypeError, ValueError, OverflowError):
         return None
     texts = (device.name, device.kind, device.description, device.address, device.task, device.status, *device.roles)
+    texts += (device.laptop, device.agent)
     lawful = (
         all(isinstance(text, str) for text in (*texts, *device.pages, *(text for _, text in device.messages)))
         and device.status in STATUSES
         and is_whole(device.joined)
+        and is_whole(device.depth)
+        and device.depth <= MAX_DEPTH
         and all(is_number(n) for n in (device.since, *(t for t, _ in device.messages)))
         and are_capabilities(device.capabilities)
         and isinstance(device.network, dict)

@@ -15,7 +15,8 @@ from difflib import get_close_matches
 from ipaddress import ip_address
 from typing import Any
 
-from middleware.entangled.network.network import Address
+from middleware.entangled.network.network import EVERYWHERE, Address
+from middleware.entangled.network.url import Url
 
 Rule = Mapping[str, Any]
 SHOWN = 60
@@ -147,13 +148,18 @@ def number(least: float, most: float) -> Rule:
 
 
 def numeric_host(is_told: bool = False) -> Rule:
-    """A rule for an address of this machine, in figures; one that ``is_told`` to others must be reachable."""
+    """A rule for an address of this machine, in figures; one that ``is_told`` to others must be reachable.
+
+    Such a one may be ``"*"``, too: every interface, IPv4 and IPv6; what the others are told follows from there.
+    """
     example = "192.168.1.10" if is_told else "0.0.0.0"
     remedy = f'write one such as "{example}" (`ip -brief address` lists yours)'
 
     def check(value: object) -> str:
         with suppress(ValueError):
             if isinstance(value, str):
+                if is_told and value == EVERYWHERE:
+                    return EVERYWHERE
                 address = ip_address(value)
                 if is_told and address.is_unspecified:
                     raise Wrong(f"must be an address that other nodes can reach, is {shown(value)}", remedy)
@@ -177,6 +183,25 @@ def addresses() -> Rule:
 
     def check(value: object) -> tuple[Address, ...]:
         return tuple(dict.fromkeys(_address(item) for item in _listed(value, 'write a list such as ["10.0.0.7:7000"]')))
+
+    return _rule(check, _comma_separated)
+
+
+def tunnels(most: int) -> Rule:
+    """A rule for a list of at most ``most`` URLs of tunnels, or the word ``auto``."""
+
+    def check(value: object) -> tuple[str, ...]:
+        remedy = 'write a list such as ["wss://node.example:443"], ["auto"] or []'
+        listed = _listed(value, remedy)
+        for item in listed:
+            try:
+                if item != "auto":
+                    Url.of(item if isinstance(item, str) else "")
+            except ValueError:
+                raise Wrong(f"{shown(item)} is no wss://host:port/path", remedy) from None
+        if len(listed) > most:
+            raise Wrong(f"has {len(listed)} entries, more than {most}", "leave some out")
+        return tuple(dict.fromkeys(str(item) for item in listed))
 
     return _rule(check, _comma_separated)
 
@@ -217,6 +242,34 @@ def table() -> Rule:
         if not isinstance(value, Mapping):
             raise Wrong(f"must be a table, is {shown(value)}", "write { key = value }")
         return dict(value)
+
+    return _rule(check)
+
+
+def kinds_with_options(most: int, example: str) -> Rule:
+    """A rule for a list of at most ``most`` tables, each with ``kind`` and ``options`` that somebody else understands.
+
+    What comes of it is a tuple of (kind, options).
+    """
+
+    def check(value: object) -> tuple[tuple[str, Mapping[str, object]], ...]:
+        if not isinstance(value, list | tuple) or len(value) > most:
+            raise Wrong(f"must be at most {most} tables, is {shown(value)}", 'write [{ kind = "..." }]')
+        checked = []
+        for number, entry in enumerate(value, 1):
+            if not isinstance(entry, Mapping):
+                raise Wrong(f"entry {number} must be a table, is {shown(entry)}", 'write { kind = "..." }')
+            for key in entry:
+                if key not in ("kind", "options"):
+                    raise Wrong(f"entry {number} has {shown(key)}, which is not a setting", "known are kind, options")
+            kind, options = entry.get("kind"), entry.get("options", {})
+            if not isinstance(kind, str) or not re.fullmatch(r"[A-Za-z_]\w*([.:][A-Za-z_]\w*)*", kind, re.ASCII):
+                problem = "has no kind" if kind is None else f"has a kind that cannot be, {shown(kind)}"
+                raise Wrong(f"entry {number} {problem}", f'write kind = "{example}"')
+            if not isinstance(options, Mapping):
+                raise Wrong(f"entry {number}: options must be a table, is {shown(options)}", "write { key = value }")
+            checked.append((kind, dict(options)))
+        return tuple(checked)
 
     return _rule(check)
 

@@ -16,11 +16,13 @@ from typing import Any
 from middleware import setting
 from middleware.entangled.data.store import MAX_BYTES, MAX_ROWS, Durable
 from middleware.entangled.network.network import Address
+from middleware.entangled.network.url import Url
 from middleware.errors import BadSetting
 
 IN_MEMORY = ":memory:"
 ROLES = ("edge", "bootstrap", "web")
 COMMAND_LINE = "command line"
+NODE_PORT = 8484
 
 
 @dataclass(frozen=True)
@@ -36,15 +38,25 @@ class NodeSettings:
     description: str = field(default="", metadata=setting.text(200))
     """A line about the device, shown on the page; at most 200 characters."""
 
-    host: str = field(default="127.0.0.1", metadata=setting.numeric_host(is_told=True))
-    """The numeric address to listen at; the others are told it too.  The default hears this machine alone."""
+    laptop: str = field(default="", metadata=setting.text(40))
+    """What people call the computer that the node runs on, such as ``dog1_laptop``, shown on the page; at most 40
+    characters.  One node and its computer belong to one device (thesis, Table 5.1)."""
 
-    port: int = field(default=0, metadata=setting.port())
-    """The UDP port; 0 takes any free one, which suits all nodes but those that others name in ``known_nodes``."""
+    host: str = field(default="127.0.0.1", metadata=setting.numeric_host(is_told=True))
+    """The numeric address to listen at; the others are told it too.  ``*`` is every interface, of IPv4 and IPv6.  The
+    default hears this machine alone."""
+
+    port: int = field(default=NODE_PORT, metadata=setting.port())
+    """The UDP port; 0 takes any free one.  Where none is set and the usual one is in use, as by another node of this
+    machine, the next free one is taken.  Nodes that others name in ``known_nodes`` had better set theirs."""
 
     known_nodes: tuple[Address, ...] = field(default=(), metadata=setting.addresses())
     """Nodes to enter the network through, as ``"host:port"``.  Any one that answers is enough; more survive more
-    losses.  None: this node is the first of its network."""
+    losses.  None: this node finds its team on the LAN, or is the first of its network."""
+
+    lan: bool = field(default=True, metadata=setting.truth())
+    """Whether the node looks for its team on its LAN, by multicast, and is found there.  False: only ``known_nodes``
+    and who comes by itself.  Nothing is sent where ``host`` is an address of this machine alone."""
 
     store: str = field(default=IN_MEMORY, metadata=setting.text(4000, least=1))
     """The data store's file, relative to the folder of the settings file; ``:memory:`` forgets all when the node ends,
@@ -61,9 +73,15 @@ class NodeSettings:
     """What a stored record has outlived before its writer is told: the loss of ``power``, or only a ``crash`` of the
     node.  ``crash`` waits for no disk, and may lose the last moments with the power; the file stays whole."""
 
-    team_key: str = field(default="swarm", metadata=setting.secret(1000), repr=False)
-    """What all nodes of a team know and nobody else does.  **The default is no secret: such a team is open to everyone
-    on its network.**  Any long text will do; it is hashed."""
+    membership: str = field(default="", metadata=setting.text(4000))
+    """The file by which this node is a member of a closed team, relative to the folder of the settings file; ``swarm
+    init`` makes the first one of a team, ``swarm join CODE`` that of a newcomer.  One node a file.  Empty: the team is
+    an open one, and ``team_key`` is needed."""
+
+    team_key: str = field(default="", metadata=setting.secret(1000), repr=False)
+    """Instead of a membership, for a classroom: what all nodes of an open team know.  **Whoever knows it is a member,
+    may do everything, and can be put out by another key for all the others only.**  Any long text will do; it is
+    hashed."""
 
     roles: tuple[str, ...] = field(default=("edge",), metadata=setting.some_of(ROLES))
     """What the node does: ``edge`` carries a device, ``bootstrap`` lets others in, ``web`` serves the page."""
@@ -84,6 +102,25 @@ class NodeSettings:
     """Where the device stands, for the page's map: ``x`` and ``y`` in metres and ``heading`` in radians, or ``lat`` and
     ``lon`` in degrees and ``accuracy`` in metres.  A device that moves and knows where it is says so itself."""
 
+    tunnels: tuple[str, ...] = field(default=("auto",), metadata=setting.tunnels(8))
+    """Tunnels over TLS by which to enter where no known node answers by UDP, as ``"wss://host:port"``; ``auto`` stands
+    for port 443 of each known node that is not this machine.  Empty: none, and where UDP is blocked the node stays
+    outside."""
+
+    tunnel_port: int = field(default=0, metadata=setting.port())
+    """The TCP port at which this node lets those in to whom UDP is blocked, best 443; 0: it does not."""
+
+    tunnel_tls: bool = field(default=True, metadata=setting.truth())
+    """False: the port speaks no TLS, and only to this machine: for a reverse proxy that has a certificate."""
+
+    @property
+    def tunnel_urls(self) -> tuple[Url, ...]:
+        """``tunnels``, those of the known nodes included."""
+        urls = [Url.of(text) for text in self.tunnels if text != "auto"]
+        if "auto" in self.tunnels:
+            urls += [Url("wss", known.host, 443) for known in self.known_nodes if not _is_here(known.host)]
+        return tuple(dict.fromkeys(urls))
+
     @property
     def team_secret(self) -> bytes:
         """The 32 bytes that seal the team's datagrams: the BLAKE2s hash of ``team_key``."""
@@ -97,16 +134,25 @@ class AgentSettings:
     module: str = field(default="", metadata=setting.pattern(r"([A-Za-z_]\w*([.:][A-Za-z_]\w*)*)?", 'such as "search"'))
     """The agent's module, by its name or its dotted path; none where empty."""
 
+    name: str = field(default="", metadata=setting.text(40))
+    """What people call the agent, such as ``dog1_agent``, shown on the page and in the log; at most 40 characters."""
+
 
 @dataclass(frozen=True)
 class DriverSettings:
     """``[driver]``: the body of the device."""
 
     kind: str = field(default="", metadata=setting.pattern(r"([A-Za-z_]\w*([.:][A-Za-z_]\w*)*)?", 'such as "sim"'))
-    """The sort of robot, by its name or its dotted path; none where empty."""
+    """The sort of robot, by its name, or the place of its driver as ``module:Class``; none where empty."""
 
     options: Mapping[str, object] = field(default_factory=dict, metadata=setting.table())
     """Handed on to the driver as they stand; it checks them."""
+
+    parts: tuple[tuple[str, Mapping[str, object]], ...] = field(
+        default=(), metadata=setting.kinds_with_options(8, "camera")
+    )
+    """What rides on the robot and only senses, as a camera board or a compass: a table ``[[driver.parts]]`` with
+    ``kind`` and ``options`` for each, at most 8.  What the robot itself can do stays the robot's."""
 
 
 @dataclass(frozen=True)
@@ -187,6 +233,12 @@ class Settings:
     faults: FaultSettings = FaultSettings()
     deployment: DeploymentSettings = DeploymentSettings()
     origin: str = ""
+    given: frozenset[tuple[str, str]] = field(default=frozenset(), compare=False, repr=False)
+    """Which keys of which tables were set, by the file or the command line; the others are as usual."""
+
+    def is_given(self, table: str, key: str) -> bool:
+        """Whether that key was set."""
+        return (table, key) in self.given
 
     @classmethod
     def load(cls, path: str) -> Settings:
@@ -219,10 +271,14 @@ class Settings:
             if not isinstance(table, Mapping):
                 raise BadSetting(origin, f"[{name}]", f"must be a table, is {setting.shown(table)}", f"write [{name}]")
             made[name] = _checked(table, name, kind, origin)
-        store = made["node"].store
-        if store != IN_MEMORY:
-            made["node"] = replace(made["node"], store=os.path.join(os.path.dirname(origin), store))
-        return cls(**made, origin=origin)
+        node, folder = made["node"], os.path.dirname(origin)
+        if node.store != IN_MEMORY:
+            node = replace(node, store=os.path.join(folder, node.store))
+        if node.membership:
+            node = replace(node, membership=os.path.join(folder, node.membership))
+        made["node"] = node
+        given = frozenset((name, key) for name, table in mapping.items() if isinstance(table, Mapping) for key in table)
+        return cls(**made, origin=origin, given=given)
 
     def with_flags(self, **flags: object) -> Settings:
         """These settings with some of them replaced from the command line.
@@ -243,7 +299,13 @@ class Settings:
                 rule = next(f for f in fields(TABLES[table]) if f.name == key).metadata
                 value = rule["read"](value) if isinstance(value, str) else value
                 changed.setdefault(table, {})[key] = _ruled(rule, value, COMMAND_LINE, shown)
-        return replace(self, **{table: replace(getattr(self, table), **keys) for table, keys in changed.items()})
+        given = self.given | {(table, key) for table, keys in changed.items() for key in keys}
+        tables = {table: replace(getattr(self, table), **keys) for table, keys in changed.items()}
+        return replace(self, **tables, given=given)
+
+
+def _is_here(host: str) -> bool:
+    return host.startswith("127.") or host in ("::1", "localhost")
 
 
 def _checked(table: Mapping[str, object], name: str, kind: type[Any], origin: str) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import pymunk
@@ -35,6 +36,7 @@ class Dog:
     def __init__(self, kennel: Kennel, number: int) -> None:
         self.name = kennel.name
         self.stripes = kennel.stripes
+        self.limits: Mapping[str, tuple[float, float]] = LIMITS
         self.command = REST
         self.felt = (0.0, 0.0)
         self.body = pymunk.Body(MASS, pymunk.moment_for_circle(MASS, 0.0, FOOTPRINT))
@@ -77,12 +79,23 @@ class Dog:
         vx, vy, wz = self.motion
         return self.command != REST or math.hypot(vx, vy) > 0.005 or abs(wz) > 0.02
 
+    @property
+    def touches(self) -> list[float]:
+        """Where something touches it now: radians from straight ahead, left positive."""
+        found: list[float] = []
+
+        def note(arbiter: pymunk.Arbiter) -> None:
+            for point in arbiter.contact_point_set.points:
+                dx, dy = point.point_a[0] - self.x, point.point_a[1] - self.y
+                found.append(math.remainder(math.atan2(dy, dx) - self.body.angle, math.tau))
+
+        self.body.each_arbiter(note)
+        return found
+
     def drive(self, motion: Motion) -> None:
-        """Walk like this from now on, clipped to what an ERS-7 can do."""
-        (low_x, high_x), (low_y, high_y), (low_z, high_z) = LIMITS.values()
-        self.command = Motion(
-            min(max(motion.vx, low_x), high_x), min(max(motion.vy, low_y), high_y), min(max(motion.wz, low_z), high_z)
-        )
+        """Move like this from now on, clipped to ``limits``; what has none there is not moved."""
+        spans = (self.limits.get(key, (0.0, 0.0)) for key in LIMITS)
+        self.command = Motion(*(min(max(v, low), high) for v, (low, high) in zip(motion, spans, strict=True)))
 
     def strive(self, dt: float) -> None:
         """Bring the velocity as near to the command as the legs can in ``dt`` seconds; called before the physics."""

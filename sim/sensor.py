@@ -23,8 +23,8 @@ GRAVITY = 9.80665
 BATTERY_S = 90 * 60.0
 SAMPLED = ("range.near", "range.far", "range.chest", "imu.ax", "imu.ay", "imu.az")
 
-_FLOOR = CHEST_HEIGHT / math.sin(CHEST_PITCH)
-_CHEST_REACH = CHEST_HEIGHT / math.tan(CHEST_PITCH)
+FLOOR = CHEST_HEIGHT / math.sin(CHEST_PITCH)
+CHEST_REACH = CHEST_HEIGHT / math.tan(CHEST_PITCH)
 
 
 class Sensors:
@@ -35,6 +35,7 @@ class Sensors:
         self._world = world
         self._dog = dog
         self._samples: dict[str, list[float]] = {key: [] for key in SAMPLED}
+        self._newest = dict.fromkeys(SAMPLED, math.nan)
         self._odometry = [0.0, 0.0, 0.0]
         # Each dog's legs are a little longer or shorter than the table says: dead reckoning drifts steadily.
         self._stride_error = 1.0 + rng.gauss(0.0, 0.01)
@@ -48,8 +49,8 @@ class Sensors:
         dog, gauss = self._dog, self._rng.gauss
         moving = dog.is_moving
         ahead = self._world.distance_ahead(dog, NOSE, FAR[1] * 1.1)
-        chest = self._world.distance_ahead(dog, NOSE, _CHEST_REACH)
-        slant = _FLOOR if chest is None else chest / math.cos(CHEST_PITCH)
+        chest = self._world.distance_ahead(dog, NOSE, CHEST_REACH)
+        slant = FLOOR if chest is None else chest / math.cos(CHEST_PITCH)
         shake = 0.25 if moving else 0.04
         for key, value in (
             ("range.near", self._ranged(ahead, NEAR)),
@@ -60,13 +61,13 @@ class Sensors:
             ("imu.az", GRAVITY + gauss(0.0, shake)),
         ):
             self._samples[key].append(value)
+            self._newest[key] = value
         self._reckon(moving)
         self._power = max(0.0, self._power - SUBSTEP / BATTERY_S * (1.0 if moving else 0.5))
 
     def values(self) -> dict[str, float | bool]:
         """The newest of each value under the flat keys of the driver contract, NaN for nothing in range."""
         vx, vy, wz = self._dog.motion
-        newest = {key: samples[-1] if samples else math.nan for key, samples in self._samples.items()}
         x, y, yaw = self._odometry
         return {
             "base.vx": vx,
@@ -77,7 +78,7 @@ class Sensors:
             "odom.y": y,
             "odom.yaw": math.remainder(yaw, math.tau),
             "compass.heading": math.remainder(self._dog.heading + self._deviation, math.tau),
-            **newest,
+            **self._newest,
             "power.level": self._power,
         }
 

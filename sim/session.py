@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from drivers.link import Link
 from drivers.sim.codec import FrameReader, Message, encoded
-from drivers.sim.link import Link
 
 
 class Session:

@@ -10,6 +10,7 @@ from middleware.entangled.control import word
 from middleware.entangled.control.command import Ask
 from middleware.entangled.control.place import found
 from middleware.entangled.record import MAX_TTL, Record, hashed_key
+from middleware.presence import DEVICES, Device, devices_of
 
 
 class Refusal(Exception):
@@ -33,6 +34,13 @@ class Asker:
             raise Refusal(f"the node's answer to a read of {key!r} is no list of records")
         return [_record(hashed_key(key), each) for each in answer]
 
+    def devices(self) -> list[tuple[Device, Record]]:
+        """All devices of the team in the order of joining, each with its record.  Raises ``Refusal``."""
+        answer = self._answer("devices")
+        if not isinstance(answer, list):
+            raise Refusal("the node's answer about the devices is no list of records")
+        return devices_of([_record(DEVICES, each) for each in answer])
+
     def put(self, key: str, name: str, value: bytes) -> int:
         """Store ``value`` in the node's own slot; returns how many replicas have it.  Raises ``Refusal``."""
         given = {"base64": base64.b64encode(value).decode()}
@@ -41,6 +49,13 @@ class Asker:
     def call(self, address: str, method: str, *arguments: Any) -> Any:
         """Let the node at ``address`` (HOST:PORT) do something, once; returns its answer.  Raises ``Refusal``."""
         return self._answer("rpc", node=address, method=method, arguments=list(arguments), changes=True)
+
+    def links(self) -> list[dict[str, Any]]:
+        """The ways to the node's peers, with the times of some questions to each.  Raises ``Refusal``."""
+        answer = self._answer("links")
+        if not isinstance(answer, list):
+            raise Refusal("the node's answer about its links is no list")
+        return answer
 
     def _answer(self, verb: str, **given: Any) -> Any:
         for line in self._ask(self._path, {"verb": verb, "with": given}):

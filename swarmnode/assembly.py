@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 from dataclasses import dataclass
 from functools import partial
+from typing import TYPE_CHECKING
 
 from twisted.application.service import Service
 from twisted.logger import Logger
@@ -17,6 +18,7 @@ from middleware import setting
 from middleware.entangled.data.store import Store
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.identity import Identity
+from middleware.entangled.wire.door import OPEN, UNPROTECTED
 from middleware.errors import BadSetting, SwarmError
 from middleware.halt import answer_halt
 from middleware.node import SwarmNode
@@ -26,6 +28,9 @@ from middleware.survey import answer_survey
 from middleware.tuning import Knob, answer_tuning
 from swarmnode.seams import Seams
 from webnode.errors import WebError
+
+if TYPE_CHECKING:
+    from middleware.admission.team import Team
 
 FAULTS = (SwarmError, EntangledError, DriverError, WebError)
 """What a person can mend, and is told in one line."""
@@ -53,15 +58,31 @@ def identity_in(store: Store, rng: random.Random) -> Identity:
     return Identity(seed)
 
 
+def checked_team(settings: Settings) -> None:
+    """Raise ``BadSetting`` where a node has no team, or two."""
+    node = settings.node
+    if not node.membership and not node.team_key:
+        problem = "is missing: this node belongs to no team"
+        remedy = "make a team by swarm init, join one by swarm join CODE, or for an open team set team_key to a secret"
+        raise BadSetting(settings.origin, "[node] membership", problem, remedy)
+    if node.membership and node.team_key:
+        problem = "stands beside a membership: a team is closed or open"
+        raise BadSetting(settings.origin, "[node] team_key", problem, "remove team_key, or the membership")
+
+
 def assembled(settings: Settings, seams: Seams) -> Assembly:
     """Wire one node as ``settings`` say (thesis, Algorithm 4.1).
 
     Raises ``SwarmError`` or ``DriverError`` where they cannot be met.
     """
     node_settings, driver = settings.node, None
+    if seams.membership is None:
+        checked_team(settings)
     if settings.agent.module and not settings.driver.kind:
         problem = f"is {settings.agent.module!r}, which has no robot to act with"
         raise BadSetting(settings.origin, "[agent] module", problem, "name its [driver] kind, or leave the agent out")
+    if settings.driver.parts and not settings.driver.kind:
+        raise BadSetting(settings.origin, "[driver] parts", "have no robot to ride on", "name its [driver] kind")
     frailty = None
     if settings.faults.allow:
         from swarmnode.frailty import Frailty  # any other node is spared the memory
@@ -71,12 +92,11 @@ def assembled(settings: Settings, seams: Seams) -> Assembly:
     capabilities = dict(node_settings.capabilities)
     kind = node_settings.kind
     if settings.driver.kind:
-        body = describe(settings.driver.kind, settings.driver.options, node_settings.name)
+        wanted = settings.driver
+        body = describe(wanted.kind, wanted.options, node_settings.name, wanted.parts)
         capabilities = {**body.capabilities, **capabilities}
         kind = kind if kind != "generic" else body.kind
-        driver = driver_for(
-            settings.driver.kind, settings.driver.options, node_settings.name, seams.clock, seams.connector
-        )
+        driver = driver_for(wanted.kind, wanted.options, node_settings.name, seams.clock, seams.connector, wanted.parts)
         driver = driver if frailty is None else frailty.drained(driver)
     device = Device(
         uuid="",
@@ -86,19 +106,30 @@ def assembled(settings: Settings, seams: Seams) -> Assembly:
         capabilities=capabilities,
         roles=tuple(node_settings.roles),
         position=node_settings.position,
+        laptop=node_settings.laptop,
+        agent=settings.agent.name,
     )
+    team = _closed_team(seams)
+    known = [] if team is None else [address for address in team.membership.known]
     node = SwarmNode(
         device,
-        identity_in(seams.store, seams.rng),
-        node_settings.team_secret,
-        list(node_settings.known_nodes),
+        identity_in(seams.store, seams.rng) if team is None else team.identity,
+        node_settings.team_secret if team is None else team.secret,
+        list(dict.fromkeys([*node_settings.known_nodes, *known])),
         seams.network(),
         seams.store,
         seams.clock,
         seams.rng,
         seams.wall,
         node_settings.presence_lease,
+        lan=None if seams.lan is None else seams.lan(),
+        door=OPEN if team is None else team.door,
     )
+    if team is None:
+        _log.warn("{name} is in an open team: {open}", name=device.name, open=UNPROTECTED)
+    else:
+        team.attach(node.entangled, seams.clock)
+        node.team = team
     answer_survey(node)
     tuning = answer_tuning(node, settings, {} if driver is None else driver.description.capabilities)
     filming: object = driver
@@ -112,7 +143,22 @@ def assembled(settings: Settings, seams: Seams) -> Assembly:
     agent = None
     if settings.agent.module and driver is not None:
         agent = agent_named(settings.agent.module)(node, driver, seams.clock, seams.rng)
+        if settings.agent.name:
+            place = f" on {node_settings.laptop}" if node_settings.laptop else ""
+            _log.info(
+                "{device} has the agent {agent}{place}", device=device.name, agent=settings.agent.name, place=place
+            )
     return Assembly(node, agent, driver)
+
+
+def _closed_team(seams: Seams) -> Team | None:
+    """The closed team that the node is a member of; a node of an open one loads none of this."""
+    if seams.membership is None:
+        return None
+    from middleware import roles
+    from middleware.admission.team import Team
+
+    return Team(seams.membership, seams.store, seams.wall, seams.rng, roles)
 
 
 def _camera_knob(driver: Filming) -> Knob:

@@ -14,7 +14,7 @@ from middleware.entangled.control.place import NoControl
 from middleware.entangled.control.word import printable
 from middleware.errors import BadFault, BadSetting
 from middleware.fault import ASKED, CAUSE, KINDS, MAX_S, MIN_S, USUAL_S, Fault, fault_of
-from middleware.presence import Device, devices_of
+from middleware.presence import Device
 from middleware.tasks import outcome_of
 from swarmnode.asker import Asker, Refusal
 from swarmnode.frailty import ASSIGN
@@ -34,7 +34,7 @@ class TeamStage:
 
     def devices(self) -> list[Device]:
         """Who is there."""
-        return [device for device, _ in devices_of(self._asker.records("devices", "fast"))]
+        return [device for device, _ in self._asker.devices()]
 
     def assign(self, task: str) -> str:
         """Publish a task, through the first device that lets us."""

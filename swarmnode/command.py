@@ -13,12 +13,24 @@ from swarmnode.ballast import drop_tls
 OURS = ("agents", "drivers", "middleware", "sim", "swarmnode", "webnode")
 # A verb whose module is not here is not offered.
 WORKS: dict[str, tuple[str, str]] = {
-    "demo": ("sim.demo.demonstration", "three robots, a yard and the page, on this machine"),
-    "yard": ("sim.server", "the yard alone"),
+    "demo": ("sim.demo.demonstration", "three robots, a red target and the page, on this machine"),
+    "yard": ("sim.server", "the yard alone, and the robots that it plays"),
     "trials": ("swarmnode.rehearsal", "both experiments, many times"),
+    "crowd": ("swarmnode.crowd", "a yard for many: agents by the hundred among robots by the thousand"),
     "chaos": ("swarmnode.chaos", "let a device of a team fail, to see another take over"),
+    "driver": ("swarmnode.driver.command", "find a robot, and try it in a terminal before it joins"),
     "deploy": ("swarmnode.deploy", "push a strategy or a behaviour to the team, see who runs it, go back"),
+    "init": ("swarmnode.team.init", "make a closed team: the operator's key, and its first node"),
+    "invite": ("swarmnode.team.invite", "a code that lets a newcomer into the team"),
+    "join": ("swarmnode.team.join", "become a member of a team, by such a code"),
+    "members": ("swarmnode.team.members", "who belongs to the team"),
+    "revoke": ("swarmnode.team.revoke", "put a member out, or end an invitation"),
+    "rotate": ("swarmnode.team.rotate", "a new secret for the team"),
+    "promote": ("swarmnode.team.promote", "let a member let others in"),
     "why": ("swarmnode.why", "who was chosen for a task, and why"),
+    "doctor": ("swarmnode.doctor.command", "what keeps a node from its team, and what to do"),
+    "links": ("swarmnode.links", "how a node reaches each of its peers, and how well"),
+    "service": ("swarmnode.systemd.command", "a node as a service of systemd: install, show, restart, remove"),
     "web": ("swarmnode.web_code", "where the page is, and the code to sign in with"),
     "password": ("swarmnode.password", "the hash of a password, for the settings of the page"),
 }

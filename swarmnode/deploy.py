@@ -32,7 +32,6 @@ from middleware.entangled.control.place import NoControl
 from middleware.entangled.control.word import printable
 from middleware.entangled.record import Record
 from middleware.errors import Undeployable
-from middleware.presence import devices_of
 from swarmnode.asker import Asker, Refusal
 
 SOURCE = "source"
@@ -130,7 +129,7 @@ def _rollback(wishes: argparse.Namespace, ask: Ask) -> Told:
 
 def _status(wishes: argparse.Namespace, ask: Ask) -> Told:
     asker = Asker(wishes.node, ask)
-    devices = devices_of(asker.records("devices"))
+    devices = asker.devices()
     names = {record.owner: device.name for device, record in devices}
     rows: list[dict[str, Any]] = []
     lines = []
@@ -147,9 +146,7 @@ def _status(wishes: argparse.Namespace, ask: Ask) -> Told:
 
 
 def _keys(wishes: argparse.Namespace, ask: Ask) -> Told:
-    keys = {
-        device.name: record.owner.hex() for device, record in devices_of(Asker(wishes.node, ask).records("devices"))
-    }
+    keys = {device.name: record.owner.hex() for device, record in Asker(wishes.node, ask).devices()}
     width = max(map(len, keys), default=0)
     return keys, [f"{name:{width}}  {key}" for name, key in keys.items()]
 

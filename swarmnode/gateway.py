@@ -17,8 +17,10 @@ from twisted.internet.defer import Deferred, DeferredList, fail, maybeDeferred, 
 from twisted.internet.interfaces import IDelayedCall
 from twisted.logger import Logger
 
+from drivers.jpeg import size_of
 from drivers.phone.driver import SIGHT, PhoneDriver
-from drivers.phone.option import FPS
+from drivers.phone.option import FPS, MOST_SIDE
+from middleware.admission.certificate import GATEWAY
 from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.identity import Identity
 from middleware.node import SwarmNode
@@ -37,7 +39,6 @@ from swarmnode.bucket import Bucket
 from swarmnode.seams import Seams
 from webnode.board import Phones, Wanted
 from webnode.errors import Refusal
-from webnode.jpeg import size_of
 
 if TYPE_CHECKING:
     from webnode.ground import Ground
@@ -63,6 +64,15 @@ PERSON = b"phone"
 def seed_of(team_secret: bytes, secret: bytes) -> bytes:
     """The seed of a phone's identity: of the phone alone, and of no use in another team."""
     return hashlib.blake2s(secret, key=team_secret, person=PERSON).digest()
+
+
+def sides(jpeg: bytes) -> tuple[int, int]:
+    """Width and height in pixels of a phone's picture; raises ``Refusal`` 400 for what is none that is used here."""
+    size = size_of(jpeg)
+    if size is None or max(size) > MOST_SIDE:
+        problem = "it is no JPEG picture that is used here" if jpeg else "it is missing or empty"
+        raise Refusal("body", problem, f"send a whole JPEG of at most {MOST_SIDE} pixels a side")
+    return size
 
 
 class Gateway:
@@ -100,6 +110,10 @@ class Gateway:
         if len(self._phones) >= MOST:
             remedy = "wait until one leaves, or join at another web node"
             return fail(Refusal("phone", f"{MOST} phones take part at this node", remedy, 409))
+        team = self._node.team
+        if team is not None and GATEWAY not in team.door.me.roles:
+            remedy = f"have the operator say: swarm promote {team.door.me.name} --role {GATEWAY}"
+            return fail(Refusal("phone", "this node may not bring guests into its team", remedy, 409))
         if not self._joins.take(now):
             return fail(Refusal("phone", "too many join at once", "try again in a few seconds", 429))
         joined: Deferred[str] = Deferred()
@@ -119,12 +133,10 @@ class Gateway:
 
     def look(self, uuid: str, jpeg: bytes, values: Mapping[str, float]) -> Wanted:
         """Take what a phone sees and measures; raises ``Refusal`` 400, 404 or 429."""
+        size = sides(jpeg)
         phone = self._phones.get(uuid)
         if phone is None:
             raise Refusal("uuid", "this phone takes no part here", "join by POST /api/v1/phones", 404)
-        size = size_of(jpeg)
-        if size is None:
-            raise Refusal("body", "it is no JPEG picture that is used here", "send a whole one")
         phone.wait(SILENCE_S)
         if not phone.bucket.take(self._node.clock.seconds()):
             raise Refusal("phone", "it looks too often", f"send at most {FPS:g} looks a second", 429)
@@ -152,6 +164,10 @@ class Gateway:
     def _made(self, uuid: str, seed: bytes, name: str, can: Mapping[str, Any]) -> _Phone:
         seams = self._seams()
         seams.store.note("identity", seed)
+        if self._node.team is not None:
+            from middleware.admission.membership import MemoryMembership
+
+            seams = replace(seams, membership=MemoryMembership(self._node.team.guest(seed, name)))
         settings = _settings_of(self._settings, self._node, name, can)
         assembly = assembled(settings, seams)
         assert isinstance(assembly.driver, PhoneDriver) and assembly.agent is not None

@@ -12,24 +12,28 @@ from twisted.logger import LoggingFile
 from twisted.python import usage
 
 from drivers.errors import DriverError
+from middleware.admission.errors import BadKeyFile
 from middleware.entangled.clock import use_monotonic_time
-from middleware.entangled.errors import BadStore, PortInUse
+from middleware.entangled.errors import BadStore, PortInUse, TunnelPortInUse
 from middleware.errors import BadSetting, MissingExtra, SwarmError, UnknownAgent
 from middleware.node import SwarmNode
 from middleware.settings import COMMAND_LINE, Settings
-from swarmnode.assembly import FAULTS
+from swarmnode.assembly import FAULTS, checked_team
 from swarmnode.ballast import drop_tls
+from swarmnode.ports import given_way
 from swarmnode.service import NodeService
 from swarmnode.warmth import STARTED_S, warmed_up
 from swarmnode.web import web_page, with_code
-from swarmnode.world import control_socket, real_seams, resolved
+from swarmnode.world import control_socket, real_seams, resolved, with_page_key
 from webnode.errors import PortTaken
 
 use_monotonic_time()
 
 KEYS: Sequence[tuple[type[Exception], str]] = (
+    (TunnelPortInUse, "[node] tunnel_port"),
     (PortInUse, "[node] port"),
     (BadStore, "[node] store"),
+    (BadKeyFile, "[node] membership"),
     (UnknownAgent, "[agent] module"),
     (DriverError, "[driver]"),
     (PortTaken, "[web] port"),
@@ -51,9 +55,13 @@ class Options(usage.Options):
         ["kind", "k", None, "kind of the device"],
         ["host", None, None, "address to listen on"],
         ["port", "p", None, "UDP port; 0 takes any"],
+        ["lan", None, None, "false: do not look for the team on the LAN"],
         ["known-nodes", None, None, "nodes to join through, as HOST:PORT,HOST:PORT"],
         ["store", "s", None, "path of the data store, or :memory:"],
-        ["team-key", None, None, "the team's secret"],
+        ["membership", None, None, "file of a member of a closed team"],
+        ["team-key", None, None, "the secret of an open team"],
+        ["tunnels", None, None, "ways in over TLS where UDP is blocked, as wss://HOST:PORT,wss://HOST:PORT"],
+        ["tunnel-port", None, None, "TCP port that lets those in to whom UDP is blocked; 0: none"],
         ["roles", "r", None, "of edge,bootstrap,web"],
         ["agent-module", "a", None, "agent of the device"],
         ["driver-kind", "d", None, "driver of its robot"],
@@ -89,8 +97,10 @@ def makeService(options: Options) -> IService:
 
     settings = options.settings
     try:
-        settings = resolved(settings)
+        settings = given_way(resolved(settings))
+        checked_team(settings)
         seams = real_seams(settings, reactor)
+        settings = with_page_key(settings, seams)
         fronts: list[Callable[[SwarmNode], IService]] = [partial(control_socket, settings, reactor)]
         if "web" in settings.node.roles:
             settings = with_code(settings, seams.rng)

@@ -10,8 +10,11 @@ from collections.abc import Mapping
 from typing import Any
 
 from agents.catalogue import DEMO, TASKS
-from drivers.sim.link import MemoryConnector
+from drivers.link import MemoryConnector
 from drivers.sim.operator import YardOperator
+from middleware.admission.membership import MemoryMembership
+from middleware.admission.operator import FIRST, drawn
+from middleware.admission.statement import SECRET_BYTES
 from middleware.entangled.clock import HeapClock
 from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.network.network import Address
@@ -65,6 +68,10 @@ class VirtualTeam:
         self.services: dict[str, NodeService] = {}
         self.frosts: dict[str, Frost] = {}
         self.connectors: dict[str, MemoryConnector] = {}
+        self.operator = drawn(f"team-{seed}", random.Random(f"{seed}/operator"))
+        self._dice = random.Random(f"{seed}/members")
+        self._secret = self._dice.randbytes(SECRET_BYTES)
+        self._memberships: dict[str, MemoryMembership] = {}
         self._names = (self.BOOTSTRAP, *self.DOGS, *others)
         self._seed = seed
         self._fps = camera_fps
@@ -84,7 +91,7 @@ class VirtualTeam:
         ``shelf`` is where it keeps deployed modules.
         """
         port = self.address(name).port
-        mapping: dict[str, Any] = {"node": {"name": name, "port": port, "team_key": str(self._seed)}}
+        mapping: dict[str, Any] = {"node": {"name": name, "port": port}}
         if name != self.BOOTSTRAP:
             mapping["node"]["known_nodes"] = [str(self.address(self.BOOTSTRAP))]
         if name in self.DOGS:
@@ -104,9 +111,18 @@ class VirtualTeam:
             frost.connector(connector),
             shelf,
             _Plug(self, name),
+            membership=self._membership(name),
         )
         self.services[name] = NodeService(Settings.from_mapping(mapping, f"seed {self._seed}"), seams)
         self.services[name].startService()
+
+    def _membership(self, name: str) -> MemoryMembership:
+        """The place of the node ``name`` in the team, the same in each of its lives; its operator has met everybody."""
+        if name not in self._memberships:
+            roles, now = ("device",) if name in self.DOGS else FIRST, self.clock.seconds()
+            membership = self.operator.founded(name, roles, now, self._dice, self._secret)
+            self._memberships[name] = MemoryMembership(membership)
+        return self._memberships[name]
 
     def address(self, name: str) -> Address:
         """Where the node ``name`` listens."""
@@ -145,6 +161,10 @@ class VirtualTeam:
         for other in self._names:
             if other != name:
                 self.board.cut(self.address(name), self.address(other), one_way)
+
+    def unplug(self, name: str) -> None:
+        """Let nothing pass between the node of a dog and its body, though no connection is closed."""
+        self.connectors[name].silence()
 
     def stop(self) -> None:
         """End everything."""

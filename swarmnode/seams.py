@@ -5,12 +5,16 @@ from __future__ import annotations
 import random
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from twisted.internet.interfaces import IReactorTime
 
 from middleware.entangled.data.store import Store
+from middleware.entangled.network.multicast import Multicast
 from middleware.entangled.network.network import Network
+
+if TYPE_CHECKING:
+    from middleware.admission.membership import Kept
 
 
 class Plug(Protocol):
@@ -29,7 +33,9 @@ class Seams:
 
     ``network`` makes the node's port each time that it enters the network; ``connector`` opens links to robots and
     yards (None: TCP); ``wall`` is unix time, for people; ``shelf`` is where deployed modules are kept (None: they are
-    forgotten when the node ends); ``plug`` is what a fault on purpose pulls (None: neither killed nor frozen).
+    forgotten when the node ends); ``plug`` is what a fault on purpose pulls (None: neither killed nor frozen);
+    ``lan`` makes its place in the group of the LAN (None: it does not look there).
+    ``membership`` is the node's place in a closed team (None: the team is open).
     """
 
     clock: IReactorTime
@@ -40,3 +46,5 @@ class Seams:
     connector: Any = None
     shelf: Any = None
     plug: Plug | None = None
+    lan: Callable[[], Multicast] | None = None
+    membership: Kept | None = None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import os
 import random
 import socket
 import time
@@ -17,11 +19,13 @@ from twisted.logger import Logger
 from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.data.sqlite import SqliteStore
 from middleware.entangled.data.store import Store
-from middleware.entangled.network.network import Address
+from middleware.entangled.network.interface import is_loopback
+from middleware.entangled.network.network import EVERYWHERE, Address
 from middleware.errors import BadSetting
 from middleware.node import SwarmNode
 from middleware.settings import IN_MEMORY, Settings
 from swarmnode.seams import Seams
+from swarmnode.tunnels import with_tunnels
 
 _log = Logger()
 
@@ -30,6 +34,11 @@ def real_seams(settings: Settings, reactor: Any) -> Seams:
     """The seams of a node that runs on this machine."""
     from middleware.entangled.network.udp import UdpNetwork
 
+    membership = None
+    if settings.node.membership:
+        from middleware.admission.membership import MembershipFile
+
+        membership = MembershipFile(Path(settings.node.membership))
     path = settings.node.store
     quota = settings.node.store_rows, settings.node.store_bytes
     rng = random.SystemRandom()
@@ -39,7 +48,14 @@ def real_seams(settings: Settings, reactor: Any) -> Seams:
     else:
         deliver, durable = reactor.callFromThread, settings.node.durable
         store = SqliteStore.open(Path(path), reactor.seconds(), *quota, deliver=deliver, durable=durable)
-    network = partial(UdpNetwork, reactor, settings.node.host, settings.node.port)
+    lan = None
+    if settings.node.lan and not is_loopback(settings.node.host):
+        from middleware.entangled.network.lan import LanMulticast
+
+        lan = partial(LanMulticast, reactor, settings.node.host)
+    network = with_tunnels(
+        settings.node, partial(UdpNetwork, reactor, settings.node.host, settings.node.port), reactor, rng, os.environ
+    )
     shelf = None
     if settings.deployment.allow and path != IN_MEMORY:
         from middleware.deployment.shelf import FileShelf
@@ -50,7 +66,16 @@ def real_seams(settings: Settings, reactor: Any) -> Seams:
         from swarmnode.plug import ProcessPlug
 
         plug = ProcessPlug()
-    return Seams(reactor, network, store, rng, time.time, shelf=shelf, plug=plug)
+    return Seams(reactor, network, store, rng, time.time, shelf=shelf, plug=plug, membership=membership, lan=lan)
+
+
+def with_page_key(settings: Settings, seams: Seams) -> Settings:
+    """``settings`` in which the team's own secret stands for the team key, for what the page signs."""
+    if seams.membership is None:
+        return settings
+    secret = seams.membership.membership.secrets[0][1]
+    key = hashlib.blake2s(secret, person=b"page").hexdigest()
+    return replace(settings, node=replace(settings.node, team_key=key))
 
 
 LookUp = Callable[..., Sequence[tuple[Any, ...]]]
@@ -59,6 +84,8 @@ LookUp = Callable[..., Sequence[tuple[Any, ...]]]
 def resolved(settings: Settings, look_up: LookUp = socket.getaddrinfo) -> Settings:
     """``settings`` with an address in figures for every host name; raises ``BadSetting`` for a name that has none."""
     family = socket.AF_INET6 if ":" in settings.node.host else socket.AF_INET
+    if settings.node.host == EVERYWHERE:
+        family = socket.AF_UNSPEC
 
     def figures(address: Address, key: str, family: int) -> Address:
         try:
@@ -83,8 +110,9 @@ def control_socket(settings: Settings, reactor: Any, node: SwarmNode) -> IServic
 
     def verbs() -> Any:
         from middleware.entangled.control.verb import Verbs
+        from swarmnode.team.verb import TeamVerbs
 
-        return Verbs.of(node.entangled, node.clock, node.rng)
+        return TeamVerbs(Verbs.of(node.entangled, node.clock, node.rng), node)
 
     try:
         return ControlPort(reactor, made(settings.node.name), verbs)

@@ -89,6 +89,10 @@ class Fleet(World):
         """Which memory the node of a place has; another one may lack what was not acknowledged."""
         return 0
 
+    def forgets(self, place: int) -> bool:
+        """Whether the next life of a node that is killed now may lack what this one has stored."""
+        return False
+
     def kill(self, place: int) -> None:
         """End a node as a loss of power does; its store is left as it is."""
         self.nodes[place].vanish()

@@ -3,37 +3,63 @@
 from __future__ import annotations
 
 import re
+import tomllib
 from collections.abc import Sequence
 from pathlib import Path
+from random import Random
 
+from twisted.internet.task import Clock
 from twisted.trial.unittest import SynchronousTestCase
 
-from agents import body, engagement, loop
+from agents import body, engagement, loop, means
 from agents.catalogue import TASKS
+from drivers import rules
+from drivers.aibo.option import PORTS
+from drivers.compass.option import PORT as COMPASS_PORT
+from drivers.create2.codec import FRAME_S as STREAM_S
+from drivers.deadman import keeper, process
+from drivers.errors import UsageError
 from drivers.phone import driver, option
-from drivers.registry import describe
-from middleware import fault, halt, takeover
+from drivers.registry import KINDS, describe
+from middleware import fault, gauge, halt, survey, takeover
 from middleware.commitment import ballot, lessee
 from middleware.consensus import guard, strategy, worker
 from middleware.deployment import manifest, module
 from middleware.dissemination import check, party, scale, teller, tree
 from middleware.entangled.control import port
-from middleware.entangled.kademlia import membership, roster
+from middleware.entangled.kademlia import detour, membership, roster
+from middleware.entangled.network import bundle, layer, link, tcp, tunnel, websocket
 from middleware.entangled.replication import handover, pusher, replica, subscriber
 from middleware.entangled.space import shelf, template
+from middleware.entangled.wire import rebuff
 from middleware.settings import Settings
+from sim import dog, scene, sensor, world
+from sim.crowd import crowd, ray
+from sim.demo.cast import CASTS
+from sim.demo.configuration import DOGS
+from sim.emulator import aibo, rosbridge
+from sim.robots import Robots
+from sim.yard import Yard
 from swarmnode import gateway
-from webnode import channel, jpeg, limits, live, team
+from swarmnode.driver import pilot
+from webnode import channel, limits, live, team
 from webnode.board import AUDITED
 from webnode.routes import orders, phones
 
 ROOT = Path(__file__).parents[1]
-DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), ROOT / "benchmarks" / "README.md"]
+DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")), ROOT / "benchmarks" / "README.md"]
 LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
 NAMED = re.compile(r"`([\w./-]+\.(?:py|toml|json|md))(?:::(\w+))?`")
 EXAMPLES = sorted((ROOT / "examples").glob("*.toml"))
 FIGURES: Sequence[tuple[str, str]] = (
+    ("simulator", f"until somebody has gone {50 * ray.SKIN:g} cm"),
+    ("simulator", f"overlaps by more than {1000 * crowd.SLOP:g} mm"),
+    ("simulator", f"Steps are of {1000 * crowd.TICK:g} ms"),
     ("agents", f"one turn each {1000 * loop.TICK:g} ms"),
+    ("agents", f"its battery is empty (below {body.EMPTY:g} where it tells its level)"),
+    ("agents", f"the simulated dog | {means.WALK:g} m/s"),
+    ("agents", f"| {means.SWIFT:g} m/s, or its own limit"),
+    ("agents", f"| {means.STOP_AT:g} m before its head"),
     ("agents", f"the first at once, the second {lessee.STAGGER:g} s later"),
     ("consensus", f"Each rank waits {lessee.STAGGER:g} s longer than the one before it"),
     ("consensus", f"News of a release is believed for {lessee.FRESH:g} s"),
@@ -50,19 +76,22 @@ FIGURES: Sequence[tuple[str, str]] = (
     ("consensus", f"after {teller.STAND_IN:g} s each the next one stands in"),
     ("consensus", f"told nothing {check.SILENCE:g} s after the waiting period asks"),
     ("consensus", f"for all behind it after {party.RELAY_SILENCE:g} s"),
+    ("demo", f"an AIBO walks on until {aibo.DEAD_MAN_S:g} s after its last command"),
     ("deployment", f"the source has at most {manifest.MAX_SOURCE // 1024} KiB"),
     ("deployment", f"takes at most {module.STEPS:,} instructions"),
+    ("drivers", f"in every state, at rest within {rules.HALT_S:g} s"),
+    ("drivers", f"While driving a key counts for {pilot.KEY_S:g} s"),
     ("faults", f"Seconds are {fault.MIN_S:g} to {fault.MAX_S:g}, {fault.USUAL_S:g} where"),
     ("faults", f"later than {takeover.TARGET_S:g} s, or nobody took over"),
     ("faults", f"below {body.EMPTY:g} its agent takes its report back"),
     ("library", f"After about {membership.SILENCE + roster.STRUCK_S:g} s the absent are struck"),
     ("library", f"A request has at most {port.MAX_REQUEST:,} bytes, a node {port.MAX_CONNECTIONS} connections"),
     ("phone", f"says nothing for {gateway.SILENCE_S:g} s has gone as well"),
-    ("phone", f"from {driver.STALE_S:g} s on it counts as silent"),
+    ("phone", f"from {driver.PhoneDriver.STALE_S:g} s on it counts as silent"),
     ("phone", f"| {gateway.MOST}: each is a node"),
     ("phone", f"| {option.FPS:g} a second wanted while it has a task, {gateway.IDLE_FPS:g} else"),
     ("phone", f"more than {gateway.LOOKS_S:g} a second ({gateway.LOOKS:g} at once)"),
-    ("phone", f"at most {jpeg.MOST_SIDE} pixels a side"),
+    ("phone", f"at most {phones.MOST_SIDE} pixels a side"),
     ("phone", f"no others, {phones.TICKET_S / 3600:g} hours"),
     ("phone", f"{option.LENS_DEG:g} degrees across the longer side"),
     ("phone", f"keeps it in view for {TASKS['watch-target'].parameters['seconds']:g} s in all"),
@@ -71,6 +100,13 @@ FIGURES: Sequence[tuple[str, str]] = (
     ("protocol", f"out of touch with a majority for {handover.OUT_OF_TOUCH:g} s"),
     ("protocol", f"Pages hold about {replica.PAGE_BYTES:,} bytes"),
     ("protocol", f"counts for {pusher.WATCH_TTL:g} s and is asked again every {subscriber.RENEW:g} s"),
+    ("robots/stopping", f"switch, {process.GRACE_S:g} s after the deadline"),
+    ("robots/stopping", f"again after {process.AGAIN_S:g} and {(process.TIMES - 1) * process.AGAIN_S:g} s"),
+    ("robots/stopping", f"another one is started after {keeper.FIRST_WAIT_S:g} s"),
+    ("robots/stopping", f"it wakes {1 / process.TICK_S:g} times a second"),
+    ("robots/stopping", f"tried again, every {keeper.LAST_WAIT_S:g} s at last"),
+    ("safety", f"halts the robot: {process.GRACE_S:g} s after the deadline, or at once"),
+    ("safety", f"AIBO {aibo.DEAD_MAN_S:g} s, most ROS bases {rosbridge.BASE_STOPS_S:g} s"),
     ("safety", f"the head of a request | {channel.HEAD_S:g} s after its first byte"),
     ("safety", f"less than {channel.PACE / 1000:g} kB/s on the average after {channel.GRACE_S:g} s"),
     ("safety", f"that has had an answer | {channel.KEEP_S:g} s"),
@@ -82,16 +118,61 @@ FIGURES: Sequence[tuple[str, str]] = (
     ),
     ("safety", f"and {limits.MOST['open']} connections"),
     ("safety", f"the newest {AUDITED} in memory"),
+    ("simulator", f"Physics in steps of {1000 * world.SUBSTEP:g} ms"),
+    ("simulator", f"a battery of {sensor.BATTERY_S / 60:g} minutes"),
+    ("simulator", f"a circle of {200 * scene.FOOTPRINT:g} cm that weighs {dog.MASS:g} kg"),
+    ("simulator", f"TCP {PORTS['main']} (main control), {PORTS['estop']} (e-stop)"),
+    ("simulator", f"{PORTS['state']} (world state), {PORTS['walk']} (walk), {PORTS['head']} (head), {PORTS['camera']}"),
+    ("simulator", f"a world state each {1000 * aibo.FRAME_S:g} ms, pictures up to {1 / aibo.CAMERA_S:g} a second"),
+    ("simulator", f"Walks on for {aibo.DEAD_MAN_S:g} s after the last command"),
+    ("simulator", f"the stream each {1000 * STREAM_S:g} ms"),
+    ("simulator", f"stands after {rosbridge.BASE_STOPS_S:g} s without"),
+    ("simulator", f"`/imu` {rosbridge.TOPICS['/imu'][1]:g} times a second, `/scan` {rosbridge.TOPICS['/scan'][1]:g}"),
+    ("simulator", f"`/camera/image_raw/compressed` {rosbridge.TOPICS['/camera/image_raw/compressed'][1]:g} times"),
+    ("simulator", f"Of the scanner's {rosbridge.BEAMS} beams"),
+    ("simulator", f"TCP {COMPASS_PORT} or `port`"),
     ("tuplespace", f"1 to {template.MAX_FIELDS} fields"),
     ("tuplespace", f"asked every {shelf.POLL:g} s whether"),
+    ("tunnel", f"no known node has answered by UDP for {detour.AFTER_S:g} s"),
+    ("tunnel", "by UDP after {:g}, {:g} and then every {:g} s".format(*detour.AGAIN_S)),
+    ("tunnel", f"carried nothing for {tunnel.UNUSED_S:g} s"),
+    ("tunnel", f"at most {tunnel.LAST_HOLD_S:g} s |"),
+    ("tunnel", f"datagrams of up to {link.SHORT} bytes"),
+    ("tunnel", f"{link.MAX_SENDING // 1024} KiB of these in the transport"),
+    ("tunnel", f"hold back no more than {tcp.UNSENT // 1024} KiB"),
+    ("tunnel", f"after {link.IDLE_S:g} s without a sign of the other end, or {link.QUIET_S:g} s when"),
+    ("tunnel", f"does not answer within {link.PONG_S:g} s"),
+    ("tunnel", f"takes nothing for {link.STALL_S:g} s"),
+    ("tunnel", f"| {tunnel.HEAD_S:g} s from the connection on, and {layer.MAX_HEAD // 1024} KiB of head"),
+    ("tunnel", f"got nothing through for {bundle.STILL_S:g} s"),
+    ("tunnel", f"until {bundle.ROUGH_S:g} s after that"),
+    ("tunnel", f"stands still for {bundle.DEAD_S:g} s while another moves"),
+    ("tunnel", f"takes no more than {bundle.HELD // 1024} KiB"),
+    ("tunnel", f"none opens within {bundle.OPENING_S:g} s"),
+    ("tunnel", f"| {bundle.MOST * tunnel.MAX_OF_HOST}, three for each of {tunnel.MAX_OF_HOST} tunnels"),
+    ("tunnel", f"| {tunnel.MAX_BEGUN}; the oldest makes room"),
+    ("tunnel", f"| {tunnel.MAX_OF_HOST}; behind a reverse proxy"),
+    ("tunnel", f"| {tunnel.MAX_LINKS}; strangers make room"),
+    ("tunnel", f"| {tunnel.UNANSWERED_S:g} s: the wire answers nobody"),
+    ("tunnel", f"| {websocket.MAX_PAYLOAD} bytes; what breaks"),
     ("actions", f"after {team.PATIENCE:g} s at the latest"),
     ("actions", f"place the target, {team.PLACING:g} s later"),
     ("protocol", f"is on: bool, by: at most {halt.MAX_NAME} characters"),
     ("web", f"`text`, 1 to {orders.MAX_MESSAGE} characters"),
     ("web", f"`seconds`, {orders.MIN_AWAY_S:g} to {orders.MAX_AWAY_S:g}, default {orders.AWAY_S:g}"),
     ("web", f"At most {live.MAX_VIEWERS} streams"),
+    ("web", f"nobody has asked for {gauge.IDLE:g} s"),
+    ("web", f"those with {survey.ENDING_S / 86_400:g} days or less come first"),
+    ("web", f"A node keeps the last {rebuff.MAX_REBUFFS}, in memory"),
 )
 """What a document says with a figure of the code in it."""
+
+
+def part_of(document: Path, title: str) -> str:
+    """What stands below the heading ``title``, down to the next one."""
+    parts = document.read_text(encoding="utf-8").split("\n## ")
+    (found,) = (part for part in parts if part.splitlines()[0] == title)
+    return found
 
 
 class DocumentTests(SynchronousTestCase):
@@ -121,6 +202,38 @@ class DocumentTests(SynchronousTestCase):
         for name, said in FIGURES:
             text = " ".join((ROOT / "docs" / f"{name}.md").read_text(encoding="utf-8").split())
             self.assertTrue(said in text, f"docs/{name}.md does not say: {said}")
+
+    def test_every_robot_is_listed(self) -> None:
+        """The table of robots in the README has each kind of driver and no other, and leads to its page."""
+        table = part_of(ROOT / "README.md", "Robots")
+        rows = re.findall(r"^\| `(\w+)` \|.*\[\w+\.md\]\(docs/([\w./]+)\) \|$", table, re.MULTILINE)
+        self.assertEqual(sorted(kind for kind, _ in rows), sorted(KINDS))
+        for kind, page in rows:
+            self.assertIn(f"`{kind}`", (ROOT / "docs" / page).read_text(encoding="utf-8"))
+
+    def test_every_cast_is_listed(self) -> None:
+        """The demonstration's page and ``make help`` name each choice of ROBOT and no other, and the same default."""
+        rows = re.findall(r"^\| `(\w+)`", part_of(ROOT / "docs" / "demo.md", "Which robots"), re.MULTILINE)
+        self.assertEqual(sorted(rows), sorted(CASTS))
+        makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+        self.assertIn(f"[ROBOT={'|'.join(sorted(CASTS))}]", makefile)
+        (default,) = re.findall(r"^ROBOT +\?= (\w+)$", makefile, re.MULTILINE)
+        self.assertIn(f"| `{default}` (default) |", part_of(ROOT / "docs" / "demo.md", "Which robots"))
+
+    def test_yard_plays_what_its_page_says(self) -> None:
+        """Each table of robots on the yard's page is one that the yard takes, and together they have all its kinds."""
+        text = (ROOT / "docs" / "simulator.md").read_text(encoding="utf-8")
+        clock, played = Clock(), set()
+        for block in re.findall(r"^```toml\n(.*?)^```$", text, re.MULTILINE | re.DOTALL):
+            table = tomllib.loads(block)
+            self.assertLessEqual(set(table), set(DOGS))
+            Robots(clock, Random(1), Yard(clock, Random(1), scene.loaded("three-dogs")), table)
+            for robot in table.values():
+                played |= {robot["kind"], *(part["kind"] for part in robot.get("parts", []))}
+        self.assertEqual(set(re.findall(r"^\| `(\w+)` \|", text, re.MULTILINE)), played)
+        with self.assertRaises(UsageError) as refused:
+            Robots(clock, Random(1), Yard(clock, Random(1), scene.loaded("three-dogs")), {"dog1": {"kind": "phone"}})
+        self.assertTrue(str(refused.exception).endswith(f"it has {', '.join(sorted(played))}"), refused.exception)
 
     def test_thesis_is_complete(self) -> None:
         """The page on the thesis has a row for each requirement, assumption and algorithm, and Figures 5.3 to 5.7."""

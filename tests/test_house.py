@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import configparser
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -20,8 +21,10 @@ ROOMS = (*BELOW, "swarmnode")
 MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "middleware": ("middleware",),
     "middleware.entangled": ("middleware.entangled",),
+    "middleware.admission": ("middleware.admission", "middleware.entangled"),
     "drivers": ("drivers",),
     "sim": ("sim", "drivers"),
+    "sim.team": ("sim.team", "middleware"),
     "webnode": ("webnode", "middleware"),
     "agents": ("agents", "middleware", "drivers.driver", "drivers.reading", "drivers.errors"),
     "swarmnode": ROOMS,
@@ -34,15 +37,32 @@ PURE = (
     "agents.circling",
     "agents.conference",
     "agents.decision",
+    "agents.detour",
     "agents.division",
     "agents.docket",
     "agents.epoch",
     "agents.execution",
     "agents.formation",
+    "agents.means",
     "agents.state",
+    "drivers.aibo.cursor",
+    "drivers.aibo.menu",
+    "drivers.aibo.odometry",
+    "drivers.aibo.picture",
+    "drivers.aibo.recipe",
+    "drivers.aibo.sense",
     "drivers.errors",
     "drivers.gate",
+    "drivers.jpeg",
     "drivers.reading",
+    "drivers.rosbridge.websocket",
+    "middleware.admission.certificate",
+    "middleware.admission.code",
+    "middleware.admission.errors",
+    "middleware.admission.knock",
+    "middleware.admission.roll",
+    "middleware.admission.sealed",
+    "middleware.admission.statement",
     "middleware.consensus.average",
     "middleware.consensus.bidder",
     "middleware.consensus.capability_cost",
@@ -84,29 +104,76 @@ PURE = (
     "middleware.entangled.identity",
     "middleware.entangled.kademlia.contact",
     "middleware.entangled.kademlia.lookup",
+    "middleware.entangled.kademlia.pace",
     "middleware.entangled.kademlia.routing",
+    "middleware.entangled.network.address",
+    "middleware.entangled.network.layer",
     "middleware.entangled.network.network",
+    "middleware.entangled.network.nat",
+    "middleware.entangled.network.selfsigned",
+    "middleware.entangled.network.url",
+    "middleware.entangled.network.websocket",
+    "middleware.entangled.reach.candidate",
+    "middleware.entangled.reach.passage",
     "middleware.entangled.record",
     "middleware.entangled.kademlia.roster",
     "middleware.entangled.space.decree",
     "middleware.entangled.space.posting",
     "middleware.entangled.space.template",
     "middleware.entangled.wire.congestion",
+    "middleware.entangled.wire.door",
     "middleware.entangled.wire.message",
     "middleware.entangled.wire.noise",
+    "middleware.entangled.wire.rebuff",
     "middleware.entangled.wire.session",
     "middleware.errors",
     "middleware.fault",
+    "middleware.link",
+    "middleware.listing",
     "middleware.order",
     "middleware.explanation",
     "middleware.presence",
+    "middleware.prefix",
+    "middleware.roles",
     "middleware.settings",
     "middleware.takeover",
     "middleware.tasks",
     "middleware.verdict",
+    "sim.crowd.body",
+    "sim.crowd.controller",
+    "sim.crowd.crowd",
+    "sim.crowd.eye",
+    "sim.crowd.feeling",
+    "sim.crowd.ground",
+    "sim.crowd.neighbour",
+    "sim.crowd.picture",
+    "sim.crowd.ray",
+    "sim.crowd.search",
     "sim.demo.configuration",
     "sim.demo.experiment",
     "sim.demo.story",
+    "sim.team.checker",
+    "sim.team.event",
+    "sim.team.fault",
+    "sim.team.figure",
+    "sim.team.history",
+    "sim.team.invariant",
+    "sim.team.link",
+    "sim.team.load.census",
+    "sim.team.scale.curve",
+    "sim.team.scale.drawing",
+    "sim.team.scale.floor",
+    "sim.team.scale.page",
+    "sim.team.scale.theory",
+    "sim.team.scenario",
+    "sim.team.session",
+    "swarmnode.doctor.diagnosis",
+    "swarmnode.doctor.facts",
+    "swarmnode.doctor.finding",
+    "swarmnode.doctor.machine",
+    "swarmnode.doctor.team",
+    "swarmnode.doctor.way",
+    "swarmnode.systemd.unit",
     "webnode.errors",
     "webnode.field",
     "webnode.guard",
@@ -119,20 +186,30 @@ NOT_IN_PURE = ("twisted", "time", "socket", "threading", "asyncio", "selectors",
 
 # The only modules of the lower floors that may touch the clock, the sockets, threads or the dice of the machine.
 EDGES = (
-    "drivers.sim.link",
+    "drivers.camera.thread",
+    "drivers.deadman.keeper",
+    "drivers.deadman.process",
+    "drivers.link",
+    "drivers.serial",
     "middleware.consensus.worker",
     "middleware.entangled.control.command",
     "middleware.entangled.clock",
+    "middleware.entangled.network.interface",
+    "middleware.entangled.network.lan",
+    "middleware.entangled.network.tcp",
     "middleware.entangled.network.udp",
     "middleware.entangled.data.writer",
 )
 WORLD = ("time", "socket", "threading", "asyncio", "selectors", "subprocess", "secrets", "twisted.internet.reactor")
 GUARDED = ("middleware", "agents", "drivers")
 
-ON_DEMAND = ("middleware.deployment", "middleware.explanation", "middleware.verdict")
+ON_DEMAND = (
+    *("middleware.deployment", "middleware.explanation", "middleware.verdict"),
+    *("middleware.admission.team", "middleware.admission.roll"),
+)
 HEAVY = (
     *("flask", "jinja2", "segno", "prometheus_client", "OpenSSL", "cryptography"),
-    *("cv2", "numpy", "pymunk", "serial", "playwright"),
+    *("cv2", "numpy", "pymunk", "serial", "playwright", "roslibpy", "autobahn"),
 )
 
 
@@ -179,7 +256,7 @@ def _allowed(module: str) -> tuple[str, ...]:
     parts = module.split(".")
     if parts[0] == "drivers" and module != "drivers.registry":
         # A kind of robot never knows another kind; only the registry knows them all.
-        kinds = sorted({name.split(".")[1] for name in FILES if name.count(".") == 2 and name.startswith("drivers.")})
+        kinds = sorted({name.split(".")[1] for name in FILES if re.fullmatch(r"drivers\.\w+\.maker", name)})
         own = parts[1] if len(parts) > 2 or module in (f"drivers.{kind}" for kind in kinds) else ""
         contract = tuple(name for name in FILES if name.startswith("drivers.") and name.split(".")[1] not in kinds)
         allowed = (*contract, f"drivers.{own}") if own else contract

@@ -263,20 +263,36 @@ class Survey(Protocol):
     def network(self) -> Deferred[Json]:
         """Who knows whom, and how far they are."""
 
+    def links(self) -> Deferred[Json]:
+        """By which way each reaches the others, how well, and whom it met that was not let in."""
+
+    def team(self) -> Json:
+        """What team this is, and who is in it."""
+
     def inventory(self, uuid: str) -> Deferred[Json]:
         """What a device stores."""
 
 
 class MemorySurvey:
-    """Answers that it was made with: of the network, and of each device by uuid."""
+    """Answers that it was made with: of the network, of each device by uuid, of the links and of the team."""
 
-    def __init__(self, network: Json, inventories: Mapping[str, Json]) -> None:
+    def __init__(self, network: Json, inventories: Mapping[str, Json], links: Json = None, team: Json = None) -> None:
         self._network = network
         self._inventories = inventories
+        self._links = links
+        self._team = team
 
     def network(self) -> Deferred[Json]:
         """Return it."""
         return succeed(self._network)
+
+    def links(self) -> Deferred[Json]:
+        """Return them."""
+        return succeed(self._links)
+
+    def team(self) -> Json:
+        """Return it."""
+        return self._team
 
     def inventory(self, uuid: str) -> Deferred[Json]:
         """Return it, or fail with 504: the device did not answer."""
@@ -433,7 +449,11 @@ class Phones(Protocol):
         """
 
     def look(self, uuid: str, jpeg: bytes, values: Mapping[str, float]) -> Wanted:
-        """Take what it sees and measures; raises ``Refusal`` 404 where it takes no part here, 429 too often."""
+        """Take what it sees and measures.
+
+        Raises ``Refusal`` 400 where it is no picture that is used, 404 where the phone takes no part here, 429 where it
+        looks too often.
+        """
 
     def leave(self, uuid: str) -> None:
         """Let it go; one that is not here has gone already."""
@@ -443,13 +463,17 @@ class Phones(Protocol):
 
 
 class MemoryPhones:
-    """Phones that are only counted: ``here`` maps each uuid to its name, ``looks`` are (uuid, bytes, values)."""
+    """Phones that are only counted: ``here`` maps each uuid to its name, ``looks`` are (uuid, bytes, values).
 
-    def __init__(self, most: int = 8) -> None:
+    ``check`` raises ``Refusal`` for what is no picture.
+    """
+
+    def __init__(self, most: int = 8, check: Callable[[bytes], object] = lambda jpeg: None) -> None:
         self.here: dict[str, str] = {}
         self.looks: list[tuple[str, bytes, Mapping[str, float]]] = []
         self.can: Mapping[str, Any] = {}
         self._most = most
+        self._check = check
 
     def join(self, secret: bytes, name: str, can: Mapping[str, Any]) -> Deferred[str]:
         """Count it; its uuid is the end of its secret."""
@@ -461,6 +485,7 @@ class MemoryPhones:
 
     def look(self, uuid: str, jpeg: bytes, values: Mapping[str, float]) -> Wanted:
         """Keep it."""
+        self._check(jpeg)
         if uuid not in self.here:
             raise Refusal("uuid", "this phone takes no part here", "join by POST /api/v1/phones", 404)
         self.looks.append((uuid, jpeg, values))

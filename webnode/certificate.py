@@ -48,8 +48,8 @@ MOST = 32
 
 
 @dataclass(frozen=True)
-class Authority:
-    """What signs for the web nodes of a team."""
+class Credential:
+    """A private key, and the certificate that says whose it is."""
 
     key: ec.EllipticCurvePrivateKey
     certificate: x509.Certificate
@@ -58,6 +58,10 @@ class Authority:
     def pem(self) -> bytes:
         """The certificate, which everybody may have."""
         return bytes(self.certificate.public_bytes(Encoding.PEM))
+
+
+class Authority(Credential):
+    """What signs for the web nodes of a team."""
 
     @property
     def fingerprint(self) -> str:
@@ -87,18 +91,13 @@ def authority(secret: bytes) -> Authority:
     return Authority(key, made.sign(key, SHA256(), ecdsa_deterministic=True))
 
 
-@dataclass(frozen=True)
-class Leaf:
+class Leaf(Credential):
     """A node's own certificate and its key."""
 
-    key: ec.EllipticCurvePrivateKey
-    certificate: x509.Certificate
-
     @property
-    def pem(self) -> bytes:
+    def pem_with_key(self) -> bytes:
         """Both, to be kept where nobody else reads them."""
-        private = self.key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
-        return bytes(private + self.certificate.public_bytes(Encoding.PEM))
+        return bytes(self.key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())) + self.pem
 
     def flaw(self, signer: Authority, names: Collection[str], now: float) -> str:
         """Why it cannot serve the page at ``names`` at the unix time ``now``; empty where it can."""
@@ -127,7 +126,7 @@ class Leaf:
 
 
 def read(pem: bytes) -> Leaf:
-    """The leaf whose ``pem`` this is; raises ``ValueError`` where it is none."""
+    """The leaf whose ``pem_with_key`` this is; raises ``ValueError`` where it is none."""
     try:
         key = load_pem_private_key(pem, None)
         certificate = x509.load_pem_x509_certificate(pem)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import errno
 import gzip
 import hashlib
+import json
 import mimetypes
 import re
 from collections.abc import Callable, Collection, Sequence
@@ -72,27 +73,31 @@ def caller(reactor: Any, usual_s: float = LIMIT_S) -> OnReactor:
 
 
 class Files(JsonResource):
-    """``/static``: the page's few files, read and packed once; revalidated by ETag, so an update shows at once."""
+    """``/static``: the page's few files, read and packed once; revalidated by ETag, so an update shows at once.
+
+    ``files.json`` has the paths of all of them, for a browser that keeps the page.
+    """
 
     def __init__(self, folder: Path = STATIC) -> None:
         super().__init__()
-        for path in sorted(folder.iterdir()):
-            if path.is_file():
-                self.putChild(path.name.encode(), _File(path))
+        paths = [path for path in sorted(folder.iterdir()) if path.is_file()]
+        for path in paths:
+            self.putChild(path.name.encode(), _File(path.name, sent(path)))
+        listed = json.dumps([f"/static/{path.name}" for path in paths]).encode()
+        self.putChild(b"files.json", _File("files.json", listed))
 
 
 class _File(JsonResource):
     isLeaf = True
     methods = (b"GET", b"HEAD")
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, name: str, content: bytes) -> None:
         super().__init__()
-        content = sent(path)
         # Packed by the same hand at every node: no time of day in it, so the tag holds everywhere.
         packed = gzip.compress(content, 9, mtime=0)
         self._forms = {"": content, "gzip": packed} if len(packed) < len(content) else {"": content}
         self._tag = hashlib.blake2s(content, digest_size=8).hexdigest()
-        kind = mimetypes.guess_type(path.name)[0] or "application/octet-stream"
+        kind = mimetypes.guess_type(name)[0] or "application/octet-stream"
         self._kind = kind + ("; charset=utf-8" if kind.startswith("text/") else "")
 
     def render_GET(self, request: Request) -> bytes:

@@ -11,10 +11,8 @@ from typing import Any
 
 from twisted.internet.defer import Deferred, DeferredSemaphore, fail, succeed
 from twisted.internet.threads import deferToThreadPool
-from twisted.logger import Logger
 
 from middleware.errors import BadSetting
-from middleware.settings import NodeSettings
 from webnode.board import OpenSessions, Role, Sessions, Token, Visitor
 from webnode.delay import Delays
 from webnode.errors import Refusal
@@ -35,8 +33,6 @@ workers, and whoever guesses must not hold them all."""
 
 Check = Callable[[str, str], Deferred[bool]]
 """Whether a hash is that of a password, worked out beside the reactor's thread."""
-
-_log = Logger()
 
 
 class SignedSessions:
@@ -145,9 +141,6 @@ def sessions(ground: Ground) -> Sessions:
                 origin, "[web] password", f"is no hash of a password ({error})", "make one by: swarm password"
             ) from error
     secret = ground.settings.node.team_secret
-    if ground.settings.node.team_key == NodeSettings.team_key:
-        _log.warn("[node] team_key is no secret: who has signed in here has to sign in again at another web node")
-        secret = ground.rng.randbytes(32)
 
     def check(text: str, password: str) -> Deferred[Any]:
         return deferToThreadPool(ground.reactor, ground.reactor.getThreadPool(), is_password, text, password)

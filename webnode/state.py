@@ -80,6 +80,8 @@ def device_view(fields: Fields) -> State:
         "network": {text(key): number(value) for key, value in network.items()} if isinstance(network, Mapping) else {},
         "deployed": {text(key): text(value, limit=64) for key, value in deployed.items()},
         "position": _position(fields.get("position")),
+        "laptop": text(fields.get("laptop"), limit=64),
+        "agent": text(fields.get("agent"), limit=64),
         "gone": None,
     }
 

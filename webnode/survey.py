@@ -6,15 +6,19 @@ However many look at the network, each device is asked once a second; what it sa
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 from twisted.internet.defer import Deferred, DeferredList, maybeDeferred, succeed
 
 from middleware.entangled.errors import EntangledError, Refused
+from middleware.entangled.reach.passage import KINDS
 from middleware.entangled.record import Record
+from middleware.entangled.wire.rebuff import SIDES
+from middleware.link import Link
 from middleware.node import SwarmNode
 from middleware.presence import DEVICES, Device, devices_of
-from middleware.survey import INVENTORY, NETWORK, inventory, network
+from middleware.survey import INVENTORY, LINKS, NETWORK, inventory, links, network, team
 from webnode.board import Survey
 from webnode.errors import Refusal
 from webnode.field import MAX_ENTRIES, Json, count, distance, number, text
@@ -25,6 +29,7 @@ PATIENCE_S = 1.2
 FRESH_S = 1.0
 MAX_ASKED = 64
 """Devices that are asked for the view of the network, in the order of joining."""
+OWN: dict[str, Callable[[SwarmNode], dict[str, Any]]] = {INVENTORY: inventory, NETWORK: network, LINKS: links}
 
 
 def survey(ground: Ground) -> Survey | None:
@@ -38,21 +43,19 @@ class TeamSurvey:
     def __init__(self, node: SwarmNode, devices: Callable[[], list[Record]]) -> None:
         self._node = node
         self._devices = devices
-        self._asked_at = float("-inf")
-        self._network: Json = None
-        self._waiting: list[Deferred[Json]] | None = None
+        self._rounds = {NETWORK: _Round(_network_view), LINKS: _Round(_links_view)}
 
     def network(self) -> Deferred[Json]:
         """Who knows whom, and how far they are; ``silent`` are the uuids of those that did not answer."""
-        if self._waiting is None:
-            if self._node.clock.seconds() - self._asked_at < FRESH_S:
-                return succeed(self._network)
-            self._ask_all()
-        if self._waiting is None:  # everybody has answered at once
-            return succeed(self._network)
-        waiter: Deferred[Json] = Deferred(self._waiting.remove)
-        self._waiting.append(waiter)
-        return waiter
+        return self._told(NETWORK)
+
+    def links(self) -> Deferred[Json]:
+        """How each device reaches the others, and how well; ``here`` is the uuid of this node."""
+        return self._told(LINKS)
+
+    def team(self) -> Json:
+        """What team this is."""
+        return team(self._node)
 
     def inventory(self, uuid: str) -> Deferred[Json]:
         """What a device stores; fails with ``Refusal`` 409 or 504."""
@@ -64,32 +67,56 @@ class TeamSurvey:
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
-    def _ask_all(self) -> None:
+    def _told(self, method: str) -> Deferred[Json]:
+        """What all answered, asked at most once a ``FRESH_S``."""
+        asked = self._rounds[method]
+        if asked.waiting is None:
+            if self._node.clock.seconds() - asked.ended_at < FRESH_S:
+                return succeed(asked.told)
+            self._ask_all(method, asked)
+        if asked.waiting is None:  # everybody has answered at once
+            return succeed(asked.told)
+        waiter: Deferred[Json] = Deferred(asked.waiting.remove)
+        asked.waiting.append(waiter)
+        return waiter
+
+    def _ask_all(self, method: str, asked: _Round) -> None:
         pairs = devices_of(self._devices())
         names = {device.uuid: device.name for device, _ in pairs}
         pairs = pairs[:MAX_ASKED]
-        self._waiting = []
+        asked.waiting = []
 
         def ended(outcomes: list[tuple[bool, Any]]) -> None:
             # In the order of joining, whoever was quicker.
             told = [(device.uuid, outcome) for (device, _), (_, outcome) in zip(pairs, outcomes, strict=True)]
-            views = {uuid: _network_view(outcome, names) for uuid, outcome in told if isinstance(outcome, dict)}
-            self._network = {"devices": views, "silent": [uuid for uuid, _ in told if uuid not in views]}
-            self._asked_at = self._node.clock.seconds()
-            waiting, self._waiting = self._waiting or [], None
+            views = {uuid: asked.view(outcome, names) for uuid, outcome in told if isinstance(outcome, dict)}
+            silent: list[Json] = [uuid for uuid, _ in told if uuid not in views]
+            asked.told = {"here": self._node.uuid, "devices": views, "silent": silent}
+            asked.ended_at = self._node.clock.seconds()
+            waiting, asked.waiting = asked.waiting or [], None
             for waiter in waiting:
-                waiter.callback(self._network)
+                waiter.callback(asked.told)
 
-        asked = [maybeDeferred(self._ask, device, record, NETWORK) for device, record in pairs]
-        DeferredList(asked, consumeErrors=True).addCallback(ended)
+        answers = [maybeDeferred(self._ask, device, record, method) for device, record in pairs]
+        DeferredList(answers, consumeErrors=True).addCallback(ended)
 
     def _ask(self, device: Device, record: Record, method: str) -> Deferred[Any]:
         if device.uuid == self._node.uuid:
-            return succeed((inventory if method == INVENTORY else network)(self._node))
+            return succeed(OWN[method](self._node))
         contact = self._node.contact_of(record)
         if contact is None:
             raise Refusal("device", f"{device.name} says no address", "wait a moment, then try again", 409)
         return self._node.entangled.endpoint.ask(contact, method, timeout=PATIENCE_S)
+
+
+@dataclass
+class _Round:
+    """What is asked of all: how an answer is made lawful, the newest answers, and who waits for others."""
+
+    view: Callable[[dict[Any, Any], dict[str, str]], Json]
+    told: Json = None
+    ended_at: float = float("-inf")
+    waiting: list[Deferred[Json]] | None = None
 
 
 def _refused(failure: Any, name: str) -> None:
@@ -128,6 +155,46 @@ def _network_view(told: dict[Any, Any], names: dict[str, str]) -> Json:
             }
             for each in lookups
         ],
+    }
+
+
+def _links_view(told: dict[Any, Any], names: dict[str, str]) -> Json:
+    ways = [each for each in _entries(told.get("links")) if isinstance(each, dict) and text(each.get("id"))]
+    refusals = [each for each in _entries(told.get("refusals")) if isinstance(each, dict)]
+    return {"links": [_link_view(each, names) for each in ways], "refusals": [_refusal_view(each) for each in refusals]}
+
+
+def _link_view(told: dict[Any, Any], names: dict[str, str]) -> Json:
+    """One way, and its score, which is None as long as nothing is measured."""
+    way, by = told.get("way"), text(told.get("by"), limit=64)
+    loss, round_trip, jitter = (distance(told.get(name)) for name in ("loss", "round_trip", "jitter"))
+    loss = None if loss is None else min(loss, 1.0)
+    return {
+        "uuid": text(told["id"], limit=64),
+        "name": names.get(told["id"], text(told["id"], limit=8)),
+        "way": way if way in KINDS else "none",
+        "by": names.get(by, by[:8]),
+        "address": text(told.get("address"), limit=64),
+        "for_s": distance(told.get("for")),
+        "score": None if loss is None else Link(loss, round_trip, jitter, way == "carried").score,
+        "loss": loss,
+        "rtt_ms": None if round_trip is None else round(1000 * round_trip, 2),
+        "jitter_ms": None if jitter is None else round(1000 * jitter, 2),
+    }
+
+
+def _refusal_view(told: dict[Any, Any]) -> Json:
+    reason, _, remedy = text(told.get("reason")).partition("; ")
+    side = told.get("side")
+    return {
+        "who": text(told.get("who"), limit=64),
+        "at": text(told.get("at"), limit=64),
+        "side": side if side in SIDES else "we",
+        "code": text(told.get("code"), limit=32),
+        "why": reason,
+        "remedy": remedy,
+        "ago_s": number(told.get("ago")),
+        "count": count(told.get("count"), 1),
     }
 
 

@@ -20,18 +20,16 @@ from twisted.protocols.tls import BufferingTLSTransport, TLSMemoryBIOFactory
 from twisted.web.server import Site
 from zope.interface import implementer
 
-from middleware.errors import BadSetting
-from middleware.settings import IN_MEMORY, NodeSettings
+from middleware.settings import IN_MEMORY
 from webnode.certificate import Authority, Leaf, authority, leaf, nameable, plain, read
 from webnode.ground import Ground
 from webnode.keyfile import Unsafe, keep, kept
 from webnode.server import listening
 
-LEAF, AUTHORITY = ".tls", ".ca"
-"""Beside the node's store: its certificate with the key, and the secret of an authority of its own."""
+LEAF = ".tls"
+"""Beside the node's store: its certificate with the key."""
 LOOK_S = 60.0
 """So often, at most, is it asked whether the certificate will still do, when somebody connects."""
-SECRET = 32
 MOST_REACHED = 8
 
 Names = Callable[[], Collection[str]]
@@ -126,7 +124,7 @@ class Certified:
             _log.warn(words, names=", ".join(foreign))
         if self._path is not None:
             try:
-                keep(self._path, made.pem)
+                keep(self._path, made.pem_with_key)
             except OSError as error:
                 _log.warn(
                     "the certificate cannot be kept in {path} ({error}): the next start makes another",
@@ -171,44 +169,11 @@ class TlsDoor:
 
 
 def door(ground: Ground, names: Names) -> TlsDoor:
-    """The page's port over TLS; raises ``BadSetting`` where a file with a key in it cannot be used."""
+    """The page's port over TLS."""
     web, node = ground.settings.web, ground.settings.node
     store = None if node.store == IN_MEMORY else node.store
-    if node.team_key == NodeSettings.team_key:
-        secret = _own(store, ground)
-        _log.warn(
-            "[node] team_key is no secret: this node signs its certificate with an authority of its own,"
-            " which phones trust for this node alone"
-        )
-    else:
-        secret = node.team_secret
-    signer = authority(secret)
+    signer = authority(node.team_secret)
     path = None if store is None else Path(f"{store}{LEAF}")
     certified = Certified(signer, node.name, path, names, ground.wall, ground.rng)
     _log.info("phones that trust the authority {fingerprint} trust the page", fingerprint=signer.fingerprint)
     return TlsDoor(ground.reactor, web.host, web.tls_port, signer, certified)
-
-
-def _own(store: str | None, ground: Ground) -> bytes:
-    """The secret of an authority that is no team's, kept for as long as the store."""
-    if store is None:
-        return ground.rng.randbytes(SECRET)
-    path = Path(f"{store}{AUTHORITY}")
-    try:
-        secret = kept(path)
-        if secret is not None and len(secret) != SECRET:
-            raise Unsafe(f"it holds {len(secret)} bytes, and no secret of {SECRET}")
-    except Unsafe as error:
-        # Who made another one in silence would leave phones that trust this one before a warning.
-        problem = f"the authority in {path} cannot be used: {error}"
-        remedy = (
-            "mend it if nobody else can have read it (chmod 600), or delete it: phones then have to trust a new one"
-        )
-        raise BadSetting(ground.settings.origin, "[web] tls", problem, remedy) from error
-    if secret is None:
-        secret = ground.rng.randbytes(SECRET)
-        try:
-            keep(path, secret)
-        except OSError as error:
-            _log.warn("the authority cannot be kept in {path} ({error})", path=str(path), error=error)
-    return secret

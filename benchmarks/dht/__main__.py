@@ -18,8 +18,9 @@ from benchmarks.dht.loss import LEAST, lost
 from benchmarks.dht.plot import drawn
 from benchmarks.dht.report import table
 from benchmarks.dht.space import space
-from benchmarks.dht.team import Lost, Team
+from benchmarks.dht.team import Team
 from benchmarks.dht.verbs import long_values, watches
+from benchmarks.remote import Lost
 
 PARTS = ("steady", "killed", "silent")
 KEYS = 200

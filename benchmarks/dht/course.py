@@ -15,7 +15,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from benchmarks.dht.meter import Cost, Meter, memory_mib, percentile
-from benchmarks.dht.team import Lost, Node, Team
+from benchmarks.dht.team import Node, Team
+from benchmarks.remote import Lost
 
 JOINERS = 4
 JOIN_LIMIT_S = 15.0

@@ -6,7 +6,8 @@ import asyncio
 
 from benchmarks.dht.course import Course, Result, times
 from benchmarks.dht.meter import Meter
-from benchmarks.dht.team import Lost, Node
+from benchmarks.dht.team import Node
+from benchmarks.remote import Lost
 
 OUTS = 30
 CROWD = 30

@@ -20,15 +20,19 @@ class Cause(Enum):
     FREEZE = "freeze"
     LOST_RADIO = "lost radio"
     ONE_WAY_RADIO = "one-way radio"
+    LOST_LINK = "lost link"
     POLITE_LEAVE = "polite leave"
     TRIPLE_KILL = "triple kill"
 
 
+VIRTUAL = frozenset({Cause.LOST_LINK})
+"""Those that are tried in virtual time only; with processes the demonstration shows it (``--lose link``)."""
 SAYS = {
     Cause.CRASH: "its node dies (SIGKILL)",
     Cause.FREEZE: "its node stands still (SIGSTOP) for two leases and more, and goes on",
     Cause.LOST_RADIO: "nothing passes between it and the others",
     Cause.ONE_WAY_RADIO: "it hears the others, and they do not hear it",
+    Cause.LOST_LINK: "nothing passes between its node and its robot",
     Cause.POLITE_LEAVE: "its node stops in order",
     Cause.TRIPLE_KILL: "it, the bootstrap node and the web node die at the same moment",
 }

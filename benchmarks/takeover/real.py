@@ -21,7 +21,7 @@ from twisted.internet.task import deferLater
 from benchmarks.takeover.cause import PHASE_S, WEB, WITNESSES, Cause, Trial
 from benchmarks.takeover.judge import LOOK_S, Judge
 from benchmarks.takeover.lan import PORT, Lan
-from drivers.sim.link import TcpConnector
+from drivers.link import TcpConnector
 from drivers.sim.operator import YardOperator
 from middleware.entangled.data.sqlite import read_records
 from middleware.entangled.errors import EntangledError
@@ -113,6 +113,8 @@ class Team:
                 self._lan.silence(name)
             case Cause.ONE_WAY_RADIO:
                 self._lan.silence(name, one_way=True)
+            case Cause.LOST_LINK:
+                raise ValueError(f"{cause.value} is tried in virtual time only")
             case Cause.POLITE_LEAVE:
                 self._processes[name].terminate()
             case Cause.TRIPLE_KILL:

@@ -77,6 +77,8 @@ def _lose(team: VirtualTeam, cause: Cause, name: str) -> None:
             team.silence(name)
         case Cause.ONE_WAY_RADIO:
             team.silence(name, one_way=True)
+        case Cause.LOST_LINK:
+            team.unplug(name)
         case Cause.POLITE_LEAVE:
             team.services[name].stopService()
         case Cause.TRIPLE_KILL:

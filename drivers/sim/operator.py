@@ -10,9 +10,9 @@ from twisted.internet.interfaces import IReactorTime
 from twisted.logger import Logger
 
 from drivers.errors import LinkLost, NoReply, UsageError
+from drivers.link import Connector, Line, Link
 from drivers.reading import Value
 from drivers.sim.codec import VERSION, Alive, Done, FrameReader, Order, Overlook, Truth, encoded
-from drivers.sim.link import Connector, Line, Link
 from drivers.sim.option import DEFAULT_PORT
 
 REPLY_S = 2.0
@@ -110,6 +110,14 @@ class YardOperator:
     def scatter(self, seed: int) -> Deferred[bool]:
         """Set all dogs down at random free places; the same seed gives the same places."""
         return self._order("scatter", seed)
+
+    def unplug(self, name: str) -> Deferred[bool]:
+        """Break what leads to the robot ``name``, where that is no simulated dog's own link (``sim.robots``)."""
+        return self._order("unplug", name)
+
+    def plug(self, name: str) -> Deferred[bool]:
+        """Mend what leads to the robot ``name``."""
+        return self._order("plug", name)
 
     def link_up(self, link: Link) -> None:
         """Ask for the view from above; called by the line."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 
 from middleware.commitment.ballot import (
+    AHEAD,
     BEHIND,
     FIRST,
     GRANTED,
@@ -45,9 +46,9 @@ class Acceptor:
         """Promise to accept nothing under a lower ballot, or say what stands against it.
 
         While another holds the lease (a former life of the same agent is another) nothing changes but that the asker
-        is told when it is given back.  Once it is given back a promise tells how long the robot may still move.  A
-        ballot of counter 0 only looks, and is promised nothing: a member whose grant has run out, because it missed a
-        renewal, is not to be lost to its healthy holder.
+        is told when it is given back.  Once it is given back, or about to run out, a promise tells how long nothing is
+        granted yet; it stands against no renewal.  A ballot of counter 0 only looks, and is promised nothing: a member
+        whose grant has run out, because it missed a renewal, is not to be lost to its healthy holder.
         """
         entry = self._entry(task_id, configuration, ttl, now)
         if isinstance(entry, Reply):
@@ -55,7 +56,8 @@ class Acceptor:
         is_kin = entry.ballot.is_kin(ballot)
         if entry.until > now and not (is_kin or entry.is_given_back):
             self._listen(entry, ballot.agent, now + ttl)
-            return self._reply(HELD, entry, now)
+            if ballot.counter == 0 or entry.until - now > AHEAD * entry.ttl:
+                return self._reply(HELD, entry, now)
         if ballot.counter > 0 and ballot < entry.promised:
             return self._reply(OUTBID, entry, now)
         entry.touched_at = now
@@ -75,12 +77,17 @@ class Acceptor:
         if entry.sealed != NONE:
             return self._reply(SEALED, entry, now)._replace(ballot=entry.sealed)
         is_lower = token < entry.token or (token == entry.token and not ballot.is_kin(entry.ballot))
-        if ballot < entry.promised or ballot <= entry.spent or is_lower:
+        is_held = entry.until > now
+        # What was promised to another for the time after a lease does not end it: who holds it renews it all the same.
+        is_own = entry.ballot.is_kin(ballot)
+        is_renewal = is_held and is_own and token == entry.token and not entry.is_given_back
+        if (ballot < entry.promised and not is_renewal) or ballot <= entry.spent or is_lower:
             return self._reply(OUTBID, entry, now)
-        if entry.until > now and not entry.ballot.is_kin(ballot):
-            return self._reply(HELD, entry, now)  # the robot of who gave it back still moves
-        is_new = (entry.promised, entry.ballot, entry.token, entry.ttl) != (ballot, ballot, token, ttl)
-        entry.promised = entry.ballot = ballot
+        if is_held and not is_own:
+            return self._reply(HELD, entry, now)
+        promised = max(entry.promised, ballot)
+        is_new = (entry.promised, entry.ballot, entry.token, entry.ttl) != (promised, ballot, token, ttl)
+        entry.promised, entry.ballot = promised, ballot
         entry.token, entry.ttl = token, ttl
         entry.until, entry.touched_at = now + ttl, now
         if is_new:
@@ -88,23 +95,37 @@ class Acceptor:
         return self._reply(GRANTED, entry, now)
 
     def release(self, task_id: str, ballot: Ballot, now: float, rest: float = 0.0) -> list[str]:
-        """End what was granted under ``ballot``, for good, and name those that are to be told.
+        """End what was granted under ``ballot`` or an older one of that life, for good, and name who is to be told.
 
         ``rest`` is how long the robot may still move: until then others are promised the lease, but not granted.
         """
         entry = self._ledger.get(task_id)
-        if entry is None or ballot not in (entry.ballot, entry.promised) or ballot <= entry.spent:
+        if entry is None or ballot <= entry.spent:
+            return []
+        is_own = entry.ballot.is_kin(ballot)
+        if not (is_own or entry.promised.is_kin(ballot)):
             return []
         # A proposal of that ballot may still be on its way: it comes too late.
+        if entry.until > now and not (is_own or entry.is_given_back):
+            # It was promised for the time after another's lease, which goes on.
+            entry.promised = max(entry.promised, Ballot(ballot.counter + 1, ""))
+            self._ledger.keep(task_id)
+            return []
         entry.spent = ballot
-        if entry.ballot == ballot:
+        if is_own and entry.ballot <= ballot:
             entry.until = min(entry.until, now + rest)
-            entry.ballot = ballot if entry.until > now else NONE
+            entry.ballot = entry.ballot if entry.until > now else NONE
         self._ledger.keep(task_id)
         if entry.until > now and not entry.is_given_back:
             return []
         listeners, entry.listeners = entry.listeners, {}
         return [agent for agent, until in listeners.items() if until > now and agent != ballot.agent]
+
+    def freed(self, task_id: str, agent: str, token: int, now: float, rest: float = 0.0) -> list[str]:
+        """End the lease of that ``agent`` and token: it said so to a stand-by that is a member, too (``release``)."""
+        entry = self._ledger.get(task_id)
+        is_its = entry is not None and entry.ballot.agent == agent and entry.token == token
+        return self.release(task_id, entry.ballot, now, rest) if entry is not None and is_its else []
 
     def close(self, task_id: str, agent: str, configuration: int, token: int, now: float) -> Reply:
         """Grant no more leases on a task that has ended; ``remaining`` is how long another may still act on it.

@@ -104,6 +104,10 @@ def is_number(value: object) -> bool:
     return type(value) is int and 0 <= value < MAX_NUMBER
 
 
+AHEAD = 0.2
+"""Share of a ttl before the end of a lease from which on its successor is promised."""
+
+
 def quorum(size: int) -> int:
     """How many of ``size`` members are a majority."""
     return size // 2 + 1

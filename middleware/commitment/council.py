@@ -31,9 +31,12 @@ from middleware.commitment.ballot import (
     Reply,
     Superseded,
 )
-from middleware.commitment.round import Ask, Round
+from middleware.commitment.round import PAUSE, Ask, Round
 from middleware.entangled.errors import Refused
 from middleware.entangled.kademlia.contact import Contact
+
+LEAP = 16
+"""More ballots than a holder needs until a stand-by looks."""
 
 
 class Council:
@@ -75,11 +78,15 @@ class Council:
         self._rounds += 1
         return Ballot(self._rounds * LIFE + self._life, self.agent)
 
-    def round(self, method: str, *arguments: Any, kinds: tuple[str, ...] = (GRANTED,)) -> Round:
-        """Ask every member; tell ``hear`` what came of it."""
+    def leap(self) -> None:
+        """Have the next ballot be above those of which nobody has told here; there are more than enough."""
+        self._rounds += LEAP
+
+    def round(self, method: str, *arguments: Any, kinds: tuple[str, ...] = (GRANTED,), short: float = PAUSE) -> Round:
+        """Ask every member; tell ``hear`` what came of it.  ``short`` is the wait for another's lease that is one."""
         self._note_silence()
         question = (self.task_id, self.configuration, *arguments)
-        self._last = Round(self.members, self._ask, self._clock, method, question, kinds, self.ttl / 3)
+        self._last = Round(self.members, self._ask, self._clock, method, question, kinds, self.ttl / 3, short)
         return self._last
 
     def visit(self) -> None:
@@ -209,7 +216,7 @@ class Council:
         accepted.close()
         if not accepted.is_won:
             self.hear(accepted)
-            self.let_go(ballot)
+            self.let_go(ballot, rest=self.ttl)  # a lease that this agent holds goes on
             _raise(accepted, "the council stays as it is")
         token = max(self.token, *(reply.token for reply in accepted.replies.values()))
         news = (self.task_id, following, packed, token)

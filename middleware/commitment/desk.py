@@ -11,6 +11,7 @@ from twisted.internet.interfaces import IReactorTime
 from middleware.commitment.acceptor import Acceptor
 from middleware.commitment.ballot import MAX_NUMBER, NONE, Ballot, Reply, members_of
 from middleware.commitment.ledger import Ledger
+from middleware.commitment.patience import in_time
 from middleware.entangled.data.store import Store
 from middleware.entangled.errors import Refused
 from middleware.entangled.kademlia.contact import Contact
@@ -78,16 +79,17 @@ class Desk:
 
     def _propose(self, peer: Contact, task_id: str, configuration: int, counter: int, token: int, ttl: float) -> Answer:
         _check(task_id, configuration, counter, token, ttl=ttl)
-        ballot, now = Ballot(counter, peer.node_id.hex()), self._clock.seconds()
-        return self._kept(self._acceptor.propose(task_id, configuration, ballot, token, float(ttl), now))
+        ballot, ttl = Ballot(counter, peer.node_id.hex()), float(ttl)
+
+        def proposed() -> Reply:
+            return self._acceptor.propose(task_id, configuration, ballot, token, ttl, self._clock.seconds())
+
+        return in_time(proposed, self._clock).addCallback(self._kept)
 
     def _release(self, peer: Contact, task_id: str, counter: int, rest: float) -> None:
         _check(task_id, counter, rest=rest)
         ballot = Ballot(counter, peer.node_id.hex())
-        for agent in self._acceptor.release(task_id, ballot, self._clock.seconds(), float(rest)):
-            contact = self._contacts.get(agent)
-            if contact is not None:
-                self._endpoint.tell(contact, "lease.freed", task_id, 0, rest)
+        self._tell(self._acceptor.release(task_id, ballot, self._clock.seconds(), float(rest)), task_id, rest)
 
     def _close(self, peer: Contact, task_id: str, configuration: int, token: int) -> Answer:
         _check(task_id, configuration, token + 1)
@@ -126,11 +128,20 @@ class Desk:
 
     def _freed(self, peer: Contact, task_id: str, token: int, rest: float) -> None:
         _check(task_id, token + 1, rest=rest)
+        agent, now = peer.node_id.hex(), self._clock.seconds()
+        self._tell(self._acceptor.freed(task_id, agent, token, now, float(rest)), task_id, rest)
         lessee = self._lessees.get(task_id)
         if lessee is not None:
             lessee.freed(token, float(rest))
 
     # -- inside -----------------------------------------------------------------------------------------------------
+
+    def _tell(self, agents: list[str], task_id: str, rest: float) -> None:
+        """Tell those that asked for it that a lease was given back."""
+        for agent in agents:
+            contact = self._contacts.get(agent)
+            if contact is not None:
+                self._endpoint.tell(contact, "lease.freed", task_id, 0, rest)
 
     def _known(self, peer: Contact) -> str:
         """The id of an agent, to which its address is remembered for a push."""

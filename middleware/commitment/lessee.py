@@ -18,9 +18,9 @@ from twisted.internet.defer import Deferred, succeed
 from twisted.internet.interfaces import IDelayedCall, IReactorTime
 from twisted.internet.task import deferLater
 
-from middleware.commitment.ballot import GRANTED, NONE, OUTBID, OVER, SEALED, Ballot
+from middleware.commitment.ballot import AHEAD, GRANTED, NONE, OUTBID, OVER, QUIET, SEALED, Ballot
 from middleware.commitment.council import Council
-from middleware.commitment.round import Round
+from middleware.commitment.round import PAUSE, Round
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.kademlia.contact import Contact
 
@@ -36,9 +36,13 @@ SOON = 1.5
 """Periods of asking within which a lease that runs out is claimed rather than looked at once more."""
 FRESH = 0.3
 """Seconds for which the news of a release is believed against members that have not heard it."""
-EARLY = 0.25
-"""Share of a round trip after which a member is taken to have counted, when what it promised is asked for."""
-STAGGER = 0.1
+EARLY = 0.8
+"""Share of the time before the end of a lease in which its successor may be promised (``AHEAD``), in which it is asked
+for: a guess that is a little late still is in time."""
+LEAD = 0.1
+"""Seconds before a lease ends at which its successor is asked for: time for another try, and what comes too early waits
+at the members (``patience``)."""
+STAGGER = 0.2
 """Seconds by which each rank of those that stand by waits longer than the one before it."""
 TICK = 0.05
 """A timer that fires later than this counts as a possible pause."""
@@ -85,6 +89,9 @@ class Lessee:
         self._free_at = -math.inf
         self._only_looks = False
         self._must_prepare = False
+        self._is_promised = False
+        self._is_outbid = False
+        self._ends_at = -math.inf
         self._round: Round | None = None
         self._timer: IDelayedCall | None = None
         self._due_at = 0.0
@@ -98,7 +105,7 @@ class Lessee:
 
     def want(self) -> None:
         """Claim the lease and keep it, trying again until it is won."""
-        self._rank = 0
+        self._move_up(0)
         if not self._is_wanted and not self.is_over:
             self._is_wanted = True
             self._claim()
@@ -108,14 +115,14 @@ class Lessee:
 
         Who holds the lease or wants it already only takes the rank.
         """
-        self._rank = max(1, rank)
+        self._move_up(max(1, rank))
         if not self._is_wanted and not self.is_over:
             self._is_wanted = self._only_looks = True
             self._again(self._rank * self.council.ttl / RENEWALS)
 
     def suspect(self) -> None:
         """The holder may be gone: ask now how long its lease runs, and be ready when it ends.  It shortens no lease."""
-        if self._is_wanted and not self._is_asking and self.lease is None:
+        if self._only_looks and self._is_wanted and not (self._is_asking or self._is_freed or self.lease is not None):
             self._look()
 
     def freed(self, token: int, rest: float = 0.0) -> None:
@@ -127,8 +134,13 @@ class Lessee:
         if self._is_wanted and self.lease is None:
             is_news = not self._is_freed
             self._free_at = self._clock.seconds() + rest
-            if is_news and not self._is_asking:
-                self._again(self._turn())
+            if is_news:
+                self.council.leap()
+                if self._is_looking:
+                    self._cancel()
+                if not self._is_asking:
+                    self._only_looks = False
+                    self._again(self._turn())
 
     def outrank(self, token: int) -> None:
         """A device has obeyed ``token``: from now on nothing is claimed that is not higher, and nothing lower used."""
@@ -137,20 +149,22 @@ class Lessee:
             self._lose()
             self._claim()
 
-    def release(self, heirs: Sequence[Contact] = ()) -> Deferred[object]:
+    def release(self, heirs: Sequence[Contact] = (), rest: float = 0.0) -> Deferred[object]:
         """Give the lease back (stop the device first), or stop claiming it; fires when the council knows.
 
-        The council is told how long the robot takes to come to rest, and grants nothing before.  Its members tell those
-        that stand by; ``heirs`` are told from here, and so half a round trip earlier.
+        The council is told how long the robot takes to come to rest, and grants nothing before: ``rest`` seconds until
+        it stops, where it can't be told to, and those that it takes to stop.  Its members tell those that stand by;
+        ``heirs`` are told from here, and so half a round trip earlier.
         """
         told: Deferred[object] = succeed(None)
         if self.lease is not None:
-            self._rests_at = self._clock.seconds() + self._stop_time
+            self._rests_at = min(self._rests_at, self._clock.seconds() + rest + self._stop_time)
         self._is_wanted = False
         self._cancel()
         if self._ballot != NONE:
-            told = self._let_go(self._ballot, heirs)
-        self._let_go_of_minority()
+            told = self._let_go(max(self._ballot, self._claimed), heirs)  # which ends the older one, too
+        else:
+            self._let_go_of_minority()
         self.token, self._deadline, self._ballot, self._claimed = 0, 0.0, NONE, NONE
         return told
 
@@ -186,9 +200,11 @@ class Lessee:
     def _claim(self) -> None:
         """Ask for promises; while a lease is held it stays in force meanwhile."""
         self._cancel()
+        self._only_looks = False
         self._claimed = ballot = self.council.next_ballot()
         kinds = (GRANTED, SEALED)
-        self._round = asked = self.council.round("lease.prepare", ballot.counter, self.council.ttl, kinds=kinds)
+        question = ballot.counter, self.council.ttl
+        self._round = asked = self.council.round("lease.prepare", *question, kinds=kinds, short=self._short)
         asked.outcome.addCallback(self._promised, ballot, self.council.configuration)
 
     def _promised(self, asked: Round, ballot: Ballot, configuration: int) -> None:
@@ -206,9 +222,10 @@ class Lessee:
             finishing.addErrback(lambda failure: failure.trap(EntangledError))
             finishing.addBoth(lambda _: self._go_on())
             return
-        wait = asked.free_in(EARLY) if self.lease is None else 0.0
+        wait = asked.free_in() - LEAD if self.lease is None else 0.0
         if wait > 0.0:
-            # The robot of who gave it back is about to stand still; who is asked too early is asked again.
+            # The lease is about to run out, or the robot of who gave it back to stand still.
+            self._is_promised = True
             self._timer = self._clock.callLater(wait, lambda: self._propose(ballot, self._next_token()))
         else:
             self._propose(ballot, self._next_token())
@@ -221,14 +238,17 @@ class Lessee:
         return self.council.token
 
     def _propose(self, ballot: Ballot, token: int) -> None:
-        self._round = asked = self.council.round("lease.propose", ballot.counter, token, self.council.ttl)
+        self._is_promised = False
+        question = ballot.counter, token, self.council.ttl
+        self._round = asked = self.council.round("lease.propose", *question, short=self._short)
         asked.outcome.addCallback(self._granted, ballot, token)
 
     def _granted(self, asked: Round, ballot: Ballot, token: int) -> None:
         self.council.hear(asked)
         if self._round is not asked or self._has_ended(asked):
             return
-        self._must_prepare = any(reply.kind != GRANTED for reply in asked.replies.values())
+        # Who may not grant anything yet needs no other ballot later.
+        self._must_prepare = any(reply.kind not in (GRANTED, QUIET) for reply in asked.replies.values())
         deadline = self._deadline_of(asked) if asked.is_won else 0.0
         if deadline <= self._clock.seconds():
             return self._failed(asked)
@@ -262,7 +282,8 @@ class Lessee:
         free_in = asked.free_in()
         if is_outbid and free_in == math.inf:
             free_in = 0.0  # the others were not heard; with a higher ballot they are
-        wait = self._turn() if self._is_freed else free_in + self._stagger()
+        self._ends_at, self._is_outbid = self._clock.seconds() + free_in, is_outbid
+        wait = self._turn() if self._is_freed else self._claims_in()
         pause = self._rng.uniform(*(BACK_OFF if is_outbid else JITTER))
         # A healthy holder renews well before: what runs out that soon is claimed in time, without a look before.
         self._only_looks = wait > SOON * self._poll_period()
@@ -271,7 +292,7 @@ class Lessee:
     def _look(self) -> None:
         """Ask whether the lease is free, and be promised nothing."""
         self._cancel()
-        self._round = asked = self.council.round("lease.prepare", 0, self.council.ttl)
+        self._round = asked = self.council.round("lease.prepare", 0, self.council.ttl, short=0.0)
         asked.outcome.addCallback(self._looked)
 
     def _looked(self, asked: Round) -> None:
@@ -279,13 +300,26 @@ class Lessee:
         if self._round is not asked or self._has_ended(asked):
             return
         asked.close()
-        if asked.is_won:
+        if asked.is_won and not self._stagger():
             self._claim()
         else:
             self._wait(asked)
 
     def _poll_period(self) -> float:
         return self.council.ttl / RENEWALS
+
+    def _move_up(self, rank: int) -> None:
+        """Take a place in the line; a claim that is due is due as much sooner or later."""
+        before, self._rank = self._stagger(), rank
+        waits = self._is_wanted and self.lease is None and not (self._only_looks or self._is_asking or self._is_freed)
+        if waits and self._stagger() != before:
+            self._again(self._claims_in() + self._rng.uniform(*JITTER))
+
+    def _claims_in(self) -> float:
+        """Seconds until it claims what runs out: the first in line is promised it before, and so has time for it."""
+        is_first = not (self._stagger() or self._is_outbid)
+        lead = EARLY * AHEAD * self.council.ttl if is_first else 0.0
+        return max(0.0, self._ends_at + self._stagger() - lead - self._clock.seconds())
 
     def _stagger(self) -> float:
         return STAGGER * max(0, self._rank - 1)
@@ -333,8 +367,17 @@ class Lessee:
         return self._clock.seconds() < self._free_at + FRESH
 
     @property
+    def _short(self) -> float:
+        """Seconds for which a lease that is in the way is waited for: one that was given back does not last."""
+        return math.inf if self._is_freed else PAUSE
+
+    @property
     def _is_asking(self) -> bool:
-        return self._round is not None and self._round.is_open
+        return self._is_promised or (self._round is not None and self._round.is_open)
+
+    @property
+    def _is_looking(self) -> bool:
+        return self._only_looks and self._is_asking
 
     def _go_on(self) -> None:
         if self._is_wanted and not self._is_asking:
@@ -355,6 +398,7 @@ class Lessee:
         if self._round is not None:
             self._round.close()
             self._round = None
+        self._is_promised = False
         if self._timer is not None and self._timer.active():
             self._timer.cancel()
         self._timer = None

@@ -16,6 +16,8 @@ TRIES = 3
 """How often a member is asked at least: a majority is enough, but who missed a renewal may promise to another."""
 PAUSE = 0.1
 """Seconds between two tries with a member that has not answered (consensus rule 6)."""
+NEWS = 0.03
+"""Seconds after which a member is asked again that has not heard of a release yet."""
 LEAST = 0.005
 """Seconds that pass at least until a member that is about to be free is asked again."""
 
@@ -26,7 +28,7 @@ Ask = Callable[[Contact, str, tuple[Any, ...]], Deferred[Any]]
 class Round:
     """``outcome`` fires with the round as soon as it is decided whether a majority answers with one of ``kinds``.
 
-    A member where another's lease ends within 100 ms is asked again then.
+    A member where another's lease ends within ``short`` seconds is asked again then, or soon where that is long.
     It also fires, undecided, when everybody answered or ``patience`` seconds have passed, and soon after a majority has
     answered.  Who has not answered is asked every 100 ms until it is decided, and at least three times in all.
     """
@@ -40,6 +42,7 @@ class Round:
         arguments: tuple[Any, ...],
         kinds: tuple[str, ...],
         patience: float,
+        short: float = PAUSE,
     ) -> None:
         self.replies: dict[int, Reply] = {}
         self.outcome: Deferred[Round] = Deferred()
@@ -50,6 +53,7 @@ class Round:
         self.kinds = kinds
         self._needed = quorum(len(members))
         self._patience = patience
+        self._short = short
         self._sent: dict[int, float] = {}
         self._heard: dict[int, tuple[float, float, float]] = {}
         self.began_at = clock.seconds()
@@ -129,8 +133,9 @@ class Round:
         if self._is_closed or reply is None or place in self.replies:
             return
         self._heard[place] = sent, self._clock.seconds(), reply.remaining
-        if reply.kind == HELD and reply.remaining < PAUSE:
-            self._clock.callLater(max(LEAST, reply.remaining), self._ask_one, place)
+        if reply.kind == HELD and reply.remaining < self._short:
+            pause = reply.remaining if reply.remaining < PAUSE else NEWS
+            self._clock.callLater(max(LEAST, pause), self._ask_one, place)
             return
         self.replies[place], self._sent[place] = reply, sent
         if len(self.replies) == len(self._members):

@@ -82,25 +82,25 @@ def _augment(costs: Costs, prices: list[float], owner: list[int], row: int) -> N
     """Give ``row`` a column along the cheapest chain of changes, and mend the prices."""
     length = [cost - price for cost, price in zip(costs[row], prices, strict=True)]
     before = [row] * len(length)
-    todo = list(range(len(length)))
-    done: list[int] = []
+    unscanned = list(range(len(length)))
+    scanned: list[int] = []
     while True:
-        reached = min(todo, key=length.__getitem__)
+        reached = min(unscanned, key=length.__getitem__)
         so_far = length[reached]
         if owner[reached] < 0:
             break
-        todo.remove(reached)
-        done.append(reached)
+        unscanned.remove(reached)
+        scanned.append(reached)
         through = owner[reached]
         line = costs[through]
         base = so_far - line[reached] + prices[reached]
-        for column in todo:
+        for column in unscanned:
             if (there := base + line[column] - prices[column]) < length[column]:
                 length[column] = there
                 before[column] = through
-    for column in done:
+    for column in scanned:
         prices[column] += length[column] - so_far
-    where = {owner[column]: column for column in done}
+    where = {owner[column]: column for column in scanned}
     while True:
         through = before[reached]
         owner[reached] = through

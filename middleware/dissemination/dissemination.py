@@ -29,6 +29,7 @@ from middleware.dissemination.scale import Scale
 from middleware.entangled.errors import EntangledError, NotRunning, Refused
 from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.wire.door import ROLE, meaning
 from middleware.errors import UnknownStrategy
 
 ERRAND_S = 0.4
@@ -51,12 +52,16 @@ class Wire(Protocol):
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What a node knows of the others: itself, whom it knows, how many they are, and the strategies by name."""
+    """What a node knows of the others: itself, whom it knows, how many they are, and the strategies by name.
+
+    ``may_bid`` says whether the member of a public key may take part in what has a key, by its role.
+    """
 
     me: Callable[[], Contact]
     contacts: Callable[[], Iterable[Contact]]
     team_size: Callable[[], int]
     strategy_for: Callable[[str], ConsensusAlgorithm]
+    may_bid: Callable[[bytes, bytes], bool] = lambda key, public: True
 
 
 class Dissemination:
@@ -160,6 +165,8 @@ class Dissemination:
             bid = bid_of(each)
             if bid is None:
                 raise Refused("a bid has a key, a finite cost that is not negative, a revision and a signature")
+            if not self._around.may_bid(auction.key, bid.public):
+                continue  # whoever carries it may carry others, too
             known = party.summary.of(bid.agent) if party is not None else None
             if known is not None and known.rank == bid.rank:
                 bids.append(known)  # a copy of what was checked; its signature may be another
@@ -167,6 +174,8 @@ class Dissemination:
                 bids.append(bid)
             else:
                 raise Refused("a bid that its agent did not sign for this auction")
+        if content and not bids:
+            raise Refused(f"no bid that counts: {meaning(ROLE)}", ROLE)
         return bids
 
     def _heard(self, party: Party, content: object) -> None:

@@ -47,25 +47,26 @@ def use_monotonic_time() -> None:
 
 @implementer(IDelayedCall)
 class _HeapCall:
-    """A call that a ``HeapClock`` will make."""
+    """A call that a ``HeapClock`` will make; ``order`` is its place among those of one moment, 0 when it is over."""
 
-    __slots__ = ("time", "order", "_clock", "_function", "_arguments", "_keywords", "_state")
+    __slots__ = ("time", "order", "_clock", "_function", "_arguments", "_keywords", "_is_cancelled")
 
     def __init__(
         self,
         clock: HeapClock,
         moment: float,
+        order: int,
         function: Callable[..., object],
         arguments: tuple[object, ...],
         keywords: dict[str, object],
     ) -> None:
         self.time = moment
-        self.order = 0
+        self.order = order
         self._clock = clock
         self._function = function
         self._arguments = arguments
         self._keywords = keywords
-        self._state = "waiting"
+        self._is_cancelled = False
 
     def getTime(self) -> float:
         """The moment at which the call is due, in seconds of its clock."""
@@ -74,7 +75,10 @@ class _HeapCall:
     def cancel(self) -> None:
         """Unschedule the call; raises ``AlreadyCalled`` or ``AlreadyCancelled``."""
         self._check()
-        self._state = "cancelled"
+        self.order = 0
+        self._is_cancelled = True
+        # The entry stays in the heap for a while; what it was for shall not.
+        self._function, self._arguments, self._keywords = _nothing, (), {}
         self._clock._dropped()
 
     def delay(self, seconds: float) -> None:
@@ -89,18 +93,22 @@ class _HeapCall:
 
     def active(self) -> bool:
         """Whether the call still waits."""
-        return self._state == "waiting"
+        return self.order > 0
 
     def run(self) -> None:
         """Make the call; only its clock does this."""
-        self._state = "called"
+        self.order = 0
         self._function(*self._arguments, **self._keywords)
 
     def _check(self) -> None:
-        if self._state == "called":
-            raise AlreadyCalled
-        if self._state == "cancelled":
+        if self._is_cancelled:
             raise AlreadyCancelled
+        if not self.order:
+            raise AlreadyCalled
+
+
+def _nothing() -> None:
+    pass
 
 
 @implementer(IReactorTime)
@@ -124,26 +132,28 @@ class HeapClock:
         """Schedule ``callable(*args, **kw)`` for ``delay`` seconds from now; ``delay`` may not be negative."""
         if delay < 0:
             raise ValueError(f"a call cannot be made {-delay} s ago")
-        call = _HeapCall(self, self._now + delay, callable, args, kw)
-        self._push(call)
+        moment, order = self._now + delay, next(self._orders)
+        call = _HeapCall(self, moment, order, callable, args, kw)
+        heapq.heappush(self._heap, (moment, order, call))
         return call
 
     def getDelayedCalls(self) -> Sequence[IDelayedCall]:
         """The calls that wait, soonest first."""
-        return [call for _, order, call in sorted(self._heap) if call.order == order and call.active()]
+        return [call for _, order, call in sorted(self._heap) if call.order == order]
 
     def run_until(self, moment: float) -> None:
         """Make every call that is due up to and with ``moment``, also those scheduled on the way, and stand there.
 
         An exception of a call passes through; the clock then stands at that call's moment.
         """
-        heap = self._heap
+        heap, pop = self._heap, heapq.heappop
         while heap and heap[0][0] <= moment:
-            due, order, call = heapq.heappop(heap)
-            if call.order != order or not call.active():
+            due, order, call = pop(heap)
+            if call.order != order:
                 self._dead -= 1
                 continue
-            self._now = max(self._now, due)
+            if due > self._now:
+                self._now = due
             call.run()
             heap = self._heap
         self._now = max(self._now, moment)
@@ -161,19 +171,15 @@ class HeapClock:
         for step in steps:
             self.advance(step)
 
-    def _push(self, call: _HeapCall) -> None:
-        call.order = next(self._orders)
-        heapq.heappush(self._heap, (call.time, call.order, call))
-
     def _move(self, call: _HeapCall, moment: float) -> None:
-        call.time = moment
-        self._push(call)  # the older entry is known by its order, and skipped
+        call.time, call.order = moment, next(self._orders)
+        heapq.heappush(self._heap, (moment, call.order, call))  # the older entry is known by its order, and skipped
         self._dropped()
 
     def _dropped(self) -> None:
         # Time-outs are mostly cancelled; without this, dead entries would make up nearly all of the heap.
         self._dead += 1
         if self._dead > _COMPACT_FROM and self._dead * 2 > len(self._heap):
-            self._heap = [entry for entry in self._heap if entry[2].order == entry[1] and entry[2].active()]
+            self._heap = [entry for entry in self._heap if entry[2].order == entry[1]]
             heapq.heapify(self._heap)
             self._dead = 0

@@ -15,11 +15,13 @@
         NotRunning
         TooLarge
         PortInUse
+          TunnelPortInUse
         BadStore
       Refused         a lawful no: an answer, and no accident
         Full
         Unwritable
         Conflict
+        NotAdmitted
 """
 
 _WAIT = "try again when members are back, or in two minutes, when the absent count no more"
@@ -95,6 +97,10 @@ class PortInUse(LocalError):
     """Another program holds the port, or the address is not one of this machine; the message says what to change."""
 
 
+class TunnelPortInUse(PortInUse):
+    """The same of the TCP port for tunnels, or the node may not open one below 1024."""
+
+
 class BadStore(LocalError):
     """The data store cannot be used as it is; the message says why and what to do."""
 
@@ -125,3 +131,10 @@ class Conflict(Refused):
         super().__init__(f"the slot holds number {sequence}, expected was {expected}; read it and decide again")
         self.expected = expected
         self.sequence = sequence
+
+
+class NotAdmitted(Refused):
+    """One of two nodes does not let the other in: ``code`` names why, the text says who refuses whom and what to do."""
+
+    def __init__(self, text: str, code: str) -> None:
+        super().__init__(text, code)

@@ -12,18 +12,22 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import msgpack
-from twisted.internet.defer import Deferred
+from twisted.internet.defer import Deferred, fail
 from twisted.internet.interfaces import IReactorTime
 from twisted.logger import Logger
 
 from middleware.entangled.background import Background
 from middleware.entangled.data.store import Store
-from middleware.entangled.errors import NotRunning, TooLarge
-from middleware.entangled.identity import Identity
+from middleware.entangled.errors import NotRunning, Refused, TooLarge
+from middleware.entangled.identity import Identity, node_id
 from middleware.entangled.kademlia.contact import Contact, unpacked
+from middleware.entangled.kademlia.discovery import Discovery
 from middleware.entangled.kademlia.membership import Membership
 from middleware.entangled.kademlia.overlay import Overlay
-from middleware.entangled.network.network import Address, Network
+from middleware.entangled.network.multicast import Multicast
+from middleware.entangled.network.network import Address, Network, detours_of
+from middleware.entangled.reach.path import PathNetwork
+from middleware.entangled.reach.reach import Reach
 from middleware.entangled.record import KEY_BYTES, MAX_NAME, MAX_VALUE, TOLERATED_ABSENCE, Lifetime, Record, Slot
 from middleware.entangled.replication.handover import Handover
 from middleware.entangled.replication.owner import Concern, Owner, Stored
@@ -31,6 +35,7 @@ from middleware.entangled.replication.reader import ReadConcern, Reader
 from middleware.entangled.replication.replica import Replica
 from middleware.entangled.replication.subscriber import Subscriber
 from middleware.entangled.replication.watch import Changed, Watch
+from middleware.entangled.wire.door import DOUBLED, OPEN, REVOKED, ROLE, SUPERSEDED, Door, meaning
 from middleware.entangled.wire.endpoint import Endpoint
 
 if TYPE_CHECKING:
@@ -53,7 +58,8 @@ class EntangledNode:
     ``lease`` is how long, in seconds, what this node owns on lease outlives its last sign of life; more means fewer
     false losses, less means quicker notice.  ``rng`` and ``clock`` are the only sources of chance and time; ``wall``
     gives seconds that go on while the node is off, by which it knows how long it was away (without it, it assumes that
-    it was not for long).
+    it was not for long).  ``door`` says who is let in, and who may do what.  ``lan`` is its place in the group of the
+    LAN, where it finds its team without known nodes.
     """
 
     _log = Logger()
@@ -68,6 +74,8 @@ class EntangledNode:
         rng: random.Random,
         lease: float = 1.0,
         wall: Callable[[], float] | None = None,
+        door: Door = OPEN,
+        lan: Multicast | None = None,
     ) -> None:
         self.identity = identity
         self.store = store
@@ -75,11 +83,20 @@ class EntangledNode:
         self._network = network
         self._wall = wall
         self._chores = chores = Background(clock)
-        self.endpoint = Endpoint(identity, team_key, network, clock, rng)
+        paths = PathNetwork(network)
+        self.endpoint = Endpoint(identity, team_key, paths, clock, rng, door)
         self.overlay = Overlay(lambda: self.contact, self.endpoint, clock, chores)
+        self.reach = Reach(identity.node_id, self.endpoint, paths, self.overlay.contacts, clock, chores)
+        self.overlay.on_named = self.reach.named
         self.replica = Replica(store, self.endpoint, clock, chores)
         self._owner = Owner(identity, lease, store, self.replica, self.overlay, self.endpoint, clock, chores)
-        self._membership = Membership(self.overlay, self.endpoint, clock, rng, chores)
+        self._membership = membership = Membership(self.overlay, self.endpoint, clock, rng, chores)
+        membership.needs_use = self.reach.needs_use
+        self.endpoint.on_let_go = self.reach.let_go
+        self._detour = membership.detour
+        self.discovery = (
+            None if lan is None else Discovery(lan, self.endpoint, self.overlay, membership, clock, rng, chores)
+        )
         self._handover = Handover(store, self.replica, self.overlay, self._owner, self.endpoint, clock, rng, chores)
         self._reader = Reader(self.replica, self.overlay, self._owner, chores)
         self._subscriber = Subscriber(
@@ -96,6 +113,11 @@ class EntangledNode:
         self.replica.on_silent = self._subscriber.silent
         self.replica.on_peer = self.overlay.heard
         self.replica.on_goodbye = self.overlay.left
+        self.replica.may_store = door.may_store
+        if wall is not None:
+            self.endpoint.echoer.wall = wall
+        self.endpoint.on_refused = self._refused
+        self.endpoint.on_refusing = self._refusing
         self._running = False
 
     @cached_property
@@ -126,23 +148,26 @@ class EntangledNode:
         for part in (self._membership, self.replica, self._owner, self._subscriber):
             part.start()
         self._chores.every(NOTE, self._note_contacts)
+        if self.discovery is not None:
+            self.discovery.start()
 
     def join(self, known: Sequence[Address]) -> Deferred[None]:
         """Enter the network through ``known`` nodes (thesis, Algorithm 4.1), with back-off until one answers.
 
-        The contacts of an earlier life, which the store remembers, are tried beside them.  Fires when one of them has
-        answered, so that keys can be read; where ``known`` is empty and nobody is remembered, at once (the first node
-        of a network).  The node then looks up its own id, meets the others, and takes over what it is to hold.
+        The contacts of an earlier life, which the store remembers, are tried beside them, and the detours of the
+        network (tunnels) when nobody has answered for 1.5 s, and whenever all contact is lost.  Fires when one of
+        them has answered, so that keys can be read; where there are none, at once (the first node of a network), or,
+        with a ``lan``, as soon as one of the team answers there or nobody did for a moment.  The node then looks up
+        its own id, meets the others, and takes over what it is to hold.
         """
+        self.reach.bootstraps |= {*known, *detours_of(self._network)}
         return _run(self._join(known))
 
     def stop(self) -> None:
         """Say goodbye, so that what is leased here leaves at once, and close the port."""
         if self._running:
             self._note_contacts()
-            for contact in {
-                c.node_id: c for c in [*self.overlay.table.contacts(), *self.overlay.roster.live()]
-            }.values():
+            for contact in self.overlay.contacts():
                 self.endpoint.tell(contact, "goodbye")
         self.vanish()
 
@@ -152,12 +177,22 @@ class EntangledNode:
             self._running = False
             self._subscriber.stop()
             self._chores.stop()
+            if self.discovery is not None:
+                self.discovery.stop()
             self.endpoint.stop()
 
     def set_lease(self, lease: float) -> None:
         """Have what this node owns on lease outlive its last sign of life for so many seconds from now on."""
         self.lease = lease
         self._owner.set_lease(lease)
+
+    def evict(self, public: bytes, code: str = REVOKED) -> None:
+        """Part with the node of that key, which the door lets in no more: it is told ``code``, and what it leased goes.
+
+        It is no member any more, and counts in no majority.
+        """
+        self.endpoint.evict(public, code)
+        self._parted(public)
 
     # -- verbs ------------------------------------------------------------------------------------------------------
 
@@ -169,6 +204,7 @@ class EntangledNode:
         lifetime: Lifetime = "team",
         concern: Concern = "majority",
         expect: int | None = None,
+        lease: float | None = None,
     ) -> Deferred[Stored]:
         """Store ``value`` in the slot (key, this node, name); fires with the number of replicas that have it by then.
 
@@ -176,14 +212,21 @@ class EntangledNode:
         counted in, or ``all`` of these.  Fails with ``NotAcknowledged`` where they cannot be reached; the record may
         spread all the same.  With ``expect`` it is stored only where the slot's sequence is that (0: it was never
         filled), and fails with ``Conflict`` else: a compare-and-set.  What it fires with is a number whose ``sequence``
-        says what the slot's is now.
+        says what the slot's is now.  What is leased may have a longer ``lease`` than the node's, in seconds.
+
+        Fails with ``Refused``, code ``role``, where this node's role, or the owner's as the replicas know it, may not
+        write there.
 
         Raises ``TooLarge`` at once for a value over ``MAX_VALUE`` or a name over ``MAX_NAME`` bytes, and
         ``ValueError`` for what is no key.
         """
         if len(value) > MAX_VALUE:
             raise TooLarge(f"value of {len(value)} bytes; a record carries at most {MAX_VALUE}")
-        return self._put(key, name, value, lifetime, concern, expect)
+        return self._put(key, name, value, lifetime, concern, expect, lease)
+
+    def release(self, key: bytes, name: str) -> None:
+        """Look after what this node leased in a slot no more: within its lease it is gone, and leaves no tombstone."""
+        self._owner.release(Slot(key, self.identity.public, name))
 
     def remove(
         self, key: bytes, name: str, concern: Concern = "majority", expect: int | None = None
@@ -250,14 +293,23 @@ class EntangledNode:
     # -- inside -----------------------------------------------------------------------------------------------------
 
     def _put(
-        self, key: bytes, name: str, value: bytes | None, lifetime: Lifetime, concern: Concern, expect: int | None
+        self,
+        key: bytes,
+        name: str,
+        value: bytes | None,
+        lifetime: Lifetime,
+        concern: Concern,
+        expect: int | None,
+        lease: float | None = None,
     ) -> Deferred[Stored]:
         self._check(key)
         if len(name.encode()) > MAX_NAME:
             raise TooLarge(f"name of {len(name.encode())} bytes; a record's name has at most {MAX_NAME}")
+        if not self.replica.may_store(Slot(key, self.identity.public, name)):
+            return fail(Refused(f"this node may not write {name!r} there: {meaning(ROLE)}", ROLE))
         if expect is not None:
             return _run(self._compare_and_set(Slot(key, self.identity.public, name), value, lifetime, concern, expect))
-        return _run(self._owner.put(self._owner.next(key, name, value, lifetime), concern))
+        return _run(self._owner.put(self._owner.next(key, name, value, lifetime, lease=lease), concern))
 
     async def _compare_and_set(
         self, slot: Slot, value: bytes | None, lifetime: Lifetime, concern: Concern, expect: int
@@ -268,7 +320,14 @@ class EntangledNode:
         return await self._owner.put(record, concern)
 
     async def _join(self, known: Sequence[Address]) -> None:
-        await self._membership.join(known, self._noted_contacts())
+        ways, noted = detours_of(self._network), self._noted_contacts()
+        self._detour.begin(ways, known)
+        if self.discovery is not None and not known:
+            await self.discovery.first()
+        if ways and not self._membership.is_entered:
+            await self._detour.beside(self._membership.join(known, noted) if known else None)
+        else:
+            await self._membership.join(known, noted)
         self._chores.fork(self._settle())
 
     async def _settle(self) -> None:
@@ -297,7 +356,8 @@ class EntangledNode:
         return self.seat.answer_enrol(peer)
 
     def _welcome(self, contact: Contact) -> None:
-        self._note_contacts()
+        if not self.overlay.is_large:  # where many come, the next note will do
+            self._note_contacts()
         for part in (self._owner, self._handover, self._subscriber):
             part.welcome(contact)
 
@@ -305,6 +365,22 @@ class EntangledNode:
         self._subscriber.forget(contact.node_id)
         self._handover.lost(contact)
         self._membership.lost(contact)
+        self.reach.lost(contact)
+
+    def _refused(self, contact: Contact, code: str) -> None:
+        """A member does not let this node in: it cannot be reached, and counts as one that is absent."""
+        self.overlay.turned_away(contact)
+
+    def _refusing(self, contact: Contact, code: str) -> None:
+        if code not in (DOUBLED, SUPERSEDED):  # else the other one of that identity is a member still
+            self._parted(contact.public)
+
+    def _parted(self, public: bytes) -> None:
+        contact = self.overlay.known(node_id(public))
+        if contact is not None:
+            self.replica.answer_goodbye(contact)
+            self._membership.forget(contact)
+            self._note_contacts()
 
     def _gone_here(self, record: Record) -> None:
         if not self._owner.lost_here(record):

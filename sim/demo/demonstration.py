@@ -10,9 +10,10 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +21,10 @@ from twisted.internet.base import ReactorBase
 from twisted.internet.defer import Deferred
 from twisted.internet.task import deferLater, react
 
-from drivers.sim.link import TcpConnector
+from drivers.link import TcpConnector
 from drivers.sim.operator import YardOperator
-from sim.demo.configuration import DOGS, LOOPBACK, Plan
+from sim.demo.cast import CASTS, LOOPBACK
+from sim.demo.configuration import DOGS, JUDGE, YARD, Plan
 from sim.demo.experiment import Experiment, report, table
 from sim.demo.port import PortBusy
 from sim.demo.processes import Team
@@ -39,16 +41,20 @@ TICK_S = 0.05
 class Demonstration:
     """Six processes, an eye on the page, and an eye over the yard."""
 
-    def __init__(self, reactor: Any, plan: Plan, seed: int, say: Callable[[str], None]) -> None:
+    def __init__(
+        self, reactor: Any, plan: Plan, seed: int, say: Callable[[str], None], loses_link: bool = False
+    ) -> None:
         self._reactor = reactor
+        self._loses_link = loses_link
         self._plan = plan
         self._seed = seed
         self._say = say
         self._born = reactor.seconds()
         self._lost: set[str] = set()
         self._team = Team(reactor, plan.run_dir)
-        self._operator = YardOperator(TcpConnector(reactor), reactor, LOOPBACK, plan.yard_port, rate=20.0)
-        host = LOOPBACK if plan.web_host == "0.0.0.0" else plan.web_host
+        here = plan.place(JUDGE)
+        self._operator = YardOperator(TcpConnector(reactor), reactor, here.yard, plan.yard_port, rate=20.0)
+        host = here.entry if plan.web_host == "0.0.0.0" else plan.web_host
         self._visitor = Visitor(reactor, host, plan.web_port, self._on_state, plan.code)
         self.address = f"http://{host}:{plan.web_port}/#code={plan.code}"
         tls = plan.tls_ports[0]
@@ -57,16 +63,27 @@ class Demonstration:
 
     async def start(self) -> None:
         """Start everything and wait until the page lists the three dogs."""
+        # The team is made while the yard starts.
+        founding = [sys.executable, "-m", "swarmnode.team.init", *self._plan.founding()]
+        founder = subprocess.Popen(founding, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+        yard = ["--host", self._plan.place(YARD).host, "--port", str(self._plan.yard_port), "--seed", str(self._seed)]
+        if self._plan.played:
+            path = self._plan.run_dir / "robots.toml"
+            path.write_text(self._plan.played, encoding="utf-8")
+            yard += ["--robots", str(path)]
+        self._team.add(YARD, ["-m", "sim.server", *yard], self._plan.place(YARD).enter)
+        self._team.start()
+        _, trouble = founder.communicate()
+        if founder.returncode != 0:
+            raise Trouble(f"no team can be made: {trouble.strip()}")
         for name, text in self._plan.texts().items():
             path = self._plan.file(name)
             path.touch(mode=0o600)
             path.write_text(text, encoding="utf-8")
-        yard = ["--host", LOOPBACK, "--port", str(self._plan.yard_port), "--seed", str(self._seed)]
-        self._team.add("yard", ["-m", "sim.server", *yard])
         twistd = str(Path(sys.executable).parent / "twistd")
         for name in self._plan.nodes:
-            self._team.add(name, [twistd, "-n", "--pidfile=", "swarm-node", "--config", str(self._plan.file(name))])
-        self._team.start()
+            node = [twistd, "-n", "--pidfile=", "swarm-node", "--config", str(self._plan.file(name))]
+            self._team.add(name, node, self._plan.place(name).enter)
         self._operator.connect().addErrback(lambda _: None)
         self._visitor.follow()
         await self._until(self._is_complete, START_S, "the page does not list all three dogs")
@@ -100,13 +117,24 @@ class Demonstration:
             still = run.takeover_s is None
             victim = run.look(now, self._visitor.state, snapshot)
             if still and run.takeover_s is not None:
-                self._tell(f"{run.takeover_s:.2f} s from the kill to the next dog moving")
+                loss = "loss of the link" if self._loses_link else "kill"
+                self._tell(f"{run.takeover_s:.2f} s from the {loss} to the next dog moving")
             if victim:
-                self._tell(f"{victim} has come nearer; its node is killed (SIGKILL, process {self._team.pid(victim)})")
-                self._lost.add(victim)
-                self._team.kill(victim)
+                await self._lose(victim)
             self._check_processes()
+        if run.killed and self._loses_link:
+            await self._operator.plug(run.killed)
         return run
+
+    async def _lose(self, victim: str) -> None:
+        """Take the dog on its way away: its node, or what leads from its node to the robot."""
+        if self._loses_link:
+            self._tell(f"{victim} has come nearer; the link between its node and the robot is lost")
+            await self._operator.unplug(victim)
+        else:
+            self._tell(f"{victim} has come nearer; its node is killed (SIGKILL, process {self._team.pid(victim)})")
+            self._lost.add(victim)
+            self._team.kill(victim)
 
     def watch(self) -> None:
         """Say when a process ends; the team starts it again."""
@@ -144,9 +172,41 @@ class Demonstration:
                 raise Trouble(f"the process of {name} ended; its last lines:\n  {tail}")
 
 
+async def judged(
+    demonstration: Demonstration, begun: Callable[[], Awaitable[None]], path: Path | None, say: Callable[[str], None]
+) -> None:
+    """Run both experiments, once the page lists all dogs and ``begun`` has come back, and end everything.
+
+    The verdict is said, and written to ``path`` as JSON; raises ``SystemExit`` with 1 where one was not held.
+    """
+    try:
+        await demonstration.start()
+        await begun()
+        runs = [await demonstration.experiment(number) for number in (1, 2)]
+    finally:
+        await demonstration.stop()
+    say(table(runs))
+    if path is not None:
+        path.write_text(json.dumps(report(runs), indent=1) + "\n", encoding="utf-8")
+    if not all(run.held for run in runs):
+        raise SystemExit(1)
+
+
 def _arguments(arguments: Sequence[str]) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="swarm demo", description="Three dogs, a red target and the page.")
+    parser = argparse.ArgumentParser(prog="swarm demo", description="Three robots, a red target and the page.")
     parser.add_argument("--headless", action="store_true", help="run both experiments, judge them, exit with 0 or 1")
+    parser.add_argument(
+        "--robot",
+        choices=sorted(CASTS),
+        default="aibo",
+        help="what the three are; mixed: an AIBO, a Create 2 and a Bittle (default %(default)s)",
+    )
+    parser.add_argument(
+        "--lose",
+        choices=("node", "link"),
+        default="node",
+        help="what experiment 2 takes from the dog on its way: node, or link to the robot (default %(default)s)",
+    )
     parser.add_argument("--seed", type=int, default=1, help="seed of the yard (default 1)")
     parser.add_argument("--web-host", default=LOOPBACK, help="address of the page; 0.0.0.0 opens it to the network")
     parser.add_argument(
@@ -159,6 +219,8 @@ def _arguments(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--run-dir", type=Path, default=Path("run"), help="logs, stores and configurations go there")
     parser.add_argument("--report", type=Path, default=None, help="with --headless: write the verdict there as JSON")
     wishes = parser.parse_args(arguments)
+    if wishes.lose == "link" and wishes.robot == "sim":
+        parser.error("--lose link: a simulated dog has no link of its own; choose another --robot")
     if wishes.report is not None and not wishes.report.absolute().parent.is_dir():
         parser.error(f"--report {wishes.report}: there is no such folder; make it, or name another file")
     return wishes
@@ -185,23 +247,17 @@ async def _run(reactor: Any, wishes: argparse.Namespace) -> None:
             if wishes.tls and not has_tls():
                 raise Trouble("--tls wants libraries that are missing; install them by: pip install 'swarm-node[tls]'")
             is_usual = not wishes.headless and wishes.web_port != 0
-            plan = arranged(folder, wishes.web_host, wishes.web_port, is_usual, _say, with_tls)
-            demonstration = Demonstration(reactor, plan, wishes.seed, _say)
+            plan = arranged(folder, wishes.web_host, wishes.web_port, is_usual, _say, with_tls, wishes.robot)
+            demonstration = Demonstration(reactor, plan, wishes.seed, _say, wishes.lose == "link")
             reactor.addSystemEventTrigger("before", "shutdown", demonstration.stop)
-            try:
-                await demonstration.start()
+
+            async def begun() -> None:
                 _invite(demonstration, plan)
                 if not wishes.headless:
                     demonstration.watch()
                     await Deferred()
-                runs = [await demonstration.experiment(number) for number in (1, 2)]
-            finally:
-                await demonstration.stop()
-        _say(table(runs))
-        if wishes.report is not None:
-            wishes.report.write_text(json.dumps(report(runs), indent=1) + "\n", encoding="utf-8")
-        if not all(run.held for run in runs):
-            raise SystemExit(1)
+
+            await judged(demonstration, begun, wishes.report, _say)
     except (Trouble, PageError, PortBusy, OSError) as problem:
         sys.stderr.write(f"swarm demo: {problem}\n")
         raise SystemExit(2 if isinstance(problem, PortBusy) else 1) from None

@@ -56,13 +56,16 @@ class Team:
         monitor.log = Logger(namespace="team", observer=self._observe)  # type: ignore[arg-type]
         self._monitor = monitor
 
-    def add(self, name: str, arguments: Sequence[str]) -> None:
-        """Add a process; it starts at once where the team runs.  Raises ``KeyError`` where the name is taken."""
+    def add(self, name: str, arguments: Sequence[str], enter: Sequence[str] = ()) -> None:
+        """Add a process; it starts at once where the team runs.  Raises ``KeyError`` where the name is taken.
+
+        ``enter`` stands before its command, and must become it (as ``nsenter`` does), or a signal would miss it.
+        """
         if name not in self._logs:
             self._logs[name] = (self._run_dir / f"{name}.log").open("a", encoding="utf-8", buffering=1)
             self._tails[name] = deque(maxlen=TAIL_LINES)
         environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
-        self._monitor.addProcess(name, on_leash(arguments), env=environment)
+        self._monitor.addProcess(name, [*enter, *on_leash(arguments)], env=environment)
 
     def start(self) -> None:
         """Start every process."""

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import TextIO
 
 from sim.demo import port
-from sim.demo.configuration import BOOTSTRAP, DOGS, LOOPBACK, RESERVE, Plan
+from sim.demo.cast import LOOPBACK, MOST_PORTS, chosen
+from sim.demo.configuration import BOOTSTRAP, DOGS, RESERVE, Plan
 
 WEB_PORT, TLS_PORT, NODE_PORT, YARD_PORT = 8080, 8443, 7000, 7400
 MARK = ".swarm-demo"
@@ -63,11 +64,13 @@ def arranged(
     usual: bool,
     say: Callable[[str], None],
     with_tls: bool = False,
+    robot: str = "sim",
 ) -> Plan:
     """A plan on ports that are free; a usual port that had to give way is said.
 
     ``usual``: try the usual ports first, for people who look at them; without it all ports are any free ones, so that
     several demonstrations can start at the same moment.  ``with_tls``: the page is served over TLS as well.
+    ``robot``: the cast, of ``sim.demo.cast.CASTS``.
     """
     try:
         port.free("tcp", web_host, 1)
@@ -96,4 +99,6 @@ def arranged(
                 say(f"port {wish} is busy; {what} uses {got}")
     nodes = {BOOTSTRAP: node, **dict(zip((RESERVE, *DOGS), others, strict=True))}
     code = "".join(secrets.choice(LETTERS) for _ in range(8))
-    return Plan(run_dir, secrets.token_hex(32), web_host, web, yard, nodes, f"{code[:4]}-{code[4:]}", reserve, tls)
+    ports = iter(port.free("tcp", LOOPBACK, MOST_PORTS * len(DOGS)))
+    robots = chosen(robot, DOGS, run_dir, ports, yard)
+    return Plan(run_dir, web_host, web, yard, nodes, f"{code[:4]}-{code[4:]}", reserve, tls, robots)

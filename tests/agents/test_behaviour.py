@@ -10,6 +10,7 @@ from typing import Any
 from twisted.trial.unittest import SynchronousTestCase
 
 from agents.behaviour import KINDS, behaviour_for
+from agents.means import Means
 from middleware.errors import MissingExtra, UnknownTask
 from middleware.tasks import Task
 
@@ -25,6 +26,27 @@ class BehaviourTests(SynchronousTestCase):
         """Each kind that is listed can be made, and knows no cost before it has looked."""
         for kind in KINDS:
             self.assertIsNone(behaviour_for(replace(TASK, kind=kind), random.Random(1)).cost)
+
+    def test_behaviour_is_told_what_its_body_can_do(self) -> None:
+        """Whoever asks for it gets the means of the body, whether it is installed or deployed; others go without."""
+        told: list[Means] = []
+
+        class Bodied:
+            def __init__(self, parameters: object, rng: object) -> None: ...
+
+            def embody(self, means: Means) -> None:
+                told.append(means)
+
+        class Other:
+            def __init__(self, parameters: object, rng: object) -> None: ...
+
+        means = Means()
+        deployed = {("behaviour", "bodied"): Bodied, ("behaviour", "other"): Other}
+        for kind in ("deployed:bodied", "deployed:other"):
+            behaviour_for(replace(TASK, kind=kind), random.Random(1), deployed, means)
+        self.assertEqual(told, [means])
+        turn: Any = behaviour_for(TASK, random.Random(1), None, means)
+        self.assertIs(turn._means, means)
 
     def test_unknown_kind_names_those_there_are(self) -> None:
         """A kind that nobody knows is refused with the list of those there are."""

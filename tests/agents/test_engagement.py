@@ -71,6 +71,7 @@ class Council:
     def __init__(self, clock: HeapClock, events: list[str]) -> None:
         self.is_wanted = False
         self.heirs: Sequence[Contact] = ()
+        self.rest = 0.0
         self.places: list[int] = []
         self.token = 0
         self.deadline = 0.0
@@ -97,10 +98,11 @@ class Council:
         """Note the place in the line."""
         self.places.append(rank)
 
-    def release(self, heirs: Sequence[Contact] = ()) -> Deferred[object]:
+    def release(self, heirs: Sequence[Contact] = (), rest: float = 0.0) -> Deferred[object]:
         """Give it back."""
         self.heirs = heirs
         if self.token:
+            self.rest = rest
             self._events.append("released")
         self.is_wanted, self.token = False, 0
         self.places.append(0)
@@ -129,6 +131,7 @@ class EngagementTests(SynchronousTestCase):
         self.results: list[Result] = []
         self.said: list[str] = []
         self.dog = Dog()
+        self.moves_for = 0.0
         self.council = Council(self.clock, self.events)
         self.others = {n: Identity(bytes([n]) * 32) for n in (2, 3)}
         self.engagement = Engagement(
@@ -141,9 +144,14 @@ class EngagementTests(SynchronousTestCase):
             self.told.append,
             self.results.append,
             self.said.append,
-            lambda: self.events.append("halted"),
+            self.halt,
         )
         self.engagement.lessee = self.council  # type: ignore[assignment]
+
+    def halt(self) -> float:
+        """Stop the body, which may not hear it."""
+        self.events.append("halted")
+        return self.moves_for
 
     def report(self, number: int, cost: float | None, status: str = WAITING) -> Member:
         """What another dog reports."""
@@ -229,12 +237,22 @@ class EngagementTests(SynchronousTestCase):
 
     def test_who_stands_by_keeps_its_place(self) -> None:
         """Who only waits, and holds nothing, stays in the line from its first step on and never goes to its end."""
-        self.hear(self.report(2, 0.5))
+        self.hear(self.report(2, 0.5, EXECUTING))
         self.see(1.0)
         for _ in range(5):
             self.assertEqual(self.step().action, HOLD)
             self.clock.advance(0.05)
         self.assertEqual(self.council.places, [1] * 5)
+
+    def test_who_is_to_act_and_does_not_yet_is_in_the_line(self) -> None:
+        """Whom the first in line waits for acts already, or is the one before it: they never claim at one moment."""
+        self.hear(self.report(2, 0.5))
+        self.see(1.0)
+        self.step()
+        self.assertEqual(self.council.places, [2])
+        self.hear(self.report(2, 0.5, EXECUTING))
+        self.step()
+        self.assertEqual(self.council.places, [2, 1])
 
     def test_who_claims_lets_a_better_one_act(self) -> None:
         """A better report that comes before the lease was granted ends the claim; there was no body to stop."""
@@ -244,7 +262,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual((self.council.is_wanted, self.engagement.course.state), (True, State.CLAIMING))
         self.hear(self.report(2, 0.5))
         self.assertEqual(self.step().action, HOLD)
-        self.assertEqual((self.council.is_wanted, self.council.places), (False, [0, 1]))
+        self.assertEqual((self.council.is_wanted, self.council.places), (False, [0, 2]))
         self.assertEqual(self.events, [])
 
     def test_who_is_not_let_insists(self) -> None:
@@ -364,6 +382,25 @@ class EngagementTests(SynchronousTestCase):
         self.step()
         self.assertEqual(self.engagement.me.assigned, self.others[2].node_id.hex())
         self.assertEqual(self.events, ["halted", "released"])
+
+    def test_lost_body_may_still_move(self) -> None:
+        """With the lease of a robot that does not hear that it is to stop goes back for how long it still moves."""
+        for leave in (Engagement.lose_body, Engagement.abandon):
+            self.setUp()
+            self.acting()
+            self.moves_for = 0.8
+            leave(self.engagement)
+            self.engagement.step()
+            self.assertEqual(self.council.rest, 0.8, str(leave))
+
+    def test_lost_body_is_not_waited_for(self) -> None:
+        """Whose robot does not answer is not free, whether it had reported or not; at the next look it is again."""
+        for cost in (None, 1.0):
+            self.see(cost)
+            self.engagement.lose_body()
+            self.assertEqual((self.told[-1].cost, self.told[-1].available), (None, False), str(cost))
+            self.see(cost)
+            self.assertEqual((self.told[-1].cost, self.told[-1].available), (cost, True), str(cost))
 
     def test_renewed_lease_goes_on_and_does_not_start_over(self) -> None:
         """While the token stays the same the execution goes on: nothing is said twice, nothing begins again."""

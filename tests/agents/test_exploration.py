@@ -8,7 +8,8 @@ import random
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from agents.exploration import CLEARANCE, LEG, OPEN, TURN_SPEED, Exploration, Pose, clipped
+from agents.exploration import CLEARANCE, LEG, OPEN, Exploration, Pose, clipped
+from agents.means import TURN_SPEED
 
 TICK = 0.05
 
@@ -102,6 +103,17 @@ class ExplorationTests(SynchronousTestCase):
         walks = [yaw for yaw in (n * 0.1 - 3.1 for n in range(63)) if self.walks_at(exploration, yaw)]
         self.assertTrue(walks)
         self.assertTrue(all(abs(yaw - 2.0) < 0.35 for yaw in walks), walks)
+
+    def test_way_that_ended_in_a_bump_is_not_tried_again_at_once(self) -> None:
+        """Where nothing is ranged, the heading of a bump is shut for as long as the robot is near that place."""
+        for seed in range(20):
+            exploration = Exploration(random.Random(seed))
+            exploration.bumped((0.1, 0.0, 2.0))
+            for n in range(70):
+                exploration.saw((0.0, 0.0, math.remainder(n * 0.1, math.tau)), 0.1 if n else 0.0, math.nan)
+            self.assertGreater(abs(math.remainder(exploration._most_open((0.0, 0.0, 0.0)) - 2.0, math.tau)), 1.0)
+        far = {round(exploration._most_open((3.0, 0.0, 0.0))) for _ in range(200)}
+        self.assertIn(2, far)
 
     def walks_at(self, exploration: Exploration, yaw: float) -> bool:
         """Whether the robot would walk on when it looks this way."""

@@ -101,6 +101,23 @@ class LoopTests(SynchronousTestCase):
         self.assertTrue(self.agent_of("dog3")._body.is_awake)
         self.assertIsNot(self.agent_of("dog3").engagement, None)
 
+    def test_switched_off_robot_takes_no_part(self) -> None:
+        """Whose robot was switched off by hand still senses, and takes no part until it is on again."""
+        self.submit(kind="find-target")
+        self.team.clock.advance(3.0)
+        driver = self.team.services["dog1"].assembly.driver
+        assert driver is not None
+        driver.disable()
+        self.team.clock.advance(1.0)
+        said = self.agent.engagement
+        assert said is not None
+        for _ in range(40):
+            self.assertEqual((said.me.available, said.me.cost), (False, None))
+            self.team.clock.advance(0.05)
+        driver.enable()
+        self.team.clock.advance(1.0)
+        self.assertTrue(said.me.available)
+
     def test_every_motion_of_the_task_is_under_a_lease(self) -> None:
         """While a dog turns for its task each command carries token and deadline of a lease that is valid then."""
         bad: list[object] = []
@@ -204,10 +221,9 @@ class LoopTests(SynchronousTestCase):
 
     def test_robot_that_the_yard_does_not_have_is_said(self) -> None:
         """A device whose robot does not exist says so, and the others do the task without it."""
-        self.team.yard.world.dogs["ghost"] = self.team.yard.world.dogs.pop("dog3")
-        self.team.add("dog3")
+        self.team.add("dog3", tables={"driver": {"kind": "sim", "options": {"robot": "ghost", "camera_fps": 0.0}}})
         self.team.clock.advance(2.0)
-        self.assertIn("has no robot: no robot is named 'dog3'", self.lines("dog3")[-1])
+        self.assertIn("has no robot: no robot is named 'ghost'", self.lines("dog3")[-1])
         self.submit(waiting_period=2.0)
         self.team.clock.advance(12.0)
         self.assertEqual(self.team.state()["tasks"][0]["status"], "COMPLETED")

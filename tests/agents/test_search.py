@@ -9,7 +9,8 @@ from typing import Any
 from twisted.trial.unittest import SynchronousTestCase
 
 from agents.context import Context
-from agents.search import MEMORY, STOP_AT, SearchAndApproach
+from agents.means import STOP_AT
+from agents.search import MEMORY, SearchAndApproach
 from drivers.reading import Action, Frame, Observation
 from sim.camera import Camera
 from sim.scene import FOOTPRINT, loaded

@@ -9,8 +9,9 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from agents.behaviour import STAND
 from agents.context import Context
+from agents.means import Means
 from agents.turn import TurnAround
-from drivers.reading import Observation, Value
+from drivers.reading import Description, Observation, Value
 
 
 def seen(**values: Value) -> Observation:
@@ -51,6 +52,14 @@ class TurnTests(SynchronousTestCase):
         self.assertIsNone(turn.execute(Context(0.0, is_resumed=True)))
         for wrong in (-1.0, math.inf, math.nan, 1e9, "often"):
             self.assertRaises(ValueError, TurnAround, {"turns": wrong}, random.Random(1))
+
+    def test_body_turns_as_fast_as_it_can(self) -> None:
+        """A body that turns more slowly than a dog is asked for no more than it can."""
+        turn = TurnAround({}, random.Random(1))
+        limits = {"base.vx": (-0.1, 0.1), "base.wz": (-0.5, 0.5)}
+        turn.embody(Means(Description("slow", "", {}, limits, 0.1)))
+        turn.look(seen(odom_yaw=0.0), 0.0)
+        self.assertEqual(turn.execute(Context(0.0, is_resumed=True)), {**STAND, "base.wz": 0.5})
 
     def test_others_stand(self) -> None:
         """Whoever does not act stands still."""

@@ -54,6 +54,26 @@ class VisionTests(SynchronousTestCase):
             self.assertLess(abs(errors[2]), 0.06, (distance, errors))
             self.assertLess(max(map(abs, errors)), 0.12, (distance, errors))
 
+    def test_lens_is_reckoned_with(self) -> None:
+        """The same picture through a lens half as wide shows a target about twice as far, and less aside."""
+        studio = Studio()
+        studio.target(0.9, 0.2)
+        picture = studio.camera.jpeg(studio.world.dogs["dog1"])
+        wide = find_target(picture, SIZE)
+        narrow = find_target(picture, SIZE, (math.radians(28.4), None))
+        assert wide is not None and narrow is not None
+        self.assertTrue(1.9 < narrow.distance / wide.distance < 2.3)
+        self.assertLess(narrow.bearing, 0.6 * wide.bearing)
+
+    def test_picture_that_is_all_target_says_so(self) -> None:
+        """From edge to edge nobody can tell how near it is; a whole target, or none at one edge, is not filling."""
+        for width, is_filling in ((64, True), (40, False)):
+            picture = np.full((48, 64, 3), 128, np.uint8)
+            picture[:, 64 - width :] = (40, 30, 200)
+            sighting = find_target(cv2.imencode(".jpg", picture)[1].tobytes(), SIZE)
+            assert sighting is not None
+            self.assertEqual(sighting.is_filling, is_filling)
+
     def test_bearing_is_right_within_a_degree_and_a_half(self) -> None:
         """The bearing is right to 1.5 degrees anywhere in the picture, left being positive."""
         studio = Studio()

@@ -12,8 +12,9 @@ from twisted.trial.unittest import SynchronousTestCase
 
 import agents
 from agents.context import Context
+from agents.means import Means
 from agents.watch import FRESH, MEMORY, SETTLE, WatchTarget
-from drivers.reading import Action, Frame, Observation, Value
+from drivers.reading import Action, Description, Frame, Observation, Value
 from tests.agents.test_search import Walk
 
 TICK = 0.1
@@ -140,6 +141,20 @@ class DogTests(SynchronousTestCase):
             self.assertLess(len(contexts), 60)
         self.assertLess(abs(walk.distance() - before), 0.05)
         self.assertGreater(walk.now, 3.0)
+
+    def test_looks_through_the_lens_of_its_body(self) -> None:
+        """A body that told its lens, however late it sees its first picture, is believed."""
+        watch = WatchTarget({}, random.Random(1))
+        lens = {"camera": {"fov_h_deg": 28.4}}
+        watch.embody(Means(Description("narrow", "", lens, {}, 0.1)))
+        walk = Walk()
+        walk.world.place_target(1.4, 1.2)
+        for n in range(4):
+            picture = Frame(n, 208, 160, walk.camera.jpeg(walk.dog), n * TICK)
+            watch.look(Observation(n * TICK, n * TICK, {"odom.yaw": 0.0}, frame=picture), n * TICK)
+        cost = watch.cost
+        assert cost is not None
+        self.assertTrue(1.8 < cost / walk.distance() < 2.5)
 
     def test_watches_with_a_camera_alone(self) -> None:
         """A camera on a wall, which has no motors and says nothing of a target, sees it too, and is told no motion."""

@@ -8,9 +8,9 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from drivers.drained import DrainedDriver
 from drivers.driver import Permit
+from drivers.link import MemoryConnector
 from drivers.reading import Observation
 from drivers.sim.driver import SimDriver
-from drivers.sim.link import MemoryConnector
 from middleware.entangled.clock import HeapClock
 
 

@@ -9,7 +9,7 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from drivers.driver import Permit
 from drivers.errors import LinkLost, NotEnabled, StaleCommand, Unsupported, UsageError
-from drivers.phone.driver import STALE_S, PhoneDriver
+from drivers.phone.driver import PhoneDriver
 from drivers.registry import describe, driver_for
 from tests.drivers.contract import SensingContract
 
@@ -75,7 +75,7 @@ class PhoneDriverTests(SensingContract, SynchronousTestCase):
     def test_goes_stale_and_comes_back(self) -> None:
         """Half a second without a look is stale; the next look is the phone again, and counts as a reconnection."""
         driver = self.ready()
-        self.clock.advance(STALE_S + 0.01)
+        self.clock.advance(PhoneDriver.STALE_S + 0.01)
         self.assertEqual(driver.state, "stale")
         self.assertRaises(NotEnabled, driver.act, {}, self.permit())
         self.failureResultOf(driver.enable(), LinkLost)

@@ -56,9 +56,11 @@ class RegistryTests(SynchronousTestCase):
     def test_imports_no_kind_before_it_is_asked_for(self) -> None:
         """The registry alone loads no driver, and the sim driver loads no OpenCV, NumPy or physics."""
         script = (
-            "import sys; import drivers.registry as r; assert 'drivers.sim.driver' not in sys.modules\n"
+            "import sys; from twisted.internet.task import Clock\n"
+            "import drivers.registry as r; assert 'drivers.sim.driver' not in sys.modules\n"
             "r.describe('sim', {}); r.driver_for('sim', {}, 'dog1', None)\n"
-            "import drivers.sim.operator; unwanted = {'cv2', 'numpy', 'pymunk', 'twisted.internet.reactor'}\n"
+            "for kind in ('create2', 'bittle'): r.driver_for(kind, {'port': '/dev/x'}, 'robot', Clock())\n"
+            "import drivers.sim.operator; unwanted = {'cv2', 'numpy', 'pymunk', 'serial', 'twisted.internet.reactor'}\n"
             "heavy = unwanted & set(sys.modules)\n"
             "assert not heavy, heavy"
         )

@@ -11,9 +11,9 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from drivers.driver import Permit
 from drivers.errors import LinkLost, NoReply, NotEnabled, Unsupported, UsageError
+from drivers.link import Link, MemoryConnector, Receiver
 from drivers.sim.codec import Motors, Sensors, encoded
-from drivers.sim.driver import STALE_S, SimDriver
-from drivers.sim.link import Link, MemoryConnector, Receiver
+from drivers.sim.driver import SimDriver
 from drivers.sim.operator import YardOperator
 from sim.scene import loaded
 from sim.yard import Yard
@@ -137,7 +137,7 @@ class SimDriverTests(DriverContract, SynchronousTestCase):
         driver = self.ready()
         self.yard._pending.cancel()
         self.yard._pending = None
-        self.pass_time(STALE_S + 0.1)
+        self.pass_time(SimDriver.STALE_S + 0.1)
         self.assertEqual(driver.state, "stale")
         self.assertRaises(NotEnabled, driver.act, {"base.vx": 0.1}, self.permit())
 

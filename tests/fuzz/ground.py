@@ -25,11 +25,12 @@ from middleware.entangled.network.network import Address, Network
 from middleware.entangled.network.switchboard import Switchboard
 from middleware.entangled.node import EntangledNode
 from middleware.entangled.wire.courier import MAX_IN_OF_PEER
+from middleware.entangled.wire.door import OPEN, Door
 from middleware.entangled.wire.endpoint import Endpoint
 
 TEAM = b"k" * 32
 STRANGER = Address("10.0.0.9", 999)
-LEFT_OUT = ("counters", "_counters", "_rng", "_network", "_clock", "_log", "_quiet", "_most")
+LEFT_OUT = ("door", "counters", "_counters", "_rng", "_network", "_clock", "_log", "_quiet", "_most", "_bucket")
 PLAIN = (bytes, str, int, float, type(None))
 
 
@@ -39,9 +40,13 @@ class Violation(AssertionError):
 
 @implementer(ILogObserver)
 class Ground:
-    """A node ``target`` and a member ``other`` with a session between them; all that came to the target is recorded."""
+    """A node ``target`` and a member ``other`` with a session between them, both behind ``door``.
 
-    def __init__(self) -> None:
+    All that came to the target is recorded.
+    """
+
+    def __init__(self, door: Door = OPEN) -> None:
+        self.room = door.room
         self.errors: list[str] = []
         self.known = ""  # the hash after the last shot, for targets that let no time pass
         self._is_shooting = False
@@ -52,7 +57,15 @@ class Ground:
         self.network = self.board.network("10.0.0.1", 1)
         self.store = MemoryStore(1000)
         self.node = EntangledNode(
-            Identity(b"t" * 32), TEAM, self._tapped(self.network), self.store, self.clock, random.Random(2), 1.0
+            Identity(b"t" * 32),
+            TEAM,
+            self._tapped(self.network),
+            self.store,
+            self.clock,
+            random.Random(2),
+            1.0,
+            None,
+            door,
         )
         self.target = self.node.endpoint
         self.node.start()
@@ -60,7 +73,9 @@ class Ground:
         self.target.expose("add", lambda peer, value: value, changes=True)
         self.contact = Contact(Identity(b"t" * 32).public, self.network.address)
         self.identity = Identity(b"o" * 32)
-        self.other = Endpoint(self.identity, TEAM, self.board.network("10.0.0.2", 2), self.clock, random.Random(3))
+        self.other = Endpoint(
+            self.identity, TEAM, self.board.network("10.0.0.2", 2), self.clock, random.Random(3), door
+        )
         self.other.start()
         self.other.expose("ping", lambda peer: "pong", changes=True)
         for method, value in (("echo", b"1"), ("add", bytes(3000))):
@@ -119,8 +134,8 @@ class Ground:
         return tapped_network
 
     def __call__(self, event: Any) -> None:
-        """Take note of what is logged while a shot is fired."""
-        if event["log_level"] >= LogLevel.warn:
+        """Take note of what is logged while a shot is fired, but for who is not let in, which has a ``code``."""
+        if event["log_level"] >= LogLevel.warn and "code" not in event:
             self.errors.append(str(event.get("log_format")))
 
 

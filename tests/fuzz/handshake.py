@@ -1,7 +1,8 @@
 """Handshake: a member that holds the team's key makes INIT, RESP and COOKIE with contents of its own choice.
 
-A refused one changes nothing (R1), and nothing that is sent is longer than what came (R3).  The first byte of an input
-says which of the three; for an INIT the second one is the seed of its ephemeral key.
+Contents are a life, a pass, a message and padding, or rubbish; a RESP may be a refusal, too.  A refused handshake
+changes nothing (R1), and nothing that is sent is longer than what came (R3).  The first byte of an input says which of
+the three, and whether the team is a closed one (from 3 on); an INIT has the seed of its ephemeral key next.
 """
 
 from __future__ import annotations
@@ -18,9 +19,18 @@ from middleware.entangled.wire.noise import Initiator, Responder
 from middleware.entangled.wire.session import INIT, MAC, PROLOGUE, RESP, Credentials, _hashed, derived_key, mac_of
 from tests.fuzz.ground import STRANGER, TEAM, Ground, Violation
 from tests.fuzz.runner import Again, main
+from tests.middleware.gate import Gate
 
 OWN = Credentials.of(Identity(b"m" * 32), TEAM)
 AT = Address("10.0.0.3", 3)
+
+
+class ShortPass(Gate):
+    """A door whose passes take little room."""
+
+    def __init__(self) -> None:
+        super().__init__(shown=b"pass")
+        self.room = 64
 
 
 def init(ground: Ground, data: bytes) -> bytes:
@@ -28,7 +38,7 @@ def init(ground: Ground, data: bytes) -> bytes:
     remote = exchange_key(ground.contact.public)
     noise = Initiator(OWN.static, remote, random.Random(data[:1]).randbytes(32), PROLOGUE, OWN.psk)
     payload = data[1:] if data[:1] < b"\x80" else data[1:5] + OWN.public + data[5:]
-    bare = bytes([INIT]) + noise.write(payload[: MAX_DATAGRAM - 200].ljust(520, b"\0"))
+    bare = bytes([INIT]) + noise.write(payload[: MAX_DATAGRAM - 200].ljust(520 + ground.room, b"\0"))
     bare += _hashed(OWN.mac_key, bare)
     return bare + (bytes(MAC) if len(data) % 2 else data[-MAC:].ljust(MAC, b"\0"))
 
@@ -74,7 +84,13 @@ def shot(ground: Ground, data: bytes) -> None:
     ground.clock.advance(2.0 if kind else 0.02)
 
 
-check = Again(shot)
+_open, _closed = Again(shot), Again(shot, made=lambda: Ground(ShortPass()))
+
+
+def check(data: bytes) -> None:
+    """Fire one input at an open team's node or at a closed one's."""
+    (_closed if data and data[0] // 3 % 2 else _open)(data)
+
 
 if __name__ == "__main__":
     main("handshake", check)

@@ -25,8 +25,11 @@ Check = Callable[[bytes], None]
 class Again:
     """A check on a ground that is made anew after every ``period`` inputs, since lawful ones leave their traces."""
 
-    def __init__(self, shot: Callable[[Ground, bytes], None], period: int = 200) -> None:
+    def __init__(
+        self, shot: Callable[[Ground, bytes], None], period: int = 200, made: Callable[[], Ground] = Ground
+    ) -> None:
         self._shot = shot
+        self._made = made
         self._period = period
         self._left = 0
         self._ground: Ground | None = None
@@ -36,7 +39,7 @@ class Again:
         if self._ground is None or not self._left:
             if self._ground is not None:
                 self._ground.stop()
-            self._ground, self._left = Ground(), self._period
+            self._ground, self._left = self._made(), self._period
         self._left -= 1
         try:
             self._shot(self._ground, data)

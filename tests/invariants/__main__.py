@@ -4,14 +4,27 @@ from __future__ import annotations
 
 import argparse
 import os
+import signal
+import subprocess
 import sys
 import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 
+from middleware.errors import BadSetting
+from sim.team import logbook
+from sim.team.shrink import Trim
 from tests.invariants.bug import BUGS, FINDERS
-from tests.invariants.run import ALONE, WORKLOADS, run_all
+from tests.invariants.least import Least, least, line
+from tests.invariants.run import ALONE, WORKLOADS, Outcome, hunt_all, run_all
 
 BOUND = 400
 """Schedules within which each bug must show, unless fewer are asked for."""
+STRETCH = 1000
+"""The most seeds that one line of a logbook tells of."""
+MOST_SHRUNK = 3
+"""Failures that are shrunk; where there are more, these say enough."""
+INTERRUPTED = 130
 
 NAMES = (*WORKLOADS, *ALONE)
 
@@ -22,55 +35,167 @@ def main() -> int:
     parser.add_argument("--schedules", type=int, help="how many to run (default 200; of each bug at most 400)")
     parser.add_argument("--seed", type=int, default=1, help="the seed of the first; the others follow (default 1)")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes (default: one for each core)")
+    parser.add_argument("--scheduler", default="", metavar="ADDRESS", help="run on the workers of this Dask scheduler")
     parser.add_argument("--only", default="", help=f"workloads in all of them, with commas: {', '.join(NAMES)}")
-    parser.add_argument("--bug", choices=sorted(BUGS), help="run with a bug put in, until it shows")
+    parser.add_argument("--keep", help="of the faults only these happen: their numbers from 0, with commas, or none")
+    parser.add_argument("--calm", action="store_true", help="take the weather away")
+    parser.add_argument("--seconds", type=float, help="end workloads and faults after so many")
+    parser.add_argument(
+        "--shrink", type=float, default=60.0, help="seconds in which a failed one is shrunk (default 60)"
+    )
+    parser.add_argument("--log", default="", metavar="FILE", help="add what came of it to a logbook")
+    parser.add_argument("--resume", action="store_true", help="leave out the seeds that the logbook has")
+    parser.add_argument("--bug", choices=sorted(BUGS), metavar="NAME", help="run with a bug put in, until it shows")
     parser.add_argument("--bugs", action="store_true", help="run with each bug in turn, and say when it showed")
     wanted = parser.parse_args()
     only = tuple(name for name in wanted.only.split(",") if name)
     if unknown := [name for name in only if name not in NAMES]:
         parser.error(f"--only: no workload {unknown[0]}; there are {', '.join(NAMES)}")
-    began, failed = time.monotonic(), 0
     count = wanted.schedules or (BOUND if wanted.bugs or wanted.bug else 200)
-    seeds = range(wanted.seed, wanted.seed + count)
-    if wanted.bugs:
-        return show_bugs(seeds, wanted.jobs)
+    if count < 1 or wanted.jobs < 1:
+        parser.error("--schedules, --jobs: at least 1")
+    if wanted.seconds is not None and not wanted.seconds > 0.0:
+        parser.error("--seconds: more than 0")
+    if wanted.resume and not wanted.log:
+        parser.error("--resume: name the logbook with --log FILE")
+    if wanted.log and (wanted.bug or wanted.bugs):
+        parser.error("--log: runs with a bug put in are not logged")
     if wanted.bug:
         only = only or FINDERS.get(wanted.bug, ("records",))
-    for outcome in run_all(seeds, wanted.jobs, only, wanted.bug):
-        if outcome.found:
-            failed += 1
-            extra = (f" --only {wanted.only}" if only else "") + (f" --bug {wanted.bug!r}" if wanted.bug else "")
-            say(f"FAILED  python -m tests.invariants --schedules 1 --seed {outcome.seed}{extra}")
-            say(f"        {outcome.title}")
-            for line in outcome.found[:6]:
-                say(f"        {line}")
-            if wanted.bug:
-                break
-    say(f"{failed} of {count} schedules failed, {time.monotonic() - began:.0f} s")
-    return int(bool(failed) != bool(wanted.bug))
+    try:
+        seeds = range(wanted.seed, wanted.seed + count)
+        if wanted.bugs:
+            return show_bugs(seeds, wanted.jobs, wanted.scheduler)
+        trim = Trim(numbers(wanted.keep), wanted.calm, only, wanted.seconds)
+        return Session(wanted, trim).run(seeds)
+    except (BadSetting, OSError, ValueError) as error:
+        parser.error(str(error))
+    except KeyboardInterrupt:
+        say("interrupted")
+        return INTERRUPTED
 
 
-def show_bugs(seeds: range, jobs: int) -> int:
-    """Print of each bug which schedule showed it, how many it took, and what was broken."""
-    hidden = 0
-    say(f"{'bug':48s} {'workloads':16s} {'seed':>5s}  {'needed':>6s}  shows as")
-    for bug in BUGS:
-        only = FINDERS.get(bug, ("records",))
-        for number, outcome in enumerate(run_all(seeds, jobs, only, bug), start=1):
-            if outcome.found:
-                broken = sorted({line.partition(":")[0] for line in outcome.found})
-                say(f"{bug:48s} {'+'.join(only):16s} {outcome.seed:5d}  {number:6d}  {', '.join(broken)}")
-                break
+def numbers(told: str | None) -> tuple[int, ...] | None:
+    """The numbers of faults as they stand behind ``--keep``."""
+    if told in (None, "none"):
+        return None if told is None else ()
+    named = str(told).split(",")
+    if not all(number.isdecimal() for number in named):
+        raise ValueError(f"--keep: {told!r} names no faults; give their numbers with commas between them, or none")
+    return tuple(map(int, named))
+
+
+class Session:
+    """One call of the command: runs, prints what failed, and adds to the logbook."""
+
+    def __init__(self, wanted: argparse.Namespace, trim: Trim) -> None:
+        self._wanted = wanted
+        self._trim = trim
+        self._began = time.monotonic()
+        self._is_interrupted = False
+        self._failed = self._ran = 0
+
+    def run(self, seeds: range) -> int:
+        """Run every seed; 1 where one failed, or where a bug that was put in did not show."""
+        wanted = self._wanted
+        signal.signal(signal.SIGINT, self._interrupt)
+        if not wanted.log:
+            for _ in self._outcomes(seeds):
+                if wanted.bug and self._failed:
+                    break
         else:
+            self._log(seeds)
+        say(f"{self._failed} of {self._ran} schedules failed, {time.monotonic() - self._began:.0f} s")
+        return int(bool(self._failed) != bool(wanted.bug))
+
+    def _outcomes(self, seeds: Sequence[int]) -> Iterator[Outcome]:
+        wanted = self._wanted
+        for outcome in run_all(seeds, wanted.jobs, (), wanted.bug, self._trim, wanted.scheduler):
+            self._ran += 1
+            if outcome.found:
+                self._failed += 1
+                self._tell(outcome)
+            yield outcome
+            if self._is_interrupted:
+                raise KeyboardInterrupt
+
+    def _interrupt(self, *_: object) -> None:
+        """End after the present schedule: within one, a Deferred would take the interrupt for its own failure."""
+        self._is_interrupted = True
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    def _tell(self, outcome: Outcome) -> None:
+        """Print what failed, and the line that repeats the least of it."""
+        say(f"FAILED  {line(outcome.seed, self._trim, self._wanted.bug)}")
+        say(f"        {outcome.title}")
+        for violation in outcome.found[:6]:
+            say(f"        {violation}")
+        if self._wanted.shrink > 0.0 and self._failed <= MOST_SHRUNK:
+            until = time.monotonic() + self._wanted.shrink
+            self._tell_least(outcome, least(outcome, self._wanted.bug, until_then(until), self._trim))
+
+    def _tell_least(self, whole: Outcome, left: Least) -> None:
+        say(f"LEAST   {line(whole.seed, left.trim, self._wanted.bug)}")
+        kept = whole.faults if left.trim.keep is None else len(left.trim.keep)
+        say(f"        {kept} of {whole.faults} faults are left, after {left.runs} runs: {left.outcome.found[0]}")
+
+    def _log(self, seeds: range) -> None:
+        """Run stretch by stretch, and add a line for each, also for one that is interrupted."""
+        wanted, what = self._wanted, "+".join(self._trim.only)
+        text = Path(wanted.log).read_text(encoding="utf-8") if os.path.exists(wanted.log) else ""
+        logged = logbook.entries(text, wanted.log)
+        left = logbook.missing(seeds, logged, what) if wanted.resume else list(seeds)
+        Path(wanted.log).open("ab").close()
+        say(f"{len(left)} of {len(seeds)} schedules, from seed {left[0]}" if left else "all are in the logbook")
+        commit, outcomes = commit_of(Path(__file__).resolve().parents[2]), self._outcomes(left)
+        for stretch in logbook.stretches(left, STRETCH):
+            began, failures, ran = time.monotonic(), [], 0
+            try:
+                for _ in stretch:
+                    outcome = next(outcomes)
+                    ran += 1
+                    if outcome.found:
+                        failures.append(outcome.seed)
+            finally:
+                if ran:
+                    date = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
+                    seconds = round(time.monotonic() - began, 1)
+                    entry = logbook.Entry(date, commit, what, stretch[0], ran, tuple(failures), seconds)
+                    logbook.append(wanted.log, entry)
+                    say(f"{self._ran} of {len(left)} schedules, {self._failed} failed; up to seed {stretch[ran - 1]}")
+
+
+def until_then(moment: float) -> Callable[[], bool]:
+    """Whether that moment is over."""
+    return lambda: time.monotonic() > moment
+
+
+def commit_of(tree: Path) -> str:
+    """The commit of the tree, with + behind it where the tree was changed; nothing where it is none of git's."""
+    asked = subprocess.run(
+        ["git", "describe", "--always", "--dirty=+", "--exclude=*"], cwd=tree, capture_output=True, text=True
+    )
+    return asked.stdout.strip()
+
+
+def show_bugs(seeds: range, jobs: int, scheduler: str) -> int:
+    """Print of each bug which schedule showed it, how many it took, and what was broken."""
+    hidden, began = 0, time.monotonic()
+    say(f"{'bug':48s} {'workloads':16s} {'seed':>5s}  {'needed':>6s}  shows as")
+    for bug, only, number, outcome in hunt_all(seeds, jobs, scheduler):
+        if outcome is None:
             hidden += 1
-            say(f"{bug:48s} {'+'.join(only):16s} {'-':>5s}  {'>' + str(len(seeds)):>6s}  nothing")
-    say(f"{len(BUGS) - hidden} of {len(BUGS)} bugs were found")
+            say(f"{bug:48s} {'+'.join(only):16s} {'-':>5s}  {'>' + str(number):>6s}  nothing")
+        else:
+            broken = sorted({violation.partition(":")[0] for violation in outcome.found})
+            say(f"{bug:48s} {'+'.join(only):16s} {outcome.seed:5d}  {number:6d}  {', '.join(broken)}")
+    say(f"{len(BUGS) - hidden} of {len(BUGS)} bugs were found, {time.monotonic() - began:.0f} s")
     return int(hidden > 0)
 
 
-def say(line: str) -> None:
+def say(text: str) -> None:
     """Print a line at once."""
-    sys.stdout.write(line + "\n")
+    sys.stdout.write(text + "\n")
     sys.stdout.flush()
 
 

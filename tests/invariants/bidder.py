@@ -6,7 +6,7 @@ import random
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from twisted.internet.defer import Deferred
+from twisted.internet.defer import Deferred, maybeDeferred
 
 from drivers.driver import Permit
 from drivers.errors import StaleCommand
@@ -16,6 +16,7 @@ from middleware.commitment.ballot import NONE, Ballot, Reply, members_of
 from middleware.commitment.council import Council
 from middleware.commitment.ledger import Ledger
 from middleware.commitment.lessee import Lessee
+from middleware.commitment.patience import in_time
 from middleware.entangled.data.store import Store
 from middleware.entangled.kademlia.contact import Contact
 from tests.invariants.machine import Machine
@@ -74,6 +75,11 @@ class Bidder:
             self._gates[task_id] = Gate()
         return self.lessees[task_id]
 
+    def holds(self, task_id: str) -> bool:
+        """Whether this agent lives and believes to hold a lease."""
+        lessee = self.lessees.get(task_id)
+        return lessee is not None and lessee.lease is not None and self.machine.is_alive
+
     def leave(self, task_id: str, heirs: Sequence[int] = ()) -> None:
         """Stop the robot, then give the lease back."""
         self.world.referee.stop(self.place, task_id)
@@ -83,6 +89,7 @@ class Bidder:
 
     def freed(self, agent: str, task_id: str, token: int, rest: float) -> None:
         """Hear that the lease was given back."""
+        self._tell(self.acceptor.freed(task_id, agent, token, self.machine.seconds(), rest), task_id, rest)
         lessee = self.lessees.get(task_id)
         if lessee is not None:
             lessee.freed(token, rest)
@@ -116,7 +123,7 @@ class Bidder:
         answered: Deferred[Any] = Deferred()
         to = self.world.place_of(member)
         if to == self.place:
-            answered.callback(self.answer(self.place, method, arguments))
+            maybeDeferred(self.answer, self.place, method, arguments).chainDeferred(answered)
             return answered
 
         def come_back(answer: object) -> None:
@@ -132,20 +139,32 @@ class Bidder:
         return answered
 
     def answer(self, source: int, method: str, arguments: tuple[Any, ...]) -> object:
-        """Do what a peer asks."""
+        """Do what a peer asks; an answer that is not there yet is a Deferred."""
         agent = self.world.contacts[source].node_id.hex()
         reply = self._methods[method](agent, *arguments)
+        if isinstance(reply, Deferred):
+            packed: Deferred[object] = reply.addCallback(Reply.packed)
+            return packed.result if packed.called else packed
         return reply.packed() if isinstance(reply, Reply) else reply
 
     def _prepare(self, agent: str, task_id: str, configuration: int, counter: int, ttl: float) -> Reply:
         return self.acceptor.prepare(task_id, configuration, Ballot(counter, agent), ttl, self.machine.seconds())
 
-    def _propose(self, agent: str, task_id: str, configuration: int, counter: int, token: int, ttl: float) -> Reply:
-        ballot = Ballot(counter, agent)
-        return self.acceptor.propose(task_id, configuration, ballot, token, ttl, self.machine.seconds())
+    def _propose(
+        self, agent: str, task_id: str, configuration: int, counter: int, token: int, ttl: float
+    ) -> Deferred[Reply]:
+        def proposed() -> Reply:
+            ballot, now = Ballot(counter, agent), self.machine.seconds()
+            return self.acceptor.propose(task_id, configuration, ballot, token, ttl, now)
+
+        return in_time(proposed, self.machine)
 
     def _release(self, agent: str, task_id: str, counter: int, rest: float) -> None:
-        for listener in self.acceptor.release(task_id, Ballot(counter, agent), self.machine.seconds(), rest):
+        freed = self.acceptor.release(task_id, Ballot(counter, agent), self.machine.seconds(), rest)
+        self._tell(freed, task_id, rest)
+
+    def _tell(self, listeners: Sequence[str], task_id: str, rest: float) -> None:
+        for listener in listeners:
             self.world.tell_freed(self.place, listener, task_id, rest)
 
     def _close(self, agent: str, task_id: str, configuration: int, token: int) -> Reply:

@@ -14,10 +14,11 @@ from agents.docket import Docket
 from drivers.errors import StaleCommand
 from drivers.gate import Gate
 from middleware.commitment import ledger, lessee
+from middleware.commitment import round as round_
 from middleware.commitment.acceptor import Acceptor
-from middleware.commitment.ballot import GRANTED, members_of
+from middleware.commitment.ballot import GRANTED, OVER, Reply, members_of
 from middleware.commitment.council import Council
-from middleware.commitment.lessee import Lessee
+from middleware.commitment.lessee import Lease, Lessee
 from middleware.commitment.round import Round
 from middleware.consensus import bidder, nearest
 from middleware.consensus.nearest import Nearest
@@ -164,6 +165,14 @@ def _deadline_without_the_stop(self: Lessee, won: Round) -> float:
     return won.sent_at + self.council.ttl * (1.0 - lessee.CLOCK_MARGIN)
 
 
+def _held_for_ever(self: Lessee) -> Lease | None:
+    return Lease(self.task_id, self.token, self._deadline) if self.token else None
+
+
+def _closed_and_forgotten(self: Acceptor, *_: Any) -> Reply:
+    return Reply(OVER)
+
+
 def _only_listens(self: Lessee, asked: Round) -> None:
     return None
 
@@ -221,6 +230,7 @@ BUGS: dict[str, list[tuple[Any, str, Any]]] = {
     # The wire.
     "questions are not remembered": [(Ledger, "entry", _never_known)],
     "the window moves before the tag is checked": [(Session, "open", _moved_before_it_is_opened)],
+    "what was here before is opened again": [(Session, "is_replay", lambda self, datagram: False)],
     "a greeting is answered twice": [(Greeter, "on_who", _greeted_twice)],
     "no cookie is asked for": [(greeting, "QUIET_RATE", 1e6), (Cookies, "admits", lambda *_: True)],
     # Stores.
@@ -238,6 +248,9 @@ BUGS: dict[str, list[tuple[Any, str, Any]]] = {
     "bidders stop after one quiet round": [(bidder, "is_over", lambda rounds, quiet, tasks, members: quiet >= 1)],
     # Leases.
     "deadline from the time of the answer": [(Lessee, "_deadline_of", _deadline_from_the_answer)],
+    "the own deadline is not looked at": [(Lessee, "lease", property(_held_for_ever))],
+    "one member of a council is a majority": [(round_, "quorum", lambda size: 1)],
+    "the end of a task is not kept by its council": [(Acceptor, "close", _closed_and_forgotten)],
     "no clock margin": [(lessee, "CLOCK_MARGIN", 0.0)],
     "a clock that stands still while suspended": [(Machine, "COUNTS_SUSPENSION", False)],
     "the council is whoever is closest now": [(Leases, "council_for", _closest_now)],
@@ -251,7 +264,7 @@ BUGS: dict[str, list[tuple[Any, str, Any]]] = {
     "a restarted member grants at once": [(Acceptor, "_silence", lambda self, ttl: 0.0)],
     "the new council decides the change": [(Council, "_decision", _decided_by_the_new)],
 }
-LEASE_BUGS = tuple(list(BUGS)[-13:])
+LEASE_BUGS = tuple(list(BUGS)[-16:])
 
 FINDERS: dict[str, tuple[str, ...]] = {
     "one promise is a majority": ("tuples",),
@@ -262,6 +275,7 @@ FINDERS: dict[str, tuple[str, ...]] = {
     "questions are not remembered": ("wire",),
     "the window moves before the tag is checked": ("wire",),
     "a greeting is answered twice": ("wire",),
+    "what was here before is opened again": ("wire",),
     "no cookie is asked for": ("wire",),
     "acknowledged before it is written": ("records", "stores"),
     "checksums are not looked at": ("records", "stores"),

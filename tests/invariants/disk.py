@@ -167,6 +167,10 @@ class DiskFleet(Fleet):
         """Which memory the node of a place has."""
         return self._memories[place]
 
+    def forgets(self, place: int) -> bool:
+        """It may: what was put a moment ago is not in the file yet, and a file may rot."""
+        return True
+
     def disk(self, place: int) -> DiskStore:
         """The store of the node of a place."""
         store = self.stores[place]

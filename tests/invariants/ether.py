@@ -260,12 +260,13 @@ class Lessee:
     def stand_by(self, rank: int = 1) -> None:
         """Nobody is told here when a lease is free: only who wants it asks."""
 
-    def release(self, heirs: object = ()) -> Deferred[object]:
-        """Give back."""
+    def release(self, heirs: object = (), rest: float = 0.0) -> Deferred[object]:
+        """Give back; where the robot still moves, leave it to run out."""
         self._wanted, self._deadline = False, 0.0
         self._life += 1
         holder = self._ether.holders.get(self._task_id)
-        if self.token and holder is not None and holder[1] == self.token and self._reached():
+        is_ours = self.token and holder is not None and holder[1] == self.token
+        if is_ours and not rest and self._reached():
             del self._ether.holders[self._task_id]
         self.token = 0
         return succeed(None)

@@ -1,10 +1,10 @@
-"""The workload of groups: as that of tasks, with tasks that are divided together, and E8: no agent acts on two."""
+"""The workload of groups: as that of tasks, with tasks divided together, and the leases that agents hold (E8)."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-from agents.state import State
+from agents.loop import Agent
 from tests.invariants.tasks import Tasks
 
 
@@ -19,13 +19,7 @@ class Groups(Tasks):
             task = self.any_task()
             self.enter(replace(task, strategy=strategy, group=rng.choice(["g", "g", "g", ""])))
 
-    def watch(self) -> None:
-        """Look at every agent, and on how many tasks it acts or may act."""
-        super().watch()
-        for place, agent in sorted(self.agents.items()):
-            engagements = {name: part.engagement for name, part in agent._parts.items()}
-            acting = [name for name, each in engagements.items() if each.course.state is State.EXECUTING]
-            lessees = {name: each.lessee for name, each in engagements.items() if each.lessee is not None}
-            holding = [name for name, lessee in lessees.items() if lessee.lease is not None]
-            if len(acting) > 1 or len(holding) > 1:
-                self.say(f"E8: dog{place} acts on {acting} and holds the leases of {holding}")
+    def holding(self, agent: Agent) -> tuple[str, ...]:
+        """The tasks whose leases an agent holds."""
+        lessees = {name: part.engagement.lessee for name, part in agent._parts.items()}
+        return tuple(name for name, lessee in lessees.items() if lessee is not None and lessee.lease is not None)

@@ -1,4 +1,4 @@
-"""The workload of leases: agents claim, keep, lose and give back tasks under every fault, with E1 to E3, E5, E8, E9.
+"""The workload of leases: agents claim, keep, lose and give back tasks under every fault (E1 to E3, E5, E8, E9).
 
 It is a world of its own, light enough for a thousand schedules in two minutes: the protocol's classes, simulated
 machines and a simulated link.  What agents select is left to dice: commitment must hold whatever selection says.
@@ -15,6 +15,8 @@ from twisted.python.failure import Failure
 from middleware.commitment.lessee import STAGGER
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.kademlia.contact import Contact
+from sim.team.event import Awaited
+from sim.team.shrink import WHOLE, Trim
 from tests.invariants.radio import CALM, Air
 from tests.invariants.team import Team
 from tests.invariants.trouble import Trouble, drawn
@@ -29,7 +31,7 @@ LEAVE = 0.2
 class Leases(Team):
     """The run of ``seed``: everything follows from it."""
 
-    def __init__(self, seed: int, ttl: float = TTL) -> None:
+    def __init__(self, seed: int, trim: Trim = WHOLE, ttl: float = TTL) -> None:
         dice = self._dice = random.Random(f"leases/{seed}")
         n = dice.choice([4, 5, 5, 6, 7])
         agents = dice.choice([2, 3, 3, 4])
@@ -47,7 +49,11 @@ class Leases(Team):
             dice.choice([0.0, 0.1, 0.3]),
             dice.choice([1.0, 1.0, 5.0]),
         )
-        self.troubles = drawn(dice, n, self.agents, has_stores)
+        if trim.calm:
+            self.air = Air(self.air.delay)
+        self.faults = drawn(dice, n, self.agents, has_stores)
+        self._trim = trim
+        self.seconds = 0.0
         self._is_well = False
         for task_id in ["t0", "t1"][: dice.choice([1, 1, 2])]:
             size = 5 if n >= 5 and dice.random() < 0.25 else 3
@@ -64,22 +70,22 @@ class Leases(Team):
         """What the schedule was."""
         stores = "stores" if self.has_stores else "no stores"
         return f"n={self.n} agents={len(self.agents)} drift={self.drift} stop={self.stop_time} {stores} {self.air} " + (
-            "; ".join(map(str, self.troubles))
+            "; ".join(map(str, self.faults))
         )
 
     def run(self) -> list[str]:
         """Troubles, then health; the violations, a line each."""
         self.clock.advance(self.ttl + 0.1)
         self.radio.air = self.air
-        ahead = sorted(
-            [(t.at, 0, n) for n, t in enumerate(self.troubles)] + [(t.until, 1, n) for n, t in enumerate(self.troubles)]
-        )
-        end = self._dice.choice([8.0, 12.0, 16.0])
+        self.referee.agree()
+        kept = [(number, fault) for number, fault in enumerate(self.faults) if self._trim.keeps(number)]
+        ahead = sorted([(fault.at, 0, n) for n, fault in kept] + [(fault.until, 1, n) for n, fault in kept])
+        self.seconds = end = self._trim.within(self._dice.choice([8.0, 12.0, 16.0]))
         began = self.clock.seconds()
         while self.clock.seconds() - began < end:
             while ahead and ahead[0][0] <= self.clock.seconds() - began:
                 _, is_end, number = ahead.pop(0)
-                (self._end if is_end else self._begin)(self.troubles[number])
+                (self._end if is_end else self._begin)(self.faults[number])
             self._choose()
             self.clock.advance(0.25)
         self._heal()
@@ -124,9 +130,9 @@ class Leases(Team):
             else:
                 lessee.want()
         # A restarted member keeps silent for a ttl; a device may have to tell its token first.
-        first = self._wait_for_command(task_id, 0, 2 * self.ttl + SLACK + 1.0)
-        if first is None:
-            return self.referee.say("E3", f"nobody executes {task_id} though all is well")
+        since, most = self.clock.seconds(), 2 * self.ttl + SLACK + 1.0
+        if not self._wait_for_command(task_id, f"all is well with {task_id}", 0, since, most, most):
+            return
         self.clock.advance(self._dice.uniform(0.7, 1.3) * self.ttl)
         _, token, holder = self.referee.accepted[task_id][-1]
         self._depart_politely(task_id, token, holder)
@@ -138,10 +144,8 @@ class Leases(Team):
     def _depart_politely(self, task_id: str, token: int, holder: int) -> None:
         left_at = self.clock.seconds()
         self.bidders[holder].leave(task_id)
-        won_at = self._wait_for_command(task_id, token, 2 * self.ttl + SLACK)
-        if won_at is None or won_at - left_at > self.stop_time + LEAVE + 0.1 + 0.1 * len(self.agents):
-            late = "never" if won_at is None else f"{won_at - left_at:.2f} s later"
-            self.referee.say("E3", f"{holder} gives {task_id} back, another acts {late}")
+        within = self.stop_time + LEAVE + 0.1 + 0.1 * len(self.agents)
+        self._wait_for_command(task_id, f"{holder} gives {task_id} back", token, left_at, within, 2 * self.ttl + SLACK)
         self.bidders[holder].lessee(task_id).stand_by(len(self.agents))
 
     def _depart_suddenly(self, task_id: str, token: int, holder: int) -> None:
@@ -164,11 +168,9 @@ class Leases(Team):
                 if dice.random() < 0.2:
                     break
             self.bidders[fickle].leave(task_id)
-        won_at = self._wait_for_command(task_id, token, 3 * self.ttl + SLACK)
-        in_line = STAGGER * (len(self.agents) - 1)
-        if won_at is None or won_at - gone_at > self.ttl / (1.0 - self.drift) + SLACK + in_line:
-            late = "never" if won_at is None else f"{won_at - gone_at:.2f} s later"
-            self.referee.say("E3", f"{holder} is gone ({how}); another acts on {task_id} {late}")
+        within = self.ttl / (1.0 - self.drift) + SLACK + STAGGER * (len(self.agents) - 1)
+        why = f"{holder} of {task_id} is gone ({how})"
+        self._wait_for_command(task_id, why, token, gone_at, within, 3 * self.ttl + SLACK)
         self._heal()
 
     def _conclude(self, task_id: str) -> None:
@@ -177,34 +179,32 @@ class Leases(Team):
         place = self._dice.choice([holder, self.n - 1])
         if place == holder:
             self.referee.stop(holder, task_id)
+        history = self.referee.history
+        asked = history.asked(place, "close", task_id)
         closing = self.bidders[place].lessee(task_id).council.close(token if place == holder else 0)
         if place == holder:
             self.bidders[holder].lessee(task_id).release()
 
-        def closed(_: object) -> None:
-            self.referee.ended(task_id)
-
         def failed(failure: Failure) -> None:
             failure.trap(EntangledError)
-            self.referee.say("E5", f"the end of {task_id} is not recorded: {failure.value}")
+            history.unanswered(asked, failure.value)
 
-        closing.addCallbacks(closed, failed)
+        closing.addCallbacks(lambda _: history.answered(asked), failed)
         self.clock.advance(2 * self.ttl)
         for agent in self.agents:
             self.bidders[agent].lessee(task_id).want()
         self.clock.advance(2 * self.ttl)
-        if not self.referee.is_over(task_id) and not self.referee.found:
-            self.referee.say("E5", f"the end of {task_id} is never acknowledged")
 
-    def _wait_for_command(self, task_id: str, above: int, most: float) -> float | None:
-        """When a command with a token higher than ``above`` is accepted, if that is within ``most`` seconds."""
+    def _wait_for_command(self, task_id: str, why: str, above: int, since: float, within: float, most: float) -> bool:
+        """Wait ``most`` seconds for a command with a token ``above``, which is late ``within`` seconds of ``since``."""
         began = self.clock.seconds()
+        self.referee.history.note(Awaited, task_id, why, above, since, within)
         accepted = self.referee.accepted[task_id]
         while self.clock.seconds() - began < most:
             if accepted and accepted[-1][1] > above and accepted[-1][0] >= began:
-                return accepted[-1][0]
+                return True
             self.clock.advance(0.02)
-        return None
+        return False
 
     # -- troubles ---------------------------------------------------------------------------------------------------
 

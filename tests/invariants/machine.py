@@ -86,6 +86,10 @@ class Machine:
         """The world's moment at which this machine's clock shows ``moment``."""
         return (moment - self.offset) / self.rate + self._lost
 
+    def truly(self, moment: float) -> float:
+        """The world's moment at which a clock like this one that never stood still shows ``moment``."""
+        return (moment - self.offset) / self.rate
+
     def take(self, deliver: Callable[..., object], *arguments: Any) -> None:
         """Take a datagram: at once, or when the machine goes on, or never."""
         if self.is_still and len(self.backlog) >= self.MOST_WAITING:

@@ -1,8 +1,8 @@
-"""The workload of records: puts, removals and reads of all concerns, and D1 to D7 over what came of them."""
+"""The workload of records: puts, removals and reads of all concerns, and what came of them (D1 to D7)."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections import Counter
 from typing import Any
 
 from twisted.internet.defer import Deferred
@@ -10,28 +10,16 @@ from twisted.python.failure import Failure
 
 from middleware.entangled.errors import EntangledError, Unavailable
 from middleware.entangled.identity import Identity
-from middleware.entangled.kademlia.distance import closest
+from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.overlay import K
 from middleware.entangled.node import EntangledNode
-from middleware.entangled.record import Record, Slot, hashed_key
+from middleware.entangled.record import Record, hashed_key
+from sim.team.event import Counted, Met, Stored
+from sim.team.invariant.durability import Slot
 from tests.invariants.schedule import Schedule
 
 KEYS = [hashed_key(f"key {number}") for number in range(4)]
 NAMES = ("a", "b")
-
-
-@dataclass
-class _Slot:
-    """What is known of a slot: the last write that was begun, and the highest that was acknowledged or read.
-
-    ``values`` are the numbers of writes with a value; the others were removals.
-    """
-
-    begun: int = 0
-    floor: int = 0
-    seen: dict[EntangledNode, int] = field(default_factory=dict)
-    values: dict[int, bytes] = field(default_factory=dict)
-    started: dict[int, float] = field(default_factory=dict)
 
 
 class Records:
@@ -39,13 +27,13 @@ class Records:
 
     def __init__(self, schedule: Schedule) -> None:
         self._schedule = schedule
+        self._history = schedule.history
         self._rng = schedule.rng
-        self._slots: dict[Slot, _Slot] = {}
-        self._found: list[str] = []
+        self._written: Counter[Slot] = Counter()
         self._held: dict[tuple[int, int, Slot], tuple[int, bytes]] = {}
+        self._met: dict[int, set[Contact]] = {}
         self._old: list[Record] = []
-        self._is_over = False
-        self._finds: list[tuple[int, bytes, list[Any]]] = []
+        schedule.attend(lambda place, node: self._met.update({place: set()}), lambda place, node: None)
         if schedule.liar is not None:
             self._let_lie(schedule.node(schedule.liar))
 
@@ -55,120 +43,79 @@ class Records:
         for _ in range(self._rng.randrange(3)):
             if alive:
                 act = self._rng.choice([self._put, self._put, self._remove, self._read, self._read, self._meddle])
-                act(self._schedule.node(self._rng.choice(alive)))
+                act(self._rng.choice(alive))
         self._look()
 
     def settled(self) -> None:
         """Everybody reads everything, and looks up a few ids."""
-        self._is_over = True
         self._look()
-        alive = self._schedule.alive()
-        for place in alive:
+        for place in self._schedule.alive():
             for key in KEYS:
-                self._get(self._schedule.node(place), key, "majority")
-                self._get(self._schedule.node(place), key, "fast")
+                self._get(place, key, "majority")
+                self._get(place, key, "fast")
             for target in KEYS[:2]:
-                found: list[Any] = []
-                self._schedule.node(place).find_node(target).addBoth(found.append)
-                self._finds.append((place, target, found))
+                self._find(place, target)
 
     def verdict(self) -> list[str]:
-        """What was found, and the tables as they are now."""
-        alive = self._schedule.alive()
-        contacts = {place: self._schedule.node(place).contact for place in alive}
-        for place in alive:
-            others = sorted(contact.node_id for other, contact in contacts.items() if other != place)
-            known = [contact.node_id for contact in self._schedule.node(place).overlay.roster.live()]
-            if known != others:
-                self._say("D7", f"node {place} knows {len(known)} live members, there are {len(others)} others")
-        for place, target, found in self._finds:
-            truth = closest([c for other, c in contacts.items() if other != place], target, K)
-            if not found or found[0] != truth:
-                self._say("D6", f"node {place} does not find the closest to {target.hex()[:6]}: {found}")
-        return self._found
+        """The tables as they are now."""
+        for place in self._schedule.alive():
+            known = self._schedule.node(place).overlay.roster.live()
+            self._history.note(Counted, place, tuple(contact.node_id for contact in known))
+        return []
 
     # -- what clients do --------------------------------------------------------------------------------------------
 
-    def _put(self, node: EntangledNode) -> None:
+    def _put(self, place: int) -> None:
         key, name = self._rng.choice(KEYS), self._rng.choice(NAMES)
         concern = self._rng.choice(["majority", "majority", "majority", "all"])
-        self._write(node, key, name, concern)
+        self._write(place, key, name, concern)
 
-    def _remove(self, node: EntangledNode) -> None:
-        mine = [slot for slot in self._slots if slot.owner == node.identity.public]
+    def _remove(self, place: int) -> None:
+        mine = [slot for slot in self._written if slot.owner == self._schedule.node(place).identity.public]
         if mine:
             slot = self._rng.choice(mine)
-            self._write(node, slot.key, slot.name, "majority", is_removal=True)
+            self._write(place, slot.key, slot.name, "majority", is_removal=True)
 
-    def _write(self, node: EntangledNode, key: bytes, name: str, concern: Any, is_removal: bool = False) -> None:
-        slot = self._slots.setdefault(Slot(key, node.identity.public, name), _Slot())
-        slot.begun += 1
-        number = slot.begun
-        slot.started[number] = self._schedule.fleet.clock.seconds()
-        if is_removal:
-            stored = node.remove(key, name, concern)
-        else:
-            slot.values[number] = b"%d" % number
-            stored = node.put(key, name, slot.values[number], "team", concern)
-        stored.addCallbacks(lambda _: self._raise(slot, number), _weather)
+    def _write(self, place: int, key: bytes, name: str, concern: Any, is_removal: bool = False) -> None:
+        node = self._schedule.node(place)
+        slot = Slot(key, node.identity.public, name)
+        self._written[slot] += 1
+        number = self._written[slot]
+        asked = self._history.asked(place, "remove" if is_removal else "write", slot, number)
+        stored = node.remove(key, name, concern) if is_removal else node.put(key, name, b"%d" % number, "team", concern)
+        stored.addCallbacks(lambda _: self._history.answered(asked), self._failed, errbackArgs=(asked,))
 
-    def _raise(self, slot: _Slot, number: int) -> None:
-        slot.floor = max(slot.floor, number)
+    def _read(self, place: int) -> None:
+        self._get(place, self._rng.choice(KEYS), self._rng.choice(["majority", "majority", "fast"]))
 
-    def _read(self, node: EntangledNode) -> None:
-        self._get(node, self._rng.choice(KEYS), self._rng.choice(["majority", "majority", "fast"]))
-
-    def _get(self, node: EntangledNode, key: bytes, concern: Any) -> None:
-        floors = {
-            place: max(slot.floor, slot.seen.get(node, 0)) for place, slot in self._slots.items() if place.key == key
-        }
-        started = self._schedule.fleet.clock.seconds()
+    def _get(self, place: int, key: bytes, concern: Any) -> None:
+        node = self._schedule.node(place)
+        # Another life of a node is another client: what it has read itself it may have forgotten.
+        asked = self._history.asked((place, self._schedule.life[place]), "read", key, concern)
         work: Deferred[list[Record]] = node.get(key, concern)
-        work.addCallbacks(
-            lambda records: self._check(node, key, concern, records, floors, started),
-            lambda failure: self._failed(failure, key, concern),
-        )
+        work.addCallbacks(self._shown, self._failed, (asked,), {}, (asked,))
 
-    def _failed(self, failure: Failure, key: bytes, concern: str) -> None:
-        failure.trap(EntangledError)
-        if self._is_over:
-            what = "is not answered" if failure.check(Unavailable) else f"fails: {failure.value}"
-            self._say("D7", f"a {concern} read of {key.hex()[:6]} {what} after everything healed")
-
-    def _check(
-        self,
-        node: EntangledNode,
-        key: bytes,
-        concern: str,
-        records: list[Record],
-        floors: dict[Slot, int],
-        started: float,
-    ) -> None:
-        """Hold what a read gave against what was acknowledged before it began."""
-        there = {record.slot: int(record.value or b"0") for record in records}
-        for place, number in there.items():
-            if place not in self._slots or number not in self._slots[place].values:
-                self._say("D4", f"a read shows {place.name}={number}, which its owner never wrote")
-        is_sure = concern == "majority" or self._is_over
-        for place, floor in floors.items():
-            slot, shown = self._slots[place], there.get(place)
-            where = f"{concern} read of {place.key.hex()[:6]} {place.owner.hex()[:4]}/{place.name} at {started:.1f}"
-            removals = [n for n in range(max(floor, 1), slot.begun + 1) if n not in slot.values]
-            if shown is None:
-                # Absent is right only where a removal may be the newest, or nothing was acknowledged yet.
-                if floor and not removals and (is_sure or not there):
-                    self._say("D1", f"{where}: {floor} was acknowledged or read, nothing is found")
-            elif is_sure and shown < floor:
-                removed = floor not in slot.values
-                self._say("D3" if removed else "D2", f"{where}: shows {shown} after {floor}")
-            elif concern == "majority":
-                slot.seen[node] = max(slot.seen.get(node, 0), shown)
+    def _shown(self, records: list[Record], asked: int) -> None:
+        shown = {Slot(*record.slot): int(record.value or b"0") for record in records}
+        self._history.answered(asked, shown)
         self._old += [record for record in records if len(self._old) < 50]
 
-    def _meddle(self, node: EntangledNode) -> None:
+    def _failed(self, failure: Failure, asked: int) -> None:
+        failure.trap(EntangledError)
+        self._history.unanswered(asked, failure.value, failure.check(Unavailable) is not None)
+
+    def _find(self, place: int, target: bytes) -> None:
+        asked = self._history.asked(place, "look up", target, K)
+        self._schedule.node(place).find_node(target).addCallbacks(
+            lambda found: self._history.answered(asked, tuple(contact.node_id for contact in found)),
+            lambda failure: self._history.unanswered(asked, failure.value),
+        )
+
+    def _meddle(self, place: int) -> None:
         """A member stores what it must not: an old record of another, and one that it made up."""
         if not self._old:
             return
+        node = self._schedule.node(place)
         old = self._rng.choice(self._old)
         made_up = Record(old.key, old.name, old.owner, old.sequence + 99, "team", 60.0, b"77777", old.signature)
         for contact in node.overlay.responsible(old.key):
@@ -190,26 +137,20 @@ class Records:
 
     def _look(self) -> None:
         fleet = self._schedule.fleet
-        places = {fleet.identity(place).public: place for place in range(self._schedule.n)}
         for place in self._schedule.alive():
-            node = self._schedule.node(place)
-            for contact in node.overlay.contacts():
-                other = places.get(contact.public)
-                if other is None or other == place or contact.address != fleet.address(other):
-                    self._say("D5", f"node {place} has {contact.address} in its table")
+            met = self._met[place]
+            for contact in self._schedule.node(place).overlay.contacts():
+                if contact not in met:
+                    met.add(contact)
+                    self._history.note(Met, place, contact.public, str(contact.address))
+            memory = fleet.memory(place)
             for record in fleet.stores[place].records():
-                at = (place, fleet.memory(place), record.slot)
-                mark = (record.sequence, record.signature)
-                if record.lifetime == "team" and mark < self._held.get(at, mark):
-                    self._say("D4", f"node {place} went back to {mark[0]} in {record.name}")
-                if mark != self._held.get(at) and record.lifetime == "team" and not record.is_genuine():
-                    self._say("D4", f"node {place} holds a forged record in {record.name}")
-                self._held[at] = mark
-
-    def _say(self, invariant: str, text: str) -> None:
-        line = f"{invariant}: {text}"
-        if line not in self._found:
-            self._found.append(line)
+                at, mark = (place, memory, Slot(*record.slot)), (record.sequence, record.signature)
+                if mark != self._held.get(at):
+                    self._held[at] = mark
+                    is_lasting = record.lifetime == "team"
+                    is_genuine = not is_lasting or record.is_genuine()
+                    self._history.note(Stored, place, memory, at[2], record.name, *mark, is_lasting, is_genuine)
 
 
 def _weather(failure: Failure) -> None:

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import gc
-import multiprocessing
 import random
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Protocol
 
+from sim.team.shrink import WHOLE, Trim
+from sim.team.sweep import sweep
 from tests.fleet import Fleet
-from tests.invariants.bug import seeded
+from tests.invariants.bug import BUGS, FINDERS, seeded
 from tests.invariants.deciders import Deciders
 from tests.invariants.disk import DiskFleet
 from tests.invariants.groups import Groups
@@ -25,7 +25,13 @@ from tests.invariants.wire import Wire
 
 
 class Alone(Protocol):
-    """A workload with a world and faults of its own."""
+    """A workload with a world and faults of its own, which last so many ``seconds``."""
+
+    seconds: float
+
+    @property
+    def faults(self) -> Sequence[object]:
+        """What happens, or has happened, to it."""
 
     @property
     def digest(self) -> str:
@@ -43,20 +49,34 @@ WORKLOADS: dict[str, Callable[[Schedule], Workload]] = {
     "deciders": Deciders,
 }
 """Each may be asked for by name; the order is the one in which they act."""
-ALONE: dict[str, Callable[[int], Alone]] = {"tasks": Tasks, "leases": Leases, "groups": Groups}
+ALONE: dict[str, Callable[[int, Trim], Alone]] = {"tasks": Tasks, "leases": Leases, "groups": Groups}
 """Those that need no fleet: a world of their own beside it, with faults of its own."""
-SHARES = {"records": 1.0, "tuples": 0.06, "stores": 0.06, "wire": 0.06, "deciders": 0.06, "groups": 0.06}
+SHARES = {"records": 0.15, "tuples": 0.06, "stores": 0.06, "wire": 0.06, "deciders": 0.06, "groups": 0.06}
 """The share of schedules in which each takes part, unless it is asked for; those that are not here are in all."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of one schedule: its ``title``, the ``found`` violations, and the hash of every datagram in it."""
+    """What came of one schedule: its ``title``, the ``found`` violations, and the hash of every datagram in it.
+
+    ``names`` are its workloads, ``faults`` how many there were in the world that had most, ``seconds`` how long they
+    went on in the one where that was longest.
+    """
 
     seed: int
     title: str
     found: list[str]
     digest: str
+    names: tuple[str, ...] = ()
+    faults: int = 0
+    seconds: float = 0.0
+
+    @property
+    def worlds(self) -> list[tuple[str, ...]]:
+        """The workloads of each of its worlds, which know nothing of each other."""
+        alone = [(name,) for name in self.names if name in ALONE]
+        together = tuple(name for name in self.names if name in WORKLOADS)
+        return [*alone, together] if together else [*alone]
 
 
 def drawn(seed: int) -> list[str]:
@@ -68,34 +88,56 @@ def drawn(seed: int) -> list[str]:
     ]
 
 
-def run(seed: int, only: tuple[str, ...] = (), bug: str | None = None) -> Outcome:
-    """Run the schedule of ``seed``, with the workloads of ``only`` instead of those drawn, and with a bug put in."""
-    names = only or drawn(seed)
+def run(seed: int, only: tuple[str, ...] = (), bug: str | None = None, trim: Trim = WHOLE) -> Outcome:
+    """Run the schedule of ``seed``, with the workloads of ``only`` instead of those drawn, and with a bug put in.
+
+    ``trim`` says what is left of it; the workloads that it names are meant, whatever ``only`` says.
+    """
+    names = tuple(trim.only or only or drawn(seed))
     with seeded(bug):
-        alone = [ALONE[name](seed) for name in ALONE if name in names]
-        found_alone = [line for world in alone for line in world.run()]
-        if alone and len(names) == len(alone):
-            return Outcome(seed, "; ".join(map(str, alone)), found_alone, " ".join(world.digest for world in alone))
-        schedule = Schedule(seed, DiskFleet if "stores" in names else Fleet)
-        found = schedule.run([WORKLOADS[name](schedule) for name in WORKLOADS if name in names])
-    faults = "; ".join(map(str, schedule.faults))
-    title = f"n={schedule.n} {'+'.join(names)} {schedule.weather} faults: {faults}"
-    return Outcome(seed, title, found_alone + found, schedule.fleet.board.digest())
+        alone = [ALONE[name](seed, trim) for name in ALONE if name in names]
+        found = [line for world in alone for line in world.run()]
+        worlds: list[Alone | Schedule] = [*alone]
+        if len(names) > len(alone):
+            schedule = Schedule(seed, DiskFleet if "stores" in names else Fleet, trim)
+            found += schedule.run([WORKLOADS[name](schedule) for name in WORKLOADS if name in names])
+            worlds.append(schedule)
+            faults = "; ".join(map(str, schedule.faults))
+            title = f"n={schedule.n} {'+'.join(names)} {schedule.weather} faults: {faults}"
+            digest = schedule.fleet.board.digest()
+        else:
+            title, digest = "; ".join(map(str, alone)), " ".join(world.digest for world in alone)
+    most = max(len(world.faults) for world in worlds)
+    return Outcome(seed, title, found, digest, names, most, max(world.seconds for world in worlds))
 
 
-def run_all(seeds: range, jobs: int, only: tuple[str, ...] = (), bug: str | None = None) -> Iterator[Outcome]:
-    """Run many, ``jobs`` at a time, and give what came of each in the order of their seeds."""
-    one = partial(run, only=only, bug=bug)
-    if jobs == 1 or len(seeds) == 1:
-        _spare_the_collector()
-        yield from map(one, seeds)
-        return
-    # Not by forking: this may run in a process that has threads and a reactor's signal handlers, which a fork inherits.
-    with multiprocessing.get_context("spawn").Pool(jobs, _spare_the_collector) as pool:
-        yield from pool.imap(one, seeds)
+def run_all(
+    seeds: Sequence[int],
+    jobs: int,
+    only: tuple[str, ...] = (),
+    bug: str | None = None,
+    trim: Trim = WHOLE,
+    scheduler: str = "",
+) -> Iterator[Outcome]:
+    """Run many, ``jobs`` at a time or on the workers of a ``scheduler``; what came of each, in the order of seeds."""
+    return sweep(seeds, partial(run, only=only, bug=bug, trim=trim), jobs, scheduler)
 
 
-def _spare_the_collector() -> None:
-    """Look for garbage rarely: a schedule makes much that lives as long as it."""
-    gc.freeze()
-    gc.set_threshold(200_000, 20, 20)
+Hunted = tuple[str, tuple[str, ...], int, Outcome | None]
+"""A bug, the workloads that looked for it, how many schedules they took, and the one that showed it, if any did."""
+
+
+def hunt(number: int, seeds: Sequence[int]) -> Hunted:
+    """Look for the bug of this number, one schedule after the other."""
+    bug = list(BUGS)[number]
+    only = FINDERS.get(bug, ("records",))
+    for needed, seed in enumerate(seeds, start=1):
+        outcome = run(seed, only, bug)
+        if outcome.found:
+            return bug, only, needed, outcome
+    return bug, only, len(seeds), None
+
+
+def hunt_all(seeds: Sequence[int], jobs: int, scheduler: str = "") -> Iterator[Hunted]:
+    """Look for every bug, several at a time; what came of each in the order in which they are listed."""
+    return sweep(range(len(BUGS)), partial(hunt, seeds=seeds), jobs, scheduler)

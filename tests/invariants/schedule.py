@@ -15,6 +15,10 @@ from middleware.entangled.errors import NotRunning
 from middleware.entangled.network.network import Address
 from middleware.entangled.network.switchboard import CALM, Weather
 from middleware.entangled.node import EntangledNode
+from sim.team.checker import check
+from sim.team.event import Born, Died, Settled
+from sim.team.history import History
+from sim.team.shrink import WHOLE, Trim
 from tests.fleet import Fleet
 
 STRANDED = 0.15
@@ -29,7 +33,7 @@ Watcher = Callable[[int, EntangledNode], object]
 
 
 class Workload(Protocol):
-    """What clients do beside the faults, and what must hold of it."""
+    """What clients do beside the faults; they write down in the history what they asked for and what they got."""
 
     def step(self) -> None:
         """Do something, every ``STEP`` seconds while the faults last."""
@@ -38,7 +42,7 @@ class Workload(Protocol):
         """The faults are over and the repair interval has passed: ask what is to be asked; 10 s are left for it."""
 
     def verdict(self) -> list[str]:
-        """Every violation so far, a line each."""
+        """Write down how things stand at the end; what only the workload itself can judge, a line each."""
 
 
 @dataclass(frozen=True)
@@ -58,16 +62,19 @@ class Schedule:
     """The run of ``seed``: a fleet, its weather and its faults.
 
     ``workloads`` are made with the schedule when the fleet stands.  ``rng`` is for the first of them; the others have
-    dice of their own, so that the seeds that show a bug go on showing it.  ``world`` is what makes the nodes.
+    dice of their own, so that the seeds that show a bug go on showing it.  ``world`` is what makes the nodes;
+    ``life`` has the number of each place's present life.  ``trim`` says what is left of it.
     """
 
-    def __init__(self, seed: int, world: type[Fleet] = Fleet) -> None:
+    def __init__(self, seed: int, world: type[Fleet] = Fleet, trim: Trim = WHOLE) -> None:
         self.seed = seed
+        self.trim = trim
         self.rng = random.Random(f"invariants/{seed}")
         dice = random.Random(f"faults/{seed}")
         self.n = dice.choice([3, 4, 5, 5, 6, 7, 9, 10, 11])
         self.seconds = dice.choice([20.0, 30.0, 45.0])
         self.fleet = world(self.n, seed, Weather(delay_s=0.002))
+        self.history = History(self.fleet.clock.seconds)
         self.liar: int | None = dice.randrange(self.n) if dice.random() < 0.2 else None
         self.weather = Weather(
             delay_s=dice.choice([0.001, 0.01, 0.05]),
@@ -77,18 +84,18 @@ class Schedule:
             reorder=dice.choice([0.0, 0.2]),
         )
         self.faults = self._faults(dice)
+        if trim.calm:
+            self.weather = Weather(delay_s=self.weather.delay_s)
         dice = random.Random(f"stranded/{seed}")
         if dice.random() < STRANDED and self.n <= 7:
             self.faults += self._stranded(dice)
+        self.seconds = trim.within(self.seconds)
         self.down: set[int] = set()
         self.dead: set[int] = set()
+        self.life: dict[int, int] = {}
         self._on_birth: list[Watcher] = []
         self._on_death: list[Watcher] = []
-
-    @property
-    def line(self) -> str:
-        """The command that replays this run."""
-        return f"python -m tests.invariants --schedules 1 --seed {self.seed}"
+        self.attend(self._born, lambda place, node: self.history.note(Died, place, self.fleet.forgets(place)))
 
     def alive(self) -> list[int]:
         """The places whose nodes run."""
@@ -118,9 +125,9 @@ class Schedule:
         fleet = self.fleet
         fleet.run(2.0)
         fleet.board.weather = self.weather
+        kept = [(number, fault) for number, fault in enumerate(self.faults) if self.trim.keeps(number)]
         ahead = sorted(
-            [(fault.at, 0, number) for number, fault in enumerate(self.faults)]
-            + [(fault.until, 1, number) for number, fault in enumerate(self.faults)]
+            [(fault.at, 0, number) for number, fault in kept] + [(fault.until, 1, number) for number, fault in kept]
         )
         now = 0.0
         while now < self.seconds:
@@ -136,12 +143,13 @@ class Schedule:
         for place in sorted(self.down):
             self.restart(place)
         fleet.run(SETTLE)
+        self.history.note(Settled)
         for workload in workloads:
             workload.settled()
         fleet.run(10.0)
         found = [line for workload in workloads for line in workload.verdict()]
         fleet.stop()
-        return found
+        return found + check(self.history)
 
     def restart(self, place: int) -> None:
         """Let the node of a place live again, on the store of its former life."""
@@ -155,6 +163,11 @@ class Schedule:
         self.fleet.enter(node, self.addresses(known)).addErrback(lambda failure: failure.trap(NotRunning))
 
     # -- inside -----------------------------------------------------------------------------------------------------
+
+    def _born(self, place: int, node: EntangledNode) -> None:
+        life = self.life[place] = self.life.get(place, 0) + 1
+        identity, address = node.identity, self.fleet.address(place)
+        self.history.note(Born, place, life, identity.public, identity.node_id, str(address))
 
     def _faults(self, dice: random.Random) -> list[Fault]:
         places, faults = list(range(self.n)), []
@@ -198,7 +211,7 @@ class Schedule:
     def _begin(self, fault: Fault) -> None:
         board = self.fleet.board
         if fault.kind == "join":
-            place, *known = fault.places
+            place, *known = len(self.fleet.nodes), *fault.places[1:]
             if self.dead.issuperset(known):
                 known = self.alive()[:1]  # who knows nobody but the dead never gets in
             self._join(place, known)

@@ -1,4 +1,4 @@
-"""The workload of tasks: whole agents over an ether in memory, and E4, E5, E6 and E7 over all that they decided.
+"""The workload of tasks: whole agents over an ether in memory, and all that they decided and did (E4 to E7).
 
 It needs no fleet of nodes: ``python -m tests.invariants --only tasks`` runs it alone, a few milliseconds a schedule.
 """
@@ -21,6 +21,10 @@ from middleware.consensus.strategy import ConsensusAlgorithm
 from middleware.entangled.clock import HeapClock
 from middleware.order import PAUSE, RESUME, Order
 from middleware.tasks import CANCELLED, Member, Result, Task
+from sim.team.checker import check
+from sim.team.event import Born, Calm, Concluded, Decided, Died, Engaged, Expired, Open, Report
+from sim.team.history import History
+from sim.team.shrink import WHOLE, Trim
 from tests.invariants.ether import OPERATOR, Ether, Lessee, Node, Weather
 from tests.invariants.walk import Robot, restarted
 
@@ -34,7 +38,7 @@ HEARD = 3.0
 class Tasks:
     """One schedule: agents, tasks and faults from ``seed``."""
 
-    def __init__(self, seed: int) -> None:
+    def __init__(self, seed: int, trim: Trim = WHOLE) -> None:
         self.rng = random.Random(f"tasks/{seed}")
         self.clock = HeapClock()
         self.n = self.rng.choice([2, 3, 3, 4, 5])
@@ -42,14 +46,16 @@ class Tasks:
         self.robots = {place: Robot(self.clock, self.rng.uniform(-3.0, 3.0)) for place in range(1, self.n + 1)}
         self.agents: dict[int, Agent] = {}
         self.tasks: dict[str, Task] = {}
-        self.found: dict[str, None] = {}
+        self.history = History(self.clock.seconds)
         self.is_calm = self.rng.random() < 0.3
         self.trace: list[str] = []
-        self._decided: dict[tuple[object, ...], str] = {}
-        self._used: dict[tuple[str, str], tuple[float, dict[str, tuple[int, int]]]] = {}
-        self._over: dict[str, float] = {}
+        self.faults: list[str] = []
+        self.seconds = trim.within(FAULTS_S)
+        self._trim = trim
         self._acting: dict[str, tuple[int, int]] = {}
-        self._faulty_until = 0.0
+        self._acknowledged: dict[str, tuple[Result, float]] = {}
+        if self.is_calm:
+            self.history.note(Calm, HEARD + Lessee.TTL)
         for place in range(1, self.n + 1):
             self.birth(place)
 
@@ -57,10 +63,11 @@ class Tasks:
         """Everything; the violations."""
         with self._recorded():
             if not self.is_calm:
-                self.ether.weather = Weather(
-                    self.rng.choice([0.005, 0.05, 0.15]), self.rng.choice([0.0, 0.1, 0.3]), self.rng.choice([0.0, 0.2])
+                delay, loss, double = (
+                    self.rng.choice(some) for some in ([0.005, 0.05, 0.15], [0.0, 0.1, 0.3], [0.0, 0.2])
                 )
-            while self.clock.seconds() < FAULTS_S:
+                self.ether.weather = Weather(delay) if self._trim.calm else Weather(delay, loss, double)
+            while self.clock.seconds() < self.seconds:
                 self.step()
                 self.live(STEP)
             self.heal()
@@ -71,11 +78,12 @@ class Tasks:
             self.late()
             self.live(2.0)
         self.verdict()
-        return list(self.found)
+        return check(self.history)
 
     def __str__(self) -> str:
         """What kind of schedule it is."""
-        return f"{self.n} agents, {len(self.tasks)} tasks, {self.ether.weather}{', calm' if self.is_calm else ''}"
+        calm = ", calm" if self.is_calm else ""
+        return f"{self.n} agents, {len(self.tasks)} tasks{calm}, faults: {'; '.join(self.faults)}"
 
     @property
     def digest(self) -> str:
@@ -86,7 +94,7 @@ class Tasks:
 
     def birth(self, place: int) -> None:
         """Start an agent."""
-        self._used = {key: used for key, used in self._used.items() if key[0] != f"{place:040x}"}
+        self.history.note(Born, place)
         self.robots[place] = restarted(self.robots[place], self.clock)
         node: Any = Node(self.ether, place)
         self.ether.nodes[place] = node
@@ -96,6 +104,7 @@ class Tasks:
 
     def death(self, place: int) -> None:
         """End it without a word."""
+        self.history.note(Died, place)
         del self.ether.nodes[place]
         self.agents.pop(place).stopService()
 
@@ -123,15 +132,18 @@ class Tasks:
         """A member that goes, one that comes back, or a cut."""
         dice = self.rng.random()
         place = self.rng.randint(1, self.n)
-        if dice < 0.06:
-            if place in self.agents:
-                self.death(place)
-            else:
-                self.birth(place)
-        elif dice < 0.09:
+        if dice >= 0.09:
+            return
+        number = len(self.faults)
+        self.faults.append(f"{self.clock.seconds():.1f} {'dog' if dice < 0.06 else 'cut'}{place}")
+        if not self._trim.keeps(number):
+            return
+        if dice >= 0.06:
             self.ether.side = {place: 1} if not self.ether.side else {}
-        if dice < 0.09:
-            self._faulty_until = self.clock.seconds() + HEARD
+        elif place in self.agents:
+            self.death(place)
+        else:
+            self.birth(place)
 
     def submit(self) -> None:
         """A task of any kind of task."""
@@ -140,6 +152,7 @@ class Tasks:
     def enter(self, task: Task) -> None:
         """Make ``task`` one of the schedule's."""
         self.tasks[task.task_id] = task
+        self.history.asked("operator", "submit", task.task_id)
         self.ether.submit(task)
 
     def any_task(self) -> Task:
@@ -177,7 +190,7 @@ class Tasks:
         """Long after the end the outcome's record has run out, and the task is still listed by who was away."""
         for name in self.tasks:
             if self.ether.outcome(OPERATOR, name) is not None:
-                self._over.setdefault(name, self.clock.seconds())
+                self.history.note(Expired, name)
                 self.ether.forget(name)
 
     def live(self, seconds: float) -> None:
@@ -187,25 +200,30 @@ class Tasks:
             self.clock.advance(0.1)
             self.watch()
 
-    # -- what must hold ---------------------------------------------------------------------------------------------
+    # -- what everybody can see -------------------------------------------------------------------------------------
 
     def watch(self) -> None:
         """Look at every agent."""
         now = self.clock.seconds()
+        for name, known in self.ether.acknowledged.items():
+            if self._acknowledged.get(name) is not known:
+                self._acknowledged[name] = known
+                self.history.note(Concluded, name, known[0].outcome)
         for place, agent in sorted(self.agents.items()):
-            for name, part in agent._parts.items():
-                if part.engagement.course.state is not State.EXECUTING:
-                    continue
-                if name in self._over:
-                    self.say(f"E4: {name} is over and is begun again")
-                known = self.ether.acknowledged.get(name)
-                if known is not None and now > max(known[1], self._faulty_until) + HEARD + Lessee.TTL and self.is_calm:
-                    self.say(f"E5: {name} is executed although it ended {known[0].outcome}")
-                token = part.engagement.me.token
+            acting = [name for name, part in agent._parts.items() if part.engagement.course.state is State.EXECUTING]
+            holding = self.holding(agent)
+            if acting or len(holding) > 1:
+                self.history.note(Engaged, place, tuple(acting), holding)
+            for name in acting:
+                token = agent._parts[name].engagement.me.token
                 before = self._acting.get(name)
                 if before is None or before[1] < token:
                     self._acting[name] = place, token
                     self.trace.append(f"{now:.2f} {name} dog{place} {token}")
+
+    def holding(self, agent: Agent) -> tuple[str, ...]:
+        """The tasks whose leases an agent holds, where that is looked at."""
+        return ()
 
     @contextmanager
     def _recorded(self) -> Iterator[None]:
@@ -222,7 +240,7 @@ class Tasks:
         ) -> Decision:
             listed = list(members)
             decision: Decision = genuine(listed, strategy, hysteresis, period, since)
-            self.check(listed, decision, hysteresis)
+            self.decided(listed, decision, hysteresis)
             return decision
 
         place.decide = decide
@@ -233,45 +251,28 @@ class Tasks:
             place.decide = genuine
             del KINDS["walk"]
 
-    def check(self, members: list[Member], decision: Decision, hysteresis: float) -> None:
-        """Of the same reports the same, never by an older report, and nothing changes hands for little."""
-        me, others = members[0], members[1:]
+    def decided(self, members: list[Member], decision: Decision, hysteresis: float) -> None:
+        """Write down what an agent decided, and from what."""
+        me = members[0]
         group = ",".join(sorted(name for name, one in self.tasks.items() if one.title == self._title(me)))
-        now = self.clock.seconds()
-        at, used = self._used.get((me.uuid, group), (now, {}))
-        self._used[me.uuid, group] = now, {m.uuid: (m.epoch, m.serial) for m in others}
-        for other in others:
-            if now - at < 1.0 and (other.epoch, other.serial) < used.get(other.uuid, (0, 0)):
-                self.say(f"E7: {me.name} decides by a report of {other.name} that is older than one it had used")
-        if decision.assigned is None:
-            return
-        agreed = self._decided.setdefault(decision.basis, decision.assigned)
-        if agreed != decision.assigned:
-            self.say(f"E7: of the same reports {me.name} names another than the others")
-        bids = {m.uuid: m.cost for m in members if m.cost is not None}
+        reports = tuple(Report(m.uuid, m.name, m.epoch, m.serial, m.cost) for m in members)
         holders = decision.basis[2]
-        if isinstance(holders, tuple) and holders:
-            holder = holders[0][1]
-            if decision.assigned != holder and not bids[decision.assigned] < bids[holder] * (1.0 - hysteresis):
-                self.say(f"E6: {bids[holder]} gives way to {bids[decision.assigned]}")
+        holder = holders[0][1] if isinstance(holders, tuple) and holders else None
+        place = int(me.uuid, 16)
+        self.history.note(Decided, place, group, reports, decision.basis, decision.assigned, holder, hysteresis)
 
     def _title(self, me: Member) -> str:
         agent = self.agents[int(me.uuid, 16)]
         return next(name for name, part in agent._parts.items() if part.engagement.me is me)
 
     def verdict(self) -> None:
-        """E4: every task has an outcome, and the same everywhere."""
-        for name in self.tasks:
-            if name not in self._over:
-                states = {p: str(a._parts[name].engagement.course) for p, a in self.agents.items() if name in a._parts}
-                self.say(f"E4: {name} has no outcome: {states}")
+        """What agents still have open."""
         for place, agent in self.agents.items():
-            for name in agent._docket.open:
-                self.say(f"E4: dog{place} does not know that {name} is over")
-
-    def say(self, line: str) -> None:
-        """Note a violation, once."""
-        self.found.setdefault(line)
+            for name in self.tasks:
+                state = str(agent._parts[name].engagement.course) if name in agent._parts else ""
+                is_docketed = name in agent._docket.open
+                if state or is_docketed:
+                    self.history.note(Open, name, place, state, is_docketed)
 
 
 def faded(task: Task, **changes: Any) -> Task:

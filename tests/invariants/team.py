@@ -6,12 +6,15 @@ import random
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from twisted.internet.defer import Deferred
+
 from middleware.commitment.ballot import FIRST
 from middleware.commitment.council import Council
 from middleware.entangled.clock import HeapClock
 from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address
+from sim.team.event import Born, Died
 from tests.invariants.bidder import TICK, Bidder
 from tests.invariants.machine import Machine
 from tests.invariants.radio import Radio
@@ -43,8 +46,9 @@ class Team:
         self.agents = list(range(agents))
         self.has_stores = has_stores
         self.clock = HeapClock()
-        self.referee = Referee(self)
         self.radio = Radio(self.clock, random.Random(f"{seed}/radio"))
+        self.referee = Referee(self)
+        self.referee.agree()
         keys = random.Random(f"{seed}/keys")
         self.contacts = [Contact(keys.randbytes(32), Address("10.0.0.1", 7000 + n)) for n in range(self.n)]
         self.councils: dict[str, tuple[tuple[Contact, ...], int]] = {}
@@ -85,10 +89,16 @@ class Team:
         def arrive() -> None:
             peer = self.bidders[to]
 
-            def run() -> None:
-                answer = peer.answer(me.place, method, arguments)
+            def reply(answer: object) -> None:
                 if answer is not None:
                     self.radio.send(to, me.place, me.machine.take, answered, answer)
+
+            def run() -> None:
+                answer = peer.answer(me.place, method, arguments)
+                if isinstance(answer, Deferred):
+                    answer.addCallback(reply)
+                else:
+                    reply(answer)
 
             peer.machine.take(run)
 
@@ -114,11 +124,12 @@ class Team:
         self.bidders[place].machine.die()
         if not self.has_stores:
             self._stores[place] = MemoryStore()
-            self.referee.is_amnesiac = True
+        self.referee.history.note(Died, place, not self.has_stores)
 
     def born(self, place: int) -> Bidder:
         """The next life at a place."""
         self._lives += 1
+        self.referee.history.note(Born, place, self._lives)
         rng = random.Random(f"{self._seed}/{place}/{self._lives}")
         machine = Machine(self.clock, self._rates[place], rng.uniform(0.0, 1e4))
         return Bidder(self, place, machine, self._stores[place], rng)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable, Mapping
-from types import SimpleNamespace
 
 from twisted.internet.defer import Deferred, succeed
 
@@ -12,7 +11,7 @@ from agents.behaviour import STAND
 from agents.context import Context
 from drivers.driver import Permit
 from drivers.gate import Gate
-from drivers.reading import Action, Observation
+from drivers.reading import Action, Description, Observation
 from middleware.entangled.clock import HeapClock
 
 
@@ -58,7 +57,7 @@ class Robot:
     """A driver whose robot walks on a line."""
 
     def __init__(self, clock: HeapClock, place: float) -> None:
-        self.description = SimpleNamespace(capabilities={})
+        self.description = Description("walker", "", {}, {"base.vx": (-1.0, 1.0)}, 0.1)
         self.state = "ready"
         self.place = place
         self.drift = 0.0
@@ -100,10 +99,11 @@ class Robot:
         """Stand."""
         self._speed = 0.0
 
-    def act(self, action: Action, permit: Permit) -> None:
+    def act(self, action: Action, permit: Permit) -> Action:
         """Walk until the permit ends."""
         self._gate.admit(permit, self._clock.seconds())
         self._speed = action["base.vx"]
+        return action
 
     def _live(self) -> None:
         if self._is_on:

@@ -1,4 +1,4 @@
-"""The workload of the wire: shots of what no lawful node sends into live schedules, and R1 to R4 over what they do.
+"""The workload of the wire: shots of what no lawful node sends into live schedules, and what they do (R1 to R4).
 
 Shots are made of datagrams that were delivered: the same again, changed, cut short, sent to another node, or to the
 next life of the same one.  What a node would send because of a shot is held back, so a shot moves nothing but counters.
@@ -7,7 +7,7 @@ next life of the same one.  What a node would send because of a shot is held bac
 from __future__ import annotations
 
 import random
-from collections import Counter, deque
+from collections import deque
 from typing import Any
 
 from twisted.logger import ILogObserver, LogLevel, globalLogPublisher
@@ -19,6 +19,8 @@ from middleware.entangled.identity import Identity, exchange_key
 from middleware.entangled.kademlia.overlay import MAX_FOUND, K
 from middleware.entangled.network.network import Address
 from middleware.entangled.node import EntangledNode
+from middleware.entangled.reach.reach import MAX_FURTHER, MAX_KNOWN
+from middleware.entangled.reach.relay import MAX_PAIRS
 from middleware.entangled.wire.answerer import MAX_CANCELLED
 from middleware.entangled.wire.greeting import TOKEN_BYTES, who
 from middleware.entangled.wire.method import MAX_ENTRIES
@@ -32,6 +34,7 @@ from middleware.entangled.wire.session import (
     Invitation,
     derived_key,
 )
+from sim.team.event import Ran, Shot, Size, Strange
 from tests.fleet import TEAM
 from tests.fuzz.ground import state_of
 from tests.invariants.schedule import Schedule
@@ -64,14 +67,13 @@ class Wire:
         self._schedule = schedule
         self._board: Any = schedule.fleet.board
         self._rng = random.Random(f"wire/{schedule.seed}")
-        self._found: list[str] = []
+        self._history = schedule.history
         self._heard: dict[Address, dict[int, deque[tuple[float, Address, bytes]]]] = {}
         self._answered: list[tuple[Address, bytes]] | None = None
         self._sent_to_stranger = self._got_from_stranger = 0
         self._ear = Ear()
-        self._lives: Counter[int] = Counter()
+        self._states: dict[str, str] = {}
         self._born_at: dict[Address, float] = {}
-        self._runs: Counter[tuple[int, int, int]] = Counter()
         self._number = 0
         carry, deliver = self._board._carry, self._board._deliver
 
@@ -114,17 +116,12 @@ class Wire:
         self._flood(self._rng.choice(alive))
 
     def verdict(self) -> list[str]:
-        """What was found, and the sizes of the tables."""
-        for (place, _, number), runs in self._runs.items():
-            if runs > 1:
-                self._say("R2", f"node {place} ran question {number} {runs} times")
-        if self._sent_to_stranger > self._got_from_stranger:
-            self._say("R3", f"{self._sent_to_stranger} bytes to a stranger who sent {self._got_from_stranger}")
+        """The bytes of the stranger, and the sizes of the tables."""
+        self._history.note(Strange, self._sent_to_stranger, self._got_from_stranger)
         for place in self._schedule.alive():
             for what, size, cap in self._tables(self._schedule.node(place)):
-                if size > cap:
-                    self._say("R4", f"node {place} remembers {size} {what}, {cap} are allowed")
-        return self._found
+                self._history.note(Size, place, what, size, cap)
+        return []
 
     # -- shots (R1, R3) ---------------------------------------------------------------------------------------------
 
@@ -137,22 +134,19 @@ class Wire:
         kind, source, datagram = shot
         node = self._schedule.node(place)
         receiver = node._network.receiver  # type: ignore[attr-defined]
-        before = self._state(node)
+        before, raised = self._state(node), ""
         self._answered = []
         globalLogPublisher.addObserver(self._ear)
         try:
             receiver(datagram, source)
         except Exception as error:  # whatever it is, it must not come out
-            self._say("R1", f"a {kind} datagram raises {error!r}")
+            raised = repr(error)
         finally:
             globalLogPublisher.removeObserver(self._ear)
         answered, self._answered = self._answered, None
-        if self._state(node) != before:
-            self._say("R1", f"a {kind} datagram of type {datagram[:1].hex()} changes node {place}")
-        if self._ear.heard:
-            self._say("R1", f"a {kind} datagram is logged: {self._ear.heard.pop()}")
-        if sum(len(answer) for _, answer in answered) > len(datagram) or any(to != source for to, _ in answered):
-            self._say("R3", f"a {kind} datagram of {len(datagram)} bytes is answered with {answered}")
+        logged = self._ear.heard.pop() if self._ear.heard else ""
+        answers = tuple((to == source, len(answer)) for to, answer in answered)
+        self._history.note(Shot, place, kind, datagram, before, self._state(node), raised, logged, answers)
 
     def _made(self, own: Address) -> tuple[str, Address, bytes] | None:
         """A shot for the node at ``own``: what it is, where it seems to come from, and its bytes."""
@@ -180,14 +174,16 @@ class Wire:
         elif kind == "truncated":
             datagram = datagram[: rng.randrange(len(datagram))]
         elif kind == "malformed":
-            datagram = bytes([rng.choice([0, 0x11, 0x12, 0x13, 0x14, 0x15, 0x16, 0xFF])]) + rng.randbytes(
+            datagram = bytes([rng.choice([0, 0x11, 0x12, 0x13, 0x14, 0x15, 0x16, 0x19, 0x1A, 0xFF])]) + rng.randbytes(
                 rng.choice([0, 1, 28, 29, 80, 600, 1300, 3000])
             )
         return kind, source or sender, datagram
 
     def _state(self, node: EntangledNode) -> str:
+        """What stands for all that a node remembers: equal states have an equal name, the same in every process."""
         clock = self._schedule.fleet.clock
-        return state_of([node, node.store, sorted((time, order) for time, order, call in clock._heap if call.active())])
+        calls = sorted((time, order) for time, order, call in clock._heap if call.active())
+        return self._states.setdefault(state_of([node, node.store, calls]), f"state {len(self._states)}")
 
     def _flood(self, place: int) -> None:
         """Begin more handshakes at once than a node answers; each is from a member that nobody knows."""
@@ -199,19 +195,17 @@ class Wire:
             datagram = Invitation(own, static, dice.randbytes(32), number, b"").datagram()
             self._got_from_stranger += len(datagram)
             node._network.receiver(datagram, STRANGER)  # type: ignore[attr-defined]
-        half_open = node.endpoint._half_open._unconfirmed
-        if len(half_open) > FLOOD * 4 // 5:
-            self._say("R4", f"node {place} began {len(half_open)} handshakes at once with who showed no cookie")
+        half_open = len(node.endpoint._half_open._unconfirmed)
+        self._history.note(Size, place, "handshakes with who showed no cookie", half_open, FLOOD * 4 // 5)
 
     # -- questions (R2) ---------------------------------------------------------------------------------------------
 
     def _born(self, place: int, node: EntangledNode) -> None:
-        self._lives[place] += 1
         self._born_at[self._schedule.fleet.address(place)] = self._schedule.fleet.clock.seconds()
-        life = self._lives[place]
+        life = self._schedule.life[place]
 
         def run(peer: object, number: int) -> int:
-            self._runs[place, life, number] += 1
+            self._history.note(Ran, place, life, number)
             return number
 
         node.endpoint.expose("run", run, changes=True)
@@ -221,16 +215,19 @@ class Wire:
 
     def _ask(self, asker: int, answerer: int) -> None:
         self._number += 1
-        number, life = self._number, self._lives[answerer]
+        number, life = self._number, self._schedule.life[answerer]
         contact = self._schedule.node(answerer).contact
+        asked = self._history.asked(asker, "run", number)
 
         def answered(answer: object) -> None:
-            runs = self._runs[answerer, life, number]
-            if answer != number or (runs != 1 and self._lives[answerer] == life):
-                self._say("R2", f"question {number} was answered with {answer!r} and ran {runs} times")
+            self._history.answered(asked, (answer, answerer, life, self._schedule.life[answerer]))
 
-        asked = self._schedule.node(asker).endpoint.ask(contact, "run", number, changes=True)
-        asked.addCallbacks(answered, _weather)
+        asking = self._schedule.node(asker).endpoint.ask(contact, "run", number, changes=True)
+        asking.addCallbacks(answered, self._failed, errbackArgs=(asked,))
+
+    def _failed(self, failure: Failure, asked: int) -> None:
+        failure.trap(EntangledError)
+        self._history.unanswered(asked, failure.value)
 
     # -- tables (R4) ------------------------------------------------------------------------------------------------
 
@@ -248,15 +245,11 @@ class Wire:
             ("questions", len(answerer._ledger), MAX_ENTRIES),
             ("cancelled questions", len(answerer._cancelled), MAX_CANCELLED),
             ("found keys", len(node.overlay._found), MAX_FOUND),
+            *_ways(node),
             ("rows", usage.rows, usage.max_rows),
             ("bytes", usage.bytes, usage.max_bytes),
             *(("contacts in a bucket", len(bucket.entries), K) for bucket in _buckets(node)),
         ]
-
-    def _say(self, invariant: str, text: str) -> None:
-        line = f"{invariant}: {text}"
-        if line not in self._found:
-            self._found.append(line)
 
 
 def _buckets(node: EntangledNode) -> list[Any]:
@@ -264,5 +257,12 @@ def _buckets(node: EntangledNode) -> list[Any]:
     return list(table._buckets)
 
 
-def _weather(failure: Failure) -> None:
-    failure.trap(EntangledError)
+def _ways(node: EntangledNode) -> list[tuple[str, int, int]]:
+    reach: Any = node.reach
+    tables = ("_namers", "_carriers", "_upgrades", "_punched", "_seen", "_told_at", "_buckets")
+    return [
+        ("peers by their ids", len(reach._ids), MAX_PEERS),
+        ("pairs that are carried for", len(reach.relay), MAX_PAIRS),
+        ("fresh ports", len(reach._further), MAX_FURTHER),
+        *((f"ways ({name})", len(getattr(reach, name)), MAX_KNOWN) for name in tables),
+    ]

@@ -1,8 +1,10 @@
-"""Demonstration: what the tests of the whole demonstration in a real browser share: its processes, and their page."""
+"""Demonstration: what the tests of the whole demonstration share: its processes, and their page in a real browser."""
 
 from __future__ import annotations
 
 import json
+import os
+import ssl
 import subprocess
 import sys
 import threading
@@ -10,39 +12,65 @@ import urllib.request
 from pathlib import Path
 from typing import Any
 
+from twisted.trial.unittest import SynchronousTestCase
+
 from tests.live.page import BrowserCase
 
 PATIENCE_MS = 30_000
 
 
-class Demonstration:
-    """``python -m sim.demo`` as a child process; ``invitation`` is the address that it prints, with the code."""
+def stretch() -> float:
+    """How much longer all takes here, as the machine has more to do than it has cores; 1 where it has not."""
+    return max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
 
-    def __init__(self, log: Path, *options: str) -> None:
+
+class Demonstration:
+    """``python -m sim.demo`` as a child process; ``invitation`` is the address that it prints, with the code.
+
+    With ``is_secure`` it serves its page over TLS as well, and the invitation leads there.
+    """
+
+    def __init__(self, log: Path, *options: str, is_secure: bool = False) -> None:
         with log.open("w", encoding="utf-8") as errors:
-            command = [sys.executable, "-m", "sim.demo", "--web-port", "0", *options]
+            # The page is the same whatever the three are, and the dogs of the yard weigh least.
+            command = [sys.executable, "-m", "sim.demo", "--robot", "sim", "--web-port", "0", *options]
+            command += ["--tls"] if is_secure else []
             root = Path(__file__).parents[2]
             self._process = subprocess.Popen(command, cwd=root, stdout=subprocess.PIPE, stderr=errors, text=True)
         self.pid = self._process.pid
+        # Whether a browser may trust the certificate is shown elsewhere; here it is only the way to the camera.
+        self._trust = ssl.create_default_context()
+        self._trust.check_hostname, self._trust.verify_mode = False, ssl.CERT_NONE
+        self._token = ""
+        try:
+            self.invitation = self._invitation("Over TLS: " if is_secure else "The page: ", log)
+            self.url, _, self.code = self.invitation.partition("#code=")
+            self._token = self.api("session", {"code": self.code})["token"]
+        except BaseException:
+            self.stop()
+            raise
+
+    def _invitation(self, begins: str, log: Path) -> str:
+        """The address in the line that begins so."""
         assert self._process.stdout is not None
         said = []
         for line in self._process.stdout:
             said.append(line)
-            if line.startswith("The page: "):
+            if line.startswith(begins):
                 break
+            if line.startswith("If the node that serves"):
+                raise AssertionError("".join(said))  # no address is said after that
         else:
             raise AssertionError("".join(said) + log.read_text(encoding="utf-8"))
         threading.Thread(target=self._process.stdout.read, daemon=True).start()
-        self.invitation = said[-1].split()[2]
-        self.url, _, self.code = self.invitation.partition("#code=")
-        self._token = ""
-        self._token = self.api("api/v1/session", json.dumps({"code": self.code}).encode())["token"]
+        return said[-1].split()[2]
 
-    def api(self, path: str, body: bytes | None = None) -> Any:
-        """What the page's node answers an operator."""
+    def api(self, path: str, body: Any = None) -> Any:
+        """What the node of the page at ``url`` answers an operator; ``body`` is sent as JSON."""
         headers = {"Content-Type": "application/json", "Authorization": f"Bearer {self._token}"}
-        asked = urllib.request.Request(self.url + path, body, headers)
-        with urllib.request.urlopen(asked, timeout=5) as answer:
+        data = None if body is None else json.dumps(body).encode()
+        asked = urllib.request.Request(f"{self.url}api/v1/{path}", data, headers)
+        with urllib.request.urlopen(asked, timeout=20, context=self._trust) as answer:
             return json.load(answer)
 
     def stop(self) -> None:
@@ -51,16 +79,21 @@ class Demonstration:
         self._process.wait(20)
 
 
-class DemonstrationCase(BrowserCase):
-    """The demonstration, started with ``options``, and a browser."""
+class DemonstrationCase(SynchronousTestCase):
+    """The demonstration, started with ``options``, over TLS as well where it ``is_secure``."""
 
     options: tuple[str, ...] = ()
+    is_secure = False
 
     def setUp(self) -> None:
-        log, run_dir = Path(self.mktemp()), Path(self.mktemp()).absolute()
-        self.demo = Demonstration(log, "--run-dir", str(run_dir), *self.options)
-        self.addCleanup(self.demo.stop)
         super().setUp()
+        log, run_dir = Path(self.mktemp()), Path(self.mktemp()).absolute()
+        self.demo = Demonstration(log, "--run-dir", str(run_dir), *self.options, is_secure=self.is_secure)
+        self.addCleanup(self.demo.stop)
+
+
+class DemonstrationPageCase(BrowserCase, DemonstrationCase):
+    """The demonstration, and a browser."""
 
     def opened(self, screen: dict[str, Any], scheme: Any = "light") -> Any:
         """The page, signed in, when it shows the team."""

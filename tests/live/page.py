@@ -23,7 +23,7 @@ PHONE = {"viewport": {"width": 412, "height": 839}, "has_touch": True}
 TABLET = {"viewport": {"width": 820, "height": 1180}, "has_touch": True}
 DESK = {"viewport": {"width": 1280, "height": 800}}
 VIEWS = ("tasks", "cameras", "map", "groups", "network", "events", "more", "devices")
-PATIENCE_MS = 20_000
+PATIENCE_MS = 45_000
 """How long a page is waited for on a machine that has more to do; where it is in time nothing waits for that."""
 MISSING = [
     *(() if CHROMIUM else ("the program chromium (apt-get install chromium)",)),
@@ -154,9 +154,14 @@ class TeamCase(SynchronousTestCase):
 class PageCase(BrowserCase, TeamCase):
     """Such a page, and a browser."""
 
+    def note(self, words: Any) -> None:
+        """Take note of what the page's console calls an error, and of where it comes from."""
+        if words.type == "error":
+            self.faults.append(f"{words.text} {words.location['url']}")
+
     def opened(self, screen: dict[str, Any], scheme: Any = "light") -> Any:
         """The page, signed in, when it shows the team."""
         page = self.tab(screen, scheme)
-        page.on("console", lambda words: self.faults.append(words.text) if words.type == "error" else None)
+        page.on("console", self.note)
         page.goto(f"{self.team.url}#code={self.team.code}")
         return self.live(page)

@@ -169,7 +169,7 @@ def lost(photographer: Photographer, demo: Demonstration) -> None:
     name = photographer.executing(desk)
     phones["dark"].locator(".point[data-agree=true]").wait_for()
     groups = photographer.seen(phones["dark"])
-    uuid = next(device["uuid"] for device in demo.api("api/v1/devices") if device["name"] == name)
+    uuid = next(device["uuid"] for device in demo.api("devices") if device["name"] == name)
     desk.evaluate(f"location.hash = 'device/{uuid}'")
     desk.locator(".chaos button").first.wait_for()
     desk.get_by_role("button", name="Cut radio").click()
@@ -194,7 +194,7 @@ def lost(photographer: Photographer, demo: Demonstration) -> None:
 
 def opened(photographer: Photographer, demo: Demonstration) -> None:
     """A device's dialog."""
-    (uuid,) = [device["uuid"] for device in demo.api("api/v1/devices") if device["name"] == "dog2"]
+    (uuid,) = [device["uuid"] for device in demo.api("devices") if device["name"] == "dog2"]
     for screen, scheme, name in ((DESK, "dark", "device-desktop"), (PHONE, "light", "device-phone")):
         page = photographer.opened(screen, scheme)
         page.evaluate(f"location.hash = 'device/{uuid}'")

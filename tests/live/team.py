@@ -28,6 +28,7 @@ from twisted.internet.threads import deferToThread
 from twisted.protocols.basic import LineReceiver
 
 from middleware.fault import KINDS
+from swarmnode.gateway import sides
 from webnode.board import (
     Board,
     Knob,
@@ -323,9 +324,9 @@ def board(team: Team) -> Board:
     desk.together["yard"] = [{"id": "t1", "title": "Find and touch the red target"}]
     sessions = SignedSessions(b"a team of the tests", "quiet-otter", PASSWORD, random.Random(), checked)
     tuning = MemoryTuning({able[0]["uuid"]: KNOBS})
-    survey = MemorySurvey(network(), {f"0{n}" * 16: inventory() for n in (1, 2)})
+    survey = MemorySurvey(network(), {f"0{n}" * 16: inventory() for n in (1, 2)}, links(), membership())
     parts: dict[str, Any] = {"halts": team.halts, "tuning": tuning, "survey": survey, "chronicle": TeamChronicle()}
-    parts["faults"], parts["phones"] = MemoryFaults(*KINDS), MemoryPhones()
+    parts["faults"], parts["phones"] = MemoryFaults(*KINDS), MemoryPhones(check=sides)
     return Board(desk, sessions, MemoryAudit(time.time), limits=AddressLimits(), **parts)
 
 
@@ -351,6 +352,55 @@ def network() -> Any:
 
     lookup = {"key": "3fa2" * 10, "asked": 5, "hops": 2, "found": 8, "ms": 12.4}
     return {"devices": {uuids[1]: view((2, 3), [lookup]), uuids[2]: view((1,), [])}, "silent": [uuids[3]]}
+
+
+def links() -> Any:
+    """The page's node reaches three in three ways; one was put out, and a code was no good."""
+    vaio, uuids = "0a" * 16, {n: f"0{n}" * 16 for n in (1, 2, 3)}
+
+    def way(n: int, kind: str, score: int | None, rtt: float | None = None, by: str = "") -> dict[str, Any]:
+        loss = None if score is None else 0.0 if score > 90 else 0.2
+        told = {"uuid": uuids[n], "name": f"dog{n}", "way": kind, "by": by, "address": "192.0.2.1:8484"}
+        return told | {
+            "for_s": None if kind == "none" else 150.0,
+            "score": score,
+            "loss": loss,
+            "rtt_ms": rtt,
+            "jitter_ms": rtt and rtt / 10,
+        }
+
+    def refusal(side: str, who: str, code: str, why: str, remedy: str, times: int = 1) -> dict[str, Any]:
+        told = {"who": who, "at": "192.0.2.66:8484", "side": side, "code": code, "why": why, "remedy": remedy}
+        return told | {"ago_s": 200.0, "count": times}
+
+    out = refusal(
+        "we", "dog9", "revoked", "the operator revoked the certificate", "only a new invitation lets it in", 3
+    )
+    own = [way(1, "lan", 98, 1.8), way(2, "punched", 63, 42.0), way(3, "carried", 24, 110.0, "dog1")]
+    code = refusal("code", "", "used", "this code was used as often as it may be", "ask the operator for another one")
+    devices = {
+        vaio: {"links": own, "refusals": [out, code]},
+        uuids[1]: {"links": [way(2, "tunnel", 88, 12.0)], "refusals": [out]},
+        uuids[2]: {"links": [way(1, "tunnel", 70, 14.0), way(3, "none", None)], "refusals": []},
+    }
+    return {"here": vaio, "devices": devices, "silent": [uuids[3]]}
+
+
+def membership() -> Any:
+    """A closed team; the certificate of one member is about to expire."""
+    now = time.time()
+    members = [
+        {
+            "uuid": f"0{n}" * 16,
+            "name": f"dog{n}",
+            "roles": ["device"] + ["bootstrap"] * (n == 1),
+            "until": int(now + days * 86_400 + 3600),
+            "is_ending": days < 14,
+        }
+        for n, days in ((2, 9), (1, 365), (7, 365))
+    ]
+    told = {"kind": "closed", "name": "yard", "fingerprint": "1a2b3c4d5e6f7081", "me": "0a" * 16}
+    return told | {"until": int(now + 4e7), "is_ending": False, "known": 3, "members": members}
 
 
 def inventory() -> Any:

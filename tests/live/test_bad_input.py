@@ -14,6 +14,8 @@ from pathlib import Path
 
 from twisted.trial.unittest import SynchronousTestCase
 
+from drivers.registry import kinds
+
 ROOT = Path(__file__).resolve().parents[2]
 PATIENCE_S = 30.0
 
@@ -61,12 +63,12 @@ class BadInputTests(LiveTests):
 
     def test_unknown_key(self) -> None:
         """An unknown key: file, key, nearest key."""
-        path = self.file('[node]\nname = "a"\nprot = 7000\n')
+        path = self.file('[node]\nname = "a"\nteam_key = "t"\nprot = 7000\n')
         self.assert_says(self.refused("--config", path), path, "[node] prot", "the nearest is port")
 
     def test_wrong_type(self) -> None:
         """A wrong type: file, key, what to write."""
-        path = self.file('[node]\nname = "a"\nport = "many"\n')
+        path = self.file('[node]\nname = "a"\nteam_key = "t"\nport = "many"\n')
         self.assert_says(self.refused("--config", path), path, "[node] port", "write a number")
 
     def test_missing_name(self) -> None:
@@ -78,7 +80,7 @@ class BadInputTests(LiveTests):
         with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as taken:
             taken.bind(("127.0.0.1", 0))
             port = taken.getsockname()[1]
-            path = self.file(f'[node]\nname = "a"\nport = {port}\n')
+            path = self.file(f'[node]\nname = "a"\nteam_key = "t"\nport = {port}\n')
             line = self.refused("--config", path)
         self.assert_says(line, path, "[node] port", str(port), "choose another port, or 0")
 
@@ -88,15 +90,15 @@ class BadInputTests(LiveTests):
             taken.bind(("127.0.0.1", 0))
             taken.listen()
             port = taken.getsockname()[1]
-            path = self.file(f'[node]\nname = "a"\nroles = ["web"]\n[web]\nport = {port}\n')
+            path = self.file(f'[node]\nname = "a"\nteam_key = "t"\nroles = ["web"]\n[web]\nport = {port}\n')
             line = self.refused("--config", path)
         self.assert_says(line, path, "[web] port", str(port), "choose another port, or 0")
 
     def test_address_of_another_machine(self) -> None:
         """An address that this machine has not: file, and an address to be given, not a port."""
         for text, key in (
-            ('[node]\nname = "a"\nhost = "192.0.2.1"\n', "[node]"),
-            ('[node]\nname = "a"\nroles = ["web"]\n[web]\nhost = "192.0.2.1"\nport = 0\n', "[web]"),
+            ('[node]\nname = "a"\nteam_key = "t"\nhost = "192.0.2.1"\n', "[node]"),
+            ('[node]\nname = "a"\nteam_key = "t"\nroles = ["web"]\n[web]\nhost = "192.0.2.1"\nport = 0\n', "[web]"),
         ):
             path = self.file(text)
             line = self.refused("--config", path)
@@ -107,22 +109,22 @@ class BadInputTests(LiveTests):
         """A SQLite file of another program: file, key, the store's name."""
         with closing(sqlite3.connect(self.folder / "birds.sqlite")) as connection:
             connection.execute("CREATE TABLE birds(name TEXT)")
-        path = self.file('[node]\nname = "a"\nstore = "birds.sqlite"\n')
+        path = self.file('[node]\nname = "a"\nteam_key = "t"\nstore = "birds.sqlite"\n')
         self.assert_says(self.refused("--config", path), path, "[node] store", "birds.sqlite", "name another file")
 
     def test_unknown_agent(self) -> None:
         """An unknown agent: file, key, those there are."""
-        path = self.file('[node]\nname = "a"\n[driver]\nkind = "sim"\n[agent]\nmodule = "serch"\n')
+        path = self.file('[node]\nname = "a"\nteam_key = "t"\n[driver]\nkind = "sim"\n[agent]\nmodule = "serch"\n')
         self.assert_says(self.refused("--config", path), path, "[agent] module", "there are search")
 
     def test_unknown_driver(self) -> None:
         """An unknown kind of robot: file, key, those there are."""
-        path = self.file('[node]\nname = "a"\n[driver]\nkind = "simm"\n')
-        self.assert_says(self.refused("--config", path), path, "[driver]", "known are phone, sim")
+        path = self.file('[node]\nname = "a"\nteam_key = "t"\n[driver]\nkind = "simm"\n')
+        self.assert_says(self.refused("--config", path), path, "[driver]", "known are " + ", ".join(kinds()))
 
     def test_name_without_address(self) -> None:
         """A known node whose name nobody can resolve: file, key, what to write."""
-        path = self.file('[node]\nname = "a"\nknown_nodes = ["no-such-host.invalid:7000"]\n')
+        path = self.file('[node]\nname = "a"\nteam_key = "t"\nknown_nodes = ["no-such-host.invalid:7000"]\n')
         line = self.refused("--config", path)
         self.assert_says(line, path, "[node] known_nodes", "no-such-host.invalid", "write the address in figures")
 
@@ -135,7 +137,9 @@ class UnreachableBootstrapTests(LiveTests):
         with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as silent:
             silent.bind(("127.0.0.1", 0))
             port = silent.getsockname()[1]
-            child = self.start("--name", "a", "--known-nodes", f"127.0.0.1:{port}", "--store", "a.sqlite")
+            child = self.start(
+                "--name", "a", "--team-key", "t", "--known-nodes", f"127.0.0.1:{port}", "--store", "a.sqlite"
+            )
             self.addCleanup(child.kill)
             assert child.stdout is not None and child.stderr is not None
             self.addCleanup(child.stdout.close)

@@ -28,7 +28,7 @@ class ControlTests(SynchronousTestCase):
     def start(self, *flags: str) -> subprocess.Popen[bytes]:
         """A node that has joined."""
         twistd = str(Path(sys.executable).parent / "twistd")
-        flags = flags or ("--name", "a", "--store", "a.sqlite")
+        flags = flags or ("--name", "a", "--store", "a.sqlite", "--team-key", "t")
         command = [sys.executable, twistd, "-n", "--pidfile=", "swarm-node", *flags]
         child = subprocess.Popen(
             command, cwd=self.runtime, env=self.environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
@@ -85,13 +85,13 @@ class ControlTests(SynchronousTestCase):
 
     def test_operator_pushes_to_a_running_node(self) -> None:
         """A node that trusts its own operator runs what is pushed, shows it, goes back, and has it after a SIGKILL."""
-        child = self.start("--name", "a", "--store", "a.sqlite")
+        child = self.start()
         key = json.loads(self.said("deploy", "keys", "--json"))["a"]
         child.kill()
         child.wait()
         settings = self.runtime / "a.toml"
         table = f'[deployment]\nallow = true\noperators = ["{key}"]\nmodules = ["mine"]\n'
-        settings.write_text(f'[node]\nname = "a"\nstore = "a.sqlite"\n{table}')
+        settings.write_text(f'[node]\nname = "a"\nteam_key = "t"\nstore = "a.sqlite"\n{table}')
         child = self.start("--config", str(settings))
         module = self.runtime / "mine.py"
         for number in (1, 2):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from tests.live.demonstration import DemonstrationCase
+from tests.live.demonstration import DemonstrationPageCase
 from tests.live.page import DESK, PHONE
 
 SMALL = """index => {
@@ -39,7 +39,7 @@ STANDING = 1500.0
 """Milliseconds in which all stand: 200 to brake; the view from above is 200 old, and more on a busy machine."""
 
 
-class DemonstrationPageTests(DemonstrationCase):
+class DemonstrationPageTests(DemonstrationPageCase):
     def assert_sound(self, page: Any, when: str) -> None:
         """Axe finds nothing, and nothing is wider than the screen or cut off in its own box."""
         from axe_playwright_python.sync_playwright import Axe
@@ -103,7 +103,7 @@ class DemonstrationPageTests(DemonstrationCase):
     def test_be_looked_at_from_a_desk(self) -> None:
         """On a desk: devices in the order of joining, three cameras whose views move as the dogs search, the map."""
         page = self.opened(DESK)
-        devices = self.demo.api("api/v1/devices")
+        devices = self.demo.api("devices")
         self.assertEqual(page.locator(".device b").all_inner_texts(), [device["name"] for device in devices])
         joined = [device["joined"] for device in devices]
         self.assertEqual(joined, sorted(joined))

@@ -8,7 +8,7 @@ import time
 from typing import Any
 
 from benchmarks.demo import family
-from tests.live.demonstration import DemonstrationCase
+from tests.live.demonstration import DemonstrationPageCase, stretch
 from tests.live.page import DESK, BrowserCase, Team
 
 NAMES = ("vaio", "pi")
@@ -102,8 +102,8 @@ class FallbackTests(BrowserCase):
     def test_open_while_the_node_is_gone(self) -> None:
         """Where the browser keeps the page, it opens at the address of a node that is gone, and finds the other."""
         self.opened()
-        # The last of what is asked for in advance.
-        self.page.wait_for_function("async () => (await caches.open('swarm.shell')).match('/static/phone.css')")
+        # The page itself is kept with all its files or not at all.
+        self.page.wait_for_function("async () => (await caches.open('swarm.shell')).match('/')")
         self.page.evaluate("navigator.serviceWorker.ready.then(() => true)")
         os.kill(self.pid(0), signal.SIGKILL)
         self.page.reload()
@@ -116,12 +116,7 @@ class FallbackTests(BrowserCase):
         self.assertEqual([path for path in kept if path != "/" and not path.startswith("/static/")], [])
 
 
-def stretch() -> float:
-    """How much longer all takes here, as the machine has more to do than it has cores; 1 where it has not."""
-    return max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
-
-
-class DemonstrationFallbackTests(DemonstrationCase):
+class DemonstrationFallbackTests(DemonstrationPageCase):
     """Experiment 2 of the thesis with the real team, and its web node lost on top."""
 
     options = ("--web-port", "0")

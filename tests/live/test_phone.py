@@ -8,10 +8,6 @@ from __future__ import annotations
 import json
 import os
 import signal
-import ssl
-import subprocess
-import sys
-import threading
 import time
 import urllib.error
 import urllib.request
@@ -23,10 +19,10 @@ from typing import Any
 from twisted.trial.unittest import SynchronousTestCase
 
 from benchmarks.demo import family
-from tests.live.page import CHROMIUM, DESK, FLAGS, MISSING, PHONE, TABLET, Team, pin
+from tests.live.demonstration import DemonstrationCase, stretch
+from tests.live.page import CHROMIUM, DESK, FLAGS, MISSING, PATIENCE_MS, PHONE, TABLET, Team, pin
 
 FAKE = ("--use-fake-device-for-media-stream", "--use-fake-ui-for-media-stream")
-IS_SECURE = all(find_spec(name) for name in ("OpenSSL", "cryptography"))
 TAKEOVER_S = 2.0
 PLACES = ((0.3, 2.1), (2.7, 2.1), (0.3, 0.3), (2.7, 0.3))
 SIGHTS = """async (pictures) => {
@@ -63,11 +59,6 @@ def film(path: Path, disc: int = 66) -> Path:
     return path
 
 
-def stretch() -> float:
-    """How much longer all takes here, as the machine has more to do than it has cores; 1 where it has not."""
-    return max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
-
-
 class Browser(SynchronousTestCase):
     if MISSING:
         skip = f"THE PHONE IS NOT TESTED IN A BROWSER: missing {'; '.join(MISSING)}"
@@ -86,7 +77,7 @@ class Browser(SynchronousTestCase):
 
     def page(self, browser: Any, address: str, screen: Any = PHONE, **more: Any) -> Any:
         page = browser.new_context(**screen, **more).new_page()
-        page.set_default_timeout(20_000)
+        page.set_default_timeout(PATIENCE_MS)
         page.on("pageerror", lambda error: self.faults.append(str(error)))
         page.goto(address)
         page.locator("#link[data-link=live]").wait_for()
@@ -203,51 +194,18 @@ class PhoneViewTests(Browser):
         self.assertGreater(count, 5)
 
 
-class DemonstrationPhoneTests(Browser):
+class DemonstrationPhoneTests(Browser, DemonstrationCase):
     """The team of the demonstration, six processes, and a visitor's phone."""
 
-    def setUp(self) -> None:
-        log, run_dir = Path(self.mktemp()), Path(self.mktemp()).absolute()
-        command = [sys.executable, "-m", "sim.demo", "--run-dir", str(run_dir), "--web-port", "0"]
-        scheme = "https" if IS_SECURE else "http"
-        command += ["--tls"] if IS_SECURE else []
-        with log.open("w", encoding="utf-8") as errors:
-            root = Path(__file__).parents[2]
-            demo = subprocess.Popen(command, cwd=root, stdout=subprocess.PIPE, stderr=errors, text=True)
-        self.addCleanup(demo.wait, 20)
-        self.addCleanup(demo.terminate)
-        self.pid = demo.pid
-        assert demo.stdout is not None
-        for line in demo.stdout:
-            # The page's addresses are the first that is said to people, that over TLS the second.
-            address = next((word for word in line.split() if word.startswith(f"{scheme}://")), "")
-            if "#code=" in address:
-                break
-            self.assertFalse(line.startswith("If the node that serves"), f"the page is not served over {scheme}")
-        else:
-            self.fail(log.read_text(encoding="utf-8"))
-        threading.Thread(target=demo.stdout.read, daemon=True).start()
-        self.url, _, code = address.partition("#code=")
-        # Whether a browser may trust the certificate is shown elsewhere; here it is only the way to the camera.
-        self.trust = ssl.create_default_context()
-        self.trust.check_hostname, self.trust.verify_mode = False, ssl.CERT_NONE
-        self.token = ""
-        self.token = self.api("session", {"code": code})["token"]
-
-    def api(self, path: str, body: Any = None) -> Any:
-        headers = {"Content-Type": "application/json", "Authorization": f"Bearer {self.token}"}
-        data = None if body is None else json.dumps(body).encode()
-        asked = urllib.request.Request(f"{self.url}api/v1/{path}", data, headers)
-        with urllib.request.urlopen(asked, timeout=20, context=self.trust) as answer:
-            return json.load(answer)
+    is_secure = all(find_spec(name) for name in ("OpenSSL", "cryptography"))
 
     def pins(self) -> str:
         """What Chromium is to trust of both web nodes."""
-        secure = [page["url"] for page in self.api("node")["pages"] if page["is_secure"]]
+        secure = [page["url"] for page in self.demo.api("node")["pages"] if page["is_secure"]]
         return ",".join(pin(int(url.rpartition(":")[2])) for url in secure)
 
     def devices(self) -> dict[str, Any]:
-        return {each["name"]: each for each in self.api("devices")}
+        return {each["name"]: each for each in self.demo.api("devices")}
 
     def until(self, is_so: Callable[[], Any], within: float, page: Any = None) -> float:
         """Wait until it is so; the seconds that it took."""
@@ -256,7 +214,7 @@ class DemonstrationPhoneTests(Browser):
             if time.monotonic() - began > within:
                 told = {name: (each["status"], each["messages"]) for name, each in self.devices().items()}
                 seen = "" if page is None else page.locator(".phone").text_content()
-                self.fail(f"{told} {[(task['status'], task['note']) for task in self.api('tasks')]} {seen}")
+                self.fail(f"{told} {[(task['status'], task['note']) for task in self.demo.api('tasks')]} {seen}")
             if page is None:
                 time.sleep(0.03)
             else:
@@ -274,7 +232,7 @@ class DemonstrationPhoneTests(Browser):
     def place_target(self) -> None:
         for x, y in PLACES:
             try:
-                self.api("target", {"x": x, "y": y})
+                self.demo.api("target", {"x": x, "y": y})
                 return
             except urllib.error.HTTPError as error:
                 error.close()
@@ -282,11 +240,11 @@ class DemonstrationPhoneTests(Browser):
 
     def joined(self) -> Any:
         """The page of a phone that takes part as anna, with the target before its camera."""
-        invitation = self.api("invitations", {"role": "phone", "name": "visitor"})["token"]
+        invitation = self.demo.api("invitations", {"role": "phone", "name": "visitor"})["token"]
         self.until(lambda: {"dog1", "dog2", "dog3"} <= set(self.devices()), 30.0 * stretch())
-        self.until(lambda: len(self.api("node")["pages"]) == (4 if IS_SECURE else 2), 30.0 * stretch())
+        self.until(lambda: len(self.demo.api("node")["pages"]) == (4 if self.is_secure else 2), 30.0 * stretch())
         browser = self.browser(66, *FAKE, f"--ignore-certificate-errors-spki-list={self.pins()}")
-        page = self.page(browser, f"{self.url}#code={invitation}/phone")
+        page = self.page(browser, f"{self.demo.url}#code={invitation}/phone")
         page.locator("#phone-name").fill("anna")
         page.get_by_role("button", name="Take part", exact=True).tap()
         page.locator(".phone", has_text="Target at about 0.2").wait_for()
@@ -301,7 +259,7 @@ class DemonstrationPhoneTests(Browser):
         self.assertNotIn("base2d", anna["capabilities"])
 
         self.place_target()
-        self.api("tasks", {"name": "watch-target"})
+        self.demo.api("tasks", {"name": "watch-target"})
         self.until(lambda: self.has_task(page), 60.0 * stretch(), page)
         self.assert_sound(page, "executing")
         page.evaluate("location.hash = 'cameras'")
@@ -314,9 +272,9 @@ class DemonstrationPhoneTests(Browser):
         self.assertTrue(reds[0] > 150 and reds[1] < 110, reds)
 
         def dog_waits() -> bool:
-            if self.api("tasks")[0]["status"] == "COMPLETED":
+            if self.demo.api("tasks")[0]["status"] == "COMPLETED":
                 # On a slow machine the dogs look for longer than the phone has to.
-                self.api("tasks", {"name": "watch-target"})
+                self.demo.api("tasks", {"name": "watch-target"})
             found = self.statuses()
             waits = any(status == "WAITING" for name, status in found.items() if name.startswith("dog"))
             return waits and found["anna"] == "EXECUTING"
@@ -335,15 +293,15 @@ class DemonstrationPhoneTests(Browser):
         page = self.joined()
         page.locator("#reserve", has_text="pi").wait_for()
         before = self.devices()["anna"]
-        os.kill(next(pid for pid, name in family(self.pid).items() if name == "vaio"), signal.SIGKILL)
+        os.kill(next(pid for pid, name in family(self.demo.pid).items() if name == "vaio"), signal.SIGKILL)
         page.locator("#node", has_text="pi").wait_for()
-        self.url = page.evaluate("import('/static/link.js').then(({ base }) => base())") + "/"
+        self.demo.url = page.evaluate("import('/static/link.js').then(({ base }) => base())") + "/"
         self.until(lambda: self.devices().get("anna", before)["address"] != before["address"], 15.0 * stretch(), page)
         page.locator(".phone .said", has_text="Nothing to do").wait_for()
         after = self.devices()["anna"]
         self.assertEqual((after["uuid"], after["joined"]), (before["uuid"], before["joined"]))
         self.assertIsNone(after["gone"])
         self.place_target()
-        self.api("tasks", {"name": "watch-target"})
+        self.demo.api("tasks", {"name": "watch-target"})
         self.until(lambda: self.has_task(page), 60.0 * stretch(), page)
         self.assertEqual(self.faults, [])

@@ -6,13 +6,17 @@ from typing import Any
 
 from tests.live.page import DESK, PHONE, TABLET, PageCase
 
-BOX = "e => { const b = e.getBoundingClientRect(); return [b.x + b.width / 2, b.y + b.height / 2]; }"
+# All of them at one moment: the page may scroll or grow between two questions.
+CENTRES = """names => names.map((name) => {
+    const box = document.querySelector(`.spot[aria-label^=${name}] .dot`).getBoundingClientRect();
+    return [box.x + box.width / 2, box.y + box.height / 2];
+})"""
 
 
 class PositionTests(PageCase):
-    def centre(self, page: Any, name: str) -> list[float]:
-        """Where a device is drawn, in pixels."""
-        return list(page.locator(f".spot[aria-label^={name}] .dot").evaluate(BOX))
+    def centres(self, page: Any, *names: str) -> list[list[float]]:
+        """Where devices are drawn at one moment, in pixels."""
+        return list(page.evaluate(CENTRES, list(names)))
 
     def test_draw_to_scale(self) -> None:
         """Metres are drawn to one scale, y upwards, with a bar that says how long it is; a tap opens the device."""
@@ -22,7 +26,7 @@ class PositionTests(PageCase):
         page = self.opened(PHONE)
         page.get_by_role("link", name="Map", exact=True).tap()
         page.locator("#spots .spot").nth(2).wait_for()
-        one, two, three = (self.centre(page, f"dog{n}") for n in (1, 2, 3))
+        one, two, three = self.centres(page, "dog1", "dog2", "dog3")
         metre = (two[0] - one[0]) / 30
         self.assertLess(abs(one[1] - three[1] - (12 * metre)), 2)
         self.assertLess(abs(one[1] - (two[1])), 1)
@@ -33,7 +37,8 @@ class PositionTests(PageCase):
         self.assertEqual(page.locator("#map:visible, #put:visible, #place:visible").count(), 0)
         self.team.order("place dog3 x=0 y=6 heading=0")
         page.locator(".spot[aria-label*='0.00, 6.00 m']").wait_for()
-        self.assertLess(abs(self.centre(page, "dog1")[1] - self.centre(page, "dog3")[1] - (6 * metre)), 2)
+        one, three = self.centres(page, "dog1", "dog3")
+        self.assertLess(abs(one[1] - three[1] - (6 * metre)), 2)
         page.locator(".spot[aria-label^=dog3] .reach").tap()
         page.locator("#d-name", has_text="dog3").wait_for()
 
@@ -47,10 +52,11 @@ class PositionTests(PageCase):
             page = self.opened(screen, scheme)
             self.view(page, "map")
             page.locator("#spots .spot").nth(1).wait_for()
-            one, two = self.centre(page, "dog1"), self.centre(page, "dog2")
+            # What it draws is to scale when it has heard of all three.
+            page.locator("#place-map", has_text="north is up. 1 more is reported in another frame").wait_for()
+            one, two = self.centres(page, "dog1", "dog2")
             # 22.3 m to the east and 11.1 m to the north.
             self.assertLess(abs((two[0] - one[0]) / (one[1] - two[1]) - (22.3 / 11.13)), 0.1)
-            self.assertIn("north is up. 1 more is reported in another frame", page.locator("#place-map").inner_text())
             self.assertIn("48.13710°, 11.57540°, to 8.0 m", page.locator(".places").inner_text())
             self.assertIn("dog3 1.00, 1.00 m", page.locator(".places").inner_text())
             self.tab_to(page, ".spot[aria-label^=dog2]")

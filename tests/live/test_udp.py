@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import random
 from collections.abc import Generator
-from typing import Any, cast
+from typing import Any
 
 from twisted.internet import reactor
 from twisted.internet.defer import Deferred, inlineCallbacks
-from twisted.internet.interfaces import IReactorUDP
 from twisted.trial.unittest import TestCase
 
 from middleware.entangled.errors import PortInUse
 from middleware.entangled.identity import Identity
-from middleware.entangled.network.network import MAX_DATAGRAM, Address
+from middleware.entangled.network.network import MAX_CARRIED, Address
 from middleware.entangled.network.udp import UdpNetwork
 from middleware.entangled.wire.endpoint import Endpoint
 
@@ -21,9 +20,9 @@ from middleware.entangled.wire.endpoint import Endpoint
 class UdpTests(TestCase):
     """Behaviour of ``UdpNetwork``."""
 
-    def network(self) -> UdpNetwork:
+    def network(self, host: str = "127.0.0.1") -> UdpNetwork:
         """A network on a free port, closed after the test."""
-        network = UdpNetwork(cast(IReactorUDP, reactor), "127.0.0.1", 0)
+        network = UdpNetwork(reactor, host, 0)
 
         def close() -> Deferred[Any]:
             network.close()
@@ -56,7 +55,7 @@ class UdpTests(TestCase):
         first = self.network()
         first.listen(lambda datagram, source: None)
         self.assertNotEqual(first.address.port, 0)
-        second = UdpNetwork(cast(IReactorUDP, reactor), "127.0.0.1", first.address.port)
+        second = UdpNetwork(reactor, "127.0.0.1", first.address.port)
         error = self.assertRaises(PortInUse, second.listen, lambda datagram, source: None)
         self.assertIn(f"127.0.0.1:{first.address.port}", str(error))
         self.assertNotIn("\n", str(error))
@@ -68,7 +67,52 @@ class UdpTests(TestCase):
         network.listen(lambda datagram, source: None)
         for address in [Address("a name", 9), Address("::1", 9), Address("127.0.0.1", 99999), Address("127.0.0.1", -1)]:
             network.send(b"x", address)
-        network.send(bytes(MAX_DATAGRAM + 1), Address("127.0.0.1", 9))
+        network.send(bytes(MAX_CARRIED + 1), Address("127.0.0.1", 9))
         self.assertEqual((network.counters["unsent"], network.counters["oversized"]), (5, 1))
         network.close()
         network.close()
+
+    @inlineCallbacks
+    def test_every_interface(self) -> Generator[Deferred[Any], Any, None]:
+        """A network at "*" hears one port of both families, and answers in the family in which it was asked."""
+        wide = self.network("*")
+        wide.listen(lambda datagram, source: wide.send(datagram + b" too", source))
+        self.assertNotIn(wide.address.host, ("*", "0.0.0.0", "::"))
+        for host in ("127.0.0.1", "::1"):
+            heard: Deferred[bytes] = Deferred()
+            near = self.network(host)
+            near.listen(lambda datagram, source, heard=heard: heard.callback(datagram))  # type: ignore[misc]
+            near.send(b"me", Address(host, wide.address.port))
+            answer = yield heard.addTimeout(5.0, reactor)
+            self.assertEqual(answer, b"me too")
+
+    @inlineCallbacks
+    def test_further_ports(self) -> Generator[Deferred[Any], Any, None]:
+        """What is led to a further port leaves by it; who writes there first is answered from there, others are not."""
+        one, other = self.network(), self.network()
+        heard: list[Address] = []
+        arrived: Deferred[None] = Deferred()
+
+        def hear(datagram: bytes, source: Address) -> None:
+            heard.append(source)
+            if len(heard) == 3:
+                arrived.callback(None)
+
+        other.listen(hear)
+        one.listen(lambda datagram, source: one.send(datagram, source))
+        port = one.open_port()
+        self.assertEqual(one.lead(other.address, port), 0)
+        one.send(b"1", other.address)
+        self.assertEqual(one.local(other.address), Address("127.0.0.1", port))
+        self.assertEqual(one.lead(other.address, 0), port)
+        one.send(b"2", other.address)
+        stranger = self.network()
+        answered: Deferred[Address] = Deferred()
+        stranger.listen(lambda datagram, source: answered.callback(source))
+        stranger.send(b"x", Address("127.0.0.1", port))
+        source = yield answered.addTimeout(5.0, reactor)
+        self.assertEqual(source.port, port)
+        one.shut_port(port)
+        one.send(b"3", other.address)
+        yield arrived.addTimeout(5.0, reactor)
+        self.assertEqual([address.port for address in heard], [port, one.address.port, one.address.port])

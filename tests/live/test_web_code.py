@@ -40,7 +40,10 @@ class WebCodeTests(LiveTests):
         self.patch(os, "environ", {**os.environ, "XDG_RUNTIME_DIR": runtime.name})
         child = self.start(
             "--config",
-            self.file('[node]\nname = "vaio"\nport = 0\nroles = ["web"]\nstore = "vaio.sqlite"\n[web]\nport = 0\n'),
+            self.file(
+                '[node]\nname = "vaio"\nteam_key = "t"\nport = 0\nroles = ["web"]\n'
+                'store = "vaio.sqlite"\n[web]\nport = 0\n'
+            ),
         )
         self.addCleanup(child.communicate)
         self.addCleanup(child.terminate)
@@ -65,5 +68,5 @@ class WebCodeTests(LiveTests):
             ('host = "0.0.0.0"\nsign_in = false\n', "[web] sign_in"),
             ('password = "correct horse"\n', "[web] password"),
         ):
-            path = self.file(f'[node]\nname = "a"\nport = 0\nroles = ["web"]\n[web]\nport = 0\n{web}')
+            path = self.file(f'[node]\nname = "a"\nteam_key = "t"\nport = 0\nroles = ["web"]\n[web]\nport = 0\n{web}')
             self.assert_says(self.refused("--config", path), path, words)

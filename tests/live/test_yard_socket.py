@@ -17,8 +17,8 @@ from twisted.trial.unittest import SynchronousTestCase, TestCase
 import sim
 from drivers.driver import Permit
 from drivers.errors import UsageError
+from drivers.link import TcpConnector
 from drivers.registry import driver_for
-from drivers.sim.link import TcpConnector
 from drivers.sim.operator import YardOperator
 
 ROOT = Path(sim.__file__).parents[1]

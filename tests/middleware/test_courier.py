@@ -24,7 +24,7 @@ from middleware.entangled.wire.message import (
     part_count,
     receipt_of,
 )
-from middleware.entangled.wire.session import INIT, MAX_PLAIN
+from middleware.entangled.wire.session import INIT, INIT_LEAST, MAX_PLAIN
 from tests.middleware.test_endpoint import DELAY, EndpointCase
 
 MIB = 2**20
@@ -91,7 +91,7 @@ class ParcelTests(ParcelCase):
         """The INIT of a large first question is as short as any, and nothing runs because of it."""
         asked = self.a.ask(self.to_b, "echo", LARGE[:5000])
         self.clock.advance(1.5 * DELAY)
-        self.assertEqual([len(d) for d, _ in self.kept(self.to_b, INIT)], [569])
+        self.assertEqual([len(d) for d, _ in self.kept(self.to_b, INIT)], [INIT_LEAST])
         self.assertEqual(self.got(asked), LARGE[:5000])
 
     def test_loss(self) -> None:

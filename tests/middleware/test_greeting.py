@@ -84,4 +84,4 @@ class CookieTests(EndpointCase):
         genuine(cookie[:1] + bytes(16) + cookie[17:], source)
         counted = [self.a.counters[name] for name in ("misdirected", "forged", "stale")]
         self.assertEqual(counted, [1, 2, 1])
-        self.assertEqual(next(iter(self.a._peers._openings.values())).cookie, b"")
+        self.assertEqual(next(iter(self.a._peers._openings.values())).doors, {self.to_b.address: b""})

@@ -9,10 +9,15 @@ from pathlib import Path
 
 from twisted.trial.unittest import SynchronousTestCase
 
+from sim.team.shrink import Trim
 from tests.invariants.bug import FINDERS, seeded
+from tests.invariants.disk import DiskFleet
+from tests.invariants.leases import Leases
+from tests.invariants.least import least, line
 from tests.invariants.records import Records
 from tests.invariants.run import WORKLOADS, run, run_all
 from tests.invariants.schedule import Schedule
+from tests.invariants.tasks import Tasks
 
 BITING = {
     "tombstone dropped too early": (4, "D4"),
@@ -49,7 +54,17 @@ BITING_ELSEWHERE = {
 }
 """The same of the quickest bugs that other workloads look for."""
 ALL = tuple(WORKLOADS)
-DIGEST = f"from tests.invariants.run import run; print(run(7, {ALL!r}).digest)"
+DIGEST = "from tests.middleware.test_invariants import digests; print(digests())"
+
+
+def digests() -> list[str]:
+    """The hashes of all datagrams and all events of a run with every workload of nodes, and of the other worlds."""
+    schedule, tasks, leases = Schedule(1, DiskFleet), Tasks(3), Leases(3)
+    schedule.run([workload(schedule) for workload in WORKLOADS.values()])
+    tasks.run()
+    leases.run()
+    histories = [schedule.history, tasks.history, leases.referee.history]
+    return [schedule.fleet.board.digest(), *(history.digest() for history in histories)]
 
 
 class InvariantTests(SynchronousTestCase):
@@ -102,8 +117,8 @@ class InvariantTests(SynchronousTestCase):
         self.assertEqual(blind, [])
 
     def test_same_in_every_process(self) -> None:
-        """A run with all workloads is the same, datagram by datagram, however the process hashes its strings."""
-        digests = set()
+        """Runs are the same, datagram by datagram and event by event, however the process hashes its strings."""
+        told_digests = set()
         for hash_seed in ("1", "2"):
             told = subprocess.run(
                 [sys.executable, "-c", DIGEST],
@@ -111,11 +126,39 @@ class InvariantTests(SynchronousTestCase):
                 env={**os.environ, "PYTHONHASHSEED": hash_seed},
                 capture_output=True,
                 text=True,
-                timeout=60,
+                timeout=300,
             )
             self.assertEqual((told.returncode, told.stderr), (0, ""))
-            digests.add(told.stdout)
-        self.assertEqual(len(digests), 1)
+            told_digests.add(told.stdout)
+        self.assertEqual(len(told_digests), 1)
+
+    def test_order(self) -> None:
+        """What runs before it in the same process changes nothing about a run: they may come in any order."""
+        wanted = [(seed, only) for only in (("records",), ("tasks",), ("leases",), ("groups",)) for seed in (3, 4)]
+        outcomes = [run(seed, only) for seed, only in wanted]
+        self.assertEqual([run(seed, only) for seed, only in reversed(wanted)], outcomes[::-1])
+
+    def test_shrunk(self) -> None:
+        """A schedule that a bug fails is shrunk to the faults that it takes, and its line repeats it."""
+        bug = "votes forgotten by a restart"
+        whole = run(1, ("tuples", "deciders"), bug)
+        left = least(whole, bug)
+        self.assertEqual(left.trim.only, ("tuples",))
+        self.assertTrue(left.trim.calm)
+        assert left.trim.keep is not None
+        self.assertLess(len(left.trim.keep), whole.faults)
+        self.assertEqual(run(1, (), bug, left.trim), left.outcome)
+        self.assertTrue(any(violation.startswith("T4: ") for violation in left.outcome.found))
+        for number in left.trim.keep:
+            fewer = Trim(tuple(one for one in left.trim.keep if one != number), only=("tuples",))
+            self.assertFalse(any(violation.startswith("T4: ") for violation in run(1, (), bug, fewer).found))
+        self.assertIn(f"--seed 1 --only tuples --keep {','.join(map(str, left.trim.keep))} --calm", line(1, left.trim))
+
+    def test_shrunk_in_no_time(self) -> None:
+        """Where there is no time to shrink it, what is left is the whole."""
+        whole = run(2, ("leases",), "the token is not stored")
+        left = least(whole, "the token is not stored", lambda: True)
+        self.assertEqual((left.outcome, left.runs, left.trim.keep), (whole, 0, None))
 
     def test_jobs(self) -> None:
         """Several processes give the same outcomes in the same order as one."""

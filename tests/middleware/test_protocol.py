@@ -16,9 +16,11 @@ from middleware.entangled.network.network import Address
 from middleware.entangled.network.switchboard import Switchboard, Weather
 from middleware.entangled.wire.endpoint import Endpoint
 from middleware.entangled.wire.session import Session
+from tests.middleware.gate import Gate
 
 VECTORS = Path(__file__).with_name("vectors") / "exchange.json"
 NAMES = {0x11: "INIT", 0x12: "RESP", 0x13: "DATA", 0x14: "WHO", 0x15: "HERE", 0x16: "COOKIE"}
+NAMES |= {0x19: "HAIL", 0x1A: "ECHO"}
 LARGE = bytes(range(256)) * 6
 
 
@@ -44,8 +46,16 @@ class Dice(random.Random):
         return number
 
 
+class Doorway(Gate):
+    """A door that shows a short pass."""
+
+    def __init__(self, name: str, seed: int) -> None:
+        super().__init__(seed, seed, f"pass of {name}".encode())
+        self.room = 16
+
+
 def exchange() -> dict[str, Any]:
-    """What ``alice`` and ``bob`` say to each other: a greeting, four calls, one of them under load."""
+    """What ``alice`` and ``bob`` say to each other: a hail, a greeting, four calls, one of them under load."""
     clock = HeapClock()
     board = Switchboard(clock, random.Random(0), Weather(0.01))
     team = bytes(range(32))
@@ -70,13 +80,17 @@ def exchange() -> dict[str, Any]:
 
         dice[name] = Dice(seed)
         network.send = heard  # type: ignore[method-assign]
-        ends[name] = Endpoint(identity, team, network, clock, dice[name]), Contact(identity.public, network.address)
+        end = Endpoint(identity, team, network, clock, dice[name], Doorway(name, seed))
+        ends[name] = end, Contact(identity.public, network.address)
         ends[name][0].start()
     (alice, _), (bob, to_bob) = ends["alice"], ends["bob"]
     bob.expose("echo", lambda peer, value: value)
     bob.expose("add", lambda peer, one, two: one + two, changes=True)
     Session.seal = noted  # type: ignore[method-assign, assignment]
     try:
+        bob.echoer.wall = lambda: 1_700_000_000.0
+        alice.hail(to_bob.address)
+        clock.advance(1)
         alice.greet(to_bob.address)
         clock.advance(1)
         bob._cookies._quiet._tokens = -1000.0
@@ -97,6 +111,9 @@ def exchange() -> dict[str, Any]:
         "bob_seed": "22" * 32,
         "alice_public": ends["alice"][1].public.hex(),
         "bob_public": to_bob.public.hex(),
+        "alice_pass": b"pass of alice".hex(),
+        "bob_pass": b"pass of bob".hex(),
+        "room": 16,
         "alice_ephemeral": dice["alice"].secrets[0],
         "bob_ephemeral": dice["bob"].secrets[-1],
         "datagrams": said,

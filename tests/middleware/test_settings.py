@@ -34,6 +34,11 @@ module = "search"
 [driver]
 kind = "sim"
 options = { robot = "dog1", port = 7400 }
+[[driver.parts]]
+kind = "camera"
+options = { source = 1 }
+[[driver.parts]]
+kind = "compass"
 [web]
 host = "::1"
 port = 0
@@ -82,6 +87,7 @@ class SettingsTest(SynchronousTestCase):
         self.assertEqual(node.capabilities, {"camera": {"width": 208, "lens": "wide"}})
         self.assertEqual(read.agent.module, "search")
         self.assertEqual((read.driver.kind, read.driver.options), ("sim", {"robot": "dog1", "port": 7400}))
+        self.assertEqual(read.driver.parts, (("camera", {"source": 1}), ("compass", {})))
         self.assertEqual((read.web.host, read.web.port, read.web.yard), ("::1", 0, Address("127.0.0.1", 7400)))
         self.assertEqual(node.position, {"x": 1.0, "y": 2.5, "heading": 0.0})
         web = read.web
@@ -96,7 +102,7 @@ class SettingsTest(SynchronousTestCase):
     def test_defaults(self) -> None:
         """A name is enough: such a node hears its own machine, forgets all at its end, and has no body."""
         read = settings()
-        self.assertEqual((read.node.host, read.node.port, read.node.store), ("127.0.0.1", 0, ":memory:"))
+        self.assertEqual((read.node.host, read.node.port, read.node.store), ("127.0.0.1", 8484, ":memory:"))
         self.assertEqual((read.node.known_nodes, read.node.roles), ((), ("edge",)))
         self.assertEqual((read.agent.module, read.driver.kind, read.web.yard), ("", "", None))
 
@@ -104,14 +110,17 @@ class SettingsTest(SynchronousTestCase):
         """A relative store lies in the folder of the settings, wherever the node was started; an absolute one stays."""
         mapping = {"node": {"name": "a", "store": "a.db"}}
         self.assertEqual(Settings.from_mapping(mapping, "/etc/swarm/a.toml").node.store, "/etc/swarm/a.db")
+        mapping["node"]["membership"] = "a.membership"
+        self.assertEqual(Settings.from_mapping(mapping, "/etc/swarm/a.toml").node.membership, "/etc/swarm/a.membership")
         mapping["node"]["store"] = "/var/a.db"
         self.assertEqual(Settings.from_mapping(mapping, "/etc/swarm/a.toml").node.store, "/var/a.db")
         mapping["node"]["store"] = ":memory:"
         self.assertEqual(Settings.from_mapping(mapping, "/etc/swarm/a.toml").node.store, ":memory:")
 
     def test_team_key(self) -> None:
-        """The team's key is hashed to 32 bytes, is not shown, and is the open one where none was given."""
-        self.assertEqual(settings().node.team_secret, hashlib.blake2s(b"swarm").digest())
+        """The team's key is hashed to 32 bytes, is not shown, and is none where none was given."""
+        self.assertEqual((settings().node.team_key, settings().node.membership), ("", ""))
+        self.assertEqual(settings(team_key="horse").node.team_secret, hashlib.blake2s(b"horse").digest())
         self.assertNotEqual(settings(team_key="correct horse").node.team_secret, settings().node.team_secret)
         self.assertNotIn("correct horse", repr(settings(team_key="correct horse")))
 
@@ -153,10 +162,20 @@ class SettingsTest(SynchronousTestCase):
             ("node", "team_key"): ["", 1],
             ("node", "roles"): [[], "edge", [1], ["boss"]],
             ("node", "presence_lease"): [0, 0.05, 61, True, "1", float("nan"), float("inf")],
+            ("node", "tunnels"): [
+                *("wss://a", [1], ["https://a"], ["wss://"], ["wss://a:0"], ["auto", "none"]),
+                [f"wss://a:{n}" for n in range(1, 10)],
+            ],
+            ("node", "tunnel_port"): [-1, 65536, "443"],
+            ("node", "tunnel_tls"): ["no", 0],
             ("node", "capabilities"): [1, {"camera": 1}, {"camera": {"fps": [30]}}, {"camera": {"fps": float("nan")}}],
             ("agent", "module"): ["no such", "1st", ".search", 1],
             ("driver", "kind"): ["sim/", 1],
             ("driver", "options"): [[]],
+            ("driver", "parts"): [
+                *(5, {"kind": "camera"}, ["camera"], [{}], [{"kind": "no such"}], [{"kind": 7}]),
+                *([{"kind": "camera", "url": "x"}], [{"kind": "camera", "options": 7}], [{"kind": "camera"}] * 9),
+            ],
             ("web", "host"): ["page.local"],
             ("web", "port"): ["8080"],
             ("web", "yard"): ["127.0.0.1", 7400, None],
@@ -185,6 +204,19 @@ class SettingsTest(SynchronousTestCase):
         flags = settings().with_flags(deployment_allow="true", deployment_modules="best, spin").deployment
         self.assertEqual((flags.allow, flags.modules), (True, ("best", "spin")))
         self.assertRaises(BadSetting, settings().with_flags, deployment_allow="yes")
+
+    def test_tunnels(self) -> None:
+        """Unless told otherwise port 443 of each known node elsewhere is a tunnel; what is named comes first."""
+        known = ["10.0.0.7:7000", "127.0.0.1:7000", "10.0.0.7:7001", "[fe80::1]:7000"]
+        found = [str(url) for url in settings(known_nodes=known).node.tunnel_urls]
+        self.assertEqual(found, ["wss://10.0.0.7/swarm", "wss://[fe80::1]/swarm"])
+        named = settings(known_nodes=known, tunnels=["auto", "wss://b.example:8443/swarm"]).node.tunnel_urls
+        self.assertEqual(str(named[0]), "wss://b.example:8443/swarm")
+        self.assertEqual(len(named), 3)
+        self.assertEqual(settings(known_nodes=known, tunnels=[]).node.tunnel_urls, ())
+        self.assertEqual(settings().node.tunnel_urls, ())
+        flags = settings().with_flags(tunnel_port="443", tunnels="wss://a", tunnel_tls="false").node
+        self.assertEqual((flags.tunnel_port, flags.tunnels, flags.tunnel_tls), (443, ("wss://a",), False))
 
     def test_capability_property_names_itself(self) -> None:
         """An error in a capability names the property."""

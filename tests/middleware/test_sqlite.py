@@ -209,7 +209,7 @@ class ReopenTest(SynchronousTestCase):
     def test_one_node_a_file(self) -> None:
         """A second node is kept off a file that is in use, and let in when the first has gone."""
         error = self.assertRaises(BadStore, SqliteStore.open, self.path, 0.0)
-        self.assertIn("another node uses it", str(error))
+        self.assertIn(f"another node uses it (process {os.getpid()})", str(error))
         self.after_restart()
 
     def test_only_for_its_owner(self) -> None:

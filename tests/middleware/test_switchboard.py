@@ -8,8 +8,19 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.clock import HeapClock
 from middleware.entangled.errors import PortInUse
-from middleware.entangled.network.network import MAX_DATAGRAM, Address, Network
+from middleware.entangled.network.network import MAX_CARRIED, Address, Network
 from middleware.entangled.network.switchboard import Switchboard, Weather
+
+
+class _Far:
+    """A link on which everything takes 2 s, comes twice, and is written down."""
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[Address, Address, int, float]] = []
+
+    def delays(self, source: Address, to: Address, size: int, now: float, rng: random.Random) -> list[float]:
+        self.asked.append((source, to, size, now))
+        return [2.0, 2.0]
 
 
 class SwitchboardTests(SynchronousTestCase):
@@ -110,7 +121,7 @@ class SwitchboardTests(SynchronousTestCase):
 
     def test_drops_what_is_too_large_or_unheard(self) -> None:
         """A datagram over the limit, and one to nobody, are counted and lost."""
-        self.a.send(bytes(MAX_DATAGRAM + 1), self.b.address)
+        self.a.send(bytes(MAX_CARRIED + 1), self.b.address)
         self.a.send(b"x", Address("127.0.0.1", 9))
         self.clock.advance(1)
         self.assertEqual((self.board.counters["oversized"], self.board.counters["unheard"], self.got), (1, 1, []))
@@ -131,3 +142,59 @@ class SwitchboardTests(SynchronousTestCase):
 
         self.assertEqual(run(1), run(1))
         self.assertNotEqual(run(1), run(2))
+
+    def test_link_says_how_long_everything_takes(self) -> None:
+        """With a link that is asked for each datagram, unless two addresses have a weather of their own."""
+        link = self.board.link = _Far()
+        self.clock.advance(5)
+        self.a.send(b"far", self.b.address)
+        self.assertEqual(link.asked, [(self.a.address, self.b.address, 3, 5.0)])
+        self.board.set_weather(self.a.address, self.b.address, Weather(delay_s=0.5), one_way=True)
+        self.a.send(b"near", self.b.address)
+        self.clock.advance(3)
+        self.assertEqual(self.got, [(5.5, b"near"), (7.0, b"far"), (7.0, b"far")])
+        self.assertEqual((len(link.asked), self.board.counters["duplicated"]), (1, 1))
+
+    def test_barriers_stop_what_they_say(self) -> None:
+        """Nothing passes a barrier, what is on its way included, until it is taken away; healing takes all of them."""
+        self.board.weather = Weather(delay_s=0.1)
+        self.a.send(b"on its way", self.b.address)
+        self.board.barriers.append(lambda source, to: source == self.a.address)
+        self.b.send(b"back", self.a.address)
+        self._send(2)
+        self.assertEqual([datagram for _, datagram in self.got], [b"back"])
+        self.assertEqual(self.board.counters["cut"], 3)
+        self.board.heal()
+        self._send(1)
+        self.assertEqual([datagram for _, datagram in self.got], [b"back", b"0"])
+
+    def test_traffic_goes_on_in_the_next_life(self) -> None:
+        """Datagrams and bytes are counted at both ends, in a tally that a later network may go on with."""
+        self.board.weather = Weather(loss=1.0)
+        self.a.send(b"lost", self.b.address)
+        self.board.weather = Weather()
+        self._send(3)
+        sent, received = self.a.traffic, self.b.traffic
+        self.assertEqual((sent.sent, sent.sent_bytes, sent.received, sent.received_bytes), (4, 7, 0, 0))
+        self.assertEqual((received.sent, received.received, received.received_bytes), (0, 3, 3))
+        self.a.close()
+        self.a = self.board.network(*self.a.address, traffic=sent)
+        self.a.listen(self._receive)
+        self._send(1)
+        self.assertEqual((self.a.traffic.sent, self.a.traffic.sent_bytes), (5, 8))
+
+    def test_digest_is_that_of_every_delivery(self) -> None:
+        """However many deliveries are hashed at once, and however often it is asked for, the digest is the same."""
+        digests = []
+        for asked_often in (False, True):
+            self.setUp()
+            for number in range(700):
+                self.a.send(b"%d" % number, self.b.address)
+                if asked_often:
+                    self.clock.advance(0)
+                    self.board.digest()
+            self.clock.advance(0)
+            digests.append(self.board.digest())
+        self.assertEqual(digests[0], digests[1])
+        self._send(1)
+        self.assertNotEqual(self.board.digest(), digests[1])

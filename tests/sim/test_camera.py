@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 from twisted.trial.unittest import SynchronousTestCase
 
-from sim.camera import FOCAL_X, HEIGHT, WIDTH, Camera, Image
+from sim.camera import Camera
+from sim.lens import FOCAL_X, HEIGHT, WIDTH, Image
 from sim.scene import loaded
 from sim.sensor import NOSE
 from sim.world import World

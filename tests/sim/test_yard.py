@@ -26,9 +26,10 @@ from drivers.sim.codec import (
     Truth,
     encoded,
 )
+from sim.reception import SILENT_S
 from sim.scene import loaded
 from sim.session import Beat, Session
-from sim.yard import SILENT_S, TICK_S, Yard
+from sim.yard import TICK_S, Yard
 
 
 class Client:

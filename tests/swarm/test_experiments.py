@@ -11,7 +11,7 @@ from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
 from agents.catalogue import task_named
-from drivers.sim.link import MemoryLink
+from drivers.link import MemoryLink
 from middleware.tasks import Task
 from sim.demo.experiment import TOUCH_M
 from sim.demo.trials import trial
@@ -237,8 +237,8 @@ class MembershipTests(TeamTests):
 
     def test_others_spread_when_one_leaves(self) -> None:
         """When the dog on its way is lost, the one that stands by moves around the target, as far from it as before."""
-        team = self.team()
-        team.scatter(2)
+        team = self.team(1)
+        team.scatter(3)
         team.run_demo()
         self.until(team, lambda: bool(self.executing(team)))
         first = self.executing(team)[0]

@@ -43,6 +43,11 @@ class TakeoverTests(SynchronousTestCase):
         """A node that leaves in order is replaced."""
         self.take_over(Cause.POLITE_LEAVE, 2)
 
+    def test_lost_link(self) -> None:
+        """The robot of who acts hears its node no more; another goes on when that robot stands by itself."""
+        for seed in (1, 2, 3):
+            self.take_over(Cause.LOST_LINK, seed)
+
     def test_dog_and_page_at_once(self) -> None:
         """The demonstration's dog on its way and the node that serves the page are lost at once: another dog goes on.
 

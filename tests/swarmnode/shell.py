@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from middleware.entangled.control.verb import Verbs
-from middleware.entangled.node import EntangledNode
+from middleware.node import SwarmNode
 from swarmnode.rehearsal import VirtualTeam
+from swarmnode.team.verb import TeamVerbs
 
 Main = Callable[..., int]
 PATIENCE = 5.0
@@ -20,9 +21,9 @@ PATIENCE = 5.0
 class Shell:
     """What a person types beside ``node`` and reads; each answer may take ``PATIENCE`` seconds of the team's time."""
 
-    def __init__(self, team: VirtualTeam, node: EntangledNode) -> None:
+    def __init__(self, team: VirtualTeam, node: SwarmNode) -> None:
         self._team = team
-        self._verbs = Verbs.of(node, team.clock, random.Random(1))
+        self._verbs = TeamVerbs(Verbs.of(node.entangled, team.clock, random.Random(1)), node)
         self.said = ""
 
     def ask(self, path: Path, request: dict[str, Any]) -> Iterator[dict[str, Any]]:

@@ -14,6 +14,8 @@ from middleware.settings import Settings
 from swarmnode.seams import Seams
 from swarmnode.service import NodeService
 
+KEY = "of tests, and of nobody else"
+
 
 class Page(Service):
     """A page that only counts."""
@@ -43,7 +45,9 @@ class World:
     def service(self, name: str, port: int, is_web: bool = False) -> NodeService:
         """A node that joins through port 7000."""
         known = [] if port == 7000 else ["127.0.0.1:7000"]
-        settings = Settings.from_mapping({"node": {"name": name, "port": port, "known_nodes": known}}, "test")
+        settings = Settings.from_mapping(
+            {"node": {"name": name, "port": port, "known_nodes": known, "team_key": KEY}}, "test"
+        )
         return NodeService(settings, self.seams(name, port), [self.page] if is_web else [])
 
     def page(self, node: SwarmNode) -> Page:

@@ -9,16 +9,20 @@ from twisted.logger import ILogObserver, LogEvent, formatEvent, globalLogPublish
 from twisted.trial.unittest import SynchronousTestCase
 from zope.interface import implementer
 
+from drivers.driver import Filming
 from middleware.entangled.data.memory import MemoryStore
+from middleware.errors import BadSetting
 from middleware.settings import Settings
 from swarmnode.assembly import assembled, identity_in
-from tests.swarmnode.team import World
+from tests.swarmnode.team import KEY, World
 
 
 class AssemblyTests(SynchronousTestCase):
     def settings(self, **tables: Any) -> Settings:
         """Settings of a node called a."""
-        return Settings.from_mapping({"node": {"name": "a", **tables.pop("node", {})}, **tables}, "test")
+        return Settings.from_mapping(
+            {"node": {"name": "a", "team_key": KEY, **tables.pop("node", {})}, **tables}, "test"
+        )
 
     def test_driver_brings_kind_and_capabilities(self) -> None:
         """A node with a driver is of the robot's kind and has its capabilities; what the settings say wins."""
@@ -36,6 +40,17 @@ class AssemblyTests(SynchronousTestCase):
             set(device.capabilities), {"base2d", "horn", "odometry", "compass", "ranger", "imu", "power"} | {"camera"}
         )
         self.assertIsNotNone(made.agent)
+
+    def test_parts_bring_their_capabilities(self) -> None:
+        """A robot with a camera on its back is a device that has both, and whose pictures can be asked for."""
+        parts = [{"kind": "camera", "options": {"source": "/pictures"}}]
+        driver = {"kind": "create2", "options": {"port": "/dev/robot"}, "parts": parts}
+        made = assembled(self.settings(driver=driver), World().seams("a", 7000))
+        self.assertTrue({"camera", "bumper"} <= set(made.node.presence.device.capabilities))
+        self.assertIsInstance(made.driver, Filming)
+        with self.assertRaises(BadSetting) as caught:
+            assembled(self.settings(driver={"parts": parts}), World().seams("b", 7001))
+        self.assertIn("[driver] parts: have no robot", str(caught.exception))
 
     def test_node_without_body_has_no_agent(self) -> None:
         """A laptop has neither driver nor agent, and its kind is what the settings say."""

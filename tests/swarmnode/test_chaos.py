@@ -35,7 +35,7 @@ class ChaosTests(SynchronousTestCase):
         self.virtual = VirtualTeam(4, faults=faults)
         self.addCleanup(self.virtual.stop)
         self.virtual.clock.advance(2.0)
-        self.shell = Shell(self.virtual, self.virtual.services["vaio"].assembly.node.entangled)
+        self.shell = Shell(self.virtual, self.virtual.services["vaio"].assembly.node)
 
     def chaos(self, line: str) -> tuple[int, str]:
         """Exit code and output of ``swarm chaos LINE``, on the team's clock."""

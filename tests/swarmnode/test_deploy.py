@@ -55,7 +55,7 @@ class DeployTests(SynchronousTestCase):
         self.team = VirtualTeam(11, dogs=())
         self.addCleanup(self.team.stop)
         self.laptop = self.team.services["vaio"].assembly.node
-        self.shell = Shell(self.team, self.laptop.entangled)
+        self.shell = Shell(self.team, self.laptop)
         self.shelves = {name: MemoryShelf() for name in self.team.DOGS}
 
     def let_in(self, *modules: str, refusing: str = "") -> None:

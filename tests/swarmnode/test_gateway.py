@@ -11,12 +11,12 @@ from twisted.trial.unittest import SynchronousTestCase
 from middleware.entangled.data.memory import MemoryStore
 from middleware.presence import DEVICES, devices_of
 from swarmnode.bucket import Bucket
-from swarmnode.gateway import FIRST_S, LOOKS, MOST, SILENCE_S, Gateway, seed_of
+from swarmnode.gateway import FIRST_S, LOOKS, MOST, SILENCE_S, Gateway, seed_of, sides
 from swarmnode.rehearsal import VirtualTeam
 from swarmnode.seams import Seams
 from tests.webnode.picture import jpeg
 from webnode.errors import Refusal
-from webnode.jpeg import MOST_SIDE
+from webnode.routes.phones import MOST_SIDE
 
 STEP = 0.1
 CAN = {"width": 208, "height": 156, "orientation": False, "position": True}
@@ -249,6 +249,18 @@ class GatewayTests(SynchronousTestCase):
         self.assertEqual(self.assertRaises(Refusal, phone.look, {}).status, 429)
         self.team.clock.advance(STEP)
         phone.look({})
+
+    def test_takes_pictures_as_large_as_announced(self) -> None:
+        """The sides of a picture are told up to what the route announces to phones; beyond it is refused in words."""
+        self.assertEqual(sides(jpeg(MOST_SIDE, 10)), (MOST_SIDE, 10))
+        for body, words in (
+            (b"", "missing"),
+            (jpeg(MOST_SIDE + 1, 10), "no JPEG"),
+            (jpeg(10, MOST_SIDE + 1), "no JPEG"),
+        ):
+            refusal = self.assertRaises(Refusal, sides, body)
+            self.assertIn(words, refusal.problem)
+            self.assertIn(f"at most {MOST_SIDE} pixels", refusal.remedy)
 
     def test_says_that_the_team_stands(self) -> None:
         """While the team is stopped the phone says so."""

@@ -11,7 +11,8 @@ from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.entangled.errors import BadStore, PortInUse
+from drivers.registry import kinds
+from middleware.entangled.errors import BadStore, PortInUse, TunnelPortInUse
 from middleware.entangled.network.network import Address
 from middleware.errors import BadSetting, UnknownAgent
 from middleware.settings import Settings
@@ -53,12 +54,12 @@ class RefusalTests(SynchronousTestCase):
 
     def test_refuse_unknown_key(self) -> None:
         """An unknown key is refused with file, key and the nearest lawful one."""
-        path = self.file('[node]\nname = "a"\nprot = 7\n')
+        path = self.file('[node]\nname = "a"\nteam_key = "t"\nprot = 7\n')
         self.assert_says(self.refusal("--config", path), path, "[node] prot", "the nearest is port")
 
     def test_refuse_wrong_type(self) -> None:
         """A value of the wrong type is refused with file, key and what to write."""
-        path = self.file('[node]\nname = "a"\nport = "high"\n')
+        path = self.file('[node]\nname = "a"\nteam_key = "t"\nport = "high"\n')
         self.assert_says(self.refusal("--config", path), path, "[node] port", "write a number")
 
     def test_refuse_missing_file(self) -> None:
@@ -78,30 +79,31 @@ class RefusalTests(SynchronousTestCase):
 
     def test_refuse_unknown_agent(self) -> None:
         """An agent that does not exist is refused with those that do."""
-        path = self.file('[node]\nname = "a"\n[driver]\nkind = "sim"\n[agent]\nmodule = "serch"\n')
+        path = self.file('[node]\nname = "a"\nteam_key = "t"\n[driver]\nkind = "sim"\n[agent]\nmodule = "serch"\n')
         self.assert_says(self.refusal("--config", path, is_made=True), path, "[agent] module", "'serch'", "search")
 
     def test_refuse_agent_without_robot(self) -> None:
         """An agent that has no robot to act with is refused, and not left out in silence."""
-        path = self.file('[node]\nname = "a"\n[agent]\nmodule = "search"\n')
+        path = self.file('[node]\nname = "a"\nteam_key = "t"\n[agent]\nmodule = "search"\n')
         self.assert_says(self.refusal("--config", path, is_made=True), path, "[agent] module", "name its [driver] kind")
 
     def test_refuse_agent_that_cannot_be_imported(self) -> None:
         """An agent of one's own that cannot be loaded says why."""
-        path = self.file('[node]\nname = "a"\n[driver]\nkind = "sim"\n[agent]\nmodule = "no_such_module:Mind"\n')
+        path = self.file(
+            '[node]\nname = "a"\nteam_key = "t"\n[driver]\nkind = "sim"\n[agent]\nmodule = "no_such_module:Mind"\n'
+        )
         line = self.refusal("--config", path, is_made=True)
         self.assert_says(line, "[agent] module", "no_such_module")
 
     def test_refuse_unknown_driver(self) -> None:
         """A kind of robot that there is no driver for is refused with those that there are."""
-        path = self.file('[node]\nname = "a"\n[driver]\nkind = "simm"\n')
-        self.assert_says(
-            self.refusal("--config", path, is_made=True), path, "[driver]", "'simm'", "known are phone, sim"
-        )
+        path = self.file('[node]\nname = "a"\nteam_key = "t"\n[driver]\nkind = "simm"\n')
+        known = "known are " + ", ".join(kinds())
+        self.assert_says(self.refusal("--config", path, is_made=True), path, "[driver]", "'simm'", known)
 
     def test_refuse_wrong_driver_option(self) -> None:
         """A driver's option with a wrong value is refused with the option and what to write."""
-        path = self.file('[node]\nname = "a"\n[driver]\nkind = "sim"\noptions = { port = "x" }\n')
+        path = self.file('[node]\nname = "a"\nteam_key = "t"\n[driver]\nkind = "sim"\noptions = { port = "x" }\n')
         self.assert_says(self.refusal("--config", path, is_made=True), path, "[driver]", "port", "as in port = 7400")
 
     def test_refuse_foreign_store(self) -> None:
@@ -110,7 +112,7 @@ class RefusalTests(SynchronousTestCase):
         with contextlib.closing(sqlite3.connect(foreign)) as connection:
             connection.execute("CREATE TABLE birds(name TEXT)")
         before = foreign.read_bytes()
-        path = self.file('[node]\nname = "a"\nstore = "foreign.sqlite"\n')
+        path = self.file('[node]\nname = "a"\nteam_key = "t"\nstore = "foreign.sqlite"\n')
         self.assert_says(self.refusal("--config", path, is_made=True), path, "[node] store", "foreign.sqlite")
         self.assertEqual(foreign.read_bytes(), before)
 
@@ -118,7 +120,7 @@ class RefusalTests(SynchronousTestCase):
         """A store that is no SQLite file, or lies in no folder, is refused and named."""
         (self.folder / "text.sqlite").write_text("this is a letter " * 99, encoding="utf-8")
         for name in ("text.sqlite", "no/such/folder.sqlite"):
-            path = self.file(f'[node]\nname = "a"\nstore = "{name}"\n')
+            path = self.file(f'[node]\nname = "a"\nteam_key = "t"\nstore = "{name}"\n')
             self.assert_says(self.refusal("--config", path, is_made=True), path, "[node] store", name)
 
     def test_refuse_name_without_address(self) -> None:
@@ -139,6 +141,9 @@ class RefusalTests(SynchronousTestCase):
     def test_say_which_setting_to_mend(self) -> None:
         """A fault that knows no file gets the file and the key in front of it, on one line."""
         self.assertEqual(told(PortInUse("UDP 1:2: taken"), "a.toml"), "a.toml: [node] port: UDP 1:2: taken")
+        self.assertEqual(
+            told(TunnelPortInUse("TCP 1:2: taken"), "a.toml"), "a.toml: [node] tunnel_port: TCP 1:2: taken"
+        )
         self.assertEqual(told(BadStore("two\nlines"), "a.toml"), "a.toml: [node] store: two lines")
         self.assertEqual(told(UnknownAgent("x"), ""), "[agent] module: x")
 
@@ -147,7 +152,7 @@ class OptionsTests(SynchronousTestCase):
     def test_flags_win_over_the_file(self) -> None:
         """A flag replaces what the file says, and leaves everything else."""
         path = Path(self.mktemp())
-        path.write_text('[node]\nname = "a"\nport = 7001\nkind = "dog"\n', encoding="utf-8")
+        path.write_text('[node]\nname = "a"\nteam_key = "t"\nport = 7001\nkind = "dog"\n', encoding="utf-8")
         options = Options()
         options.parseOptions(["--config", str(path), "--port", "7002", "--roles", "edge,bootstrap"])
         node = options.settings.node
@@ -165,8 +170,9 @@ class OptionsTests(SynchronousTestCase):
         """Each flag but the file's is a setting: all of them at once are accepted."""
         values = {
             "name": "a", "kind": "k", "host": "127.0.0.1", "port": "0", "known-nodes": "10.0.0.1:1",
-            "store": "s.sqlite", "team-key": "t", "roles": "edge", "agent-module": "search", "driver-kind": "sim",
-            "web-host": "127.0.0.1", "web-port": "0", "web-tls": "auto", "web-tls-port": "0", "web-yard": "10.0.0.1:1",
+            "store": "s.sqlite", "membership": "m", "team-key": "t", "roles": "edge", "agent-module": "search",
+            "driver-kind": "sim", "web-host": "127.0.0.1", "web-port": "0", "web-tls": "auto", "web-tls-port": "0",
+            "web-yard": "10.0.0.1:1", "tunnels": "wss://a", "tunnel-port": "443", "lan": "false",
         }  # fmt: skip
         self.assertEqual(set(values), {str(row[0]) for row in Options.optParameters} - {"config"})
         Options().parseOptions([word for name, value in values.items() for word in (f"--{name}", value)])

@@ -37,13 +37,15 @@ class WebRoleTests(SynchronousTestCase):
 
     def test_web_role_without_flask_names_the_extra(self) -> None:
         """Where Flask is not installed the web role is refused with the command that installs it."""
-        hidden = {
-            name: sys.modules.pop(name) for name in list(sys.modules) if name.split(".")[0] in ("flask", "webnode")
-        }
+
+        def needing() -> list[str]:
+            return [n for n in sys.modules if n.split(".")[0] in ("flask", "webnode") or n == "swarmnode.page"]
+
+        hidden = {name: sys.modules.pop(name) for name in needing()}
         sys.modules["flask"] = None  # type: ignore[assignment]
 
         def restore() -> None:
-            for name in [name for name in sys.modules if name.split(".")[0] in ("flask", "webnode")]:
+            for name in needing():
                 del sys.modules[name]
             sys.modules.update(hidden)
 

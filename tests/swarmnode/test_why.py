@@ -28,7 +28,7 @@ class WhyTests(SynchronousTestCase):
         made("vaio").touch()
         self.team = VirtualTeam(4)
         self.addCleanup(self.team.stop)
-        self.shell = Shell(self.team, self.team.services["vaio"].assembly.node.entangled)
+        self.shell = Shell(self.team, self.team.services["vaio"].assembly.node)
 
     def why(self, line: str) -> str:
         """What ``swarm why LINE`` prints, without trouble."""

@@ -104,16 +104,16 @@ class LeafTests(SynchronousTestCase):
 
     def test_read_what_was_kept(self) -> None:
         """What is written is read again; what is cut, empty, of another kind or no text at all is refused."""
-        again = read(self.leaf.pem)
-        self.assertEqual((again.names, again.pem), (self.leaf.names, self.leaf.pem))
+        again = read(self.leaf.pem_with_key)
+        self.assertEqual((again.names, again.pem_with_key), (self.leaf.names, self.leaf.pem_with_key))
         key = rsa.generate_private_key(65537, 2048)
         foreign = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
         certificate = self.leaf.certificate.public_bytes(Encoding.PEM)
         for pem in (
             b"",
             b"\xff\x00" * 50,
-            self.leaf.pem[:-40],
-            self.leaf.pem[:200],
+            self.leaf.pem_with_key[:-40],
+            self.leaf.pem_with_key[:200],
             certificate,
             foreign + certificate,
         ):

@@ -12,6 +12,7 @@ from twisted.internet.task import Clock
 from twisted.trial.unittest import SynchronousTestCase
 from twisted.web.resource import Resource
 
+from swarmnode.gateway import sides
 from tests.webnode.browser import Connection, site_of
 from tests.webnode.picture import jpeg
 from webnode.app import create_app
@@ -31,7 +32,7 @@ JOIN: dict[str, Any] = {"secret": SECRET, "name": "anna", "width": 208, "height"
 class PhoneRouteTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.sessions = SignedSessions(b"the team's secret", "quiet-otter", "", random.Random(1), lambda *_: succeed(0))
-        self.phones = MemoryPhones(most=2)
+        self.phones = MemoryPhones(most=2, check=sides)
         self.board = Board(MemoryDesk(), self.sessions, MemoryAudit(), phones=self.phones)
         state = state_of([], [], {}, node="vaio")
         self.client = create_app(lambda: state, self.board, wall=lambda: 1000.0).test_client()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -62,6 +63,13 @@ class RootTests(SynchronousTestCase):
         self.assertIn(b"native", self.asked("/events"))
         self.assertIn(b"flask api/v1/state 0", self.asked("/api/v1/state"))
         self.assertIn(b"flask  0", self.asked("/"))
+
+    def test_tell_all_files(self) -> None:
+        """A browser that keeps the page is told each of its files, and each is there."""
+        paths = json.loads(self.asked("/static/files.json").partition(b"\r\n\r\n")[2])
+        self.assertLess({"/static/page.js", "/static/sw.js", "/static/base.css"}, set(paths))
+        for path in paths:
+            self.assertIn(b" 200 ", self.asked(path)[:15], path)
 
     def test_refuse_in_json(self) -> None:
         """Whatever a native route refuses is JSON with the strict headers and no version of the server."""

@@ -173,11 +173,12 @@ class FactoryTests(SynchronousTestCase):
         self.assertIn("swarm password", str(error))
         self.assertNotIn("horse", str(error))
 
-    def test_keep_a_team_without_secret_apart(self) -> None:
-        """Where the team's key is the one that everybody knows, nobody can make a token with it."""
-        ground = self.ground(code="quiet-otter")
-        settings = Settings.from_mapping({"node": {"name": "vaio"}, "web": {"code": "quiet-otter"}}, "vaio.toml")
-        first, second = (sessions(replace(ground, settings=settings)) for _ in range(2))
+    def test_keep_teams_apart(self) -> None:
+        """Two web nodes of one team take each other's tokens; that of another team does not."""
+        first, second = (sessions(self.ground()) for _ in range(2))
+        ground = self.ground()
+        settings = Settings.from_mapping({"node": {"name": "vaio", "team_key": "y" * 20}, "web": {}}, "vaio.toml")
+        stranger = sessions(replace(ground, settings=settings))
         token = first.token("operator", "operator", 0.0, 10.0)
-        self.assertEqual(first.visitor(token.text, 1.0).role, "operator")
-        self.assertEqual(second.visitor(token.text, 1.0), Visitor())
+        self.assertEqual(second.visitor(token.text, 1.0).role, "operator")
+        self.assertEqual(stranger.visitor(token.text, 1.0), Visitor())

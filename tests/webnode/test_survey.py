@@ -6,8 +6,10 @@ from typing import Any
 
 from middleware.entangled.network.switchboard import Weather
 from middleware.entangled.record import hashed_key
+from middleware.entangled.wire.door import UNPROTECTED
+from middleware.link import Link
 from middleware.node import SwarmNode
-from middleware.survey import NETWORK, answer_survey, network
+from middleware.survey import LINKS, NETWORK, answer_survey, network
 from tests.fleet import FleetCase, SwarmFleet
 from tests.webnode.guests import Guests
 from webnode.app import create_app
@@ -93,6 +95,68 @@ class SurveyTests(FleetCase):
             else:
                 self.assertIsNone(view)
 
+    def links(self) -> Any:
+        return self.done(self.team, self.survey.links(), PATIENCE_S + 1)
+
+    def test_tell_how_each_is_reached(self) -> None:
+        """Each of three tells its ways to the two others; a moment later each way has its score, and why."""
+        told = self.links()
+        self.assertEqual((told["here"], list(told["devices"]), told["silent"]), (self.dogs[0], self.dogs, []))
+        self.assertEqual({way["score"] for view in told["devices"].values() for way in view["links"]}, {None})
+        self.team.run(2)
+        for place, view in enumerate(self.links()["devices"].values()):
+            others = {f"dog{other}" for other in range(3) if other != place}
+            self.assertEqual(({way["name"] for way in view["links"]}, view["refusals"]), (others, []))
+            for way in view["links"]:
+                self.assertEqual((way["way"], way["by"], way["loss"], way["score"]), ("machine", "", 0.0, 100))
+                self.assertTrue(5 < way["rtt_ms"] < 8 and way["jitter_ms"] < 1 and way["for_s"] > 1, way)
+
+    def test_tell_what_got_worse(self) -> None:
+        """A way that loses much has fewer points than one that loses nothing, as the rule of the terminal has it."""
+        self.links()
+        self.team.run(3)
+        far = self.team.address(2)
+        for near in (0, 1):
+            self.team.board.set_weather(self.team.address(near), far, Weather(delay_s=0.15, jitter_s=0.02))
+        for _ in range(6):
+            self.team.run(2)
+            told = self.links()
+        scores = {way["name"]: way["score"] for way in told["devices"][self.dogs[0]]["links"]}
+        self.assertEqual(scores["dog1"], 100)
+        self.assertTrue(0 < scores["dog2"] < 80, scores)
+        way = next(each for each in told["devices"][self.dogs[0]]["links"] if each["name"] == "dog2")
+        judged = Link(way["loss"], way["rtt_ms"] / 1000, way["jitter_ms"] / 1000, False).score
+        self.assertEqual(way["score"], judged)
+
+    def test_carrying_costs(self) -> None:
+        """Of two ways with the same figures that which others carry has fewer points, and says who carries."""
+        ways = [
+            {"id": uuid, "way": way, "by": by, "loss": 0.0, "round_trip": 0.002, "jitter": 0.0}
+            for uuid, way, by in ((self.dogs[0], "punched", ""), (self.dogs[2], "carried", self.dogs[0]))
+        ]
+        self.team.nodes[1].entangled.endpoint.expose(LINKS, lambda peer: {"links": ways, "refusals": []})
+        punched, carried = self.links()["devices"][self.dogs[1]]["links"]
+        self.assertEqual((punched["score"], punched["by"]), (100, ""))
+        self.assertEqual((carried["score"], carried["by"]), (Link(0.0, 0.002, 0.0, True).score, "dog0"))
+        self.assertLess(carried["score"], 100)
+
+    def test_believe_no_unlawful_way(self) -> None:
+        """What a device says of its ways is made lawful: kinds, sides and numbers that there are, and no others."""
+        way = {"id": "ab", "way": "magic", "loss": 7, "round_trip": float("nan"), "for": -1, "by": 3, "address": ["x"]}
+        refusal = {"who": "x\n" * 99, "side": 3, "code": None, "reason": "why; do; this", "ago": "y", "count": 1.5}
+        answer = {"links": [way, {"id": 4}, 5], "refusals": [refusal, "x"]}
+        self.team.nodes[1].entangled.endpoint.expose(LINKS, lambda peer: answer)
+        view = self.links()["devices"][self.dogs[1]]
+        ((only,), (refused,)) = view["links"], view["refusals"]
+        self.assertEqual((only["way"], only["loss"], only["score"], only["for_s"]), ("none", 1.0, 0, None))
+        self.assertEqual((refused["side"], refused["why"], refused["remedy"]), ("we", "why", "do; this"))
+        self.assertEqual((refused["ago_s"], refused["count"], len(refused["who"]) <= 64), (0.0, 1, True))
+
+    def test_open_team(self) -> None:
+        """An open team says what it does not protect."""
+        told: Any = self.survey.team()
+        self.assertEqual((told["kind"], told["unprotected"]), ("open", UNPROTECTED))
+
     def test_tell_what_is_stored(self) -> None:
         """A device tells how much it holds of each kind, and its newest records; another one, or the node itself."""
         self.done(self.team, self.team.nodes[1].entangled.put(hashed_key("a"), "note", b"\xa1x", "team"), 1)
@@ -131,7 +195,8 @@ class SurveyTests(FleetCase):
     def test_ask_by_http(self) -> None:
         """Both are read by viewers; an unknown device is 404, a silent one 504, a node that cannot ask says so."""
         state = state_of([{"uuid": "01", "name": "dog1"}, {"uuid": "02", "name": "dog2"}], [], {})
-        survey = MemorySurvey({"devices": {}, "silent": ["02"]}, {"01": {"records": 4}})
+        others: Any = ({"here": "01", "devices": {}, "silent": []}, {"kind": "open", "unprotected": "much"})
+        survey = MemorySurvey({"devices": {}, "silent": ["02"]}, {"01": {"records": 4}}, *others)
 
         def asked(board: Board, path: str) -> tuple[int, Any]:
             client = create_app(lambda: state, board).test_client()
@@ -140,9 +205,11 @@ class SurveyTests(FleetCase):
 
         board = Board(MemoryDesk(), Guests(), survey=survey)
         self.assertEqual(asked(board, "network"), (200, {"devices": {}, "silent": ["02"]}))
+        self.assertEqual((asked(board, "links"), asked(board, "team")), ((200, others[0]), (200, others[1])))
         self.assertEqual(asked(board, "devices/01/inventory"), (200, {"records": 4}))
         self.assertEqual([asked(board, f"devices/{uuid}/inventory")[0] for uuid in ("02", "03")], [504, 404])
-        self.assertEqual(asked(Board(MemoryDesk(), Guests()), "network")[0], 409)
+        for path in ("network", "links", "team"):
+            self.assertEqual(asked(Board(MemoryDesk(), Guests()), path)[0], 409)
 
 
 def _refuse(peer: object, too: int, many: int) -> None:

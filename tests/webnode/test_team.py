@@ -55,7 +55,7 @@ class TeamDeskTests(SynchronousTestCase):
             self.assertEqual((refusal.field, refusal.status), ("device", 409))
             self.assertEqual(refusal.problem, "dog2 left while it was asked")
             self.team.add("dog2")
-            self.team.clock.advance(1.0)
+            self.team.clock.advance(3.0)
 
     def test_device_that_is_silent_is_told(self) -> None:
         """A device that others still hear and that does not answer is reported with 504."""

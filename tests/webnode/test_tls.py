@@ -29,7 +29,6 @@ from webnode.live import SENT_AHEAD, SYSTEM_AHEAD, Viewer
 
 MISSING = [name for name in ("OpenSSL", "cryptography") if find_spec(name) is None]
 if not MISSING:
-    from middleware.errors import BadSetting
     from middleware.settings import Settings
     from webnode.certificate import authority, read
     from webnode.ground import Ground
@@ -154,7 +153,7 @@ class DoorTests(SynchronousTestCase):
         self.folder.mkdir()
 
     def door(self, team_key: str = "of a test", store: str = "a.sqlite") -> TlsDoor:
-        node = {"name": "a", "team_key": team_key, "roles": ["web"], "store": store}
+        node = {"name": "a", "roles": ["web"], "store": store, "team_key": team_key}
         settings = Settings.from_mapping({"node": node, "web": {"tls": "auto"}}, str(self.folder / "a.toml"))
         anything: Any = None
         return door(
@@ -167,33 +166,10 @@ class DoorTests(SynchronousTestCase):
         self.assertNotEqual(self.door("of another team").signer.pem, self.door().signer.pem)
         self.assertEqual(sorted(os.listdir(self.folder)), ["a.sqlite.tls", "b.sqlite.tls"])
 
-    def test_have_one_of_its_own(self) -> None:
-        """With the default key, which everybody knows, the node has an authority of its own, keeps it and says so."""
-        with capturedLogs() as said:
-            first = self.door("swarm")
-        self.assertIn("team_key is no secret", "\n".join(formatEvent(each) for each in said))
-        self.assertEqual(self.door("swarm").signer.pem, first.signer.pem)
-        self.assertEqual(stat.S_IMODE((self.folder / "a.sqlite.ca").stat().st_mode), 0o600)
-        self.assertNotEqual(
-            first.signer.pem, authority(Settings.from_mapping({"node": {"name": "a"}}, "").node.team_secret).pem
-        )
-
     def test_keep_nothing_in_memory(self) -> None:
         """A node that stores nothing leaves no file behind."""
-        self.door("swarm", ":memory:")
+        self.door(store=":memory:")
         self.assertEqual(os.listdir(self.folder), [])
-
-    def test_refuse_an_unsafe_authority(self) -> None:
-        """An authority that others may read, or that is cut, is refused in one line: phones trust it."""
-        self.door("swarm")
-        path = self.folder / "a.sqlite.ca"
-        path.chmod(0o644)
-        line = str(self.assertRaises(BadSetting, self.door, "swarm"))
-        for words in ("a.toml", "[web] tls", str(path), "mode 644", "chmod 600"):
-            self.assertIn(words, line)
-        path.chmod(0o600)
-        path.write_bytes(b"short")
-        self.assertIn("5 bytes", str(self.assertRaises(BadSetting, self.door, "swarm")))
 
     def test_tell_of_a_taken_port(self) -> None:
         """A port that is held is told with the setting that names it."""

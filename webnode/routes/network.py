@@ -1,4 +1,4 @@
-"""Routes of the network: who knows whom, and what each device stores."""
+"""Routes of the network: who knows whom, by which ways, in what team, and what each device stores."""
 
 from __future__ import annotations
 
@@ -12,6 +12,16 @@ from webnode.route import API, Ask, Field, Route, device
 def network(ask: Ask) -> Any:
     """Who knows whom, and how far they are."""
     return _survey(ask).network()
+
+
+def links(ask: Ask) -> Any:
+    """How each reaches the others."""
+    return _survey(ask).links()
+
+
+def team(ask: Ask) -> Any:
+    """What team this is."""
+    return _survey(ask).team()
 
 
 def inventory(ask: Ask) -> Any:
@@ -33,6 +43,22 @@ ROUTES = (
         "viewer",
         network,
         gives="devices (by uuid: contacts, known, sent, received, lost, lookups), silent",
+    ),
+    Route(
+        "GET",
+        f"{API}/links",
+        "By which way each device reaches the others, and how well, measured while somebody asks; who was not let in",
+        "viewer",
+        links,
+        gives="here (this node), devices (by uuid: links, refusals), silent",
+    ),
+    Route(
+        "GET",
+        f"{API}/team",
+        "Open or closed; of a closed team its members, their roles, and until when they are certified",
+        "viewer",
+        team,
+        gives="kind; unprotected, or name, fingerprint, me, until, is_ending, known, members",
     ),
     Route(
         "GET",

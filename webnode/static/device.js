@@ -41,6 +41,7 @@ function fill() {
   facts(at("d-capabilities"), Object.entries(device.capabilities).map(([name, entries]) => [name, properties(entries)]));
   facts(at("d-network"), [
     ["address", device.address], ["roles", device.roles.join(", ")], ["joined", device.joined ? `as number ${device.joined}` : ""],
+    ...["laptop", "agent"].filter((name) => device[name]).map((name) => [name, device[name]]),
     ...(device.position ? [["position", whereabouts(device.position)]] : []),
     ...Object.entries(device.network), ...Object.entries(device.deployed).map(([name, label]) => [`deployed ${name}`, label]),
     ["uuid", device.uuid]]);

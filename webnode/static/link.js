@@ -14,6 +14,7 @@ const flying = new Set();
 let here = location.origin;
 let finding = null;
 let orders = 0;
+let left = null;
 
 // Where the page is served from now: the origin of every address.
 export const base = () => here;
@@ -41,6 +42,7 @@ function find() {
 
 // One question, once; whoever asks it knows what to make of no answer.
 export async function fly(address, options) {
+  if (left) return left;
   const flight = new AbortController();
   const deadline = setTimeout(() => flight.abort(), PATIENCE);
   flying.add(flight);
@@ -84,6 +86,14 @@ async function call(method, path, body) {
 // Both give what the node answers, or throw an Error whose message is for people (with status and field, if it refused).
 export const get = (path) => call("GET", path);
 export const ask = (method, path, body = {}) => call(method, path, body);
+
+// Says goodbye: the last thing that a page asks.  What is under way is dropped, or it would come without a session.
+export async function leave() {
+  flying.forEach((flight) => flight.abort());
+  const last = ask("DELETE", "session").catch(() => {});
+  left = new Promise(() => {});
+  await Promise.race([last, pause(PATIENCE)]);
+}
 
 // The next picture of a camera, as a Response: 200, 204 where there is no newer one, or a refusal.
 export const frames = (uuid, after, signal) => fetch(`${here}/shot/${uuid}?after=${after}&viewer=${VIEWER}&ticket=${ticket()}`, { signal });

@@ -1,6 +1,7 @@
 // The network: who knows whom and how far they are, asked of the devices while somebody looks.
 import { at, attribute, drawn, element, keyed, words } from "./element.js";
 import { get } from "./link.js";
+import { watch } from "./watch.js";
 
 const EVERY = 2000;
 const DRAWN = 12;
@@ -58,38 +59,17 @@ function show(told, known) {
 }
 
 export function make(root, { model }) {
-  let inSight = false;
-  let timer = null;
   root.append(
     element("p", { class: "hint", id: "network-line", role: "status" }),
     drawn("svg", { id: "graph", viewBox: `0 0 ${SIDE} ${SIDE}`, role: "img", "aria-label": "Who knows whom; the table has the same in numbers" }),
     element("div", { class: "wide", tabindex: 0, role: "region", "aria-label": "Round trips" }, element("table", { id: "ties" })),
     element("ul", { id: "traffic" }), element("h3", { id: "no-lookups" }, "Newest lookups"), element("ol", { id: "lookups", class: "plain" }));
-
-  async function turn() {
-    clearTimeout(timer);
-    timer = null;
-    if (!inSight || document.hidden) return;
-    timer = setTimeout(turn, EVERY);
+  const close = watch(root, EVERY, async () => {
     try {
       show(await get("network"), model.devices);
     } catch (error) {
       words(at("network-line"), error.message);
     }
-  }
-
-  const watch = new IntersectionObserver(([entry]) => {
-    inSight = entry.isIntersecting;
-    if (inSight !== Boolean(timer)) turn();
   });
-  watch.observe(root);
-  document.addEventListener("visibilitychange", turn);
-  return {
-    close() {
-      inSight = false;
-      watch.disconnect();
-      document.removeEventListener("visibilitychange", turn);
-      turn();
-    },
-  };
+  return { close };
 }

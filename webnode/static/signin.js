@@ -1,6 +1,6 @@
 // Signing in and out: by the code that the node printed, which a link may carry, or by the password.
 import { element, words } from "./element.js";
-import { ask, get } from "./link.js";
+import { ask, get, leave } from "./link.js";
 import { panel } from "./panel.js";
 import { forget, keep, token } from "./session.js";
 
@@ -57,7 +57,7 @@ panel({
     const more = element("button", { class: "operators" }, "Invite …");
     const trouble = element("p", { role: "status" });
     out.onclick = async () => {
-      await ask("DELETE", "session").catch(() => null);
+      await leave();
       forget();
       location.reload();
     };

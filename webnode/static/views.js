@@ -50,5 +50,7 @@ panel({ place: "more", order: 35, title: "Take part", needs: { role: "phone", ha
 } });
 panel({ place: "phone", title: "This phone", needs: { role: "viewer", has: "phones" }, make: phone });
 panel({ place: "events", title: "Events", load: () => import("./events.js") });
+panel({ place: "network", order: 5, title: "Links", needs: { role: "viewer", has: "survey" }, load: () => import("./ways.js") });
+panel({ place: "network", order: 7, title: "Team", needs: { role: "viewer", has: "survey" }, load: () => import("./membership.js") });
 panel({ place: "network", order: 10, title: "Network", needs: { has: "survey" }, load: () => import("./network.js") });
 panel({ place: "device", order: 10, title: "Stores", needs: { has: "survey" }, load: () => import("./inventory.js") });

@@ -11,6 +11,7 @@ from twisted.internet.defer import Deferred, maybeDeferred
 from twisted.internet.interfaces import IReactorTime
 
 from middleware.entangled.control import word
+from middleware.entangled.control.health import health, links
 from middleware.entangled.errors import LocalError
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address
@@ -41,11 +42,12 @@ class Verbs:
     node: EntangledNode
     space: TupleSpace
     keywords: Keywords
+    clock: IReactorTime
 
     @classmethod
     def of(cls, node: EntangledNode, clock: IReactorTime, rng: random.Random) -> Verbs:
         """The verbs of ``node``, over the tuple space that has no other name."""
-        return cls(node, TupleSpace(node, clock, rng), Keywords(node))
+        return cls(node, TupleSpace(node, clock, rng), Keywords(node), clock)
 
     def run(self, name: object, arguments: object, tell: Tell) -> Deferred[Any]:
         """Do what ``name`` says; events go to ``tell``, the Deferred fires with the answer and may be cancelled.
@@ -77,13 +79,15 @@ class Verbs:
             "tuple get": self._tuple_get,
             "tuple read": self._tuple_read,
             "rpc": self._rpc,
+            "health": lambda a, _: health(self.node),
+            "links": lambda a, _: Deferred.fromCoroutine(links(self.node, self.clock)),
         }
 
     # -- dht --------------------------------------------------------------------------------------------------------
 
     def _dht_get(self, a: Arguments, tell: Tell) -> object:
         concern = cast(ReadConcern, a.choice("concern", "majority", get_args(ReadConcern)))
-        return self.node.get(key_of(a.text("key")), concern).addCallback(_records)
+        return self.node.get(key_of(a.text("key")), concern).addCallback(rows_of)
 
     def _dht_put(self, a: Arguments, tell: Tell) -> object:
         lifetime = cast(Lifetime, a.choice("lifetime", "team", get_args(Lifetime)))
@@ -101,7 +105,7 @@ class Verbs:
         return found.addCallback(lambda contacts: [_contact(contact) for contact in contacts])
 
     def _dht_watch(self, a: Arguments, tell: Tell) -> object:
-        return _until_cancelled(self.node.watch(key_of(a.text("key")), lambda records: tell(_records(records))))
+        return _until_cancelled(self.node.watch(key_of(a.text("key")), lambda records: tell(rows_of(records))))
 
     # -- keywords and tuples ----------------------------------------------------------------------------------------
 
@@ -253,7 +257,8 @@ def _stored(stored: Stored) -> dict[str, int]:
     return {"replicas": int(stored), "sequence": stored.sequence}
 
 
-def _records(records: Sequence[Record]) -> list[dict[str, Any]]:
+def rows_of(records: Sequence[Record]) -> list[dict[str, Any]]:
+    """Records as the socket tells them; tombstones are left out."""
     return [
         {
             "owner": record.owner.hex(),

@@ -132,6 +132,12 @@ class MemoryStore:
         made_room, self._made_room = self._made_room, []
         return made_room + self._run_out(now)
 
+    def due(self) -> float:
+        """The moment before which ``expire`` finds nothing to let go of."""
+        if self._made_room:
+            return float("-inf")
+        return self._heap[0][0] if self._heap else float("inf")
+
     def drop_leased(self, owner: bytes) -> list[Record]:
         """Let go of all leased records of ``owner`` and return them in the order of their slots."""
         return [self._remove(record.slot) for record in self.owned(owner) if record.lifetime == "leased"]

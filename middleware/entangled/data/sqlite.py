@@ -263,9 +263,24 @@ def _locked(path: str) -> int:
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
+        holder = _holder(lock)
         os.close(lock)
-        raise _bad(path, "another node uses it", "stop that one, or name another file") from error
+        who = "another node uses it" + (f" (process {holder})" if holder else "")
+        raise _bad(path, who, "stop that one, or give each node a store of its own: its identity lies there") from error
     except OSError as error:
         os.close(lock)
         raise _bad(path, error.strerror or str(error), "name a file of your own on a local disk") from error
     return lock
+
+
+def _holder(lock: int) -> int:
+    """The process that has locked the file; 0 where the system does not tell."""
+    inode = os.fstat(lock).st_ino
+    try:
+        with open("/proc/locks", encoding="ascii") as lines:
+            rows = [line.split() for line in lines]
+    except (OSError, ValueError):
+        return 0
+    # "12: FLOCK  ADVISORY  WRITE 4711 00:2d:1234 0 EOF"
+    held = [row[4] for row in rows if len(row) > 5 and row[1] == "FLOCK" and row[5].rpartition(":")[2] == str(inode)]
+    return int(held[0]) if held and held[0].isdecimal() else 0

@@ -102,6 +102,9 @@ class Store(Protocol):
     def expire(self, now: float) -> list[Record]:
         """Let go of what has run out by ``now``; return it, the earliest first, and before it what had to make room."""
 
+    def due(self) -> float:
+        """The moment before which ``expire`` finds nothing to let go of; infinite where nothing is held."""
+
     def drop_leased(self, owner: bytes) -> list[Record]:
         """Let go of all leased records of ``owner`` (it said goodbye) and return them in the order of their slots."""
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from middleware.entangled.identity import node_id
-from middleware.entangled.network.network import Address
+from middleware.entangled.network.network import Address, relayed
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Contact:
     """A node's public key (32 bytes) and address; the id follows from the key."""
 
@@ -20,8 +20,9 @@ class Contact:
         object.__setattr__(self, "node_id", node_id(self.public))
 
     def packed(self) -> list[object]:
-        """The contact as it stands in a message."""
-        return [self.public, self.address.host, self.address.port]
+        """The contact as it stands in a message: a way that is this node's own (a tunnel) is of no use to others."""
+        host, port = relayed(self.node_id) if self.address.is_virtual else self.address
+        return [self.public, host, port]
 
 
 def unpacked(fields: object) -> Contact | None:
@@ -35,4 +36,6 @@ def unpacked(fields: object) -> Contact | None:
         return None
     if not (type(port) is int and 0 < port < 65536):
         return None
-    return Contact(public, Address(host, port))
+    contact = Contact(public, Address(host, port))
+    # Nobody can name a way of ours: whatever stands there, it only says that others have to carry what is sent.
+    return Contact(public, relayed(contact.node_id)) if host[0] == "~" else contact

@@ -3,12 +3,15 @@
 Every ping carries a digest of the live members; where two nodes differ, one asks the other for its list and pings whom
 it did not know (nobody enters unproved).  So in a small team everybody knows everybody, and after a partition the two
 sides find each other again through any pair, whether the node that all joined by is still there or not.
+
+A network of more than ``MAX_MEMBERS`` is too large for that.  There a node asks its neighbours often, for they hold
+what it holds, and of the others whoever was silent for longest, at a ``pace`` that follows how many come and go.
 """
 
 from __future__ import annotations
 
 import random
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from twisted.internet.defer import Deferred, DeferredList
 from twisted.internet.interfaces import IReactorTime
@@ -17,7 +20,9 @@ from twisted.logger import Logger
 from middleware.entangled.background import Background
 from middleware.entangled.errors import NoAnswer, NotRunning, Refused
 from middleware.entangled.kademlia.contact import Contact, unpacked
-from middleware.entangled.kademlia.overlay import Overlay, contacts_of
+from middleware.entangled.kademlia.detour import Detour
+from middleware.entangled.kademlia.overlay import K, Overlay, contacts_of
+from middleware.entangled.kademlia.pace import Pace
 from middleware.entangled.kademlia.roster import MAX_MEMBERS
 from middleware.entangled.network.network import Address
 from middleware.entangled.wire.endpoint import Endpoint
@@ -30,23 +35,43 @@ PROBE = 1.0
 REFRESH = 3600.0
 """Seconds after which a bucket that nobody searched is refreshed (Kademlia, section 2.3)."""
 BACKOFF = (0.2, 5.0)
+HINT_AFTER = 4
+"""Tries in vain after which a person is told, once, where to look: a node of another team hears no answer at all."""
 MAX_FORMER = 32
 """Addresses of known nodes and lost contacts that are tried when nobody is left."""
 AGAIN = 4.0
 """Seconds before an absent member, or one that was only named, is tried again."""
 LARGE_FOR = 60.0
-"""Seconds for which one word that the network is too large to be known whole holds against those who do not see it."""
+"""Seconds for which one word that the network is too large to be known whole holds against those who do not see it.
+Who hears no such word for as long again begins to know the members anew."""
+AROUND = (3.0, 60.0)
+"""Seconds until a newcomer of a large network looks up its own id again; twice as many each time, up to these."""
+NEAR_SILENCE = 12.0
+"""Seconds of silence after which a neighbour, or one whose way has to be used, is asked in a large network."""
+PROBES = 2
+"""Far contacts that are asked in one ``PROBE``."""
+UPKEEP = 15.0
+"""Seconds between two looks at what changes slowly in a large network."""
+SESSION_S = 120.0
+"""Seconds of silence after which a session is let go of in a large network: there are too many peers to keep all."""
+IN_TOUCH = 90.0
+"""Seconds of silence up to which the other side surely has its end of a session yet."""
 BREATH = 0.02
 """Seconds that a newcomer lets its first reads, and those of others, have before it meets the next few strangers, and
 as much again at most."""
 AT_ONCE = 8
 """Strangers that are met at the same time: a handshake takes 0.3 ms of a core on each side."""
+_BY_TABLE = b"-"
+"""Stands for the digest of who has none, since it goes by its table: nobody's list is like it."""
 PAGE = 20
 """Members in one message."""
 
 
 class Membership:
-    """The comings and goings around one node."""
+    """The comings and goings around one node.
+
+    ``needs_use`` says of a contact whether the way to it is open for only so long as it is used.
+    """
 
     _log = Logger()
 
@@ -63,7 +88,14 @@ class Membership:
         self._listed_at: dict[bytes, float] = {}
         self._returning = False
         self._large_until = float("-inf")
+        self._pace = Pace()
+        self._sounding: set[bytes] = set()
+        self._next_sounding = self._next_upkeep = float("-inf")
+        self._fragile: list[Contact] = []
+        self.needs_use: Callable[[Contact], bool] = lambda contact: False
         self._joining = False
+        self._is_entered = False
+        self.detour = Detour(overlay, endpoint, clock, rng, chores, self._enter)
         endpoint.expose("ping", self._answer_ping, changes=True, idempotent=True)
         endpoint.expose("members", self._answer_members)
         endpoint.expose("known", self._answer_known)
@@ -78,13 +110,13 @@ class Membership:
         ``remembered`` are greeted beside them, and waited for only where there are known nodes: without any, this may
         be the first node of its network.  A known node that turns out to be this one is waited for no longer.
         """
-        others, pause = list(known), BACKOFF[0]
+        others, pause, tries = list(known), BACKOFF[0], 0
         for contact in remembered:
             self._overlay.roster.remembered(contact, self._clock.seconds())
-        addresses = [contact.address for contact in remembered]
+        addresses = [contact.address for contact in remembered if not contact.address.is_virtual]
         self._former |= dict.fromkeys([*known, *addresses])
         while others or addresses:
-            if await self._greeted(others, addresses):
+            if await self._greeted(others, addresses) or self._is_entered:
                 return
             if self._chores.is_stopped:
                 raise NotRunning("the node stopped while it was joining")
@@ -92,9 +124,30 @@ class Membership:
                 break
             names = ", ".join(map(str, others))
             self._log.info("no answer from {known}; trying again in {s:.1f} s", known=names, s=pause)
+            tries += 1
+            if tries == HINT_AFTER:
+                self._log.warn("nobody lets this node in; swarm doctor SETTINGS says why")
             await self._chores.sleep(pause * (0.75 + self._rng.random() / 2))
             pause = min(pause * 2, BACKOFF[1])
-        self._overlay.is_whole = True
+        # Others may have come in meanwhile, and said that there are too many.
+        if not self._is_entered and not self._overlay.is_large:
+            self._overlay.is_whole = True
+
+    @property
+    def is_entered(self) -> bool:
+        """Whether another way than a known node led into the network."""
+        return self._is_entered
+
+    async def meet(self, address: Address) -> bool:
+        """Greet whoever of the team is said to listen at ``address``: its network and this node's become one.
+
+        Returns whether it is another node; raises ``NoAnswer``.
+        """
+        found = await self._endpoint.greet(address)
+        if found.node_id == self._overlay.own_id:
+            return False
+        await self._enter(found)
+        return True
 
     async def settle(self) -> None:
         """Look up the own id (Kademlia, section 2.3), so that this node knows where it is and is known there."""
@@ -103,13 +156,23 @@ class Membership:
         if not self._overlay.is_whole:
             await self._overlay.lookup(self._overlay.own_id)
         self._overlay.is_placed = True
+        if self._overlay.is_large:
+            self._chores.fork(self._look_around())
 
     def lost(self, contact: Contact) -> None:
         """Keep in mind where ``contact`` was."""
+        self._pace.lost()
+        self._next_sounding = float("-inf")
+        if contact.address.is_virtual:
+            return
         self._former.pop(contact.address, None)
         self._former[contact.address] = None
         if len(self._former) > MAX_FORMER:
             del self._former[next(iter(self._former))]
+
+    def forget(self, contact: Contact) -> None:
+        """Do not look for ``contact`` any more."""
+        self._former.pop(contact.address, None)
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
@@ -126,16 +189,23 @@ class Membership:
         pings = [Deferred.fromCoroutine(self._ping(contact)) for contact in found]
         return any([ok for ok, _ in await DeferredList(pings, consumeErrors=True)])
 
+    async def _enter(self, contact: Contact) -> None:
+        """Enter the network by whom a detour led to."""
+        await self._ping(contact)
+        self._is_entered = True
+
     async def _ping(self, contact: Contact) -> None:
         # Who does not know all members yet has no list to compare.
         digest = self._overlay.roster.digest() if self._overlay.is_whole else b""
         answer = await self._overlay.ask(contact, "ping", digest, changes=True)
-        self._compare(contact, answer)
+        if answer == b"" and not self._overlay.is_placed and not self._overlay.is_whole:
+            self._heard_large(0.0)  # it goes by its table; for how long is asked as soon as this node is placed
+        self._compare(contact, _BY_TABLE if answer == b"" else answer)
 
     def _compare(self, contact: Contact, digest: object) -> None:
         """Ask ``contact`` for its members where it knows others than this node does."""
         now = self._clock.seconds()
-        if now < self._large_until or not digest or (self._joining and not self._overlay.is_whole):
+        if self._overlay.is_large or not digest or (self._joining and not self._overlay.is_whole):
             return
         if self._overlay.is_whole and digest == self._overlay.roster.digest():
             return
@@ -173,11 +243,13 @@ class Membership:
         after, strangers = b"", []
         for _ in range(1 + MAX_MEMBERS // PAGE):
             answer = await self._overlay.ask(contact, "members", after)
-            if answer is None:
-                self._large_until = self._clock.seconds() + LARGE_FOR
-                self._overlay.is_whole, self._overlay.is_large = False, True
-                return
+            if answer is None or (type(answer) is int and answer > 0):
+                return self._heard_large(LARGE_FOR if answer is None else min(float(answer), LARGE_FOR))
+            if self._overlay.is_large or type(answer) is int:
+                return None  # of one who has yet to hear it, or whose word is over
             found = contacts_of(answer)
+            for named in found:
+                self._overlay.on_named(named, contact)
             strangers += [c for c in found if self._is_worth_a_try(c)]
             if len(found) < PAGE:
                 break
@@ -189,8 +261,15 @@ class Membership:
                 await self._chores.sleep(self._breath())
         if not self._overlay.is_whole and not self._overlay.roster.is_settled:
             await self._count_absent()
-        self._overlay.is_whole = self._clock.seconds() > self._large_until
-        self._overlay.is_large = not self._overlay.is_whole
+        self._overlay.is_whole = not self._overlay.is_large
+
+    def _heard_large(self, seconds: float) -> None:
+        """Take it that the network is too large to be known whole, for so many ``seconds``."""
+        self._large_until = max(self._large_until, self._clock.seconds() + seconds)
+        if not self._overlay.is_large:
+            self._overlay.grew()
+            if self._overlay.is_placed:
+                self._chores.fork(self._look_around())
 
     async def _count_absent(self) -> None:
         """Count as absent whom others know and this newcomer cannot reach, or it would take its side of a cut for all.
@@ -220,7 +299,7 @@ class Membership:
         """Look for those that were known once: a radio that was out costs a node all its contacts."""
         self._returning = True
         try:
-            if await self._greeted([], list(self._former)):
+            if await self._greeted([], list(self._former)) or await self.detour.taken():
                 await self._overlay.lookup(self._overlay.own_id)
         finally:
             self._returning = False
@@ -233,9 +312,11 @@ class Membership:
 
     def _probe(self) -> None:
         overlay, now = self._overlay, self._clock.seconds()
+        if overlay.is_large and self._sound_out(now):
+            return
         overlay.roster.strike(now)
         contacts = overlay.contacts()
-        if not contacts and self._former and not self._returning:
+        if not contacts and (self._former or self.detour.is_possible) and not self._returning:
             self._chores.fork(self._return())
         # With n members each pair needs one ping in a while, so the while grows with n: the sum stays what it was.
         patience = min(MAX_SILENCE, SILENCE * max(1.0, len(contacts) / SMALL))
@@ -247,16 +328,134 @@ class Membership:
             contact = absent[self._rng.randrange(len(absent))]
             self._tried_at[contact.node_id] = now
             self._chores.fork(self._seek(contact))
+        self._refresh(now)
+
+    def _refresh(self, now: float) -> None:
+        overlay = self._overlay
         for index in overlay.table.stale_buckets(now, REFRESH)[:1]:
             target = overlay.table.refresh_target(index, self._rng)
             overlay.table.searched(target, now)
             if not overlay.is_complete:
                 self._chores.fork(overlay.lookup(target))
 
+    # -- in a large network -----------------------------------------------------------------------------------------
+
+    async def _look_around(self) -> None:
+        """Look up the own id again until that brings no nearer ones: where many come at once nobody knows many yet."""
+        overlay, pause = self._overlay, AROUND[0]
+        while not self._chores.is_stopped and overlay.is_large:
+            before = overlay.neighbours()
+            await self._chores.sleep(pause * (0.75 + self._rng.random() / 2))
+            pause = min(2 * pause, AROUND[1])
+            await overlay.lookup(overlay.own_id)
+            if len(before) == K and overlay.neighbours() == before:
+                return
+
+    def _sound_out(self, now: float) -> bool:
+        """Ask neighbours that were silent for a while, and a few of the others; False where this node is lost."""
+        overlay = self._overlay
+        if not overlay.is_placed:
+            return False
+        near = overlay.neighbours()
+        if not near:
+            return False
+        if now >= self._next_upkeep:
+            self._next_upkeep = now + UPKEEP
+            self._keep_up(now)
+        for contact in near:
+            if overlay.silence(contact) > NEAR_SILENCE:
+                self._sound(contact, True)
+        for contact in self._fragile:
+            if overlay.silence(contact) > NEAR_SILENCE and overlay.is_contact(contact):
+                self._sound(contact, True)
+        if now >= self._next_sounding or overlay.is_anybody_doubted:
+            self._next_sounding = self._sound_far(now)
+        return True
+
+    def _keep_up(self, now: float) -> None:
+        """Do what need not be done every second."""
+        overlay = self._overlay
+        overlay.patience = self._pace.wait
+        overlay.tidy()
+        self._endpoint.let_go(SESSION_S)
+        self._look_whether_large(now)
+        self._refresh(now)
+        self._fragile = [contact for contact in overlay.contacts() if self.needs_use(contact)]
+
+    def _sound_far(self, now: float) -> float:
+        """Ask those of the contacts that were silent for longest; the moment when the next one may be due."""
+        overlay, wait, left = self._overlay, self._pace.wait, PROBES
+        silences = overlay.silences()
+        if not silences or silences[-1][1] > SILENCE:
+            return now + PROBE  # nobody at all is heard: it is this node that is out of touch
+        near = {contact.node_id for contact in overlay.neighbours()}
+        for doubted in overlay.doubted():
+            if doubted.node_id not in near and left > 0:
+                self._sound(doubted, False)
+                left -= 1
+        for node_id, silence in silences:
+            if silence <= wait:
+                return now + min(wait - silence, UPKEEP)
+            contact = overlay.contact(node_id)
+            if contact is None or node_id in self._sounding or node_id in near:
+                continue
+            if left <= 0:
+                return now + PROBE
+            self._sound(contact, False)
+            left -= 1
+        return now + UPKEEP
+
+    def _sound(self, contact: Contact, is_near: bool) -> None:
+        if contact.node_id not in self._sounding:
+            self._sounding.add(contact.node_id)
+            self._chores.fork(self._sounded(contact, is_near))
+
+    async def _sounded(self, contact: Contact, is_near: bool) -> None:
+        """Ask a contact whether it is there, without the cost of a handshake where it is not."""
+        overlay = self._overlay
+        silence = overlay.silence(contact)
+        try:
+            if silence < IN_TOUCH and not overlay.is_doubted(contact) and self._endpoint.is_met(contact):
+                await overlay.ask(contact, "ping", b"", changes=True, is_light=True)
+            else:
+                await self._greet_again(contact, is_near)
+            if not is_near and silence >= self._pace.wait:
+                self._pace.answered()
+        except NoAnswer:
+            if not is_near:
+                overlay.missed(contact, is_over=True)
+            raise
+        finally:
+            self._sounding.discard(contact.node_id)
+
+    async def _greet_again(self, contact: Contact, is_near: bool) -> None:
+        """See whether ``contact`` still listens at its address; a neighbour shows its key as well."""
+        try:
+            found = await self._endpoint.greet(contact.address)
+            if found.public != contact.public:
+                raise NoAnswer(f"another node listens at {contact.address}")
+        except NoAnswer:
+            self._overlay.missed(contact)
+            raise
+        if is_near:
+            await self._overlay.ask(contact, "ping", b"", changes=True)
+        else:
+            self._overlay.heard(contact)
+
+    def _look_whether_large(self, now: float) -> None:
+        """Be sure from time to time that the network is still large, by what is known here or by others' word."""
+        overlay = self._overlay
+        if overlay.sees_many:
+            self._large_until = now + LARGE_FOR
+        elif now > self._large_until + LARGE_FOR:
+            overlay.shrank()
+        elif now > self._large_until and (contacts := overlay.contacts()):
+            self._chores.fork(self._list(contacts[self._rng.randrange(len(contacts))]))
+
     def _answer_ping(self, peer: Contact, digest: bytes = b"") -> bytes:
         self._overlay.heard(peer)
         self._compare(peer, digest)
-        return self._overlay.roster.digest()
+        return b"" if self._overlay.is_large else self._overlay.roster.digest()
 
     def _answer_known(self, peer: Contact) -> list[object] | None:
         """KNOWN: the settled members, and for how long each has been absent; a newcomer has nothing to say."""
@@ -265,11 +464,15 @@ class Membership:
         known = [(self._overlay.me(), 0.0), *self._overlay.roster.known(self._clock.seconds())]
         return [[contact.packed(), int(away)] for contact, away in known]
 
-    def _answer_members(self, peer: Contact, after: bytes) -> list[object] | None:
+    def _answer_members(self, peer: Contact, after: bytes) -> list[object] | int | None:
+        """MEMBERS: the next page of them; None where there are too many, seconds where others said so."""
         if len(after) not in (0, len(peer.node_id)):
             raise Refused("members takes nothing or a node id of 20 bytes")
-        if self._overlay.roster.is_full:
+        overlay = self._overlay
+        if overlay.roster.is_full or (overlay.is_large and overlay.sees_many):
             return None
+        if overlay.is_large:
+            return max(0, int(self._large_until - self._clock.seconds()))
         later = [c for c in self._overlay.roster.live() if c.node_id > after]
         return [c.packed() for c in later[:PAGE]]
 

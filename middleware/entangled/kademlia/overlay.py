@@ -8,8 +8,9 @@ iterative lookups find them.
 from __future__ import annotations
 
 import random
-from collections import OrderedDict, deque
+from collections import deque
 from collections.abc import Callable, Iterable
+from functools import cached_property
 from typing import Any, NamedTuple
 
 from twisted.internet.defer import Deferred
@@ -20,8 +21,9 @@ from middleware.entangled.errors import EntangledError, NoAnswer, Refused
 from middleware.entangled.kademlia.contact import Contact, unpacked
 from middleware.entangled.kademlia.distance import closest
 from middleware.entangled.kademlia.lookup import Lookup
-from middleware.entangled.kademlia.roster import Roster
+from middleware.entangled.kademlia.roster import MAX_MEMBERS, Roster
 from middleware.entangled.kademlia.routing import STALE_AFTER, RoutingTable
+from middleware.entangled.wire.asker import PATIENCE
 from middleware.entangled.wire.congestion import RoundTrip
 from middleware.entangled.wire.endpoint import Endpoint
 
@@ -36,7 +38,11 @@ FRESH = 0.1
 FIRST_HEDGE, MOST_HEDGE = 0.01, 0.15
 """Seconds after which others are asked beside one that does not answer: while nobody was measured yet, and at most;
 else those within which nearly every answer comes."""
+LEAST_PATIENCE, TRIES = 0.4, 2.6
+"""Seconds, and usual waits, that a question of a lookup may take in a large network: two tries."""
 MAX_FOUND = 512
+MAX_HEARD = 4096
+"""Contacts of which is kept when they were heard, or missed; who was heard longest ago is forgotten first."""
 """Keys whose closest nodes, as the last lookup found them, are remembered."""
 
 PLACING, PLACING_STEP = 15, 0.1
@@ -61,11 +67,15 @@ class Looked(NamedTuple):
 
 
 class Overlay:
-    """Who a node knows; ``on_newcomer`` and ``on_lost`` are told of contacts that come and go.
+    """Who a node knows.
+
+    ``patience`` is for how many seconds a contact may have been silent that is not asked for a newcomer's sake.
+    ``on_newcomer`` and ``on_lost`` are told of contacts that come and go, ``on_named`` of each that another one names.
 
     ``is_whole`` says whether all members of the team are known, ``is_large`` that there are too many for that,
-    ``is_placed`` whether this node has looked around at
-    all, so that where it knows few there are few; whoever asks around sets them.
+    ``is_placed`` whether this node has looked around at all, so that where it knows few there are few; whoever asks
+    around sets them.  In a large network the table counts, and the roster has only some whom the table has no place
+    for, where it knows few.
     """
 
     def __init__(self, me: Callable[[], Contact], endpoint: Endpoint, clock: IReactorTime, chores: Background) -> None:
@@ -73,8 +83,6 @@ class Overlay:
         self.own_id = me().node_id
         self._endpoint = endpoint
         self._clock = clock
-        # They only spread the load, so anybody may foretell them; those of the machine would be a system call each.
-        self._dice = random.Random(int.from_bytes(self.own_id))
         self._chores = chores
         self.table = RoutingTable(self.own_id, K)
         self.roster = Roster(self.own_id)
@@ -83,15 +91,24 @@ class Overlay:
         self.is_placed = False
         self.on_newcomer: OnContact = lambda contact: None
         self.on_lost: OnContact = lambda contact: None
+        self.on_named: Callable[[Contact, Contact], None] = lambda contact, by: None
         self._heard_at: dict[bytes, float] = {}
         self._round_trip = RoundTrip(FIRST_HEDGE)
         self._slow: set[bytes] = set()
-        self._found: OrderedDict[bytes, list[Contact]] = OrderedDict()
+        self._found: dict[bytes, list[Contact]] = {}
         self._misses: dict[bytes, tuple[int, float]] = {}
+        self._near: list[Contact] = []
+        self._near_of = (-1, -1)
+        self.patience = 0.0
         self._checked_at: dict[bytes, float] = {}
         self.lookups: deque[Looked] = deque(maxlen=LOOKUPS_KEPT)
         endpoint.on_contact = self.proved
         endpoint.expose("find_node", self._answer_find_node)
+
+    @cached_property
+    def _dice(self) -> random.Random:
+        # They only spread the load, so anybody may foretell them; those of the machine would be a system call each.
+        return random.Random(int.from_bytes(self.own_id))
 
     # -- where things belong ----------------------------------------------------------------------------------------
 
@@ -112,6 +129,18 @@ class Overlay:
         known = [*self._found.get(key, ()), *self.table.closest(key), *self.roster.live(), self.me()]
         return _closest(known, key)
 
+    def neighbours(self) -> list[Contact]:
+        """The k contacts closest to this node: they are found with it, and hold what it holds."""
+        version = self.table.version, self.roster.version
+        if self._near_of != version:
+            self._near_of, self._near = version, self.nearest(self.own_id)
+        return self._near
+
+    @property
+    def sees_many(self) -> bool:
+        """Whether so many are known here that nobody need be asked whether the network is large."""
+        return self.roster.is_full or len(self.table) + len(self.roster) >= MAX_MEMBERS
+
     def keepers(self, key: bytes) -> list[Contact]:
         """The nodes, this one not included, that may hold records of ``key``: those responsible, and those last found.
 
@@ -131,13 +160,14 @@ class Overlay:
 
         A node that is still joining waits a little, for it knows nobody to ask.
         """
-        await self._wait(lambda: self.is_whole or len(self.roster) > 0, PLACING, PLACING_STEP)
+        await self._wait(lambda: self.is_whole or self.is_large or len(self.roster) > 0, PLACING, PLACING_STEP)
         if not self.is_sparse:
             self._found.pop(key, None)
             return self.responsible(key)
         found = await self.lookup(key)
-        self.note_found(key, found)
-        return _closest([*found, self.me()], key) if len(found) >= K else self.responsible(key)
+        nearest = _closest([*found, self.me()], key)
+        self.note_found(key, [contact for contact in nearest if contact.node_id != self.own_id])
+        return nearest if len(found) >= K else self.responsible(key)
 
     async def met(self) -> None:
         """Give a node that is still joining a moment to learn who is there."""
@@ -145,10 +175,10 @@ class Overlay:
 
     def note_found(self, key: bytes, found: list[Contact]) -> None:
         """Keep in mind what a lookup found."""
+        self._found.pop(key, None)
         self._found[key] = found
-        self._found.move_to_end(key)
         if len(self._found) > MAX_FOUND:
-            self._found.popitem(last=False)
+            del self._found[next(iter(self._found))]
 
     def voters(self, key: bytes, targets: list[Contact]) -> list[bytes]:
         """The ids of the nodes among whom a majority for ``key`` is counted; ``targets`` are its holders.
@@ -158,7 +188,7 @@ class Overlay:
         if not (self.is_whole or self.is_large):
             # It has not met its team yet: whoever knows a few of them shall not take those for all.
             return [self.own_id, NOBODY]
-        absent = [] if self.roster.is_full else self.roster.absent()
+        absent = [] if self.roster.is_full or self.is_large else self.roster.absent()
         return [contact.node_id for contact in (_closest([*targets, *absent], key) if absent else targets)]
 
     async def lookup(self, target: bytes) -> list[Contact]:
@@ -172,9 +202,10 @@ class Overlay:
 
         async def visit(contact: Contact) -> None:
             asked.append(hops.setdefault(contact.node_id, 1))
-            answer = await self.ask(contact, "find_node", target)
+            answer = await self.ask(contact, "find_node", target, timeout=self.patience_of_lookups)
             named = contacts_of(answer)
             for other in named:
+                self.on_named(other, contact)
                 hops.setdefault(other.node_id, hops[contact.node_id] + 1)
             lookup.answered(contact, named)
 
@@ -219,15 +250,23 @@ class Overlay:
     # -- who is there -----------------------------------------------------------------------------------------------
 
     async def ask(
-        self, contact: Contact, method: str, *arguments: object, changes: bool = False, timeout: float | None = None
+        self,
+        contact: Contact,
+        method: str,
+        *arguments: object,
+        changes: bool = False,
+        timeout: float | None = None,
+        is_light: bool = False,
     ) -> Any:
         """Ask ``contact``; one that does not answer is on its way out."""
         began = self._clock.seconds()
         is_met = self._endpoint.is_met(contact)
         try:
-            answer = await self._endpoint.ask(contact, method, *arguments, changes=changes, timeout=timeout)
+            answer = await self._endpoint.ask(
+                contact, method, *arguments, changes=changes, timeout=timeout, is_light=is_light
+            )
         except NoAnswer:
-            self._missed(contact)
+            self.missed(contact)
             raise
         if is_met:  # else it was a handshake, too
             self._round_trip.measured(self._clock.seconds() - began)
@@ -239,10 +278,23 @@ class Overlay:
         The time of all is a better measure than a contact's own, of which there are few samples and old ones; to ask
         one that is much farther away than the others costs a question or two more.
         """
+        if self.is_large:  # strangers take a handshake, and may be far away
+            guess = self._endpoint.peers.guess
+            return guess if not self._round_trip.is_measured else min(guess, max(MOST_HEDGE, self._round_trip.usual))
         return min(MOST_HEDGE, self._round_trip.usual)
+
+    @property
+    def patience_of_lookups(self) -> float | None:
+        """Seconds that one question of a lookup may take; None: as long as any.
+
+        In a large network there are always others, and some of those that are named are dead.
+        """
+        return min(PATIENCE, max(LEAST_PATIENCE, TRIES * self._endpoint.peers.guess)) if self.is_large else None
 
     def slow(self, contact: Contact) -> None:
         """``contact`` took longer than it should; until it is heard, others are asked first."""
+        if len(self._slow) >= MAX_HEARD:
+            self._slow.clear()
         self._slow.add(contact.node_id)
 
     def quickest(self, contacts: Iterable[Contact]) -> list[Contact]:
@@ -264,14 +316,18 @@ class Overlay:
         if is_fresh and node_id not in self._misses and node_id not in self._slow and self._known(node_id) == contact:
             return  # it was said a moment ago
         is_new = self.table.get(contact.node_id) is None and self.roster.get(contact.node_id) is None
-        self._heard_at[contact.node_id] = now
+        self._heard_at.pop(node_id, None)
+        self._heard_at[node_id] = now
+        if len(self._heard_at) > MAX_HEARD:
+            del self._heard_at[next(iter(self._heard_at))]
         self._misses.pop(contact.node_id, None)
         self._slow.discard(contact.node_id)
         doubtful = self.table.saw(contact, now)
-        if doubtful is not None:
+        if doubtful is not None and self.silence(doubtful) >= self.patience:
             self._chores.fork(self.check(doubtful))
-        is_new_here = self.roster.heard(contact, now)
-        if is_new_here or (is_new and self.table.get(contact.node_id) is not None):
+        has_place = self.table.get(node_id) is not None
+        is_new_here = self._is_for_roster(node_id, has_place) and self.roster.heard(contact, now)
+        if is_new_here or (is_new and has_place):
             # A turn later: what a newcomer is told shall not overtake the answer to its own greeting.
             self._chores.later(0.0, self.on_newcomer, contact)
 
@@ -281,6 +337,8 @@ class Overlay:
             self.proved(contact)
             return
         now = self._clock.seconds()
+        if self.is_large and self.sees_many and not self.table.has_place(contact.node_id):
+            return
         if contact.node_id == self.own_id or now - self._checked_at.get(contact.node_id, -CHECK_GAP) < CHECK_GAP:
             return  # in a large network not everybody finds a place here: two such must not ping each other for ever
         if len(self._checked_at) > MAX_FOUND:
@@ -294,6 +352,18 @@ class Overlay:
         self.roster.left(contact.node_id)
         self._forget(contact)
 
+    def turned_away(self, contact: Contact) -> None:
+        """``contact`` does not let this node in; as a member it is absent."""
+        now = self._clock.seconds()
+        self.table.remove(contact, now)
+        if self.roster.lost(contact.node_id, now):
+            self._forget(contact)
+
+    def known(self, node_id: bytes) -> Contact | None:
+        """The contact with this id, the absent ones among the members too."""
+        absent = (contact for contact in self.roster.absent() if contact.node_id == node_id)
+        return self._known(node_id) or next(absent, None)
+
     def contacts(self) -> list[Contact]:
         """Everybody who is known here."""
         return list({c.node_id: c for c in [*self.table.contacts(), *self.roster.live()]}.values())
@@ -301,6 +371,91 @@ class Overlay:
     async def check(self, contact: Contact) -> None:
         """Ask ``contact`` whether it is there."""
         await self.ask(contact, "ping", self.roster.digest(), changes=True)
+
+    def silences(self) -> list[tuple[bytes, float]]:
+        """The ids of contacts and perhaps of others, and for how many seconds each was silent, the longest first."""
+        now = self._clock.seconds()
+        return [(node_id, now - at) for node_id, at in self._heard_at.items()]
+
+    def contact(self, node_id: bytes) -> Contact | None:
+        """The contact with this id."""
+        return self._known(node_id)
+
+    def is_contact(self, contact: Contact) -> bool:
+        """Whether this very contact is known."""
+        return self._known(contact.node_id) == contact
+
+    def missed(self, contact: Contact, is_over: bool = False) -> None:
+        """``contact`` did not answer, once more; ``is_over``: it is let go of at once.
+
+        In a large network one miss makes a far contact stale: others of its range do as well, and a lookup that waits
+        for the dead costs more than one that passes over the living.
+        """
+        now = self._clock.seconds()
+        count, at = self._misses.get(contact.node_id, (0, -MISS_GAP))
+        if now - at < MISS_GAP and not is_over:
+            return
+        was_known = self.table.get(contact.node_id) is not None
+        is_far = self.is_large and was_known and contact not in self.neighbours()
+        count += STALE_AFTER if is_far or is_over else 1
+        if len(self._misses) >= MAX_HEARD or len(self._slow) >= MAX_HEARD:
+            self._misses.clear()
+            self._slow.clear()
+        self._slow.add(contact.node_id)
+        self._misses[contact.node_id] = (count, now)
+        if is_over:
+            self.table.remove(contact, now)
+        for _ in range(STALE_AFTER if is_far else 1):
+            self.table.failed(contact, now)
+        if count < STALE_AFTER:
+            return
+        was_member = self.roster.lost(contact.node_id, now)
+        if was_member or (was_known and self.table.get(contact.node_id) is None) or not was_known:
+            self._forget(contact)
+
+    def doubted(self) -> list[Contact]:
+        """The contacts that did not answer the last time."""
+        return [contact for node_id in self._misses if (contact := self._known(node_id)) is not None]
+
+    @property
+    def is_anybody_doubted(self) -> bool:
+        """Whether anybody did not answer the last time."""
+        return bool(self._misses)
+
+    def is_doubted(self, contact: Contact) -> bool:
+        """Whether ``contact`` did not answer the last time."""
+        return contact.node_id in self._misses
+
+    def grew(self) -> None:
+        """Go by the table from now on: the network is too large to be known whole."""
+        self.is_whole, self.is_large = False, True
+        self._endpoint.peers.is_wide = True
+        self.tidy()
+
+    def shrank(self) -> None:
+        """Begin to know the members again, as a newcomer does: nobody has seen many for long."""
+        self.is_large, self.patience = False, 0.0
+        self._endpoint.peers.is_wide = False
+        for contact in self.table.contacts():
+            self.roster.heard(contact, self._clock.seconds())
+
+    def tidy(self) -> None:
+        """Forget whom a large network need not remember: members in the table or absent, and who was heard once."""
+        table, live = self.table, self.roster.live()
+        spare = max(0, MAX_MEMBERS - len(table))
+        extra = [contact.node_id for contact in live if table.get(contact.node_id) is None]
+        kept = frozenset(extra[:spare])
+        self.roster.shed([c.node_id for c in (*live, *self.roster.absent()) if c.node_id not in kept])
+        before = self._clock.seconds() - CHECK_GAP
+        heard = self._heard_at
+        unheard = {c.node_id: float("-inf") for c in table.contacts() if c.node_id not in heard}
+        for node_id in [node_id for node_id in self._misses if self._known(node_id) is None]:
+            del self._misses[node_id]
+        self._heard_at = unheard | {
+            node_id: at
+            for node_id, at in heard.items()
+            if at > before or node_id in kept or table.get(node_id) is not None
+        }
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
@@ -314,20 +469,10 @@ class Overlay:
     def _known(self, node_id: bytes) -> Contact | None:
         return self.roster.get(node_id) or self.table.get(node_id)
 
-    def _missed(self, contact: Contact) -> None:
-        now = self._clock.seconds()
-        count, at = self._misses.get(contact.node_id, (0, -MISS_GAP))
-        if now - at < MISS_GAP:
-            return
-        self._slow.add(contact.node_id)
-        self._misses[contact.node_id] = (count + 1, now)
-        was_known = self.table.get(contact.node_id) is not None
-        self.table.failed(contact, now)
-        if count + 1 < STALE_AFTER:
-            return
-        was_member = self.roster.lost(contact.node_id, now)
-        if was_member or (was_known and self.table.get(contact.node_id) is None) or not was_known:
-            self._forget(contact)
+    def _is_for_roster(self, node_id: bytes, has_place: bool) -> bool:
+        if not self.is_large:
+            return True
+        return not has_place and (self.roster.get(node_id) is not None or not self.sees_many)
 
     def _forget(self, contact: Contact) -> None:
         for memory in (self._heard_at, self._misses):
@@ -344,8 +489,10 @@ class Overlay:
 
     def nearest(self, target: bytes) -> list[Contact]:
         """The k closest contacts to ``target`` that are known here, this node not included."""
-        known = {c.node_id: c for c in [*self.roster.live(), *self.table.closest(target)]}
-        return closest(known.values(), target, K)
+        members, near = self.roster.live(), self.table.closest(target)
+        if not members:
+            return near
+        return closest({c.node_id: c for c in [*members, *near]}.values(), target, K)
 
 
 def contacts_of(answer: object) -> list[Contact]:

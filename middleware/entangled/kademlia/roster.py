@@ -13,6 +13,8 @@ majority of members, or the few behind a cut could strike the many with the help
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from middleware.entangled.kademlia.contact import Contact
 
 MAX_MEMBERS = 64
@@ -49,6 +51,7 @@ class Roster:
         self._absent: list[_Member] = []
         self.version = 0
         self.is_settled = True
+        self._digest = _digest_of(self._own_number, ())
 
     def __len__(self) -> int:
         return len(self._live)
@@ -98,6 +101,12 @@ class Roster:
         if self._members.pop(node_id, None) is not None:
             self._sort()
 
+    def shed(self, node_ids: Iterable[bytes]) -> None:
+        """Strike some, where the network is too large for majorities to be counted here."""
+        found = [self._members.pop(node_id) for node_id in node_ids if node_id in self._members]
+        if found:
+            self._sort()
+
     def settle(self, node_id: bytes, is_settled: bool = True) -> None:
         """Take note whether a member has once caught up, so that it counts; who says nothing else does."""
         member = self._members.get(node_id)
@@ -127,10 +136,7 @@ class Roster:
 
     def digest(self) -> bytes:
         """Eight bytes that tell whether two nodes know the same live members, themselves included."""
-        mixed = self._own_number
-        for member in self._live:
-            mixed ^= member.number
-        return (mixed & (2**64 - 1)).to_bytes(8)
+        return self._digest
 
     def in_touch(self, now: float, within: float) -> bool:
         """Whether a majority of all settled members was heard in the last ``within`` seconds, this node counted in."""
@@ -163,3 +169,11 @@ class Roster:
         members = sorted(self._members.values(), key=lambda member: member.number)
         self._live = [member for member in members if member.lost_at is None]
         self._absent = [member for member in members if member.lost_at is not None]
+        self._digest = _digest_of(self._own_number, self._live)
+
+
+def _digest_of(own_number: int, live: Iterable[_Member]) -> bytes:
+    mixed = own_number
+    for member in live:
+        mixed ^= member.number
+    return (mixed & (2**64 - 1)).to_bytes(8)

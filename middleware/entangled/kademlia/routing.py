@@ -25,7 +25,7 @@ PATIENCE = 1.0
 """Seconds for which a contact that was heard, or that was just handed out to be pinged, is not handed out again."""
 
 
-@dataclass
+@dataclass(slots=True)
 class _Entry:
     """A contact in its bucket, and how it has behaved."""
 
@@ -39,7 +39,7 @@ class _Entry:
         return self.misses >= STALE_AFTER
 
 
-@dataclass
+@dataclass(slots=True)
 class _Bucket:
     """One k-bucket, of the ids from ``low`` to below ``high``; both dicts begin with the least recently seen."""
 
@@ -53,7 +53,8 @@ class RoutingTable:
     """The contacts of the node ``own_id``, at most ``k`` in each bucket.
 
     More ``k`` means more replicas, more contacts to keep alive and lookups that survive more losses at once.  Moments
-    (``now``) are in seconds on one clock of the caller.
+    (``now``) are in seconds on one clock of the caller.  ``version`` is another one whenever a contact came, went or
+    moved.
     """
 
     def __init__(self, own_id: bytes, k: int = 8) -> None:
@@ -62,8 +63,11 @@ class RoutingTable:
         self._own = int.from_bytes(own_id)
         self._buckets = [_Bucket(0, 1 << (8 * ID_BYTES))]
         self._size = 0
+        self.version = 0
         self._lows = [0]
         self._searched_at: dict[int, float] = {}
+        self._apart: list[int] = []
+        self._nearest_of = -1
 
     def __len__(self) -> int:
         return self._size
@@ -85,14 +89,18 @@ class RoutingTable:
         Stale contacts are passed over as long as there are enough others; they still serve a node that lost sight of
         everybody at once, so that a dropped radio does not empty the table.
         """
-        wanted = self._k if count is None else count
+        wanted, goal = self._k if count is None else count, int.from_bytes(target)
         stale: list[Contact] = []
-        live: list[Contact] = []
-        for bucket in self._buckets:
+        chosen: list[Contact] = []
+        # Whatever is in a bucket nearer to the target is nearer than all that is in a farther one.
+        for bucket in sorted(self._buckets, key=lambda bucket: (bucket.low ^ goal) & -(bucket.high - bucket.low)):
+            live: list[Contact] = []
             for entry in bucket.entries.values():
-                (stale if entry.is_stale else live).append(entry.contact)
-        chosen = closest(live, target, wanted)
-        if len(chosen) < wanted and stale:
+                (stale if entry.misses >= STALE_AFTER else live).append(entry.contact)
+            chosen += closest(live, target, wanted - len(chosen))
+            if len(chosen) == wanted:
+                return chosen
+        if stale:
             chosen = closest([*chosen, *closest(stale, target, wanted - len(chosen))], target, wanted)
         return chosen
 
@@ -104,23 +112,41 @@ class RoutingTable:
         """
         if contact.node_id == self._own_id:
             return None
-        self._searched_at.setdefault(bucket_index(self._own_id, contact.node_id), now)
         bucket = self._bucket_of(contact.node_id)
-        known = contact.node_id in bucket.entries
-        while not known and len(bucket.entries) >= self._k and self._may_split(bucket, contact):
+        entry = bucket.entries.pop(contact.node_id, None)
+        if entry is not None:
+            bucket.entries[contact.node_id] = entry  # the most recently seen is the last one
+            if entry.contact != contact:  # else the object that is there will do for all who keep it
+                entry.contact = contact
+                self.version += 1
+            entry.seen_at = entry.questioned_at = now
+            entry.misses = 0
+            return None
+        self._searched_at.setdefault(bucket_index(self._own_id, contact.node_id), now)
+        while len(bucket.entries) >= self._k and self._may_split(bucket, contact.node_id):
             self._split(bucket)
             bucket = self._bucket_of(contact.node_id)
-        if not known and len(bucket.entries) >= self._k:
+        if len(bucket.entries) >= self._k:
             stale = next((node_id for node_id, entry in bucket.entries.items() if entry.is_stale), None)
             if stale is None:
                 return self._queue(bucket, contact, now)
             del bucket.entries[stale]
             self._size -= 1
-        bucket.entries.pop(contact.node_id, None)
         bucket.waiting.pop(contact.node_id, None)
         bucket.entries[contact.node_id] = _Entry(contact, now, now)
-        self._size += 0 if known else 1
+        self._size += 1
+        self.version += 1
         return None
+
+    def has_place(self, node_id: bytes) -> bool:
+        """Whether a contact of this id would find, or has, a place in its bucket."""
+        bucket = self._bucket(node_id)
+        if bucket is None:
+            return False
+        entries = bucket.entries
+        if len(entries) < self._k or node_id in entries or any(entry.is_stale for entry in entries.values()):
+            return True
+        return self._may_split(bucket, node_id)
 
     def failed(self, contact: Contact, now: float) -> None:
         """Count that ``contact`` did not answer at its address.
@@ -177,16 +203,22 @@ class RoutingTable:
         number = int.from_bytes(node_id)
         return self._buckets[bisect_right(self._lows, number) - 1]
 
-    def _may_split(self, bucket: _Bucket, newcomer: Contact) -> bool:
+    def _may_split(self, bucket: _Bucket, newcomer: bytes) -> bool:
         if bucket.high - bucket.low == 1:
             return False
         if bucket.low <= self._own < bucket.high:
             return True
-        apart = int.from_bytes(newcomer.node_id) ^ self._own
-        nearer = 0
-        for other in self._buckets:
-            nearer += sum(1 for node_id in other.entries if int.from_bytes(node_id) ^ self._own < apart)
-        return nearer < self._k
+        apart = int.from_bytes(newcomer) ^ self._own
+        return len(self._nearest()) < self._k or apart < self._nearest()[-1]
+
+    def _nearest(self) -> list[int]:
+        """How far the k contacts closest to this node are, the closest first."""
+        if self._nearest_of != self.version:
+            self._nearest_of = self.version
+            own = self._own
+            apart = [int.from_bytes(node_id) ^ own for bucket in self._buckets for node_id in bucket.entries]
+            self._apart = sorted(apart)[: self._k]
+        return self._apart
 
     def _split(self, bucket: _Bucket) -> None:
         """Put two buckets, of half the range each, in the place of ``bucket``."""
@@ -204,6 +236,7 @@ class RoutingTable:
         """Take a contact out; the most recently seen newcomer, if any, takes its place."""
         del bucket.entries[node_id]
         self._size -= 1
+        self.version += 1
         if bucket.waiting:
             newcomer_id, newcomer = bucket.waiting.popitem()
             bucket.entries[newcomer_id] = _Entry(newcomer, now, now)

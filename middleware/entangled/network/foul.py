@@ -12,7 +12,7 @@ from collections.abc import Callable
 
 from twisted.internet.interfaces import IReactorTime
 
-from middleware.entangled.network.network import Address, Network, Receiver
+from middleware.entangled.network.network import Address, Network, Ports, Receiver, detours_of, ports_of
 from middleware.entangled.network.switchboard import CALM
 
 
@@ -38,6 +38,16 @@ class FoulNetwork:
     def address(self) -> Address:
         """The node's own address."""
         return self._network.address
+
+    @property
+    def ports(self) -> Ports | None:
+        """The local ports of the network."""
+        return ports_of(self._network)
+
+    @property
+    def detours(self) -> list[Address]:
+        """The ways around of the network."""
+        return detours_of(self._network)
 
     def listen(self, receiver: Receiver) -> None:
         """Open the port and hand on what gets through; raises ``PortInUse`` where another holds it."""

@@ -1,93 +1,266 @@
-"""Udp: a ``Network`` over one real UDP port of Twisted."""
+"""Udp: a ``Network`` over real UDP ports of Twisted."""
 
 from __future__ import annotations
 
 import errno
+import fcntl
+import math
 import socket
+import struct
 from collections import Counter
+from collections.abc import Callable
+from contextlib import suppress
 from functools import lru_cache
 from typing import Any
 
 from twisted.internet.abstract import isIPAddress, isIPv6Address
-from twisted.internet.defer import Deferred, succeed
+from twisted.internet.defer import Deferred, gatherResults, maybeDeferred, succeed
 from twisted.internet.error import CannotListenError
-from twisted.internet.interfaces import IReactorUDP
 from twisted.internet.protocol import DatagramProtocol
 from twisted.logger import Logger
 
 from middleware.entangled.errors import PortInUse
-from middleware.entangled.network.network import MAX_DATAGRAM, Address, Receiver
+from middleware.entangled.network.network import EVERYWHERE, MAX_CARRIED, MAX_LED, Address, Receiver
 
 # Bursts come in faster than Python reads: the usual 208 KiB hold 160 full datagrams, this holds five times as many.
 RECEIVE_BUFFER = 1 << 20
+ROUTE_S = 5.0
+"""Seconds for which what the system said of a way holds: addresses of a laptop change as it moves."""
+_PAIRS = 8
+_SIOCGIFADDR = 0x8915
+_GLOBAL = "00"
 
 
 class UdpNetwork:
-    """One UDP port at ``host`` (an IP address; "0.0.0.0" or "::" for every interface) and ``port`` (0: any free one).
+    """One UDP port at ``host`` and ``port`` (0: any free one), and further ones that are opened on the way.
+
+    ``host`` is an IP address ("0.0.0.0" or "::" for every interface of one family), or ``EVERYWHERE`` for every
+    interface of both families; where the machine has no IPv6, of the other one.
 
     ``counters`` counts the datagrams that were sent, received, unsent (no route, no such address, full buffer) and
-    oversized.  ``closed`` fires when the port is really free again.
+    oversized.  ``closed`` fires when every port is really free again.
     """
 
     _log = Logger()
 
-    def __init__(self, reactor: IReactorUDP, host: str, port: int = 0) -> None:
+    def __init__(self, reactor: Any, host: str, port: int = 0) -> None:
         self.counters: Counter[str] = Counter()
         self.closed: Deferred[Any] = succeed(None)
         self._reactor = reactor
-        self._host = host
+        self._host = EVERYWHERE if host == "" else host
         self._wanted = port
-        self._port: Any = None
         self._number = port
+        self._receiver: Receiver | None = None
+        self._ports: dict[tuple[int, bool], Any] = {}
+        self._led: dict[Address, int] = {}
+        self._locals: dict[str, tuple[str, float]] = {}
+        self._hosts: list[str] = []
+        self._hosts_at = -math.inf
 
     @property
     def address(self) -> Address:
         """The node's own address; the port is known once ``listen`` was called."""
-        return Address(self._host, self._number)
+        host = self._host
+        if host in ("0.0.0.0", "::", EVERYWHERE):
+            host = self._cached("", self._own_host)
+        return Address(host, self._number)
 
     def listen(self, receiver: Receiver) -> None:
         """Open the port and hand each datagram to ``receiver``; raises ``PortInUse`` where that cannot be."""
-        if self._port is not None:
+        if self._ports:
             return
-        protocol = _Protocol(receiver, self.counters)
-        try:
-            # One byte more than may come, so that what is too large is seen to be.
-            self._port = self._reactor.listenUDP(self._wanted, protocol, self._host, MAX_DATAGRAM + 1)
-        except CannotListenError as error:
-            why = getattr(error.socketError, "strerror", None) or error.socketError
-            is_foreign = getattr(error.socketError, "errno", None) == errno.EADDRNOTAVAIL
-            remedy = "give host an address of this machine" if is_foreign else "choose another port, or 0 for any"
-            raise PortInUse(f"UDP {self._host}:{self._wanted}: {why}; {remedy}") from error
-        self._number = self._port.getHost().port
-        try:
-            self._port.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
-        except OSError as error:
-            self._log.debug("the receive buffer stays as it is: {error}", error=error)
+        self._receiver = receiver
+        if self._host != EVERYWHERE:
+            self._number = self._open(0, self._host, self._wanted)
+            return
+        for left in reversed(range(1 if self._wanted else _PAIRS)):
+            self._number = self._open(0, "0.0.0.0", self._wanted)
+            try:
+                self._open_six(self._number)
+                return
+            except PortInUse:  # any port will do where none is wanted, but the same one in both families
+                self._shut(0)
+                if not left:
+                    raise
 
     def send(self, datagram: bytes, to: Address) -> None:
-        """Send at most ``MAX_DATAGRAM`` bytes; what cannot be sent is counted and lost."""
-        if len(datagram) > MAX_DATAGRAM:
+        """Send at most ``MAX_CARRIED`` bytes; what cannot be sent is counted and lost."""
+        if len(datagram) > MAX_CARRIED:
             self.counters["oversized"] += 1
             return
+        is_six = ":" in to.host
+        number = self._led.get(to, 0) if self._led else 0
+        port = self._ports.get((number, is_six)) or self._ports.get((0, is_six))
         # The address comes from a peer: the system would look up what is no IP, and wait for the answer.
-        if self._port is None or not _is_ip(to.host):
+        if port is None or not _is_ip(to.host):
             self.counters["unsent"] += 1
             return
         try:
             # Past the port's own ``write``, which checks the address anew each time: half of what a send costs.
-            self._port.socket.sendto(datagram, to)
-        # Another family, ports out of range and a full buffer each raise something else.
+            port.socket.sendto(datagram, to)
+        # Ports out of range and a full buffer each raise something else.
         except (OSError, ValueError, OverflowError, TypeError):
             self.counters["unsent"] += 1
         else:
             self.counters["sent"] += 1
 
     def close(self) -> None:
-        """Close the port; may be called twice."""
-        if self._port is not None:
-            port, self._port = self._port, None
-            stopped = port.stopListening()
-            self.closed = stopped if stopped is not None else succeed(None)
+        """Close every port; may be called twice."""
+        if self._ports:
+            ports, self._ports = list(self._ports.values()), {}
+            self._receiver = None
+            self._led.clear()
+            self.closed = gatherResults([maybeDeferred(port.stopListening) for port in ports])
+
+    # -- further ports ----------------------------------------------------------------------------------------------
+
+    def open_port(self) -> int:
+        """A further local port, for IPv4 where that is spoken; 0 where there is none to be had."""
+        if not self._ports:
+            return 0
+        host = "0.0.0.0" if self._host == EVERYWHERE else self._host
+        try:
+            return self._open(None, host, 0)
+        except PortInUse:
+            return 0
+
+    def shut_port(self, port: int) -> None:
+        """Close a further port."""
+        if port:
+            self._led = {to: number for to, number in self._led.items() if number != port}
+            self._shut(port)
+
+    def lead(self, to: Address, port: int) -> int:
+        """Let what goes to ``to`` leave by ``port``; 0: by the first one."""
+        before = self._led.pop(to, 0)
+        self._led[to] = port
+        if len(self._led) > MAX_LED:
+            del self._led[next(iter(self._led))]
+        return before
+
+    def local(self, to: Address, port: int = 0) -> Address:
+        """The address of this machine from which a datagram to ``to`` leaves."""
+        host = self._host
+        if host in ("0.0.0.0", "::", EVERYWHERE):
+            host = self._cached(to.host, lambda: _route(to.host)) or self.address.host
+        return Address(host, port or self._led.get(to, 0) or self._number)
+
+    def hosts(self) -> list[str]:
+        """The addresses of this machine at which it hears, asked anew after ``ROUTE_S``."""
+        if self._host not in ("0.0.0.0", "::", EVERYWHERE):
+            return [self._host]
+        now = self._reactor.seconds()
+        if now - self._hosts_at > ROUTE_S:
+            self._hosts, self._hosts_at = _own_hosts(), now
+        families = {is_six for _, is_six in self._ports}
+        return [host for host in self._hosts if (":" in host) in families]
+
+    # -- inside -----------------------------------------------------------------------------------------------------
+
+    def _open(self, number: int | None, host: str, wanted: int) -> int:
+        """Open a port that is known by ``number``, else by its own; gives its own."""
+        protocol = _Protocol(self, number or 0)
+        try:
+            # One byte more than may come, so that what is too large is seen to be.
+            port = self._reactor.listenUDP(wanted, protocol, host, MAX_CARRIED + 1)
+        except CannotListenError as error:
+            raise _in_use(host, wanted, error.socketError) from error
+        own: int = port.getHost().port
+        protocol.number = own if number is None else number
+        self._keep(port, protocol.number, ":" in host)
+        return own
+
+    def _open_six(self, wanted: int) -> None:
+        """Open the IPv6 port beside that of IPv4; Twisted alone would open one that takes both."""
+        try:
+            with socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as six:
+                six.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
+                six.setblocking(False)
+                six.bind(("::", wanted))
+                port = self._reactor.adoptDatagramPort(
+                    six.fileno(), socket.AF_INET6, _Protocol(self, 0), MAX_CARRIED + 1
+                )
+        except OSError as error:
+            if error.errno == errno.EADDRINUSE:
+                raise _in_use("::", wanted, error) from error
+            self._log.info("no IPv6 on this machine: {error}", error=error)
+        else:
+            self._keep(port, 0, True)
+
+    def _keep(self, port: Any, number: int, is_six: bool) -> None:
+        self._ports[number, is_six] = port
+        try:
+            port.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
+        except OSError as error:
+            self._log.debug("the receive buffer stays as it is: {error}", error=error)
+
+    def _shut(self, number: int) -> None:
+        for is_six in (False, True):
+            port = self._ports.pop((number, is_six), None)
+            if port is not None:
+                maybeDeferred(port.stopListening)
+
+    def _own_host(self) -> str:
+        # Anything beyond this machine will do: nothing is sent there (RFC 5737 and 3849).
+        six = self._host == "::"
+        own = [host for host in _own_hosts() if (":" in host) == six]
+        return _route("2001:db8::1" if six else "192.0.2.1") or next(iter(own), "::1" if six else "127.0.0.1")
+
+    def _cached(self, host: str, ask: Callable[[], str]) -> str:
+        """What the system says of the way to ``host``, asked again after ``ROUTE_S``."""
+        found, asked_at = self._locals.get(host, ("", -math.inf))
+        now = self._reactor.seconds()
+        if now - asked_at > ROUTE_S:
+            if len(self._locals) > MAX_LED:
+                self._locals.clear()
+            found = ask()
+            self._locals[host] = found, now
+        return found
+
+    def _came(self, datagram: bytes, source: Address, number: int) -> None:
+        if len(datagram) > MAX_CARRIED:
+            self.counters["oversized"] += 1
+            return
+        self.counters["received"] += 1
+        if number and source not in self._led:
+            self.lead(source, number)
+        if self._receiver is not None:
+            self._receiver(datagram, source)
+
+
+def _in_use(host: str, port: int, trouble: Any) -> PortInUse:
+    why = getattr(trouble, "strerror", None) or trouble
+    is_foreign = getattr(trouble, "errno", None) == errno.EADDRNOTAVAIL
+    remedy = "give host an address of this machine" if is_foreign else "choose another port, or 0 for any"
+    return PortInUse(f"UDP {host}:{port}: {why}; {remedy}")
+
+
+def _route(host: str) -> str:
+    """The own address from which the system would write to ``host``; empty where it has no way there."""
+    if not _is_ip(host):
+        return ""
+    try:
+        with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            probe.connect((host, 9))  # sends nothing: it only asks for the way
+            return str(probe.getsockname()[0])
+    except OSError:
+        return ""
+
+
+def _own_hosts() -> list[str]:
+    """The addresses of this machine that others may reach: not those of its loopback or of one link alone."""
+    found = []
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        for _, name in socket.if_nameindex():
+            with suppress(OSError):
+                answer = fcntl.ioctl(probe, _SIOCGIFADDR, struct.pack("256s", name.encode()[:15]))
+                found.append(socket.inet_ntoa(answer[20:24]))
+    with suppress(OSError, ValueError), open("/proc/net/if_inet6", encoding="ascii") as lines:
+        for line in lines:
+            figures, _, _, scope, *_ = line.split()
+            if scope == _GLOBAL:
+                found.append(socket.inet_ntop(socket.AF_INET6, bytes.fromhex(figures)))
+    return [host for host in found if not host.startswith("127.")]
 
 
 @lru_cache(maxsize=1024)
@@ -96,17 +269,15 @@ def _is_ip(host: str) -> bool:
 
 
 class _Protocol(DatagramProtocol):
-    def __init__(self, receiver: Receiver, counters: Counter[str]) -> None:
-        self._receiver = receiver
-        self._counters = counters
+    """Hands on what comes in at one port, which its network knows by ``number``."""
+
+    def __init__(self, network: UdpNetwork, number: int) -> None:
+        self._network = network
+        self.number = number
 
     def datagramReceived(self, datagram: bytes, addr: Any) -> None:
         """Hand a datagram on."""
-        if len(datagram) > MAX_DATAGRAM:
-            self._counters["oversized"] += 1
-            return
-        self._counters["received"] += 1
-        self._receiver(datagram, Address(addr[0], addr[1]))
+        self._network._came(datagram, Address(addr[0], addr[1]), self.number)
 
     def connectionRefused(self) -> None:
         """Ignore the ICMP message: anybody may forge one, and time-outs tell the same."""

@@ -5,8 +5,6 @@ A copy is no replica: it is never counted in a majority, never handed on, lives 
 
 from __future__ import annotations
 
-from collections import OrderedDict
-
 from middleware.entangled.record import Record
 
 MAX_KEYS = 256
@@ -19,7 +17,7 @@ class PathCache:
     """The copies of one node, at most ``MAX_KEYS`` keys and ``MAX_BYTES``; the least recently read goes first."""
 
     def __init__(self) -> None:
-        self._copies: OrderedDict[bytes, tuple[float, int, list[Record]]] = OrderedDict()
+        self._copies: dict[bytes, tuple[float, int, list[Record]]] = {}
         self._bytes = 0
 
     def put(self, key: bytes, records: list[Record], ttl: float, now: float) -> None:
@@ -41,7 +39,7 @@ class PathCache:
         if copy[0] <= now:
             self.drop(key)
             return None
-        self._copies.move_to_end(key)
+        self._copies[key] = self._copies.pop(key)
         return copy[2]
 
     def drop(self, key: bytes) -> None:

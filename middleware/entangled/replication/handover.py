@@ -112,6 +112,7 @@ class Handover:
         self._reconciled.pop(contact.node_id, None)
         self._overlap.asked_at.pop(contact.node_id, None)
         self._given.pop(contact.node_id, None)
+        self._standings.pop(contact.node_id, None)
         heirs: dict[bytes, tuple[Contact, list[Record]]] = {}
         for record in self._overlap.records():
             nearest = self._overlay.responsible(record.key)
@@ -139,8 +140,11 @@ class Handover:
 
     def _is_near(self, contact: Contact) -> bool:
         """Whether this node and ``contact`` may have records in common."""
-        near = self._overlay.responsible(self._own_id)
-        return self._overlay.is_complete or any(c.node_id == contact.node_id for c in near)
+        return self._overlay.is_complete or contact in self._others()
+
+    def _others(self) -> list[Contact]:
+        """Those with whom this node may have records in common."""
+        return self._overlay.roster.live() if self._overlay.is_complete else self._overlay.neighbours()
 
     async def _reconcile(self, contact: Contact) -> None:
         """Give ``contact`` what it lacks, and get from it what this node lacks."""
@@ -254,8 +258,7 @@ class Handover:
                     await self._chores.sleep(NOT_YET)  # it has yet to hear who is there
                     continue
                 began = self._clock.seconds()
-                near = [c for c in self._overlay.responsible(self._own_id) if c.node_id != self._own_id]
-                others = self._overlay.roster.live() if self._overlay.is_complete else near
+                others = self._others()
                 # One first, who has most of it; what it gave, the next ones need not give.
                 reached = [await self._caught_up_with(contact) for contact in others[:STEWARDS]]
                 work = [Deferred.fromCoroutine(self._caught_up_with(contact)) for contact in others[STEWARDS:]]
@@ -283,7 +286,7 @@ class Handover:
     def _settle(self) -> None:
         """From now on this node is sure, and counts."""
         self._overlay.roster.is_settled = True
-        if self._standing.settle():
+        if self._standing.settle() and not self._overlay.is_large:
             for contact in self._overlay.roster.live():
                 self._chores.fork(self._overlay.ask(contact, "settled", changes=True))
 
@@ -299,16 +302,14 @@ class Handover:
     def _look_around(self) -> None:
         now = self._clock.seconds()
         was = self.is_sure()
-        if self._overlay.roster.in_touch(now, OUT_OF_TOUCH) or not self._overlay.is_complete:
+        if not self._overlay.is_complete or self._overlay.roster.in_touch(now, OUT_OF_TOUCH):
             self._touched_at = now
         if not was and not self._catching_up:
             self._chores.fork(self._catch_up())
 
     def _mend(self) -> None:
         """Compare with one of the others, and give on what nobody gave on for long."""
-        others = [c for c in self._overlay.responsible(self._own_id) if c.node_id != self._own_id]
-        if self._overlay.is_complete:
-            others = self._overlay.roster.live()
+        others = self._others()
         if others:
             self._chores.fork(self._reconcile(others[self._rng.randrange(len(others))]))
         now = self._clock.seconds()

@@ -27,6 +27,8 @@ PLACES = 12
 LISTED_S = 2.0
 """Seconds for which who pages through the places gets to see them as they were when it asked for the digests."""
 MAX_LISTED = 8
+MAX_ASKED = 1024
+"""Peers of which is kept when they asked; the one that asked longest ago is forgotten first."""
 BITS = 512
 """Bits of a signature: one of them, which the asker draws, says which records are in a sum of lives."""
 
@@ -104,7 +106,10 @@ class Overlap:
         if not 0 <= bit < BITS:
             raise Refused(f"a signature has the bits 0 to {BITS - 1}")
         *groups, extra = self._lists(peer)
+        self.asked_at.pop(peer.node_id, None)
         self.asked_at[peer.node_id] = self._clock.seconds()
+        if len(self.asked_at) > MAX_ASKED:
+            del self.asked_at[next(iter(self.asked_at))]
         self._overlay.roster.settle(peer.node_id, standing > NOVICE)
         lives = [self.life(group, bit) for group in groups]
         return [[digest_of(group) for group in groups], len(extra), lives, self.standing()]

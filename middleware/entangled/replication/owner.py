@@ -6,6 +6,7 @@ goes on until all have them, keeps leases alive, and mends what replicas have lo
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
@@ -21,9 +22,10 @@ from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.overlay import Overlay
 from middleware.entangled.record import TEAM_TTL, TOMBSTONE_TTL, Lifetime, Record, Slot
-from middleware.entangled.replication.replica import HELD, Replica, pages_of
+from middleware.entangled.replication.replica import FORBIDDEN, HELD, Replica, pages_of
 from middleware.entangled.replication.shipper import Shipper
 from middleware.entangled.replication.watch import digest_of
+from middleware.entangled.wire.door import ROLE, meaning
 from middleware.entangled.wire.endpoint import Endpoint
 
 Concern = Literal["one", "majority", "all"]
@@ -34,6 +36,8 @@ REPUBLISH = 3600.0
 """Seconds between two words of an owner about a team record: 24 for each life (Kademlia, section 2.5).  Within as many
 every replica gives on what no other one gave on."""
 BEATS_PER_LEASE = 3
+SLACK = 1e-6
+"""Seconds by which a sign of life may be early: sums of times are not exact."""
 STEPS = 3
 UNSURE_FOR = (0.1, 0.2, 0.4, 0.8)
 """Seconds after which a replica that is not sure yet, and whose word would count, is asked again."""
@@ -88,9 +92,14 @@ class Owner:
         self._own: dict[Slot, Record] = {}
         self._owing: dict[Slot, None] = {}
         self._said_at: dict[Slot, float] = {}
+        self._leases: dict[Slot, float] = {}
+        self._due_at: dict[Slot, float] = {}
+        self._kept_by: dict[Slot, list[Contact]] = {}
+        self._period = lease / BEATS_PER_LEASE
         self._bringing: set[bytes] = set()
         self._republishing = False
         self._next_beat: Callable[[], None] | None = None
+        self._rested_at = -1.0
         self._first = self._last = self._noted = 0
         endpoint.expose("missing", self._answer_missing, changes=True)
 
@@ -99,15 +108,25 @@ class Owner:
         for record in self._store.owned(self._identity.public):
             if record.lifetime == "team" and not record.is_tombstone:
                 self._own[record.slot] = record
-        self._next_beat = self._chores.later(self._lease / BEATS_PER_LEASE, self._go_on)
+        self._next_beat = self._chores.later(self._period, self._go_on)
         self._chores.every(RETRY, self._republish)
 
     def set_lease(self, lease: float) -> None:
         """Have own leases run for so many seconds from now on; they are told at once."""
         self._lease = lease
+        self._due_at.clear()
         if self._next_beat is not None:
             self._next_beat()
             self._go_on()
+        elif self._rested_at >= 0:
+            self._rested_at = self._clock.seconds()
+
+    def release(self, slot: Slot) -> None:
+        """Say nothing more of the lease in ``slot``: it ends by itself, and leaves no tombstone."""
+        record = self._own.get(slot)
+        if record is not None and record.lifetime == "leased":
+            self._let_go(slot)
+            self._replica.answer_let_go(self._overlay.me(), [digest_of([record])])
 
     def owns(self, slot: Slot) -> bool:
         """Whether this node looks after what is in ``slot``."""
@@ -121,17 +140,22 @@ class Owner:
         lifetime: Lifetime,
         expect: int | None = None,
         read: Record | None = None,
+        lease: float | None = None,
     ) -> Record:
         """The signed record that follows what the own slot (key, name) holds; from now on it is kept alive.
 
-        Raises ``Conflict`` where the slot does not hold the sequence ``expect``; ``read`` is what others hold there.
+        A ``lease`` of its own, in seconds, is at least as long as the node's.  Raises ``Conflict`` where the slot does
+        not hold the sequence ``expect``; ``read`` is what others hold there.
         """
         slot = Slot(key, self._identity.public, name)
         held = (self._own.get(slot), self._store.slot(slot), read)
         known = max((record.sequence for record in held if record is not None), default=0)
         if expect is not None and known != expect:
             raise Conflict(expect, known)
-        ttl = TOMBSTONE_TTL if value is None else self._lease if lifetime == "leased" else TEAM_TTL
+        self._leases.pop(slot, None)
+        if lease is not None and lease > self._lease:
+            self._leases[slot] = lease
+        ttl = TOMBSTONE_TTL if value is None else self._lease_of(slot) if lifetime == "leased" else TEAM_TTL
         sequence = self._next_sequence(known)
         return self._take(Record(key, name, slot.owner, sequence, lifetime, ttl, value))
 
@@ -155,7 +179,8 @@ class Owner:
     async def store_everywhere(self, record: Record, concern: Concern = "majority") -> tuple[int, int]:
         """Store at every holder: how many took it, and the highest sequence that stood against it (0: none).
 
-        Raises ``NotAcknowledged`` where too few took it and nothing stood against it.
+        Raises ``NotAcknowledged`` where too few took it and nothing stood against it, ``Refused`` where that is because
+        its owner's role may not write it.
         """
         if concern != "one":
             await self._overlay.met()
@@ -168,6 +193,7 @@ class Owner:
 
         left = self.left(record)
         verdicts: dict[bytes, int] = {}
+        forbidden: list[Refused] = []
         counted = [c for c in targets if concern == "one" or c.node_id in voters]
         spare = self._spare(record, targets, counted, needed)
         released: Deferred[None] = Deferred()
@@ -181,8 +207,10 @@ class Owner:
                 await released
             try:
                 verdict = await self.store_at(contact, record, left)
-            except EntangledError:
+            except EntangledError as error:
                 release()
+                if isinstance(error, Refused) and error.code == ROLE:
+                    forbidden.append(error)
                 raise
             for pause in UNSURE_FOR if concern != "one" and contact.node_id in voters else ():
                 if verdict != HELD:
@@ -210,6 +238,9 @@ class Owner:
         held = sum(1 for verdict in answers.values() if verdict in (0, HELD))
         votes = sum(1 for node_id, verdict in answers.items() if verdict in (0, HELD) and is_vote(node_id, verdict))
         if votes < needed and not newest:
+            if forbidden:
+                self._let_go(record.slot)  # to say it again would change nothing
+                raise forbidden[0]
             raise NotAcknowledged(votes, needed)
         return held, newest
 
@@ -223,6 +254,8 @@ class Owner:
         verdict = await self._shipper.store(contact, record, left)
         if type(verdict) is int and (verdict in (0, HELD) or record.sequence <= verdict < MAX_SEQUENCE):
             return verdict
+        if verdict == FORBIDDEN:
+            raise Refused(f"{contact.address} does not take {record.name!r} from its owner: {meaning(ROLE)}", ROLE)
         raise Refused(f"{contact.address} does not take the record")
 
     def left(self, record: Record) -> float | None:
@@ -231,7 +264,9 @@ class Owner:
 
     def welcome(self, contact: Contact) -> None:
         """Give a newcomer the own leases that it is now among the closest to; other records find it by themselves."""
-        self._chores.fork(self._bring(contact, [r for r in self._leased() if self._overlay.belongs(r.key, contact)]))
+        lacking = [r for r in self._leased() if self._overlay.belongs(r.key, contact)]
+        if lacking:
+            self._chores.fork(self._bring(contact, lacking))
 
     def lost_here(self, record: Record) -> bool:
         """Hold ``record`` on where it is one of our own: a late timer must not end our own lease.  Whether it was."""
@@ -272,10 +307,12 @@ class Owner:
         record = record.signed(self._identity)
         self._own[record.slot] = record
         self._owing[record.slot] = None
+        if record.lifetime == "leased":
+            self._hasten(self._lease_of(record.slot) / BEATS_PER_LEASE)
         return record
 
     def _let_go(self, slot: Slot) -> None:
-        for memory in (self._own, self._owing, self._said_at):
+        for memory in (self._own, self._owing, self._said_at, self._leases, self._due_at, self._kept_by):
             memory.pop(slot, None)
 
     def _settled(self, record: Record) -> None:
@@ -290,19 +327,57 @@ class Owner:
     def _leased(self) -> list[Record]:
         return [r for r in self._own.values() if r.lifetime == "leased"]
 
-    def _go_on(self) -> None:
-        self._next_beat = self._chores.later(self._lease / BEATS_PER_LEASE, self._go_on)
-        self._beat()
+    def _lease_of(self, slot: Slot) -> float:
+        return max(self._lease, self._leases.get(slot, 0.0))
 
-    def _beat(self) -> None:
-        """Say to every replica of an own lease that this node lives, and what it should hold."""
+    def _go_on(self) -> None:
+        """Give the signs of life that are due, and come back as soon as the shortest lease wants the next."""
+        leases = [self._lease_of(record.slot) for record in self._leased()]
+        self._period = min(leases, default=self._lease) / BEATS_PER_LEASE
+        self._next_beat = self._chores.later(self._period, self._go_on)
+        if not self._beat():
+            self._next_beat()
+            self._next_beat, self._rested_at = None, self._clock.seconds()
+
+    def _hasten(self, pause: float) -> None:
+        """See that the next sign of life comes within ``pause``, where any are given at all."""
+        if self._next_beat is None and self._rested_at >= 0:
+            self._beat_again()
+        elif self._next_beat is not None and pause < self._period:
+            self._next_beat()
+            self._next_beat = self._chores.later(pause, self._go_on)
+
+    def _beat_again(self) -> None:
+        """Go on where it was left off when nothing was leased: at a multiple of the beat."""
+        now, at = self._clock.seconds(), self._rested_at
+        beat = self._lease / BEATS_PER_LEASE
+        at += beat * math.floor((now - at) / beat)
+        while at <= now:
+            at += beat
+        self._next_beat = self._chores.later(at - now, self._go_on)
+
+    def _beat(self) -> bool:
+        """Say to the replicas of own leases that are due that this node lives, and what they should hold.
+
+        Who holds longer leases beside a shorter one is told the shorter one.  Returns whether there are any.
+        """
+        now = self._clock.seconds()
+        due: set[bytes] = set()
         there: dict[bytes, tuple[Contact, list[Record]]] = {}
         for record in self._leased():
-            for contact in self._overlay.keepers(record.key):
+            slot = record.slot
+            if self._due_at.get(slot, now) <= now + SLACK:
+                self._due_at[slot] = now + self._lease_of(slot) / BEATS_PER_LEASE
+                self._kept_by[slot] = self._overlay.keepers(record.key)
+                due.update(contact.node_id for contact in self._kept_by[slot])
+            for contact in self._kept_by[slot]:
                 there.setdefault(contact.node_id, (contact, []))[1].append(record)
-        self._store.extend(self._identity.public, self._clock.seconds() + self._lease)
+        held = self._store.extend(self._identity.public, now + BEATS_PER_LEASE * self._period)
         for contact, records in there.values():
-            self._endpoint.tell(contact, "alive", self._lease, digest_of(records))
+            if contact.node_id in due:
+                lease = min(self._lease_of(record.slot) for record in records)
+                self._endpoint.tell(contact, "alive", lease, digest_of(records))
+        return held > 0 or bool(self._leased())
 
     def _answer_missing(self, peer: Contact, marks: list[object]) -> None:
         """Store at ``peer`` what it lacks of our leases, and tell it what it holds in vain."""

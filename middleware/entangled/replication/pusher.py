@@ -1,7 +1,7 @@
 """Pusher: tells those who watch a key what changes here.
 
-Soft state: a watcher counts for ``WATCH_TTL`` seconds after it last asked.  Pushes to one watcher of one key are
-numbered without a gap, so that it notices what it missed, and asks again.
+Soft state: a watcher counts for some seconds after it last asked, ``WATCH_TTL`` where it names no others.  Pushes to
+one watcher of one key are numbered without a gap, so that it notices what it missed, and asks again.
 """
 
 from __future__ import annotations
@@ -15,11 +15,15 @@ from twisted.python.failure import Failure
 from middleware.entangled.background import Background
 from middleware.entangled.errors import NotRunning, Refused, WeatherError
 from middleware.entangled.kademlia.contact import Contact
-from middleware.entangled.record import Record
+from middleware.entangled.record import Record, Slot
 from middleware.entangled.wire.endpoint import Endpoint
 
-WATCH_TTL = 8.0
+WATCH_TTL, MAX_TTL = 8.0, 60.0
 MAX_WATCHERS = 1000
+FEW, GATHERED = 64, 0.1
+"""Watchers of a key up to which each change is pushed by itself, and seconds for which they are gathered beyond."""
+PUSH_BYTES, MOST_GONE = 12_000, 100
+"""What one push of several changes carries, about."""
 MAX_WATCHED = 10_000
 """Keys that are watched here at the same time."""
 
@@ -48,18 +52,21 @@ class Pusher:
         self._clock = clock
         self._chores = chores
         self._watchers: dict[bytes, dict[bytes, _Watcher]] = {}
+        self._gathered: dict[bytes, dict[Slot, tuple[Record, bool]]] = {}
 
     def start(self) -> None:
         """Forget who does not ask again, from now on."""
         self._chores.every(WATCH_TTL, self._prune)
 
-    def watched(self, key: bytes, peer: Contact) -> int:
+    def watched(self, key: bytes, peer: Contact, ttl: float = WATCH_TTL) -> int:
         """``peer`` watches ``key`` from now on; the number of the last push to it.  Raises ``Refused``."""
+        if not 0.0 < ttl <= MAX_TTL:
+            raise Refused(f"a watch counts for up to {MAX_TTL:g} s")
         watchers = self._watchers.get(key, {})
         is_full = len(watchers) >= MAX_WATCHERS or (not watchers and len(self._watchers) >= MAX_WATCHED)
         if peer.node_id not in watchers and is_full:
             raise Refused("too many watchers of this key")
-        until = self._clock.seconds() + WATCH_TTL
+        until = self._clock.seconds() + ttl
         watcher = watchers.setdefault(peer.node_id, _Watcher(peer, until))
         watcher.contact, watcher.until = peer, until
         self._watchers[key] = watchers
@@ -70,9 +77,35 @@ class Pusher:
         watchers = self._watchers.get(key)
         if not watchers:
             return
+        if len(watchers) <= FEW and key not in self._gathered:
+            self._push(key, [record.packed() for record in records], [[record.owner, record.name] for record in gone])
+            return
+        if key not in self._gathered:
+            self._chores.later(GATHERED, self._push_gathered, key)
+        # Of each slot the last word only: it was there and went, or went and is there again.
+        words = self._gathered.setdefault(key, {})
+        words.update((record.slot, (record, True)) for record in records)
+        words.update((record.slot, (record, False)) for record in gone)
+
+    def _push_gathered(self, key: bytes) -> None:
+        packed: list[object] = []
+        places: list[object] = []
+        size = 0
+        for record, is_there in self._gathered.pop(key).values():
+            if is_there:
+                packed.append(record.packed())
+                size += record.message_bytes
+            else:
+                places.append([record.owner, record.name])
+            if size > PUSH_BYTES or len(places) >= MOST_GONE:
+                self._push(key, packed, places)
+                packed, places, size = [], [], 0
+        if packed or places:
+            self._push(key, packed, places)
+
+    def _push(self, key: bytes, packed: list[object], places: list[object]) -> None:
         now = self._clock.seconds()
-        packed = [record.packed() for record in records]
-        places = [[record.owner, record.name] for record in gone]
+        watchers = self._watchers.get(key, {})
         for watcher in list(watchers.values()):
             if watcher.until < now:
                 del watchers[watcher.contact.node_id]

@@ -102,7 +102,9 @@ class Reader:
         """Whether ``record``, told by ``contact``, is one of ``key`` and its owner's own word."""
         if record.key != key:
             return False
-        return record.owner == contact.public or self._replica.is_genuine(record)
+        if record.owner == contact.public:
+            return self._replica.may_store(record.slot)
+        return self._replica.is_genuine(record)
 
     # -- inside -----------------------------------------------------------------------------------------------------
 

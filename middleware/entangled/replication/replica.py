@@ -18,18 +18,20 @@ from middleware.entangled.background import Background
 from middleware.entangled.data.store import Store
 from middleware.entangled.errors import Refused
 from middleware.entangled.kademlia.contact import Contact
-from middleware.entangled.record import KEY_BYTES, Record, Signed, unpacked
+from middleware.entangled.record import KEY_BYTES, Record, Signed, Slot, unpacked
 from middleware.entangled.replication.cache import PathCache
 from middleware.entangled.replication.keepsake import Keepsakes
-from middleware.entangled.replication.pusher import Pusher
+from middleware.entangled.replication.pusher import WATCH_TTL, Pusher
 from middleware.entangled.replication.watch import digest_of
 from middleware.entangled.wire.endpoint import Endpoint
 
 PAGE_BYTES = 12_000
 """A page of small records goes out in one burst: ten datagrams are the first window of a parcel."""
-SWEEP = 0.1
+SWEEP, LONGEST_SWEEP = 0.1, 60.0
+"""Seconds between two looks for what ran out, and those after which is looked though nothing can have."""
 MAX_LEASE = 3600.0
 MARKS = 100
+MAX_DOUBTFUL = 4096
 """Leased records that are named in one message."""
 
 UNSURE, SURE, CACHED = 0, 1, 2
@@ -37,6 +39,8 @@ UNSURE, SURE, CACHED = 0, 1, 2
 
 HELD = -2
 """Answer to a STORE of a replica that is not sure: the record is held, and yet that is no vote."""
+FORBIDDEN = -3
+"""Answer to a STORE of what its owner may not write, by its role."""
 
 OnRecord = Callable[[Record], None]
 
@@ -44,7 +48,8 @@ OnRecord = Callable[[Record], None]
 class Replica:
     """The records of others, held for them; ``keepsakes`` are the node's own copies, which nobody else gets to see.
 
-    ``is_sure`` says whether this node has caught up with the others, ``nearest`` whom it knows close to a key.
+    ``may_store`` says whether the owner of a slot may write there, by its role, ``is_sure`` whether this node has
+    caught up with the others, ``nearest`` whom it knows close to a key.
 
     ``on_record`` is told of every record that was accepted, ``on_gone`` of every one that is let go of, ``on_silent``
     of every owner (its public key) whose lease ran out or that said goodbye, ``on_peer`` of every peer that stores,
@@ -59,9 +64,12 @@ class Replica:
         self.pusher = Pusher(endpoint, clock, chores)
         self.cache = PathCache()
         self._signed = Signed()
+        self.may_store: Callable[[Slot], bool] = lambda slot: True
         self.is_sure: Callable[[], bool] = lambda: True
         self.nearest: Callable[[bytes], list[Contact]] = lambda key: []
         self._doubtful: set[bytes] = set()
+        self._swept_at = self._sweep_at = -1.0
+        self._no_sweep: Callable[[], None] = lambda: None
         self.on_record: OnRecord = lambda record: None
         self.on_gone: OnRecord = lambda record: None
         self.on_silent: Callable[[bytes], None] = lambda owner: None
@@ -78,7 +86,8 @@ class Replica:
 
     def start(self) -> None:
         """Let go of what runs out from now on."""
-        self._chores.every(SWEEP, self._sweep)
+        self._swept_at = self._clock.seconds()
+        self._sweep_later()
         self.pusher.start()
 
     def held(self, key: bytes) -> list[Record]:
@@ -101,6 +110,7 @@ class Replica:
         before = self._store.slot(record.slot)
         life = record.ttl if left is None else min(left, record.ttl)
         if self._store.put(record, self._clock.seconds() + life):
+            self._sweep_in_time()
             self.on_record(record)
             self.pusher.push(record.key, [record], [])
             return 0
@@ -123,7 +133,8 @@ class Replica:
     def answer_store(self, peer: Contact, packed: list[object], left: list[object] | None = None) -> list[int]:
         """STORE: keep records; answers for each what ``store`` says, or -1 for a forged one.
 
-        ``left`` are the seconds that each is to be kept, where it does not come from its owner.
+        It is ``FORBIDDEN`` for one that its owner may not write.  ``left`` are the seconds that each is to be
+        kept, where it does not come from its owner.
         """
         self.on_peer(peer)
         records = [record for record in map(unpacked, packed) if record is not None]
@@ -131,7 +142,7 @@ class Replica:
         if len(records) < len(packed) or len(lives) != len(packed):
             raise Refused("not a record")
         return [
-            self.store(record, life) if self.is_lawful(record, peer) else -1
+            self.store(record, life) if not (refusal := self._refusal(record, peer)) else refusal
             for record, life in zip(records, lives, strict=True)
         ]
 
@@ -167,13 +178,13 @@ class Replica:
         if not self.held(key) and all(self.is_genuine(record) for record in records):
             self.cache.put(key, records, ttl, self._clock.seconds())
 
-    def answer_watch(self, peer: Contact, key: bytes, digest: bytes) -> list[object]:
-        """WATCH: push changes of ``key`` to ``peer`` for a while.
+    def answer_watch(self, peer: Contact, key: bytes, digest: bytes, ttl: float = WATCH_TTL) -> list[object]:
+        """WATCH: push changes of ``key`` to ``peer`` for ``ttl`` seconds, a minute at most.
 
         Answers the number of the last push, and the first page (None where ``digest`` is that of what is held).
         """
         self.on_peer(peer)
-        number = self.pusher.watched(_checked_key(key), peer)
+        number = self.pusher.watched(_checked_key(key), peer, ttl)
         return [number, None if digest == digest_of(self.held(key)) else self.first_page(key)]
 
     def answer_alive(self, peer: Contact, lease: float, digest: bytes) -> None:
@@ -187,6 +198,8 @@ class Replica:
             self._doubtful.discard(peer.node_id)
             self._endpoint.tell(peer, "missing", [digest_of([r]) for r in held[:MARKS]])
         else:
+            if len(self._doubtful) >= MAX_DOUBTFUL:
+                self._doubtful.clear()  # these are told one sign later
             self._doubtful.add(peer.node_id)
 
     def answer_let_go(self, peer: Contact, marks: list[object]) -> None:
@@ -201,6 +214,11 @@ class Replica:
         self._doubtful.discard(peer.node_id)
         self.on_goodbye(peer)
 
+    def _refusal(self, record: Record, peer: Contact) -> int:
+        if not self.may_store(record.slot):
+            return FORBIDDEN
+        return 0 if self.is_lawful(record, peer) else -1
+
     def is_lawful(self, record: Record, peer: Contact) -> bool:
         """Whether ``peer`` may store ``record``.
 
@@ -210,8 +228,11 @@ class Replica:
         return record.owner == peer.public or (record.lifetime == "team" and self.is_genuine(record))
 
     def is_genuine(self, record: Record) -> bool:
-        """Whether ``record`` is its owner's own word: the very one that is held here, or one with a good signature."""
-        return self.holds(record) or self._signed.is_genuine(record)
+        """Whether ``record`` is its owner's own word, and one that it may give.
+
+        So is the very one that is held here, and one with a good signature.
+        """
+        return self.may_store(record.slot) and (self.holds(record) or self._signed.is_genuine(record))
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
@@ -253,8 +274,27 @@ class Replica:
             self.pusher.push(record.key, [], [record])
             self.on_gone(record)
 
+    def _sweep_in_time(self) -> None:
+        """Sweep earlier than was thought, where something that was taken in runs out sooner."""
+        if self._swept_at >= 0 and self._store.due() <= self._sweep_at - SWEEP:
+            self._no_sweep()
+            self._sweep_later()
+
+    def _sweep_later(self) -> None:
+        """Sweep in a multiple of ``SWEEP``: as soon as something may have run out."""
+        now, at = self._clock.seconds(), self._swept_at + SWEEP
+        due = min(self._store.due(), now + LONGEST_SWEEP)
+        while at < due or at <= now:
+            at += SWEEP
+        self._sweep_at = at
+        self._no_sweep = self._chores.later(at - now, self._sweep)
+
     def _sweep(self) -> None:
-        ended = self._store.expire(self._clock.seconds())
+        self._swept_at = self._sweep_at
+        try:
+            ended = self._store.expire(self._clock.seconds())
+        finally:
+            self._sweep_later()
         self._gone(ended)
         for owner in dict.fromkeys(r.owner for r in ended if r.lifetime == "leased"):
             self.on_silent(owner)

@@ -9,9 +9,10 @@ from twisted.internet.interfaces import IReactorTime
 from twisted.logger import Logger
 
 from middleware.entangled.background import Background
-from middleware.entangled.errors import EntangledError
+from middleware.entangled.errors import EntangledError, Refused
 from middleware.entangled.identity import node_id
 from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.kademlia.distance import closest
 from middleware.entangled.kademlia.overlay import Overlay
 from middleware.entangled.record import Record, Slot, unpacked
 from middleware.entangled.replication.reader import Reader
@@ -21,6 +22,10 @@ from middleware.entangled.wire.endpoint import Endpoint
 
 RENEW = 2.0
 """Four renewals in the time for which a replica remembers a watcher."""
+LARGE_RENEW, LARGE_TTL = 20.0, 60.0
+"""The same in a large network, where to find the holders takes a walk: three renewals."""
+ASKED = 3
+"""Holders of a key that push to one watcher in a large network, where thousands may watch the same key."""
 
 
 class Subscriber:
@@ -82,11 +87,16 @@ class Subscriber:
         """Hear what a newcomer holds of watched keys."""
         for watch in self._watches:
             if self._overlay.belongs(watch.key, contact):
-                self._chores.fork(self._renew_at(watch, contact))
+                if self._overlay.is_large:
+                    watch.due_at = 0.0
+                else:
+                    self._chores.fork(self._renew_at(watch, contact))
 
     def forget(self, replica: bytes) -> None:
         """What the node with the id ``replica`` said does not count any more."""
         for watch in list(self._watches):
+            if replica in watch.asked:
+                watch.due_at = 0.0
             watch.forget(replica)
             self._settle(watch)
 
@@ -122,13 +132,18 @@ class Subscriber:
         self._replica.keepsakes.keep(key, records.values(), self._clock.seconds())
 
     def _renew_all(self) -> None:
+        now = self._clock.seconds()
         for watch in self._watches:
-            self._chores.fork(self._renew(watch))
+            if now >= watch.due_at or not self._overlay.is_large:
+                self._chores.fork(self._renew(watch))
 
     async def _renew(self, watch: Watch) -> None:
+        watch.due_at = self._clock.seconds() + LARGE_RENEW
         targets = await self._overlay.holders(watch.key)
         if watch not in self._watches:
             return
+        if self._overlay.is_large:
+            targets = closest(targets, self._own_id, ASKED)  # each watcher has its own ones
         ids = [c.node_id for c in targets]
         for replica in watch.view.replicas():
             # Whoever is not asked any more will not tell when its opinion ends.
@@ -143,7 +158,12 @@ class Subscriber:
         watch.asked.add(contact.node_id)
         try:
             digest = watch.view.digest(contact.node_id)
-            answer = await self._overlay.ask(contact, "watch", watch.key, digest, changes=True)
+            ttl = (LARGE_TTL,) if self._overlay.is_large else ()
+            try:
+                answer = await self._overlay.ask(contact, "watch", watch.key, digest, *ttl, changes=True)
+            except Refused:  # too many watch there: what it holds now has to do
+                watch.view.replace(contact.node_id, (await self._reader.pages(contact, watch.key)).records)
+                return self._settle(watch)
             number, page = answer if isinstance(answer, list) and len(answer) == 2 else (0, [[], None])
             if type(number) is not int:
                 return

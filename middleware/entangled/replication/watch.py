@@ -17,8 +17,14 @@ from middleware.entangled.record import Record, Slot
 Changed = Callable[[list[Record]], None]
 
 
+_OF_NOTHING = hashlib.blake2s(digest_size=8).digest()
+
+
 def digest_of(records: Iterable[Record]) -> bytes:
     """Eight bytes that tell whether two replicas hold the same of a key."""
+    records = list(records)
+    if not records:
+        return _OF_NOTHING
     h = hashlib.blake2s(digest_size=8)
     for record in sorted(records, key=lambda r: (r.key, r.owner, r.name)):
         place = record.owner + record.name.encode() + b"\0"
@@ -84,7 +90,8 @@ class Watch:
     """One subscription to one key; ``records`` is what is known now.
 
     ``asked`` are the node ids of the replicas that were asked to push; nobody else is believed.  ``keep`` says whether
-    what is known is to be kept in the node's own store as well.  ``pushed`` is the number of each replica's last push.
+    what is known is to be kept in the node's own store as well.  ``pushed`` is the number of each replica's last push,
+    ``due_at`` when the replicas of a large network are asked again.
     """
 
     def __init__(self, key: bytes, changed: Changed, renewer: Renewer, own_id: bytes = b"", keep: bool = False) -> None:
@@ -93,6 +100,7 @@ class Watch:
         self.records: list[Record] = []
         self.asked: set[bytes] = set()
         self.pushed: dict[bytes, int] = {}
+        self.due_at = 0.0
         self.keep = keep
         self._changed = changed
         self._renewer = renewer

@@ -113,13 +113,14 @@ class Taker:
     ) -> tuple[list[Posted], float | None]:
         """The tuples to try now, in this node's own order, and the seconds until another may be tried.
 
-        Every node has another order, so that takers seldom fight for the same tuple.
+        Every node has another order, so that takers seldom fight for the same tuple.  What was missed comes after what
+        was not tried, the longest ago first: else two tuples whose councils are gone would keep the rest from us.
         """
         now = self._clock.seconds()
         open_ = [p for p in posted if p.place not in self.gone and p.place not in self.held]
         fitting = [p for p in open_ if template.matches(p.fields)]
         ready = [p for p in fitting if not is_patient or self._not_before.get(p.place, 0.0) <= now]
-        ready.sort(key=lambda p: (zlib.crc32(p.place.mark, self._seed), p.place))
+        ready.sort(key=lambda p: (self._not_before.get(p.place, 0.0), zlib.crc32(p.place.mark, self._seed), p.place))
         moments = [self._not_before[p.place] for p in fitting if p.place in self._not_before]
         return ready, min((max(0.001, moment - now) for moment in moments), default=None)
 

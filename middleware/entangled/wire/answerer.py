@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections import Counter, OrderedDict
+from collections import Counter
 from collections.abc import Callable
 
 from twisted.internet.defer import Deferred
@@ -17,6 +17,7 @@ from twisted.python.failure import Failure as Trouble
 
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.wire.courier import Courier
+from middleware.entangled.wire.door import ROLE, meaning
 from middleware.entangled.wire.message import (
     BUSY,
     GONE,
@@ -37,13 +38,20 @@ from middleware.entangled.wire.method import Entry, ErrorCodes, Ledger, Method
 from middleware.entangled.wire.session import MAX_PLAIN, Session
 
 MAX_CANCELLED = 1024
+# What one peer may ask in a second, and at once: several times what the busiest of a team does, a quarter of a core.
+QUESTIONS, QUESTIONS_AT_ONCE = 2000.0, 8192.0
+MAX_ASKING = 4096
 _BUSY = "this node holds as many open questions as it may; ask again later"
+_HASTY = "this peer asks more than this node can answer; ask again later, and less often"
 _FULL = "too much is on its way to you already; ask again later"
 _GONE = "the call ran, and its answer was too large to keep; ask what it changed"
 
 
 class Answerer:
-    """What peers may ask of this node; ``send`` is called with a session and the bytes of a message."""
+    """What peers may ask of this node; ``send`` is called with a session and the bytes of a message.
+
+    ``may`` says whether a peer of that public key may call a method, ``on_refused`` is told of each that may not.
+    """
 
     _log = Logger()
 
@@ -56,18 +64,33 @@ class Answerer:
         counters: Counter[str],
     ) -> None:
         self.methods: dict[str, Method] = {}
+        self.may: Callable[[bytes, str], bool] = lambda public, method: True
+        self.on_refused: Callable[[Contact, str], None] = lambda peer, method: None
         self._clock = clock
         self._send = send
         self._courier = courier
         self._codes = codes
         self._counters = counters
         self._ledger = Ledger()
-        self._cancelled: OrderedDict[tuple[bytes, int], None] = OrderedDict()
+        self._cancelled: dict[tuple[bytes, int], None] = {}
+        self._asking: dict[bytes, Allowance] = {}
 
     def clear(self) -> None:
         """Forget what was asked; answers that are still being made go nowhere."""
         self._ledger.clear()
         self._cancelled.clear()
+        self._asking.clear()
+
+    def evict(self, public: bytes) -> None:
+        """Forget what a peer asked, and stop the work on it."""
+        for work in self._ledger.evict(public):
+            work.cancel()
+
+    def tidy(self, now: float) -> None:
+        """Forget how much those asked who asked nothing for so long that they may ask as much as anybody again."""
+        before = now - QUESTIONS_AT_ONCE / QUESTIONS
+        for public in [public for public, allowance in self._asking.items() if allowance.at <= before]:
+            del self._asking[public]
 
     def answer(self, question: Question, session: Session, is_bulky: bool = False) -> None:
         """Answer a question of an established session, now or when the method is done.
@@ -99,6 +122,9 @@ class Answerer:
         if not question.left_ms:
             self._counters["late"] += 1
             return
+        if not self._is_within(public):
+            self._reply(session, question.id, self._busy(question.id, _HASTY), is_bulky)
+            return
         answer = self._run(question, session.contact, session, is_bulky)
         if answer is not None:
             self._reply(session, question.id, answer, is_bulky)
@@ -118,8 +144,14 @@ class Answerer:
     def take(self, told: Told, peer: Contact) -> None:
         """Run what a peer told us; it hears nothing back."""
         method = self.methods.get(told.method)
+        if not self._is_within(peer.public):
+            self._counters["busy"] += 1
+            return
         if method is None:
             self._counters["unknown method"] += 1
+            return
+        if not self.may(peer.public, told.method):
+            self._refuse(peer, told.method)
             return
         result = self._called(method, peer, told.arguments, math.inf)
         if isinstance(result, Deferred):
@@ -135,7 +167,7 @@ class Answerer:
         if entry is None:
             self._cancelled[public, message.id] = None
             if len(self._cancelled) > MAX_CANCELLED:
-                self._cancelled.popitem(last=False)
+                del self._cancelled[next(iter(self._cancelled))]
         elif entry.work is not None:
             self._counters["cancelled"] += 1
             self._stop(entry)
@@ -145,6 +177,9 @@ class Answerer:
         method = self.methods.get(question.method)
         if method is None:
             return encoded(Failure(question.id, UNKNOWN_METHOD, f"{question.method}: no such method here"))
+        if not self.may(peer.public, question.method):
+            self._refuse(peer, question.method)
+            return encoded(Failure(question.id, ROLE, f"{question.method}: {meaning(ROLE)}"))
         public, entry, now = peer.public, None, self._clock.seconds()
         if method.is_once:
             entry = self._ledger.begin(public, question.id, session, now, is_bulky)
@@ -207,9 +242,24 @@ class Answerer:
         if work is not None:
             work.cancel()
 
-    def _busy(self, number: int) -> bytes:
+    def _refuse(self, peer: Contact, method: str) -> None:
+        self._counters["refused"] += 1
+        self.on_refused(peer, method)
+
+    def _busy(self, number: int, text: str = _BUSY) -> bytes:
         self._counters["busy"] += 1
-        return encoded(Failure(number, BUSY, _BUSY))
+        return encoded(Failure(number, BUSY, text))
+
+    def _is_within(self, public: bytes) -> bool:
+        """Whether a peer may ask one thing more now."""
+        asking = self._asking
+        allowance = asking.pop(public, None)
+        if allowance is None:
+            allowance = Allowance(QUESTIONS_AT_ONCE, self._clock.seconds())
+            if len(asking) >= MAX_ASKING:
+                del asking[next(iter(asking))]
+        asking[public] = allowance
+        return allowance.take(self._clock.seconds())
 
     def _called(self, method: Method, peer: Contact, arguments: tuple[object, ...], deadline: float) -> object:
         """What the method returned, a Deferred for a coroutine, or the trouble it raised."""
@@ -242,6 +292,25 @@ class Answerer:
             self._counters["refused"] += 1
         else:
             self._log.failure("{method} failed for a peer", failure=trouble, method=method.name)
+
+
+class Allowance:
+    """What one peer may still ask."""
+
+    __slots__ = ("_left", "at")
+
+    def __init__(self, left: float, now: float) -> None:
+        self._left = left
+        self.at = now
+
+    def take(self, now: float) -> bool:
+        """Whether there is one left; it is gone then."""
+        self._left = min(QUESTIONS_AT_ONCE, self._left + (now - self.at) * QUESTIONS)
+        self.at = now
+        if self._left < 1.0:
+            return False
+        self._left -= 1.0
+        return True
 
 
 def _kept(number: int, answer: bytes) -> bytes:

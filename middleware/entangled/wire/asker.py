@@ -51,7 +51,8 @@ _FULL = "too much is on its way already; ask again later"
 class Inquiry:
     """A question of ours that waits for its answer.
 
-    ``is_patient``: the caller gave a longer time-out than the usual one; ``is_bulky``: the question goes as a parcel.
+    ``is_patient``: the caller gave a longer time-out than the usual one; ``is_bulky``: the question goes as a parcel;
+    ``is_light``: it is not worth a handshake.
     ``grace`` is how long the answer may still come after the question had its turn, and after each sign of progress of
     a parcel: none (0) where the caller gave a time-out.
     """
@@ -66,6 +67,7 @@ class Inquiry:
     deadline: float
     is_patient: bool
     is_bulky: bool
+    is_light: bool
     grace: float
     deferred: Deferred[object]
     tries: int = 0
@@ -105,7 +107,13 @@ class Asker:
         peers.on_unheard = self._unheard
 
     def ask(
-        self, contact: Contact, method: str, arguments: tuple[object, ...], timeout: float | None, changes: bool
+        self,
+        contact: Contact,
+        method: str,
+        arguments: tuple[object, ...],
+        timeout: float | None,
+        changes: bool,
+        is_light: bool = False,
     ) -> Deferred[object]:
         """Ask; see ``Endpoint.ask``."""
         number = self._next_number
@@ -140,16 +148,17 @@ class Asker:
             deadline=now + patience,
             is_patient=patience > PATIENCE,
             is_bulky=is_bulky,
+            is_light=is_light,
             grace=PATIENCE if timeout is None else 0.0,
             deferred=deferred,
         )
         self._inquiries[number] = inquiry
-        peer.inquiries[number] = None
+        peer.began(number)
         is_open = self._peers.usable(peer) is not None
         if is_open and (peer.in_flight < MAX_IN_FLIGHT or not inquiry.is_counted):
             self._try(inquiry)
             return deferred
-        peer.queue[number] = None
+        peer.put_off(number)
         self._queued += 1
         self._set_timer(inquiry, patience)
         if not is_open and not self._open(inquiry):
@@ -173,7 +182,7 @@ class Asker:
                 # Nobody answers a tell: without this a restarted peer would never be noticed.
                 self._peers.open(peer, contact.address)
         elif len(peer.tells) < MAX_TELLS and (peer.opening is not None or self._peers.open(peer, contact.address)):
-            peer.tells.append(message)
+            peer.tells += (message,)
         else:
             self._counters["untold"] += 1
 
@@ -184,6 +193,16 @@ class Asker:
             self._drop(inquiry)
         for inquiry in inquiries:
             inquiry.deferred.errback(error)
+
+    def refused(self, peer: Peer, error: Callable[[], Exception]) -> None:
+        """Fail every question to a peer: one of us does not let the other in."""
+        self._counters["untold"] += len(peer.tells)
+        peer.tells = ()
+        inquiries = self._of(peer)
+        for inquiry in inquiries:
+            self._drop(inquiry)
+        for inquiry in inquiries:
+            inquiry.deferred.errback(error())
 
     def is_asked(self, number: int, public: bytes) -> bool:
         """Whether the question ``number`` waits for an answer of the peer with that key."""
@@ -205,9 +224,12 @@ class Asker:
             return
         if inquiry.progress_at < 0 and not inquiry.is_bulky:  # else it is the time of the transfer
             if inquiry.tries == 1:
-                inquiry.peer.round_trip.measured(self._clock.seconds() - inquiry.sent_at)
+                took = self._clock.seconds() - inquiry.sent_at
+                inquiry.peer.round_trip.measured(took)
+                self._peers.usual.measured(took)
             elif inquiry.tries > 1:
                 inquiry.peer.round_trip.ambiguous()
+                self._peers.usual.ambiguous()
         self._forget(inquiry)
         if isinstance(message, Answer):
             inquiry.deferred.callback(message.value)
@@ -220,7 +242,7 @@ class Asker:
         for message in peer.tells:
             self._send(session, message)
             sent += 1
-        peer.tells.clear()
+        peer.tells = ()
         if is_owed:  # of those that were tried, the peer may have lost the session
             for inquiry in self._of(peer):
                 if inquiry.tries:
@@ -283,7 +305,7 @@ class Asker:
             else:
                 self._fail(inquiry, f"no answer to {inquiry.tries} tries")
         else:
-            if is_silent:
+            if is_silent and not inquiry.is_light:
                 self._open(inquiry)  # perhaps it restarted and knows no session
             self._try(inquiry)
 
@@ -301,7 +323,7 @@ class Asker:
 
     def _leave_queue(self, inquiry: Inquiry) -> None:
         if inquiry.number in inquiry.peer.queue:
-            del inquiry.peer.queue[inquiry.number]
+            inquiry.peer.taken_up(inquiry.number)
             self._queued -= 1
 
     def _of(self, peer: Peer) -> list[Inquiry]:
@@ -316,7 +338,7 @@ class Asker:
         """Give up what waited for a handshake that nobody answered."""
         peer = opening.peer
         self._counters["untold"] += len(peer.tells)
-        peer.tells.clear()
+        peer.tells = ()
         if peer.sessions:
             for inquiry in self._of(peer):
                 if inquiry.tries >= MAX_TRIES:  # it waited for this handshake only
@@ -356,7 +378,7 @@ class Asker:
         cancel(inquiry.timer)
         if self._inquiries.pop(inquiry.number, None) is None:
             return
-        inquiry.peer.inquiries.pop(inquiry.number, None)
+        inquiry.peer.ended(inquiry.number)
         self._leave_queue(inquiry)
         if inquiry.tries:
             inquiry.peer.in_flight -= inquiry.is_counted

@@ -6,7 +6,7 @@ finds no room to come in waits at its sender.
 
 from __future__ import annotations
 
-from collections import Counter, OrderedDict
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -36,6 +36,13 @@ MAX_IN = 8 * MAX_MESSAGE
 ROOM_PARTS = 128
 LEAST_ROOM = 4
 LONGEST_S = 60.0
+# Where there is no room for one more, parcels that are older than this and grow more slowly than so many parts (88
+# kbit/s) in a second are given up: else a few members could hold all the room with parcels that they never finish.
+SETTLED_S, SLOW = 1.0, 8.0
+CLEARING_S = 0.5
+# Whose parcel was given up does not get this part of the room for a while; so it is there for others.
+KEPT_FREE = 2 * MAX_MESSAGE
+TARDY_S, MAX_TARDY = 60.0, 1024
 # Of this many questions a receiver knows that it has had them; their repeated parts get a receipt and are dropped.
 MAX_ENDED = 1024
 MAX_FLOWS = 64
@@ -61,6 +68,11 @@ class Assembly:
     def is_whole(self) -> bool:
         """Whether every part is here."""
         return self.here == (1 << len(self.parts)) - 1
+
+    def is_slow(self, now: float) -> bool:
+        """Whether it has to give way to others where room is short."""
+        age = now - self.begun_at
+        return age > SETTLED_S and self.here.bit_count() < SLOW * age
 
     def add(self, part: Part, now: float) -> bool:
         """Put a part into its place; whether to tell its sender at once, since it leaves a gap or is here twice."""
@@ -104,12 +116,14 @@ class Courier:
         self._is_awaited = is_awaited
         self._on_progress = on_progress
         self._counters = counters
-        self._flows: OrderedDict[bytes, Flow] = OrderedDict()
+        self._flows: dict[bytes, Flow] = {}
         self._bytes_out: Counter[bytes] = Counter()
         self._assemblies: dict[tuple[bytes, Key], Assembly] = {}
         self._bytes_in: Counter[bytes] = Counter()
-        self._ended: OrderedDict[tuple[bytes, Key], None] = OrderedDict()
+        self._ended: dict[tuple[bytes, Key], None] = {}
         self._sweeper: IDelayedCall | None = None
+        self._cleared_at = -CLEARING_S
+        self._tardy: dict[bytes, float] = {}
 
     def stop(self) -> None:
         """Forget everything and cancel every timer."""
@@ -120,6 +134,7 @@ class Courier:
         self._assemblies.clear()
         self._bytes_in.clear()
         self._ended.clear()
+        self._tardy.clear()
         self._bytes_out.clear()
 
     def reserve(self, public: bytes, size: int) -> bool:
@@ -141,7 +156,7 @@ class Courier:
         flow = self._flows.get(public)
         if flow is None:
             flow = self._new_flow(public)
-        self._flows.move_to_end(public)
+        self._flows[public] = self._flows.pop(public)  # whichever was used longest ago stands first
         if key in flow.parcels:
             return True  # it is under way
         if key.is_answer and not self.reserve(public, len(message)):
@@ -169,6 +184,20 @@ class Courier:
         flow = self._flows.get(public)
         if flow is not None and flow.parcels:
             flow.restart()
+
+    def evict(self, public: bytes) -> None:
+        """Forget what goes to a peer and comes from it."""
+        flow = self._flows.get(public)
+        for key in list(flow.parcels) if flow is not None else ():
+            self.drop(public, key)
+        for where in [where for where in self._assemblies if where[0] == public]:
+            self._forget(where)
+
+    def let_go(self, public: bytes) -> None:
+        """Forget how fast the way to a peer is, where nothing goes there."""
+        flow = self._flows.get(public)
+        if flow is not None and not flow.parcels:
+            del self._flows[public]
 
     def on_receipt(self, session: Session, plain: bytes) -> None:
         """Take a RECEIPT."""
@@ -206,7 +235,7 @@ class Courier:
                 if part.is_wanted:
                     self._send(public, packed_receipt(key, True, 0, part.number, 0))
                 return
-            if self._bytes_in[public] + part.total > MAX_IN_OF_PEER or self._bytes_in.total() + part.total > MAX_IN:
+            if not self._has_room(public, part.total, now):
                 self._counters["crowded"] += 1
                 if part.is_wanted:
                     self._send(public, packed_receipt(key, False, 0, part.number, 0))
@@ -224,7 +253,7 @@ class Courier:
             if not key.is_answer:
                 self._ended[where] = None
                 if len(self._ended) > MAX_ENDED:
-                    self._ended.popitem(last=False)
+                    del self._ended[next(iter(self._ended))]
             self._send(public, packed_receipt(key, True, 0, part.number, assembly.here))
             self._deliver(session, key, assembly.message())
             return
@@ -233,6 +262,25 @@ class Courier:
             self._send(public, packed_receipt(key, False, room, part.number, assembly.here))
         if key.is_answer:
             self._on_progress(key.id, public)
+
+    def _has_room(self, public: bytes, size: int, now: float) -> bool:
+        """Whether another parcel of a peer can come in; slow ones make room for it."""
+        if self._bytes_in[public] + size > MAX_IN_OF_PEER:
+            return False
+        most = MAX_IN - KEPT_FREE if now - self._tardy.get(public, -TARDY_S) < TARDY_S else MAX_IN
+        if self._bytes_in.total() + size > MAX_IN and now - self._cleared_at >= CLEARING_S:
+            self._cleared_at = now
+            for where in [where for where, assembly in self._assemblies.items() if assembly.is_slow(now)]:
+                self._give_up(where, now)
+        return self._bytes_in.total() + size <= most
+
+    def _give_up(self, where: tuple[bytes, Key], now: float) -> None:
+        self._counters["abandoned"] += 1
+        self._forget(where)
+        self._tardy.pop(where[0], None)
+        self._tardy[where[0]] = now
+        if len(self._tardy) > MAX_TARDY:
+            del self._tardy[next(iter(self._tardy))]
 
     def _new_flow(self, public: bytes) -> Flow:
         if len(self._flows) >= MAX_FLOWS:
@@ -263,7 +311,6 @@ class Courier:
         now = self._clock.seconds()
         for where, assembly in list(self._assemblies.items()):
             if now - assembly.heard_at >= IDLE_S or now - assembly.begun_at >= LONGEST_S:
-                self._counters["abandoned"] += 1
-                self._forget(where)
+                self._give_up(where, now)
         if self._assemblies:
             self._sweeper = self._clock.callLater(1.0, self._sweep)

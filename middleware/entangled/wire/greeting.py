@@ -25,7 +25,7 @@ from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address, Network
 from middleware.entangled.wire.congestion import BACK_OFF, FIRST_GUESS, LONGEST
 from middleware.entangled.wire.peer import Peers
-from middleware.entangled.wire.session import MAC, has_cookie, mac_of
+from middleware.entangled.wire.session import MAC, Credentials, has_cookie, mac_of
 
 WHO = 0x14
 HERE = 0x15
@@ -82,7 +82,7 @@ def opened_cookie(key: bytes, datagram: bytes) -> bytes:
 
 
 class Cookies:
-    """Decides which INIT is worth a key exchange, and makes cookies; it remembers no initiator.
+    """Decides which INIT is worth a key exchange, and makes cookies; it remembers no initiator.  ``key`` seals them.
 
     A cookie is a keyed hash of the initiator's address and of the time in steps of ``COOKIE_S``; those of this step and
     of the last one hold.
@@ -92,8 +92,8 @@ class Cookies:
         self._key = key
         self._rng = rng
         self._secret = rng.randbytes(32)
-        self._quiet = _Bucket(QUIET_RATE)
-        self._most = _Bucket(MOST_RATE)
+        self._quiet = Bucket(QUIET_RATE)
+        self._most = Bucket(MOST_RATE)
 
     def is_lawful(self, init: bytes, source: Address, now: float) -> bool:
         """Whether the last field of an INIT is what it must be: zero, or made with a cookie of ours."""
@@ -105,11 +105,14 @@ class Cookies:
             return self._most.take(now)
         return self._quiet.take(now)
 
-    def reply(self, init: bytes, source: Address, now: float) -> bytes:
-        """The COOKIE datagram for who sent this INIT; shorter than any INIT."""
+    def reply(self, init: bytes, source: Address, now: float, key: bytes = b"") -> bytes:
+        """The COOKIE datagram for who sent this INIT, sealed under ``key`` where that is another one.
+
+        It is shorter than any INIT.
+        """
         head, nonce = bytes([COOKIE]) + mac_of(init), self._rng.randbytes(_NONCE)
         cookie = self._cookie(source, int(now / COOKIE_S))
-        return head + nonce + bindings.crypto_aead_xchacha20poly1305_ietf_encrypt(cookie, head, nonce, self._key)
+        return head + nonce + bindings.crypto_aead_xchacha20poly1305_ietf_encrypt(cookie, head, nonce, key or self._key)
 
     def _is_paid(self, init: bytes, source: Address, now: float) -> bool:
         step = int(now / COOKIE_S)
@@ -121,7 +124,7 @@ class Cookies:
         ).digest()
 
 
-class _Bucket:
+class Bucket:
     """A token bucket that holds what one second brings."""
 
     def __init__(self, rate: float) -> None:
@@ -129,6 +132,7 @@ class _Bucket:
         self._filled_at = 0.0
 
     def take(self, now: float) -> bool:
+        """Whether there was a token left; it is gone then."""
         self._tokens = min(self._rate, self._tokens + (now - self._filled_at) * self._rate)
         self._filled_at = now
         if self._tokens < 1.0:
@@ -138,13 +142,14 @@ class _Bucket:
 
 
 class Greeter:
-    """Greets addresses for an endpoint until one answers or the time is up, greets back, and pays with cookies."""
+    """Greets addresses for an endpoint until one answers or the time is up, greets back, and pays with cookies.
+
+    It does so under each secret of the team that ``peers`` goes by, in turn, the newest first.
+    """
 
     def __init__(
         self,
         public: bytes,
-        key: bytes,
-        cookie_key: bytes,
         peers: Peers,
         network: Network,
         clock: IReactorTime,
@@ -152,8 +157,6 @@ class Greeter:
         counters: Counter[str],
     ) -> None:
         self._public = public
-        self._key = key
-        self._cookie_key = cookie_key
         self._peers = peers
         self._network = network
         self._clock = clock
@@ -165,10 +168,19 @@ class Greeter:
         """Learn who listens at ``address`` within ``timeout`` seconds; fails with ``NoAnswer``."""
         token = self._rng.randbytes(TOKEN_BYTES)
         deferred: Deferred[Contact] = Deferred(lambda _: self._cancelled(token))
-        datagram = who(self._key, token, self._rng)
-        self._pending[token] = _Greeting(address, datagram, self._clock.seconds() + timeout, deferred)
+        datagrams = [who(own.greet_key, token, self._rng) for own in self._peers.ring]
+        now = self._clock.seconds()
+        self._pending[token] = _Greeting(address, datagrams, now + timeout, deferred, now)
         self._send(token, FIRST_GUESS)
         return deferred
+
+    def call(self) -> bytes:
+        """A WHO for many, such as all on a LAN; whose HERE comes is then greeted at its address."""
+        return who(self._peers.ring[0].greet_key, self._rng.randbytes(TOKEN_BYTES), self._rng)
+
+    def opens(self, datagram: bytes) -> bool:
+        """Whether ``datagram`` is a WHO or HERE of this team."""
+        return self._opened(datagram) is not None
 
     def stop(self, error: Exception) -> None:
         """Fail what is pending with ``error``."""
@@ -179,20 +191,17 @@ class Greeter:
 
     def on_who(self, datagram: bytes, source: Address) -> None:
         """Answer a greeting, if it is one of our team."""
-        try:
-            token, _ = opened_greeting(self._key, datagram)
-        except Forged:
-            self._counters["forged"] += 1
-            return
-        self._network.send(here(self._key, token, self._public, self._rng), source)
+        found = self._opened(datagram)
+        if found is not None:
+            own, token, _ = found
+            self._network.send(here(own.greet_key, token, self._public, self._rng), source)
 
     def on_here(self, datagram: bytes, source: Address) -> None:
         """Take the answer to a greeting of ours."""
-        try:
-            token, public = opened_greeting(self._key, datagram)
-        except Forged:
-            self._counters["forged"] += 1
+        found = self._opened(datagram)
+        if found is None:
             return
+        own, token, public = found
         greeting = self._pending.get(token)
         if greeting is None:
             self._counters["unasked"] += 1
@@ -200,22 +209,36 @@ class Greeter:
             self._counters["misdirected"] += 1
         else:
             self._forget(token)
-            greeting.deferred.callback(Contact(public, source))
+            contact = Contact(public, source)
+            self._peers.met_under(contact, own)
+            if not self._peers.usual.is_measured:  # a guess: it may have been a later try that was answered
+                self._peers.usual.measured(self._clock.seconds() - greeting.begun_at)
+            greeting.deferred.callback(contact)
 
     def on_cookie(self, datagram: bytes, source: Address) -> None:
         """Pay with the cookie that the answer to an INIT of ours brings."""
         opening = self._peers.opening_of(datagram[1 : 1 + MAC])
         if opening is None:
             self._counters["stale"] += 1
-        elif source != opening.address:
+        elif source not in opening.doors:
             self._counters["misdirected"] += 1
         else:
             try:
-                cookie = opened_cookie(self._cookie_key, datagram)
+                cookie = opened_cookie(opening.invitation.own.cookie_key, datagram)
             except Forged:
                 self._counters["forged"] += 1
                 return
-            self._peers.paid(opening, cookie)
+            self._peers.paid(opening, cookie, source)
+
+    def _opened(self, datagram: bytes) -> tuple[Credentials, bytes, bytes] | None:
+        """The token and the key in a greeting, and what it was sealed under; None, and counted, where it opens not."""
+        for own in self._peers.ring:
+            try:
+                return own, *opened_greeting(own.greet_key, datagram)
+            except Forged:
+                continue
+        self._counters["forged"] += 1
+        return None
 
     def _send(self, token: bytes, wait: float) -> None:
         greeting = self._pending[token]
@@ -224,7 +247,8 @@ class Greeter:
             self._forget(token)
             greeting.deferred.errback(NoAnswer(f"nobody of this team answers at {greeting.address}"))
             return
-        self._network.send(greeting.datagram, greeting.address)
+        self._network.send(greeting.datagrams[greeting.tries % len(greeting.datagrams)], greeting.address)
+        greeting.tries += 1
         wait = min(wait, LONGEST)
         greeting.timer = self._clock.callLater(min(wait, left), self._send, token, wait * BACK_OFF)
 
@@ -241,7 +265,9 @@ class Greeter:
 @dataclass(slots=True, eq=False)
 class _Greeting:
     address: Address
-    datagram: bytes
+    datagrams: list[bytes]
     deadline: float
     deferred: Deferred[Contact]
+    begun_at: float
+    tries: int = 0
     timer: IDelayedCall | None = None

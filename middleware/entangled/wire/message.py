@@ -38,6 +38,8 @@ _QUESTION, _ANSWER, _FAILURE, _TOLD, _CANCEL = range(5)
 _UINT32 = b"\xce"
 
 PART, RECEIPT = 0x01, 0x02
+REFUSAL = 0x04
+"""Followed by the name of it: who sends this does not let the other in, and forgets the session."""
 OF_ANSWER = 0x01  # flag of both: the parcel is the answer to the question with this id, else the question itself
 WANTED = 0x02  # flag of PART: the sender wants a receipt now
 DONE = 0x02  # flag of RECEIPT: send no more; everything is here, or nobody waits for it

@@ -12,11 +12,10 @@ import math
 import re
 import types
 import typing
-from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import NamedTuple
+from weakref import WeakKeyDictionary
 
 from twisted.internet.defer import CancelledError, Deferred
 from twisted.internet.interfaces import IDelayedCall
@@ -35,6 +34,7 @@ LIFE_BITS = 32
 MAX_LIVES = 4
 """Lives of one peer within ``KEPT_S`` of which is known how far they had come."""
 MAX_ENTRIES = 16384
+MAX_ACCOUNTS = 4096
 _PLAIN = (int, float, bool, str, bytes, list, dict, type(None))
 _BY_NAME: dict[str, tuple[type, ...]] = {kind.__name__: (kind,) for kind in _PLAIN}
 _BY_NAME |= {"None": (type(None),), "float": (float, int)}
@@ -56,7 +56,11 @@ class _Form(NamedTuple):
     wants_deadline: bool
 
 
-@dataclass(frozen=True)
+_FORMS: WeakKeyDictionary[Callable[..., object], _Form] = WeakKeyDictionary()
+"""What the functions of classes take: the same for all nodes of a process."""
+
+
+@dataclass(frozen=True, slots=True)
 class Method:
     """An exposed function.
 
@@ -71,10 +75,24 @@ class Method:
     answer: Callable[..., object]
     changes: bool = False
     is_idempotent: bool = False
+    _known: _Form | None = field(default=None, init=False, repr=False, compare=False)
 
-    @cached_property
+    @property
     def _form(self) -> _Form:
         """Found out at the first call: to look into all methods would be half of what it takes to make a node."""
+        form = self._known
+        if form is None:
+            answer = inspect.unwrap(self.answer)
+            function = answer.__func__ if isinstance(answer, types.MethodType) else None
+            form = _FORMS.get(function) if function is not None else None
+            if form is None:
+                form = self._looked_into()
+                if function is not None:
+                    _FORMS[function] = form
+            object.__setattr__(self, "_known", form)
+        return form
+
+    def _looked_into(self) -> _Form:
         signature = inspect.signature(self.answer)
         positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
         parameters = [parameter for parameter in signature.parameters.values() if parameter.kind in positional]
@@ -215,7 +233,7 @@ class Ledger:
     """
 
     def __init__(self) -> None:
-        self._accounts: OrderedDict[bytes, _Account] = OrderedDict()
+        self._accounts: dict[bytes, _Account] = {}
         self._count = 0
 
     def __len__(self) -> int:
@@ -233,6 +251,8 @@ class Ledger:
 
     def settle(self, public: bytes, oldest: int, now: float) -> None:
         """Forget what ended of the questions of a peer before ``oldest``: it has those answers, or gave them up."""
+        if public not in self._accounts and not self._has_place():
+            return  # it is turned away in a moment
         account = self._account(public, now)
         life = oldest >> LIFE_BITS
         before = account.settled.get(life)
@@ -247,6 +267,8 @@ class Ledger:
 
     def begin(self, public: bytes, question: int, session: Session | None, now: float, is_bulky: bool) -> Entry | None:
         """Enter a question that is about to run; None where there is no room."""
+        if public not in self._accounts and not self._has_place():
+            return None
         account = self._account(public, now)
         if self._count >= MAX_ENTRIES or len(account.running) + len(account.ended) >= MAX_PER_PEER:
             return None
@@ -268,6 +290,16 @@ class Ledger:
             entry.answer, entry.ended_at, entry.session = answer, now, None
             account.ended[question] = entry
 
+    def evict(self, public: bytes) -> list[Deferred[object]]:
+        """Forget the questions of a peer; the work on those that run is for the caller to cancel."""
+        account = self._accounts.pop(public, None)
+        if account is None:
+            return []
+        self._count -= len(account.running) + len(account.ended)
+        for entry in account.running.values():
+            cancel(entry.timer)
+        return [entry.work for entry in account.running.values() if entry.work is not None]
+
     def clear(self) -> None:
         """Forget everything, and cancel the timers."""
         for account in self._accounts.values():
@@ -276,19 +308,29 @@ class Ledger:
         self._accounts.clear()
         self._count = 0
 
+    def _has_place(self) -> bool:
+        """Whether there is room for one more peer; who has nothing here makes it, the most silent first."""
+        if len(self._accounts) < MAX_ACCOUNTS:
+            return True
+        idle = (public for public, account in self._accounts.items() if not (account.running or account.ended))
+        found = next(idle, None)
+        if found is not None:
+            del self._accounts[found]
+        return found is not None
+
     def _account(self, public: bytes, now: float) -> _Account:
         """The account of a peer, without what is over; the one that was silent for longest goes, if that is long."""
         account = self._accounts.get(public)
         if account is None:
             account = self._accounts[public] = _Account()
-        self._accounts.move_to_end(public)
+        self._accounts[public] = self._accounts.pop(public)  # whoever was silent for longest stands first
         account.heard_at = now
         self._expire(account, now)
         oldest_public, oldest = next(iter(self._accounts.items()))
         if oldest.heard_at <= now - KEPT_S:
             self._expire(oldest, now)
             if oldest.running or oldest.ended:
-                self._accounts.move_to_end(oldest_public)
+                self._accounts[oldest_public] = self._accounts.pop(oldest_public)
             else:
                 del self._accounts[oldest_public]
         return account

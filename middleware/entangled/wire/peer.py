@@ -6,17 +6,20 @@
 from __future__ import annotations
 
 import random
-from collections import Counter, OrderedDict
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
+from types import MappingProxyType
 
 from twisted.internet.interfaces import IDelayedCall, IReactorTime
 
 from middleware.entangled.identity import exchange_key
 from middleware.entangled.kademlia.contact import Contact
-from middleware.entangled.network.network import Address, Network
-from middleware.entangled.wire.congestion import BACK_OFF, RoundTrip
-from middleware.entangled.wire.session import INDEX_BYTES, MAX_RIDER, Credentials, Invitation, Session
+from middleware.entangled.network.network import Address, Network, is_relayed
+from middleware.entangled.wire.congestion import BACK_OFF, FIRST_GUESS, LONGEST, RoundTrip
+from middleware.entangled.wire.door import OPEN, Door
+from middleware.entangled.wire.session import INDEX_BYTES, Credentials, Hello, Invitation, Session
 
 STRANGER_WAIT = 0.3
 MAX_TRIES = 4
@@ -24,38 +27,77 @@ MAX_PEERS = 4096
 MAX_OPENINGS = 1024
 MAX_SESSIONS = 3
 OPENING_S = 1.5
+MAX_DOORS = 12
+"""Addresses at which one handshake knocks."""
+MOST_GUESSED = 0.5
+"""Seconds that a stranger is waited for at most, before it is asked again."""
+HELP_S = 0.2
+"""Seconds without an answer after which others are asked how a far peer is reached."""
+KNOCK_S, KNOCKS = 0.1, 16
+"""Seconds between knocks where others help, and for how many of them; then they become rarer."""
+LIVELY_S = 3.0
 SESSION_LIFE_S = 3600.0
 SESSION_END_S = SESSION_LIFE_S + 600.0
 # Far below what ChaCha20-Poly1305 allows under one key (2**62 datagrams of this size).
 SESSION_DATAGRAMS = 2**32
 
 
+NONE: Mapping[int, None] = MappingProxyType({})
+"""No questions: hardly any peer is asked something at any moment, so what has none shares this."""
+
+
+def _with(numbers: Mapping[int, None], number: int) -> Mapping[int, None]:
+    if not isinstance(numbers, dict):
+        return {number: None}
+    numbers[number] = None
+    return numbers
+
+
+def _without(numbers: Mapping[int, None], number: int) -> Mapping[int, None]:
+    if isinstance(numbers, dict):
+        numbers.pop(number, None)
+    return numbers or NONE
+
+
 @dataclass(slots=True, eq=False)
 class Opening:
-    """A handshake of ours that waits for its RESP."""
+    """A handshake of ours that waits for its RESP.
+
+    ``address`` is where it was begun, ``doors`` has every address at which it knocks with the cookie that was asked for
+    there.  Up to ``held_until`` others help, and it goes on whatever the number of its tries.  With ``is_wanted``
+    somebody here waits for it; else it was begun to let the peer in, or to find a better way.
+    """
 
     invitation: Invitation
     peer: Peer
     address: Address
     started_at: float
-    cookie: bytes = b""
+    doors: dict[Address, bytes]
     tries: int = 0
+    knocks: int = 0
+    held_until: float = 0.0
+    is_wanted: bool = True
     timer: IDelayedCall | None = None
+    helper: IDelayedCall | None = None
 
 
 @dataclass(slots=True, eq=False)
 class Peer:
-    """One peer, known by its public key; ``static`` is the X25519 key that follows from it."""
+    """One peer, known by its public key; ``static`` is the X25519 key that follows from it.
+
+    ``own`` is under which of the team's secrets it is to be met, where that is not the newest one.
+    """
 
     public: bytes
     static: bytes
     sessions: list[Session] = field(default_factory=list)
     opening: Opening | None = None
     round_trip: RoundTrip = field(default_factory=RoundTrip)
-    tells: list[bytes] = field(default_factory=list)
-    inquiries: dict[int, None] = field(default_factory=dict)  # the numbers of what is asked of it, in order
-    queue: dict[int, None] = field(default_factory=dict)  # those of them that have not been sent yet
+    tells: tuple[bytes, ...] = ()
+    inquiries: Mapping[int, None] = field(default_factory=lambda: NONE)  # the numbers of what is asked of it, in order
+    queue: Mapping[int, None] = field(default_factory=lambda: NONE)  # those of them that have not been sent yet
     in_flight: int = 0
+    own: Credentials | None = None
 
     @property
     def session(self) -> Session | None:
@@ -66,6 +108,22 @@ class Peer:
         """The oldest question that is asked of it; ``number`` where there is none."""
         return next(iter(self.inquiries), number)
 
+    def began(self, number: int) -> None:
+        """Take note that a question is asked of it."""
+        self.inquiries = _with(self.inquiries, number)
+
+    def ended(self, number: int) -> None:
+        """Take note that nobody waits for an answer to a question any more."""
+        self.inquiries = _without(self.inquiries, number)
+
+    def put_off(self, number: int) -> None:
+        """Take note that a question waits for its turn."""
+        self.queue = _with(self.queue, number)
+
+    def taken_up(self, number: int) -> None:
+        """Take note that a question waits for its turn no more."""
+        self.queue = _without(self.queue, number)
+
     @property
     def is_idle(self) -> bool:
         """Whether nobody waits for anything from this peer."""
@@ -75,20 +133,40 @@ class Peer:
 class Peers:
     """All peers of an endpoint, ``sessions`` by their index, and the handshakes that we began.
 
-    ``on_unheard`` is called with a handshake of ours that got no answer to any of its tries.
+    ``ring`` are the credentials under the team's secrets, newest first; ``door`` says what is shown to others.
+    ``on_unheard`` is called with a handshake of ours that got no answer to any of its tries.  ``is_far`` says of which
+    addresses others may know more; ``on_silence`` is called with a handshake that such a one does not answer at first,
+    ``on_established`` with each session that is used from now on, and ``on_moved`` with one whose peer writes from
+    elsewhere.
+
+    ``usual`` is how long anybody takes.  In a network that ``is_wide`` strangers are thought to take as long: there
+    are so many that what is asked twice for nothing counts.
     """
 
     def __init__(
-        self, own: Credentials, clock: IReactorTime, rng: random.Random, network: Network, counters: Counter[str]
+        self,
+        ring: Sequence[Credentials],
+        clock: IReactorTime,
+        rng: random.Random,
+        network: Network,
+        counters: Counter[str],
+        door: Door = OPEN,
     ) -> None:
+        self.ring = ring
+        self.door = door
         self.sessions: dict[int, Session] = {}
         self.on_unheard: Callable[[Opening], None] = lambda opening: None
-        self._own = own
+        self.is_far: Callable[[Address], bool] = lambda address: False
+        self.on_silence: Callable[[Opening], None] = lambda opening: None
+        self.on_established: Callable[[Session], None] = lambda session: None
+        self.on_moved: Callable[[Session], None] = lambda session: None
         self._clock = clock
         self._rng = rng
         self._network = network
         self._counters = counters
-        self._peers: OrderedDict[bytes, Peer] = OrderedDict()
+        self.usual = RoundTrip()
+        self.is_wide = False
+        self._peers: dict[bytes, Peer] = {}
         self._openings: dict[int, Opening] = {}
         self._by_mac: dict[bytes, Opening] = {}
 
@@ -100,15 +178,22 @@ class Peers:
         """The peer of that key, remembered from now on; raises ``ValueError`` where the key is none."""
         peer = self._peers.get(contact.public)
         if peer is not None:
-            self._peers.move_to_end(contact.public)
+            self._peers[contact.public] = self._peers.pop(contact.public)  # whoever is wanted least stands first
             return peer
         peer = self._peers[contact.public] = Peer(contact.public, exchange_key(contact.public))
+        if self.is_wide:
+            peer.round_trip = RoundTrip(self.guess)
         if len(self._peers) > MAX_PEERS:
             idle = next((other for other in self._peers.values() if other.is_idle and other is not peer), None)
             if idle is not None:
                 del self._peers[idle.public]
                 self._end(idle.sessions)
         return peer
+
+    @property
+    def guess(self) -> float:
+        """How long to wait for the first answer of a stranger, in seconds, as far as others tell."""
+        return max(FIRST_GUESS, min(self.usual.wait, MOST_GUESSED))
 
     def wait_for(self, public: bytes) -> float:
         """How long to wait for a sign of a peer before trying again, in seconds."""
@@ -132,9 +217,17 @@ class Peers:
     def established(self, session: Session) -> Peer:
         """Use a session for sending from now on; gives its peer."""
         peer = self.peer(session.contact)
-        peer.sessions.append(session)
+        is_carried = is_relayed(session.contact.address)
+        newest = peer.session
+        if is_carried and newest is not None and self._is_lively_and_direct(newest):
+            peer.sessions.insert(-1, session)  # one that others carry gives way to one that is as good and needs nobody
+        else:
+            peer.sessions.append(session)
         if len(peer.sessions) > MAX_SESSIONS:
             self._end([peer.sessions.pop(0)])
+        if peer.opening is not None and peer.opening.knocks and not is_carried:
+            self.close(peer.opening)  # the peer, which was told to knock too, came first
+        self.on_established(session)
         return peer
 
     def moved(self, session: Session) -> None:
@@ -143,18 +236,65 @@ class Peers:
         if peer is not None:
             for other in peer.sessions:
                 other.contact = session.contact
+            self.on_moved(session)
+
+    def rekey(self, ring: Sequence[Credentials]) -> None:
+        """Begin handshakes under the first of ``ring`` from now on."""
+        self.ring = ring
+        for peer in self._peers.values():
+            peer.own = None
+
+    def met_under(self, contact: Contact, own: Credentials) -> None:
+        """Take note under which of several secrets ``contact`` goes by."""
+        if len(self.ring) > 1:
+            with suppress(ValueError):  # what it said to be its key is none
+                self.peer(contact).own = own
+
+    def evict(self, peer: Peer) -> None:
+        """Forget the sessions with a peer, and a handshake with it."""
+        if peer.opening is not None:
+            self.close(peer.opening)
+        self._end(peer.sessions)
+        peer.sessions = []
+        peer.tells = ()
+
+    def let_go(self, before: float) -> list[bytes]:
+        """Forget the peers that were last heard before that moment, and from whom nobody waits for anything."""
+        silent = [
+            peer
+            for peer in self._peers.values()
+            if peer.is_idle and not peer.tells and all(session.heard_at < before for session in peer.sessions)
+        ]
+        for peer in silent:
+            self._end(peer.sessions)
+            del self._peers[peer.public]
+        return [peer.public for peer in silent]
+
+    def drop(self, session: Session) -> None:
+        """Forget one session."""
+        self._end([session])
+        peer = self._peers.get(session.contact.public)
+        if peer is not None and session in peer.sessions:
+            peer.sessions.remove(session)
+
+    @property
+    def hello(self) -> Hello:
+        """What this node says of itself in a handshake."""
+        door = self.door
+        return Hello(door.life, door.shown, door.room)
 
     def new_index(self) -> int:
-        """A free index for a session."""
+        """A free index for a session; 0 is none."""
         while True:
             index = self._rng.getrandbits(8 * INDEX_BYTES)
-            if index not in self.sessions and index not in self._openings:
+            if index and index not in self.sessions and index not in self._openings:
                 return index
 
     def stop(self) -> None:
         """Cancel every handshake and forget every peer."""
         for opening in self._openings.values():
             cancel(opening.timer)
+            cancel(opening.helper)
         self._openings.clear()
         self._by_mac.clear()
         self._peers.clear()
@@ -162,22 +302,46 @@ class Peers:
 
     # -- handshakes of ours -----------------------------------------------------------------------------------------
 
-    def open(self, peer: Peer, address: Address, rider: bytes = b"") -> bool:
+    def open(self, peer: Peer, address: Address, rider: bytes = b"", is_wanted: bool = True) -> bool:
         """Open a session, unless that is under way; False where there are too many handshakes.
 
         ``rider`` is a message for its INIT; one that does not fit stays behind.
         """
         if peer.opening is not None:
+            if is_wanted and not peer.opening.is_wanted:
+                peer.opening.is_wanted = True
+                peer.opening.doors.setdefault(address, b"")
+                self._prepare_help(peer.opening, address)
             return True
         if len(self._openings) >= MAX_OPENINGS:
             self._counters["crowded"] += 1
             return False
-        rider = rider if len(rider) <= MAX_RIDER else b""
-        invitation = Invitation(self._own, peer.static, self._rng.randbytes(32), self.new_index(), rider)
-        opening = Opening(invitation, peer, address, self._clock.seconds())
+        own, hello = peer.own or self.ring[0], self.hello
+        rider = rider if len(rider) <= hello.rider_room else b""
+        invitation = Invitation(own, peer.static, self._rng.randbytes(32), self.new_index(), rider, hello)
+        opening = Opening(invitation, peer, address, self._clock.seconds(), {address: b""})
         self._openings[invitation.local_index] = self._by_mac[invitation.mac] = peer.opening = opening
+        opening.is_wanted = is_wanted
+        if is_wanted:
+            self._prepare_help(opening, address)
         self._knock(opening)
         return True
+
+    def hold(self, opening: Opening, until: float) -> None:
+        """Go on with a handshake up to a moment, since others help; an earlier one than now: no longer than usual."""
+        if opening.peer.opening is opening:
+            opening.held_until = until
+
+    def knock_at(self, opening: Opening, addresses: Iterable[Address]) -> None:
+        """Knock at further addresses, at once and often from now on."""
+        if opening.peer.opening is not opening:
+            return
+        for address in addresses:
+            if len(opening.doors) < MAX_DOORS:
+                opening.doors.setdefault(address, b"")
+        opening.knocks = 1
+        cancel(opening.timer)
+        self._knock(opening)
 
     def opening(self, index: int) -> Opening | None:
         """The handshake of ours that has this session index."""
@@ -187,35 +351,66 @@ class Peers:
         """The handshake of ours whose INIT has this hash."""
         return self._by_mac.get(mac)
 
-    def paid(self, opening: Opening, cookie: bytes) -> None:
-        """Send the INIT again at once, with the cookie that the responder asked for."""
-        if opening.cookie != cookie:
-            opening.cookie = cookie
-            self._network.send(opening.invitation.datagram(cookie), opening.address)
+    def paid(self, opening: Opening, cookie: bytes, source: Address) -> None:
+        """Send the INIT again at once, with the cookie that the responder asked for at that address."""
+        if opening.doors.get(source) != cookie:
+            opening.doors[source] = cookie
+            self._network.send(opening.invitation.datagram(cookie), source)
 
     def accepted(self, opening: Opening) -> None:
         """Take note that a handshake of ours got its RESP."""
-        self._close(opening)
-        if opening.tries == 1 and not opening.cookie:
-            opening.peer.round_trip.measured(self._clock.seconds() - opening.started_at)
+        self.close(opening)
+        if opening.tries == 1 and not any(opening.doors.values()):
+            took = self._clock.seconds() - opening.started_at
+            opening.peer.round_trip.measured(took)
+            self.usual.measured(took)
+        else:
+            self.usual.ambiguous()
 
     def _knock(self, opening: Opening) -> None:
         """Send an INIT, again if need be, until the tries are used up."""
-        if opening.tries >= MAX_TRIES:
-            self._close(opening)
+        if opening.tries >= MAX_TRIES and self._clock.seconds() >= opening.held_until:
+            self.close(opening)
+            if len(self.ring) > 1:  # it may not have heard of the newest secret, or of nothing older any more
+                ring = list(self.ring)
+                tried = ring.index(opening.invitation.own) if opening.invitation.own in ring else -1
+                opening.peer.own = ring[(tried + 1) % len(ring)]
             self.on_unheard(opening)
             return
         opening.tries += 1
-        self._network.send(opening.invitation.datagram(opening.cookie), opening.address)
+        for address, cookie in opening.doors.items():
+            self._network.send(opening.invitation.datagram(cookie), address)
+        if opening.knocks:
+            opening.knocks += 1
+            wait = min(KNOCK_S * BACK_OFF ** max(0, opening.knocks - KNOCKS), LONGEST)
+        else:
+            wait = self._wait(opening)
+        opening.timer = self._clock.callLater(wait, self._knock, opening)
+
+    def _wait(self, opening: Opening) -> float:
         round_trip = opening.peer.round_trip
-        wait = round_trip.wait * BACK_OFF ** (opening.tries - 1)
+        wait = round_trip.wait * BACK_OFF ** (min(opening.tries, MAX_TRIES) - 1)
         if opening.tries == MAX_TRIES and not round_trip.is_measured:
             # Nothing is known of this peer: it may be far away rather than gone.
             wait = max(wait, opening.started_at + OPENING_S - self._clock.seconds())
-        opening.timer = self._clock.callLater(wait, self._knock, opening)
+        return wait
 
-    def _close(self, opening: Opening) -> None:
+    def _prepare_help(self, opening: Opening, address: Address) -> None:
+        if self.is_far(address):
+            wait = 0.0 if is_relayed(address) else HELP_S
+            opening.helper = self._clock.callLater(wait, self._call_for_help, opening)
+
+    def _call_for_help(self, opening: Opening) -> None:
+        self.on_silence(opening)
+
+    def _is_lively_and_direct(self, session: Session) -> bool:
+        is_lively = self._clock.seconds() - session.heard_at < LIVELY_S
+        return is_lively and not is_relayed(session.contact.address)
+
+    def close(self, opening: Opening) -> None:
+        """Forget a handshake of ours."""
         cancel(opening.timer)
+        cancel(opening.helper)
         self._openings.pop(opening.invitation.local_index, None)
         self._by_mac.pop(opening.invitation.mac, None)
         opening.peer.opening = None

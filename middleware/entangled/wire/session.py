@@ -1,8 +1,9 @@
 """Session: the datagrams that open one (INIT, RESP) and those that it carries (DATA).
 
-INIT carries a message of the initiator, RESP the responder's; INIT is padded so that RESP need never be larger.  A
-keyed hash near the end of INIT lets a node drop what outsiders make up for a microsecond instead of four key exchanges;
-a second one, made with a cookie that the responder gave, is asked for when too many come (see ``greeting``).
+Each of the first two carries a message, the sender's pass, which the ``door`` of the other side judges, and the life
+that it lives.  INIT is padded so that RESP need never be larger; RESP says from where the INIT came, or that it is
+refused.  A keyed hash near the end of INIT lets a node drop what outsiders make up for a microsecond instead of four
+key exchanges; a second one, made with a cookie that the responder gave, is asked for when too many come (``greeting``).
 
 A DATA datagram is: type (1), the receiver's index of the session (4), counter (8), then the sealed message with its tag
 (16): 29 bytes more than the message.  The 13 bytes in front are authenticated too.
@@ -12,13 +13,15 @@ from __future__ import annotations
 
 import hashlib
 import hmac
-from collections import OrderedDict
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from middleware.entangled.errors import Forged
 from middleware.entangled.identity import Identity, exchange_key
 from middleware.entangled.kademlia.contact import Contact
-from middleware.entangled.network.network import MAX_DATAGRAM
+from middleware.entangled.network.address import ADDRESS, address_of, packed_address
+from middleware.entangled.network.network import MAX_DATAGRAM, Address
+from middleware.entangled.wire.door import NONCE, UNCOUNTED, Life, is_refusal
 from middleware.entangled.wire.noise import (
     FIRST_OVERHEAD,
     KEY,
@@ -40,9 +43,12 @@ PROLOGUE = b"swarm-wire-1"
 INDEX_BYTES = 4
 MAC = 16
 ANSWER_ROOM = 512
-_PAYLOAD = INDEX_BYTES + KEY + 2
+_LIFE = 8 + NONCE
+_ASKED = INDEX_BYTES + KEY + _LIFE  # before the pass of an INIT
+_GIVEN = INDEX_BYTES + _LIFE + ADDRESS  # before that of a RESP
+_PAYLOAD = _ASKED + 2 + 2
 _INIT_BARE = 1 + FIRST_OVERHEAD + _PAYLOAD + 2 * MAC
-_RESP_BARE = 1 + INDEX_BYTES + SECOND_OVERHEAD + INDEX_BYTES
+_RESP_BARE = 1 + INDEX_BYTES + SECOND_OVERHEAD + _GIVEN + 2
 RESP_LEAST = _RESP_BARE
 INIT_LEAST = _RESP_BARE + ANSWER_ROOM
 MAX_RIDER = MAX_DATAGRAM - _INIT_BARE
@@ -55,6 +61,7 @@ MAX_UNCONFIRMED = 512
 UNCONFIRMED_S = 10.0
 MAX_RESPONSES = 512
 RESPONSES_S = 30.0
+_NO_LIFE = bytes(_LIFE)
 _WINDOW_MASK = (1 << WINDOW) - 1
 
 
@@ -65,34 +72,81 @@ def derived_key(team_key: bytes, purpose: bytes) -> bytes:
 
 @dataclass(frozen=True)
 class Credentials:
-    """What a node needs to open and to accept sessions."""
+    """What a node needs to open and to accept sessions under one secret of its team; what shows it shows no secret."""
 
     public: bytes
-    static: KeyPair
-    psk: bytes
-    mac_key: bytes
+    static: KeyPair = field(repr=False)
+    psk: bytes = field(repr=False)
+    mac_key: bytes = field(repr=False)
+    greet_key: bytes = field(repr=False)
+    cookie_key: bytes = field(repr=False)
 
     @classmethod
     def of(cls, identity: Identity, team_key: bytes) -> Credentials:
         """The credentials of ``identity`` in the team that holds ``team_key`` (32 bytes)."""
-        return cls(
-            identity.public,
-            key_pair(identity.exchange_secret),
-            derived_key(team_key, b"psk"),
-            derived_key(team_key, b"mac"),
-        )
+        purposes = (b"psk", b"mac", b"greet", b"cookie")
+        keys = [derived_key(team_key, purpose) for purpose in purposes]
+        return cls(identity.public, key_pair(identity.exchange_secret), *keys)
+
+
+class Hello(NamedTuple):
+    """What a node says of itself in a handshake: its life and its pass.
+
+    ``room`` is what the pass of the other side may take.
+    """
+
+    life: Life = UNCOUNTED
+    shown: bytes = b""
+    room: int = 0
+
+    @property
+    def rider_room(self) -> int:
+        """The bytes of a message that an INIT may carry beside the pass."""
+        return MAX_RIDER - len(self.shown)
+
+    @property
+    def init_least(self) -> int:
+        """The length of the shortest INIT that is answered with a pass and a message of ``ANSWER_ROOM``."""
+        return INIT_LEAST + self.room
+
+
+OF_OPEN_TEAM = Hello()
+
+
+class Reply(NamedTuple):
+    """What a RESP says: ``remote_index``, the responder's index, its life, pass and message.
+
+    ``seen`` is where the INIT came from, as the responder saw it (None: it cannot say).  ``refusal`` names why it lets
+    us not in; then nothing else counts.
+    """
+
+    remote_index: int
+    life: Life
+    seen: Address | None
+    shown: bytes
+    message: bytes
+    refusal: str
+    keys: TransportKeys
 
 
 class Invitation:
     """The initiator's half of a handshake; ``mac`` is the first of the two hashes in its INIT."""
 
     def __init__(
-        self, own: Credentials, remote_static: bytes, ephemeral_secret: bytes, local_index: int, rider: bytes
+        self,
+        own: Credentials,
+        remote_static: bytes,
+        ephemeral_secret: bytes,
+        local_index: int,
+        rider: bytes,
+        hello: Hello = OF_OPEN_TEAM,
     ) -> None:
+        self.own = own
         self._noise = Initiator(own.static, remote_static, ephemeral_secret, PROLOGUE, own.psk)
         self.local_index = local_index
-        payload = local_index.to_bytes(INDEX_BYTES, "little") + own.public + len(rider).to_bytes(2, "little") + rider
-        payload = payload.ljust(_PAYLOAD + INIT_LEAST - _INIT_BARE, b"\0")
+        index = local_index.to_bytes(INDEX_BYTES, "little")
+        payload = index + own.public + _packed_life(hello.life) + _counted(hello.shown) + _counted(rider)
+        payload = payload.ljust(_PAYLOAD + hello.init_least - _INIT_BARE, b"\0")
         bare = bytes([INIT]) + self._noise.write(payload)
         self.mac = _hashed(own.mac_key, bare)
         self._proven = bare + self.mac
@@ -101,23 +155,30 @@ class Invitation:
         """The INIT, which may be sent again unchanged, or with a ``cookie`` that the responder asked for."""
         return self._proven + (_hashed(cookie, self._proven) if cookie else bytes(MAC))
 
-    def accepted(self, datagram: bytes) -> tuple[int, bytes, TransportKeys]:
-        """The responder's session index, its message (perhaps empty) and the keys in a RESP; raises ``Forged``.
+    def accepted(self, datagram: bytes) -> Reply:
+        """What a RESP says, with the keys of the session; raises ``Forged``.
 
         A failed reading spoils the state only if the datagram was forged by somebody who saw the INIT; so each reading
         works on a copy.
         """
         payload, keys = self._noise.copy().read(datagram[1 + INDEX_BYTES :])
-        if len(payload) < INDEX_BYTES:
-            raise Forged("a RESP without a session index")
-        return int.from_bytes(payload[:INDEX_BYTES], "little"), payload[INDEX_BYTES:], keys
+        index = int.from_bytes(payload[:INDEX_BYTES], "little")
+        life = _life(payload[INDEX_BYTES : INDEX_BYTES + _LIFE])
+        seen = address_of(payload[INDEX_BYTES + _LIFE : _GIVEN])
+        shown, message = _taken(payload, _GIVEN)
+        if index:
+            return Reply(index, life, seen, shown, message, "", keys)
+        refusal = message.decode("ascii", errors="replace")
+        if not is_refusal(refusal):
+            raise Forged("a RESP with neither a session nor a refusal")
+        return Reply(0, life, seen, b"", b"", refusal, keys)
 
 
 class Acceptance:
     """The responder's half: reads an INIT, then makes its RESP.
 
-    ``public`` is the initiator's Ed25519 key, proved; ``rider`` its message; ``answer_room`` the bytes that the RESP
-    may carry.  Raises ``Forged`` where anything is not as it must be.
+    ``public`` is the initiator's Ed25519 key, proved; ``life`` and ``shown`` what it says of itself, ``rider`` its
+    message.  Raises ``Forged`` where anything is not as it must be.
     """
 
     def __init__(self, own: Credentials, datagram: bytes, ephemeral_secret: bytes) -> None:
@@ -125,26 +186,37 @@ class Acceptance:
         payload, static = self._noise.read(datagram[1 : -2 * MAC])
         self.remote_index = int.from_bytes(payload[:INDEX_BYTES], "little")
         self.public = payload[INDEX_BYTES : INDEX_BYTES + KEY]
-        length = int.from_bytes(payload[_PAYLOAD - 2 : _PAYLOAD], "little")
+        self.life = _life(payload[INDEX_BYTES + KEY : _ASKED])
         try:
             proved = exchange_key(self.public) == static
         except (ValueError, RuntimeError, TypeError):
             proved = False
-        if not proved or len(payload) < _PAYLOAD + length:
-            raise Forged("an INIT whose key is not its sender's, or that is cut short")
-        self.rider = payload[_PAYLOAD : _PAYLOAD + length]
-        self.answer_room = len(datagram) - _RESP_BARE
+        if not proved:
+            raise Forged("an INIT whose key is not its sender's")
+        self.shown, rest = _taken(payload, _ASKED)
+        self.rider, _ = _taken(rest, 0)
+        self._room = len(datagram) - _RESP_BARE
 
-    def accept(self, local_index: int, answer: bytes) -> tuple[bytes, TransportKeys]:
+    def answer_room(self, hello: Hello) -> int:
+        """The bytes of a message that the RESP may carry beside the pass."""
+        return self._room - len(hello.shown)
+
+    def accept(
+        self, local_index: int, answer: bytes, seen: Address, hello: Hello = OF_OPEN_TEAM
+    ) -> tuple[bytes, TransportKeys]:
         """The RESP datagram that carries ``answer`` (at most ``answer_room`` bytes), and the keys."""
-        message, keys = self._noise.write(local_index.to_bytes(INDEX_BYTES, "little") + answer)
+        index = local_index.to_bytes(INDEX_BYTES, "little")
+        payload = index + _packed_life(hello.life) + packed_address(seen) + _counted(hello.shown) + answer
+        message, keys = self._noise.write(payload)
         return bytes([RESP]) + self.remote_index.to_bytes(INDEX_BYTES, "little") + message, keys
+
+    def refuse(self, code: str, seen: Address, life: Life) -> bytes:
+        """The RESP datagram that says why its sender is not let in."""
+        return self.accept(0, code.encode("ascii"), seen, Hello(life))[0]
 
 
 def is_init_of_team(own: Credentials, datagram: bytes) -> bool:
-    """Whether an INIT has a lawful size and was made by somebody who holds the team's key."""
-    if not INIT_LEAST <= len(datagram) <= MAX_DATAGRAM:
-        return False
+    """Whether an INIT of a lawful size was made by somebody who holds the secret that ``own`` goes by."""
     return hmac.compare_digest(_hashed(own.mac_key, datagram[: -2 * MAC]), mac_of(datagram))
 
 
@@ -167,17 +239,42 @@ def _hashed(key: bytes, data: bytes) -> bytes:
     return hashlib.blake2s(data, key=key, digest_size=MAC).digest()
 
 
+def _packed_life(life: Life) -> bytes:
+    return life.number.to_bytes(8, "little") + life.nonce
+
+
+def _life(packed: bytes) -> Life:
+    if packed == _NO_LIFE:
+        return UNCOUNTED
+    return Life(int.from_bytes(packed[:8], "little"), packed[8:])
+
+
+def _counted(data: bytes) -> bytes:
+    return len(data).to_bytes(2, "little") + data
+
+
+def _taken(payload: bytes, start: int) -> tuple[bytes, bytes]:
+    """The bytes whose count stands at ``start``, and what follows them; raises ``Forged`` where they are cut short."""
+    begin = start + 2
+    end = begin + int.from_bytes(payload[start:begin], "little")
+    if len(payload) < end or len(payload) < begin:
+        raise Forged("a handshake that is cut short")
+    return payload[begin:end], payload[end:]
+
+
 class Session:
     """One agreed pair of keys with one peer.
 
     ``local_index`` is the number under which we find the session, ``remote_index`` the one under which the peer does.
     ``contact`` is the peer with the address from which its newest datagram came.  ``is_confirmed`` says that the peer
     has shown to hold the keys at that address; until then nothing may be sent.  Moments are seconds of the endpoint's
-    clock.
+    clock.  ``life`` is the one that the peer lives in it; with ``is_over`` a later one has taken its place.
     """
 
     __slots__ = (
         "contact",
+        "life",
+        "is_over",
         "local_index",
         "remote_index",
         "is_confirmed",
@@ -192,9 +289,18 @@ class Session:
     )
 
     def __init__(
-        self, contact: Contact, local_index: int, remote_index: int, keys: TransportKeys, now: float, is_confirmed: bool
+        self,
+        contact: Contact,
+        local_index: int,
+        remote_index: int,
+        keys: TransportKeys,
+        now: float,
+        is_confirmed: bool,
+        life: Life = UNCOUNTED,
     ) -> None:
         self.contact = contact
+        self.life = life
+        self.is_over = False
         self.local_index = local_index
         self.remote_index = remote_index
         self.is_confirmed = is_confirmed
@@ -257,26 +363,43 @@ class HalfOpen:
 
     def __init__(self, sessions: dict[int, Session]) -> None:
         self._sessions = sessions
-        self._unconfirmed: OrderedDict[int, Session] = OrderedDict()
-        self._responses: OrderedDict[bytes, tuple[float, bytes]] = OrderedDict()
+        self._unconfirmed: dict[int, Session] = {}
+        self._responses: dict[bytes, tuple[float, bytes]] = {}
 
     def response(self, init: bytes, now: float) -> bytes | None:
         """The RESP that this INIT got already."""
         made_at, response = self._responses.get(ephemeral_of(init), (-RESPONSES_S, None))
         return response if made_at > now - RESPONSES_S else None
 
-    def add(self, session: Session, init: bytes, response: bytes, now: float) -> None:
+    def add(self, session: Session, now: float) -> None:
         """Keep a new session, and let go of those that are too many or too old."""
-        unconfirmed, responses = self._unconfirmed, self._responses
+        unconfirmed = self._unconfirmed
         self._sessions[session.local_index] = unconfirmed[session.local_index] = session
-        responses[ephemeral_of(init)] = (now, response)
-        responses.move_to_end(ephemeral_of(init))
+        self._expire(now)
+
+    def sweep(self, now: float) -> None:
+        """Let go of what is too old."""
+        self._expire(now)
+        self._tidy(now)
+
+    def _expire(self, now: float) -> None:
+        unconfirmed = self._unconfirmed
         while unconfirmed:
             index, oldest = next(iter(unconfirmed.items()))
             if len(unconfirmed) <= MAX_UNCONFIRMED and oldest.opened_at > now - UNCONFIRMED_S:
                 break
             del unconfirmed[index]
             self._sessions.pop(index, None)
+
+    def answered(self, init: bytes, response: bytes, now: float) -> None:
+        """Keep the RESP of an INIT, and let go of those that are too many or too old."""
+        responses = self._responses
+        responses.pop(ephemeral_of(init), None)
+        responses[ephemeral_of(init)] = (now, response)
+        self._tidy(now)
+
+    def _tidy(self, now: float) -> None:
+        responses = self._responses
         while responses:
             ephemeral, (made_at, _) = next(iter(responses.items()))
             if len(responses) <= MAX_RESPONSES and made_at > now - RESPONSES_S:
@@ -287,6 +410,17 @@ class HalfOpen:
         """Take note that the initiator holds the keys, at the address that it wrote from."""
         session.is_confirmed = True
         self._unconfirmed.pop(session.local_index, None)
+
+    def forget(self, session: Session) -> None:
+        """Forget a session that was not let in."""
+        if self._unconfirmed.pop(session.local_index, None) is not None:
+            self._sessions.pop(session.local_index, None)
+
+    def drop(self, public: bytes) -> None:
+        """Forget the sessions of one initiator."""
+        for index in [index for index, session in self._unconfirmed.items() if session.contact.public == public]:
+            del self._unconfirmed[index]
+            self._sessions.pop(index, None)
 
     def clear(self) -> None:
         """Forget everything."""

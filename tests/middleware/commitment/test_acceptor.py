@@ -60,6 +60,30 @@ class AcceptorTests(SynchronousTestCase):
             self.assertEqual(self.prepare(number, "b", 1.0).kind, HELD)
         self.assertEqual(self.propose(1, "a", 1, 1.5).kind, GRANTED)
 
+    def test_promise_for_the_time_after_a_lease(self) -> None:
+        """Shortly before a lease ends another is promised what follows; nothing is granted sooner for that."""
+        self.prepare(1, "a", 0.0)
+        self.propose(1, "a", 1, 0.0)
+        self.assertEqual(self.prepare(2, "b", 1.5).kind, HELD)
+        self.assertEqual(self.prepare(0, "b", 1.75).kind, HELD)
+        promised = self.prepare(2, "b", 1.75)
+        self.assertEqual((promised.kind, promised.remaining, promised.token), (GRANTED, 0.25, 1))
+        self.assertEqual(self.propose(2, "b", 2, 1.99).kind, HELD)
+        self.assertEqual(self.propose(2, "b", 2, 2.0).kind, GRANTED)
+
+    def test_promise_ends_no_lease(self) -> None:
+        """Who holds the lease renews it in spite of the promise, also when that is given back, but claims no other."""
+        self.prepare(1, "a", 0.0)
+        self.propose(1, "a", 1, 0.0)
+        self.prepare(2, "b", 1.75)
+        self.assertEqual(self.propose(1, "a", 2, 1.8).kind, OUTBID)
+        self.assertEqual(self.propose(1, "a", 1, 1.8).kind, GRANTED)
+        self.assertEqual(self.propose(2, "b", 2, 2.0).kind, HELD)
+        self.acceptor.release("t", ballot(2, "b"), 2.1)
+        self.assertEqual(self.propose(1, "a", 1, 2.2).kind, GRANTED)
+        self.assertEqual(self.propose(2, "b", 2, 4.3).kind, OUTBID)
+        self.assertEqual(self.prepare(3, "b", 4.3).kind, GRANTED)
+
     def test_promise_bars_lower_ballots(self) -> None:
         """What is proposed under a lower ballot than one promised is refused, and told which."""
         self.prepare(1, "a", 0.0)
@@ -123,7 +147,9 @@ class AcceptorTests(SynchronousTestCase):
         self.assertEqual(self.prepare(3, "b", 0.2).kind, HELD)
         self.assertEqual(self.propose(2, "a", 1, 0.2).kind, SEALED)
         self.acceptor.install("t", 2, MEMBERS[:3], 1, 0.3, ballot(2, "a"), TTL)
-        self.assertEqual(self.acceptor.prepare("t", 2, ballot(3, "b"), TTL, 0.2 + TTL).kind, HELD)
+        self.assertEqual(self.acceptor.prepare("t", 2, ballot(3, "b"), TTL, 1.0).kind, HELD)
+        self.assertEqual(self.acceptor.prepare("t", 2, ballot(3, "b"), TTL, 0.2 + TTL).kind, GRANTED)
+        self.assertEqual(self.acceptor.propose("t", 2, ballot(3, "b"), 2, TTL, 0.2 + TTL).kind, HELD)
         self.assertEqual(self.acceptor.prepare("t", 2, ballot(4, "a"), TTL, 0.4).kind, GRANTED)
         self.assertEqual(self.acceptor.prepare("t", 2, ballot(5, "b"), TTL, 0.3 + TTL).kind, GRANTED)
 
@@ -133,6 +159,32 @@ class AcceptorTests(SynchronousTestCase):
         self.acceptor.release("t", ballot(1, "a"), 0.1)
         self.assertEqual(self.propose(1, "a", 1, 0.2).kind, OUTBID)
         self.assertEqual(self.prepare(2, "a", 0.3).kind, GRANTED)
+
+    def test_release_of_an_older_ballot_too(self) -> None:
+        """Who gives back the latest that it asked for gives back all, whatever of it has arrived, and in what order."""
+        for proposes_first in (True, False):
+            self.setUp()
+            self.prepare(1, "a", 0.0)
+            self.propose(1, "a", 1, 0.0)
+            self.prepare(2, "a", 0.1)
+            if proposes_first:
+                self.propose(2, "a", 1, 0.2)
+            self.acceptor.release("t", ballot(2, "a"), 0.3)
+            self.assertEqual(self.propose(2, "a", 1, 0.4).kind, OUTBID)
+            self.acceptor.release("t", ballot(1, "a"), 0.5)
+            self.assertEqual(self.prepare(3, "b", 0.6)[::3], (GRANTED, 0.0))
+
+    def test_freed(self) -> None:
+        """A member that hears of a release as a stand-by takes it for one: from who holds that token, from no other."""
+        self.prepare(1, "a", 0.0)
+        self.propose(1, "a", 1, 0.0)
+        for agent, token in (("b", 1), ("a", 0), ("a", 2)):
+            self.assertEqual(self.acceptor.freed("t", agent, token, 0.5), [])
+            self.assertEqual(self.prepare(2, "b", 0.5).kind, HELD)
+        self.assertEqual(self.acceptor.freed("t", "a", 1, 0.5, 0.1), ["b"])
+        self.assertEqual(self.propose(1, "a", 1, 0.55).kind, OUTBID)
+        self.assertEqual(self.prepare(2, "b", 0.6).kind, GRANTED)
+        self.assertEqual(self.acceptor.freed("u", "a", 1, 0.5), [])
 
     def test_release_of_others(self) -> None:
         """Nobody ends what another holds, nor something unknown."""
@@ -232,20 +284,30 @@ class AcceptorTests(SynchronousTestCase):
         )
     )
     def test_never_two_and_never_lower(self, events: list[tuple[str, str, int, int, float]]) -> None:
-        """Whatever comes, the promised ballot and the token never fall, and no lease of a lower ballot replaces one."""
-        acceptor, now, highest, best = Acceptor(Ledger()), 0.0, 0, ballot(0, "")
+        """Whatever comes, the promised ballot and the token never fall, and no lease of a lower ballot replaces one.
+
+        Nobody is granted what another holds; below a promise there is nothing but the renewal of what is held.
+        """
+        acceptor, now, highest, best, held = Acceptor(Ledger()), 0.0, 0, ballot(0, ""), (ballot(0, ""), 0, 0.0)
         for kind, agent, number, token, pause in events:
             now += pause
             one = ballot(number, agent)
             if kind == "r":
                 acceptor.release("t", one, now)
+                held = (one, 0, now) if held[0].agent == agent and held[0] <= one else held
                 continue
             if kind == "p":
                 reply = acceptor.prepare("t", 1, one, TTL, now)
             else:
                 reply = acceptor.propose("t", 1, one, token, TTL, now)
             if reply.kind == GRANTED:
-                self.assertGreaterEqual(one, best)
-                best = one
+                if kind == "q":
+                    is_renewal = now < held[2] and (held[0].agent, held[1]) == (agent, token)
+                    self.assertTrue(now >= held[2] or held[0].agent == agent)
+                    held = one, token, now + TTL
+                if kind == "p" or not is_renewal:
+                    self.assertGreaterEqual(one, best)
+                best = max(best, one)
+                self.assertGreaterEqual(reply.ballot, best)
             self.assertGreaterEqual(reply.token, highest)
             highest = reply.token

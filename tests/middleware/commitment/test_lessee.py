@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from middleware.entangled.data.memory import MemoryStore
 from tests.invariants.radio import Air
 from tests.invariants.takeover import takeover, upkeep
 from tests.middleware.commitment.room import TTL, RoomCase, T
@@ -41,6 +42,81 @@ class LesseeTests(RoomCase):
             self.room.kill(0)
             self.run_for(TTL + 0.3)
             self.assertEqual(self.holders()[-1:], [2], seed)
+
+    def test_first_in_line_is_ready(self) -> None:
+        """It has the lease as soon as the one before it ends at a majority and an answer has come, and never sooner."""
+        for seed in range(5):
+            self.room = self.made(seed=f"ready {seed}")
+            self.wanting(0)
+            self.lessee(1).stand_by(1)
+            self.run_for(TTL)
+            self.room.kill(0)
+            members = [self.room.bidders[place] for place in (3, 4, 5)]
+            _, ends, _ = sorted(one.machine.at(one.acceptor._ledger.get(T).until) for one in members)  # type: ignore[union-attr]
+            self.run_for(ends - self.room.clock.seconds() - 0.001)
+            self.assertIsNone(self.lessee(1).lease, seed)
+            self.run_for(0.02)
+            self.assertIsNotNone(self.lessee(1).lease, seed)
+
+    def test_ready_for_a_lease_that_is_renewed(self) -> None:
+        """Who was promised the lease of a holder that was away is no takeover when that comes back in time."""
+        self.wanting(0)
+        self.lessee(1).stand_by(1)
+        self.run_for(TTL)
+        self.cut(0, 3, 4, 5)
+        until = [self.room.bidders[place].acceptor._ledger.get(T).until for place in (3, 4, 5)]  # type: ignore[union-attr]
+        self.run_for(min(until) - self.room.bidders[3].machine.seconds() - 0.2)
+        self.room.radio.cut.clear()
+        self.run_for(2 * TTL)
+        self.assertEqual((self.holders(), self.token(0)), ([0], 1))
+
+    def test_place_in_the_line_that_changes(self) -> None:
+        """Who is moved up or down shortly before the lease ends claims at the time of its new place."""
+        for seed in range(5):
+            self.room = self.made(seed=f"moved {seed}")
+            self.wanting(0)
+            self.lessee(1).stand_by(1)
+            self.lessee(2).stand_by(2)
+            self.run_for(TTL)
+            self.room.kill(0)
+            self.run_for(0.55 * TTL)
+            self.lessee(1).stand_by(3)
+            self.lessee(2).stand_by(1)
+            self.run_for(0.45 * TTL + 0.1)
+            self.assertEqual(self.holders()[-1:], [2], seed)
+
+    def test_second_in_line_lets_the_first_try(self) -> None:
+        """Of two that find at one moment that nobody holds the lease, the first in line has it."""
+        for seed in range(5):
+            self.room = self.made(seed=f"free {seed}")
+            for place, rank in ((2, 2), (1, 1)):
+                self.lessee(place).stand_by(rank)
+                self.lessee(place).suspect()
+            self.run_for(0.1)
+            self.assertEqual(self.holders(), [1], seed)
+
+    def test_heir_that_never_looked(self) -> None:
+        """Whoever hears of a release before its first look claims above what it has not heard of, at the first try."""
+        for seed in range(5):
+            self.room = self.made(seed=f"heir {seed}")
+            for _ in range(4):
+                self.lessee(0).release()
+                self.wanting(0)
+            self.lessee(1).stand_by(1)
+            self.room.bidders[0].leave(T, [1])
+            self.run_for(0.04)
+            self.assertEqual(self.holders(), [1], seed)
+
+    def test_member_that_keeps_silent(self) -> None:
+        """A holder goes on under its ballot while a member may grant nothing yet: another would serve no better."""
+        self.room.kill(3)
+        self.room._stores[3] = MemoryStore()
+        self.room.bidders[3] = self.room.born(3)
+        self.wanting(0)
+        first = self.room.bidders[4].acceptor._ledger.get(T).ballot  # type: ignore[union-attr]
+        self.run_for(2 * TTL)
+        for place in (3, 4):
+            self.assertEqual(self.room.bidders[place].acceptor._ledger.get(T).ballot, first)  # type: ignore[union-attr]
 
     def test_stand_by_that_is_named(self) -> None:
         """Who stands by and is wanted then keeps its place; who holds the lease is not put off by a rank."""

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from twisted.internet.defer import Deferred, fail, succeed
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.commitment.ballot import GRANTED, HELD, Reply
-from middleware.commitment.round import PAUSE, TRIES, Round
+from middleware.commitment.round import NEWS, PAUSE, TRIES, Round
 from middleware.entangled.clock import HeapClock
 from middleware.entangled.errors import NoAnswer
 from middleware.entangled.kademlia.contact import Contact
@@ -27,9 +28,9 @@ class RoundTests(SynchronousTestCase):
         self.asked.append((self.clock.seconds(), MEMBERS.index(member), Deferred()))
         return self.asked[-1][2]
 
-    def round(self, size: int = 3) -> Round:
+    def round(self, size: int = 3, short: float = PAUSE) -> Round:
         """A question to the first members."""
-        return Round(MEMBERS[:size], self.ask, self.clock, "lease.prepare", ("t",), (GRANTED,), 0.5)
+        return Round(MEMBERS[:size], self.ask, self.clock, "lease.prepare", ("t",), (GRANTED,), 0.5, short)
 
     def answer(self, number: int, reply: Reply) -> None:
         """Answer the question of that number."""
@@ -62,6 +63,23 @@ class RoundTests(SynchronousTestCase):
         self.answer(3, YES)
         self.answer(2, YES)
         self.assertTrue(self.successResultOf(asked.outcome).is_won)
+
+    def test_news_that_a_member_has_not_heard(self) -> None:
+        """Where the lease was given back, who still counts it is asked again soon; who only looks takes it as it is."""
+        asked = self.round(short=math.inf)
+        self.answer(0, NO)
+        self.answer(1, NO)
+        self.assertNoResult(asked.outcome)
+        self.clock.advance(NEWS)
+        self.assertEqual([member for _, member, _ in self.asked[3:]], [0, 1])
+        self.answer(3, YES)
+        self.answer(4, YES)
+        self.assertTrue(self.successResultOf(asked.outcome).is_won)
+        self.asked.clear()
+        looked = self.round(short=0.0)
+        self.answer(0, Reply(HELD, remaining=0.03))
+        self.answer(1, Reply(HELD, remaining=0.03))
+        self.assertFalse(self.successResultOf(looked.outcome).is_won)
 
     def test_who_is_silent(self) -> None:
         """Whoever answers anything is there; who does not is silent once it was asked three times, and not before."""

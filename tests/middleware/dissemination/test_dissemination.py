@@ -16,8 +16,9 @@ from middleware.dissemination.scale import TREE
 from middleware.entangled.errors import Refused
 from middleware.entangled.kademlia.distance import closest
 from middleware.entangled.network.switchboard import Weather
+from middleware.entangled.wire.door import ROLE
 from middleware.node import SwarmNode
-from middleware.tasks import Task, group_key
+from middleware.tasks import MEMBER, Task, group_key
 from tests.fleet import FleetCase, SwarmFleet
 
 WAITING = 0.5
@@ -210,6 +211,27 @@ class HostileTests(AuctionCase):
         for bid in bids:
             answer = self.ask(fleet, liar, victim, "bid.offer", auction.packed(), [bid.packed()], 0, False)
             self.assertIsInstance(answer, Refused)
+
+    def test_bids_of_those_who_may_not(self) -> None:
+        """A bid of a member whose role lets it take no part does not count; where that was all, its carrier is told."""
+        fleet = self.prepared(4)
+        viewer, victim, good = fleet.nodes[3], fleet.nodes[0], fleet.nodes[1]
+        public, auction = viewer.entangled.identity.public, self.auction()
+        victim.entangled.replica.may_store = lambda slot: slot.owner != public or slot.name != MEMBER
+        bids = [
+            Bid(node.entangled.identity.public, Report(node.uuid, 1.0))
+            .signed(node.entangled.identity, auction)
+            .packed()
+            for node in (viewer, good)
+        ]
+        answer = self.ask(fleet, viewer, victim, "bid.offer", auction.packed(), bids[:1], 0, False)
+        self.assertEqual(getattr(answer, "code", ""), ROLE)
+        self.assertEqual(len(list(victim.dissemination._parties)), 0)
+        answer = self.ask(fleet, viewer, victim, "bid.offer", auction.packed(), bids, 0, False)
+        self.assertNotIsInstance(answer, Refused)
+        party = next(iter(victim.dissemination._parties))
+        self.assertIsNone(party.summary.of(viewer.uuid))
+        self.assertIsNotNone(party.summary.of(good.uuid))
 
     def test_nonsense(self) -> None:
         """Nonsense is refused in one line that says what is wanted; nobody stumbles."""

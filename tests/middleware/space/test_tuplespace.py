@@ -9,6 +9,7 @@ from twisted.internet.defer import CancelledError, Deferred
 from middleware.entangled.errors import NoAnswer, NotRunning, TooLarge
 from middleware.entangled.network.switchboard import Weather
 from middleware.entangled.space.claim import Claim, ClaimLost
+from middleware.entangled.space.posting import Posted, posting
 from middleware.entangled.space.template import ANY, BadTuple, where
 from middleware.entangled.space.tuplespace import NoTuple, TupleSpace
 from tests.fleet import Fleet, FleetCase
@@ -36,6 +37,11 @@ class SpaceCase(FleetCase):
         for space in self.made:
             space.stop()
         super().tearDown()
+
+    def posted(self, fleet: Fleet) -> list[Posted]:
+        """Every tuple that some node keeps, each once."""
+        said = [posting(record) for node in fleet.nodes for record in node.store.records()]
+        return list({one.place: one for one in said if isinstance(one, Posted)}.values())
 
     def moment(self, fleet: Fleet, work: Deferred[Any]) -> list[float]:
         """Where the moment at which ``work`` fires will stand."""
@@ -208,6 +214,23 @@ class TupleSpaceTests(SpaceCase):
         fleet.run(3.0)
         self.assertEqual(self.done(fleet, spaces[0].get(("legacy", int))), ("legacy", 1))
         self.assertIsNone(self.done(fleet, spaces[1].get_if_exists(("legacy", int))))
+
+    def test_tuples_that_nobody_can_take_do_not_keep_the_others(self) -> None:
+        """Where tuples stand whose councils lost their majority for good, ``get`` takes the others all the same."""
+        fleet, spaces = self.spaces(8)
+        for number in range(4):
+            self.done(fleet, spaces[0].put(("stuck", number)), 0.5)
+        [council] = {one.council for one in self.posted(fleet)}
+        dead = [n for n, node in enumerate(fleet.nodes) if any(m.contact == node.contact for m in council)][:2]
+        for place in dead:
+            spaces[place].stop()
+            fleet.kill(place)
+        fleet.run(20.0)
+        living = [space for place, space in enumerate(spaces) if place not in dead]
+        for number in range(4):
+            self.done(fleet, living[0].put(("good", number)))
+        for space in living[1:5]:
+            self.assertEqual(self.done(fleet, space.get((str, int)), 20.0)[0], "good")
 
     def test_slots_are_used_again(self) -> None:
         """However many tuples come and go, the slots they leave behind stay as many as a few seconds need."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import re
 import socket
 import tomllib
 from dataclasses import replace
@@ -12,7 +13,9 @@ from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
+from drivers.registry import describe
 from sim.demo import port, stage
+from sim.demo.cast import CASTS, MOST_PORTS, chosen
 from sim.demo.configuration import DOGS, Plan
 from sim.demo.demonstration import main
 from sim.demo.experiment import LIMIT_S, Experiment, report, table, to_target
@@ -194,7 +197,8 @@ class ConfigurationTests(SynchronousTestCase):
     def setUp(self) -> None:
         ports = {"vaio": 7000, "pi": 7004, "dog1": 7001, "dog2": 7002, "dog3": 7003}
         folder = Path('/tmp/a "strange"\\folder\x7f')
-        self.plan = Plan(folder, "ab" * 32, "127.0.0.1", 8080, 7400, ports, "quiet-otter", 8081)
+        self.plan = Plan(folder, "127.0.0.1", 8080, 7400, ports, "quiet-otter", 8081)
+        self.plan = replace(self.plan, robots=chosen("sim", DOGS, folder, iter(()), 7400))
         self.tables = {name: tomllib.loads(text) for name, text in self.plan.texts().items()}
 
     def test_every_node_has_a_file_in_lawful_toml(self) -> None:
@@ -203,7 +207,15 @@ class ConfigurationTests(SynchronousTestCase):
         nodes = [table["node"] for table in self.tables.values()]
         self.assertEqual([node["port"] for node in nodes], [7000, 7004, 7001, 7002, 7003])
         self.assertEqual(nodes[1]["store"], str(self.plan.run_dir / "pi.sqlite"))
-        self.assertEqual({node["team_key"] for node in nodes}, {"ab" * 32})
+        folder = self.plan.run_dir
+        self.assertEqual([node["membership"] for node in nodes], [str(folder / f"{n}.membership") for n in self.tables])
+
+    def test_every_node_is_a_member(self) -> None:
+        """What the team is founded with names each node that has a file, and no key of an open team."""
+        words = self.plan.founding()
+        members = [word.partition("=")[0] for flag, word in zip(words, words[1:], strict=False) if flag == "--member"]
+        self.assertEqual([words[words.index("--first") + 1], *members], list(self.tables))
+        self.assertNotIn("team_key", str(self.tables))
 
     def test_dogs_know_the_laptop_and_drive_themselves(self) -> None:
         """A dog knows the bootstrap node only, and its driver asks for the robot of its own name."""
@@ -211,6 +223,31 @@ class ConfigurationTests(SynchronousTestCase):
         self.assertEqual(dog["node"]["known_nodes"], ["127.0.0.1:7000"])
         self.assertEqual(dog["agent"], {"module": "search"})
         self.assertEqual((dog["driver"]["kind"], dog["driver"]["options"]["robot"]), ("sim", "dog2"))
+
+    def test_cast(self) -> None:
+        """Each dog's driver is told of the robot that the yard plays; without robots of other kinds it plays none."""
+        self.assertEqual(self.plan.played, "")
+        robots = chosen("mixed", DOGS, self.plan.run_dir, iter(range(9000, 9100)), 7400)
+        plan = replace(self.plan, robots=robots)
+        drivers = {name: tomllib.loads(plan.texts()[name])["driver"] for name in DOGS}
+        self.assertEqual([table["kind"] for table in drivers.values()], ["aibo", "create2", "bittle"])
+        played = tomllib.loads(plan.played)
+        self.assertEqual(played, drivers)
+        models = [tomllib.loads(plan.texts()[name])["node"]["kind"] for name in DOGS]
+        self.assertEqual(models, ["AIBO ERS-7", "iRobot Create 2", "Petoi Bittle"])
+        taken = [n for table in drivers.values() for n in re.findall(r"\b90\d\d\b", str(table))]
+        self.assertEqual(len(taken), len(set(taken)))
+
+    def test_every_cast_is_known_to_its_drivers(self) -> None:
+        """Whatever the three are, the drivers take their options, and the older Tekkotsu is among the dogs."""
+        for wish in CASTS:
+            robots = chosen(wish, DOGS, self.plan.run_dir, iter(range(9000, 9000 + MOST_PORTS * len(DOGS))), 7400)
+            for name, robot in robots.items():
+                parts = [(part["kind"], part["options"]) for part in robot.parts]
+                capabilities = describe(robot.kind, robot.options, name, parts).capabilities
+                self.assertLessEqual({"base2d", "odometry", "camera"}, set(capabilities), wish)
+        dogs = chosen("aibo", DOGS, self.plan.run_dir, iter(range(9000, 9100)), 7400)
+        self.assertEqual([dog.played.get("dialect") for dog in dogs.values()], [None, None, "T2"])
 
     def test_laptop_has_the_page_and_no_driver(self) -> None:
         """The laptop serves the page over the yard, and has neither agent nor driver."""

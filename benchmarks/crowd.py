@@ -1,0 +1,147 @@
+"""What a yard for many costs: rays, moves and controllers of 3 to 10,000 robots, and a hundred agents attached.
+
+``make bench-crowd``.  Milliseconds are of processor, so that other work on the machine matters little; each size is a
+process of its own, so that its memory is its own.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+TICK_MS = 32.0
+LOOK_S = 2.0
+"""Virtual seconds for which attached agents are measured, once they have settled."""
+SETTLING_S = 4.0
+ARGOS = "ARGoS is quoted with 10,000 e-pucks at 1.7 x real time, by many threads on a machine of 2012"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measure and print; 1 where the yard is slower than real time."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.crowd", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--bodies", default="3,100,1000,10000", help="sizes, with commas (default %(default)s)")
+    parser.add_argument(
+        "--agents", type=int, default=100, help="attached to 1,000 robots; 0: none (default %(default)s)"
+    )
+    parser.add_argument("--controller", default="search", help="of all robots (default %(default)s)")
+    parser.add_argument("--seconds", type=float, default=3.0, help="of processor for each size (default %(default)s)")
+    parser.add_argument("--out", type=Path, help="write the figures to this file, as JSON")
+    parser.add_argument("--one", type=int, help=argparse.SUPPRESS)
+    given = parser.parse_args(arguments)
+    sizes = given.bodies.split(",")
+    if not all(size.isdecimal() and 1 <= int(size) <= 100_000 for size in sizes):
+        parser.error(f"--bodies must be numbers from 1 to 100000 with commas between, not {given.bodies!r}")
+    if not 0.1 <= given.seconds <= 600 or not 0 <= given.agents <= 1000:
+        parser.error("--seconds must be 0.1 to 600, and --agents 0 to 1000")
+    if given.one is not None:
+        sys.stdout.write(json.dumps(_alone(given.one, given.controller, given.seconds)) + "\n")
+        return 0
+    sys.stdout.write(
+        f"{'robots':>8}{'rays ms':>9}{'moves':>9}{'control':>9}{'step ms':>9}{'x real time':>13}{'MiB':>8}\n"
+    )
+    rows = []
+    for size in sizes:
+        command = [sys.executable, "-m", "benchmarks.crowd", "--one", size, "--controller", given.controller]
+        child = subprocess.run(
+            [*command, "--seconds", str(given.seconds)], stdout=subprocess.PIPE, text=True, check=True
+        )
+        row = json.loads(child.stdout)
+        rows.append(row)
+        cells = (f"{row[key]:9.3f}" for key in ("rays", "moves", "control", "step"))
+        _say(f"{row['robots']:>8,}{''.join(cells)}{row['factor']:13.1f}{row['mib']:8.1f}")
+    _say(f"8 rays each, steps of 32 ms, all {given.controller}, one thread; MiB: more than the program without robots")
+    _say(f"{ARGOS}: the same order, on one core")
+    figures: dict[str, Any] = {"alone": rows}
+    if given.agents:
+        figures["attached"] = _attached(given.agents)
+    if given.out is not None:
+        given.out.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+    return 0 if all(row["factor"] >= 1.0 for row in rows) else 1
+
+
+def _alone(bodies: int, controller: str, seconds: float) -> dict[str, float]:
+    """The crowd alone: the mean of a step and of its parts, searches for neighbours and all."""
+    from sim.crowd.controller import CONTROLLERS, Senses
+    from sim.crowd.crowd import Crowd
+    from sim.crowd.ground import roomy
+
+    class Timed(Crowd):
+        rays = 0.0
+
+        def cast(self) -> Any:
+            began = time.process_time()
+            met = super().cast()
+            self.rays = 1e3 * (time.process_time() - began)
+            return met
+
+    before = _peak()
+    crowd = Timed(1, roomy(bodies))
+    crowd.place_target_at_random()
+    senses, control = Senses(crowd), CONTROLLERS[controller]
+    parts: dict[str, list[float]] = {"rays": [], "moves": [], "control": [], "step": []}
+    end = time.process_time() + seconds
+    while time.process_time() < end or len(parts["step"]) < 20:
+        began = time.process_time()
+        crowd.wish[:] = control(senses)
+        controlled = time.process_time()
+        crowd.step()
+        stepped = time.process_time()
+        parts["step"].append(1e3 * (stepped - began))
+        parts["control"].append(1e3 * (controlled - began))
+        parts["rays"].append(crowd.rays)
+        parts["moves"].append(1e3 * (stepped - controlled) - crowd.rays)
+    means = {key: statistics.fmean(costs) for key, costs in parts.items()}
+    return {"robots": bodies, **means, "factor": TICK_MS / means["step"], "mib": _peak() - before}
+
+
+def _attached(agents: int) -> dict[str, float]:
+    """Agents with nodes and drivers, attached to a crowd of 1,000 and without a task, with cameras and without."""
+    from sim.crowd.ground import roomy
+    from swarmnode.crowd import CAMERA_FPS, CrowdTeam
+
+    began = time.process_time()
+    team = CrowdTeam(1, agents, roomy(max(1000, agents)), stopwatch=time.process_time)
+    team.clock.advance(SETTLING_S)
+    figures = {"agents": float(agents), "joining": time.process_time() - began}
+    _say(f"\n{agents} agents attached to {team.yard.crowd.ground.bodies:,} robots, without a task; ms a virtual second")
+    _say(f"{'':24}{'moves, rays':>12}{'telling':>9}{'agents':>9}{'yard alone':>13}{'all':>9}{'datagrams':>11}")
+    for part, fps in ((f"{CAMERA_FPS:g} pictures a second", CAMERA_FPS), ("no camera", 0.0)):
+        for service in team.services.values():
+            driver: Any = service.assembly.driver
+            if driver is not None:
+                driver.set_camera_fps(fps)
+        team.clock.advance(0.5)
+        moving, telling, sent = team.yard.moving, team.yard.telling, team.board.counters["sent"]
+        began = time.process_time()
+        team.clock.advance(LOOK_S)
+        whole = (time.process_time() - began) / LOOK_S
+        moving, telling = (team.yard.moving - moving) / LOOK_S, (team.yard.telling - telling) / LOOK_S
+        rate = (team.board.counters["sent"] - sent) / LOOK_S
+        yard = moving + telling
+        costs = "".join(f"{1e3 * cost:{wide}.0f}" for cost, wide in ((moving, 12), (telling, 9), (whole - yard, 9)))
+        _say(f"{part:24}{costs}{1 / yard:11.1f} x{1 / whole:7.2f} x{rate:11,.0f}")
+        figures |= {f"{part}, yard": yard, f"{part}, all": whole, f"{part}, datagrams": rate}
+    team.stop()
+    return figures
+
+
+def _peak() -> float:
+    """MiB that this process has had in use at most."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+
+
+def _say(line: str) -> None:
+    sys.stdout.write(f"{line}\n")
+    sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,308 @@
+"""Forged datagrams against a node: ``python -m benchmarks.flood``.
+
+Two nodes of a closed team, each a process of its own, call each other over loopback, while a third process fires 20,000
+datagrams a second at one of them from a thousand addresses: rubbish, handshakes of a good form, datagrams for a true
+session, recordings, greetings, hails, knocks, and all of it mixed.  Says which calls came back, how late heartbeats
+were, what the node sent to who attacked it, its memory, and what a forged datagram costs; exits with 1 where a target
+is missed.  Linux only: addresses of 127.0.0.0/8 and the figures come from the system.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import random
+import resource
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from middleware.admission import knock, membership
+from middleware.admission.operator import drawn
+from middleware.entangled.identity import Identity
+from middleware.entangled.wire import greeting, hail, session
+
+RATE = 20_000
+SECONDS = 20.0
+SOURCES = 1000
+PAUSE_S = 0.002
+FIRST_S = 4.0
+"""Seconds without a flood, by which the rest is judged."""
+KINDS = ("random", "init", "data", "replay", "who", "hail", "knock", "mixed")
+TARGETS = {"good": 0.99, "late_ms": 100.0, "amplification": 1.0, "growth_mib": 16.0, "cost_us": 25.0, "rate": 0.9}
+"""Share of good calls at least; how late 99 of 100 heartbeats are at most; bytes out per byte in; memory; processor
+time of the node for each forged datagram, the system's share included; share of the wanted rate that was reached."""
+CAPS = {"responses": 512, "unconfirmed": 512, "peers": 4096, "sessions": 4096, "led": 1024, "seen": 1024}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measure and print; 1 where a target is missed."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.flood", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--seconds", type=float, default=SECONDS, help="of the flood (default %(default)s)")
+    parser.add_argument("--rate", type=int, default=RATE, help="datagrams a second (default %(default)s)")
+    parser.add_argument("--out", type=Path, help="write the figures there, as JSON")
+    parser.add_argument("--fire", help=argparse.SUPPRESS)
+    given = parser.parse_args(arguments)
+    if given.fire:
+        return _fire(json.loads(sys.stdin.readline()))
+    if given.seconds < len(KINDS) or not 0 < given.rate <= 100_000:
+        parser.error(f"--seconds must be {len(KINDS)} or more, --rate 1 to 100000")
+    found = _measured(given.seconds, given.rate)
+    missed = _printed(found)
+    if given.out:
+        given.out.parent.mkdir(parents=True, exist_ok=True)
+        given.out.write_text(json.dumps({**found, "missed": missed}, indent=1) + "\n")
+    return 1 if missed else 0
+
+
+# -- the one who attacks -------------------------------------------------------------------------------------------
+
+
+def makers(order: dict[str, Any]) -> dict[str, Callable[[], bytes]]:
+    """What makes a datagram of each kind, of what any eavesdropper on the way knows."""
+    dice = random.Random(7)
+    rubbish = dice.randbytes(1 << 20)
+    recorded = [bytes.fromhex(each) for each in order["recorded"]]
+    indexes = [index.to_bytes(4, "little") for index in order["index"]] or [bytes(4)]
+    number = 0
+
+    def some(size: int) -> bytes:
+        start = dice.randrange(len(rubbish) - size)
+        return rubbish[start : start + size]
+
+    def data() -> bytes:
+        nonlocal number
+        number += 1
+        head = bytes([session.DATA]) + dice.choice(indexes)
+        return bytes(head) + (1_000_000 + number).to_bytes(8, "little") + some(60)
+
+    single: dict[str, Callable[[], bytes]] = {
+        "random": lambda: some(dice.randrange(1, 1400)),
+        # As long and as padded as a true one, without the mac that takes the team's secret, and with no payment.
+        "init": lambda: bytes([session.INIT]) + some(1283) + bytes(16),
+        "data": data,
+        "replay": lambda: dice.choice(recorded),
+        "who": lambda: bytes([greeting.WHO]) + some(greeting.GREETING_BYTES - 1),
+        "hail": lambda: hail.hail(some(hail.TOKEN)),
+        "knock": lambda: bytes([knock.KNOCK]) + some(knock.KNOCK_BYTES - 1),
+    }
+    return {**single, "mixed": lambda: dice.choice(list(single.values()))()}
+
+
+def _fire(order: dict[str, Any]) -> int:
+    """Fire what is ordered; says at the end how much it was."""
+    resource.setrlimit(resource.RLIMIT_NOFILE, (min(4096, resource.getrlimit(resource.RLIMIT_NOFILE)[1]),) * 2)
+    guns = []
+    for number in range(SOURCES):
+        gun = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        gun.bind((f"127.66.{number // 250}.{1 + number % 250}", 0))
+        gun.setblocking(False)
+        guns.append(gun)
+    to = ("127.0.0.1", order["port"])
+    made = makers(order)
+    fired = {}
+    for kind, seconds in order["kinds"]:
+        made_one = made[kind]
+        began, count = time.monotonic(), 0
+        while (now := time.monotonic()) < began + seconds:
+            due = int((now - began) * order["rate"])
+            while count < due:
+                with suppress(BlockingIOError):
+                    guns[count % SOURCES].sendto(made_one(), to)
+                count += 1
+            time.sleep(PAUSE_S)
+        fired[kind] = count
+        sys.stdout.write(json.dumps({"kind": kind, "fired": count}) + "\n")
+        sys.stdout.flush()
+        sys.stdin.readline()  # until the one who measures is ready for the next kind
+    return 0
+
+
+# -- the one who measures ------------------------------------------------------------------------------------------
+
+
+class Child:
+    """A process that is asked and answers in lines of JSON."""
+
+    def __init__(self, *arguments: str) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", *arguments], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+
+    def read(self) -> dict[str, Any]:
+        """The next line."""
+        assert self.process.stdout is not None
+        line = self.process.stdout.readline()
+        if not line:
+            raise RuntimeError("a process of the measurement ended early")
+        found: dict[str, Any] = json.loads(line)
+        return found
+
+    def say(self, what: str = "") -> None:
+        """Write a line."""
+        assert self.process.stdin is not None
+        self.process.stdin.write(what + "\n")
+        self.process.stdin.flush()
+
+    def asked(self) -> dict[str, Any]:
+        """A report."""
+        self.say()
+        return self.read()
+
+    def end(self) -> None:
+        """Close it, and wait until it is gone."""
+        assert self.process.stdin is not None
+        self.process.stdin.close()
+        try:
+            self.process.wait(5.0)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+
+
+def _measured(seconds: float, rate: int) -> dict[str, Any]:
+    dice = random.SystemRandom()
+    operator = drawn("flooded", dice)
+    first = operator.founded("target", ("device", "bootstrap", "gateway"), time.time(), dice)
+    second = operator.founded("friend", ("device", "gateway"), time.time(), dice, first.secrets[0][1])
+    children: list[Child] = []
+    with tempfile.TemporaryDirectory(prefix="flood") as folder:
+        paths = [Path(folder) / name for name in ("target", "friend")]
+        for path, paper in zip(paths, (first, second), strict=True):
+            membership.made(path, paper)
+        keys = [Identity(paper.seed).public.hex() for paper in (first, second)]
+        try:
+            children.append(Child("benchmarks.flood_node", str(paths[0]), "", keys[1]))
+            port = children[0].read()["ready"]
+            children.append(Child("benchmarks.flood_node", str(paths[1]), f"127.0.0.1:{port}", keys[0]))
+            children[1].read()
+            return _flooded(children, port, seconds, rate)
+        finally:
+            for child in children:
+                child.end()
+
+
+def _flooded(children: list[Child], port: int, seconds: float, rate: int) -> dict[str, Any]:
+    target, friend = children[:2]
+    time.sleep(1.5)
+    begun = [target.asked(), friend.asked()]
+    time.sleep(FIRST_S)
+    quiet = [target.asked(), friend.asked()]
+    gun = Child("benchmarks.flood", "--fire", "yes")
+    children.append(gun)
+    each = seconds / len(KINDS)
+    order = {"port": port, "rate": rate, "kinds": [(kind, each) for kind in KINDS]}
+    gun.say(json.dumps({**order, "recorded": quiet[0]["recorded"], "index": quiet[0]["index"]}))
+    idle = _share(begun[0], quiet[0])
+    before, found = quiet[0], []
+    calls, gaps, lags, trips = _counted(()), [], [], []
+    peak = quiet[0]["rss"]
+    for kind in KINDS:
+        fired = gun.read()
+        time.sleep(0.05)  # what is in the buffer of the port
+        now, other = target.asked(), friend.asked()
+        calls = _counted((calls, now["calls"], other["calls"]))
+        gaps += now["gaps"] + other["gaps"]
+        lags += now["lags"]
+        trips += other["trips"]
+        peak = max(peak, now["rss"])
+        found.append({"kind": kind, "fired": fired["fired"], **_between(before, now, idle)})
+        before = now
+        gun.say()
+    return {
+        "seconds": seconds,
+        "rate": rate,
+        "quiet": {"cpu": idle, "late_ms": _high(quiet[0]["gaps"] + quiet[1]["gaps"]), "calls": quiet[1]["calls"]},
+        "kinds": found,
+        "good": calls["good"] / max(1, calls["good"] + calls["bad"]),
+        "calls": calls,
+        "late_ms": _high(gaps),
+        "lag_ms": _high(lags),
+        "trip_ms": _high(trips),
+        "bytes": before["bytes"],
+        "amplification": before["bytes"]["out"] / max(1, before["bytes"]["in"]),
+        "growth_mib": (peak - quiet[0]["rss"]) / 2**20,
+        "rss_mib": peak / 2**20,
+        "cost_us": max(each["cost_us"] for each in found),
+        "rate_reached": sum(each["received"] for each in found) / (rate * seconds),
+        "tables": before["tables"],
+        "counters": before["counters"],
+        "cores": os.cpu_count(),
+    }
+
+
+def _counted(several: Sequence[dict[str, int]]) -> dict[str, int]:
+    return {name: sum(each[name] for each in several) for name in ("good", "bad")}
+
+
+def _share(one: dict[str, Any], other: dict[str, Any]) -> float:
+    """The share of a core between two reports."""
+    return float((other["cpu"] - one["cpu"]) / (other["at"] - one["at"]))
+
+
+def _between(before: dict[str, Any], now: dict[str, Any], idle: float) -> dict[str, Any]:
+    count = now["bytes"]["count"] - before["bytes"]["count"]
+    spent = now["cpu"] - before["cpu"] - idle * (now["at"] - before["at"])
+    bytes_in = now["bytes"]["in"] - before["bytes"]["in"]
+    bytes_out = now["bytes"]["out"] - before["bytes"]["out"]
+    return {
+        "received": count,
+        "cost_us": 1e6 * spent / max(1, count),
+        "core": _share(before, now),
+        "in": bytes_in,
+        "out": bytes_out,
+        "late_ms": _high(now["gaps"]),
+        "good": now["calls"]["good"] / max(1, sum(now["calls"].values())),
+    }
+
+
+def _high(seconds: Sequence[float]) -> float:
+    """What 99 of 100 stay below, in milliseconds."""
+    if not seconds:
+        return float("inf")
+    return 1000.0 * sorted(seconds)[min(len(seconds) - 1, int(0.99 * len(seconds)))]
+
+
+def _printed(found: dict[str, Any]) -> list[str]:
+    """Print the table; gives what missed its target."""
+    head = f"{'kind':8}{'fired':>9}{'received':>10}{'us each':>9}{'core':>7}{'bytes in':>12}{'out':>9}{'late ms':>9}"
+    lines = [head + f"{'good':>8}"]
+    for each in found["kinds"]:
+        lines.append(
+            f"{each['kind']:8}{each['fired']:9}{each['received']:10}{each['cost_us']:9.1f}{each['core']:7.0%}"
+            f"{each['in']:12}{each['out']:9}{each['late_ms']:9.1f}{each['good']:8.1%}"
+        )
+    verdicts = {
+        "good": ("calls good", found["good"], found["good"] >= TARGETS["good"], ".4f"),
+        "late_ms": ("heartbeats late, ms (p99)", found["late_ms"], found["late_ms"] <= TARGETS["late_ms"], ".1f"),
+        "amplification": (
+            *("bytes out for each byte in", found["amplification"]),
+            *(found["amplification"] <= TARGETS["amplification"], ".4f"),
+        ),
+        "growth_mib": ("memory grown, MiB", found["growth_mib"], found["growth_mib"] <= TARGETS["growth_mib"], ".1f"),
+        "cost_us": ("us of processor, dearest kind", found["cost_us"], found["cost_us"] <= TARGETS["cost_us"], ".1f"),
+        "rate": ("share of the rate received", found["rate_reached"], found["rate_reached"] >= TARGETS["rate"], ".3f"),
+    }
+    missed = [name for name, (_, _, is_met, _) in verdicts.items() if not is_met]
+    lines.append("")
+    for name, (text, value, is_met, form) in verdicts.items():
+        lines.append(f"{text:32}{value:10{form}}   target {TARGETS[name]:g}{'' if is_met else '   MISSED'}")
+    over = [name for name, most in CAPS.items() if found["tables"][name] > most]
+    missed += [f"cap of {name}" for name in over]
+    lines.append(f"{'tables':32}{' '.join(f'{name} {size}' for name, size in found['tables'].items())}")
+    lines.append(
+        f"{'without a flood':32}heartbeats late {found['quiet']['late_ms']:.1f} ms, core {found['quiet']['cpu']:.1%}"
+    )
+    sys.stdout.write("\n".join(lines) + "\n")
+    return missed
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,97 @@
+"""``make live-nat``: real nodes behind every pair of routers: who reaches whom, how, and in how many seconds.
+
+Needs Linux and either root or user namespaces; everything happens in network namespaces of its own.  Prints a table,
+writes every trial as JSON and the matrix as SVG; exit code 1 where a promise is broken, 2 where it cannot run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+from benchmarks.nat.internet import Internet
+from benchmarks.nat.outcome import PLAIN, Outcome, promises
+from benchmarks.nat.picture import drawn
+from benchmarks.nat.report import table, written
+from benchmarks.nat.room import refusal
+
+DOCUMENT = Path("docs/nat.md")
+PICTURE = "images/nat.svg"
+
+
+def whole(word: str) -> int:
+    """A number that is not negative, from the command line."""
+    if not (word.isdecimal() and len(word) <= 6):
+        raise argparse.ArgumentTypeError(f"must be a whole number from 0 on, is {word!r}")
+    return int(word)
+
+
+def say(line: str) -> None:
+    """Tell the person who waits."""
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()
+
+
+async def run(count: int, lossy: int, seed: int) -> list[Outcome]:
+    """The whole matrix; ends well on SIGTERM, too."""
+    from benchmarks.nat.fleet import Fleet
+    from benchmarks.nat.matrix import Matrix, sites
+
+    task = asyncio.current_task()
+    assert task is not None
+    for number in (signal.SIGTERM, signal.SIGINT):
+        asyncio.get_running_loop().add_signal_handler(number, task.cancel)
+    with tempfile.TemporaryDirectory(prefix="nat-") as folder, Internet(sites(), seed) as net:
+        say(f"{len(net.hosts)} hosts on {len(net.sites)} sites")
+        async with Fleet(net, net.hosts, Path(folder)) as fleet:
+            matrix = Matrix(net, fleet, seed, say)
+            await matrix.run(count, lossy)
+            return matrix.outcomes
+
+
+def main(arguments: Sequence[str] = tuple(sys.argv[1:])) -> int:
+    """The command line."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.nat", description="Who reaches whom behind routers.")
+    parser.add_argument("--count", type=whole, default=5, help="rounds of every pair (%(default)s)")
+    parser.add_argument("--lossy", type=whole, default=4, help="rounds with 30 %% lost (%(default)s)")
+    parser.add_argument("--seed", type=int, default=1, help="seed of losses and keys (%(default)s)")
+    parser.add_argument("--out", type=Path, default=Path("build"), help="folder for the JSON and the picture")
+    parser.add_argument("--docs", action="store_true", help=f"write table and picture into {DOCUMENT}, too")
+    given = parser.parse_args(list(arguments))
+    why = refusal()
+    if why:
+        sys.stderr.write(f"!!!\n!!! live-nat CANNOT RUN HERE: {why}\n!!!\n")
+        return 2
+    try:
+        given.out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        parser.error(f"--out {given.out} cannot be made ({error.strerror}); name another folder")
+    began = time.monotonic()
+    try:
+        outcomes = asyncio.run(run(given.count, given.lossy, given.seed))
+    except asyncio.CancelledError:
+        sys.stderr.write("live-nat: ended before its time; all it had made is gone\n")
+        return 130
+    kept = promises(outcomes)
+    file = given.out / "live-nat"
+    trials = {"promises": [asdict(one) for one in kept], "trials": [asdict(one) for one in outcomes]}
+    file.with_suffix(".json").write_text(json.dumps(trials, indent=1) + "\n", encoding="utf-8")
+    picture = drawn([one for one in outcomes if one.part == PLAIN], "Seconds until the first answer")
+    file.with_suffix(".svg").write_text(picture, encoding="utf-8")
+    say(f"\n{table(outcomes)}\n{file}.json, .svg; {time.monotonic() - began:.0f} s")
+    if given.docs:
+        DOCUMENT.write_text(written(DOCUMENT.read_text(encoding="utf-8"), outcomes), encoding="utf-8")
+        (DOCUMENT.parent / PICTURE).write_text(picture, encoding="utf-8")
+    return 0 if all(one.is_kept for one in kept) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,168 @@
+"""Capture: what passes an interface, kept for whoever searches it, and counted by the peer it went to or came from.
+
+    with Capture(net, "pub", folder / "pub.pcap") as seen:
+        ...
+    seen.found([b"red target"]), seen.traffic["198.18.1.2:7000"].amplification
+
+``python -m benchmarks.nat.capture INTERFACE FILE`` is the part of it that runs on the host; it needs no ``tcpdump``.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import socket
+import struct
+import subprocess
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, BinaryIO
+
+from benchmarks.nat.internet import Internet
+from benchmarks.nat.kind import WAN
+from benchmarks.nat.switch import EVERYTHING, FILE_HEADER, SNAP
+
+OUTGOING = 4
+IPV4, UDP = 0x0800, 17
+
+
+@dataclass
+class Traffic:
+    """Datagrams and their payload in bytes, from a peer (``received``) and to it (``sent``)."""
+
+    received: int = 0
+    received_bytes: int = 0
+    sent: int = 0
+    sent_bytes: int = 0
+
+    @property
+    def amplification(self) -> float:
+        """Bytes sent for each byte received; infinite for a peer that sent none."""
+        if not self.sent_bytes:
+            return 0.0
+        return self.sent_bytes / self.received_bytes if self.received_bytes else float("inf")
+
+
+class Capture:
+    """What passes ``interface`` of ``host`` between ``with`` and its end; ``traffic`` is there afterwards."""
+
+    def __init__(self, net: Internet, host: str, file: Path, interface: str = WAN) -> None:
+        self.traffic: dict[str, Traffic] = {}
+        self.file = file
+        arguments = [sys.executable, "-m", "benchmarks.nat.capture", interface, str(file.absolute())]
+        self._process = net.start(host, arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+    def __enter__(self) -> Capture:
+        assert self._process.stdout is not None
+        if not self._process.stdout.readline():
+            raise RuntimeError("the capture did not start")
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        said = self._process.communicate(timeout=20)[0]
+        self.traffic = {peer: Traffic(**counts) for peer, counts in json.loads(said).items()}
+
+    def from_host(self, address: str) -> Traffic:
+        """The traffic with all ports of one address."""
+        whole = Traffic()
+        for peer, each in self.traffic.items():
+            if peer.rpartition(":")[0] == address:
+                whole.received += each.received
+                whole.received_bytes += each.received_bytes
+                whole.sent += each.sent
+                whole.sent_bytes += each.sent_bytes
+        return whole
+
+    def found(self, words: Iterable[bytes]) -> list[bytes]:
+        """Those of ``words`` that can be read in what passed."""
+        return readable(self.file.read_bytes(), words)
+
+
+def readable(passed: bytes, words: Iterable[bytes]) -> list[bytes]:
+    """Those of ``words`` that stand in ``passed`` as they are, whatever their letters' case, or as UTF-16."""
+    text = passed.lower()
+    return [w for w in words if w.lower() in text or w.decode().lower().encode("utf-16-le") in text]
+
+
+def frames(file: Path) -> Iterator[bytes]:
+    """The frames of a capture."""
+    data, place = file.read_bytes(), len(FILE_HEADER)
+    while place + 16 <= len(data):
+        length = struct.unpack_from("=I", data, place + 8)[0]
+        yield data[place + 16 : place + 16 + length]
+        place += 16 + length
+
+
+def datagrams(file: Path) -> Iterator[tuple[str, str, bytes]]:
+    """The UDP datagrams of a capture: from where, to where, and what they hold."""
+    for frame in frames(file):
+        held = payload(frame)
+        if held is not None:
+            yield held
+
+
+def payload(frame: bytes) -> tuple[str, str, bytes] | None:
+    """Where a frame's datagram comes from, where it goes, and what it holds; None for what is no UDP over IPv4."""
+    if len(frame) < 42 or int.from_bytes(frame[12:14]) != IPV4 or frame[23] != UDP:
+        return None
+    udp = 14 + 4 * (frame[14] & 15)
+    if int.from_bytes(frame[20:22]) & 0x1FFF or len(frame) < udp + 8:
+        return None  # a later fragment has no ports
+    source_port, target_port, length = struct.unpack_from("!HHH", frame, udp)
+    source, target = socket.inet_ntoa(frame[26:30]), socket.inet_ntoa(frame[30:34])
+    return f"{source}:{source_port}", f"{target}:{target_port}", frame[udp + 8 : udp + length]
+
+
+def capture(interface: str, out: BinaryIO, orders: int, ready: Any) -> dict[str, Traffic]:
+    """Write frames to ``out`` until the file ``orders`` ends; returns what was counted."""
+    raw = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(EVERYTHING))
+    raw.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 8 << 20)
+    raw.bind((interface, 0))
+    counts: defaultdict[str, Traffic] = defaultdict(Traffic)
+    out.write(FILE_HEADER)
+    ready()
+    is_over = False
+    files: list[Any] = [raw, orders]
+    while not is_over or select.select([raw], [], [], 0.0)[0]:
+        readable = [raw] if is_over else select.select(files, [], [])[0]
+        is_over = is_over or orders in readable
+        if raw not in readable:
+            continue
+        frame, (_, _, direction, *_) = raw.recvfrom(SNAP)
+        now = time.time()
+        out.write(struct.pack("=IIII", int(now), int(now % 1 * 1_000_000), len(frame), len(frame)) + frame)
+        datagram = payload(frame)
+        if datagram is None:
+            continue
+        source, target, held = datagram
+        if direction == OUTGOING:
+            counts[target].sent += 1
+            counts[target].sent_bytes += len(held)
+        else:
+            counts[source].received += 1
+            counts[source].received_bytes += len(held)
+    return counts
+
+
+def main(interface: str, file: str) -> None:
+    """Capture until the input ends, then say what was counted."""
+
+    def ready() -> None:
+        sys.stdout.write("ready\n")
+        sys.stdout.flush()
+
+    with open(file, "wb") as out:
+        counts = capture(interface, out, sys.stdin.fileno(), ready)
+    sys.stdout.write(json.dumps({peer: vars(each) for peer, each in counts.items()}) + os.linesep)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,255 @@
+"""Computer: real nodes on one host of the internet; it does what it is told in JSON lines.
+
+``python -m benchmarks.nat.computer``.  A trial is a team of its own, so many can run beside each other in one process.
+What is measured of a node is the node's own doing: the first moment at which it asks a peer anything, and the first
+answer that it gets.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import sys
+import threading
+from collections.abc import Callable
+from typing import Any
+
+from twisted.internet import reactor as _reactor
+from twisted.internet.defer import Deferred
+
+from middleware.entangled.clock import use_monotonic_time
+from middleware.entangled.errors import EntangledError
+from middleware.entangled.identity import Identity
+from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.node import EntangledNode
+from middleware.settings import Settings
+from swarmnode.world import real_seams
+
+Order = dict[str, Any]
+reactor: Any = _reactor
+CALL = "matrix.hello"
+AGAIN_S = 0.25
+"""Seconds between two calls to a peer that has not answered yet."""
+IN_FLIGHT = 8
+
+
+class Sight:
+    """What one node has seen of one peer."""
+
+    def __init__(self) -> None:
+        self.contact: Contact | None = None
+        """As the node calls it."""
+        self.proved: Contact | None = None
+        """As it answered, or came in."""
+        self.known_at = self.answered_at = -1.0
+        self.path = ""
+        self.waiting: list[Callable[[], None]] = []
+
+
+class Member:
+    """A node of a trial, with an eye on what it does."""
+
+    def __init__(self, settings: Settings, seed: bytes) -> None:
+        seams = real_seams(settings, reactor)
+        identity, network = Identity(seed), seams.network()
+        self.node = EntangledNode(identity, settings.node.team_secret, network, seams.store, reactor, seams.rng)
+        self.sights: dict[bytes, Sight] = {}
+        self.sought: dict[bytes, float] = {}
+        """The peers that are called as soon as they are known, and for how many seconds at most."""
+        self._network = network
+        endpoint = self.node.endpoint
+        self._ask, self._proved = endpoint.ask, endpoint.on_contact
+        # From outside nobody can tell when a node first hears of another: so its own questions are looked at.
+        endpoint.ask = self._asked  # type: ignore[method-assign]
+        endpoint.on_contact = self._met
+        self.node.rpc(CALL)(lambda peer: True)
+
+    def sight(self, public: bytes) -> Sight:
+        """What is known of the peer with that key."""
+        return self.sights.setdefault(public, Sight())
+
+    def start(self) -> int:
+        """Open the port; returns it."""
+        self.node.start()
+        return self._network.address.port
+
+    def call(self, public: bytes, done: Callable[[float], None], limit_s: float) -> None:
+        """Call a peer again and again until it answers; ``done`` with the seconds that it took, -1 where none came."""
+        began = reactor.seconds()
+        state = {"open": True, "in flight": 0}
+
+        def over(seconds: float) -> None:
+            if state["open"]:
+                state["open"] = False
+                done(seconds)
+
+        def answered(_: object) -> None:
+            state["in flight"] -= 1
+            over(reactor.seconds() - began)
+
+        def failed(failure: Any) -> None:
+            state["in flight"] -= 1
+            failure.trap(EntangledError)
+
+        def again() -> None:
+            if not state["open"]:
+                return
+            if reactor.seconds() - began > limit_s:
+                over(-1.0)
+                return
+            sight = self.sight(public)
+            contact = sight.proved or sight.contact
+            if contact is not None and state["in flight"] < IN_FLIGHT:
+                state["in flight"] += 1
+                asked: Deferred[Any] = self.node.call(contact, CALL)
+                asked.addCallbacks(answered, failed)
+            reactor.callLater(AGAIN_S, again)
+
+        again()
+
+    def path(self, public: bytes) -> str:
+        """How a peer is reached now."""
+        proved = self.sight(public).proved
+        return "" if proved is None else path(proved)
+
+    def _asked(self, contact: Contact, method: str, *arguments: object, **options: Any) -> Deferred[Any]:
+        sight = self.sight(contact.public)
+        self._note(contact, sight)
+        asked = self._ask(contact, method, *arguments, **options)
+
+        def answered(answer: object) -> object:
+            if sight.answered_at < 0:
+                sight.answered_at = reactor.seconds()
+                sight.path = self.path(contact.public)
+                for waiting in sight.waiting:
+                    waiting()
+            return answer
+
+        return asked.addCallback(answered)
+
+    def _met(self, contact: Contact) -> None:
+        sight = self.sight(contact.public)
+        sight.proved = contact
+        self._note(contact, sight)
+        self._proved(contact)
+
+    def _note(self, contact: Contact, sight: Sight) -> None:
+        sight.contact = contact
+        if sight.known_at < 0:
+            sight.known_at = reactor.seconds()
+            if contact.public in self.sought:
+                # An application that calls whom it hears of; on its way in the next turn, as the node's own question.
+                reactor.callLater(0.0, self.call, contact.public, lambda _: None, self.sought[contact.public])
+
+
+def path(contact: Contact) -> str:
+    """What the address of a contact says of the way to it."""
+    host = contact.address.host
+    if host.startswith("~wss"):
+        return "tunnel"
+    return "relayed" if host.startswith("~") else "direct"
+
+
+class Computer:
+    """Carries out orders and answers each by its id."""
+
+    def __init__(self) -> None:
+        self._members: dict[str, Member] = {}
+        self._lock = threading.Lock()
+        self._out = os.fdopen(os.dup(1), "w")
+        # Orders own the real output; what a library prints goes the way of errors.
+        os.dup2(2, 1)
+
+    def begin(self) -> None:
+        """Read orders from now on."""
+        threading.Thread(target=self._read, daemon=True).start()
+        self._answer({"id": 0})
+
+    def _read(self) -> None:
+        for line in sys.stdin:
+            reactor.callFromThread(self._obey, json.loads(line))
+        os._exit(0)
+
+    def _obey(self, order: Order) -> None:
+        try:
+            getattr(self, "_do_" + order["do"])(order)
+        except Exception as error:
+            self._answer(order, cannot=f"{type(error).__name__}: {error}")
+
+    def _answer(self, order: Order, **fields: object) -> None:
+        with self._lock:
+            self._out.write(json.dumps({"id": order["id"], **fields}) + "\n")
+            self._out.flush()
+
+    # -- orders -----------------------------------------------------------------------------------------------------
+
+    def _do_start(self, order: Order) -> None:
+        """Start a node; answers when it has joined, which the first of a team has at once, or when it is too late."""
+        settings = Settings.from_mapping({"node": order["node"]}, "trial")
+        member = self._members[order["trial"]] = Member(settings, bytes.fromhex(order["seed"]))
+        member.sought = {bytes.fromhex(public): order["limit_s"] for public in order["sought"]}
+        port, began = member.start(), reactor.seconds()
+        late = reactor.callLater(order["limit_s"], self._answer, order, port=port, joined_s=None)
+
+        def joined(_: object) -> None:
+            if late.active():
+                late.cancel()
+                self._answer(order, port=port, joined_s=reactor.seconds() - began)
+
+        member.node.join(settings.node.known_nodes).addCallbacks(joined, lambda _: None)
+
+    def _do_meet(self, order: Order) -> None:
+        """Wait until a peer has answered; says how long that took, counted from when the node heard of it."""
+        member = self._members[order["trial"]]
+        public = bytes.fromhex(order["peer"])
+        sight = member.sight(public)
+
+        def tell() -> None:
+            if not timer.active():
+                return
+            timer.cancel()
+            self._answer(order, took_s=sight.answered_at - sight.known_at, path=sight.path)
+
+        def late() -> None:
+            self._answer(order, took_s=None, path="", known=sight.known_at >= 0)
+
+        timer = reactor.callLater(order["limit_s"], late)
+        if sight.answered_at >= 0:
+            tell()
+        else:
+            sight.waiting.append(tell)
+
+    def _do_call(self, order: Order) -> None:
+        """Call a peer until it answers."""
+        member, public = self._members[order["trial"]], bytes.fromhex(order["peer"])
+
+        def done(seconds: float) -> None:
+            self._answer(order, took_s=None if seconds < 0 else seconds, path=member.path(public))
+
+        member.call(public, done, order["limit_s"])
+
+    def _do_path(self, order: Order) -> None:
+        """How peers are reached now."""
+        member = self._members[order["trial"]]
+        self._answer(order, paths=[member.path(bytes.fromhex(peer)) for peer in order["peers"]])
+
+    def _do_stop(self, order: Order) -> None:
+        """End nodes without a word."""
+        for trial in order["trials"]:
+            member = self._members.pop(trial, None)
+            if member is not None:
+                member.node.vanish()
+        self._answer(order)
+
+
+def main() -> None:
+    """Be a computer until the orders end."""
+    logging.disable(logging.CRITICAL)
+    use_monotonic_time()
+    reactor.callWhenRunning(Computer().begin)
+    reactor.run(installSignalHandlers=False)
+
+
+if __name__ == "__main__":
+    main()

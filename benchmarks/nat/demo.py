@@ -1,0 +1,154 @@
+"""The demonstration across an internet: ``make demo NAT=1``, or ``python -m benchmarks.nat.demo``.
+
+Two dogs' computers are behind routers of their own, one of them a symmetric one; the third is on the LAN of the
+bootstrap and web node, whose router hands two ports on to it; and whoever looks at the page sits behind a fourth.  Each
+robot hangs on its computer by a cable, at the other end of which is the yard.  Both experiments of the thesis are run
+and judged as on one machine.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+from benchmarks.nat.internet import Internet, Site
+from benchmarks.nat.kind import Kind
+from benchmarks.nat.room import refusal
+from sim.demo.cast import CASTS, LOOPBACK, MOST_PORTS, Robot, chosen
+from sim.demo.configuration import BOOTSTRAP, DOGS, JUDGE, RESERVE, YARD, Place, Plan
+
+NODE_PORT, WEB_PORT, YARD_PORT, ROBOT_PORT = 7000, 8080, 7400, 7500
+HOME, KINDS = "home", (Kind.PORT, Kind.SYM)
+HOSTS = {BOOTSTRAP: "home1", RESERVE: "home2", DOGS[2]: "home3", DOGS[0]: "far1", DOGS[1]: "farther1", JUDGE: "cafe1"}
+"""On which host each one runs."""
+SITES = (
+    Site(HOME, Kind.PORT, 3),
+    Site("far", KINDS[0]),
+    Site("farther", KINDS[1]),
+    Site("cafe", Kind.PORT),
+)
+
+
+def laid_out(net: Internet) -> dict[str, Place]:
+    """Join the robots to their computers and open the ports of the home; says where everything is."""
+    net.island(YARD)
+    cables = {name: net.cable(host, YARD)[1] for name, host in HOSTS.items()}
+    inside = net.address(HOSTS[BOOTSTRAP])
+    net.forward(HOME, HOSTS[BOOTSTRAP], ("udp", NODE_PORT), ("tcp", WEB_PORT))
+    places = {YARD: Place(host="0.0.0.0", enter=net.room(YARD).inner_entry)}
+    for name, host in HOSTS.items():
+        entry = inside if host.startswith(HOME) else net.outside(HOME)
+        places[name] = Place(net.address(host), entry, cables[name], net.room(host).inner_entry)
+    return places
+
+
+def planned(run_dir: Path, robot: str, places: dict[str, Place], code: str) -> Plan:
+    """The plan of the demonstration at ``places``."""
+    ports = iter(range(ROBOT_PORT, ROBOT_PORT + MOST_PORTS * len(DOGS)))
+    robots = {
+        name: _cabled(each, places[name].yard) for name, each in chosen(robot, DOGS, run_dir, ports, YARD_PORT).items()
+    }
+    nodes = dict.fromkeys((BOOTSTRAP, RESERVE, *DOGS), NODE_PORT)
+    return Plan(
+        run_dir, "0.0.0.0", WEB_PORT, YARD_PORT, nodes, code, WEB_PORT, robots=robots, places=places
+    )  # fmt: skip
+
+
+def _cabled(robot: Robot, yard: str) -> Robot:
+    """``robot``, found at the yard's end of its cable."""
+    there = json.loads(json.dumps({"options": robot.options, "parts": robot.parts}).replace(LOOPBACK, yard))
+    return replace(robot, options=there["options"], parts=tuple(there["parts"]))
+
+
+def inside(given: argparse.Namespace) -> None:
+    """Run and judge both experiments; called on the host of whoever looks at the page."""
+    from twisted.internet.base import ReactorBase
+    from twisted.internet.defer import Deferred
+    from twisted.internet.task import react
+
+    from sim.demo.demonstration import Demonstration, judged
+    from sim.demo.stage import Trouble, fresh
+    from sim.demo.visitor import PageError
+
+    ReactorBase.seconds = staticmethod(time.monotonic)
+    folder = given.run_dir.absolute()
+
+    async def run(reactor: Any) -> None:
+        try:
+            with fresh(folder):
+                said = json.loads(sys.stdin.readline())
+                places = {name: Place(**{**each, "enter": tuple(each["enter"])}) for name, each in said.items()}
+                plan = planned(folder, given.robot, places, "over-there")
+                demonstration = Demonstration(reactor, plan, given.seed, _say, given.lose == "link")
+                reactor.addSystemEventTrigger("before", "shutdown", demonstration.stop)
+
+                async def begun() -> None:
+                    _say(f"{time.monotonic() - began:7.2f} s  the page lists all dogs: {demonstration.address}")
+
+                await judged(demonstration, begun, given.report, _say)
+        except (Trouble, PageError, OSError) as problem:
+            sys.stderr.write(f"demo across namespaces: {problem}\n")
+            raise SystemExit(1) from None
+
+    began = time.monotonic()
+    react(lambda reactor: Deferred.fromCoroutine(run(reactor)))
+
+
+def main(arguments: Sequence[str] = tuple(sys.argv[1:])) -> int:
+    """The command line; returns 0 where both experiments held, 2 where namespaces are refused."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.nat.demo", description="Both experiments, behind routers."
+    )
+    parser.add_argument("--robot", choices=sorted(CASTS), default="aibo", help="what the three are (%(default)s)")
+    parser.add_argument(
+        "--lose", choices=("node", "link"), default="node", help="what experiment 2 takes (%(default)s)"
+    )
+    parser.add_argument("--seed", type=int, default=1, help="seed of the yard (%(default)s)")
+    parser.add_argument("--run-dir", type=Path, default=Path("run"), help="logs, stores and configurations go there")
+    parser.add_argument("--report", type=Path, default=None, help="write the verdict there as JSON")
+    parser.add_argument("--loss", type=float, default=0.0, help="percent lost on every line (%(default)s)")
+    parser.add_argument("--record", type=Path, default=None, help="write every frame of the wide area there")
+    for ignored in ("--web-host", "--web-port"):
+        parser.add_argument(ignored, help=argparse.SUPPRESS)
+    for ignored in ("--headless", "--tls"):
+        parser.add_argument(ignored, action="store_true", help=argparse.SUPPRESS)
+    parser.add_argument("--inside", action="store_true", help=argparse.SUPPRESS)
+    given = parser.parse_args(list(arguments))
+    if given.inside:
+        inside(given)
+    why = refusal()
+    if why:
+        sys.stderr.write(f"!!!\n!!! NO DEMONSTRATION ACROSS NAMESPACES HERE: {why}\n!!!\n")
+        return 2
+    # What is made is unmade on the way out, so a request to end has to lead there.
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: sys.exit(130))
+    with Internet(SITES, given.seed) as net:
+        places = laid_out(net)
+        for site in net.sites:
+            net.weather(site, loss=given.loss)
+        net.record(given.record)
+        _say(f"dog1 behind a router ({KINDS[0].meaning}), dog2 behind another ({KINDS[1].meaning}), dog3 at home")
+        command = [sys.executable, "-m", "benchmarks.nat.demo", "--inside", *arguments]
+        process = net.start(HOSTS[JUDGE], command, stdin=subprocess.PIPE, cwd=Path.cwd(), text=True)
+        assert process.stdin is not None
+        process.stdin.write(json.dumps({name: asdict(place) for name, place in places.items()}) + "\n")
+        process.stdin.flush()
+        return int(process.wait())
+
+
+def _say(line: str) -> None:
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,113 @@
+"""Line: what one direction of one link does to a frame; pure: time and dice are handed in."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from random import Random
+
+
+@dataclass(frozen=True)
+class Weather:
+    """How bad a line is.
+
+    ``loss``, ``dup``, ``reorder`` and ``corrupt`` are percents; ``burst`` is how many frames are lost in a row on the
+    average (1: each by itself), ``delay`` and ``jitter`` (a standard deviation) are milliseconds, ``rate`` is kbit/s
+    (0: as fast as can be) with a queue of ``queue`` milliseconds, behind which frames are lost.
+    """
+
+    loss: float = 0.0
+    burst: float = 1.0
+    dup: float = 0.0
+    reorder: float = 0.0
+    corrupt: float = 0.0
+    delay: float = 0.0
+    jitter: float = 0.0
+    rate: float = 0.0
+    queue: float = 500.0
+
+    def __post_init__(self) -> None:
+        for name in ("loss", "dup", "reorder", "corrupt"):
+            if not 0.0 <= getattr(self, name) <= 100.0:
+                raise ValueError(f"{name} is a percentage from 0 to 100, not {getattr(self, name)!r}")
+        for name in ("delay", "jitter", "rate", "queue"):
+            if not 0.0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"{name} is a number from 0 on, not {getattr(self, name)!r}")
+        if not 1.0 <= self.burst < math.inf:
+            raise ValueError(f"burst is a number of frames from 1 on, not {self.burst!r}")
+
+    @property
+    def is_fair(self) -> bool:
+        """Whether every frame passes at once and whole."""
+        return not (self.loss or self.dup or self.reorder or self.corrupt or self.delay or self.jitter or self.rate)
+
+
+class Line:
+    """One direction; ``passed`` and ``lost`` count frames, ``carried`` the bytes of those that passed."""
+
+    def __init__(self, rng: Random) -> None:
+        self.passed = self.lost = self.carried = 0
+        self._rng = rng
+        self._weather = Weather()
+        self._is_in_burst = False
+        self._free_at = 0.0
+
+    @property
+    def weather(self) -> Weather:
+        """How bad it is."""
+        return self._weather
+
+    @weather.setter
+    def weather(self, weather: Weather) -> None:
+        self._weather, self._is_in_burst = weather, False
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """What it counted."""
+        return {"passed": self.passed, "lost": self.lost, "bytes": self.carried}
+
+    def fates(self, size: int, now: float) -> list[float]:
+        """The moments at which a frame of ``size`` bytes comes out: none where it is lost, two where it is doubled."""
+        weather = self._weather
+        if weather.is_fair:
+            self.passed += 1
+            self.carried += size
+            return [now]
+        moment = now
+        if self._is_lost():
+            self.lost += 1
+            return []
+        if weather.rate:
+            begins = max(now, self._free_at)
+            if begins - now > weather.queue / 1000:
+                self.lost += 1
+                return []
+            self._free_at = begins + size * 8 / (weather.rate * 1000)
+            moment = self._free_at
+        # A frame that is reordered overtakes those that wait.
+        if not self._happens(weather.reorder):
+            spread = self._rng.gauss(0.0, weather.jitter) if weather.jitter else 0.0
+            moment += max(0.0, weather.delay + spread) / 1000
+        self.passed += 1
+        self.carried += size
+        return [moment] * (2 if self._happens(weather.dup) else 1)
+
+    def spoiled(self, frame: bytes, header: int) -> bytes:
+        """``frame``, with one bit behind its first ``header`` bytes turned where that happens."""
+        if len(frame) <= header or not self._happens(self._weather.corrupt):
+            return frame
+        place = self._rng.randrange(header, len(frame))
+        return frame[:place] + bytes([frame[place] ^ 1 << self._rng.randrange(8)]) + frame[place + 1 :]
+
+    def _is_lost(self) -> bool:
+        """Losses in bursts (Gilbert, Elliott): a bad time loses all, and begins so often that the rate is met."""
+        loss, burst = self._weather.loss / 100, self._weather.burst
+        if burst <= 1.0 or not 0.0 < loss < 1.0:
+            return self._happens(100 * loss)
+        turns = 1 / burst if self._is_in_burst else min(1.0, loss / (1 - loss) / burst)
+        if self._rng.random() < turns:
+            self._is_in_burst = not self._is_in_burst
+        return self._is_in_burst
+
+    def _happens(self, percent: float) -> bool:
+        return percent > 0.0 and self._rng.random() * 100 < percent

@@ -1,0 +1,270 @@
+"""Matrix: every pair of kinds of routers, tried with real nodes, many at a time in one internet."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from random import Random
+from typing import Any
+
+from benchmarks.nat.fleet import Fleet
+from benchmarks.nat.internet import PUB, PUBS, Internet, Site
+from benchmarks.nat.kind import Kind
+from benchmarks.nat.outcome import ALONE, FORGOTTEN, HOME, IDLE, LEAKY, LOSS, MATRIX, MOVED, PLAIN, RENUMBERED, Outcome
+from benchmarks.remote import Lost
+from middleware.entangled.identity import Identity
+from middleware.settings import NodeSettings
+
+JOIN_S, LOSSY_JOIN_S = 6.0, 20.0
+MEET_S, LOSSY_MEET_S = 6.0, 10.0
+BACK_S = 12.0
+LATE_MS = 500.0
+"""How late a word of the bootstrap comes to the late side of a staggered pair."""
+LOST_PERCENT = 30.0
+SHORT_S = 20
+HOMES = (Kind.FULL, Kind.PORT, Kind.SYM)
+"""Kinds of which a router has two hosts behind it."""
+KNOBS = {"tunnel_port", "tunnels", "lan"} & set(NodeSettings.__dataclass_fields__)
+"""Settings that are used where the nodes have them."""
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two hosts that are to meet; ``a`` and ``b`` are what the table calls them."""
+
+    part: str
+    a: str
+    b: str
+    host_a: str
+    host_b: str
+    note: str = ""
+
+
+def sites() -> list[Site]:
+    """All sites of a run: two of each kind, and those of the special cases."""
+    both = [
+        Site(f"{kind.value}{side}", kind, 2 if side == "a" and kind in HOMES else 1)
+        for kind in (*MATRIX, Kind.LEAKY)
+        for side in ("a", "b")
+    ]
+    late = [Site("lateleaky", Kind.LEAKY), Site("lateport", Kind.PORT)]
+    return [*both, *late, Site("short", Kind.PORT), Site("wifi", Kind.PORT, len(ROAMERS)), Site("phone", Kind.SYM)]
+
+
+def plain_pairs(part: str) -> list[Pair]:
+    """Every pair of the matrix once."""
+    pairs = itertools.combinations_with_replacement(MATRIX, 2)
+    return [Pair(part, a.value, b.value, f"{a.value}a1", f"{b.value}b1") for a, b in pairs]
+
+
+def special_pairs() -> list[Pair]:
+    """Two behind one router, and routers without a firewall, also where one side hears late of the other."""
+    homes = [Pair(HOME, k.value, k.value, f"{k.value}a1", f"{k.value}a2") for k in HOMES]
+    leaky = [
+        Pair(LEAKY, "leaky", "leaky", "leakya1", "leakyb1"),
+        Pair(LEAKY, "port", "leaky", "porta1", "leakyb1"),
+        Pair(LEAKY, "leaky", "leaky", "lateleaky1", "leakyb1", "the first is late"),
+        Pair(LEAKY, "leaky", "port", "lateleaky1", "portb1", "the first is late"),
+        Pair(LEAKY, "port", "leaky", "lateport1", "leakyb1", "the first is late"),
+    ]
+    return [*homes, *leaky]
+
+
+def roaming_pairs() -> list[Pair]:
+    """Pairs of which the first will be carried to the other network."""
+    return [Pair(MOVED, "port", to, roamer, f"{to}b1", NOTE_MOVED) for roamer, to in ROAMERS.items()]
+
+
+NOTE_MOVED = "the first is carried from Wi-Fi (port) to a phone (sym)"
+ROAMERS = {"wifi1": "none", "wifi2": "port", "wifi3": "full"}
+"""Hosts that are carried away, and the kind of whom they have met."""
+IDLE_PAIR = Pair(IDLE, "port", "port", "short1", "portb1", "mappings of the first live for 20 s")
+
+
+class Trial:
+    """One team of three: a bootstrap node on the public host, and the two of a pair."""
+
+    def __init__(self, fleet: Fleet, pair: Pair, number: int, rng: Random) -> None:
+        self.pair = pair
+        self._fleet = fleet
+        self._name = f"t{number}"
+        self._number = number
+        self._key = rng.randbytes(16).hex()
+        self._seeds = {host: rng.randbytes(32) for host in (PUB, pair.host_a, pair.host_b)}
+        self._publics = {host: Identity(seed).public.hex() for host, seed in self._seeds.items()}
+        self._is_swapped = rng.random() < 0.5
+        self.outcome = Outcome(pair.part, pair.a, pair.b, [None, None], note=pair.note)
+
+    @property
+    def order(self) -> tuple[str, str]:
+        """The two hosts, who comes first first."""
+        both = (self.pair.host_a, self.pair.host_b)
+        return (both[1], both[0]) if self._is_swapped and not self.pair.note else both
+
+    async def run(self, join_s: float, meet_s: float) -> None:
+        """Let the two join, one after the other, and see how long they need for each other."""
+        try:
+            port = (await self._start(PUB, [], join_s))["port"]
+            for host in self.order:
+                answer = await self._start(host, [f"{PUBS[0]}:{port}"], join_s)
+                if answer["joined_s"] is None:
+                    raise Lost(f"{host} did not join within {join_s:g} s")
+                self.outcome.joined_s.append(answer["joined_s"])
+            met = await asyncio.gather(*(self._ask("meet", host, meet_s) for host in self.order))
+            self.outcome.took_s = [answer["took_s"] for answer in met]
+            self.outcome.path = self._path([answer["path"] for answer in met], await self._bootstrap_paths())
+        except Lost as error:
+            self.outcome.trouble = str(error)
+
+    async def again(self, part: str, first: int) -> Outcome:
+        """See how long one side needs to reach the other again, of two that had met."""
+        host = self.order[first]
+        outcome = Outcome(part, self.pair.a, self.pair.b, [None], note=self.pair.note)
+        try:
+            answer = await self._ask("call", host, BACK_S)
+            outcome.took_s = [answer["took_s"]]
+            outcome.path = self._path([answer["path"]], await self._bootstrap_paths())
+        except Lost as error:
+            outcome.trouble = str(error)
+        return outcome
+
+    async def look(self) -> None:
+        """Take note how they reach each other by now."""
+        try:
+            paths = []
+            for host in self.order:
+                paths += (await self._fleet[host].order("path", trial=self._name, peers=[self._other(host)]))["paths"]
+            self.outcome.later = self._path(paths, await self._bootstrap_paths())
+        except Lost as error:
+            self.outcome.trouble = str(error)
+
+    async def end(self) -> None:
+        """End its nodes."""
+        for host in self._seeds:
+            await self._fleet[host].order("stop", trials=[self._name])
+
+    def _other(self, host: str) -> str:
+        return next(public for other, public in self._publics.items() if other not in (host, PUB))
+
+    async def _ask(self, do: str, host: str, limit_s: float) -> dict[str, Any]:
+        return await self._fleet[host].order(do, limit_s, trial=self._name, peer=self._other(host))
+
+    async def _bootstrap_paths(self) -> list[str]:
+        paths = []
+        for host in self.order:
+            asked = self._fleet[host].order("path", trial=self._name, peers=[self._publics[PUB]])
+            paths += (await asked)["paths"]
+        return paths
+
+    def _path(self, between: Sequence[str], to_bootstrap: Sequence[str]) -> str:
+        """The worse of the two directions; a relayed one whose first hop is a tunnel is one by tunnel."""
+        if "" in between:
+            return ""  # one of them never had an answer
+        if any(path != "direct" for path in between):
+            return "tunnel" if "tunnel" in (*between, *to_bootstrap) else "relayed"
+        return "direct"
+
+    async def _start(self, host: str, known: list[str], limit_s: float) -> dict[str, Any]:
+        tunnel_port = 4430 + self._number
+        # Who will be elsewhere listens at whatever address it has.
+        address = "*" if host in ROAMERS else self._fleet.net.address(host)
+        node: dict[str, Any] = {"name": self._name, "host": address, "port": 0, "team_key": self._key}
+        node["known_nodes"] = known
+        more: dict[str, Any] = {"lan": False}
+        if host == PUB:
+            node["roles"] = ["bootstrap"]
+            more["tunnel_port"] = tunnel_port
+        else:
+            more["tunnels"] = [f"wss://{PUBS[0]}:{tunnel_port}"]
+        node |= {name: value for name, value in more.items() if name in KNOBS}
+        sought = [public for other, public in self._publics.items() if other not in (host, PUB)] if known else []
+        order = {"trial": self._name, "node": node, "seed": self._seeds[host].hex(), "sought": sought}
+        return await self._fleet[host].order("start", limit_s, **order)
+
+
+class Matrix:
+    """One run: ``count`` rounds of every pair, ``lossy`` of them again with losses; ``say`` is told what happens."""
+
+    def __init__(self, net: Internet, fleet: Fleet, seed: int, say: Callable[[str], None]) -> None:
+        self.outcomes: list[Outcome] = []
+        self._net = net
+        self._fleet = fleet
+        self._rng = Random(seed)
+        self._say = say
+        self._numbers = itertools.count(1)
+        self._born = time.monotonic()
+
+    async def run(self, count: int, lossy: int) -> None:
+        """Try everything."""
+        self._net.mapping_life("short", SHORT_S)
+        for site in ("lateleaky", "lateport"):
+            self._net.weather(PUB, to=f"{site}-gw", delay=LATE_MS)
+        (idle,) = await self._wave([IDLE_PAIR], JOIN_S, MEET_S)
+        began = time.monotonic()
+        pairs = [*plain_pairs(PLAIN), *special_pairs()]
+        for number in range(count):
+            trials = await self._wave(pairs, JOIN_S, MEET_S)
+            self.outcomes += [trial.outcome for trial in trials]
+            if number < count - 1:
+                await self._end(trials)
+        if count:
+            await self._lost_mappings([trial for trial in trials if trial.pair.part == PLAIN])
+            await self._end(trials)
+            await self._moved()
+        for name in self._net.sites:
+            self._net.weather(name, loss=LOST_PERCENT)
+        for _ in range(lossy):
+            trials = await self._wave(plain_pairs(LOSS), LOSSY_JOIN_S, LOSSY_MEET_S)
+            self.outcomes += [trial.outcome for trial in trials]
+            await self._end(trials)
+        for name in self._net.sites:
+            self._net.heal(name)
+        if count and lossy:
+            self._tell(f"{time.monotonic() - began:.0f} s without a call between the two of the idle pair")
+            self.outcomes.append(await idle.again(IDLE, 1))
+
+    async def _wave(self, pairs: Sequence[Pair], join_s: float, meet_s: float) -> list[Trial]:
+        """Try all pairs at once."""
+        trials = [Trial(self._fleet, pair, next(self._numbers), self._rng) for pair in pairs]
+        await asyncio.gather(*(trial.run(join_s, meet_s) for trial in trials))
+        await asyncio.gather(*(trial.look() for trial in trials if not trial.outcome.trouble))
+        there = sum(not trial.outcome.trouble and None not in trial.outcome.took_s for trial in trials)
+        self._tell(f"{pairs[0].part}: {there} of {len(trials)} pairs have met")
+        return trials
+
+    async def _lost_mappings(self, trials: Sequence[Trial]) -> None:
+        """Cut the bootstrap off for a moment; let routers forget, then have other addresses; see who is back."""
+        met = [trial for trial in trials if None not in trial.outcome.took_s]
+        self._net.cut(PUB)
+        direct = [trial for trial in met if trial.outcome.later == "direct"]
+        found = await asyncio.gather(*(trial.again(ALONE, 0) for trial in direct))
+        self._net.heal(PUB)
+        self.outcomes += found
+        self._tell(f"{ALONE}: {sum(None not in one.took_s for one in found)} of {len(direct)} direct pairs go on")
+        routers = [name for name, site in self._net.sites.items() if site.kind is not Kind.NONE and name != "short"]
+        for part, first, change in ((FORGOTTEN, 0, self._net.forget), (RENUMBERED, 1, self._net.renumber)):
+            for name in routers:
+                change(name)
+            found = await asyncio.gather(*(trial.again(part, first) for trial in met))
+            self.outcomes += found
+            self._tell(f"{part}: {sum(None not in one.took_s for one in found)} of {len(found)} pairs are back")
+
+    async def _moved(self) -> None:
+        """Carry hosts to another network; see whether both sides reach each other again."""
+        trials = await self._wave(roaming_pairs(), JOIN_S, MEET_S)
+        for trial in trials:
+            self._net.move(trial.pair.host_a, "phone")
+        both = [trial.again(MOVED, first) for trial in trials for first in (0, 1)]
+        self.outcomes += await asyncio.gather(*both)
+        back = sum(None not in one.took_s for one in self.outcomes if one.part == MOVED)
+        self._tell(f"{MOVED}: {back} of {len(both)} sides are back")
+        await self._end(trials)
+
+    async def _end(self, trials: Sequence[Trial]) -> None:
+        await asyncio.gather(*(trial.end() for trial in trials))
+
+    def _tell(self, line: str) -> None:
+        self._say(f"{time.monotonic() - self._born:6.1f} s  {line}")

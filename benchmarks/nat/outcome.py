@@ -1,0 +1,150 @@
+"""Outcome: what came of each trial, and which promise that keeps; pure."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+
+from benchmarks.nat.kind import Kind
+
+MATRIX = (Kind.NONE, Kind.FULL, Kind.ADDR, Kind.PORT, Kind.SYM, Kind.NOUDP)
+PLAIN, ALONE, LOSS, HOME, LEAKY, FORGOTTEN, RENUMBERED, MOVED, IDLE = (
+    "plain",
+    "bootstrap cut off",
+    "30 % loss",
+    "one router",
+    "leaky",
+    "forgotten",
+    "renumbered",
+    "moved",
+    "idle",
+)
+"""The parts of a run."""
+DIRECT_S, RELAYED_S, LOSS_S, LEAKY_S, BACK_S, JOIN_S = 1.0, 2.5, 5.0, 5.0, 5.0, 2.5
+
+
+@dataclass
+class Outcome:
+    """One trial of the pair ``a`` and ``b``; ``took_s`` is what each of the two needed, None where it got no answer.
+
+    ``path`` is how they reached each other at their first answers, and ``later`` at the end of the trial.
+    """
+
+    part: str
+    a: str
+    b: str
+    took_s: list[float | None]
+    path: str = ""
+    later: str = ""
+    joined_s: list[float] = field(default_factory=list)
+    trouble: str = ""
+    note: str = ""
+
+    @property
+    def seconds(self) -> float:
+        """What the slower of the two needed; infinite where one got no answer."""
+        return max((math.inf if took is None else took for took in self.took_s), default=math.inf)
+
+    @property
+    def pair(self) -> tuple[str, str]:
+        """The two kinds."""
+        return self.a, self.b
+
+
+@dataclass(frozen=True)
+class Promise:
+    """One line of what is wanted: whether it was kept, and what was seen."""
+
+    what: str
+    seen: str
+    is_kept: bool
+
+
+def is_punchable(a: Kind, b: Kind) -> bool:
+    """Whether datagrams sent at the same time from both sides can open a way.
+
+    They cannot where a filter of ports meets ports that are another one for each peer.
+    """
+    closed = {Kind.PORT, Kind.SYM}
+    return Kind.NOUDP not in (a, b) and not (Kind.SYM in (a, b) and {a, b} <= closed)
+
+
+def percentile(values: Sequence[float], share: float) -> float:
+    """The smallest of ``values`` that at least ``share`` of them do not exceed; NaN where there are none."""
+    ordered = sorted(values)
+    return ordered[max(0, math.ceil(share * len(ordered)) - 1)] if ordered else math.nan
+
+
+def cell(outcomes: Sequence[Outcome]) -> str:
+    """What one pair comes to, as it stands in the table: the path, the median and the worst seconds."""
+    if not outcomes:
+        return ""
+    there = [one for one in outcomes if one.seconds < math.inf]
+    if not there:
+        return "fails"
+    paths = sorted({one.path for one in there}, key=lambda path: -sum(one.path == path for one in there))
+    middle = statistics.median(one.seconds for one in there)
+    words = f"{'/'.join(paths)} {middle:.2f} ({max(one.seconds for one in there):.2f})"
+    return words if len(there) == len(outcomes) else f"{words}, {len(outcomes) - len(there)} of {len(outcomes)} fail"
+
+
+def promises(outcomes: Iterable[Outcome]) -> list[Promise]:
+    """What is wanted of a run, in the order of the parts; what was not tried is not among it."""
+    every = list(outcomes)
+    plain = [one for one in every if one.part == PLAIN]
+    open_ones = [one for one in plain if is_punchable(Kind(one.a), Kind(one.b))]
+    closed = [one for one in plain if not is_punchable(Kind(one.a), Kind(one.b))]
+    wanted: list[Promise] = []
+
+    def want(what: str, some: Sequence[Outcome], kept: Callable[[Outcome], bool], share: float = 1.0) -> None:
+        if some:
+            held = [one for one in some if kept(one)]
+            times = [one.seconds for one in some]
+            seen = f"{len(held)} of {len(some)}; p50 {_s(percentile(times, 0.5))}, worst {_s(max(times))}"
+            wanted.append(Promise(what, seen, len(held) >= share * len(some)))
+
+    want("what can be punched is direct", open_ones, lambda one: one.path == "direct" and one.seconds < math.inf)
+    if open_ones:
+        p95 = percentile([one.seconds for one in open_ones], 0.95)
+        wanted.append(Promise(f"its 95th percentile is at most {DIRECT_S:g} s", _s(p95), p95 <= DIRECT_S))
+    want(f"all others reach each other within {RELAYED_S:g} s", closed, lambda one: one.seconds <= RELAYED_S)
+    tunnelled = [one for one in closed if Kind.NOUDP.value in one.pair]
+    if tunnelled:
+        times = [max(one.joined_s, default=math.inf) if len(one.joined_s) == 2 else math.inf for one in tunnelled]
+        seen = f"{sum(took <= JOIN_S for took in times)} of {len(times)}; worst {_s(max(times))}"
+        wanted.append(Promise(f"whose UDP is blocked joins within {JOIN_S:g} s", seen, max(times) <= JOIN_S))
+    for part, limit, share in (
+        (ALONE, DIRECT_S, 1.0),
+        (HOME, DIRECT_S, 1.0),
+        (LEAKY, LEAKY_S, 1.0),
+        (FORGOTTEN, BACK_S, 1.0),
+        (RENUMBERED, BACK_S, 1.0),
+        (MOVED, BACK_S, 1.0),
+        (IDLE, DIRECT_S, 1.0),
+    ):
+        some = [one for one in every if one.part == part]
+        want(_WANTED[part].format(limit), some, lambda one, limit=limit: one.seconds <= limit, share)  # type: ignore[misc]
+    lossy = [one for one in every if one.part == LOSS]
+    with_udp = [one for one in lossy if Kind.NOUDP.value not in one.pair]
+    without = [one for one in lossy if Kind.NOUDP.value in one.pair]
+    for some, of in ((lossy, "of all pairs"), (with_udp, "of those with UDP"), (without, "of those without")):
+        want(_WANTED[LOSS].format(LOSS_S, of), some, lambda one: one.seconds <= LOSS_S, 0.95)
+    return wanted
+
+
+_WANTED = {
+    ALONE: "who reaches each other directly goes on without the bootstrap: an answer within {:g} s",
+    HOME: "two behind one router within {:g} s",
+    LEAKY: "a router without a firewall, and one side late: within {:g} s",
+    LOSS: "30 % lost on both lines: within {:g} s 95 % {}",
+    FORGOTTEN: "all mappings forgotten: reached again within {:g} s",
+    RENUMBERED: "another outside address: reached again within {:g} s",
+    MOVED: "carried to another network: reached again, and reaching, within {:g} s",
+    IDLE: "mappings that live for 20 s, nothing said for a minute: an answer within {:g} s",
+}
+
+
+def _s(seconds: float) -> str:
+    return "never" if seconds == math.inf else f"{seconds:.2f} s"

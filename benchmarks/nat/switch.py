@@ -1,0 +1,178 @@
+"""Switch: the wide area as one process: it carries every frame between the sites by hand, and makes the lines bad.
+
+``python -m benchmarks.nat.switch SEED NAME=INTERFACE ..`` joins those interfaces of its namespace by raw sockets, so it
+needs no traffic control in the kernel.  Orders come as JSON lines, each is repeated when it is in force; it ends with
+its input.  A frame passes three lines: out of its site, along the way between the two sites, and into the other.
+"""
+
+from __future__ import annotations
+
+import heapq
+import json
+import os
+import select
+import socket
+import struct
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Iterator
+from random import Random
+from typing import Any, BinaryIO
+
+from benchmarks.nat.line import Line, Weather
+
+EVERYTHING = 3
+PACKET, IGNORE_OUTGOING = 263, 23
+ADDRESSES = 14
+"""Bytes of an Ethernet header: two addresses and a type."""
+IP_HEADERS = ADDRESSES + 20
+ARP = b"\x08\x06"
+BUFFER = 4 << 20
+AT_ONCE = 64
+SNAP = 65535
+FILE_HEADER = struct.pack("=IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, SNAP, 1)
+"""The old format of tcpdump: magic, version 2.4, no zone, whole frames, Ethernet."""
+
+
+class Port:
+    """One interface: where frames of one site come in and go out."""
+
+    def __init__(self, name: str, interface: str, rng: Random) -> None:
+        self.name = name
+        self.socket = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(EVERYTHING))
+        self.socket.setsockopt(PACKET, IGNORE_OUTGOING, 1)
+        self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER)
+        self.socket.bind((interface, 0))
+        self.socket.setblocking(False)
+        self.up, self.down = Line(rng), Line(rng)
+
+    def frames(self) -> Iterator[bytes]:
+        """What has come in, a bounded number at a time."""
+        for _ in range(AT_ONCE):
+            try:
+                yield self.socket.recv(SNAP)
+            except OSError:
+                return
+
+
+class Switch:
+    """All ports; frames go to where their receiver was last heard, or everywhere."""
+
+    def __init__(self, ports: dict[str, str], rng: Random) -> None:
+        self._rng = rng
+        self._ports = {name: Port(name, interface, rng) for name, interface in ports.items()}
+        self._by_file = {port.socket.fileno(): port for port in self._ports.values()}
+        self._ways: defaultdict[tuple[str, str], Line] = defaultdict(lambda: Line(rng))
+        self._heard_at: dict[bytes, Port] = {}
+        self._waiting: list[tuple[float, int, Port, bytes]] = []
+        self._number = 0
+        self._record: BinaryIO | None = None
+
+    def run(self, orders: int) -> None:
+        """Carry frames until the file ``orders`` ends."""
+        poll = select.epoll()
+        for file in (orders, *self._by_file):
+            poll.register(file, select.EPOLLIN)
+        rest = b""
+        while True:
+            wait = -1.0 if not self._waiting else max(0.0, self._waiting[0][0] - time.monotonic())
+            for file, _ in poll.poll(wait):
+                if file != orders:
+                    port = self._by_file[file]
+                    for frame in port.frames():
+                        self._enter(port, frame)
+                    continue
+                read = os.read(orders, 65536)
+                if not read:
+                    return
+                *lines, rest = (rest + read).split(b"\n")
+                for line in lines:
+                    sys.stdout.write(json.dumps(self._obey(json.loads(line))) + "\n")
+                    sys.stdout.flush()
+            now = time.monotonic()
+            while self._waiting and self._waiting[0][0] <= now:
+                _, _, port, frame = heapq.heappop(self._waiting)
+                self._leave(port, frame)
+
+    def _enter(self, source: Port, frame: bytes) -> None:
+        receiver, sender = frame[:6], frame[6:12]
+        self._heard_at[sender] = source
+        target = None if receiver[0] & 1 else self._heard_at.get(receiver)
+        targets = [target] if target is not None else [port for port in self._ports.values() if port is not source]
+        if self._record is not None:
+            self._write(frame)
+        now = time.monotonic()
+        for port in targets:
+            if port is source:
+                continue
+            lines = [source.up, port.down]
+            way = self._ways.get((source.name, port.name))
+            if way is not None:
+                lines.insert(1, way)
+            self._carry(lines, port, frame, now)
+
+    def _carry(self, lines: list[Line], port: Port, frame: bytes, now: float) -> None:
+        if frame[12:14] == ARP:
+            # A far line has no ARP on it, and who asks for a lost one again waits a whole second.
+            if not any(line.weather.loss == 100.0 for line in lines):
+                self._leave(port, frame)
+            return
+        moments = [now]
+        for line in lines:
+            moments = [later for moment in moments for later in line.fates(len(frame), moment)]
+            frame = line.spoiled(frame, IP_HEADERS)
+        for moment in moments:
+            if moment <= now:
+                self._leave(port, frame)
+            else:
+                self._number += 1
+                heapq.heappush(self._waiting, (moment, self._number, port, frame))
+
+    def _leave(self, port: Port, frame: bytes) -> None:
+        try:
+            port.socket.send(frame)
+        except OSError:
+            port.down.lost += 1
+
+    def _obey(self, order: dict[str, Any]) -> object:
+        match order["do"]:
+            case "weather":
+                self._line(order).weather = Weather(**order["weather"])
+            case "count":
+                return {name: {"up": port.up.counts, "down": port.down.counts} for name, port in self._ports.items()}
+            case "record":
+                self._record_to(order["file"])
+        return order
+
+    def _line(self, order: dict[str, Any]) -> Line:
+        if order["to"]:
+            return self._ways[order["port"], order["to"]]
+        port = self._ports[order["port"]]
+        return port.up if order["is_up"] else port.down
+
+    def _record_to(self, path: str) -> None:
+        if self._record is not None:
+            self._record.close()
+        self._record = None
+        if path:
+            self._record = open(path, "wb")  # noqa: SIM115 - it stays open until the order to close it
+            self._record.write(FILE_HEADER)
+
+    def _write(self, frame: bytes) -> None:
+        assert self._record is not None
+        now = time.time()
+        self._record.write(struct.pack("=IIII", int(now), int(now % 1 * 1_000_000), len(frame), len(frame)) + frame)
+
+
+def main(seed: str, *ports: str) -> None:
+    """Be the switch until the input ends."""
+    pairs = (port.partition("=")[::2] for port in ports)
+    switch = Switch(dict(pairs), Random(seed))
+    sys.stdout.write('"ready"\n')
+    sys.stdout.flush()
+    switch.run(0)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

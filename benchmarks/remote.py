@@ -1,0 +1,82 @@
+"""Remote: a process that is given orders in JSON lines and answers them by id."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import signal
+from pathlib import Path
+from typing import Any
+
+
+class Lost(Exception):
+    """A process ended, did not answer an order in time, or could not do it."""
+
+
+class Unable(Lost):
+    """What a process says of an order that it cannot do."""
+
+
+class Remote:
+    """One process, as ``name`` in what goes wrong; the file ``errors`` has what it writes to its standard error.
+
+    It answers the order 0, which nobody gives, when it takes orders.
+    """
+
+    def __init__(self, name: str, process: asyncio.subprocess.Process, errors: Path) -> None:
+        self.name = name
+        self.pid = process.pid
+        self.is_alive = True
+        self._process = process
+        self._errors = errors
+        self._number = 0
+        self._waiting: dict[int, asyncio.Future[dict[str, Any]]] = {0: asyncio.get_running_loop().create_future()}
+        self._reading = asyncio.ensure_future(self._read())
+
+    async def up(self, limit_s: float) -> None:
+        """Wait until it takes orders."""
+        await self._answered(0, "come up", limit_s)
+
+    async def order(self, do: str, patience_s: float, /, **fields: Any) -> dict[str, Any]:
+        """Have something done; raises ``Lost``."""
+        self._number += 1
+        self._waiting[self._number] = asyncio.get_running_loop().create_future()
+        assert self._process.stdin is not None
+        self._process.stdin.write(json.dumps({"do": do, "id": self._number, **fields}).encode() + b"\n")
+        answer = await self._answered(self._number, do, patience_s)
+        if "cannot" in answer:
+            raise Unable(answer["cannot"])
+        return answer
+
+    def send(self, number: signal.Signals) -> None:
+        """Kill or stop it; either way it takes no more orders."""
+        self.is_alive = False
+        if self._process.returncode is None:
+            self._process.send_signal(number)
+
+    async def ended(self) -> None:
+        """Kill it and wait until it is gone; also one that was stopped."""
+        self.send(signal.SIGKILL)
+        await self._process.wait()
+        self._reading.cancel()
+
+    async def _answered(self, number: int, what: str, limit_s: float) -> dict[str, Any]:
+        try:
+            return await asyncio.wait_for(self._waiting[number], limit_s)
+        except TimeoutError:
+            raise Lost(f"{self.name} did not {what} within {limit_s:g} s") from None
+        finally:
+            self._waiting.pop(number, None)
+
+    async def _read(self) -> None:
+        assert self._process.stdout is not None
+        while line := await self._process.stdout.readline():
+            answer = json.loads(line)
+            waiting = self._waiting.get(answer["id"])
+            if waiting is not None and not waiting.done():
+                waiting.set_result(answer)
+        last = (self._errors.read_text(errors="replace").strip() or "without a word").splitlines()[-1]
+        for waiting in self._waiting.values():
+            if not waiting.done():
+                waiting.set_exception(Lost(f"the process of {self.name} ended: {last}"))
+                waiting.exception()

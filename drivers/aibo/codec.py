@@ -1,0 +1,171 @@
+"""Codec of the dog's own ports: walk, head, joints, e-stop, world state and gains; pure.
+
+All numbers are little-endian, 32 bits wide.  The world state comes in two dialects, which the reader tells apart by
+its first bytes: ``T4`` (Tekkotsu 4.0 and 5.x: model, counts of everything) and ``T2`` (2.x: no model, no frame
+number).  Counts are taken from the stream, so other models than the ERS-7 are read as well.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from drivers.aibo.cursor import Cursor, Short
+from drivers.errors import BadFrame
+
+T4, T2 = "T4", "T2"
+MAX_LINE = 4096
+MODEL_START = b"ERS-"
+PID_JOINTS = 18
+COMMAND = 5
+"""Every walk and head command is so many bytes: a letter and a float."""
+
+
+@dataclass(frozen=True)
+class WorldState:
+    """What the dog feels at ``t`` ms after it was switched on (it wraps after 49.7 days)."""
+
+    dialect: str
+    model: str
+    t: int
+    frame: int
+    outputs: tuple[float, ...]
+    sensors: tuple[float, ...]
+    buttons: tuple[float, ...]
+    duties: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Gains:
+    """The gains P, I and D of each joint at ``t`` ms."""
+
+    t: int
+    pids: tuple[tuple[float, float, float], ...]
+
+
+def command(letter: str, value: float) -> bytes:
+    """A walk command (``f s r`` and the digits) or a head command (``t p r``), -1 to 1."""
+    return struct.pack("<cf", letter.encode("ascii"), value)
+
+
+def pose(positions: Sequence[float]) -> bytes:
+    """All joints at once, in radians, as the joint writer of Tekkotsu 2.x reads them."""
+    if len(positions) != PID_JOINTS:
+        raise ValueError(f"a pose has {PID_JOINTS} joints, not {len(positions)}")
+    return struct.pack(f"<{PID_JOINTS}f", *positions)
+
+
+class CommandReader:
+    """The dog's side of walk and head: cuts a stream into commands, however it is cut."""
+
+    def __init__(self) -> None:
+        self._rest = bytearray()
+
+    def read(self, data: bytes) -> Iterator[tuple[str, float]]:
+        """Yield letter and value of each command that ``data`` completes."""
+        self._rest += data
+        while len(self._rest) >= COMMAND:
+            letter, value = struct.unpack("<cf", self._rest[:COMMAND])
+            del self._rest[:COMMAND]
+            yield letter.decode("latin-1"), value
+
+
+class LineReader:
+    """Cuts a stream into lines; a line that never ends is thrown away and counted."""
+
+    def __init__(self) -> None:
+        self.bad_lines = 0
+        self._rest = b""
+
+    def read(self, data: bytes) -> Iterator[str]:
+        """Yield the lines that ``data`` completes, without their ends."""
+        *lines, self._rest = (self._rest + data).split(b"\n")
+        if len(self._rest) > MAX_LINE:
+            self._rest = b""
+            self.bad_lines += 1
+        for line in lines:
+            if len(line) > MAX_LINE:
+                self.bad_lines += 1
+                continue
+            yield line.removesuffix(b"\r").decode("latin-1")
+
+
+def encoded(state: WorldState) -> bytes:
+    """The packet of ``state`` in its own dialect; T2 knows joints only, which are the first of the outputs."""
+    if state.dialect == T2:
+        rows = (state.outputs[: len(state.duties)], state.sensors, state.buttons)
+        return struct.pack("<I", state.t) + b"".join(_counted(row) for row in rows) + _floats(state.duties)
+    head = state.model.encode("ascii") + b"\0" + struct.pack("<II", state.t, state.frame)
+    return head + b"".join(_counted(row) for row in (state.outputs, state.sensors, state.buttons, state.duties))
+
+
+def encoded_gains(gains: Gains) -> bytes:
+    """The packet of ``gains``."""
+    flat = [value for row in gains.pids for value in row]
+    return struct.pack("<II", gains.t, len(gains.pids)) + _floats(flat)
+
+
+def _floats(row: Sequence[float]) -> bytes:
+    return struct.pack(f"<{len(row)}f", *row)
+
+
+def _counted(row: Sequence[float]) -> bytes:
+    return struct.pack("<I", len(row)) + _floats(row)
+
+
+class StateReader:
+    """Cuts a stream into world states of whichever dialect; raises ``BadFrame`` where it is neither.
+
+    There is no mark to find the next packet by: after ``BadFrame`` the link has to be opened again, with a new reader.
+    """
+
+    def __init__(self) -> None:
+        self._rest = bytearray()
+        self._need = 8
+
+    def read(self, data: bytes) -> Iterator[WorldState]:
+        """Yield the world states that ``data`` completes."""
+        self._rest += data
+        while len(self._rest) >= self._need:
+            cursor = Cursor(bytes(self._rest))
+            try:
+                state = _state(cursor, self._rest.startswith(MODEL_START))
+            except Short as short:
+                self._need = short.need
+                continue
+            del self._rest[: cursor.at]
+            self._need = 8
+            yield state
+
+
+def _state(cursor: Cursor, has_model: bool) -> WorldState:
+    if has_model:
+        model = cursor.until_nul()
+        t, frame = cursor.words(2)
+        return WorldState(T4, model, t, frame, cursor.row(), cursor.row(), cursor.row(), cursor.row())
+    (t,) = cursor.words(1)
+    joints = cursor.count()
+    if joints != PID_JOINTS:
+        raise BadFrame(f"neither dialect begins so: no model, and {joints} joints")
+    return WorldState(T2, "", t, 0, cursor.floats(joints), cursor.row(), cursor.row(), cursor.floats(joints))
+
+
+class GainReader:
+    """Cuts the stream of port 10032 into gains; raises ``BadFrame`` where it is none, as ``StateReader`` does."""
+
+    def __init__(self) -> None:
+        self._rest = bytearray()
+
+    def read(self, data: bytes) -> Iterator[Gains]:
+        """Yield the gains that ``data`` completes."""
+        self._rest += data
+        while True:
+            cursor = Cursor(bytes(self._rest))
+            try:
+                (t,) = cursor.words(1)
+                flat = cursor.floats(3 * cursor.count())
+            except Short:
+                return
+            del self._rest[: cursor.at]
+            yield Gains(t, tuple(zip(flat[::3], flat[1::3], flat[2::3], strict=True)))

@@ -1,0 +1,150 @@
+"""Link: one port of the dog as the driver sees it, over TCP or, for the camera, over datagrams."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+from twisted.internet.defer import Deferred, succeed
+from twisted.internet.interfaces import IReactorTime
+from twisted.internet.protocol import DatagramProtocol
+
+from drivers.link import Connector, Line, Link
+
+WAITS = (0.5, 1.0, 2.0, 5.0)
+"""A port that was just closed does not accept at once; so long the dog's own clients wait as well."""
+FLUSH_S = 1.0
+
+
+class Port:
+    """One port that is called until it answers, and again when it is lost; it knows no message."""
+
+    def __init__(
+        self,
+        connector: Connector,
+        clock: IReactorTime,
+        address: tuple[str, int],
+        on_up: Callable[[], None],
+        on_down: Callable[[], None],
+        on_bytes: Callable[[bytes], None],
+    ) -> None:
+        self.opened_at: float | None = None
+        self._connector = connector
+        self._clock = clock
+        self._address = address
+        self._on_up = on_up
+        self._on_down = on_down
+        self._on_bytes = on_bytes
+        self._line: Line | None = None
+        self._link: Link | None = None
+
+    @property
+    def number(self) -> int:
+        """The port's number."""
+        return self._address[1]
+
+    @property
+    def link(self) -> Link | None:
+        """The link there is now."""
+        return self._link
+
+    @property
+    def is_up(self) -> bool:
+        """Whether there is a link now."""
+        return self._link is not None
+
+    def open(self) -> None:
+        """Call now, and go on calling; where there is a link already, it stays."""
+        if self._link is not None:
+            return
+        if self._line is not None:
+            self._line.hang_up()
+        else:
+            self.opened_at = self._clock.seconds()
+        self._line = self._connector.call(*self._address, self)
+
+    def send(self, data: bytes) -> None:
+        """Send bytes; does nothing without a link."""
+        if self._link is not None:
+            self._link.send(data)
+
+    def drop(self) -> None:
+        """Break the link; it is opened again after a wait."""
+        if self._link is not None:
+            self._link.close()
+
+    def close(self) -> Deferred[None]:
+        """Close for good: what was sent leaves first, but nobody waits long for a link that is dead."""
+        line, self._line = self._line, None
+        if line is None:
+            return succeed(None)
+        link, self.opened_at = self._link, None
+        closed = line.hang_up()
+        if link is not None and not closed.called:
+            patience = self._clock.callLater(FLUSH_S, link.close)
+            closed.addCallback(lambda _: patience.cancel() if patience.active() else None)
+        return closed
+
+    def link_up(self, link: Link) -> None:
+        """Take the link; called by the line."""
+        self._link = link
+        self._on_up()
+
+    def link_down(self) -> None:
+        """Forget the link; called by the line."""
+        self._link = None
+        self.opened_at = None if self._line is None else self._clock.seconds()
+        self._on_down()
+
+    def received(self, data: bytes) -> None:
+        """Take bytes; called by the line."""
+        if self._line is not None:
+            self._on_bytes(data)
+
+
+class Datagrams(Protocol):
+    """What opens the way for datagrams."""
+
+    def open(self, host: str, port: int, received: Callable[[bytes], None]) -> Link:
+        """A way to ``host``, whose datagrams go to ``received``."""
+
+
+class UdpDatagrams:
+    """Datagrams over UDP on ``reactor``, from a port that the machine chooses."""
+
+    def __init__(self, reactor: Any) -> None:
+        self._reactor = reactor
+
+    def open(self, host: str, port: int, received: Callable[[bytes], None]) -> Link:
+        """A way to ``host``, whose datagrams go to ``received``."""
+        link = _UdpLink(host, port, received)
+        self._reactor.listenUDP(0, link, maxPacketSize=65536)
+        return link
+
+
+class _UdpLink(DatagramProtocol):
+    noisy = False
+    is_busy = False
+
+    def __init__(self, host: str, port: int, received: Callable[[bytes], None]) -> None:
+        self._address = (host, port)
+        self._received = received
+
+    def startProtocol(self) -> None:
+        transport: Any = self.transport
+        transport.connect(*self._address)
+
+    def datagramReceived(self, datagram: bytes, addr: object) -> None:
+        self._received(datagram)
+
+    def connectionRefused(self) -> None:
+        """Nothing listens there yet; the request is sent again."""
+
+    def send(self, data: bytes) -> None:
+        transport: Any = self.transport
+        if transport is not None:
+            transport.write(data)
+
+    def close(self) -> None:
+        if self.transport is not None:
+            self.transport.stopListening()

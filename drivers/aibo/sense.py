@@ -1,0 +1,96 @@
+"""Sense: what the numbers of a world state mean: names, units and bounds of an ERS-7; pure, both ways.
+
+Names are Tekkotsu's.  The signs of the accelerometers are as its headers say; nobody has checked them on a dog.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+from drivers.aibo.codec import T2, WorldState
+from drivers.errors import BadFrame
+from drivers.reading import Value
+
+MODEL = "ERS-7"
+JOINTS = (
+    *(f"{leg}:{joint}" for leg in ("LFr", "RFr", "LBk", "RBk") for joint in ("rotor", "elvtr", "knee")),
+    *("NECK:tilt", "NECK:pan", "NECK:nod", "TAIL:tilt", "TAIL:pan", "MOUTH"),
+)
+RANGES = {"near": (0.05, 0.5), "far": (0.2, 1.5), "chest": (0.1, 0.9)}
+"""The infrared rangers in the order of the packet, each with what it can measure in metres."""
+BUTTONS = ("LFrPaw", "RFrPaw", "LBkPaw", "RBkPaw", "chin", "head", "frontback", "middleback", "rearback", "wireless")
+PAN, TILT, NOD = (-1.536, 1.536), (-1.309, 0.0), (-0.262, 0.785)
+OUTPUTS = 47
+TAKEN_MM = 10_000.0
+"""Beyond this no infrared says anything that can be believed."""
+
+_SENSOR_BOUNDS = (
+    *((-1.0, TAKEN_MM),) * 3,
+    *((-200.0, 200.0),) * 3,
+    *((-0.01, 1.5), (-50.0, 150.0), (0.0, 1e5), (0.0, 100.0), (-1e5, 1e5)),
+)
+_CAPACITY_MAH = 2200.0
+
+
+def is_known(state: WorldState) -> bool:
+    """Whether it comes from a dog whose numbers have names here; old Tekkotsu does not name its model."""
+    counts = (len(state.sensors), len(state.buttons), len(state.duties))
+    return state.model in (MODEL, "") and counts == (len(_SENSOR_BOUNDS), len(BUTTONS), len(JOINTS))
+
+
+def values(state: WorldState) -> dict[str, Value]:
+    """What a dog feels under the keys of an observation; raises ``BadFrame`` where any of it cannot be.
+
+    A range is NaN where the sensor sees as far as it can: then nothing is there.
+    """
+    joints = state.outputs[: len(JOINTS)]
+    if len(joints) != len(JOINTS):
+        raise BadFrame(f"an ERS-7 has {len(JOINTS)} joints, not {len(joints)}")
+    _check(state.sensors, _SENSOR_BOUNDS)
+    _check(joints, ((-math.tau, math.tau),) * len(joints))
+    _check(state.buttons, ((-1.0, 10.0),) * len(state.buttons))
+    _check(state.duties, ((-2.0, 2.0),) * len(state.duties))
+    sensors = state.sensors
+    found: dict[str, Value] = {}
+    for (name, (_, far)), mm in zip(RANGES.items(), sensors, strict=False):
+        found[f"range.{name}"] = math.nan if mm >= far * 1000.0 else max(mm, 0.0) / 1000.0
+    found |= {"imu.ax": -sensors[3], "imu.ay": sensors[4], "imu.az": -sensors[5]}
+    found |= {
+        "power.level": min(max(sensors[6], 0.0), 1.0),
+        "power.celsius": sensors[7],
+        "power.volts": sensors[9],
+        "power.amps": sensors[10] / 1000.0,
+    }
+    for name, pressed in zip(BUTTONS, state.buttons, strict=True):
+        found[f"button.{name}"] = min(max(pressed, 0.0), 1.0)
+    for name, position, duty in zip(JOINTS, joints, state.duties, strict=True):
+        found[f"joint.{name}.pos"] = position
+        found[f"joint.{name}.effort"] = min(max(duty, -1.0), 1.0)
+    found |= {"ptz.tilt": joints[12], "ptz.pan": joints[13], "ptz.nod": joints[14]}
+    return found
+
+
+def state(values: Mapping[str, Value], joints: Sequence[float], dialect: str, t: int, frame: int) -> WorldState:
+    """The packet of an ERS-7 that feels ``values`` and holds its joints so; what is missing is as at rest."""
+
+    def number(key: str, default: float) -> float:
+        return float(values.get(key, default))
+
+    sensors = []
+    for name, (near, far) in RANGES.items():
+        metres = number(f"range.{name}", math.nan)
+        sensors.append(1000.0 * (far if math.isnan(metres) else min(max(metres, near), far)))
+    sensors += [-number("imu.ax", 0.0), number("imu.ay", 0.0), -number("imu.az", 9.81)]
+    sensors += [number("power.level", 1.0), number("power.celsius", 30.0), _CAPACITY_MAH]
+    sensors += [number("power.volts", 7.9), 1000.0 * number("power.amps", -1.2)]
+    outputs = (*joints, *(0.0,) * (OUTPUTS - len(joints)))
+    buttons = tuple(number(f"button.{name}", 0.0) for name in BUTTONS)
+    model = "" if dialect == T2 else MODEL
+    return WorldState(dialect, model, t, frame, outputs, tuple(sensors), buttons, (0.0,) * len(joints))
+
+
+def _check(row: Sequence[float], bounds: Sequence[tuple[float, float]]) -> None:
+    for value, (low, high) in zip(row, bounds, strict=True):
+        if not low <= value <= high:  # NaN is in no bounds
+            raise BadFrame(f"{value} lies outside {low} to {high}")

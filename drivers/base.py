@@ -1,0 +1,341 @@
+"""Base: what the driver of any robot does the same way; a robot of one's own adds how its link speaks.
+
+A kind of robot inherits from ``BaseDriver``, says five things to its robot (``_open _close _power _drive _halt``), and
+tells what it hears (``_up _observed _down _refused``).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from twisted.internet.defer import Deferred, fail, gatherResults, succeed
+from twisted.internet.interfaces import IReactorTime
+from twisted.logger import Logger
+
+from drivers.deadman.switch import DeadMan, LastWord
+from drivers.driver import Permit
+from drivers.errors import LinkLost, NoReply, NotEnabled, Unsupported, UsageError
+from drivers.gate import Gate
+from drivers.reading import Action, Description, Frame, Observation, Value
+
+ENGAGED = "estop.engaged"
+"""Whether the robot's own switch keeps its motors off; a robot without one leaves the key out."""
+
+
+def heard_at(moment: float, due: float, now: float) -> float:
+    """When a robot was heard last, for who should have looked at ``due`` and does so ``now``.
+
+    While this process was frozen nobody listened: that time is no silence of the robot's, whose words wait to be read.
+    """
+    return min(now, moment + max(0.0, now - due))
+
+
+class BaseDriver:
+    """One robot called ``name``; everything happens on the reactor's thread.
+
+    ``state`` says ``ready`` while observations flow, ``stale`` while they do not (none for ``STALE_S``, or the link is
+    being opened again) and ``stopped`` after ``disable``.  A link that comes back finds the motors as they were asked
+    for, and the motion at rest.  The motion ends by itself at the permit's deadline, and no token older than the
+    newest is obeyed.  Where the robot itself knows no deadlines, ``dead_man`` halts it when this process stands still.
+    """
+
+    log = Logger()
+    STALE_S = 0.25
+    """Without an observation for so long the link counts as stale."""
+    SWITCH_S = 1.0
+    """A robot that has not switched its motors after so long does not answer."""
+
+    def __init__(
+        self, description: Description, name: str, clock: IReactorTime, dead_man: DeadMan | None = None
+    ) -> None:
+        self._description = description
+        self._name = name
+        self._clock = clock
+        self._dead_man = dead_man
+        self._gate = Gate()
+        self._is_open = self._is_closed = self._is_up = self._is_heard = False
+        self._connecting: Deferred[Description] | None = None
+        self._wants_motors: bool | None = None
+        self._switching: list[tuple[bool, Deferred[bool], Any]] = []
+        self._motion = dict.fromkeys(description.limits, 0.0)
+        self._end: Any = None
+        self._newest: Observation | None = None
+        self._seen: list[Callable[[Observation], None]] = []
+        self._counts = dict.fromkeys(("frames", "bad_frames", "pictures", "bytes", "links", "refused"), 0)
+
+    # -- the contract -----------------------------------------------------------------------------------------------
+
+    @property
+    def description(self) -> Description:
+        """What the robot is; valid before ``connect``."""
+        return self._description
+
+    @property
+    def state(self) -> str:
+        """Where the link stands: ``idle connecting ready stale stopped closed``."""
+        if self._is_closed:
+            return "closed"
+        if not self._is_open:
+            return "idle"
+        if self._newest is None:
+            return "connecting"
+        if not self._is_heard or self._clock.seconds() - self._newest.t_host > self.STALE_S:
+            return "stale"
+        return "stopped" if self._wants_motors is False else "ready"
+
+    @property
+    def token(self) -> int:
+        """The highest token that the robot has obeyed, as far as it told, whoever commanded it then."""
+        return self._gate.token or 0
+
+    def connect(self) -> Deferred[Description]:
+        """Open the link; fires when the first observation has arrived.  Lost links are opened again with back-off."""
+        if self._is_closed:
+            return fail(UsageError("this driver was disconnected; make a new one"))
+        if self._is_open:
+            return fail(UsageError("this driver is connected already, or on its way"))
+        self._is_open = True
+        connecting = self._connecting = Deferred(self._on_cancelled_connecting)
+        self._open()
+        return connecting
+
+    def disconnect(self) -> Deferred[None]:
+        """Stop the motion, then close.  May be called twice."""
+        if self._is_closed:
+            return succeed(None)
+        self.stop()
+        ended = self._shut()
+        self._fail_connecting(LinkLost(f"{self._name}: disconnected before the first observation"))
+        closed = self._close() if self._is_open else succeed(None)
+        return closed if ended is None else gatherResults([closed, ended]).addCallback(lambda _: None)
+
+    def enable(self) -> Deferred[bool]:
+        """Motors on; fires with True when the robot says so, fails with ``LinkLost`` or ``NoReply``."""
+        return self._switch(True)
+
+    def disable(self) -> Deferred[bool]:
+        """Motors off; fires with True when the robot says so, fails with ``LinkLost`` or ``NoReply``."""
+        self.stop()
+        return self._switch(False)
+
+    def act(self, action: Action, permit: Permit) -> Action:
+        """Do ``action`` until ``permit.deadline``; returns what is really done, clipped to the limits.  Never blocks.
+
+        Raises ``NotEnabled``, ``Unsupported`` (unknown key, NaN), ``StaleCommand``.
+        """
+        for key, value in action.items():
+            if key not in self._motion:
+                known = ", ".join(self._motion) or "none"
+                raise Unsupported(f"{self._name} has no action {key!r}; it knows {known}")
+            if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+                raise Unsupported(f"{key} must be a finite number, not {value!r}")
+        if self.state != "ready" or self._newest is None or not self._is_up:
+            raise NotEnabled(f"{self._name} is {self.state}, not ready; wait for the link, or call enable()")
+        if self._newest.values.get(ENGAGED, False) is not False:
+            raise NotEnabled(f"{self._name}'s motors are off; call enable() first")
+        now = self._clock.seconds()
+        if self._gate.is_over(now):
+            # This process stood still: what was in force is not, whoever has halted the robot.
+            self.stop()
+        self._gate.admit(permit, now)
+        for key, value in action.items():
+            low, high = self._description.limits[key]
+            self._motion[key] = min(max(float(value), low), high)
+        if self._dead_man is not None:
+            self._dead_man.until(permit.deadline - now)
+        done = self._drive(self._motion, permit)
+        self._cancel_end()
+        self._end = self._clock.callLater(permit.deadline - now, self._on_end)
+        return dict(done)
+
+    def stop(self) -> Action:
+        """Zero motion now; safe in any state and never refused."""
+        self._rest()
+        if self._is_up:
+            self._halt()
+        return dict(self._motion)
+
+    def observe(self) -> Observation | None:
+        """The newest observation; never blocks."""
+        return self._newest
+
+    def subscribe(self, seen: Callable[[Observation], None]) -> Callable[[], None]:
+        """Call ``seen`` at each observation; call what is returned to end that."""
+        self._seen.append(seen)
+
+        def end() -> None:
+            if seen in self._seen:
+                self._seen.remove(seen)
+
+        return end
+
+    def invoke(self, name: str, **arguments: float | str) -> Deferred[Mapping[str, Value]]:
+        """Have the robot do one of ``description.skills``, or tell something that is not observed all the time."""
+        known = ", ".join(self._description.skills) or "none"
+        return fail(Unsupported(f"{self._name} has no skill {name!r}; it knows {known}"))
+
+    def diagnostics(self) -> dict[str, float]:
+        """Counters: frames, bad frames, pictures, bytes, links, reconnects, refused; ``age`` of the newest in s.
+
+        Also the commands ``accepted`` here, and those refused as ``lower token`` or ``late``; ``halts``, how often the
+        dead man's switch halted the robot, where it has one.
+        """
+        counts: dict[str, float] = {**self._counts, "accepted": self._gate.accepted, **self._gate.refused}
+        if self._dead_man is not None:
+            counts["halts"] = self._dead_man.halts
+        counts["reconnects"] = max(0, self._counts["links"] - 1)
+        counts["age"] = math.inf if self._newest is None else self._clock.seconds() - self._newest.t_host
+        return counts
+
+    # -- what a kind of robot says to its robot ---------------------------------------------------------------------
+
+    def _open(self) -> None:
+        """Begin to open the link, and open it again whenever it is lost; ``_up`` when there is one."""
+        raise NotImplementedError
+
+    def _close(self) -> Deferred[None]:
+        """Close the link for good."""
+        raise NotImplementedError
+
+    def _power(self, on: bool) -> None:
+        """Switch the motors; done when an observation says so, or where it says nothing of that, at once."""
+
+    def _drive(self, motion: Action, permit: Permit) -> Action:
+        """Move like this from now on; returns what the robot really does, where it can do only some of it."""
+        raise NotImplementedError
+
+    def _halt(self) -> None:
+        """Stand still now."""
+
+    def _last_word(self) -> LastWord | None:
+        """By what another process halts the robot while there is a link; None where the robot stops by itself."""
+        return None
+
+    # -- what a kind of robot hears from its robot ------------------------------------------------------------------
+
+    def _up(self) -> None:
+        """There is a link: a first one, or one after a loss."""
+        self._is_up = True
+        self._counts["links"] += 1
+        self._guard()
+        if self._wants_motors:
+            self._power(True)
+
+    def _down(self) -> None:
+        """The link is gone: the motion is at rest, as far as it is known."""
+        self._is_up = self._is_heard = False
+        self._rest()
+        if self._dead_man is not None:
+            self._dead_man.leave()
+        self._fail_switching(LinkLost(f"the link to {self._name} went away; it is being opened again"))
+
+    def _observed(
+        self,
+        values: Mapping[str, Value],
+        t_robot: float,
+        samples: Mapping[str, Sequence[float]] | None = None,
+        frame: Frame | None = None,
+    ) -> None:
+        """The robot says how it is."""
+        told = {key: tuple(row) for key, row in (samples or {}).items()}
+        observation = self._newest = Observation(self._clock.seconds(), t_robot, values, told, frame)
+        self._is_heard = True
+        self._settle_switching(values.get(ENGAGED))
+        connecting, self._connecting = self._connecting, None
+        if connecting is not None:
+            connecting.callback(self._description)
+        for seen in list(self._seen):
+            try:
+                seen(observation)
+            except Exception:
+                self.log.failure("a subscriber of {robot} failed", robot=self._name)
+
+    def _refused(self, error: Exception) -> None:
+        """There is no such robot, for good."""
+        self._shut()
+        self._close()
+        if self._connecting is None:
+            self.log.error("{robot}: {error}", robot=self._name, error=error)
+        self._fail_connecting(error)
+
+    @property
+    def _may_move(self) -> bool:
+        """Whether a motion is in force whose deadline lies ahead.
+
+        Asked by whoever says a motion again: after a freeze of the node all timers are late, and what repeats a motion
+        may be called before what ends it.
+        """
+        return self._gate.deadline is not None and not self._gate.is_over(self._clock.seconds())
+
+    # -- inside -----------------------------------------------------------------------------------------------------
+
+    def _guard(self) -> None:
+        """Tell the dead man's switch by what the robot is halted now."""
+        word = None if self._dead_man is None else self._last_word()
+        if self._dead_man is not None and word is not None:
+            self._dead_man.guard(word)
+
+    def _switch(self, on: bool) -> Deferred[bool]:
+        if not self._is_up or self._newest is None:
+            return fail(LinkLost(f"{self._name} is {self.state}; connect first, or wait for the link"))
+        self._fail_switching(UsageError("another enable() or disable() came in between"))
+        self._wants_motors = on
+        self._power(on)
+        if ENGAGED not in self._newest.values:
+            return succeed(True)
+        switched: Deferred[bool] = Deferred()
+        self._switching.append((on, switched, self._clock.callLater(self.SWITCH_S, self._on_no_switch)))
+        return switched
+
+    def _settle_switching(self, is_engaged: object) -> None:
+        waiting, self._switching = self._switching, []
+        for on, switched, timer in waiting:
+            if is_engaged is (not on):
+                timer.cancel()
+                switched.callback(True)
+            else:
+                self._switching.append((on, switched, timer))
+
+    def _on_no_switch(self) -> None:
+        self._fail_switching(NoReply(f"{self._name} did not switch its motors within {self.SWITCH_S:g} s"))
+
+    def _fail_switching(self, error: Exception) -> None:
+        waiting, self._switching = self._switching, []
+        for _, switched, timer in waiting:
+            if timer.active():
+                timer.cancel()
+            switched.errback(error)
+
+    def _on_cancelled_connecting(self, _connecting: object) -> None:
+        self._connecting = None
+        self.disconnect()
+
+    def _fail_connecting(self, error: Exception) -> None:
+        connecting, self._connecting = self._connecting, None
+        if connecting is not None:
+            connecting.errback(error)
+
+    def _on_end(self) -> None:
+        self._end = None
+        self.stop()
+
+    def _rest(self) -> None:
+        self._cancel_end()
+        self._gate.close()
+        if self._dead_man is not None:
+            self._dead_man.rest()
+        for key in self._motion:
+            self._motion[key] = 0.0
+
+    def _cancel_end(self) -> None:
+        if self._end is not None and self._end.active():
+            self._end.cancel()
+        self._end = None
+
+    def _shut(self) -> Deferred[None] | None:
+        self._is_closed = True
+        self._rest()
+        self._fail_switching(LinkLost(f"{self._name}: disconnected"))
+        return None if self._dead_man is None else self._dead_man.close()

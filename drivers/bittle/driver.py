@@ -1,0 +1,402 @@
+"""BittleDriver: Petoi's robot dog on a cable or over Wi-Fi.
+
+A gait goes on until another skill is asked for: the robot has no time-out of its own.  So the driver ends each motion
+at its deadline, and a process beside it where this one stands still; a dog whose link is lost while it walks walks on.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from twisted.internet.defer import Deferred, fail, succeed
+from twisted.internet.interfaces import IReactorTime
+from twisted.python.failure import Failure
+
+from drivers.base import ENGAGED, BaseDriver
+from drivers.bittle import codec
+from drivers.bittle.dialogue import Dialogue
+from drivers.bittle.gait import REST, STAND, Velocity, chosen
+from drivers.bittle.link import HttpLine
+from drivers.bittle.option import JOINT_LIMITS, JOINT_NAMES, Options, described
+from drivers.deadman.switch import DeadMan, LastWord
+from drivers.driver import Permit
+from drivers.errors import BadFrame, DriverError, LinkLost, NotEnabled, Unsupported
+from drivers.link import Connector, Line, Link
+from drivers.reading import Action, Value
+
+GREET_S = 1.0
+"""A robot that has not told its version after so long is asked again: it may be booting."""
+POLL_S, HTTP_POLL_S = 0.05, 0.2
+POLL_PATIENCE_S = 1.0
+GAIT_S = 1.0
+"""A gait that the robot has not taken after so long is asked for again."""
+REST_S = 2.0
+"""And so long to lie down."""
+SKILL_S = 15.0
+"""A behaviour is over after so long; the longest take about eight seconds."""
+MISSES = 3
+"""After so many missing answers what the robot told before is no longer told; and when all fail, it is greeted anew."""
+SLOW_EVERY = 20
+"""The battery is asked for once in so many questions."""
+EMPTY_V, FULL_V = 6.8, 8.4
+"""Two lithium cells."""
+
+
+class BittleDriver(BaseDriver):
+    """One dog.
+
+    ``enable`` has it stand, ``disable`` lie down with its servos off, as it does after ``connect``.  ``act`` returns
+    the velocity of the gait that comes nearest to what is wished for, and where the dog is, is reckoned from that.
+    """
+
+    SWITCH_S = 4.0
+
+    def __init__(
+        self,
+        options: Options,
+        name: str,
+        connector: Connector,
+        clock: IReactorTime,
+        dead_man: DeadMan | None = None,
+    ) -> None:
+        super().__init__(described(options), name, clock, dead_man)
+        self.STALE_S = 2.0 if options.host else 1.0
+        self._options = options
+        self._gaits = dict(options.gaits)
+        self._moving = {codec.skill(name) for name, velocity in options.gaits if velocity != REST}
+        self._connector = connector
+        self._line: Line | None = None
+        self._link: Link | None = None
+        self._reader = codec.LineReader()
+        self._dialogue = Dialogue(clock, self._send)
+        self._board = ""
+        self._timer: Any = None
+        self._greet_s = GREET_S
+        self._problem = ""
+        self._wish = ""
+        self._is_sure = True
+        self._walk = REST
+        self._walk_since = clock.seconds()
+        self._pose = (0.0, 0.0, 0.0)
+        self._is_lying = True
+        self._running = ""
+        self._turn = 0
+        self._missed: dict[str, int] = {}
+        self._values: dict[str, dict[str, Value]] = {}
+
+    @property
+    def problem(self) -> str:
+        """What keeps the robot from being heard, and the remedy; empty where it is heard."""
+        return str(getattr(self._line, "problem", "")) or self._problem
+
+    def invoke(self, name: str, **arguments: float | str) -> Deferred[Mapping[str, Value]]:
+        """A posture or behaviour by its name, until it is done; ``joint``: turn joints, by their names, to radians."""
+        if name not in self._description.skills:
+            return super().invoke(name, **arguments)
+        if not self._is_up or self.state in ("stale", "closed"):
+            return fail(LinkLost(f"{self._name} is {self.state}; connect first, or wait for the link"))
+        if self._is_lying or self._wants_motors is not True:
+            return fail(NotEnabled(f"{self._name}'s motors are off; call enable() first"))
+        if self._running:
+            return fail(NotEnabled(f"{self._name} is busy with {self._running}; wait until it is done"))
+        try:
+            command = self._joint_command(arguments) if name == "joint" else codec.skill(name)
+            if name != "joint" and arguments:
+                raise Unsupported(f"{name} takes no arguments")
+        except Unsupported as error:
+            return fail(error)
+        # The skill takes the place of any gait.
+        self._rest()
+        self._reckon()
+        self._walk, self._wish, self._running = REST, "", name
+        # It answers nothing else meanwhile.
+        self.STALE_S += SKILL_S
+        return self._dialogue.ask(command, SKILL_S).addBoth(self._on_skill_done, name)
+
+    def act(self, action: Action, permit: Permit) -> Action:
+        """As every driver does; ``NotEnabled`` while a skill runs: what comes then would be done after it."""
+        if self._running:
+            raise NotEnabled(f"{self._name} is busy with {self._running}; wait until it is done")
+        return super().act(action, permit)
+
+    # -- to the robot -----------------------------------------------------------------------------------------------
+
+    def _open(self) -> None:
+        where, number = self._options.port, self._options.baud
+        if self._options.host:
+            where, number = self._options.host, self._options.http_port
+        self._line = self._connector.call(where, number, self)
+        if isinstance(self._line, HttpLine):
+            self._line.may_leave = self._may_leave
+
+    def _close(self) -> Deferred[None]:
+        self._cancel_timer()
+        self._send(codec.REST)
+        self._dialogue.end(LinkLost(f"{self._name}: disconnected"))
+        return succeed(None) if self._line is None else self._line.hang_up()
+
+    def _power(self, on: bool) -> None:
+        if on:
+            self._ask_gait(STAND, REST)
+        else:
+            self._lie_down()
+
+    def _drive(self, motion: Action, permit: Permit) -> Action:
+        name, velocity = chosen(motion.get("base.vx", 0.0), motion.get("base.wz", 0.0), self._gaits)
+        if name != self._wish or not self._is_sure:
+            self._ask_gait(name, velocity)
+        return {key: getattr(velocity, key.removeprefix("base.")) for key in motion}
+
+    def _halt(self) -> None:
+        # A dog whose servos are off would stand up.
+        if self._wants_motors is True:
+            self._ask_gait(STAND, REST)
+
+    def _last_word(self) -> LastWord | None:
+        halt = codec.skill(STAND)
+        if self._link is None or not isinstance(self._line, HttpLine):
+            return None if self._link is None else LastWord(halt, self._link)
+        return LastWord(self._line.asked_of(halt), self._link, self._line.address)
+
+    def _ask_gait(self, name: str, velocity: Velocity) -> None:
+        self._wish, self._is_sure = name, True
+        patience = GAIT_S + (SKILL_S if self._running else 0.0)
+        self._dialogue.ask(codec.skill(name), patience).addCallbacks(
+            lambda _: self._on_gait(name, velocity), lambda failure: self._on_no_gait(name, velocity, failure)
+        )
+
+    def _on_gait(self, name: str, velocity: Velocity) -> None:
+        self._is_lying = False
+        self._reckon()
+        self._walk = velocity
+        self._tell("base", {})
+
+    def _on_no_gait(self, name: str, velocity: Velocity, failure: Failure) -> None:
+        if failure.check(Unsupported):
+            self._counts["refused"] += 1
+            self.log.error("{robot}: {error}; take it out of gaits", robot=self._name, error=failure.value)
+        elif self._is_up and self._wish == name and not self._is_closed:
+            if velocity == REST or self._may_move:
+                self._ask_gait(name, velocity)
+            else:
+                self.stop()
+
+    def _lie_down(self) -> None:
+        self._wish = ""
+        self._dialogue.ask(codec.REST, REST_S).addCallbacks(self._on_lying, self._on_not_lying)
+
+    def _on_lying(self, _lines: list[str]) -> None:
+        self._is_lying = True
+        self._reckon()
+        self._walk = REST
+        self._tell("base", {})
+
+    def _on_not_lying(self, _failure: Failure) -> None:
+        if self._is_up and not self._is_closed and not self._wish and not self._running:
+            self._lie_down()
+
+    def _joint_command(self, arguments: Mapping[str, float | str]) -> bytes:
+        numbers = {name: joint for joint, name in JOINT_NAMES.items()}
+        wanted: list[float] = []
+        for name, angle in arguments.items():
+            if name not in numbers:
+                raise Unsupported(f"there is no joint {name!r}; known are {', '.join(numbers)}")
+            if isinstance(angle, (bool, str)) or not math.isfinite(angle):
+                raise Unsupported(f"{name} must be a finite number of radians, not {angle!r}")
+            low, high = JOINT_LIMITS[name]
+            wanted += [numbers[name], min(max(math.degrees(angle), low), high)]
+        if not wanted:
+            raise Unsupported("joint needs an angle, as in joint(head_pan=0.5)")
+        return codec.text("i", *wanted)
+
+    def _on_skill_done(self, result: list[str] | Failure, name: str) -> Mapping[str, Value] | Failure:
+        self._running = ""
+        self.STALE_S -= SKILL_S
+        return result if isinstance(result, Failure) else {"skill.done": name}
+
+    def _may_leave(self, command: bytes) -> bool:
+        """Whether a command that waited is wanted still."""
+        return self._may_move or command not in self._moving
+
+    def _send(self, data: bytes) -> None:
+        if self._link is not None:
+            self._link.send(data)
+
+    # -- from the robot ---------------------------------------------------------------------------------------------
+
+    def link_up(self, link: Link) -> None:
+        """Greet; called by the line."""
+        self._link = link
+        self._greet_s = GREET_S
+        self._reader = codec.LineReader()
+        self._greet()
+
+    def link_down(self) -> None:
+        """Bring the motion to rest here; the dog goes on until it is told, if it can be; called by the line."""
+        self._link = None
+        self._lose(LinkLost(f"the link to {self._name} went away"))
+
+    def received(self, data: bytes) -> None:
+        """Take bytes from the robot; called by the line."""
+        self._counts["bytes"] += len(data)
+        bad = self._reader.bad_lines
+        for line in self._reader.read(data):
+            if self._is_closed:
+                return
+            if codec.is_banner(line) and self._is_up:
+                self._lose(LinkLost(f"{self._name} was started anew"))
+                self._greet()
+            else:
+                self._dialogue.heard(line)
+        self._counts["bad_frames"] += self._reader.bad_lines - bad
+
+    def _lose(self, error: Exception) -> None:
+        self._cancel_timer()
+        is_up, self._is_up = self._is_up, False
+        self._wish = ""
+        self._reckon()
+        self._walk = REST
+        self._is_lying = True
+        self._dialogue.end(error)
+        if is_up or self._link is None:
+            self._down()
+
+    def _greet(self) -> None:
+        self._cancel_timer()
+        self._dialogue.ask(codec.VERSION, self._greet_s).addCallbacks(self._on_greeted, self._on_no_greeting)
+
+    def _on_greeted(self, lines: list[str]) -> None:
+        told = codec.board_of(lines)
+        self._board = self._options.board if self._options.board != "auto" else told or "biboard"
+        if told and told != self._board:
+            self._name_problem(f"this robot has a {told}, the option board says {self._board}; correct it")
+        else:
+            self._problem = ""
+        self._values = {"mode": {"mode": self._board}}
+        self._missed = {}
+        # Nobody knows what it did before: it lies down, with its servos off, before it is told anything else.
+        self._lie_down()
+        self._up()
+        self._poll()
+
+    def _on_no_greeting(self, failure: Failure) -> None:
+        if self._link is None or self._is_closed:
+            return
+        self._name_problem(
+            f"it does not tell its version; is it switched on, and {self._options.baud} baud right?"
+            if self._options.port
+            else "it does not tell its version; is it switched on, and its web server part of the firmware?"
+        )
+        self._greet_s = min(self._greet_s * 1.5, 5.0)
+        if not failure.check(LinkLost):
+            self._greet()
+
+    def _poll(self) -> None:
+        self._timer = self._clock.callLater(HTTP_POLL_S if self._options.host else POLL_S, self._poll_next)
+
+    def _poll_next(self) -> None:
+        self._timer = None
+        if self._running:
+            self._poll()
+            return
+        polls = self._polls()
+        self._turn += 1
+        is_slow = self._turn % SLOW_EVERY == 0 and self._board != "nyboard"
+        key = "power" if is_slow else list(polls)[self._turn % len(polls)]
+        command, read = (codec.VOLTAGE, _power) if is_slow else polls[key]
+        answered = self._dialogue.ask(command, POLL_PATIENCE_S)
+        answered.addCallback(self._on_answer, key, read).addErrback(self._on_no_answer, key)
+
+    def _polls(self) -> dict[str, tuple[bytes, Callable[[list[str]], dict[str, Value]]]]:
+        polls: dict[str, tuple[bytes, Callable[[list[str]], dict[str, Value]]]] = {
+            "imu": (codec.ATTITUDE_OLD, _imu_old) if self._board == "nyboard" else (codec.ATTITUDE, _imu),
+            "joint": (codec.JOINT_ANGLES, _joints),
+        }
+        if self._options.ultrasonic is not None:
+            polls["range"] = (codec.ultrasonic(*self._options.ultrasonic), _range)
+        return polls
+
+    def _on_answer(self, lines: list[str], key: str, read: Callable[[list[str]], dict[str, Value]]) -> None:
+        self._missed[key] = 0
+        try:
+            values = read(lines)
+        except BadFrame:
+            self._counts["bad_frames"] += 1
+        else:
+            self._counts["frames"] += 1
+            self._tell(key, values)
+        if self._is_up and not self._is_closed:
+            self._poll()
+
+    def _on_no_answer(self, failure: Failure, key: str) -> None:
+        failure.trap(DriverError)
+        if not self._is_up or self._is_closed:
+            return
+        self._missed[key] = self._missed.get(key, 0) + 1
+        # It may have started anew meanwhile, and lie: the next action tells it its gait again.
+        self._is_sure = False
+        if self._missed[key] >= MISSES:
+            self._values.pop(key, None)
+        polls = self._polls()
+        if all(self._missed.get(one, 0) >= MISSES for one in polls):
+            self._name_problem("it answers nothing; is it switched on, and in reach?")
+            self._lose(LinkLost(f"{self._name} fell silent"))
+            self._greet()
+        else:
+            self._poll()
+
+    def _tell(self, key: str, values: dict[str, Value]) -> None:
+        self._values[key] = values
+        self._reckon()
+        x, y, yaw = self._pose
+        vx, wz = self._walk
+        told: dict[str, Value] = {"odom.x": x, "odom.y": y, "odom.yaw": yaw, ENGAGED: self._is_lying}
+        told |= {"base.vx": vx, "base.vy": 0.0, "base.wz": wz, "base.moving": self._walk != REST}
+        told["skill.running"] = self._running or (self._wish if self._walk != REST else "")
+        for group in self._values.values():
+            told |= group
+        # The robot has no clock that it tells.
+        self._observed(told, self._clock.seconds())
+
+    def _reckon(self) -> None:
+        now = self._clock.seconds()
+        span, self._walk_since = now - self._walk_since, now
+        x, y, yaw = self._pose
+        middle = yaw + self._walk.wz * span / 2.0
+        x += self._walk.vx * span * math.cos(middle)
+        y += self._walk.vx * span * math.sin(middle)
+        self._pose = (x, y, math.remainder(yaw + self._walk.wz * span, math.tau))
+
+    def _name_problem(self, problem: str) -> None:
+        if problem != self._problem:
+            self.log.warn("{robot}: {problem}", robot=self._name, problem=problem)
+        self._problem = problem
+
+    def _cancel_timer(self) -> None:
+        if self._timer is not None and self._timer.active():
+            self._timer.cancel()
+        self._timer = None
+
+
+def _imu(lines: list[str]) -> dict[str, Value]:
+    return {f"imu.{key}": angle for key, angle in codec.attitude(lines).items()}
+
+
+def _imu_old(lines: list[str]) -> dict[str, Value]:
+    return {f"imu.{key}": angle for key, angle in codec.attitude_old(lines).items()}
+
+
+def _joints(lines: list[str]) -> dict[str, Value]:
+    angles = codec.joints(lines)
+    return {f"joint.{JOINT_NAMES[joint]}.pos": angle for joint, angle in angles.items() if joint in JOINT_NAMES}
+
+
+def _range(lines: list[str]) -> dict[str, Value]:
+    return {"range.front": codec.distance(lines)}
+
+
+def _power(lines: list[str]) -> dict[str, Value]:
+    volts = codec.volts(lines)
+    return {"power.volts": volts, "power.level": min(max((volts - EMPTY_V) / (FULL_V - EMPTY_V), 0.0), 1.0)}

@@ -1,0 +1,286 @@
+"""Create2Driver: a Create 2 or Roomba on a serial cable.
+
+The robot has no time-out of its own: it drives on until it is told otherwise, or until its own guards stop it.  So
+the driver ends each motion at its deadline, and a process beside it where this one stands still; when the cable falls
+out while it moves, nobody can.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from twisted.internet.defer import Deferred, fail, succeed
+from twisted.internet.interfaces import IReactorTime
+
+from drivers.base import BaseDriver, heard_at
+from drivers.create2 import codec
+from drivers.create2.odometry import WHEEL_BASE, Odometry
+from drivers.create2.option import SKILLS, Options, described
+from drivers.create2.sense import ARMED, IDS, event_of, mode_of, seen
+from drivers.deadman.switch import DeadMan, LastWord
+from drivers.driver import Permit
+from drivers.errors import LinkLost, NoReply, NotEnabled, Unsupported, UsageError
+from drivers.link import Connector, Line, Link
+from drivers.reading import Action, Value
+
+SETTLE_S = 0.05
+"""The robot is given so long after ``START`` before the next command."""
+SILENCE_S = 0.5
+"""Without a frame for so long the robot is started again: it was switched off, or rebooted."""
+LAST_SILENCE_S = 4.0
+DOCK_S = 120.0
+"""It has so long to find its home base."""
+
+
+class Create2Driver(BaseDriver):
+    """One robot at the end of a serial device.
+
+    ``enable`` takes the robot into safe (or full) mode, ``disable`` into passive mode.  When the robot leaves safe
+    mode by itself (a cliff, a lifted wheel, a charger) that is a safety event: ``safety.event`` names it, the motion
+    is at rest, and the motors stay off until ``enable`` is called again.
+    """
+
+    def __init__(
+        self,
+        options: Options,
+        name: str,
+        connector: Connector,
+        clock: IReactorTime,
+        dead_man: DeadMan | None = None,
+    ) -> None:
+        super().__init__(described(options), name, clock, dead_man)
+        self._options = options
+        self._connector = connector
+        self._line: Line | None = None
+        self._link: Link | None = None
+        self._reader = codec.StreamReader(IDS)
+        self._odometry = Odometry()
+        self._timer: Any = None
+        self._silence_s = SILENCE_S
+        self._heard_at = self._watch_at = 0.0
+        self._bytes_at_start = 0
+        self._mode = ""
+        self._event = ""
+        self._problem = ""
+        self._docking: Deferred[Mapping[str, Value]] | None = None
+        self._dock_timer: Any = None
+        self._counts |= {"safety_events": 0, "jumps": 0}
+
+    @property
+    def problem(self) -> str:
+        """What keeps the robot from being heard, and the remedy; empty where it is heard."""
+        return str(getattr(self._line, "problem", "")) or self._problem
+
+    def invoke(self, name: str, **arguments: float | str) -> Deferred[Mapping[str, Value]]:
+        """``dock``: seek the home base, until it charges; ``beep``: sound ``hz`` (32 to 12500) for ``s`` seconds."""
+        if name not in SKILLS:
+            return super().invoke(name, **arguments)
+        if not self._is_up or self.state in ("stale", "closed"):
+            return fail(LinkLost(f"{self._name} is {self.state}; connect first, or wait for the link"))
+        try:
+            return self._dock(arguments) if name == "dock" else self._beep(arguments)
+        except UsageError as error:
+            return fail(error)
+
+    # -- to the robot -----------------------------------------------------------------------------------------------
+
+    def _open(self) -> None:
+        self._line = self._connector.call(self._options.port, self._options.baud, self)
+
+    def _close(self) -> Deferred[None]:
+        self._cancel_timer()
+        self._end_docking(LinkLost(f"{self._name}: disconnected"))
+        # Without a stop at the end the robot stays awake and drains its battery.
+        self._send(codec.drive_direct(0, 0) + codec.pause(False) + bytes((codec.START, codec.STOP)))
+        return succeed(None) if self._line is None else self._line.hang_up()
+
+    def _power(self, on: bool) -> None:
+        self._end_docking(NotEnabled("enable() or disable() came in between"))
+        if on:
+            self._event = ""
+            self._send(bytes((codec.SAFE if self._options.mode == "safe" else codec.FULL,)))
+        else:
+            self._send(codec.drive_direct(0, 0) + bytes((codec.START,)))
+
+    def _drive(self, motion: Action, permit: Permit) -> Action:
+        ahead, turn = motion["base.vx"] * 1000.0, motion["base.wz"] * WHEEL_BASE / 2.0
+        right, left = ahead + turn, ahead - turn
+        share = min(1.0, codec.TOP_SPEED / max(abs(right), abs(left), 1.0))
+        right, left = round(right * share), round(left * share)
+        self._send(codec.drive_direct(right, left))
+        return {"base.vx": (right + left) / 2000.0, "base.wz": (right - left) / WHEEL_BASE}
+
+    def _halt(self) -> None:
+        if not self._end_docking(NotEnabled("stop() came in between")):
+            self._send(codec.drive_direct(0, 0))
+
+    def _last_word(self) -> LastWord | None:
+        return None if self._link is None else LastWord(codec.drive_direct(0, 0), self._link)
+
+    def _dock(self, arguments: Mapping[str, float | str]) -> Deferred[Mapping[str, Value]]:
+        if arguments:
+            raise Unsupported("dock takes no arguments")
+        if self._docking is not None:
+            raise UsageError("it seeks its dock already")
+        if self._wants_motors is not True or self._mode not in ARMED:
+            raise NotEnabled(f"{self._name}'s motors are off; call enable() first")
+        self.stop()
+        # The robot drives itself now, in passive mode; that is no safety event.
+        self._wants_motors = False
+        self._docking = Deferred(self._on_cancelled)
+        self._dock_timer = self._clock.callLater(DOCK_S, self._on_no_dock)
+        self._send(bytes((codec.DOCK,)))
+        return self._docking
+
+    def _on_cancelled(self, _docking: object) -> None:
+        self._end_docking(None)
+
+    def _on_no_dock(self) -> None:
+        self._end_docking(NoReply(f"{self._name} did not find its dock within {DOCK_S:g} s"))
+
+    def _on_docked(self) -> None:
+        docking, self._docking = self._docking, None
+        self._dock_timer.cancel()
+        if docking is not None:
+            docking.callback({"dock.on": True})
+
+    def _end_docking(self, error: Exception | None) -> bool:
+        """Whether it was seeking its dock; it stands still now, in passive mode."""
+        docking, self._docking = self._docking, None
+        if docking is None:
+            return False
+        if self._dock_timer.active():
+            self._dock_timer.cancel()
+        # While it docks it hears no wheel command: control is taken back, and given up at rest.
+        self._send(bytes((codec.SAFE,)) + codec.drive_direct(0, 0) + bytes((codec.START,)))
+        if error is not None:
+            docking.errback(error)
+        return True
+
+    def _beep(self, arguments: Mapping[str, float | str]) -> Deferred[Mapping[str, Value]]:
+        unknown = sorted(set(arguments) - {"hz", "s"})
+        if unknown:
+            raise Unsupported(f"beep has no argument {unknown[0]!r}; it knows hz, s")
+        hz, seconds = arguments.get("hz", 440.0), arguments.get("s", 0.5)
+        if not _is_between(hz, 49.0, 12544.0) or not _is_between(seconds, 1 / 64, 3.98):
+            raise Unsupported("beep needs hz from 49 to 12544 and s from 0.016 to 3.98")
+        if self._mode not in ARMED:
+            raise NotEnabled(f"{self._name} sounds in safe or full mode only; call enable() first")
+        note = min(127, round(69 + 12 * math.log2(float(hz) / 440.0)))
+        self._send(codec.song(0, [(note, round(float(seconds) * 64))]) + codec.play(0))
+        return succeed({"beep.hz": 440.0 * 2.0 ** ((note - 69) / 12)})
+
+    def _send(self, data: bytes) -> None:
+        if self._link is not None:
+            self._link.send(data)
+
+    # -- from the robot ---------------------------------------------------------------------------------------------
+
+    def link_up(self, link: Link) -> None:
+        """Begin to talk; called by the line."""
+        self._link = link
+        self._silence_s = SILENCE_S
+        self._start()
+
+    def link_down(self) -> None:
+        """Bring the motion to rest here; the robot goes on until it is told, if it can be; called by the line."""
+        self._link = None
+        self._cancel_timer()
+        self._end_docking(LinkLost(f"the link to {self._name} went away"))
+        self._down()
+
+    def received(self, data: bytes) -> None:
+        """Take bytes from the robot; called by the line."""
+        self._counts["bytes"] += len(data)
+        bad = self._reader.bad_frames
+        for frame in self._reader.read(data):
+            if self._is_closed:
+                return
+            self._counts["frames"] += 1
+            self._on_frame(frame)
+        self._counts["bad_frames"] += self._reader.bad_frames - bad
+
+    def _on_frame(self, frame: Mapping[str, int]) -> None:
+        now = self._clock.seconds()
+        self._heard_at = now
+        self._silence_s = SILENCE_S
+        self._problem = ""
+        mode, before = mode_of(frame), self._mode
+        self._mode = mode
+        if not self._is_up:
+            self._up()
+        self._odometry.count(frame["left_encoder"], frame["right_encoder"], now)
+        self._counts["jumps"] = self._odometry.jumps
+        values = seen(frame)
+        if before in ARMED and mode not in ARMED and self._wants_motors:
+            self._on_safety_event(event_of(values))
+        where = self._odometry
+        values |= {"odom.x": where.x, "odom.y": where.y, "odom.yaw": where.yaw}
+        values |= {"base.vx": where.vx, "base.vy": 0.0, "base.wz": where.wz}
+        values["base.moving"] = bool(where.vx or where.wz)
+        values["safety.event"] = self._event
+        values["skill.running"] = "" if self._docking is None else "dock"
+        if self._docking is not None and values["dock.on"]:
+            self._on_docked()
+        # The robot has no clock of its own.
+        self._observed(values, now)
+
+    def _on_safety_event(self, event: str) -> None:
+        self._event = event
+        self._counts["safety_events"] += 1
+        self.stop()
+        self._wants_motors = False
+        self.log.warn("{robot} left {mode} mode: {event}", robot=self._name, mode=self._options.mode, event=event)
+
+    def _start(self) -> None:
+        # A robot that was cut off within a command takes the first of these as the bytes that it lacks.
+        self._send(bytes((codec.START,)) * 5)
+        self._reader = codec.StreamReader(IDS)
+        self._odometry.forget()
+        self._mode = ""
+        self._bytes_at_start = self._counts["bytes"]
+        self._timer = self._clock.callLater(SETTLE_S, self._ask)
+
+    def _ask(self) -> None:
+        self._send(codec.stream(IDS))
+        self._heard_at = self._clock.seconds()
+        self._watch_in(self._silence_s)
+
+    def _watch_in(self, seconds: float) -> None:
+        self._watch_at = self._clock.seconds() + seconds
+        self._timer = self._clock.callLater(seconds, self._watch)
+
+    def _watch(self) -> None:
+        now = self._clock.seconds()
+        self._heard_at = heard_at(self._heard_at, self._watch_at, now)
+        silent = now - self._heard_at
+        if silent < self._silence_s:
+            self._watch_in(self._silence_s - silent)
+            return
+        self._silence_s = min(2.0 * self._silence_s, LAST_SILENCE_S)
+        is_babble = self._counts["bytes"] > self._bytes_at_start and not self._is_up
+        self._name_problem(
+            f"it sends, but no frames; is {self._options.baud} baud right, and is it a Create 2?"
+            if is_babble
+            else "it sends nothing; is it switched on, and the cable in?"
+        )
+        self._end_docking(LinkLost(f"{self._name} fell silent"))
+        if self._is_up:
+            self._down()
+        self._start()
+
+    def _name_problem(self, problem: str) -> None:
+        if problem != self._problem:
+            self.log.warn("{robot}: {problem}", robot=self._name, problem=problem)
+        self._problem = problem
+
+    def _cancel_timer(self) -> None:
+        if self._timer is not None and self._timer.active():
+            self._timer.cancel()
+        self._timer = None
+
+
+def _is_between(value: float | str, low: float, high: float) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and low <= value <= high

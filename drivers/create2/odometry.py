@@ -1,0 +1,70 @@
+"""Odometry: where the wheels say that the robot is."""
+
+from __future__ import annotations
+
+import math
+
+MM_PER_COUNT = math.pi * 72.0 / 508.8
+WHEEL_BASE = 235.0
+"""Millimetres from wheel to wheel."""
+WINDOW_S = 0.12
+"""Speeds are means over so long: one count within one frame would be 30 mm/s."""
+TOP = 0.8
+"""No wheel moves faster, m/s; the counts of who says so are none."""
+SLACK = 0.05
+"""Metres that frames which come late, and together, may seem too far."""
+
+
+class Odometry:
+    """Pose and speed from the counts of both wheels, which wrap at 65536.
+
+    Lengths are metres, angles radians, counter-clockwise; the pose is 0 at first.
+    """
+
+    def __init__(self, wheel_base: float = WHEEL_BASE, mm_per_count: float = MM_PER_COUNT) -> None:
+        self.x = self.y = self.yaw = 0.0
+        self.vx = self.wz = 0.0
+        self.jumps = 0
+        self._base = wheel_base / 1000.0
+        self._step = mm_per_count / 1000.0
+        self._last: tuple[int, int] | None = None
+        self._trail: list[tuple[float, float, float]] = []
+
+    def forget(self) -> None:
+        """Keep the pose, not the counts: the next ones may come from a robot that was started again."""
+        self._last = None
+        self._trail = []
+        self.vx = self.wz = 0.0
+
+    def count(self, left: int, right: int, now: float) -> None:
+        """Take the wheels' counts of ``now``; jumps that no wheel can make move nothing."""
+        before, self._last = self._last, (left, right)
+        if before is None:
+            self._trail = [(now, 0.0, 0.0)]
+            return
+        left_m, right_m = (_signed(new - old) * self._step for new, old in zip((left, right), before, strict=True))
+        if max(abs(left_m), abs(right_m)) > TOP * (now - self._trail[-1][0]) + SLACK:
+            self.jumps += 1
+            self.forget()
+            self.count(left, right, now)
+            return
+        self._move(left_m, right_m)
+        self._trail.append((now, left_m, right_m))
+        while len(self._trail) > 2 and now - self._trail[1][0] >= WINDOW_S:
+            del self._trail[0]
+        span = now - self._trail[0][0]
+        if span > 0.0:
+            left_v, right_v = (sum(step[wheel] for step in self._trail[1:]) / span for wheel in (1, 2))
+            self.vx, self.wz = (left_v + right_v) / 2.0, (right_v - left_v) / self._base
+
+    def _move(self, left: float, right: float) -> None:
+        ahead, turn = (left + right) / 2.0, (right - left) / self._base
+        # The chord of the arc that both wheels drew.
+        chord = ahead if abs(turn) < 1e-9 else 2.0 * ahead / turn * math.sin(turn / 2.0)
+        self.x += chord * math.cos(self.yaw + turn / 2.0)
+        self.y += chord * math.sin(self.yaw + turn / 2.0)
+        self.yaw = math.remainder(self.yaw + turn, math.tau)
+
+
+def _signed(counts: int) -> int:
+    return (counts + 0x8000) % 0x10000 - 0x8000

@@ -1,0 +1,65 @@
+"""Sense: what a frame of the Create 2 means, under the keys of an observation; pure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from drivers.create2.codec import MODES
+from drivers.reading import Value
+
+IDS = (7, 9, 10, 11, 12, 13, 14, 17, 18, 21, 22, 23, 24, 25, 26, 28, 29, 30, 31, 34, 35, 43, 44, *range(45, 52), 58)
+"""The packets that are streamed: a frame of 81 bytes, about half of what the line carries."""
+LEDGES = ("left", "front_left", "front_right", "right")
+LIGHTS = ("left", "front_left", "center_left", "center_right", "front_right", "right")
+BUTTONS = ("clean", "spot", "dock", "minute", "hour", "day", "schedule", "clock")
+ARMED = ("safe", "full")
+CHARGING = (1, 2, 3)
+HOME_BASE = 2
+
+
+def mode_of(frame: Mapping[str, int]) -> str:
+    """``off passive safe full``; the wheels turn on command in the last two."""
+    return MODES[frame["mode"]]
+
+
+def seen(frame: Mapping[str, int]) -> dict[str, Value]:
+    """What the robot feels, in SI units; the battery's level is left out where it does not know its capacity."""
+    values: dict[str, Value] = {
+        "mode": mode_of(frame),
+        "estop.engaged": mode_of(frame) not in ARMED,
+        "bump.right": bool(frame["bumps"] & 1),
+        "bump.left": bool(frame["bumps"] & 2),
+        "wheeldrop.right": bool(frame["bumps"] & 4),
+        "wheeldrop.left": bool(frame["bumps"] & 8),
+        "stall.moving": bool(frame["stasis"] & 1),
+        "stall.left": bool(frame["overcurrent"] & 16),
+        "stall.right": bool(frame["overcurrent"] & 8),
+        "wall.virtual": bool(frame["virtual_wall"]),
+        "infrared": float(frame["infrared"]),
+        "power.volts": frame["voltage"] / 1000.0,
+        "power.amps": frame["current"] / 1000.0,
+        "power.celsius": float(frame["temperature"]),
+        "power.charging": frame["charging_state"] in CHARGING,
+        "dock.on": bool(frame["charger"] & HOME_BASE),
+    }
+    if frame["capacity"] > 0:
+        values["power.level"] = min(1.0, frame["charge"] / frame["capacity"])
+    for name in LEDGES:
+        values[f"cliff.{name}"] = bool(frame[f"cliff_{name}"])
+        values[f"cliff.{name}.signal"] = frame[f"cliff_{name}_signal"] / 4095.0
+    for bit, name in enumerate(LIGHTS):
+        values[f"lightbump.{name}"] = frame[f"light_{name}"] / 4095.0
+        values[f"lightbump.{name}.hit"] = bool(frame["light_bumper"] >> bit & 1)
+    for bit, name in enumerate(BUTTONS):
+        values[f"button.{name}"] = float(frame["buttons"] >> bit & 1)
+    return values
+
+
+def event_of(values: Mapping[str, Value]) -> str:
+    """Why the robot left safe mode by itself, as far as it tells."""
+    causes = [
+        key for key in (*(f"cliff.{name}" for name in LEDGES), "wheeldrop.left", "wheeldrop.right") if values[key]
+    ]
+    if values["dock.on"] or values["power.charging"]:
+        causes.append("charger")
+    return ", ".join(causes) or "mode"

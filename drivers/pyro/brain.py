@@ -1,0 +1,154 @@
+"""Brain: what decides for a robot ten times a second; and Engine, which lets one run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from twisted.internet.defer import Deferred
+from twisted.internet.interfaces import IReactorTime
+from twisted.internet.task import LoopingCall
+
+from drivers.pyro.device import Device
+from drivers.pyro.robot import PyroRobot
+
+
+class Brain:
+    """A brain: override ``setup``, ``step``, and ``destroy`` where there is something to give back."""
+
+    pauseTime = 0.1
+    """Seconds from step to step."""
+
+    def __init__(self, name: str = "brain", engine: Engine | None = None, **arguments: Any) -> None:
+        self.name = name
+        self.engine = engine
+        self.stepCount = 0
+        self.needToStop = self.needToQuit = 0
+        self._robot = None if engine is None else engine.robot
+        self.setup(**arguments)
+
+    @property
+    def robot(self) -> PyroRobot:
+        """The robot."""
+        if self._robot is None:
+            raise AttributeError(f"{self.name} was made without an engine, so it has no robot")
+        return self._robot
+
+    def setup(self, **arguments: Any) -> None:
+        """Get ready."""
+
+    def step(self) -> None:
+        """Decide once; called after the robot was updated."""
+        raise NotImplementedError(f"{type(self).__name__} has no step")
+
+    def destroy(self) -> None:
+        """Give back what was taken in ``setup``."""
+
+    def pleaseStop(self) -> None:
+        """Pause: the robot stands."""
+        self.needToStop = 1
+
+    def pleaseRun(self) -> None:
+        """Go on."""
+        self.needToStop = 0
+
+    def quit(self) -> None:
+        """End after this step."""
+        self.needToQuit = 1
+
+    def getEngine(self) -> Engine | None:
+        """What lets it run."""
+        return self.engine
+
+    def getRobot(self) -> PyroRobot:
+        """As ``robot``."""
+        return self.robot
+
+    # Short ways to the robot.
+
+    def move(self, translate: float, rotate: float) -> None:
+        """As the robot's."""
+        self.robot.move(translate, rotate)
+
+    def translate(self, share: float) -> None:
+        """As the robot's."""
+        self.robot.translate(share)
+
+    def rotate(self, share: float) -> None:
+        """As the robot's."""
+        self.robot.rotate(share)
+
+    def motors(self, left: float, right: float) -> None:
+        """As the robot's."""
+        self.robot.motors(left, right)
+
+    def stop(self) -> None:
+        """As the robot's."""
+        self.robot.stop()
+
+    def update(self) -> None:
+        """As the robot's."""
+        self.robot.update()
+
+    def getDevice(self, kind: str, index: int = 0) -> Device:
+        """As the robot's."""
+        return self.robot.getDevice(kind, index)
+
+    def startDevice(self, name: str, **options: object) -> Device:
+        """As the robot's."""
+        return self.robot.startDevice(name, **options)
+
+    def removeDevice(self, kind: str, index: int | None = None) -> None:
+        """As the robot's."""
+        self.robot.removeDevice(kind, index)
+
+    def hasA(self, kind: str) -> int:
+        """As the robot's."""
+        return self.robot.hasA(kind)
+
+    def requires(self, wanted: str | list[str]) -> int:
+        """As the robot's."""
+        return self.robot.requires(wanted)
+
+
+class Engine:
+    """Lets one brain run on ``robot``; ``init`` makes it out of the engine, as ``INIT`` in a brain's file does."""
+
+    def __init__(self, robot: PyroRobot, clock: IReactorTime) -> None:
+        self.robot = robot
+        self.brain: Brain | None = None
+        self._clock = clock
+        self._loop: LoopingCall | None = None
+
+    def run(self, init: Callable[[Engine], Brain]) -> Deferred[None]:
+        """Make the brain and step it; fires once it has quit, and fails with what it raises.  The robot stands then."""
+        self.robot.update()
+        self.robot.localize()
+        brain = self.brain = init(self)
+        loop = self._loop = LoopingCall(self._step)
+        loop.clock = self._clock
+        done: Deferred[Any] = loop.start(brain.pauseTime)
+        return done.addBoth(self._ended)
+
+    def stop(self) -> None:
+        """End the brain."""
+        if self._loop is not None and self._loop.running:
+            self._loop.stop()
+
+    def _step(self) -> None:
+        brain = self.brain
+        assert brain is not None
+        if brain.needToQuit:
+            return self.stop()
+        self.robot.update()
+        if brain.needToStop:
+            return self.robot.stop()
+        brain.step()
+        brain.stepCount += 1
+
+    def _ended(self, result: Any) -> Any:
+        self.robot.stop()
+        brain, self.brain = self.brain, None
+        if brain is not None:
+            brain.destroy()
+        return None if isinstance(result, LoopingCall) else result

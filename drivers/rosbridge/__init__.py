@@ -1,0 +1,1 @@
+"""A ROS robot behind rosbridge: JSON over a WebSocket."""

@@ -1,0 +1,341 @@
+"""RosbridgeDriver: a robot that runs ROS 1 or 2, asked through its rosbridge."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+from twisted.internet.defer import Deferred, fail
+from twisted.internet.interfaces import IReactorTime
+from twisted.python.failure import Failure
+
+from drivers.base import ENGAGED, BaseDriver
+from drivers.deadman.switch import DeadMan, LastWord
+from drivers.driver import Permit
+from drivers.errors import BadFrame, LinkLost, NoReply, RobotError
+from drivers.link import Connector
+from drivers.reading import Action, Frame, Value
+from drivers.rosbridge import codec
+from drivers.rosbridge.codec import Answered, Published, Status, decoded, encoded
+from drivers.rosbridge.link import Bridge
+from drivers.rosbridge.option import RATES, TYPES, Options, checked, described, sectors
+from drivers.rosbridge.websocket import Nonce
+
+REPEAT_S = 0.1
+"""A velocity is said so often while it is in force: most bases stop by themselves when they hear none."""
+ASK_S = 1.0
+"""The robot has so long to say which type its velocity has."""
+CALL_S = 5.0
+SOURCE_S = 2.0
+"""What a topic said last is shown for so long; then its keys are left out, though others go on."""
+TYPE_SERVICE = "/rosapi/topic_type"
+
+
+class RosbridgeDriver(BaseDriver):
+    """One robot.
+
+    ROS has no motors to switch: ``enable`` and ``disable`` are a lock in this driver (``estop.engaged``), and the
+    service ``motor_service`` besides, where the options name one.  The driver says the velocity again and again while
+    it is in force, and zero at its end.  When the link is lost, only the base itself can stop: see docs/robots.
+    """
+
+    STALE_S = 0.5
+
+    def __init__(
+        self,
+        options: Options | Mapping[str, object],
+        connector: Connector,
+        clock: IReactorTime,
+        name: str = "the ROS robot",
+        nonce: Nonce = os.urandom,
+        dead_man: DeadMan | None = None,
+    ) -> None:
+        self._options = options if isinstance(options, Options) else checked(options)
+        super().__init__(described(self._options), name, clock, dead_man)
+        self._bridge = Bridge(self, connector, clock, nonce, self._options.host, self._options.port, self._options.path)
+        self._sources = {topic: source for source, topic in self._options.topics.items()}
+        self._sectors = sectors()
+        self._told: dict[str, tuple[float, dict[str, Value]]] = {}
+        self._frame: Frame | None = None
+        self._t_robot = 0.0
+        self._has_motors = False
+        self._is_stamped: bool | None = None
+        self._was_stamped = False
+        self._velocity = (0.0, 0.0, 0.0)
+        self._repeat: Any = None
+        self._settling: Any = None
+        self._calls: dict[str, tuple[Deferred[Mapping[str, Any]], Any]] = {}
+        self._number = 0
+        self._warned: set[str] = set()
+
+    @property
+    def camera_fps(self) -> float:
+        """Pictures a second that the camera is asked for."""
+        return self._options.camera_fps if self._options.image_topic else 0.0
+
+    def set_camera_fps(self, fps: float) -> None:
+        """Ask for so many pictures a second from now on; 0: none."""
+        self._options = replace(self._options, camera_fps=fps)
+        if self._options.image_topic:
+            self._subscribe("image", self._options.image_topic)
+
+    def invoke(self, name: str, **arguments: float | str) -> Deferred[Mapping[str, Value]]:
+        """Call the service of this skill; fires with the plain values of its answer."""
+        if name not in self._options.services:
+            return super().invoke(name, **arguments)
+        if not self._is_up:
+            return fail(LinkLost(f"{self._name} is {self.state}; connect first, or wait for the link"))
+
+        def plain(values: Mapping[str, Any]) -> Mapping[str, Value]:
+            return {key: value for key, value in values.items() if isinstance(value, (bool, int, float, str))}
+
+        return self._call(self._options.services[name], **arguments).addCallback(plain)
+
+    def diagnostics(self) -> dict[str, float]:
+        """As every driver's; ``age.SOURCE``, the seconds since each topic spoke, and the ``faults`` of the link."""
+        now = self._clock.seconds()
+        ages = {f"age.{source}": now - at for source, (at, _) in self._told.items()}
+        return {**super().diagnostics(), "bytes": self._bridge.bytes, "faults": self._bridge.faults, **ages}
+
+    # -- to the robot -----------------------------------------------------------------------------------------------
+
+    def _open(self) -> None:
+        self._bridge.open()
+
+    def _close(self) -> Deferred[None]:
+        self._quiet()
+        self._fail_calls(LinkLost(f"{self._name}: disconnected"))
+        return self._bridge.hang_up()
+
+    def _power(self, on: bool) -> None:
+        def switched(values: Mapping[str, Any]) -> None:
+            if values.get("success") is True:
+                self._has_motors = on
+            else:
+                self._warn(f"{self._options.motor_service} refused: {str(values.get('message'))[:200]}")
+
+        if self._options.motor_service:
+            self._call(self._options.motor_service, data=on).addCallbacks(switched, self._on_call_failed)
+        else:
+            self._has_motors = on
+
+    def _drive(self, motion: Action, permit: Permit) -> Action:
+        self._velocity = (motion["base.vx"], motion.get("base.vy", 0.0), motion["base.wz"])
+        self._say_velocity()
+        if self._repeat is None:
+            self._repeat = self._clock.callLater(REPEAT_S, self._on_repeat)
+        return motion
+
+    def _halt(self) -> None:
+        self._quiet()
+        self._say_velocity()
+
+    def _on_repeat(self) -> None:
+        self._repeat = None
+        if not self._may_move:
+            self.stop()
+            return
+        self._repeat = self._clock.callLater(REPEAT_S, self._on_repeat)
+        if not self._bridge.is_busy:
+            self._say_velocity()
+
+    def _quiet(self) -> None:
+        self._velocity = (0.0, 0.0, 0.0)
+        if self._repeat is not None:
+            self._repeat.cancel()
+        self._repeat = None
+
+    def _last_word(self) -> LastWord | None:
+        link = self._bridge.link
+        return None if link is None else LastWord(self._bridge.framed(self._published(0.0, 0.0, 0.0)), link)
+
+    def _say_velocity(self) -> None:
+        self._bridge.send(self._published(*self._velocity))
+
+    def _published(self, vx: float, vy: float, wz: float) -> bytes:
+        said = (codec.twist_stamped if self._is_stamped else codec.twist)(vx, vy, wz)
+        return encoded("publish", topic=self._options.velocity_topic, msg=said)
+
+    def _subscribe(self, source: str, topic: str) -> None:
+        rate = self._options.camera_fps if source == "image" else RATES[source]
+        if rate <= 0:
+            self._bridge.send(encoded("unsubscribe", id=source, topic=topic))
+            return
+        self._bridge.send(
+            encoded(
+                "subscribe",
+                id=source,
+                topic=topic,
+                type=self._options.type_of(TYPES[source]),
+                throttle_rate=round(1000 / rate),
+                queue_length=1,
+            )
+        )
+
+    def _call(self, service: str, **arguments: object) -> Deferred[Mapping[str, Any]]:
+        self._number += 1
+        number = f"call:{self._number}"
+        answered: Deferred[Mapping[str, Any]] = Deferred()
+
+        def late() -> None:
+            del self._calls[number]
+            answered.errback(NoReply(f"{service} did not answer within {CALL_S:g} s"))
+
+        self._calls[number] = (answered, self._clock.callLater(CALL_S, late))
+        self._bridge.send(encoded("call_service", id=number, service=service, args=arguments))
+        return answered
+
+    # -- from the robot ---------------------------------------------------------------------------------------------
+
+    def bridge_up(self) -> None:
+        """Subscribe, and find out which type the velocity has; called by the bridge."""
+        for source, topic in self._options.topics.items():
+            if source != "image" or self._options.camera_fps > 0:
+                self._subscribe(source, topic)
+        self._ask_type()
+        if self._options.velocity_type != "auto":
+            self._settle(self._options.velocity_type == "twist_stamped")
+
+    def bridge_down(self) -> None:
+        """Bring the motion to rest here, as the base should there; called by the bridge."""
+        self._quiet()
+        self._stop_settling()
+        self._is_stamped = None
+        self._t_robot = 0.0
+        self._fail_calls(LinkLost(f"the link to {self._name} went away"))
+        self._down()
+
+    def bridge_said(self, payload: bytes) -> None:
+        """Take one message; called by the bridge."""
+        self._counts["frames"] += 1
+        try:
+            self._on_message(decoded(payload))
+        except BadFrame as error:
+            self._counts["bad_frames"] += 1
+            self.log.debug("{robot}: {error}", robot=self._name, error=error)
+
+    def _on_message(self, message: codec.Message) -> None:
+        match message:
+            case Published(topic, said):
+                if topic in self._sources:
+                    self._on_published(self._sources[topic], said)
+            case Answered(number, values, is_done):
+                self._on_answer(number, values, is_done)
+            case Status(level, text):
+                self._counts["refused"] += level == "error"
+                if level in ("error", "warning"):
+                    self._warn(f"rosbridge says: {text}")
+
+    def _on_published(self, source: str, said: Mapping[str, Any]) -> None:
+        values: dict[str, Value] = {}
+        match source:
+            case "odometry":
+                values = codec.odometry(said)
+            case "scan":
+                values = codec.scan(said, self._sectors, math.radians(self._options.scan_turn))
+            case "imu":
+                values = codec.imu(said)
+            case "battery":
+                values = codec.battery(said, self._options.battery_full)
+        stamp = codec.stamp(said)
+        # Topics arrive a little out of turn; only a clock that was set goes back.
+        if stamp is not None and (stamp > self._t_robot or self._t_robot - stamp > 1.0):
+            self._t_robot = stamp
+        if source == "image":
+            data, width, height = codec.picture(said)
+            self._counts["pictures"] += 1
+            self._frame = Frame(self._counts["pictures"], width, height, data, self._t_robot)
+        now = self._clock.seconds()
+        self._told[source] = (now, values)
+        if self._is_stamped is None:
+            return  # it cannot be driven yet, so it is not ready
+        seen: dict[str, Value] = {ENGAGED: not self._has_motors}
+        for at, some in self._told.values():
+            if now - at <= SOURCE_S:
+                seen.update(some)
+        self._observed(seen, self._t_robot, frame=self._frame)
+
+    def _on_answer(self, number: str, values: Mapping[str, Any], is_done: bool) -> None:
+        if number not in self._calls:
+            return  # it came too late
+        answered, timer = self._calls.pop(number)
+        timer.cancel()
+        if is_done:
+            answered.callback(values)
+        else:
+            answered.errback(RobotError(str(values.get("error", values))[:300]))
+
+    # -- which type the velocity has --------------------------------------------------------------------------------
+
+    def _ask_type(self) -> None:
+        asked = self._call(TYPE_SERVICE, topic=self._options.velocity_topic)
+        asked.addCallbacks(self._on_type, lambda _: None)
+        if self._options.velocity_type == "auto":
+            self._settling = self._clock.callLater(ASK_S, self._on_no_type)
+
+    def _on_type(self, values: Mapping[str, Any]) -> None:
+        topic, found = self._options.velocity_topic, str(values.get("type", ""))[:100]
+        known = {"Twist": False, "TwistStamped": True}.get(found.rpartition("/")[2])
+        if self._is_stamped is not None:
+            if known is not None and known is not self._is_stamped:
+                self._on_other_type(known, found)
+            return
+        self._stop_settling()
+        if known is not None:
+            self._settle(known)
+            return
+        # Nobody listens there yet, or somebody to something else; a base may still be starting.
+        self._warn(f"{topic} is {found or 'listened to by nobody'}; is velocity_topic right? asking again")
+        self._settling = self._clock.callLater(ASK_S, self._ask_type)
+
+    def _on_no_type(self) -> None:
+        self._settling = None
+        taken = "TwistStamped" if self._was_stamped else "Twist"
+        self._warn(f"no rosapi says which type the velocity has: taking {taken}; velocity_type can say it")
+        self._settle(self._was_stamped)
+
+    def _on_other_type(self, is_stamped: bool, found: str) -> None:
+        if self._options.velocity_type == "auto":
+            self._advertise(is_stamped)  # the answer came late
+            return
+        wanted, topic = "twist_stamped" if is_stamped else "twist", self._options.velocity_topic
+        self._warn(f'{topic} is {found}, so it would not move: write velocity_type = "{wanted}" or "auto"')
+
+    def _settle(self, is_stamped: bool) -> None:
+        self._advertise(is_stamped)
+        self._say_velocity()  # zero: what was said before the link was lost may still be in force
+        self._up()
+
+    def _advertise(self, is_stamped: bool) -> None:
+        self._is_stamped = self._was_stamped = is_stamped
+        name = self._options.type_of("geometry_msgs/TwistStamped" if is_stamped else "geometry_msgs/Twist")
+        self._bridge.send(encoded("advertise", topic=self._options.velocity_topic, type=name))
+        if self._is_up:
+            self._guard()
+
+    def _stop_settling(self) -> None:
+        if self._settling is not None and self._settling.active():
+            self._settling.cancel()
+        self._settling = None
+
+    # -- inside -----------------------------------------------------------------------------------------------------
+
+    def _fail_calls(self, error: Exception) -> None:
+        self._stop_settling()
+        calls, self._calls = self._calls, {}
+        for answered, timer in calls.values():
+            timer.cancel()
+            answered.errback(error)
+
+    def _on_call_failed(self, failure: Failure) -> None:
+        if not failure.check(LinkLost):
+            self._warn(f"{self._options.motor_service}: {failure.getErrorMessage()[:200]}")
+
+    def _warn(self, text: str) -> None:
+        """Say it once."""
+        if text not in self._warned and len(self._warned) < 100:
+            self._warned.add(text)
+            self.log.warn("{robot}: {text}", robot=self._name, text=text)

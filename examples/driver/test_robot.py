@@ -1,0 +1,15 @@
+"""The tests that every driver needs, two lines each."""
+
+from functools import partial
+
+from emulator import Emulator
+from robot import Rover
+from twisted.trial.unittest import SynchronousTestCase
+
+from drivers.conformance import Conformance, MemoryBench
+
+
+class RoverTests(Conformance, SynchronousTestCase):
+    """The template conforms."""
+
+    bench = partial(MemoryBench, Rover, Emulator, {"host": "rover"})

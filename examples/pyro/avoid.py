@@ -1,0 +1,53 @@
+"""Avoid: wander about, and turn away from what is ahead.  ``python examples/pyro/avoid.py`` or ``--host ROBOT``."""
+
+from __future__ import annotations
+
+import math
+
+from drivers.pyro.brain import Brain, Engine
+
+NEAR, FREE = 0.55, 0.9
+"""Metres ahead at which it turns away, and which it wants to have before it goes on."""
+CRUISE, TURN, SWING = 0.7, 0.4, 0.45
+"""Shares of what the robot can."""
+
+
+class Avoid(Brain):
+    """Walks on while the way is free; swings as it goes, for an AIBO ranges straight ahead only."""
+
+    def setup(self) -> None:
+        """No turn yet."""
+        self.side = 0
+        self.more = 0
+        self.bumps = 0
+
+    def step(self) -> None:
+        """Look ahead, and decide."""
+        robot = self.robot
+        if robot.hasA("bumper") and any(robot.bumper[0].value):
+            self.bumps = 8
+        if self.bumps:
+            self.bumps -= 1
+            return robot.move(-0.3, 0.0) if self.bumps > 4 else robot.move(0.0, TURN)
+        ahead = min((one.distance("M") for one in robot.range["front-all"]), default=math.inf)
+        if self.side == 0 and ahead < NEAR:
+            # Where it swings to now, there it stands: the other side is the better one.
+            self.side = -1 if math.sin(self.stepCount * 0.5) > 0 else 1
+        if self.side:
+            self.more = 5 if ahead < FREE else self.more - 1
+            if self.more > 0:
+                return robot.move(0.0, self.side * TURN)
+            self.side = 0
+        robot.move(CRUISE, SWING * math.cos(self.stepCount * 0.5))
+
+
+def INIT(engine: Engine) -> Brain:
+    """The brain of this file."""
+    engine.robot.requires("range-sensor")
+    return Avoid("Avoid", engine)
+
+
+if __name__ == "__main__":
+    from lab import main
+
+    main(INIT, "Wander about without hitting anything.")

@@ -1,0 +1,180 @@
+"""Certificate: what a member shows of itself when it opens a session (its *pass*), and what of it is believed.
+
+A pass is one msgpack array, of at most ``ROOM`` bytes: either the operator's grant, or a chain, which takes two to
+make: ``[1, invite, wish, proof, name, not before, not after, signature, grant]``.  The ``proof`` is the invitation's
+signature under the newcomer's key and the name that it wished for; the ``signature`` that of the bootstrap node which
+let it in, and whose own ``grant``, by the operator, has the role ``bootstrap``.  So a bootstrap node alone can admit
+nobody, and neither can a code that leaked.
+
+A third kind is that of a guest, such as a visitor's phone: ``[2, name, not before, not after, signature, gateway,
+pass]``.  A member with the role ``gateway`` vouches for it, for a day at most, and its guests are gone with it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import msgpack
+
+from middleware.admission.statement import Grant, Invite, moment, named, opened, sized, unpacked
+from middleware.entangled.errors import Forged, Malformed
+from middleware.entangled.identity import Identity, verified
+
+ROOM = 640
+"""Bytes that a pass may have."""
+SKEW = 300
+"""Seconds by which two clocks of one team may differ."""
+BOOTSTRAP = "bootstrap"
+GATEWAY = "gateway"
+GUEST_LIFE = 86_400
+"""Seconds for which a gateway vouches for a guest at most."""
+_GUEST = b"swarm-guest-1 "
+_JOIN = b"swarm-join-1 "
+_ADMIT = b"swarm-admit-1 "
+
+
+@dataclass(frozen=True)
+class Member:
+    """What a pass says of who holds ``public``.
+
+    ``invitation`` is the public key of that by which it came, ``admitter`` that of the bootstrap node; both are empty
+    where the operator named the member itself.  ``voucher`` is the member that vouches for a guest.
+    """
+
+    public: bytes
+    name: str
+    roles: tuple[str, ...]
+    not_before: int
+    not_after: int
+    invitation: bytes = b""
+    admitter: bytes = b""
+    voucher: Member | None = None
+
+    def trouble(self, now: float) -> str:
+        """``early`` or ``expired``, or nothing where the pass is valid at that moment of the wall clock."""
+        if now < self.not_before - SKEW:
+            return "early"
+        return "expired" if now >= self.not_after else ""
+
+
+def pass_of(grant: bytes) -> bytes:
+    """The pass of who got a grant of the operator's own."""
+    return bytes(msgpack.packb([0, grant]))
+
+
+def proof(invitation: Identity, public: bytes, wish: str) -> bytes:
+    """The signature by which whoever has the code brings in the key ``public``."""
+    return invitation.sign(_wished(public, wish))
+
+
+def is_proof(invitation: bytes, public: bytes, wish: str, signature: bytes) -> bool:
+    """Whether the holder of an invitation's key brings in ``public``."""
+    return verified(invitation, _wished(public, wish), signature)
+
+
+def chained(
+    bootstrap: Identity,
+    grant: bytes,
+    invite: tuple[bytes, Invite],
+    newcomer: tuple[bytes, str, bytes],
+    name: str,
+    now: int,
+) -> bytes:
+    """The pass that a bootstrap node makes: ``invite`` as packed and as read, ``newcomer`` its key, wish and proof."""
+    packed, terms = invite
+    public, wish, signature = newcomer
+    end = now + terms.life
+    admission = bootstrap.sign(_admitted(terms.public, public, name, now, end))
+    return bytes(msgpack.packb([1, packed, wish, signature, name, now, end, admission, grant]))
+
+
+def guest_pass(gateway: Identity, own: bytes, public: bytes, name: str, now: int, life: int = GUEST_LIFE) -> bytes:
+    """The pass of a guest, made by the ``gateway`` whose ``own`` pass that is.
+
+    Raises ``Malformed`` where that one is too long to stand in another: its operator has to grant it one (swarm
+    promote).
+    """
+    end = now + min(life, GUEST_LIFE)
+    signature = gateway.sign(_vouched(public, name, now, end))
+    shown = bytes(msgpack.packb([2, name, now, end, signature, gateway.public, own]))
+    if len(shown) > ROOM:
+        raise Malformed("the pass of this gateway is too long to vouch for others; have the operator grant it one")
+    return shown
+
+
+def member_of(operator: bytes, public: bytes, shown: bytes) -> Member:
+    """What the pass says of ``public``, if it goes back to that operator; raises ``Malformed`` or ``Forged``.
+
+    Whether it is the time for it, and whether anything of it was revoked, is for the caller to look after.
+    """
+    if len(shown) > ROOM:
+        raise Malformed("a pass that is too long")
+    fields = unpacked(shown)
+    try:
+        kind, *rest = fields
+        if kind == 0:
+            [whole] = rest
+            grant = _grant(operator, whole)
+            if grant.public != public:
+                raise Forged("a grant of somebody else")
+            return Member(public, grant.name, grant.roles, grant.not_before, grant.not_after)
+        if kind == 1:
+            return _chain(operator, public, rest)
+        if kind == 2:
+            return _guest(operator, public, rest)
+    except (ValueError, TypeError) as error:
+        raise Malformed("a pass with other fields than it should have") from error
+    raise Malformed("a pass of no known kind")
+
+
+def _chain(operator: bytes, public: bytes, fields: list[Any]) -> Member:
+    packed, wish, signature, name, begin, end, admission, whole = fields
+    invite = opened(operator, packed)
+    if not isinstance(invite, Invite):
+        raise Malformed("a chain begins with an invitation")
+    moment(begin, max(0, invite.not_before - SKEW), invite.not_after)
+    moment(end, begin + 1, begin + invite.life)
+    if wish != "":
+        named(wish)
+    if not is_proof(invite.public, public, wish, sized(signature, 64)):
+        raise Forged("the invitation does not stand for this key")
+    grant = _grant(operator, whole)
+    if BOOTSTRAP not in grant.roles or not grant.not_before - SKEW <= begin < grant.not_after:
+        raise Forged("who let this key in was no bootstrap node then")
+    if not verified(grant.public, _admitted(invite.public, public, named(name), begin, end), sized(admission, 64)):
+        raise Forged("no bootstrap node let this key in")
+    return Member(public, name, invite.roles, begin, end, invite.public, grant.public)
+
+
+def _guest(operator: bytes, public: bytes, fields: list[Any]) -> Member:
+    name, begin, end, signature, gateway, own = fields
+    if not isinstance(own, bytes):
+        raise Malformed("a guest wants somebody's pass")
+    voucher = member_of(operator, sized(gateway, 32), own)
+    moment(begin)
+    moment(end, begin + 1, begin + GUEST_LIFE)
+    if voucher.voucher is not None:
+        raise Forged("a guest vouches for nobody")
+    if not verified(voucher.public, _vouched(public, named(name), begin, end), sized(signature, 64)):
+        raise Forged("nobody vouches for this key")
+    return Member(public, name, ("device",), begin, end, voucher=voucher)
+
+
+def _vouched(public: bytes, name: str, begin: int, end: int) -> bytes:
+    return _GUEST + bytes(msgpack.packb([public, name, begin, end]))
+
+
+def _grant(operator: bytes, whole: Any) -> Grant:
+    grant = opened(operator, whole)
+    if not isinstance(grant, Grant):
+        raise Malformed("a pass wants a grant")
+    return grant
+
+
+def _wished(public: bytes, wish: str) -> bytes:
+    return _JOIN + public + wish.encode()
+
+
+def _admitted(invitation: bytes, public: bytes, name: str, begin: int, end: int) -> bytes:
+    return _ADMIT + bytes(msgpack.packb([invitation, public, name, begin, end]))

@@ -1,0 +1,148 @@
+"""Membership: what a member of a closed team keeps in a file of its own: who it is, and what lets it in.
+
+The file is a secret: whoever has it is this member.  It is refused where others can read it, and replaced whole when
+the team's secret is rotated or the operator grants something else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from middleware.admission import keyfile
+from middleware.admission.certificate import Member, member_of
+from middleware.admission.errors import BadKeyFile
+from middleware.admission.roll import MAX_SECRETS
+from middleware.admission.statement import SECRET_BYTES, moment, named, sized
+from middleware.entangled.errors import RemoteError
+from middleware.entangled.identity import Identity
+from middleware.entangled.network.network import Address
+
+KIND = "swarm-node membership 1"
+MAX_KNOWN = 64
+
+
+@dataclass(frozen=True)
+class Membership:
+    """One member's place in its team.
+
+    ``operator`` is the public key of who signs for the team; ``secrets`` are the team's, the newest first: a
+    number, the secret, and the moment of the wall clock until which those before it are accepted; ``known`` are nodes
+    to enter through, and ``settings`` what the team wants of each node.
+    """
+
+    team: str
+    seed: bytes = field(repr=False)
+    operator: bytes
+    shown: bytes
+    secrets: tuple[tuple[int, bytes, int], ...] = field(repr=False)
+    known: tuple[Address, ...] = ()
+    settings: Mapping[str, str | int | float | bool] = field(default_factory=dict)
+
+    @property
+    def identity(self) -> Identity:
+        """The member's lasting key pair."""
+        return Identity(self.seed)
+
+    @property
+    def member(self) -> Member:
+        """What the pass says; raises ``BadKeyFile`` where it is none of this team."""
+        try:
+            return member_of(self.operator, self.identity.public, self.shown)
+        except RemoteError as error:
+            raise BadKeyFile(f"the certificate in the membership is none of this team: {error}; join again") from error
+
+    def with_secret(self, number: int, secret: bytes, until: int) -> Membership:
+        """This membership with one more secret; those before it are accepted until ``until``."""
+        secrets = [each for each in self.secrets if each[0] != number] + [(number, secret, until)]
+        return replace(self, secrets=tuple(sorted(secrets, key=lambda each: -each[0])[:MAX_SECRETS]))
+
+    def accepted(self, now: float) -> list[tuple[int, bytes, int]]:
+        """The secrets that hold at a moment of the wall clock, the newest first; that one holds always."""
+        found: list[tuple[int, bytes, int]] = []
+        for each in self.secrets:
+            if all(now < until for _, _, until in found):
+                found.append(each)
+        return found
+
+    def packed(self) -> dict[str, Any]:
+        """As it stands in the file."""
+        return {
+            "kind": KIND,
+            "team": self.team,
+            "operator": self.operator.hex(),
+            "seed": self.seed.hex(),
+            "pass": self.shown.hex(),
+            "secrets": [[number, secret.hex(), until] for number, secret, until in self.secrets],
+            "known_nodes": [[address.host, address.port] for address in self.known],
+            "settings": dict(self.settings),
+        }
+
+
+def unpacked(found: Mapping[str, Any]) -> Membership:
+    """The membership that a file holds; raises ``BadKeyFile``."""
+    try:
+        if found["kind"] != KIND:
+            raise ValueError("another kind of file")
+        secrets = [
+            (moment(number, 1), sized(bytes.fromhex(secret), SECRET_BYTES), moment(until))
+            for number, secret, until in found["secrets"][:MAX_SECRETS]
+        ]
+        if not secrets:
+            raise ValueError("no secret of the team")
+        known = [Address(str(host), moment(port, 1, 65535)) for host, port in found["known_nodes"][:MAX_KNOWN]]
+        operator, seed = sized(bytes.fromhex(found["operator"]), 32), sized(bytes.fromhex(found["seed"]), 32)
+        shown = bytes.fromhex(found["pass"])
+        membership = Membership(
+            named(found["team"]), seed, operator, shown, tuple(secrets), tuple(known), dict(found["settings"])
+        )
+    except (KeyError, ValueError, TypeError, RemoteError) as error:
+        raise BadKeyFile(f"this is no membership of a team ({error}); join again, or take it from a backup") from error
+    # Whether it is one of that team is found out now and not at the first handshake.
+    assert membership.member
+    return membership
+
+
+def with_settings(membership: Membership, settings: Mapping[str, str | int | float | bool]) -> Membership:
+    """The same membership in a team that wants these settings of each node."""
+    return replace(membership, settings=dict(settings))
+
+
+class MembershipFile:
+    """The file of one member, as it was read; ``keep`` replaces it."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        try:
+            self.membership = unpacked(keyfile.read(path))
+        except BadKeyFile as error:
+            text = str(error)
+            raise error if str(path) in text else BadKeyFile(f"{path}: {text}") from error
+
+    def keep(self, membership: Membership) -> None:
+        """Put ``membership`` in the file's place; raises ``BadKeyFile``."""
+        if membership != self.membership:
+            keyfile.write(self.path, membership.packed())
+            self.membership = membership
+
+
+class MemoryMembership:
+    """The same without a file, for nodes that are gone when their process ends."""
+
+    def __init__(self, membership: Membership) -> None:
+        self.membership = membership
+
+    def keep(self, membership: Membership) -> None:
+        """Remember ``membership``."""
+        self.membership = membership
+
+
+def made(path: Path, membership: Membership) -> None:
+    """Make the file of a new member; raises ``BadKeyFile``, also where there is one already."""
+    keyfile.write(path, membership.packed(), is_new=True)
+
+
+Kept = MembershipFile | MemoryMembership
+Keep = Callable[[Membership], None]

@@ -1,0 +1,198 @@
+"""Reception: the bootstrap node's side of admission: who knocks with a good code is let in (thesis, Figure 4.5).
+
+A knock that names no invitation of this team costs a look into a table, one that does not open one hash; only then is
+anything remembered, and the wire gets at most one answer to each, no longer than the knock.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import random
+from collections import OrderedDict
+from collections.abc import Callable
+from typing import Any
+
+from twisted.internet.defer import Deferred
+from twisted.logger import Logger
+from twisted.python.failure import Failure
+
+from middleware.admission import knock
+from middleware.admission.certificate import BOOTSTRAP, SKEW, chained, is_proof
+from middleware.admission.errors import WHY
+from middleware.admission.knock import Knock, Welcome
+from middleware.admission.roll import Roll, packed_admission
+from middleware.admission.statement import Invite
+from middleware.entangled.errors import EntangledError, RemoteError
+from middleware.entangled.identity import Identity
+from middleware.entangled.network.network import Address
+from middleware.entangled.wire.door import Noted
+
+RATE = 50.0
+"""Knocks a second whose signature is checked; these are 1 % of a core."""
+HINTS = 20.0
+"""Knocks a second that name nothing known and are told so."""
+MAX_ANSWERS = 256
+
+
+class Reception:
+    """Lets newcomers in, for a node that may.
+
+    ``identity`` signs for the node, ``take`` uses an invitation once, ``admit`` tells the team of an admission,
+    ``given`` is what a newcomer with that pass is given, and ``send`` carries the answer.  ``now`` is the clock that
+    rates are measured by, ``wall`` that of statements.
+    """
+
+    _log = Logger()
+
+    def __init__(
+        self,
+        roll: Roll,
+        identity: Identity,
+        take: Callable[[Invite], Deferred[bool]],
+        admit: Callable[[bytes], object],
+        given: Callable[[bytes], Welcome],
+        send: Callable[[bytes, Address], None],
+        now: Callable[[], float],
+        wall: Callable[[], float],
+        rng: random.Random,
+    ) -> None:
+        self._roll = roll
+        self._identity = identity
+        self._take = take
+        self._admit = admit
+        self._given = given
+        self._send = send
+        self._now = now
+        self._wall = wall
+        self._rng = rng
+        self._answers: OrderedDict[bytes, bytes] = OrderedDict()
+        self._under_way: dict[bytes, str] = {}
+        self.on_refused: Callable[[bytes, Address, str], None] = lambda who, source, code: None
+        """Called when a newcomer is not let in, with its key (empty: nobody knows its code) and the code of ``WHY``."""
+        self._said = Noted()
+        self._opening = _Rate(RATE)
+        self._hinting = _Rate(HINTS)
+
+    def on_knock(self, datagram: bytes, source: Address) -> None:
+        """Answer a KNOCK; nothing that it holds raises."""
+        digest = hashlib.blake2s(datagram, digest_size=16).digest()
+        answer = self._answers.get(digest)
+        if answer is not None:
+            self._send(answer, source)
+            return
+        try:
+            name = knock.id_of(datagram)
+            known = self._roll.invited(name)
+            if known is None:
+                if self._hinting.is_within(self._now()):
+                    self._say(name, "unknown", source)
+                    self._send(knock.unknown(name), source)
+                return
+            invite, packed = known
+            heard = knock.opened_knock(datagram, invite.public)
+            # After that, or whoever has seen the id on its way could use up what is meant for those with the code.
+            if not self._opening.is_within(self._now()):
+                return
+            if not is_proof(invite.public, heard.public, heard.wish, heard.proof):
+                return
+        except RemoteError:
+            return
+        if heard.public in self._under_way:
+            return  # it will ask again
+        self._under_way[heard.public] = ""
+        decided = Deferred.fromCoroutine(self._decide(heard, invite, packed))
+        decided.addBoth(self._decided, heard, invite, digest, source).addErrback(self._failed)
+
+    async def _decide(self, heard: Knock, invite: Invite, packed: bytes) -> bytes | str:
+        """The pass of who knocked, or the code of the refusal."""
+        now = int(self._wall())
+        me = self._roll.granted(self._identity.public)
+        if me is None or BOOTSTRAP not in me[0].roles:
+            return "role"
+        if self._roll.revoked(invite.public) is not None or self._roll.revoked(heard.public) is not None:
+            return "revoked"
+        before = self._roll.admitted(heard.public)
+        if before is not None and before.member.invitation == invite.public:
+            return before.shown
+        if now < invite.not_before - SKEW:
+            return "early"
+        if now >= invite.not_after:
+            return "expired"
+        if sum(each.member.invitation == invite.public for each in self._roll.admissions()) >= invite.uses:
+            return "used"
+        name = self._named(heard, invite)
+        if name is None:
+            return "name"
+        self._under_way[heard.public] = name
+        try:
+            if not await self._take(invite):
+                return "used"
+        except EntangledError:
+            return "later"
+        came = (heard.public, heard.wish, heard.proof)
+        begin = max(now, invite.not_before)
+        shown = chained(self._identity, me[1], (packed, invite), came, name, begin)
+        self._admit(packed_admission(heard.public, shown))
+        return shown
+
+    def _named(self, heard: Knock, invite: Invite) -> str | None:
+        """What the newcomer is to be called; None where another member is called so already."""
+        taken = {member.name for member in self._roll.members(self._wall()) if member.public != heard.public}
+        taken.update(self._under_way.values())
+        if invite.uses == 1:
+            return invite.name if invite.name not in taken else None
+        if heard.wish:
+            return heard.wish if heard.wish not in taken else None
+        free = (f"{invite.name[:36]}-{number}" for number in range(1, len(taken) + 2))
+        return next((name for name in free if name not in taken), None)
+
+    def _decided(
+        self, result: bytes | str | Failure, heard: Knock, invite: Invite, digest: bytes, source: Address
+    ) -> Any:
+        del self._under_way[heard.public]
+        if isinstance(result, Failure):
+            result.trap(EntangledError)
+            self._log.warn("a newcomer cannot be let in: {problem}", problem=result.getErrorMessage())
+            result = "later"
+        if isinstance(result, bytes):
+            answer = knock.welcome(invite.public, heard.ephemeral, self._given(result), self._rng)
+            self._log.info("let in by the invitation of {name}: {public}", name=invite.name, public=heard.public.hex())
+        else:
+            self._say(heard.public, result, source, invite.name)
+            answer = knock.refusal(invite.public, heard.ephemeral, result, self._rng)
+        if result not in ("later", "role", "name"):  # these may be otherwise in a moment
+            self._answers[digest] = answer
+            if len(self._answers) > MAX_ANSWERS:
+                self._answers.popitem(last=False)
+        self._send(answer, source)
+        return None
+
+    def _failed(self, failure: Failure) -> None:
+        if failure.check(RemoteError) is None:  # an ephemeral key that is none is the newcomer's own fault
+            self._log.failure("while letting a newcomer in", failure)
+
+    def _say(self, who: bytes, code: str, source: Address, name: str = "") -> None:
+        """Once for each newcomer and reason, and not for each datagram; who makes up ids cannot fill the log."""
+        self.on_refused(b"" if code == "unknown" else who, source, code)
+        if not self._said.is_new(self._now(), who, code):
+            return
+        whose = f" by the invitation of {name}" if name else ""
+        self._log.warn(
+            "not let in{whose}, from {source}: {code}: {why}", whose=whose, source=source, code=code, why=WHY[code]
+        )
+
+
+class _Rate:
+    """At most so many a second, and as many at once."""
+
+    def __init__(self, rate: float) -> None:
+        self._rate = self._left = rate
+        self._at = 0.0
+
+    def is_within(self, now: float) -> bool:
+        self._left = min(self._rate, self._left + (now - self._at) * self._rate)
+        self._at = now
+        if self._left < 1.0:
+            return False
+        self._left -= 1.0
+        return True

@@ -1,0 +1,252 @@
+"""Team: a closed team as one of its nodes lives it: door, roll, gossip and reception, wired around the node."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import msgpack
+from twisted.internet.interfaces import IReactorTime
+from twisted.logger import Logger
+
+from middleware.admission import knock
+from middleware.admission.certificate import Member, guest_pass
+from middleware.admission.doorkeeper import Doorkeeper, Rules, begun
+from middleware.admission.errors import WHY, BadKeyFile
+from middleware.admission.gossip import COMPARED, Gossip
+from middleware.admission.knock import Welcome
+from middleware.admission.membership import Kept, Membership
+from middleware.admission.reception import Reception
+from middleware.admission.roll import MAX_ENTRIES, Admission, Entry, Roll, invitation_id, packed_admission
+from middleware.admission.statement import Grant, Invite, Revoke, Secret
+from middleware.entangled.background import Background
+from middleware.entangled.data.store import Store
+from middleware.entangled.errors import Full, Refused, RemoteError
+from middleware.entangled.identity import Identity, node_id
+from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.node import EntangledNode
+from middleware.entangled.wire.door import REVOKED, meaning
+
+if TYPE_CHECKING:
+    from middleware.admission.uses import Uses
+
+ROLL = "admission/roll"
+"""The note of what the node knows of its team."""
+
+
+class Team:
+    """One node's closed team: made before the node, whose ``door`` it has, and then wired to it by ``attach``.
+
+    ``kept`` is the node's own place in the team; ``rules`` say what each role may do.
+    """
+
+    _log = Logger()
+
+    def __init__(self, kept: Kept, store: Store, wall: Callable[[], float], rng: random.Random, rules: Rules) -> None:
+        self._kept = kept
+        self._store = store
+        self._wall = wall
+        self._rng = rng
+        self.identity = kept.membership.identity
+        self.roll = Roll(kept.membership.operator)
+        self._remember()
+        self.door = Doorkeeper(self.roll, lambda: self.membership, wall, begun(store, wall(), rng), rules)
+        self._node: EntangledNode | None = None
+        self._uses: Uses | None = None
+        self._accepted = [secret for _, secret, _ in self.membership.accepted(wall())]
+
+    @property
+    def membership(self) -> Membership:
+        """This node's own place in the team, as it is now."""
+        return self._kept.membership
+
+    @property
+    def secret(self) -> bytes:
+        """The team's newest secret that this node knows."""
+        return self.membership.secrets[0][1]
+
+    def attach(self, node: EntangledNode, clock: IReactorTime) -> None:
+        """Be the team of ``node``, which has this door and is not started yet."""
+        self._node, self._clock = node, clock
+        self._chores = Background(clock)
+        endpoint = node.endpoint
+        self._gossip = Gossip(
+            self.roll, endpoint, node.overlay.contacts, self._rng, self._chores, self._wall, self._on_new
+        )
+        reception = Reception(
+            self.roll,
+            self.identity,
+            lambda invite: self.uses.take(invite),
+            self._gossip.add,
+            self._given,
+            endpoint.post,
+            clock.seconds,
+            self._wall,
+            self._rng,
+        )
+        reception.on_refused = lambda who, source, code: endpoint.rebuffs.met(
+            who, str(source), "code", code, WHY[code], clock.seconds()
+        )
+        endpoint.route(knock.KNOCK, reception.on_knock)
+        endpoint.expose("roll.secret", self._answer_secret)
+        welcome = node.overlay.on_newcomer
+
+        def met(contact: Contact) -> None:
+            welcome(contact)
+            self._gossip.met(contact)
+
+        node.overlay.on_newcomer = met
+        if len(self._accepted) > 1:
+            endpoint.rekey(*self._accepted)
+
+    def start(self) -> None:
+        """Begin to compare with others, and to look after what has run out."""
+        self._log.info("member {name} of the closed team {team}", name=self.door.me.name, team=self.membership.team)
+        trouble = self.door.me.trouble(self._wall())
+        if trouble:
+            # It is not known here yet whether the clock is right, so both are said; nobody else may be there to say it.
+            self._log.warn("the certificate of this node does not hold by its clock: {why}", why=meaning(trouble))
+        self._gossip.start()
+        self._chores.every(COMPARED, self._look_after)
+
+    def stop(self) -> None:
+        """End what is under way."""
+        if self._node is not None:
+            self._chores.stop()
+        if self._uses is not None:
+            self._uses.stop()
+
+    # -- what an operator does --------------------------------------------------------------------------------------
+
+    @property
+    def uses(self) -> Uses:
+        """The uses of invitations; made when first somebody needs them."""
+        if self._uses is None:
+            assert self._node is not None
+            # With it comes the tuple space: a node at which nobody knocks is spared a MiB.
+            from middleware.admission.uses import Uses
+
+            self._uses = Uses(self._node, self._clock, self._rng)
+        return self._uses
+
+    async def tell(self, packed: bytes) -> str:
+        """Tell the team what its operator signed; returns what it is, in a word.
+
+        An invitation can be used when this is done.  Raises ``Refused`` for what is none of this team.
+        """
+        check = Roll(self.roll.operator)
+        try:
+            entry = check.add(packed, self._wall())
+        except RemoteError as error:
+            raise Refused(f"{error}; sign with the key of the team {self.membership.team}") from error
+        if entry is None:
+            raise Refused("that has run out already; look whether this machine's clock is right")
+        if isinstance(entry, Invite) and self.roll.invited(invitation_id(entry.public)) is None:
+            await self.uses.issue(entry)
+        self._gossip.add(packed)
+        return entry.slot[0]
+
+    def members(self) -> list[Member]:
+        """All that are members now, as far as this node has heard, by name."""
+        return self.roll.members(self._wall())
+
+    def guest(self, seed: bytes, name: str) -> Membership:
+        """The membership of a guest for whom this node vouches; raises ``Malformed`` where its own pass is too long."""
+        own, now = self.membership, int(self._wall())
+        shown = guest_pass(self.identity, self.door.shown, Identity(seed).public, name, now)
+        return replace(own, seed=seed, shown=shown, known=())
+
+    # -- inside -----------------------------------------------------------------------------------------------------
+
+    def _remember(self) -> None:
+        """Take in what an earlier life knew, and what the own pass says."""
+        try:
+            noted = msgpack.unpackb(self._store.noted(ROLL) or b"\x90", max_array_len=MAX_ENTRIES)
+        except Exception:  # a rotten file may hold anything
+            noted = []
+        shown, public = self.membership.shown, self.identity.public
+        own = msgpack.unpackb(shown)
+        known = {0: [own[1]], 1: [packed_admission(public, shown)]}.get(own[0], [])  # of a guest nothing is kept
+        for packed in [*(noted if isinstance(noted, list) else []), *known]:
+            try:
+                self.roll.add(packed, self._wall())
+            except (RemoteError, Full):
+                continue
+
+    def _on_new(self, entry: Entry) -> None:
+        self._store.note(ROLL, msgpack.packb(self.roll.packed()))
+        if isinstance(entry, Revoke):
+            self._log.info("revoked: {name}", name=entry.name)
+            self._sweep()
+            self._part_with(entry.public)
+        elif isinstance(entry, Secret):
+            self._heard_of(entry)
+        elif isinstance(entry, Grant) and entry.public == self.identity.public:
+            self._keep(replace(self.membership, shown=self.door.shown))
+        elif isinstance(entry, Admission):
+            self._log.info("{name} is a member now", name=entry.member.name)
+
+    def _look_after(self) -> None:
+        self._sweep()
+        self._go_by_secrets()
+        newest = next(iter(self.roll.secrets()), None)
+        if newest is not None and newest.number > self.membership.secrets[0][0]:
+            self._chores.fork(self._ask_for(newest))
+
+    def _sweep(self) -> None:
+        if self._node is not None:
+            for public, refusal in self.door.swept():
+                self._node.evict(public, refusal)
+
+    def _part_with(self, public: bytes) -> None:
+        """Also of who is absent nothing is expected any more."""
+        came = [each.member.public for each in self.roll.admissions() if each.member.invitation == public]
+        for each in (public, *came):
+            if self._node is not None and self._node.overlay.known(node_id(each)) is not None:
+                self._node.evict(each, REVOKED)
+
+    def _heard_of(self, entry: Secret) -> None:
+        found = entry.opened(self.identity)
+        if found is not None:
+            self._take_over(entry, found)
+
+    def _take_over(self, entry: Secret, secret: bytes) -> None:
+        self._log.info("the team has a new secret, number {number}", number=entry.number)
+        self._keep(self.membership.with_secret(entry.number, secret, entry.at + entry.grace))
+        self._go_by_secrets()
+
+    def _go_by_secrets(self) -> None:
+        accepted = [secret for _, secret, _ in self.membership.accepted(self._wall())]
+        if accepted != self._accepted and self._node is not None:
+            self._accepted = accepted
+            self._node.endpoint.rekey(*accepted)
+
+    async def _ask_for(self, entry: Secret) -> None:
+        """Ask another member for a secret that was not sealed for this one, since it came in meanwhile."""
+        assert self._node is not None
+        others = self._node.overlay.contacts()
+        if others:
+            found = await self._node.endpoint.ask(self._rng.choice(others), "roll.secret", entry.number)
+            if isinstance(found, bytes) and entry.is_it(found):
+                self._take_over(entry, found)
+
+    def _answer_secret(self, peer: Contact, number: int) -> bytes | None:
+        """Who asks is a member, or its session would not be."""
+        return next((secret for known, secret, _ in self.membership.secrets if known == number), None)
+
+    def _given(self, shown: bytes) -> Welcome:
+        membership = self.membership
+        assert self._node is not None
+        contacts = [contact for contact in self._node.overlay.contacts() if not contact.address.host.startswith("~")]
+        picked = self._rng.sample(contacts, min(len(contacts), knock.MAX_CONTACTS))
+        secrets = tuple(membership.accepted(self._wall()))
+        return Welcome(membership.operator, membership.team, shown, secrets, tuple(picked), dict(membership.settings))
+
+    def _keep(self, membership: Membership) -> None:
+        try:
+            self._kept.keep(membership)
+        except BadKeyFile as error:
+            self._log.error("what the team changed is not kept for the next start: {error}", error=error)
+            self._kept.membership = membership

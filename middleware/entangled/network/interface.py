@@ -1,0 +1,101 @@
+"""Interface: the network interfaces of this machine, as Linux tells of them."""
+
+from __future__ import annotations
+
+import fcntl
+import socket
+import struct
+from dataclasses import dataclass
+from ipaddress import IPv6Address, ip_address
+from pathlib import Path
+
+_FLAGS, _ADDRESS = 0x8913, 0x8915  # SIOCGIFFLAGS, SIOCGIFADDR
+_UP, _LOOPBACK, _RUNNING, _MULTICAST = 0x1, 0x8, 0x40, 0x1000
+_ADDRESSES6 = Path("/proc/net/if_inet6")
+
+
+@dataclass(frozen=True)
+class Interface:
+    """One interface that is up; ``addresses`` are those in figures that reach beyond one link."""
+
+    index: int
+    name: str
+    addresses: tuple[str, ...]
+    is_loopback: bool = False
+    is_multicast: bool = True
+    is_running: bool = True
+
+
+def interfaces() -> list[Interface]:
+    """The interfaces that are up; none where the system does not tell."""
+    found: list[Interface] = []
+    sixes = _sixes()
+    try:
+        names = socket.if_nameindex()
+        asked = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    except OSError:
+        return found
+    with asked:
+        for index, name in names:
+            request = struct.pack("40s", name.encode()[:15])
+            try:
+                flags = struct.unpack_from("H", fcntl.ioctl(asked, _FLAGS, request), 16)[0]
+            except OSError:
+                continue
+            try:
+                fours = [socket.inet_ntoa(fcntl.ioctl(asked, _ADDRESS, request)[20:24])]
+            except OSError:
+                fours = []
+            if flags & _UP:
+                addresses = (*fours, *sixes.get(name, []))
+                found.append(
+                    Interface(
+                        index,
+                        name,
+                        addresses,
+                        bool(flags & _LOOPBACK),
+                        bool(flags & (_MULTICAST | _LOOPBACK)),
+                        bool(flags & _RUNNING),
+                    )
+                )
+    return found
+
+
+def chosen(found: list[Interface], host: str) -> list[Interface]:
+    """Those of ``found`` on which a node that listens at ``host`` can be met: all, or the one that has the address.
+
+    The loopback only where there is nothing else, or where the node listens there.
+    """
+    if not is_any(host):
+        return [interface for interface in found if host in interface.addresses]
+    usable = [i for i in found if i.is_multicast and i.addresses and not i.is_loopback]
+    return usable or [i for i in found if i.is_loopback]
+
+
+def is_any(host: str) -> bool:
+    """Whether who listens at ``host`` listens at every interface."""
+    return host in ("", "*", "0.0.0.0", "::")
+
+
+def is_loopback(host: str) -> bool:
+    """Whether ``host`` is heard on this machine alone."""
+    try:
+        return ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def _sixes() -> dict[str, list[str]]:
+    """The IPv6 addresses of each interface but those of one link, which say nothing without their interface."""
+    found: dict[str, list[str]] = {}
+    try:
+        lines = _ADDRESSES6.read_text(encoding="ascii").splitlines()
+    except (OSError, ValueError):
+        return found
+    for line in lines:
+        words = line.split()
+        if len(words) == 6:
+            address = IPv6Address(bytes.fromhex(words[0]))
+            if not address.is_link_local:
+                found.setdefault(words[5], []).append(str(address))
+    return found

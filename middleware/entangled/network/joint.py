@@ -1,0 +1,69 @@
+"""Joint: a ``Network`` of two: UDP, and tunnels for those to whom no UDP leads; it picks by the address."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+from middleware.entangled.errors import EntangledError
+from middleware.entangled.network.network import Address, Network, Receiver
+from middleware.entangled.network.tunnel import TunnelNetwork
+from middleware.entangled.network.url import VIRTUAL
+
+
+class JointNetwork:
+    """``udp`` and ``tunnel`` as one; its address is that of ``udp``."""
+
+    def __init__(self, udp: Network, tunnel: TunnelNetwork) -> None:
+        self.udp = udp
+        self.tunnel = tunnel
+
+    @property
+    def address(self) -> Address:
+        """The node's own address."""
+        return self.udp.address
+
+    @property
+    def counters(self) -> Counter[str]:
+        """What both count together: sent, received, unsent, ...; and of the tunnels alone, with that before it."""
+        counted: Counter[str] = Counter(getattr(self.udp, "counters", {}))
+        counted.update({f"tunnel {name}": number for name, number in self.tunnel.counters.items()})
+        for name in ("sent", "received", "unsent"):
+            counted[name] += self.tunnel.counters[name]
+        return counted
+
+    @property
+    def ports(self) -> Any:
+        """The local ports of ``udp``, where it can have several."""
+        return self.udp if hasattr(self.udp, "open_port") else getattr(self.udp, "ports", None)
+
+    @property
+    def detours(self) -> list[Address]:
+        """The tunnels that may be dialled."""
+        return self.tunnel.detours
+
+    @property
+    def closed(self) -> Any:
+        """Fires when the UDP port is really free again."""
+        return getattr(self.udp, "closed", None)
+
+    def listen(self, receiver: Receiver) -> None:
+        """Open both; raises ``PortInUse`` where either cannot be."""
+        self.udp.listen(receiver)
+        try:
+            self.tunnel.listen(receiver)
+        except EntangledError:
+            self.close()
+            raise
+
+    def send(self, datagram: bytes, to: Address) -> None:
+        """Send by the way that the address names."""
+        if to.host.startswith(VIRTUAL):
+            self.tunnel.send(datagram, to)
+        else:
+            self.udp.send(datagram, to)
+
+    def close(self) -> None:
+        """Close both; may be called twice."""
+        self.tunnel.close()
+        self.udp.close()

@@ -1,0 +1,326 @@
+"""Tunnel: a ``Network`` whose datagrams travel as WebSocket messages over TLS, where a firewall lets no UDP pass.
+
+A node that serves one has a peer for each connection, a node that dials one for each URL that it was given; both are
+known by virtual addresses, ``~wss-`` and 12 hexadecimal digits, that mean nothing to anybody else.  A URL is dialled
+when something is sent to its address, and let go when nothing was carried for a while: who sends decides whether there
+is a tunnel.  Nobody is trusted for having come by one: the wire inside proves who is there, and TLS is here only
+because what is not TLS on port 443 may not get through.
+"""
+
+from __future__ import annotations
+
+import random
+import ssl
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from ipaddress import ip_address
+
+from twisted.internet.interfaces import IDelayedCall, IReactorTime
+from twisted.logger import Logger
+
+from middleware.entangled.network.bundle import MOST, Bundle
+from middleware.entangled.network.carrier import Carrier
+from middleware.entangled.network.layer import Layer, Proxied, Tls, client_context, server_context
+from middleware.entangled.network.link import Link
+from middleware.entangled.network.network import Address, Receiver
+from middleware.entangled.network.selfsigned import selfsigned
+from middleware.entangled.network.url import VIRTUAL, Proxy, Url
+from middleware.entangled.network.websocket import MAX_PAYLOAD, WebSocket
+
+LOOK_S = 1.0
+HEAD_S = 8.0
+"""From the connection on: TLS and the greeting of the WebSocket are complete by then."""
+DIALLED_S = 12.0
+"""The same for who dials, through a proxy perhaps."""
+UNANSWERED_S = 10.0
+"""The wire answers nobody who lacks the team's key: to whom it said nothing for so long, that is no member."""
+UNUSED_S = 60.0
+"""A tunnel that carried nothing for so long is let go by who dialled it."""
+MAX_LINKS = 256
+MAX_BEGUN = 64
+"""Connections that are not open yet; beyond, the oldest goes."""
+MAX_OF_HOST = 32
+"""Connections of one address to which the node has sent nothing; of all, and a team behind one NAT shares one, as many
+as so many tunnels may have."""
+FIRST_HOLD_S, LAST_HOLD_S = 0.5, 10.0
+"""How long after it was dialled a URL that failed is left alone."""
+
+
+@dataclass(slots=True, eq=False)
+class _Way:
+    """One URL that may be dialled."""
+
+    url: Url
+    hold_s: float = FIRST_HOLD_S
+    hold_until: float = float("-inf")
+    told: str = ""
+
+
+class TunnelNetwork:
+    """Tunnels to ``urls``, and from whoever dials this node where it ``is_served``.
+
+    With ``is_plain`` it is served without TLS, for a reverse proxy on the same machine, which names whom it speaks
+    for in ``X-Forwarded-For``. ``proxy_for`` says by which HTTP proxy a URL is dialled. ``counters`` counts
+    datagrams: sent, received, unsent (no such tunnel), dropped (no room); and links: opened, lost, refused (no
+    greeting of ours, or not in time), crowded.
+    """
+
+    _log = Logger()
+
+    def __init__(
+        self,
+        carrier: Carrier,
+        clock: IReactorTime,
+        rng: random.Random,
+        urls: Sequence[Url] = (),
+        is_served: bool = False,
+        is_plain: bool = False,
+        proxy_for: Callable[[Url], Proxy | None] = lambda url: None,
+    ) -> None:
+        self.counters: Counter[str] = Counter()
+        self._carrier = carrier
+        self._clock = clock
+        self._rng = rng
+        self._ways = {url.address: _Way(url) for url in urls}
+        self._is_served = is_served
+        self._is_plain = is_plain
+        self._proxy_for = proxy_for
+        self._bundles: dict[Address, Bundle] = {}
+        self._tokens: dict[bytes, Bundle] = {}
+        self._ending: set[Link] = set()
+        self._receiver: Receiver | None = None
+        self._timer: IDelayedCall | None = None
+
+    @property
+    def address(self) -> Address:
+        """What stands for this end; nobody can be sent to it."""
+        return Address(VIRTUAL + "0" * 12, 1)
+
+    @property
+    def detours(self) -> list[Address]:
+        """The addresses of the URLs that may be dialled."""
+        return list(self._ways)
+
+    @property
+    def peers(self) -> list[Address]:
+        """The addresses to which a tunnel is open."""
+        return [address for address, bundle in self._bundles.items() if bundle.is_open]
+
+    def listen(self, receiver: Receiver) -> None:
+        """Serve tunnels, if so wished, and hand each datagram to ``receiver``; raises ``PortInUse``."""
+        if self._receiver is None and self._is_served:
+            self._carrier.listen(self._accept)
+        self._receiver = receiver
+
+    def send(self, datagram: bytes, to: Address) -> None:
+        """Send a datagram; where there is no tunnel yet, it waits for one, or is lost."""
+        bundle = self._bundles.get(to) or self._begin(to)
+        if bundle is None or self._receiver is None or len(datagram) > MAX_PAYLOAD:
+            self.counters["unsent"] += 1
+            return
+        now = self._clock.seconds()
+        self.counters["sent" if bundle.send(datagram, now) else "dropped"] += 1
+        self._mend(bundle, now)
+
+    def close(self) -> None:
+        """End all tunnels; may be called twice."""
+        self._receiver = None
+        self._carrier.close()
+        for link in self._links:
+            link.end("the node stops")
+        for link in list(self._ending):
+            link.forget()
+        self._ending.clear()
+        if self._timer is not None and self._timer.active():
+            self._timer.cancel()
+        self._timer = None
+
+    # -- called by the links ----------------------------------------------------------------------------------------
+
+    def link_open(self, link: Link) -> bool:
+        """Count a link that is open, unless too many came from there."""
+        if self._is_plain and link.address not in self._ways:
+            host = _neighbourhood(link.socket.forwarded) or link.host
+            if link.socket.forwarded and self._is_crowded(host):
+                self.counters["crowded"] += 1
+                return False
+            link.host = host
+        self.counters["opened"] += 1
+        now = self._clock.seconds()
+        link.begun_at = now
+        bundle = self._bundles[link.address]
+        if link.address not in self._ways:
+            self._join(link, bundle, now)
+        elif sum(each.is_open for each in bundle.links) == 1:
+            bundle.carried_at = now
+            self._log.info("a tunnel to {url} is open", url=str(self._ways[link.address].url))
+        return True
+
+    def link_said(self, link: Link, datagram: bytes) -> None:
+        """Hand on a datagram."""
+        if self._receiver is not None:
+            self.counters["received"] += 1
+            bundle = self._bundles.get(link.address)
+            if bundle is not None:
+                bundle.carried_at = self._clock.seconds()
+            self._receiver(datagram, link.address)
+
+    def link_over(self, link: Link, why: str) -> None:
+        """Forget a link; one that was dialled is left alone for a while."""
+        now = self._clock.seconds()
+        bundle = self._bundles.get(link.address)
+        if bundle is not None:
+            bundle.remove(link, now)
+            if not bundle.links:
+                del self._bundles[link.address]
+                if self._tokens.get(bundle.token) is bundle:
+                    del self._tokens[bundle.token]
+        if self._receiver is not None:
+            self._ending.add(link)
+        self.counters["lost" if link.socket.is_open else "refused"] += 1
+        way = self._ways.get(link.address)
+        if way is None or (bundle is not None and bundle.links):
+            return
+        if link.socket.is_open and now - link.begun_at > LAST_HOLD_S:
+            way.hold_s = FIRST_HOLD_S
+        # Counted from when it was dialled: what took long to fail has waited already.
+        way.hold_until = link.begun_at + way.hold_s * (0.75 + self._rng.random() / 2)
+        way.hold_s = min(2 * way.hold_s, LAST_HOLD_S)
+        if link.socket.is_open or way.told != why:
+            way.told = why
+            self._log.info("no tunnel to {url}: {why}", url=str(way.url), why=why)
+
+    # -- inside -----------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def _client_context(self) -> ssl.SSLContext:
+        return client_context()
+
+    @cached_property
+    def _server_context(self) -> ssl.SSLContext:
+        return server_context(selfsigned(self._rng.randbytes(32), self._rng.randbytes(8)))
+
+    @property
+    def _links(self) -> list[Link]:
+        return [link for bundle in self._bundles.values() for link in bundle.links]
+
+    def _begin(self, to: Address) -> Bundle | None:
+        """A tunnel to a URL, which has one connection at first."""
+        way, now = self._ways.get(to), self._clock.seconds()
+        if way is None or self._receiver is None or now < way.hold_until:
+            return None
+        bundle = Bundle(to, self._carrier.strain, now)
+        bundle.token = self._rng.randbytes(16)
+        self._dial(way, bundle)
+        return self._bundles.get(to)
+
+    def _mend(self, bundle: Bundle, now: float) -> None:
+        """Have as many connections as the line asks for, of a tunnel that was dialled here."""
+        way = self._ways.get(bundle.address)
+        if way is None or len(bundle.links) == bundle.wanted(now) == 1:
+            return
+        for link in bundle.dead(now):
+            is_still = link.is_open and bundle.wanted(now) > 1
+            link.end("it stands still" if is_still else "one is enough", is_rude=is_still)
+        while bundle.links and len(bundle.links) < bundle.wanted(now) and now >= bundle.hold_until:
+            self._dial(way, bundle)
+
+    def _join(self, link: Link, bundle: Bundle, now: float) -> None:
+        """Let an accepted connection be of the tunnel that it names; the stillest makes room where there are enough."""
+        token = link.socket.token
+        if not token:
+            return
+        whole = self._tokens.setdefault(token, bundle)
+        if whole is bundle:
+            bundle.token = token
+            return
+        del self._bundles[bundle.address]
+        link.address = whole.address
+        whole.add(link)
+        if len(whole.links) > MOST:
+            whole.stillest(now).end("newer ones of the same tunnel need its place", is_rude=True)
+
+    def _dial(self, way: _Way, bundle: Bundle) -> None:
+        url, proxy = way.url, self._proxy_for(way.url)
+        layers: list[Layer] = []
+        where = Address(url.host, url.port)
+        if proxy is not None:
+            host = f"[{url.host}]" if ":" in url.host else url.host
+            layers.append(Proxied(f"{host}:{url.port}", proxy.login))
+            where = Address(proxy.host, proxy.port)
+        if url.is_tls:
+            layers.append(Tls(self._client_context, url.host))
+        socket = WebSocket(self._rng.randbytes, url, bundle.token)
+        link = self._kept(Link(self, self._clock, bundle.address, url.host, layers, socket), bundle)
+        self._carrier.dial(where, link, lambda why: link.end(why, is_rude=True))
+
+    def _accept(self, host: str) -> Link | None:
+        """A link for who has dialled from ``host``; None where there is no room for it."""
+        place = _neighbourhood(host)
+        # All that a reverse proxy brings comes from one address: it is counted when it says for whom.
+        if self._receiver is None or (not self._is_plain and self._is_crowded(place)):
+            self.counters["crowded"] += 1
+            return None
+        served = [link for link in self._links if link.address not in self._ways]
+        begun = [link for link in served if not link.is_open]
+        unproved = [link for link in served if link.is_open and not self._bundles[link.address].is_answered]
+        if len(begun) >= MAX_BEGUN:
+            begun[0].end("newer ones need its place", is_rude=True)
+        elif len(served) >= MAX_LINKS:
+            further = [link for link in served if link is not self._bundles[link.address].links[0]]
+            if not (begun or unproved or further):
+                self.counters["crowded"] += 1
+                return None
+            (begun or unproved or further)[0].end("newer ones need its place", is_rude=True)
+        address = Address(VIRTUAL + self._rng.randbytes(6).hex(), 1)
+        layers = [] if self._is_plain else [Tls(self._server_context, is_server=True)]
+        bundle = Bundle(address, self._carrier.strain, self._clock.seconds())
+        return self._kept(Link(self, self._clock, address, place, layers, WebSocket(self._rng.randbytes)), bundle)
+
+    def _kept(self, link: Link, bundle: Bundle) -> Link:
+        self._bundles[link.address] = bundle
+        bundle.add(link)
+        if self._timer is None:
+            self._timer = self._clock.callLater(LOOK_S, self._look)
+        return link
+
+    def _is_crowded(self, host: str) -> bool:
+        """Whether so many connections of one address are borne that another one is not."""
+        there = [self._bundles[link.address] for link in self._links if link.host == host]
+        return len(there) >= MOST * MAX_OF_HOST or sum(not each.is_answered for each in there) >= MAX_OF_HOST
+
+    def _look(self) -> None:
+        now = self._clock.seconds()
+        self._timer = None
+        self._ending = {link for link in self._ending if link.is_closing}
+        for link in self._links:
+            bundle = self._bundles.get(link.address)
+            if bundle is None or link.is_over:
+                continue
+            is_ours, age = link.address in self._ways, now - link.begun_at
+            if not link.is_open:
+                if age > (DIALLED_S if is_ours else HEAD_S):
+                    link.end("no greeting in time", is_rude=True)
+            elif is_ours and now - bundle.carried_at > UNUSED_S:
+                link.end("nobody has used it for a while")
+            elif not is_ours and not bundle.is_answered and age > UNANSWERED_S:
+                link.end("no member of this team")
+            else:
+                link.look(now)
+        for bundle in list(self._bundles.values()):
+            self._mend(bundle, now)
+        if self._bundles or self._ending:
+            self._timer = self._clock.callLater(LOOK_S, self._look)
+
+
+def _neighbourhood(host: str) -> str:
+    """Who counts as one: an IPv4 address, or the 64 bits of IPv6 of which one household has all; or nobody, ""."""
+    try:
+        ip = ip_address(host)
+    except ValueError:
+        return ""
+    if ip.version == 4:
+        return str(ip)
+    return str(ip.ipv4_mapped) if ip.ipv4_mapped is not None else ip.exploded[:19]

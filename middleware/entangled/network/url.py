@@ -1,0 +1,70 @@
+"""Url: where a tunnel begins, ``wss://host:443/swarm`` or, inside one machine, ``ws://127.0.0.1:8000/swarm``.  Pure."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from typing import NamedTuple
+from urllib.parse import unquote
+
+from middleware.entangled.network.network import Address
+
+PATH = "/swarm"
+USUAL_PORTS = {"wss": 443, "ws": 80}
+VIRTUAL = "~wss-"
+"""How the addresses of tunnels begin, at both ends."""
+_FORM = re.compile(r"(wss?)://(\[[0-9a-fA-F:.]{2,45}\]|[A-Za-z0-9._-]{1,253})(?::([0-9]{1,5}))?(/[!-~]{0,200})?")
+
+
+class Url(NamedTuple):
+    """The parts of an address on the web; ``ws`` goes without TLS."""
+
+    scheme: str
+    host: str
+    port: int
+    path: str = PATH
+
+    @classmethod
+    def of(cls, text: str) -> Url:
+        """The parts of ``text``; raises ``ValueError`` where it is none."""
+        found = _FORM.fullmatch(text)
+        port = int(found[3] or USUAL_PORTS[found[1]]) if found else 0
+        if found is None or not 0 < port < 65536:
+            raise ValueError(f"{text[:80]!r} is no wss://host:port/path")
+        return cls(found[1], found[2].strip("[]"), port, found[4] or PATH)
+
+    @property
+    def is_tls(self) -> bool:
+        """Whether it goes over TLS."""
+        return self.scheme == "wss"
+
+    @property
+    def authority(self) -> str:
+        """Host and port, as HTTP writes them; a usual port is left out, as browsers do."""
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return host if self.port == USUAL_PORTS[self.scheme] else f"{host}:{self.port}"
+
+    @property
+    def address(self) -> Address:
+        """The virtual address of the node at its other end."""
+        return Address(VIRTUAL + hashlib.blake2s(str(self).encode(), digest_size=6).hexdigest(), 1)
+
+    def __str__(self) -> str:
+        return f"{self.scheme}://{self.authority}{self.path}"
+
+
+class Proxy(NamedTuple):
+    """An HTTP proxy that opens streams for others; ``login`` is ``user:password``."""
+
+    host: str
+    port: int
+    login: str = ""
+
+    @classmethod
+    def of(cls, text: str) -> Proxy:
+        """What the environment variable ``https_proxy`` says; raises ``ValueError`` where it is no proxy of ours."""
+        found = re.fullmatch(r"(?:http://)?(?:([^@/]+)@)?(\[[0-9a-fA-F:.]+\]|[^:@/\[\]]+)(?::([0-9]{1,5}))?/?", text)
+        port = int(found[3] or 3128) if found else 0
+        if found is None or not 0 < port < 65536:
+            raise ValueError("it is no http://host:port")
+        return cls(found[2].strip("[]"), port, unquote(found[1] or ""))

@@ -1,0 +1,165 @@
+"""Hail: HAIL and ECHO, by which anybody learns who is there at all; neither is sealed, and nothing secret is in them.
+
+Who finds no team, or not its own, learns so whether an address is reached, which team is there, which version it
+speaks, by how much the clocks differ, and from where it is seen.  An ECHO is as long as its HAIL, and there are few.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from twisted.internet.defer import Deferred
+from twisted.internet.interfaces import IDelayedCall, IReactorTime
+
+from middleware.entangled.errors import Malformed, NoAnswer
+from middleware.entangled.network.address import ADDRESS, address_of, packed_address
+from middleware.entangled.network.network import Address
+from middleware.entangled.wire.congestion import BACK_OFF, FIRST_GUESS, LONGEST
+from middleware.entangled.wire.greeting import Bucket
+from middleware.entangled.wire.peer import cancel
+
+HAIL, ECHO = 0x19, 0x1A
+VERSION = 1
+TOKEN = 16
+FINGERPRINT = 8
+RATE = 20.0
+"""Echoes in a second: enough for every doctor of a team, and 8 kbit/s at most."""
+_HEAD = 1 + TOKEN
+HAIL_BYTES = _HEAD + 1 + FINGERPRINT + 8 + ADDRESS
+
+
+class Echo(NamedTuple):
+    """Who is there.
+
+    ``fingerprint`` tells its team from others (zero: an open team, which does not say), ``wall`` is what its clock
+    shows, in unix seconds (0: it does not say), ``seen`` from where the HAIL came.
+    """
+
+    token: bytes
+    version: int
+    fingerprint: bytes
+    wall: float
+    seen: Address | None
+
+
+def hail(token: bytes) -> bytes:
+    """The question of anybody; ``token`` (16 bytes) comes back."""
+    return (bytes([HAIL]) + token).ljust(HAIL_BYTES, b"\0")
+
+
+def echo(asked: bytes, fingerprint: bytes, wall: float, source: Address) -> bytes:
+    """The answer to the HAIL ``asked``, which came from ``source``; raises ``Malformed`` where it is none."""
+    if len(asked) != HAIL_BYTES or asked[0] != HAIL:
+        raise Malformed("a HAIL of a wrong length")
+    moment = max(0, int(1000 * wall)).to_bytes(8, "little")
+    return bytes([ECHO]) + asked[1:_HEAD] + bytes([VERSION]) + fingerprint + moment + packed_address(source)
+
+
+def echo_of(datagram: bytes) -> Echo:
+    """What an ECHO says; raises ``Malformed``."""
+    if len(datagram) != HAIL_BYTES or datagram[0] != ECHO:
+        raise Malformed("an ECHO of a wrong length")
+    rest = datagram[_HEAD:]
+    fingerprint, moment = rest[1 : 1 + FINGERPRINT], rest[1 + FINGERPRINT : -ADDRESS]
+    wall = int.from_bytes(moment, "little") / 1000
+    return Echo(datagram[1:_HEAD], rest[0], fingerprint, wall, address_of(rest[-ADDRESS:]))
+
+
+class Echoer:
+    """Answers HAILs, ``RATE`` of them in a second; ``send`` sends a datagram, ``wall`` gives unix seconds."""
+
+    def __init__(
+        self, send: Callable[[bytes, Address], None], clock: IReactorTime, fingerprint: Callable[[], bytes]
+    ) -> None:
+        self.wall: Callable[[], float] = lambda: 0.0
+        self._send = send
+        self._clock = clock
+        self._fingerprint = fingerprint
+        self._bucket = Bucket(RATE)
+
+    def on_hail(self, datagram: bytes, source: Address) -> str:
+        """Answer one; why it was not, in one word."""
+        try:
+            answer = echo(datagram, self._fingerprint(), self.wall(), source)
+        except Malformed:
+            return "malformed"
+        if not self._bucket.take(self._clock.seconds()):
+            return "crowded"
+        self._send(answer, source)
+        return ""
+
+
+@dataclass(slots=True, eq=False)
+class _Hailing:
+    address: Address
+    deadline: float
+    deferred: Deferred[Echo]
+    timer: IDelayedCall | None = None
+
+
+class Hailer:
+    """Hails addresses until one answers or the time is up; ``send`` sends a datagram.
+
+    ``on_other`` is told of echoes from elsewhere than where the HAIL went, as after one to a group.
+    """
+
+    def __init__(self, send: Callable[[bytes, Address], None], clock: IReactorTime, rng: random.Random) -> None:
+        self.on_other: Callable[[Echo, Address], None] = lambda echo, source: None
+        self._send = send
+        self._clock = clock
+        self._rng = rng
+        self._pending: dict[bytes, _Hailing] = {}
+
+    def hail(self, address: Address, timeout: float = 1.5) -> Deferred[Echo]:
+        """Who is at ``address``; fails with ``NoAnswer`` after ``timeout`` seconds."""
+        token = self._rng.randbytes(TOKEN)
+        deferred: Deferred[Echo] = Deferred(lambda _: self._cancelled(token))
+        self._pending[token] = _Hailing(address, self._clock.seconds() + timeout, deferred)
+        self._again(token, FIRST_GUESS)
+        return deferred
+
+    def on_echo(self, datagram: bytes, source: Address) -> str:
+        """Take an answer; why it was dropped, in one word."""
+        try:
+            answer = echo_of(datagram)
+        except Malformed:
+            return "malformed"
+        hailing = self._pending.get(answer.token)
+        if hailing is None:
+            return "unasked"
+        if hailing.address != source:
+            self.on_other(answer, source)
+            return ""
+        self._forget(answer.token)
+        hailing.deferred.callback(answer)
+        return ""
+
+    def stop(self, error: Exception) -> None:
+        """Fail what is pending with ``error``."""
+        for token in list(self._pending):
+            hailing = self._forget(token)
+            if hailing is not None:
+                hailing.deferred.errback(error)
+
+    def _again(self, token: bytes, wait: float) -> None:
+        hailing = self._pending[token]
+        left = hailing.deadline - self._clock.seconds()
+        if left <= 0:
+            self._forget(token)
+            hailing.deferred.errback(NoAnswer(f"nobody answers at {hailing.address}"))
+            return
+        self._send(hail(token), hailing.address)
+        wait = min(wait, LONGEST)
+        hailing.timer = self._clock.callLater(min(wait, left), self._again, token, wait * BACK_OFF)
+
+    def _cancelled(self, token: bytes) -> None:
+        self._forget(token)
+
+    def _forget(self, token: bytes) -> _Hailing | None:
+        hailing = self._pending.pop(token, None)
+        if hailing is not None:
+            cancel(hailing.timer)
+        return hailing

@@ -1,0 +1,1 @@
+"""A yard for many: round robots by the thousand, whose rays, moves and controllers are computed as arrays."""

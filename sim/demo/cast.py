@@ -1,0 +1,101 @@
+"""Cast: which robot each dog of the demonstration is, and what its driver is told of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+LOOPBACK = "127.0.0.1"
+FPS = 15
+CASTS = {
+    "aibo": ("aibo", "aibo", "aibo"),
+    "bittle": ("bittle", "bittle", "bittle"),
+    "create2": ("create2", "create2", "create2"),
+    "mixed": ("aibo", "create2", "bittle"),
+    "rosbridge": ("rosbridge", "rosbridge", "rosbridge"),
+    "sim": ("sim", "sim", "sim"),
+}
+"""The kinds of the three robots, by what a person asks for."""
+MOST_PORTS = 8
+"""So many TCP ports a robot and its parts need at most."""
+SERVICES = ("main", "estop", "state", "walk", "head", "camera")
+
+
+@dataclass(frozen=True)
+class Robot:
+    """One robot: the table that its node's driver gets, and what else the yard has to know to play it."""
+
+    kind: str
+    model: str
+    about: str
+    options: Mapping[str, Any]
+    parts: tuple[Mapping[str, Any], ...] = ()
+    more: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def driver(self) -> dict[str, Any]:
+        """The table ``[driver]`` of its node."""
+        return {"kind": self.kind, "options": self.options, **({"parts": self.parts} if self.parts else {})}
+
+    @property
+    def played(self) -> dict[str, Any]:
+        """What the yard is told of it."""
+        return {**self.driver, **self.more}
+
+
+def chosen(wish: str, names: tuple[str, ...], folder: Path, ports: Iterator[int], yard_port: int) -> dict[str, Robot]:
+    """The robots of the cast ``wish``, by name; each takes of ``ports`` what it needs, and cables end in ``folder``."""
+    makers: dict[str, Callable[[str], Robot]] = {
+        "aibo": lambda name: _aibo(name, ports),
+        "bittle": lambda name: _bittle(name, folder, ports),
+        "create2": lambda name: _create2(name, folder, ports),
+        "rosbridge": lambda name: _rosbridge(ports),
+        "sim": lambda name: _sim(name, yard_port),
+    }
+    return {name: makers[kind](name) for name, kind in zip(names, CASTS[wish], strict=True)}
+
+
+def _aibo(name: str, ports: Iterator[int]) -> Robot:
+    served = {service: next(ports) for service in SERVICES}
+    options = {"host": LOOPBACK, "camera_fps": FPS, "camera_width": 208, "ports": served}
+    # One of them runs the older Tekkotsu: a driver finds out by itself which one its dog has.
+    more = {"dialect": "T2"} if name.endswith("3") else {}
+    stripes = _stripes(name)
+    return Robot("aibo", "AIBO ERS-7", f"With {stripes}", options, (_compass(ports),), more)
+
+
+def _bittle(name: str, folder: Path, ports: Iterator[int]) -> Robot:
+    options = {"port": str(folder / f"{name}.tty"), "board": "biboard", "ultrasonic": [16, 17]}
+    return Robot("bittle", "Petoi Bittle", "With a camera on its back", options, (_camera(ports), _compass(ports)))
+
+
+def _create2(name: str, folder: Path, ports: Iterator[int]) -> Robot:
+    options = {"port": str(folder / f"{name}.tty")}
+    return Robot("create2", "iRobot Create 2", "With a camera on its back", options, (_camera(ports), _compass(ports)))
+
+
+def _rosbridge(ports: Iterator[int]) -> Robot:
+    camera = {"camera_fps": FPS, "camera_width": 208, "camera_height": 160, "camera_lens": 56.9}
+    options = {"host": LOOPBACK, "port": next(ports), "image_topic": "/camera/image_raw/compressed", **camera}
+    return Robot("rosbridge", "ROS 2 robot", "Behind rosbridge", options, (_compass(ports),))
+
+
+def _sim(name: str, yard_port: int) -> Robot:
+    options = {"host": LOOPBACK, "port": yard_port, "robot": name, "camera_fps": FPS}
+    stripes = _stripes(name)
+    return Robot("sim", "simulated ERS-7", f"With {stripes}", options)
+
+
+def _stripes(name: str) -> str:
+    return f"{name[-1]} yellow stripe" + ("s" if name[-1] != "1" else "")
+
+
+def _camera(ports: Iterator[int]) -> Mapping[str, Any]:
+    lens = {"width": 208, "height": 160, "lens": 56.9, "ahead": 0.105, "fps": FPS}
+    return {"kind": "camera", "options": {"url": f"http://{LOOPBACK}:{next(ports)}/stream", **lens}}
+
+
+def _compass(ports: Iterator[int]) -> Mapping[str, Any]:
+    return {"kind": "compass", "options": {"host": LOOPBACK, "port": next(ports)}}

@@ -1,0 +1,65 @@
+"""Body: what an emulator moves and senses; the yard's dogs are such, and ``MemoryBody`` for tests."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from drivers.reading import Value
+
+
+class Body(Protocol):
+    """One body in SI units; x forward, y left, counter-clockwise positive."""
+
+    def drive(self, vx: float, vy: float, wz: float) -> None:
+        """Move with this velocity in the body's own frame (m/s, m/s, rad/s) until told otherwise."""
+
+    def halt(self) -> None:
+        """Stand still as fast as it can."""
+
+    def sense(self) -> Mapping[str, Value]:
+        """What is known of it now, under the keys of an observation: ``odom.x``, ``range.near``, ``power.level`` ..."""
+
+    def picture(self, is_halved: bool = False) -> bytes | None:
+        """What its camera sees now as a JPEG, with half the width and height if asked for; None without a camera."""
+
+
+@dataclass
+class MemoryBody:
+    """A body on an endless floor; ``pass_time`` moves it exactly as it was told."""
+
+    x: float = 0.0
+    y: float = 0.0
+    yaw: float = 0.0
+    motion: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    values: dict[str, Value] = field(default_factory=lambda: {"power.level": 1.0})
+    jpeg: bytes | None = None
+
+    def drive(self, vx: float, vy: float, wz: float) -> None:
+        """Move with this velocity."""
+        self.motion = (vx, vy, wz)
+
+    def halt(self) -> None:
+        """Stand still."""
+        self.motion = (0.0, 0.0, 0.0)
+
+    def sense(self) -> Mapping[str, Value]:
+        """Its place, its speed, and ``values``."""
+        vx, vy, wz = self.motion
+        moving = any(self.motion)
+        place: dict[str, Value] = {"odom.x": self.x, "odom.y": self.y, "odom.yaw": self.yaw, "base.moving": moving}
+        return {**place, "base.vx": vx, "base.vy": vy, "base.wz": wz, **self.values}
+
+    def picture(self, is_halved: bool = False) -> bytes | None:
+        """``jpeg``, whatever size is asked for."""
+        return self.jpeg
+
+    def pass_time(self, seconds: float) -> None:
+        """Let so much time pass, in one step along a straight line."""
+        vx, vy, wz = self.motion
+        cos, sin = math.cos(self.yaw), math.sin(self.yaw)
+        self.x += (vx * cos - vy * sin) * seconds
+        self.y += (vx * sin + vy * cos) * seconds
+        self.yaw = math.remainder(self.yaw + wz * seconds, math.tau)

@@ -1,0 +1,128 @@
+"""Command: ``sim run``, a scenario played to its verdict."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TextIO
+
+from middleware.errors import BadSetting
+from sim.team.load.catalogue import LOADS
+from sim.team.memory import Read, check, resident
+from sim.team.picture import drawn
+from sim.team.progress import Progress
+from sim.team.report import Cost, again, packed, text
+from sim.team.run import Run
+from sim.team.samples import Samples
+from sim.team.scenario import Scenario, loaded, names
+from sim.team.standing import STANDING
+from sim.team.trace import Trace
+from sim.team.workload import Kinds
+
+KINDS: Kinds = {"standing": STANDING, **LOADS}
+MISSED, ENDED = 1, 130
+
+
+@dataclass
+class World:
+    """What a command needs of the machine; tests have another one.
+
+    ``wall`` and ``cpu`` give seconds; ``columns`` is how wide the terminal is, 0 where there is none; ``is_stopped``
+    says whether a person wants an end; ``grown`` is called when most of what a run makes is there.
+    """
+
+    out: TextIO
+    err: TextIO
+    wall: Callable[[], float]
+    cpu: Callable[[], float]
+    read: Read
+    columns: int = 0
+    is_stopped: Callable[[], bool] = field(default=lambda: False)
+    grown: Callable[[], None] = field(default=lambda: None)
+
+
+def run(arguments: Sequence[str], world: World, kinds: Kinds = KINDS) -> int:
+    """Run what the arguments say; 1 where a target or an invariant is missed.  Raises ``BadSetting``."""
+    wanted = _parsed(arguments)
+    changes = {} if wanted.nodes is None else {"nodes": wanted.nodes}
+    scenario = loaded(wanted.scenario, {name: kind.settings for name, kind in kinds.items()}, changes)
+    check_targets(scenario, kinds)
+    check(scenario, world.read)
+    line = again(wanted.scenario, wanted.seed, wanted.nodes)
+    with ExitStack() as files:
+        # Opened first: who waited for an hour wants no word about a folder that is not there.
+        json_out = _opened(wanted.json, "--json", files)
+        trace_out = _opened(wanted.trace, "--trace", files)
+        picture_out = _opened(wanted.picture, "--picture", files)
+        began, cpu = world.wall(), world.cpu()
+        memory = lambda: resident(world.read)  # noqa: E731
+        progress, samples = Progress(world.err, world.columns, world.wall, memory), Samples()
+
+        def looked(run: Run) -> bool:
+            samples.looked(run)
+            return False
+
+        def watched(run: Run) -> bool:
+            progress.looked(run)
+            return world.is_stopped()
+
+        going = Run(scenario, wanted.seed, kinds, looked, world.grown, watched, world.wall)
+        faults: list[tuple[float, str]] = []
+        going.team.told.append(lambda now, what, _, more: faults.append((now, more)) if what == "fault" else None)
+        trace = None if trace_out is None else Trace(trace_out)
+        if trace is not None:
+            trace.begin(scenario=scenario.name, seed=wanted.seed, nodes=scenario.nodes, again=line)
+            going.team.told.append(trace.told)
+        outcome = going.go()
+        progress.close()
+        cost = Cost(world.cpu() - cpu, world.wall() - began, memory())
+        if trace is not None:
+            trace.end(partial=outcome.is_partial, hash=outcome.digest)
+        if json_out is not None:
+            json_out.write(packed(scenario, outcome, cost, line, samples.series))
+        if picture_out is not None:
+            title = f"{scenario.name}, {scenario.nodes:,} nodes, seed {wanted.seed}"
+            picture_out.write(drawn(title + (" (partial)" if outcome.is_partial else ""), samples.series, faults))
+        world.out.write(text(scenario, outcome, cost, line))
+    if outcome.is_partial:
+        return ENDED
+    return MISSED if outcome.missed or outcome.violations else 0
+
+
+def check_targets(scenario: Scenario, kinds: Kinds) -> None:
+    """Raise ``BadSetting`` for a target that no figure of the scenario's workloads can be held to."""
+    sorts = [kinds[name] for name, _ in scenario.loads]
+    known = [figure for sort in sorts for figure in sort.figures]
+    if all(sort.figures for sort in sorts):
+        for name, _ in scenario.targets:
+            if name not in known:
+                remedy = f"there are {', '.join(known)}" if known else "write a [load.NAME] that measures it"
+                raise BadSetting(scenario.name, f"[targets] {name}", "is no figure of these workloads", remedy)
+
+
+def _parsed(arguments: Sequence[str]) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        prog="sim run",
+        description="Play a scenario with whole nodes in this process, to its verdict; Ctrl-C gives what there is.",
+        epilog="Exit code: 0 all is well, 1 a target or an invariant is missed, 2 it cannot be run, 130 it was ended.",
+    )
+    parser.add_argument("--scenario", required=True, metavar="NAME", help=f"{', '.join(names())}, or a .toml file")
+    parser.add_argument("--seed", type=int, default=1, metavar="N", help="everything follows from it (default 1)")
+    parser.add_argument("--nodes", type=int, metavar="N", help="instead of what the scenario says")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="the report for programs")
+    parser.add_argument("--trace", type=Path, metavar="FILE", help="what happened, a line of JSON each")
+    parser.add_argument("--picture", type=Path, metavar="FILE", help="the figures over time, as SVG")
+    return parser.parse_args(arguments)
+
+
+def _opened(path: Path | None, key: str, files: ExitStack) -> TextIO | None:
+    if path is None:
+        return None
+    try:
+        return files.enter_context(path.open("w", encoding="utf-8"))
+    except OSError as error:
+        problem = f"{path} cannot be written: {error.strerror or error}"
+        raise BadSetting("command line", key, problem, "name a file in a folder that is there") from error

@@ -1,0 +1,82 @@
+"""Execution, the half of tasks and decisions: E4, E5, E6 and E7."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterable, Iterator
+
+from sim.team.event import Asked, Born, Calm, Concluded, Decided, Engaged, Event, Expired, Open
+
+KINDS = Asked, Born, Calm, Engaged, Concluded, Expired, Open, Decided
+"""What these invariants look at."""
+RECENT = 1.0
+"""E7: seconds between two decisions of an agent within which no report that it used may have grown older."""
+
+
+def e4(events: Iterable[Event]) -> Iterator[str]:
+    """No task lost: each that was submitted comes to an end which everybody hears of, and is not begun again."""
+    submitted: dict[Hashable, None] = {}
+    over: set[Hashable] = set()
+    states: dict[str, dict[int, str]] = {}
+    for event in events:
+        match event:
+            case Asked(_, _, _, "submit", task):
+                submitted[task] = None
+            case Expired(_, task):
+                over.add(task)
+            case Engaged(_, _, acting):
+                for task in acting:
+                    if task in over:
+                        yield f"{task} is over and is begun again"
+            case Open(_, task, place, state, is_docketed):
+                if state:
+                    states.setdefault(task, {})[place] = state
+                if is_docketed:
+                    yield f"dog{place} does not know that {task} is over"
+    for task in submitted:
+        if task not in over:
+            yield f"{task} has no outcome: {states.get(str(task), {})}"
+
+
+def e5(events: Iterable[Event]) -> Iterator[str]:
+    """No ghost, of agents: in calm nobody goes on with a task when its end must have been heard."""
+    within: float | None = None
+    ended: dict[str, Concluded] = {}
+    for event in events:
+        match event:
+            case Calm():
+                within = event.within
+            case Concluded():
+                ended[event.task] = event
+            case Engaged(at, _, acting) if within is not None:
+                for task in acting:
+                    if task in ended and at > ended[task].at + within:
+                        yield f"{task} is executed although it ended {ended[task].outcome}"
+
+
+def e6(events: Iterable[Event]) -> Iterator[str]:
+    """No flapping: whoever acts gives way only to a bid that is better by the hysteresis."""
+    for event in events:
+        if not isinstance(event, Decided) or event.assigned is None or event.holder in (None, event.assigned):
+            continue
+        costs = {report.agent: report.cost for report in event.reports}
+        mine, held = costs.get(event.assigned), costs.get(event.holder or "")
+        if mine is None or held is None or not mine < held * (1.0 - event.hysteresis):
+            yield f"{held} gives way to {mine}"
+
+
+def e7(events: Iterable[Event]) -> Iterator[str]:
+    """Agreement: of the same reports all name the same, and nobody goes back to an older report."""
+    agreed: dict[Hashable, str] = {}
+    used: dict[tuple[int, str], tuple[float, dict[str, tuple[int, int]]]] = {}
+    for event in events:
+        if isinstance(event, Born):
+            used = {key: known for key, known in used.items() if key[0] != event.place}
+        elif isinstance(event, Decided):
+            me, *others = event.reports
+            before, known = used.get((event.place, event.group), (event.at, {}))
+            used[event.place, event.group] = event.at, {one.agent: (one.epoch, one.serial) for one in others}
+            for other in others:
+                if event.at - before < RECENT and (other.epoch, other.serial) < known.get(other.agent, (0, 0)):
+                    yield f"{me.name} decides by a report of {other.name} that is older than one it had used"
+            if event.assigned is not None and agreed.setdefault(event.basis, event.assigned) != event.assigned:
+                yield f"of the same reports {me.name} names another than the others"

@@ -1,0 +1,220 @@
+"""Durability: D1 to D7, over what clients wrote and read, what stores hold, and whom nodes know.
+
+A client numbers its writes of a slot 1, 2, 3 ...; a removal is a write of nothing.  A write that was not acknowledged
+may have happened, so a read may show it; nothing may be shown that is older than what was acknowledged before, or read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+from sim.team.event import Answered, Asked, Born, Counted, Died, Event, Met, Settled, Stored, Unanswered
+
+KINDS = Asked, Answered, Unanswered, Born, Died, Settled, Stored, Met, Counted
+"""What these invariants look at."""
+MAJORITY = "majority"
+
+
+class Slot(NamedTuple):
+    """Where a record lives."""
+
+    key: bytes
+    owner: bytes
+    name: str
+
+
+@dataclass
+class _Known:
+    """Of a slot: the last write that was begun, the highest that is acknowledged, and what each reader saw."""
+
+    begun: int = 0
+    floor: int = 0
+    seen: dict[Hashable, int] = field(default_factory=dict)
+    values: set[int] = field(default_factory=set)
+
+
+@dataclass
+class _Reading:
+    """A read under way, and what each slot had to show when it began."""
+
+    asked: Asked
+    floors: dict[Slot, int]
+
+
+def _reads(events: Iterable[Event]) -> Iterator[tuple[str, str]]:
+    """D1 to D4 of every read, each with its invariant: they look at the same."""
+    slots: dict[Slot, _Known] = {}
+    by_key: dict[Hashable, list[Slot]] = {}
+    writing: dict[int, tuple[_Known, int]] = {}
+    reading: dict[int, _Reading] = {}
+    is_over = False
+    for event in events:
+        match event:
+            case Settled():
+                is_over = True
+            case Asked(_, number, _, "write" | "remove" as what, Slot() as slot, int(write)):
+                if slot not in slots:
+                    slots[slot] = _Known()
+                    by_key.setdefault(slot.key, []).append(slot)
+                known = slots[slot]
+                known.begun = write
+                if what == "write":
+                    known.values.add(write)
+                writing[number] = known, write
+            case Answered(_, number) if number in writing:
+                known, write = writing.pop(number)
+                known.floor = max(known.floor, write)
+            case Asked(_, number, client, "read", key):
+                floors = {slot: max(slots[slot].floor, slots[slot].seen.get(client, 0)) for slot in by_key.get(key, ())}
+                reading[number] = _Reading(event, floors)
+            case Answered(_, number, dict() as shown) if number in reading:
+                yield from _judged(reading.pop(number), shown, slots, is_over)
+
+
+def _judged(
+    reading: _Reading, shown: dict[Slot, int], slots: dict[Slot, _Known], is_over: bool
+) -> Iterator[tuple[str, str]]:
+    """Hold what a read gave against what was acknowledged before it began."""
+    asked = reading.asked
+    for place, number in shown.items():
+        if place not in slots or number not in slots[place].values:
+            yield "D4", f"a read shows {place.name}={number}, which its owner never wrote"
+    is_sure = asked.argument == MAJORITY or is_over
+    for place, floor in reading.floors.items():
+        slot, there = slots[place], shown.get(place)
+        where = f"{asked.argument} read of {place.key.hex()[:6]} {place.owner.hex()[:4]}/{place.name} at {asked.at:.1f}"
+        if there is None:
+            # Absent is right only where a removal may be the newest, or nothing was acknowledged yet.
+            is_removed = any(number not in slot.values for number in range(max(floor, 1), slot.begun + 1))
+            if floor and not is_removed and (is_sure or not shown):
+                yield "D1", f"{where}: {floor} was acknowledged or read, nothing is found"
+        elif is_sure and there < floor:
+            yield "D2" if floor in slot.values else "D3", f"{where}: shows {there} after {floor}"
+        elif asked.argument == MAJORITY:
+            slot.seen[asked.client] = max(slot.seen.get(asked.client, 0), there)
+
+
+def _only(invariant: str, events: Iterable[Event]) -> Iterator[str]:
+    return (text for found, text in _reads(events) if found == invariant)
+
+
+def d1(events: Iterable[Event]) -> Iterator[str]:
+    """Durability: what was acknowledged is found, or its absence is called unavailable."""
+    return _only("D1", events)
+
+
+def d2(events: Iterable[Event]) -> Iterator[str]:
+    """Freshness: a read of a majority shows nothing older than what was acknowledged or read before it began."""
+    return _only("D2", events)
+
+
+def d3(events: Iterable[Event]) -> Iterator[str]:
+    """No resurrection: nothing older comes back after a removal was acknowledged."""
+    return _only("D3", events)
+
+
+def d4(events: Iterable[Event]) -> Iterator[str]:
+    """Owner only: reads and stores hold what its owner signed, and go up in number.
+
+    No owner gives a number twice, in none of its lives; but one that has lost what it stored knows no better.
+    """
+    yield from _only("D4", events)
+    held: dict[tuple[int, int, Hashable], tuple[int, bytes]] = {}
+    written: dict[Hashable, Hashable] = {}
+    signed: dict[tuple[Hashable, int], tuple[Hashable, bytes]] = {}
+    forgetful: set[Hashable] = set()
+    owners: dict[int, bytes] = {}
+    for event in events:
+        if isinstance(event, Born):
+            owners[event.place] = event.public
+        elif isinstance(event, Died) and event.forgets:
+            forgetful.add(owners.get(event.place))
+        if isinstance(event, Asked) and isinstance(event.subject, Slot):
+            written[event.subject] = event.subject.owner
+        if not isinstance(event, Stored):
+            continue
+        at, mark = (event.place, event.memory, event.slot), (event.sequence, event.signature)
+        if event.is_lasting and mark < held.get(at, mark):
+            yield f"node {event.place} went back to {event.sequence} in {event.name}"
+        if event.is_lasting and not event.is_genuine:
+            yield f"node {event.place} holds a forged record in {event.name}"
+        elif event.is_lasting and event.slot in written and written[event.slot] not in forgetful:
+            record = event.slot, event.signature
+            if signed.setdefault((written[event.slot], event.sequence), record) != record:
+                yield f"the owner of {event.name} gave the number {event.sequence} to two records"
+        held[at] = mark
+
+
+def d5(events: Iterable[Event]) -> Iterator[str]:
+    """Table hygiene: a contact is another node of this world, at its address."""
+    places: dict[bytes, tuple[int, str]] = {}
+    for event in events:
+        if isinstance(event, Born):
+            places[event.public] = event.place, event.address
+        elif isinstance(event, Met):
+            place, address = places.get(event.public, (event.place, ""))
+            if place == event.place or address != event.address:
+                yield f"node {event.place} has {event.address} in its table"
+
+
+def d6(events: Iterable[Event]) -> Iterator[str]:
+    """Exact lookup: when all is settled a lookup finds the k live nodes that are closest, the closest first."""
+    living: dict[int, bytes] = {}
+    looking: dict[int, Asked] = {}
+    for event in events:
+        match event:
+            case Born(_, place, _, _, node_id):
+                living[place] = node_id
+            case Died(_, place):
+                living.pop(place, None)
+            case Asked(_, number, _, "look up"):
+                looking[number] = event
+            case Answered(_, number, found) if number in looking:
+                asked = looking.pop(number)
+                others = [node_id for place, node_id in living.items() if place != asked.client]
+                if found != _closest(others, asked):
+                    yield _lost(asked, found)
+            case Unanswered(_, number, why) if number in looking:
+                yield _lost(looking.pop(number), why)
+    for asked in looking.values():
+        yield _lost(asked, "no answer")
+
+
+def _closest(others: list[bytes], asked: Asked) -> tuple[bytes, ...]:
+    subject: Any = asked.subject
+    count: Any = asked.argument
+    goal = int.from_bytes(subject)
+    return tuple(sorted(others, key=lambda node_id: int.from_bytes(node_id) ^ goal)[:count])
+
+
+def _lost(asked: Asked, found: object) -> str:
+    subject: Any = asked.subject
+    shown = ", ".join(one.hex()[:6] for one in found) if isinstance(found, tuple) else str(found)
+    return f"node {asked.client} does not find the closest to {subject.hex()[:6]}: {shown}"
+
+
+def d7(events: Iterable[Event]) -> Iterator[str]:
+    """Healing: when all is settled every node knows all that live, and every read is answered."""
+    living: dict[int, bytes] = {}
+    reading: dict[int, Asked] = {}
+    is_over = False
+    for event in events:
+        match event:
+            case Settled():
+                is_over = True
+            case Born(_, place, _, _, node_id):
+                living[place] = node_id
+            case Died(_, place):
+                living.pop(place, None)
+            case Asked(_, number, _, "read"):
+                reading[number] = event
+            case Unanswered(_, number, why, is_unavailable) if number in reading and is_over:
+                key: Any = reading[number].subject
+                what = "is not answered" if is_unavailable else f"fails: {why}"
+                yield f"a {reading[number].argument} read of {key.hex()[:6]} {what} after everything healed"
+            case Counted(_, place, ids):
+                others = tuple(sorted(node_id for other, node_id in living.items() if other != place))
+                if ids != others:
+                    yield f"node {place} knows {len(ids)} live members, there are {len(others)} others"

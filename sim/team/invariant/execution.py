@@ -1,0 +1,152 @@
+"""Execution, the half of leases and devices: E1, E2, E3, E5, E8 and E9."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+from sim.team.event import (
+    Answered,
+    Asked,
+    Awaited,
+    Commanded,
+    Died,
+    Engaged,
+    Event,
+    Halted,
+    Held,
+    Issued,
+    Reached,
+    Terms,
+    Unanswered,
+    Won,
+)
+
+KINDS = Asked, Answered, Unanswered, Terms, Died, Won, Held, Issued, Commanded, Halted, Reached, Awaited, Engaged
+"""What these invariants look at."""
+ROUGH = 0.06
+"""E1: by this share of the ttl a device's count of a duration may differ from a clock that is 5 % off."""
+BOUNDED = 0.01
+"""E2 rests on clocks that are not further off than this share; E1 does not."""
+A_MOMENT = 1e-6
+
+
+def e1(events: Iterable[Event]) -> Iterator[str]:
+    """Fenced effects: tokens never fall, neither of leases nor of accepted commands, and none is taken after its end.
+
+    Where members lose their stores, the tokens of leases may fall back: what devices take may not even then.
+    """
+    granted: dict[str, int] = {}
+    taken: dict[str, int] = {}
+    ttl, forgot = 0.0, False
+    for event in events:
+        match event:
+            case Terms():
+                ttl = event.ttl
+            case Died(forgets=True):
+                forgot = True
+            case Won(_, task, place, token):
+                highest = granted.get(task, 0)
+                if token <= highest and not forgot:
+                    yield f"token {token} of {task} is granted to {place} after {highest}"
+                granted[task] = max(highest, token)
+            case Commanded(at, task, _, token, True, _, truly):
+                if token < taken.get(task, 0):
+                    yield f"the device of {task} takes token {token} after {taken[task]}"
+                if at > truly + ROUGH * ttl:
+                    yield f"the device of {task} takes a command {at - truly:.2f} s after its lease ended"
+                taken[task] = token
+
+
+def e2(events: Iterable[Event]) -> Iterator[str]:
+    """One lease: whenever one is won or renewed nobody else holds it by his own clock, and no other robot moves.
+
+    Looked at then, for whatever overlaps, overlaps then.
+    """
+    still: dict[tuple[str, int], float] = {}
+    is_bounded, stop_time = True, 0.0
+    for event in events:
+        match event:
+            case Terms():
+                is_bounded, stop_time = event.drift <= BOUNDED, event.stop_time
+            case Commanded(_, task, place, _, True, until, _):
+                still[task, place] = until + stop_time
+            case Halted(_, task, place, rest_at):
+                still[task, place] = min(still.get((task, place), 0.0), rest_at)
+            case Held(at, task, place, others) if is_bounded:
+                for other in others:
+                    yield f"{place} and {other} hold {task} at {at:.2f}"
+                for (moving, other), until in still.items():
+                    if moving == task and other != place and until > at + A_MOMENT:
+                        yield f"the robot of {other} moves for {task} at {at:.2f}, {place} holds it"
+
+
+def e3(events: Iterable[Event]) -> Iterator[str]:
+    """Takeover: where one is gone and the rest is well, a command with a higher token is taken in time."""
+    waited: list[Awaited] = []
+    for event in events:
+        if isinstance(event, Awaited):
+            waited.append(event)
+        elif isinstance(event, Commanded) and event.is_accepted and waited:
+            heard = [one for one in waited if one.task == event.task and event.token > one.above]
+            for one in heard:
+                waited.remove(one)
+                if event.at - one.since > one.within:
+                    yield f"{one.why}, another acts {event.at - one.since:.2f} s later"
+    for one in waited:
+        yield f"{one.why}, another acts never"
+
+
+def e5(events: Iterable[Event]) -> Iterator[str]:
+    """No ghost, at the device: it obeys nobody after the end of a task was acknowledged; and the end is recorded."""
+    closing: dict[int, str] = {}
+    over: dict[str, float] = {}
+    for event in events:
+        match event:
+            case Asked(_, number, _, "close", str(task)):
+                closing[number] = task
+            case Answered(at, number) if number in closing:
+                over.setdefault(closing.pop(number), at)
+            case Unanswered(_, number, why) if number in closing:
+                yield f"the end of {closing.pop(number)} is not recorded: {why}"
+            case Commanded(at, task, place, _, True) if task in over:
+                yield f"the device of {task} obeys {place} at {at:.2f}, it ended at {over[task]:.2f}"
+    for task in closing.values():
+        yield f"the end of {task} is never acknowledged"
+
+
+def e8(events: Iterable[Event]) -> Iterator[str]:
+    """Zombie: nobody commands under a lease that is over, nor acts or may act on two tasks at once."""
+    terms = Terms(0.0, 0.0, 0.0, 0.0, 0.0)
+    for event in events:
+        match event:
+            case Terms():
+                terms = event
+            case Issued(at, task, place, ends, truly):
+                is_late = terms.drift <= BOUNDED and at > max(ends, truly) + A_MOMENT
+                if is_late or at > truly + ROUGH * terms.ttl:
+                    yield f"{place} commands for {task} at {at:.2f}, its lease ended at {truly:.2f}"
+            case Engaged(_, place, acting, holding) if len(acting) > 1 or len(holding) > 1:
+                yield f"dog{place} acts on {list(acting)} and holds the leases of {list(holding)}"
+
+
+def e9(events: Iterable[Event]) -> Iterator[str]:
+    """Minority: who is cut from the majority wins nothing more, and stops by the end of its lease."""
+    cut: dict[tuple[str, int], float] = {}
+    terms = Terms(0.0, 0.0, 0.0, 0.0, 0.0)
+    for event in events:
+        match event:
+            case Terms():
+                terms = event
+            case Reached(at, task, place, is_reached):
+                if is_reached:
+                    cut.pop((task, place), None)
+                else:
+                    cut.setdefault((task, place), at)
+            case Won(at, task, place) if (task, place) in cut:
+                since = cut[task, place]
+                if at > since + terms.ttl / 3 + terms.slowest + 0.1:
+                    yield f"{place} wins {task} at {at:.2f}, cut from the majority since {since:.2f}"
+            case Commanded(at, task, place, _, True) if (task, place) in cut:
+                since = cut[task, place]
+                if at > since + terms.ttl * 1.1 + terms.slowest:
+                    yield f"{place} acts on {task} at {at:.2f}, cut from the majority since {since:.2f}"

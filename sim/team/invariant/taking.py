@@ -1,0 +1,178 @@
+"""Taking: T1 to T6, over tuples that were put, taken, read and waited for."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Hashable, Iterable, Iterator
+
+from sim.team.event import Answered, Asked, Event, Posted, Repeated, Seated, Settled, Unanswered, Voted
+
+KINDS = Asked, Answered, Unanswered, Settled, Posted, Voted, Seated, Repeated
+"""What these invariants look at."""
+WAKE = 1.0
+"""T6: seconds within which whoever waits is woken."""
+PUT, TAKE, SURVEY, WAIT, RING = "put", "take", "survey", "wait", "ring"
+"""What clients do: put one, take some, read all that there are, wait for the bell, ring it."""
+
+
+class _Space:
+    """What is known of all tuples, as far as the history has been read."""
+
+    def __init__(self) -> None:
+        self.posted: dict[Hashable, Posted] = {}
+        self.members: dict[bytes, bytes] = {}
+        self.votes: dict[Hashable, dict[tuple[Hashable, bytes], set[bytes]]] = defaultdict(lambda: defaultdict(set))
+
+    def read(self, event: Event) -> None:
+        """Take in what an event says."""
+        match event:
+            case Posted(_, mark):
+                self.posted[mark] = event
+            case Voted(_, mark, ballot, taker, member):
+                self.votes[mark][ballot, taker].add(member)
+            case Seated(_, members):
+                self.members = dict(members)
+
+    def takers(self, mark: Hashable) -> set[bytes]:
+        """Everybody for whom a majority of the council ever accepted a take, under one ballot."""
+        quorum = len(self.posted[mark].council) // 2 + 1
+        return {taker for (_, taker), members in self.votes[mark].items() if len(members) >= quorum}
+
+    def can_decide(self, posted: Posted) -> bool:
+        """Whether a majority of its council lives, and remembers."""
+        seats = zip(posted.council, posted.incarnations, strict=True)
+        able = [member for member, incarnation in seats if self.members.get(member) == incarnation]
+        return 2 * len(able) > len(posted.council)
+
+
+def t1(events: Iterable[Event]) -> Iterator[str]:
+    """One taker: no tuple is confirmed to two, neither by two majorities nor in what clients were told."""
+    space, told = _Space(), defaultdict[Hashable, list[str]](list)
+    taking: dict[int, Asked] = {}
+    for event in events:
+        space.read(event)
+        match event:
+            case Asked(_, number, _, "take"):
+                taking[number] = event
+            case Answered(at, number, tuple() as taken) if number in taking:
+                for fields in taken:
+                    told[fields].append(f"node {taking[number].client} at {at:.1f}")
+    for mark, posted in space.posted.items():
+        if len(space.takers(mark)) > 1:
+            yield f"{posted.fields} was accepted for two"
+    for fields, ways in told.items():
+        if len(ways) > 1:
+            yield f"{fields} was confirmed to {' and '.join(ways)}"
+
+
+def t2(events: Iterable[Event]) -> Iterator[str]:
+    """Durability: an acknowledged tuple that nobody took is seen by all; and when all is settled, asking works."""
+    space = _Space()
+    asked: dict[int, Asked] = {}
+    acknowledged: dict[Hashable, None] = {}
+    is_over, is_rung = False, True
+    for event in events:
+        space.read(event)
+        match event:
+            case Settled():
+                is_over = True
+            case Asked(_, number, _, what):
+                asked[number] = event
+                is_rung = is_rung and what != RING
+            case Answered(_, number, result) if number in asked:
+                what, subject = asked[number].what, asked[number].subject
+                if what == PUT:
+                    acknowledged[subject] = None
+                is_rung = is_rung or what == RING
+                if what == SURVEY and isinstance(result, tuple):
+                    yield from _unseen(space, acknowledged, set(result), asked[number].client)
+            case Unanswered(_, number, why) if is_over and number in asked and asked[number].what in (SURVEY, RING):
+                what = "a put" if asked[number].what == RING else "a read of all tuples"
+                yield f"{what} fails after everything healed: {why}"
+    if not is_rung:
+        yield "a put is not acknowledged after everything healed"
+
+
+def _unseen(space: _Space, acknowledged: Iterable[Hashable], seen: set[Hashable], client: Hashable) -> Iterator[str]:
+    known = {posted.fields: mark for mark, posted in space.posted.items()}
+    for fields in acknowledged:
+        is_lost = fields not in known or not (space.takers(known[fields]) or fields in seen)
+        if is_lost:
+            yield f"{fields} was acknowledged and not taken; node {client} does not see it"
+
+
+def t3(events: Iterable[Event]) -> Iterator[str]:
+    """Finality: what was confirmed to a taker is seen by nobody when all is settled."""
+    space = _Space()
+    asked: dict[int, Asked] = {}
+    told: dict[Hashable, str] = {}
+    for event in events:
+        space.read(event)
+        match event:
+            case Asked(_, number):
+                asked[number] = event
+            case Answered(at, number, tuple() as result) if number in asked:
+                client = asked[number].client
+                if asked[number].what == TAKE:
+                    for fields in result:
+                        told.setdefault(fields, f"node {client} at {at:.1f}")
+                elif asked[number].what == SURVEY:
+                    known = {posted.fields: posted for posted in space.posted.values()}
+                    for fields in result:
+                        if fields in told and space.can_decide(known[fields]):
+                            yield f"{fields} was taken by {told[fields]}; node {client} still sees it"
+
+
+def t4(events: Iterable[Event]) -> Iterator[str]:
+    """The same answer: a member that accepted what was decided says so again, whenever it is asked."""
+    for event in events:
+        if isinstance(event, Repeated) and event.said != event.taker:
+            said = event.said.hex()[:6] if event.said else event.said
+            yield f"a member does not stand by what it said about {event.fields}: {said}"
+
+
+def t5(events: Iterable[Event]) -> Iterator[str]:
+    """Given back: at the end no acknowledged tuple is held by one who died, where its council can decide."""
+    space = _Space()
+    putting: dict[int, Hashable] = {}
+    acknowledged: set[Hashable] = set()
+    is_over = False
+    for event in events:
+        space.read(event)
+        match event:
+            case Settled():
+                is_over = True
+            case Asked(_, number, _, "put", fields):
+                putting[number] = fields
+            case Answered(_, number) if number in putting:
+                acknowledged.add(putting.pop(number))
+    for mark, posted in space.posted.items() if is_over else ():
+        if posted.fields in acknowledged and not space.takers(mark) and space.can_decide(posted):
+            yield f"{posted.fields} is held by nobody who lives, and cannot be taken"
+
+
+def t6(events: Iterable[Event]) -> Iterator[str]:
+    """Wake: whoever waits when the bell has rung hears it within a second.  Who died meanwhile waits no more."""
+    waiting: dict[int, Asked] = {}
+    heard: dict[int, float] = {}
+    ringing: dict[int, float | None] = {}
+    for event in events:
+        match event:
+            case Asked(_, number, _, "wait"):
+                waiting[number] = event
+            case Asked(_, number, _, "ring"):
+                ringing[number] = None
+            case Answered(at, number) if number in waiting:
+                heard[number] = at
+            case Answered(at, number) if number in ringing:
+                ringing[number] = at
+            case Unanswered(_, number):
+                waiting.pop(number, None)
+    rung_at = next((at for at in ringing.values() if at is not None), None)
+    if rung_at is None:
+        return
+    for number, asked in waiting.items():
+        heard_at = heard.get(number)
+        if heard_at is None or heard_at > rung_at + WAKE:
+            late = "never" if heard_at is None else f"{heard_at - rung_at:.2f} s later"
+            yield f"{asked.subject}, hears the bell {late}"

@@ -1,0 +1,64 @@
+"""Wire: R1 to R4, over datagrams that must change nothing, questions that may run once, bytes, and tables."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator
+
+from sim.team.event import Answered, Asked, Event, Ran, Shot, Size, Strange
+
+KINDS = Asked, Answered, Shot, Ran, Strange, Size
+"""What these invariants look at."""
+
+
+def r1(events: Iterable[Event]) -> Iterator[str]:
+    """Nothing but counters: an unlawful datagram leaves all that a node remembers as it was, and is no event."""
+    for event in events:
+        if not isinstance(event, Shot):
+            continue
+        if event.raised:
+            yield f"a {event.kind} datagram raises {event.raised}"
+        if event.after != event.before:
+            yield f"a {event.kind} datagram of type {event.datagram[:1].hex()} changes node {event.place}"
+        if event.logged:
+            yield f"a {event.kind} datagram is logged: {event.logged}"
+
+
+def r2(events: Iterable[Event]) -> Iterator[str]:
+    """Once: a question that changes something runs at most once, and whoever is answered knows that it ran."""
+    runs: Counter[tuple[int, int, int]] = Counter()
+    lives: dict[int, int] = {}
+    asked: dict[int, Asked] = {}
+    for event in events:
+        match event:
+            case Ran(_, place, life, question):
+                lives[place] = max(life, lives.get(place, 0))
+                runs[place, life, question] += 1
+            case Asked(_, number, _, "run"):
+                asked[number] = event
+            case Answered(_, number, (answer, place, life, newest)) if number in asked:
+                ran = runs[place, life, asked[number].subject]  # type: ignore[index]
+                if answer != asked[number].subject or (ran != 1 and newest == life):
+                    yield f"question {asked[number].subject} was answered with {answer!r} and ran {ran} times"
+    for (place, _, question), ran in runs.items():
+        if ran > 1:
+            yield f"node {place} ran question {question} {ran} times"
+
+
+def r3(events: Iterable[Event]) -> Iterator[str]:
+    """No amplification: whoever proved nothing gets no more bytes than he sent, and nobody else any."""
+    for event in events:
+        if isinstance(event, Shot):
+            size = len(event.datagram)
+            is_elsewhere = any(not is_back for is_back, _ in event.answers)
+            if is_elsewhere or sum(answer for _, answer in event.answers) > size:
+                yield f"a {event.kind} datagram of {size} bytes is answered with {list(event.answers)}"
+        elif isinstance(event, Strange) and event.sent > event.got:
+            yield f"{event.sent} bytes to a stranger who sent {event.got}"
+
+
+def r4(events: Iterable[Event]) -> Iterator[str]:
+    """Caps: no table grows beyond its cap."""
+    for event in events:
+        if isinstance(event, Size) and event.size > event.cap:
+            yield f"node {event.place} remembers {event.size} {event.what}, {event.cap} are allowed"

@@ -1,0 +1,137 @@
+"""Link: what lies between the nodes of a team: a LAN, a radio or the internet, with bursts, queues and lost datagrams.
+
+State is kept by sender and receiver, never by pair: ten thousand nodes have fifty million of those.  So a burst is that
+of a radio, a queue that of an access line, and the distance of two nodes follows from where each of them is.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from middleware import setting
+from middleware.entangled.network.network import Address
+
+KINDS = ("none", "lan", "wifi", "internet")
+MEAN_RTT = 0.156
+"""Seconds; what the measured delays of the King data set come to in the simulations that ours are held against."""
+HEIGHT = 0.0125
+"""Mean seconds that the last mile of a node adds to each way, whoever it talks to."""
+SIDE = (MEAN_RTT / 2 - 2 * HEIGHT) / 0.521405
+"""Side, in seconds one way, of the square in which nodes lie; 0.5214 is the mean distance in a unit square."""
+SPREAD = 0.05
+"""Share by which the delays of one pair vary."""
+LOST: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class LinkSettings:
+    """``[link]``: what lies between the nodes."""
+
+    kind: str = field(default="lan", metadata=setting.one_of(KINDS))
+    """``none``: no delay.  ``lan``: 0.2 to 0.6 ms.  ``wifi``: 1 ms and up, 5 ms on average.  ``internet``: by where
+    nodes are, 156 ms there and back on average."""
+
+    loss: float = field(default=0.0, metadata=setting.number(0.0, 0.9))
+    """Share of the datagrams that is lost, each way."""
+
+    burst: float = field(default=0.0, metadata=setting.seconds(0.0, 10.0))
+    """Mean seconds for which a sender loses everything, so that the share is as ``loss`` says (Gilbert-Elliott); 0:
+    each datagram by itself."""
+
+    asymmetry: float = field(default=0.0, metadata=setting.number(0.0, 1.0))
+    """Of two directions one loses this share more than ``loss`` says, and the other as much less."""
+
+    duplicate: float = field(default=0.0, metadata=setting.number(0.0, 0.9))
+    """Share of the datagrams that arrives twice."""
+
+    reorder: float = field(default=0.0, metadata=setting.number(0.0, 0.9))
+    """Share of the datagrams that takes as long again, and a millisecond, so that others overtake it."""
+
+    bandwidth: float = field(default=0.0, metadata=setting.number(0.0, 1e9))
+    """Bytes a second that a node can send; 0: as many as it likes."""
+
+    queue: float = field(default=0.5, metadata=setting.seconds(0.001, 60.0))
+    """Seconds for which a datagram waits for its turn to be sent; what would have to wait longer is lost."""
+
+
+class TeamLink:
+    """The link of a whole board (``switchboard.Link``); ``seed`` says where nodes are."""
+
+    def __init__(self, settings: LinkSettings, seed: str) -> None:
+        self.settings = settings
+        self.worse = 0.0
+        """Share of the datagrams that is lost besides, for as long as the weather is bad."""
+        self._seed = seed
+        self._loss = settings.loss
+        self._plain_loss = settings.loss if not (settings.burst or settings.asymmetry) else 0.0
+        self._bursts: dict[Address, tuple[float, bool]] = {}
+        self._free_at: dict[Address, float] = {}
+        self._spots: dict[Address, tuple[float, float, float]] = {}
+        self._delay = getattr(self, f"_{settings.kind}")
+        self._is_plain = not (settings.duplicate or settings.reorder or settings.bandwidth)
+
+    def delays(self, source: Address, to: Address, size: int, now: float, rng: random.Random) -> Sequence[float]:
+        """The seconds that each copy of a datagram takes; none where it is lost."""
+        if self._loss and self._is_lost(source, to, now, rng):
+            return LOST
+        if self.worse and rng.random() < self.worse:
+            return LOST
+        if self._is_plain:
+            return (self._delay(source, to, rng),)
+        settings, waited = self.settings, 0.0
+        if settings.bandwidth:
+            begins = max(now, self._free_at.get(source, 0.0))
+            if begins - now > settings.queue:
+                return LOST
+            self._free_at[source] = begins + size / settings.bandwidth
+            waited = self._free_at[source] - now
+        copies = 2 if settings.duplicate and rng.random() < settings.duplicate else 1
+        delays = [self._delay(source, to, rng) for _ in range(copies)]
+        if settings.reorder:
+            delays = [2 * d + 0.001 if rng.random() < settings.reorder else d for d in delays]
+        return [waited + delay for delay in delays]
+
+    def distance(self, source: Address, to: Address) -> float:
+        """Seconds one way between two nodes on the internet, without what varies."""
+        (x, y, height), (x2, y2, height2) = self._spot(source), self._spot(to)
+        return math.hypot(x - x2, y - y2) + height + height2
+
+    # -- inside -----------------------------------------------------------------------------------------------------
+
+    def _is_lost(self, source: Address, to: Address, now: float, rng: random.Random) -> bool:
+        if self._plain_loss:
+            return rng.random() < self._plain_loss
+        settings, loss = self.settings, self._loss
+        if settings.asymmetry:
+            loss = min(0.99, loss * (1 + settings.asymmetry if source < to else 1 - settings.asymmetry))
+        if not settings.burst:
+            return rng.random() < loss
+        # The two-state chain in continuous time: what it is now follows from what it was when it was last looked at.
+        since, was_bad = self._bursts.get(source, (-1e9, False))
+        remembered = math.exp((since - now) / (settings.burst * (1 - loss)))
+        is_bad = rng.random() < loss + ((1.0 if was_bad else 0.0) - loss) * remembered
+        self._bursts[source] = now, is_bad
+        return is_bad
+
+    def _spot(self, address: Address) -> tuple[float, float, float]:
+        spot = self._spots.get(address)
+        if spot is None:
+            dice = random.Random(f"{self._seed}/{address}")
+            spot = dice.uniform(0, SIDE), dice.uniform(0, SIDE), dice.expovariate(1 / HEIGHT)
+            self._spots[address] = spot
+        return spot
+
+    def _none(self, source: Address, to: Address, rng: random.Random) -> float:
+        return 0.0
+
+    def _lan(self, source: Address, to: Address, rng: random.Random) -> float:
+        return 0.0002 + 0.0004 * rng.random()
+
+    def _wifi(self, source: Address, to: Address, rng: random.Random) -> float:
+        return 0.001 + rng.expovariate(250.0)
+
+    def _internet(self, source: Address, to: Address, rng: random.Random) -> float:
+        return self.distance(source, to) * (1 - SPREAD + 2 * SPREAD * rng.random())

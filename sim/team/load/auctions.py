@@ -1,0 +1,134 @@
+"""Auctions: one task at a time, for which everybody bids; how soon who agrees, and what it costs.
+
+The seconds count from the end of the waiting period, which begins with the first bid: until then everybody waits.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+from twisted.internet.defer import Deferred
+
+from middleware.setting import seconds, whole
+from middleware.tasks import Task
+from sim.team.figure import Figure, mean, share, spread
+from sim.team.load.contest import Contest
+from sim.team.load.deputies import deputies_of
+from sim.team.load.deputy import Deputy
+from sim.team.load.residents import Residents
+from sim.team.team import Team
+
+
+@dataclass(frozen=True)
+class AuctionSettings:
+    """``[load.auctions]``: one task after the other, for all."""
+
+    count: int = field(default=3, metadata=whole(1, 10_000))
+    """Auctions in all."""
+
+    every: float = field(default=10.0, metadata=seconds(2.0, 3600.0))
+    """Seconds from one to the next."""
+
+    waiting: float = field(default=0.5, metadata=seconds(0.0, 60.0))
+    """Seconds that the agents wait for each other's bids after the first one."""
+
+    spread: float = field(default=0.1, metadata=seconds(0.0, 60.0))
+    """Seconds within which all of them bid."""
+
+
+class Auctions:
+    """The workload ``auctions``."""
+
+    def __init__(self, team: Team, settings: AuctionSettings) -> None:
+        self._team = team
+        self._settings = settings
+        self._rng = team.rng("auctions")
+        self._residents = Residents(team)
+        self._deputies = deputies_of(team)
+        self._contest: Contest | None = None
+        self._begun = 0
+        self._before: dict[int, tuple[int, int, int]] = {}
+        self._next_at = -math.inf
+        self.right: list[float] = []
+        self.agreed: list[float] = []
+        self.last: list[float] = []
+        self.messages: list[float] = []
+        self.busiest: list[float] = []
+        self.bytes: list[float] = []
+        self.trouble: list[str] = []
+
+    def step(self) -> None:
+        """Read an auction when its time is over, and begin the next one."""
+        now = self._team.clock.seconds()
+        if now >= self._next_at:
+            self._end()
+            if self._begun < self._settings.count:
+                self._begin()
+            self._next_at = now + self._settings.every
+
+    def settled(self) -> None:
+        """Read the last one."""
+        self._end()
+
+    def verdict(self) -> list[str]:
+        """Auctions that could not begin."""
+        return self.trouble
+
+    def figures(self) -> list[Figure]:
+        """Who is right, the seconds until they are, and the messages that it took."""
+        n = len(self.right)
+        return [
+            Figure("auctions.right", mean(self.right), "share", n=n),
+            share("auctions.unanimous", sum(part == 1.0 for part in self.right), n),
+            *spread("auctions.agree", self.agreed, "s", (0.5, 0.95, 0.99)),
+            Figure("auctions.last", mean(self.last), "s", n=n),
+            Figure("auctions.messages", mean(self.messages), "datagrams a node", n=n),
+            Figure("auctions.bytes", mean(self.bytes), "B a node in questions", n=n),
+            Figure("auctions.busiest", max(self.busiest, default=None), "datagrams", n=n),
+        ]
+
+    # -- inside -----------------------------------------------------------------------------------------------------
+
+    def _begin(self) -> None:
+        self._begun += 1
+        self._before = {deputy.place: _counts(deputy) for deputy in self._deputies.present()}
+        task = Task(f"auction {self._begun}", "none", "nothing", waiting_period=self._settings.waiting)
+        dice = self._team.rng(f"auction/{self._begun}")
+        places = self._residents.places()
+        dice.shuffle(places)  # who is first asks for the council
+        contest = Contest(task, self._deputies, places, self._team.clock, dice, self._settings.spread)
+        self._contest = contest
+        Deferred.fromCoroutine(contest.begin())
+
+    def _end(self) -> None:
+        contest, self._contest = self._contest, None
+        if contest is None:
+            return
+        if contest.trouble:
+            self.trouble.append(f"{contest.task.task_id} did not begin: {contest.trouble}")
+            return
+        present, best = contest.present(), contest.best()
+        passed = [self._passed(deputy) for deputy in self._deputies.present()]
+        n = max(1, len(present))
+        self.messages.append(sum(sent for sent, _, _ in passed) / n)
+        self.busiest.append(max((handled for _, handled, _ in passed), default=0))
+        self.bytes.append(sum(volume for _, _, volume in passed) / n)
+        right = [bidder for bidder in present if bidder.assigned == best]
+        took = [max(0.0, bidder.changed_at - contest.over_at) for bidder in right]
+        self.right.append(len(right) / n)
+        self.agreed += took
+        self.last.append(max(took) if len(right) == len(present) and took else math.inf)
+        contest.end()
+
+    def _passed(self, deputy: Deputy) -> tuple[int, int, int]:
+        """The datagrams that it sent since the auction began, those that it had to do with, and bytes of questions."""
+        sent, handled, volume = self._before.get(deputy.place, (0, 0, 0))
+        now_sent, now_handled, now_volume = _counts(deputy)
+        if now_handled < handled:  # another life
+            return now_sent, now_handled, now_volume
+        return now_sent - sent, now_handled - handled, now_volume - volume
+
+
+def _counts(deputy: Deputy) -> tuple[int, int, int]:
+    return deputy.tally.sent, deputy.tally.handled, deputy.tally.bytes

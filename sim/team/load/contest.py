@@ -1,0 +1,151 @@
+"""Contest: one task, those that bid for it, what each of them takes for decided, and who holds its lease.
+
+It does what an agent does (``agents.engagement``) with a body that never moves: whom the announced bids name claims the
+lease, the next two stand by, and who is named no more gives it back.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from twisted.internet.interfaces import IReactorTime
+
+from middleware.commitment.lessee import Lessee
+from middleware.consensus.nearest import Nearest
+from middleware.consensus.strategy import Report
+from middleware.dissemination.auction import Auction
+from middleware.dissemination.bidding import Bidding
+from middleware.entangled.errors import EntangledError
+from middleware.tasks import Task
+from sim.team.load.deputies import Deputies
+from sim.team.load.deputy import Deputy
+
+HEIRS = 2
+"""So many stand by, as in a team of agents."""
+FARTHEST = 100.0
+_NEAREST = Nearest()
+
+
+@dataclass
+class Bidder:
+    """One that bids: its cost, whom it takes for the one that should act, and since when."""
+
+    deputy: Deputy
+    cost: float
+    bidding: Bidding | None = None
+    lessee: Lessee | None = None
+    assigned: str | None = None
+    changed_at: float = math.inf
+
+
+class Contest:
+    """One task among the agents of ``places``, each at a random distance from its target.
+
+    All bid within ``spread`` seconds; with ``claims`` they go on to the lease, else it ends with what is decided.
+    ``began_at`` is when the first bid was made, ``held_at`` when somebody held the lease first; ``overlaps`` counts how
+    often one won it while another held it; ``trouble`` says why it did not begin.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        deputies: Deputies,
+        places: Sequence[int],
+        clock: IReactorTime,
+        rng: random.Random,
+        spread: float = 0.1,
+        claims: bool = False,
+    ) -> None:
+        self.task = task
+        self.began_at = math.inf
+        self.held_at = math.inf
+        self.overlaps = 0
+        self.trouble = ""
+        self._deputies = deputies
+        self._clock = clock
+        self._rng = rng
+        self._spread = spread
+        self._claims = claims
+        known = [deputy for place in places if (deputy := deputies.of(place)) is not None]
+        self.bidders = {deputy.uuid: Bidder(deputy, rng.uniform(1.0, FARTHEST)) for deputy in known}
+
+    async def begin(self) -> None:
+        """Have a council, and let everybody bid."""
+        try:
+            council = await next(iter(self.bidders.values())).deputy.council(self.task)
+        except EntangledError as error:
+            self.trouble = str(error)
+            return
+        self.task = replace(self.task, council=council)
+        task = self.task
+        auction = Auction(task.task_id, 1, council, task.strategy, task.waiting_period, task.exclusive)
+        for bidder in self.bidders.values():
+            self._clock.callLater(self._rng.uniform(0.0, self._spread), self._bid, bidder, auction)
+
+    @property
+    def over_at(self) -> float:
+        """When the waiting period ended."""
+        return self.began_at + self.task.waiting_period
+
+    def present(self) -> list[Bidder]:
+        """The bidders whose nodes live."""
+        return [bidder for bidder in self.bidders.values() if self._deputies.lives(bidder.deputy)]
+
+    def best(self) -> str | None:
+        """Who should act, of those that live."""
+        return min(((b.cost, b.deputy.uuid) for b in self.present()), default=(0.0, None))[1]
+
+    def holders(self) -> list[Bidder]:
+        """Who holds the lease now, by the own clock; more than one is a violation (E2)."""
+        return [b for b in self.present() if b.lessee is not None and b.lessee.lease is not None]
+
+    def end(self) -> None:
+        """Nobody claims, listens or bids any more."""
+        for bidder in self.present():
+            if bidder.bidding is not None:
+                bidder.bidding.leave()
+            if bidder.lessee is not None:
+                bidder.lessee.release()
+                bidder.lessee = None
+
+    # -- inside -----------------------------------------------------------------------------------------------------
+
+    def _bid(self, bidder: Bidder, auction: Auction) -> None:
+        if not self._deputies.lives(bidder.deputy):
+            return
+        self.began_at = min(self.began_at, self._clock.seconds())
+        bidder.bidding = bidder.deputy.bidding(auction, lambda reports: self._heard(bidder, reports))
+        bidder.bidding.report(Report(bidder.deputy.uuid, bidder.cost))
+
+    def _heard(self, bidder: Bidder, reports: tuple[Report, ...]) -> None:
+        consensus = _NEAREST.find(reports)
+        if consensus.assigned_agent != bidder.assigned:
+            bidder.assigned, bidder.changed_at = consensus.assigned_agent, self._clock.seconds()
+        if self._claims:
+            self._line_up(bidder, (consensus.assigned_agent, *consensus.standby))
+
+    def _line_up(self, bidder: Bidder, order: Sequence[str | None]) -> None:
+        uuid = bidder.deputy.uuid
+        rank = order.index(uuid) if uuid in order else HEIRS + 1
+        if rank > HEIRS:
+            if bidder.lessee is not None:
+                bidder.lessee.release()
+            return
+        if bidder.lessee is None:
+            bidder.lessee = bidder.deputy.lessee(self.task, lambda: self._changed(bidder))
+        if rank == 0:
+            bidder.lessee.want()
+        elif bidder.lessee.lease is not None:
+            bidder.lessee.release()
+        else:
+            bidder.lessee.stand_by(rank)
+
+    def _changed(self, bidder: Bidder) -> None:
+        if bidder.lessee is None or bidder.lessee.lease is None:
+            return
+        others = [one for one in self.holders() if one is not bidder]
+        self.overlaps += len(others)
+        self.held_at = min(self.held_at, self._clock.seconds())

@@ -1,0 +1,111 @@
+"""Directory: how the devices of a team are announced: who holds how many of them, and how soon somebody lists all.
+
+It goes by what stands in the stores, so it says the same whatever keys the directory is kept under.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from middleware.entangled.record import Record
+from middleware.node import SwarmNode
+from middleware.presence import device_of, devices_of
+from middleware.setting import seconds, whole
+from sim.team.figure import Figure, mean, share, spread
+from sim.team.load.residents import Residents
+from sim.team.team import Team
+
+
+@dataclass(frozen=True)
+class DirectorySettings:
+    """``[load.directory]``: who lists the devices; of nodes of kind ``swarm`` only."""
+
+    readers: int = field(default=3, metadata=whole(0, 10_000))
+    """Nodes that list all devices, one after the other."""
+
+    every: float = field(default=5.0, metadata=seconds(0.5, 3600.0))
+    """Seconds that each of them is given."""
+
+
+class Directory:
+    """The workload ``directory``."""
+
+    def __init__(self, team: Team, settings: DirectorySettings) -> None:
+        self._team = team
+        self._settings = settings
+        self._rng = team.rng("directory")
+        self._residents = Residents(team)
+        self._begun = 0
+        self._next_at = -math.inf
+        self._stop: Callable[[], object] = lambda: None
+        self.seconds: list[float] = []
+        self.listed: list[float] = []
+        self._most = 0
+
+    def step(self) -> None:
+        """Let the next one list all devices, when it is time."""
+        now = self._team.clock.seconds()
+        if now < self._next_at:
+            return
+        self._end()
+        chosen = self._residents.any(self._rng) if self._begun < self._settings.readers else []
+        if not chosen:
+            self._next_at = math.inf
+            return
+        self._begun += 1
+        self._next_at = now + self._settings.every
+        self._list(chosen[0])
+
+    def settled(self) -> None:
+        """The last one has had its time."""
+        self._end()
+
+    def verdict(self) -> list[str]:
+        """Nothing: a device that is missing from a list is a figure."""
+        return []
+
+    def figures(self) -> list[Figure]:
+        """How many devices a node holds, the share of the busiest, and how soon and how wholly they are listed."""
+        held = []
+        for place in self._team.alive():
+            store = self._team.entangled(place).store
+            held.append(len({record.owner for record in store.records() if device_of(record) is not None}))
+        n = len(held)
+        most = max(held, default=0)
+        return [
+            Figure("directory.devices", float(n), "devices"),
+            Figure("directory.held.mean", mean([float(count) for count in held]), "devices a node", n=n),
+            Figure("directory.held.max", float(most), "devices", n=n),
+            Figure("directory.busiest", most / n if n else None, "share of all", n=n),
+            share("directory.listed_whole", sum(part >= 1.0 for part in self.listed), len(self.listed)),
+            Figure("directory.listed", mean(self.listed), "share", n=len(self.listed)),
+            *spread("directory.seconds", self.seconds, "s", (0.5,)),
+        ]
+
+    # -- inside -----------------------------------------------------------------------------------------------------
+
+    def _list(self, place: int) -> None:
+        node = self._team.node(place)
+        if not isinstance(node, SwarmNode):
+            return
+        began, wanted = self._team.clock.seconds(), len(self._team.inside())
+        self._most = 0
+
+        def changed(records: list[Record]) -> None:
+            before, self._most = self._most, max(self._most, len(devices_of(records)))
+            if before < wanted <= self._most:
+                self.seconds.append(self._team.clock.seconds() - began)
+
+        watch = node.watch_devices(changed)
+
+        def end() -> None:
+            watch.stop()
+            self.listed.append(min(1.0, self._most / wanted))
+
+        self._stop = end
+
+    def _end(self) -> None:
+        self._stop()
+        self._stop = lambda: None

@@ -1,0 +1,192 @@
+"""Lookups: somebody looks for somebody else, over and over; how many are found, in how many hops and seconds.
+
+As in the studies that the targets come from (Li et al., INFOCOM 2005), the target is the id of a random node that lives
+and has entered, and a lookup succeeds where that node is the first of its answer within the limit.  Where the one that
+looks or the one that is looked for dies meanwhile, nobody could have succeeded, and the trial is void.
+
+``seconds`` count until the whole answer is there, the k closest; ``reached`` until the one that is looked for has
+answered itself, which is what those studies time.
+
+In quiet a number of random keys are looked up besides: the answer is exact where it has the k closest of all that
+live, in their order (invariant D6).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+from twisted.python.failure import Failure
+
+from middleware.entangled.errors import EntangledError
+from middleware.entangled.identity import ID_BYTES
+from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.kademlia.overlay import K
+from middleware.entangled.node import EntangledNode
+from middleware.setting import number, seconds, whole
+from sim.team.figure import Figure, at_most, mean, share, spread
+from sim.team.load.pace import Pace
+from sim.team.load.residents import Residents
+from sim.team.team import Team
+
+LISTED = 20
+"""Violations that are told one by one."""
+
+
+@dataclass(frozen=True)
+class LookupSettings:
+    """``[load.lookups]``: how often somebody looks for somebody."""
+
+    rate: float = field(default=10.0, metadata=number(0.0, 10_000.0))
+    """Lookups a second, of all nodes together."""
+
+    limit: float = field(default=4.0, metadata=seconds(0.1, 60.0))
+    """Seconds after which a lookup is late, and has failed."""
+
+    exact: int = field(default=100, metadata=whole(0, 100_000))
+    """Random keys that are looked up in quiet at the end, where the answer has to be exact."""
+
+
+@dataclass
+class Trial:
+    """One lookup: who looks (its life), for whom, and since when."""
+
+    place: int
+    life: EntangledNode
+    target: bytes
+    began: float
+
+
+class Lookups:
+    """The workload ``lookups``."""
+
+    def __init__(self, team: Team, settings: LookupSettings) -> None:
+        self._settings = settings
+        self._clock = team.clock
+        self._rng = team.rng("lookups")
+        self._residents = Residents(team)
+        self._pace = Pace(team.clock, settings.rate)
+        self._open: dict[int, Trial] = {}
+        self._begun = 0
+        self.found = self.missed = self.late = self.void = 0
+        self.hops: list[float] = []
+        self.asked: list[float] = []
+        self.seconds: list[float] = []
+        self.reached: list[float] = []
+        self.exact = self.inexact = 0
+        self._violations: list[str] = []
+        self._is_settled = False
+
+    def step(self) -> None:
+        """The lookups that are due."""
+        self._drop_late()
+        for _ in range(self._pace.due()):
+            pair = self._residents.any(self._rng, 2)
+            if len(pair) == 2:
+                self._look(*pair)
+
+    def settled(self) -> None:
+        """Look up random keys, which in quiet has to be exact."""
+        self._drop_late()
+        self._is_settled = True
+        for _ in range(self._settings.exact if len(self._residents) > 1 else 0):
+            place = self._residents.any(self._rng)[0]
+            life = self._residents.node(place)
+            key = self._rng.randbytes(ID_BYTES)
+            truth = self._residents.census.closest(key, K, life.identity.node_id)
+            life.find_node(key).addCallbacks(self._compared, self._not_compared, (place, key, truth), {}, (place,))
+
+    def verdict(self) -> list[str]:
+        """Lookups that were not exact in quiet."""
+        more = self.inexact - len(self._violations)
+        return self._violations + ([f"D6: {more} more lookups are not exact"] if more > 0 else [])
+
+    def figures(self) -> list[Figure]:
+        """Success, exactness, hops, questions and seconds."""
+        self._drop_late()
+        n = self.found + self.missed + self.late
+        # Two at least: who is asked names others, and these are asked whether they are there.
+        most = max(2.0, math.log2(max(2, len(self._residents))) / 2)
+        figures = [
+            share("lookups.success", self.found, n),
+            Figure("lookups.late", float(self.late), "lookups", n=n),
+            Figure("lookups.wrong", float(self.missed), "lookups", n=n),
+            Figure("lookups.void", float(self.void), "lookups"),
+            at_most("lookups.hops.mean", mean(self.hops), "hops", most, n=len(self.hops)),
+            Figure("lookups.hops.max", max(self.hops, default=None), "hops", n=len(self.hops)),
+            Figure("lookups.asked.mean", mean(self.asked), "nodes", n=len(self.asked)),
+            *spread("lookups.seconds", self.seconds, "s", (0.5, 0.95, 0.99)),
+            *spread("lookups.reached", self.reached, "s", (0.5, 0.95)),
+        ]
+        compared = self.exact + self.inexact
+        return [*figures, share("lookups.exact", self.exact, compared)] if compared else figures
+
+    # -- inside -----------------------------------------------------------------------------------------------------
+
+    def _look(self, place: int, other: int) -> None:
+        life, sought = self._residents.node(place), self._residents.node(other)
+        self._begun += 1
+        number = self._begun
+        self._open[number] = Trial(place, life, sought.identity.node_id, self._clock.seconds())
+        life.find_node(sought.identity.node_id).addCallbacks(self._answered, self._failed, (number,), {}, (number,))
+
+    def _answered(self, contacts: list[Contact], number: int) -> None:
+        trial = self._open.pop(number, None)
+        if trial is None:
+            return  # it was late
+        took = self._clock.seconds() - trial.began
+        if self._is_void(trial):
+            self.void += 1
+        elif took > self._settings.limit:
+            self.late += 1
+        elif not contacts or contacts[0].node_id != trial.target:
+            self.missed += 1
+        else:
+            self.found += 1
+            self.seconds.append(took)
+            # It was heard last when it answered this lookup, or up to a tenth of a second before (``overlay.FRESH``).
+            self.reached.append(took - min(took, trial.life.overlay.silence(contacts[0])))
+            looked = next((one for one in reversed(trial.life.overlay.lookups) if one.key == trial.target), None)
+            if looked is not None:
+                self.hops.append(float(looked.hops))
+                self.asked.append(float(looked.asked))
+
+    def _failed(self, failure: Failure, number: int) -> None:
+        failure.trap(EntangledError)
+        trial = self._open.pop(number, None)
+        if trial is not None:
+            if self._is_void(trial):
+                self.void += 1
+            else:
+                self.missed += 1
+
+    def _drop_late(self) -> None:
+        since = self._clock.seconds() - self._settings.limit
+        while self._open:
+            number, trial = next(iter(self._open.items()))
+            if trial.began > since:
+                return
+            del self._open[number]
+            if self._is_void(trial):
+                self.void += 1
+            else:
+                self.late += 1
+
+    def _is_void(self, trial: Trial) -> bool:
+        return not (self._residents.lives(trial.place, trial.life) and trial.target in self._residents.census)
+
+    def _compared(self, contacts: list[Contact], place: int, key: bytes, truth: list[bytes]) -> None:
+        if [contact.node_id for contact in contacts] == truth:
+            self.exact += 1
+        else:
+            right = len({contact.node_id for contact in contacts} & set(truth))
+            self._inexact(f"D6: node {place} finds {right} of the {len(truth)} closest to {key.hex()[:8]}")
+
+    def _not_compared(self, failure: Failure, place: int) -> None:
+        failure.trap(EntangledError)
+        self._inexact(f"D6: node {place} finds nobody: {failure.getErrorMessage()}")
+
+    def _inexact(self, line: str) -> None:
+        self.inexact += 1
+        if len(self._violations) < LISTED:
+            self._violations.append(line)

@@ -1,0 +1,179 @@
+"""Takeovers: who acts dies at a random moment; how long until another one holds its lease.
+
+Each trial is a task of its own with three agents, of which one holds the lease and two stand by, as in a team; several
+may go on at once.  One in which a majority of the task's council is dead as well counts for nothing: nobody may take
+over then (invariant E3).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+from twisted.internet.defer import Deferred
+
+from middleware.commitment.lessee import Lessee
+from middleware.entangled.errors import EntangledError
+from middleware.setting import number, seconds, whole
+from middleware.tasks import Task
+from sim.team.figure import Figure, at_most, share, spread
+from sim.team.load.deputies import deputies_of
+from sim.team.load.deputy import Deputy
+from sim.team.load.pace import Pace
+from sim.team.load.residents import Residents
+from sim.team.team import Team
+
+AGENTS = 3
+PATIENCE = 30.0
+"""Seconds after which a lease that nobody took is said to have been taken by nobody."""
+
+
+@dataclass(frozen=True)
+class TakeoverSettings:
+    """``[load.takeovers]``: who dies, and how often."""
+
+    count: int = field(default=200, metadata=whole(1, 1_000_000))
+    """Trials in all."""
+
+    rate: float = field(default=0.1, metadata=number(0.0001, 1000.0))
+    """Trials that begin in a second."""
+
+    ttl: float = field(default=1.5, metadata=seconds(0.1, 60.0))
+    """Seconds for which a lease runs."""
+
+    away: float = field(default=10.0, metadata=seconds(0.1, 3600.0))
+    """Seconds after which who died is back, from its disk."""
+
+
+class Trial:
+    """One task, its three agents, and when the one that acted died."""
+
+    def __init__(self, task: Task, agents: list[Deputy]) -> None:
+        self.task = task
+        self.agents = agents
+        self.lessees: list[Lessee] = []
+        self.died_at = math.inf
+        self.gone: Deputy | None = None
+        self.has_quorum = True
+
+
+class Takeovers:
+    """The workload ``takeovers``."""
+
+    def __init__(self, team: Team, settings: TakeoverSettings) -> None:
+        self._team = team
+        self._settings = settings
+        self._clock = team.clock
+        self._rng = team.rng("takeovers")
+        self._residents = Residents(team)
+        self._deputies = deputies_of(team)
+        self._pace = Pace(team.clock, settings.rate, settings.count)
+        self._begun = self._due = 0
+        self._busy: set[int] = set()
+        self.seconds: list[float] = []
+        self.never = self.overlaps = self.unheld = 0
+
+    def step(self) -> None:
+        """Begin the trials that are due, as far as there are agents that have no other one."""
+        self._due += self._pace.due()
+        while self._due and self._begin():
+            self._due -= 1
+
+    def settled(self) -> None:
+        """Nothing is left to do."""
+
+    def verdict(self) -> list[str]:
+        """Leases that two held at once (E2), and tasks that nobody took over (E3)."""
+        found = [f"E2: {self.overlaps} times two agents held one lease"] if self.overlaps else []
+        return found + ([f"E3: {self.never} tasks were taken over by nobody"] if self.never else [])
+
+    def figures(self) -> list[Figure]:
+        """The seconds, and how often it failed."""
+        n = len(self.seconds) + self.never
+        return [
+            *spread("takeovers.seconds", self.seconds, "s", (0.5, 0.95, 0.99)),
+            at_most("takeovers.never", float(self.never), "tasks", 0.0, n=n),
+            at_most("takeovers.overlaps", float(self.overlaps), "leases", 0.0, n=n),
+            share("takeovers.begun", n, n + self.unheld + self._due),
+        ]
+
+    # -- inside -----------------------------------------------------------------------------------------------------
+
+    def _begin(self) -> bool:
+        free = [place for place in self._residents.any(self._rng, 4 * AGENTS) if place not in self._busy]
+        agents = [deputy for place in free[:AGENTS] if (deputy := self._deputies.of(place)) is not None]
+        if len(agents) < AGENTS:
+            return False
+        self._begun += 1
+        task = Task(f"takeover {self._begun}", "none", "nothing", lease_ttl=self._settings.ttl)
+        trial = Trial(task, agents)
+        self._busy.update(agent.place for agent in agents)
+        Deferred.fromCoroutine(self._stand(trial))
+        return True
+
+    async def _stand(self, trial: Trial) -> None:
+        """Let the first agent hold the lease and the others stand by, then set the moment of the first one's death."""
+        try:
+            council = await trial.agents[0].council(trial.task)
+        except EntangledError:
+            self._end(trial)
+            self.unheld += 1
+            return
+        trial.task = replace(trial.task, council=council)
+        for agent in trial.agents:
+            trial.lessees.append(agent.lessee(trial.task, lambda: self._changed(trial)))
+        for rank, lessee in enumerate(trial.lessees):
+            if rank:
+                lessee.stand_by(rank)
+            else:
+                lessee.want()
+        ttl = self._settings.ttl
+        self._clock.callLater(2.0 * ttl + self._rng.uniform(0.0, ttl), self._kill, trial)
+
+    def _kill(self, trial: Trial) -> None:
+        holder = next((place for place, lessee in enumerate(trial.lessees) if lessee.lease is not None), None)
+        if holder is None or not all(self._deputies.lives(agent) for agent in trial.agents):
+            self.unheld += 1  # the faults of the scenario were faster
+            self._end(trial)
+            return
+        trial.gone, trial.died_at = trial.agents[holder], self._clock.seconds()
+        self._team.kill(trial.gone.place)
+        there = sum(member.node_id in self._residents.census for member in trial.task.council)
+        trial.has_quorum = 2 * there > len(trial.task.council)
+        self._clock.callLater(self._settings.away, self._return, trial.gone.place)
+        self._clock.callLater(PATIENCE, self._too_late, trial)
+
+    def _changed(self, trial: Trial) -> None:
+        held = [
+            lessee
+            for agent, lessee in zip(trial.agents, trial.lessees, strict=False)
+            if lessee.lease is not None and self._deputies.lives(agent)
+        ]
+        self.overlaps += max(0, len(held) - 1)
+        if held and trial.died_at != math.inf:
+            if trial.has_quorum:
+                self.seconds.append(self._clock.seconds() - trial.died_at)
+            else:
+                self.unheld += 1
+            trial.died_at = math.inf
+            self._clock.callLater(self._settings.ttl, self._end, trial)
+
+    def _too_late(self, trial: Trial) -> None:
+        if trial.died_at == math.inf:
+            return
+        trial.died_at = math.inf
+        if trial.has_quorum and sum(self._deputies.lives(agent) for agent in trial.agents) == AGENTS - 1:
+            self.never += 1
+        else:
+            self.unheld += 1
+        self._end(trial)
+
+    def _return(self, place: int) -> None:
+        if place not in self._team.nodes:
+            self._team.start(place)
+
+    def _end(self, trial: Trial) -> None:
+        for agent, lessee in zip(trial.agents, trial.lessees, strict=False):
+            if self._deputies.lives(agent):
+                lessee.release()
+        self._busy.difference_update(agent.place for agent in trial.agents)

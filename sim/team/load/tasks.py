@@ -1,0 +1,106 @@
+"""Tasks: very many at once, each bid for by the few agents that sense it (Assumption 1), each to have one holder.
+
+Every one goes the whole way: council, bids, announcement, claim.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+from twisted.internet.defer import Deferred
+
+from middleware.setting import seconds, whole
+from middleware.tasks import Task
+from sim.team.figure import Figure, at_most, share, spread
+from sim.team.load.contest import Contest
+from sim.team.load.deputies import deputies_of
+from sim.team.load.lookups import LISTED
+from sim.team.load.residents import Residents
+from sim.team.team import Team
+
+
+@dataclass(frozen=True)
+class TaskSettings:
+    """``[load.tasks]``: how many at once."""
+
+    count: int = field(default=1000, metadata=whole(1, 100_000))
+    """Tasks that are published at the same moment."""
+
+    bidders: int = field(default=8, metadata=whole(1, 10_000))
+    """Agents that bid for each of them."""
+
+    waiting: float = field(default=0.5, metadata=seconds(0.0, 60.0))
+    """Seconds that they wait for each other's bids after the first one."""
+
+    ttl: float = field(default=1.5, metadata=seconds(0.1, 60.0))
+    """Seconds for which a lease runs."""
+
+    after: float = field(default=2.0, metadata=seconds(0.0, 3600.0))
+    """Seconds after the first step at which they are published."""
+
+
+class Tasks:
+    """The workload ``tasks``."""
+
+    def __init__(self, team: Team, settings: TaskSettings) -> None:
+        self._team = team
+        self._settings = settings
+        self._rng = team.rng("tasks")
+        self._residents = Residents(team)
+        self._deputies = deputies_of(team)
+        self._due_at: float | None = None
+        self._contests: list[Contest] = []
+        self._counted: list[int] = []
+        self._right = 0
+
+    def step(self) -> None:
+        """Publish all of them when it is time."""
+        now = self._team.clock.seconds()
+        if self._due_at is None:
+            self._due_at = now + self._settings.after
+        if now < self._due_at or self._contests:
+            return
+        for number in range(1, self._settings.count + 1):
+            waiting, ttl = self._settings.waiting, self._settings.ttl
+            task = Task(f"task {number}", "none", "nothing", waiting_period=waiting, lease_ttl=ttl)
+            places = self._residents.any(self._rng, self._settings.bidders)
+            contest = Contest(task, self._deputies, places, self._team.clock, self._rng, claims=True)
+            self._contests.append(contest)
+            if contest.bidders:
+                Deferred.fromCoroutine(contest.begin())
+
+    def settled(self) -> None:
+        """Count the holders of each, and let them go."""
+        self._counted = [len(contest.holders()) for contest in self._contests]
+        self._right = self._nearest()
+        for contest in self._contests:
+            contest.end()
+
+    def verdict(self) -> list[str]:
+        """Tasks without a holder, and those that two held at once (E2)."""
+        found = [f"E2: two held {c.task.task_id} at once" for c in self._contests if c.overlaps]
+        found += [
+            f"{contest.task.task_id} is held by {held} agents{': ' if contest.trouble else ''}{contest.trouble}"
+            for contest, held in zip(self._contests, self._counted, strict=False)
+            if held != 1 and contest.present()
+        ]
+        more = len(found) - LISTED
+        return found[:LISTED] + ([f"and {more} more tasks"] if more > 0 else [])
+
+    def figures(self) -> list[Figure]:
+        """How many have exactly one holder, and how soon they had one."""
+        n = len(self._contests)
+        held = self._counted or [len(contest.holders()) for contest in self._contests]
+        right = self._right if self._counted else self._nearest()
+        took = [contest.held_at - contest.over_at for contest in self._contests if contest.held_at != math.inf]
+        return [
+            share("tasks.held_once", sum(count == 1 for count in held), n),
+            at_most("tasks.overlaps", float(sum(c.overlaps for c in self._contests)), "leases", 0.0, n=n),
+            share("tasks.by_the_nearest", right, n),
+            *spread("tasks.seconds", took, "s", (0.5, 0.99)),
+        ]
+
+    def _nearest(self) -> int:
+        """How many tasks are held by the nearest of those that live."""
+        return sum(any(b.deputy.uuid == contest.best() for b in contest.holders()) for contest in self._contests)

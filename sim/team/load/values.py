@@ -1,0 +1,249 @@
+"""Values: somebody stores something, some of its holders die at once, somebody else reads it.
+
+``deaths`` says how many: "quorum" is one less than acknowledged it, the most that an acknowledged value has to outlive
+(invariant D1); "none" leaves the dying to the faults of the scenario, so that what half of a network takes along
+can be held against the model 2 ** -k.  Until it is read, an answer may be the value or "unavailable", never "not
+found"; a value that nobody can read for ``patience`` seconds is lost.
+
+Without deaths a random reader looks up who holds each value before it is read; the share of its holders (of the k
+closest of them) that it finds is what lookups of KAD in the field had 18 % of (Kang et al., 2009).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from twisted.python.failure import Failure
+
+from middleware.entangled.errors import EntangledError
+from middleware.entangled.identity import node_id
+from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.kademlia.distance import distance
+from middleware.entangled.kademlia.overlay import K
+from middleware.entangled.node import EntangledNode
+from middleware.entangled.record import Record, Slot, hashed_key
+from middleware.entangled.replication.owner import Stored
+from middleware.setting import number, one_of, seconds, whole
+from sim.team.figure import Figure, at_most, mean, share, spread
+from sim.team.load.lookups import LISTED
+from sim.team.load.pace import Pace
+from sim.team.load.residents import Residents
+from sim.team.team import Team
+
+QUORUM, NONE = "quorum", "none"
+AGAIN = 2.0
+"""Seconds between two tries to read a value that is not available."""
+NAME = "value"
+
+
+@dataclass(frozen=True)
+class ValueSettings:
+    """``[load.values]``: what is stored, and who dies for it."""
+
+    count: int = field(default=1000, metadata=whole(1, 1_000_000))
+    """Values in all."""
+
+    rate: float = field(default=1.0, metadata=number(0.001, 10_000.0))
+    """Values that are stored in a second."""
+
+    deaths: str = field(default=NONE, metadata=one_of((NONE, QUORUM)))
+    """``quorum``: at once one less than acknowledged it; ``none``: only whom the scenario lets die."""
+
+    age: float = field(default=5.0, metadata=seconds(0.0, 86_400.0))
+    """Seconds after these deaths in which a value is read; without deaths it is read at the end."""
+
+    away: float = field(default=30.0, metadata=seconds(1.0, 86_400.0))
+    """Seconds after which a newcomer takes the place of each that died."""
+
+    patience: float = field(default=90.0, metadata=seconds(0.0, 3600.0))
+    """Seconds for which reading is tried before a value counts as lost.  Members that died count in majorities for
+    half a minute at least, so what many of them held may be unavailable for as long."""
+
+
+@dataclass
+class Value:
+    """One value on its way through its life."""
+
+    number: int
+    key: bytes
+    slot: Slot
+    began: float
+    acknowledged: int = 0
+    killed: int = 0
+    asked_since: float = 0.0
+
+    @property
+    def content(self) -> bytes:
+        """What was stored."""
+        return b"value %d" % self.number
+
+
+class Values:
+    """The workload ``values``."""
+
+    def __init__(self, team: Team, settings: ValueSettings) -> None:
+        self._team = team
+        self._settings = settings
+        self._clock = team.clock
+        self._rng = team.rng("values")
+        self._residents = Residents(team)
+        self._pace = Pace(team.clock, settings.rate, settings.count)
+        self._begun = 0
+        self._waiting: list[Value] = []
+        self.refused = 0
+        self.put_seconds: list[float] = []
+        self.get_seconds: list[float] = []
+        self.outages: list[float] = []
+        self.holders: list[float] = []
+        self.copies: list[float] = []
+        self.kills = self.read = self.lost = self.missing = self.unread = 0
+        self._found: list[str] = []
+
+    def step(self) -> None:
+        """Store what is due."""
+        for _ in range(self._pace.due()):
+            place = self._residents.any(self._rng)
+            if place:
+                self._put(place[0])
+
+    def settled(self) -> None:
+        """Read what nobody has read yet."""
+        waiting, self._waiting = self._waiting, []
+        for value in waiting:
+            self._count_holders(value)
+            self._read(value)
+
+    def verdict(self) -> list[str]:
+        """Values that were lost, or said not to be there; with "none" the faults may have taken more than they may."""
+        return self._found if self._settings.deaths == QUORUM else []
+
+    def figures(self) -> list[Figure]:
+        """Durability, seconds, and how many holders a reader finds."""
+        over = self.read + self.lost
+        figures = [
+            Figure("values.acknowledged", float(self._begun - self.refused), "values", n=self._begun),
+            *spread("values.put", self.put_seconds, "s", (0.5, 0.99)),
+            *spread("values.get", self.get_seconds, "s", (0.5, 0.99)),
+            share("values.read", self.read, over),
+            share("values.read_at_once", self.read - len(self.outages), over),
+            Figure("values.outage.max", max(self.outages, default=0.0), "s", n=len(self.outages)),
+            Figure("values.missing", float(self.missing), "answers", n=over),
+            Figure("values.open", float(self.unread), "values"),
+        ]
+        if self._settings.deaths == QUORUM:
+            lost = at_most("values.lost", float(self.lost), "values", 0.0, n=over)
+            return [*figures, lost, Figure("values.killed", float(self.kills), "nodes")]
+        figures += [
+            Figure("values.holders_found", mean(self.holders), "share", n=len(self.holders)),
+            Figure("values.copies", mean(self.copies), "nodes", n=len(self.copies)),
+        ]
+        return [*figures, Figure("values.lost", self.lost / over if over else None, "share", n=over)]
+
+    # -- inside -----------------------------------------------------------------------------------------------------
+
+    def _put(self, place: int) -> None:
+        life = self._residents.node(place)
+        self._begun += 1
+        key = hashed_key(f"{NAME} {self._begun}")
+        value = Value(self._begun, key, Slot(key, life.identity.public, NAME), self._clock.seconds())
+        life.put(key, NAME, value.content).addCallbacks(self._stored, self._not_stored, (value,))
+
+    def _not_stored(self, failure: Failure) -> None:
+        failure.trap(EntangledError)
+        self.refused += 1
+
+    def _stored(self, stored: Stored, value: Value) -> None:
+        value.acknowledged = int(stored)
+        self.put_seconds.append(self._clock.seconds() - value.began)
+        if self._settings.deaths == QUORUM:
+            self._kill(value)
+            self._clock.callLater(self._settings.age, self._read, value)
+        else:
+            self._waiting.append(value)
+
+    def _held_by(self, value: Value) -> list[int]:
+        """The places of those that live and hold the value."""
+        holders = []
+        for place in self._residents.places():
+            held = self._residents.node(place).store.slot(value.slot)
+            if held is not None and held.value == value.content:
+                holders.append(place)
+        return holders
+
+    def _kill(self, value: Value) -> None:
+        """Let as many of those that acknowledged it die at once as it has to outlive."""
+        held = self._held_by(value)
+        dying = self._rng.sample(held, min(value.acknowledged - 1, len(held) - 1)) if held else []
+        for place in dying:
+            self.kills += 1
+            value.killed += 1
+            self._team.kill(place)
+            self._clock.callLater(self._settings.away, self._return, place)
+
+    def _return(self, place: int) -> None:
+        if place not in self._team.nodes:
+            self._team.replace(place)
+            self._team.start(place)
+
+    def _count_holders(self, value: Value) -> None:
+        """Let somebody look up who holds it, and count those of the holders that it finds."""
+        held = [self._residents.node(place) for place in self._held_by(value)]
+        life = self._reader()
+        if life is None or not held:
+            return
+        self.copies.append(float(len(held)))
+        ids = sorted((one.identity.node_id for one in held), key=lambda id_: distance(id_, value.key))[:K]
+        life.find_node(value.key).addCallbacks(self._counted, _weather, (ids, life))
+
+    def _counted(self, contacts: list[Contact], ids: list[bytes], reader: EntangledNode) -> None:
+        seen = {contact.node_id for contact in contacts} | {node_id(reader.identity.public)}
+        self.holders.append(sum(id_ in seen for id_ in ids) / len(ids))
+
+    def _read(self, value: Value) -> None:
+        now = self._clock.seconds()
+        if not value.asked_since:
+            value.asked_since = now
+            self.unread += 1
+        life = self._reader()
+        if life is None:
+            self._go_on(value)
+            return
+        life.get(value.key).addCallbacks(self._answered, self._unavailable, (value, now), {}, (value,))
+
+    def _reader(self) -> EntangledNode | None:
+        chosen = self._residents.any(self._rng)
+        return self._residents.node(chosen[0]) if chosen else None
+
+    def _answered(self, records: list[Record], value: Value, asked_at: float) -> None:
+        if any(record.slot == value.slot and record.value == value.content for record in records):
+            now = self._clock.seconds()
+            self.get_seconds.append(now - asked_at)
+            if asked_at > value.asked_since:
+                self.outages.append(asked_at - value.asked_since)
+            self.read += 1
+            self.unread -= 1
+            return
+        self.missing += 1
+        self._say(f"D1: value {value.number}, acknowledged by {value.acknowledged}, is said not to be there")
+        self._go_on(value)
+
+    def _unavailable(self, failure: Failure, value: Value) -> None:
+        failure.trap(EntangledError)
+        self._go_on(value)
+
+    def _go_on(self, value: Value) -> None:
+        if self._clock.seconds() - value.asked_since < self._settings.patience:
+            self._clock.callLater(AGAIN, self._read, value)
+            return
+        self.lost += 1
+        self.unread -= 1
+        after = f"after {value.killed} of {value.acknowledged} that acknowledged it died"
+        self._say(f"D1: value {value.number} is lost {after}")
+
+    def _say(self, line: str) -> None:
+        if len(self._found) < LISTED:
+            self._found.append(line)
+
+
+def _weather(failure: Failure) -> None:
+    failure.trap(EntangledError)

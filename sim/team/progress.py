@@ -1,0 +1,85 @@
+"""Progress: how far a run is, as a bar on a terminal and in lines elsewhere."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TextIO
+
+from sim.team.figure import shown
+from sim.team.run import Run
+
+BAR = 24
+OFTEN, RARELY = 0.2, 10.0
+"""Seconds between two looks on a terminal, and between two lines elsewhere."""
+FIGURES_EVERY = 2.0
+"""Seconds between two looks at the workloads' figures: some of them go through all there is."""
+
+
+class Progress:
+    """Writes to ``out`` how a run goes; ``seconds`` is the real time, and ``resident`` gives bytes of memory.
+
+    ``columns`` is how wide the terminal is, 0 where there is none.
+    """
+
+    def __init__(self, out: TextIO, columns: int, seconds: Callable[[], float], resident: Callable[[], int]) -> None:
+        self._out = out
+        self._columns = columns
+        self._seconds = seconds
+        self._resident = resident
+        self._last: tuple[float, float] | None = None
+        self._width = 0
+        self._figures = ""
+        self._figures_at = float("-inf")
+
+    def looked(self, run: Run) -> None:
+        """Say how far it is, unless that was said a moment ago."""
+        now, moment = self._seconds(), run.team.clock.seconds()
+        if self._last is None:
+            self._last = now, moment
+            return
+        before, then = self._last
+        if now - before < (OFTEN if self._columns else RARELY):
+            return
+        self._last = now, moment
+        if run.began_at is not None and now - self._figures_at >= FIGURES_EVERY:
+            self._figures_at = now
+            self._figures = "".join(
+                f", {figure.name} {shown(figure.value)}{'' if figure.holds else ' (!)'}"
+                for figure in run.figures()
+                if figure.target and figure.value is not None
+            )
+        self._say(self.line(run, (moment - then) / (now - before)))
+
+    def line(self, run: Run, pace: float) -> str:
+        """How far it is, in one line, with the figures that have targets, marked where these are missed so far.
+
+        ``pace`` is how many times as fast as the world's time it goes.
+        """
+        team, moment, end = run.team, run.team.clock.seconds(), run.expected_end
+        share = min(1.0, moment / end) if end else 0.0
+        done = round(BAR * share)
+        bar = f"[{'#' * done}{'.' * (BAR - done)}] " if self._columns else ""
+        alive, inside = len(team.nodes), len(team.inside())
+        who = f"{alive:,} alive" + (f", {alive - inside:,} of them not in" if alive != inside else "")
+        sent = team.board.counters["sent"]
+        memory = f", {self._resident() / 2**20:,.0f} MiB" if self._resident() else ""
+        return (
+            f"{bar}{share:4.0%} {run.phase}, {moment:.1f} of {end:.0f} s, {who}, {sent:,} datagrams, "
+            f"{pace:.2g} x real time{memory}{self._figures}"
+        )
+
+    def close(self) -> None:
+        """Leave the terminal as it was."""
+        if self._width:
+            self._out.write("\r" + " " * self._width + "\r")
+            self._out.flush()
+            self._width = 0
+
+    def _say(self, line: str) -> None:
+        if self._columns:
+            line = line[: self._columns - 1]
+            self._out.write("\r" + line.ljust(self._width))
+            self._width = len(line)
+        else:
+            self._out.write(line + "\n")
+        self._out.flush()

@@ -1,0 +1,222 @@
+"""Run: a scenario from the first node to the verdict; it may be ended at any moment, and then says what there is."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import cast
+
+from twisted.logger import ILogObserver, LogEvent, Logger, globalLogPublisher
+
+from sim.team.checker import check
+from sim.team.event import Settled
+from sim.team.figure import Bound, Figure
+from sim.team.scenario import Scenario
+from sim.team.team import Team
+from sim.team.trouble import Troubles
+from sim.team.workload import Kinds, Workload
+
+ASKED = 10.0
+"""Seconds in which the workloads get what they ask for at the end."""
+SLICE = 0.25
+"""Seconds of the team's time between two looks at it."""
+MOST_VIOLATIONS = 1000
+NONE = 1e-9
+"""Seconds that are no time at all: what is left over from adding up steps."""
+LONG, SHORT, LEAST_GRAIN = 0.5, 0.1, 1e-4
+"""Real seconds that a person waits for a word at most, about; where that takes longer the grain gets finer, where it
+takes less, coarser; and how fine it gets, in seconds of the team's time."""
+
+Phase = str
+JOINING, SETTLING, RUNNING, REPAIRING, ASKING, DONE = "joining", "settling", "running", "repairing", "asking", "done"
+Looked = Callable[["Run"], bool]
+"""Called after every slice; True ends the run."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of a run; ``is_partial`` where it was ended before its time, in the ``phase`` that it names."""
+
+    seed: int
+    phase: Phase
+    seconds: float
+    figures: list[Figure] = field(default_factory=list)
+    violations: list[str] = field(default_factory=list)
+    digest: str = ""
+
+    @property
+    def is_partial(self) -> bool:
+        """Whether it was ended before its time."""
+        return self.phase != DONE
+
+    @property
+    def missed(self) -> list[Figure]:
+        """The figures that are not as they should be."""
+        return [figure for figure in self.figures if figure.holds is False]
+
+
+class Run:
+    """One run of a ``scenario``.
+
+    ``looked`` is called now and then, at moments that follow from the seed, and may end it.  ``watched`` is called more
+    often where the machine is slow, ``seconds`` being its real time, and may end it, too.  ``grown`` is called when
+    the nodes are there: from then on most of what the process has lives as long as they do.
+    """
+
+    _log = Logger()
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        seed: int,
+        kinds: Kinds,
+        looked: Looked = lambda run: False,
+        grown: Callable[[], None] = lambda: None,
+        watched: Looked = lambda run: False,
+        seconds: Callable[[], float] = lambda: 0.0,
+    ) -> None:
+        self.scenario = scenario
+        self.team = Team(scenario, seed)
+        self.phase: Phase = JOINING
+        self.began_at: float | None = None
+        """When the team stood, on its clock."""
+        self.workloads: list[tuple[str, Workload]] = [
+            (name, kinds[name].make(self.team, settings)) for name, settings in scenario.loads
+        ]
+        self.violations: list[str] = []
+        join = scenario.join
+        self.expected_end = join.settle + scenario.seconds + scenario.repair + (ASKED if self.workloads else 0.0)
+        """When it will have ended, on the team's clock, as far as is known."""
+        self._looked = looked
+        self._grown = grown
+        self._watched = watched
+        self._seconds = seconds
+        self._grain = SLICE
+        self._troubles = Troubles(self.team)
+        self._is_ended = False
+
+    def go(self) -> Outcome:
+        """Run everything; what came of it."""
+        phases = (
+            (JOINING, self._join),
+            (SETTLING, self._settle),
+            (RUNNING, self._act),
+            (REPAIRING, self._repair),
+            (ASKING, self._ask),
+        )
+        logged = cast(ILogObserver, self._logged)
+        globalLogPublisher.addObserver(logged)
+        try:
+            for self.phase, work in phases:
+                work()
+                if self._is_ended:
+                    return self.outcome()
+        finally:
+            globalLogPublisher.removeObserver(logged)
+        self.phase = DONE
+        return self.outcome()
+
+    def figures(self) -> list[Figure]:
+        """Every figure so far, held to the targets of the scenario."""
+        found = [figure for _, workload in self.workloads for figure in workload.figures()]
+        targets: dict[str, Bound] = dict(self.scenario.targets)
+        return [figure.against(targets[figure.name]) if figure.name in targets else figure for figure in found]
+
+    def outcome(self) -> Outcome:
+        """What came of it so far."""
+        team = self.team
+        figures = self.figures()
+        violations = [
+            *self.violations,
+            *self._unheld(figures),
+            *(line for _, workload in self.workloads for line in workload.verdict()),
+            *check(team.history),
+        ]
+        whole = hashlib.blake2b(digest_size=16)
+        whole.update(team.digest().encode())
+        for figure in figures:
+            if figure.is_exact:
+                whole.update(f"{figure.name} {figure.value!r}\n".encode())
+        for line in violations:
+            whole.update(f"{line}\n".encode())
+        return Outcome(team.seed, self.phase, team.clock.seconds(), figures, violations, whole.hexdigest())
+
+    # -- inside -----------------------------------------------------------------------------------------------------
+
+    def _logged(self, event: LogEvent) -> None:
+        """A failure that a node logged, where nobody else would hear of it, is one of the team."""
+        failure = event.get("log_failure")
+        if failure is not None and len(self.violations) < MOST_VIOLATIONS:
+            name, moment = failure.type.__name__, self.team.clock.seconds()
+            self.violations.append(f"exception: {name} at {moment:.3f} s: {failure.getErrorMessage()}")
+
+    def _join(self) -> None:
+        team, within = self.team, self.scenario.join.within
+        last = team.come()
+        self.expected_end += last
+        self._pass(last)
+        self._pass(within, until=team.is_standing)
+        self.expected_end += team.clock.seconds() - last
+        outside = len(team.nodes) - len(team.inside())
+        if outside and not self._is_ended:
+            self.violations.append(f"join: {outside} nodes are not in {within:g} s after the last came")
+
+    def _settle(self) -> None:
+        self._grown()
+        self._pass(self.scenario.join.settle)
+
+    def _act(self) -> None:
+        """Let faults and sessions befall the team while the workloads act."""
+        scenario, clock = self.scenario, self.team.clock
+        self.began_at = began = clock.seconds()
+        self._troubles.begin()
+        end = began + scenario.seconds
+        while not self._is_ended and clock.seconds() < end - NONE:
+            if clock.seconds() >= began + scenario.lead - NONE:
+                for _, workload in self.workloads:
+                    workload.step()
+            self._pass(min(scenario.step, end - clock.seconds()))
+
+    def _repair(self) -> None:
+        if self.scenario.repair:
+            self._troubles.end()
+        self._pass(self.scenario.repair)
+
+    def _ask(self) -> None:
+        if self.scenario.repair:
+            self.team.history.note(Settled)
+        for _, workload in self.workloads:
+            workload.settled()
+        self._pass(ASKED if self.workloads else 0.0)
+
+    def _unheld(self, figures: list[Figure]) -> list[str]:
+        """The targets that no figure was held to."""
+        names = [figure.name for figure in figures]
+        unheld = [] if self.phase != DONE else [name for name, _ in self.scenario.targets if name not in names]
+        return [f"targets: nothing measured {name!r}; there are {', '.join(names) or 'none'}" for name in unheld]
+
+    def _pass(self, seconds: float, until: Callable[[], bool] = lambda: False) -> None:
+        """Let time pass, a slice after the other."""
+        clock = self.team.clock
+        end = clock.seconds() + seconds
+        while not self._is_ended and clock.seconds() < end - NONE and not until():
+            self._slice(min(SLICE, end - clock.seconds()))
+            self._is_ended = self._is_ended or self._looked(self)
+
+    def _slice(self, seconds: float) -> None:
+        """Let time pass, in grains; what happens does not depend on how fine they are."""
+        clock = self.team.clock
+        end = clock.seconds() + seconds
+        while not self._is_ended and clock.seconds() < end:
+            began = self._seconds()
+            try:
+                clock.run_until(min(end, clock.seconds() + self._grain))
+            except Exception:  # a reactor would go on, too
+                self._log.failure("a call of the team failed")
+            self._is_ended = self._watched(self)
+            took = self._seconds() - began
+            if took > LONG:
+                self._grain = max(LEAST_GRAIN, self._grain / 4)
+            elif took < SHORT:
+                self._grain = min(SLICE, self._grain * 2)

@@ -1,0 +1,131 @@
+"""Command: ``sim scale``, what a team costs and takes at one size after the other, drawn beside what theory says."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+
+from middleware.errors import BadSetting
+from sim.team.command import ENDED, MISSED, World
+from sim.team.figure import Figure, table
+from sim.team.memory import check
+from sim.team.scale.apart import apart
+from sim.team.scale.curve import CURVES
+from sim.team.scale.drawing import drawn
+from sim.team.scale.page import page
+from sim.team.scale.record import Record
+from sim.team.scale.survey import Ended, Sized, SurveySettings, Watcher, surveyed
+from sim.team.scenario import Scenario
+
+SIZES = "3,10,30,100,300,1000,3000,10000"
+LEAST, MOST = 3, 100_000
+
+
+Measure = Callable[[int, SurveySettings, Watcher], Sized]
+
+
+def surveyed_apart(nodes: int, settings: SurveySettings, watcher: Watcher) -> Sized:
+    """Measure a team of that size in a process of its own; raises ``Ended``.
+
+    What one team leaves behind would be free memory for the next one, which then seemed to need less.
+    """
+    return apart(partial(surveyed, nodes, settings, watcher), Ended)
+
+
+def scale(arguments: Sequence[str], world: World, measure: Measure = surveyed_apart) -> int:
+    """Measure the sizes that are not measured yet, print and draw all; 1 where a target is missed.
+
+    Raises ``BadSetting``.
+    """
+    wanted = _parsed(arguments)
+    sizes = _sizes(wanted.nodes)
+    out = Path(wanted.out)
+    settings = SurveySettings(seed=wanted.seed, takeovers=wanted.takeovers, swarm_most=wanted.swarm_most)
+    out.mkdir(parents=True, exist_ok=True)
+    record = Record(out / "scale.json", settings)
+    record.read()
+    watcher = Watcher(lambda line: _say(world, line), world.is_stopped)
+    for nodes in sizes:
+        check(Scenario(nodes=nodes), world.read)
+        if nodes in record.sizes:
+            world.err.write(f"{nodes:,} nodes are measured already\n")
+            continue
+        try:
+            sized = measure(nodes, settings, watcher)
+        except Ended:
+            break
+        record.add(sized)
+        world.out.write(f"\n{nodes:,} nodes, {sized.cpu:,.0f} s of the processor\n{table(held(sized))}\n")
+        for line in sized.violations:
+            world.out.write(f"violated  {line}\n")
+        world.out.flush()
+        _draw(out, record.sizes, settings)
+    _draw(out, record.sizes, settings)
+    found = [figure for sized in record.sizes.values() for figure in held(sized)]
+    missed = [figure for figure in found if figure.holds is False]
+    world.out.write(f"\n{len(found)} figures, {len(missed)} missed; {out / 'scale.json'}, {out / 'scale.svg'}\n")
+    if world.is_stopped():
+        return ENDED
+    return MISSED if missed or any(sized.violations for sized in record.sizes.values()) else 0
+
+
+def held(sized: Sized) -> list[Figure]:
+    """The figures of one size, held to what is wanted of a team of that size."""
+    targets = {curve.figure: curve.target(sized.nodes) for curve in CURVES}
+    return [figure.against(targets.get(figure.name)) for figure in sized.figures]
+
+
+def points(sizes: Mapping[int, Sized]) -> dict[str, list[tuple[int, float]]]:
+    """By figure, its value at each size at which it was measured."""
+    found: dict[str, list[tuple[int, float]]] = {}
+    for nodes in sorted(sizes):
+        for figure in sizes[nodes].figures:
+            if figure.value is not None and math.isfinite(figure.value):
+                found.setdefault(figure.name, []).append((nodes, figure.value))
+    return found
+
+
+def _draw(out: Path, sizes: Mapping[int, Sized], settings: SurveySettings) -> None:
+    measured = ", ".join(f"{nodes:,}" for nodes in sorted(sizes))
+    note = f"seed {settings.seed}; measured at {measured} nodes, all in one process on one turned clock"
+    (out / "scale.svg").write_text(drawn(CURVES, points(sizes), note), encoding="utf-8")
+    (out / "table.md").write_text(f"# Scale: the figures\n\n{page(CURVES, points(sizes))}", encoding="utf-8")
+
+
+def _say(world: World, line: str) -> None:
+    world.err.write(f"{line}\n")
+    world.err.flush()
+
+
+def _sizes(text: str) -> list[int]:
+    try:
+        sizes = [int(word) for word in text.split(",")]
+    except ValueError:
+        sizes = []
+    if not sizes or not all(LEAST <= nodes <= MOST for nodes in sizes):
+        problem = f"must be numbers from {LEAST} to {MOST:,}, is {text!r}"
+        raise BadSetting("command line", "--nodes", problem, f"write --nodes {SIZES}")
+    return sorted(set(sizes))
+
+
+def _parsed(arguments: Sequence[str]) -> argparse.Namespace:
+    default = SurveySettings()
+    parser = argparse.ArgumentParser(prog="sim scale", description=__doc__)
+    parser.add_argument("--nodes", default=SIZES, help="the sizes (default %(default)s)")
+    parser.add_argument(
+        "--out", default="docs/scale", help="where scale.json, scale.svg and table.md are (default %(default)s)"
+    )
+    parser.add_argument("--seed", type=int, default=default.seed, help="everything follows from it (default 1)")
+    parser.add_argument(
+        "--takeovers", type=int, default=default.takeovers, help="holders that die (default %(default)s)"
+    )
+    parser.add_argument(
+        "--swarm-most",
+        type=int,
+        default=default.swarm_most,
+        help="nodes of the largest team of whole nodes, for the directory (default %(default)s)",
+    )
+    return parser.parse_args(arguments)

@@ -1,0 +1,118 @@
+"""Curve: one figure against the number of nodes, with the theory's and others' beside it; pure."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from sim.team.figure import Bound
+from sim.team.scale import theory
+from sim.team.scale.theory import Published, Theory
+
+
+@dataclass(frozen=True)
+class Curve:
+    """``figure`` under ``title`` in ``unit``; ``bound`` is what it is held to, by size where there is one for some."""
+
+    figure: str
+    title: str
+    unit: str
+    theory: Theory | None = None
+    says: str = ""
+    """What the theory's curve is."""
+    is_limit: bool = False
+    """Whether the theory's curve is the target."""
+    bound: Bound | None = None
+    since: int = 0
+    """Nodes from which on it is held to that; below, nobody asked for anything."""
+    at: tuple[tuple[int, Bound], ...] = ()
+    published: Sequence[Published] = ()
+
+    def target(self, nodes: int) -> Bound | None:
+        """What is wanted of a team of that size."""
+        if self.is_limit and self.theory is not None:
+            return Bound(self.theory(nodes))
+        return dict(self.at).get(nodes, self.bound if nodes >= self.since else None)
+
+
+LARGE = 1000
+"""Nodes from which on the targets of cost are meant."""
+
+CURVES = (
+    Curve("lookups.success", "Lookups that find their node within 4 s", "share", bound=Bound(0.999, most=False)),
+    Curve("lookups.hops.mean", "Hops of a lookup", "hops", theory.hops, "log2(n) / 2, the most that is wanted", True),
+    Curve(
+        "lookups.reached.p50",
+        "Until the node that is looked for answers, half of them, 156 ms there and back",
+        "s",
+        bound=Bound(0.45),
+        published=(
+            Published(1024, 0.45, "Kademlia in p2psim, Li et al. 2005"),
+            Published(5000, 0.63, "5 parallel in OverSim, Heep 2010"),
+        ),
+    ),
+    Curve("lookups.seconds.p50", "... until all of the k closest have answered", "s"),
+    Curve("lookups.exact", "Lookups with exactly the k closest, in quiet", "share", bound=Bound(1.0, most=False)),
+    Curve("traffic.datagrams", "Datagrams sent by a node, in quiet", "a second"),
+    Curve(
+        "traffic.bytes",
+        "Bytes sent by a node, in quiet",
+        "B/s",
+        bound=Bound(200.0),
+        since=LARGE,
+        published=(
+            Published(1000, 900.0, "Bamboo, sessions of 1.4 min, Rhea et al. 2004"),
+            Published(5000, 300.0, "Kademlia in OverSim, Heep 2010"),
+        ),
+    ),
+    Curve("traffic.contacts", "Contacts of a node", "contacts", theory.contacts, "k out of each half of the ids"),
+    Curve("traffic.memory", "Memory of a node, simulated", "KiB", bound=Bound(200.0), since=LARGE),
+    Curve("traffic.cpu", "Processor of a node, simulated, in quiet", "ms a second", bound=Bound(0.5), since=LARGE),
+    Curve(
+        "auctions.agree.p95",
+        "One task for all: seconds until 95 % of the agents agree, 10 % loss",
+        "s",
+        theory.agreement,
+        "rounds of the simulation in docs/consensus.md",
+        bound=Bound(1.0),
+        at=((100, Bound(0.6)), (1000, Bound(0.8))),
+    ),
+    Curve("auctions.right", "... the share of agents that is right", "share", bound=Bound(0.99, most=False)),
+    Curve(
+        "auctions.messages",
+        "... datagrams sent by an agent",
+        "datagrams",
+        theory.tree,
+        "4 (n - 1) / n: a tree, without loss",
+        bound=Bound(6.0),
+        at=((3, Bound(10.0)), (10, Bound(10.0)), (30, Bound(10.0))),
+        published=(Published(100, 4.6, "acknowledged tree, simulated"),),
+    ),
+    Curve(
+        "auctions.busiest",
+        "... datagrams at the busiest node",
+        "datagrams",
+        theory.busiest,
+        "the same simulation, without loss",
+        bound=Bound(1000.0),
+    ),
+    Curve(
+        "takeovers.seconds.p50",
+        "Takeover after the death of who acts, half of them, lease of 1.5 s, 10 % loss",
+        "s",
+        theory.takeover,
+        "the lease alone, simulated",
+        bound=Bound(1.5),
+    ),
+    Curve("takeovers.seconds.p99", "... 99 % of them", "s", bound=Bound(2.0)),
+    Curve(
+        "directory.busiest",
+        "Directory: share of all devices that the busiest node holds",
+        "share",
+        theory.share,
+        "k / n: spread evenly",
+        bound=Bound(0.01),
+        since=LARGE,
+    ),
+    Curve("directory.seconds.p50", "... seconds until somebody has listed all devices", "s"),
+)

@@ -1,0 +1,68 @@
+"""Record: the JSON of measured sizes, which a run that was ended is taken up from."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from middleware.errors import BadSetting
+from sim.team.figure import Figure
+from sim.team.scale.survey import Sized, SurveySettings
+
+
+class Record:
+    """The sizes that were measured with ``settings``, in the file ``path``; those of other settings are let go of."""
+
+    def __init__(self, path: Path, settings: SurveySettings) -> None:
+        self._path = path
+        self._settings = settings
+        self.sizes: dict[int, Sized] = {}
+
+    def read(self) -> None:
+        """Take up what is there; raises ``BadSetting`` for a file that is none of ours."""
+        try:
+            content = json.loads(self._path.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            return
+        except (OSError, ValueError) as error:
+            raise self._wrong(str(error)) from error
+        if not isinstance(content, dict) or not isinstance(content.get("sizes"), dict):
+            raise self._wrong("it has no sizes")
+        if content.get("digest") != self._settings.digest():
+            return
+        try:
+            self.sizes = {int(nodes): _sized(int(nodes), size) for nodes, size in content["sizes"].items()}
+        except (TypeError, ValueError, KeyError) as error:
+            raise self._wrong(f"a size in it is not as it was written: {error}") from error
+
+    def add(self, sized: Sized) -> None:
+        """Keep one more size, and write the file whole: it is there at any moment."""
+        self.sizes[sized.nodes] = sized
+        content = {
+            "digest": self._settings.digest(),
+            "settings": asdict(self._settings),
+            "sizes": {str(nodes): _packed(self.sizes[nodes]) for nodes in sorted(self.sizes)},
+        }
+        new = self._path.with_suffix(".new")
+        new.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+        os.replace(new, self._path)
+
+    def _wrong(self, problem: str) -> BadSetting:
+        return BadSetting(str(self._path), "", f"cannot be taken up: {problem}", "move it away, or name another --out")
+
+
+def _packed(sized: Sized) -> dict[str, Any]:
+    return {
+        "figures": [figure.packed() for figure in sized.figures],
+        "violations": sized.violations,
+        "hash": sized.hash,
+        "cpu": round(sized.cpu, 1),
+    }
+
+
+def _sized(nodes: int, content: dict[str, Any]) -> Sized:
+    figures = [Figure(**fields) for fields in content["figures"]]
+    return Sized(nodes, figures, list(content["violations"]), str(content["hash"]), float(content["cpu"]))

@@ -1,0 +1,257 @@
+"""Trouble: the faults and sessions of a scenario, as they befall a team."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+from middleware.entangled.network.switchboard import Barrier
+from sim.team import barrier
+from sim.team.disk import Disk
+from sim.team.fault import Fault
+from sim.team.team import Node, Team
+
+FEW = 2
+"""So many nodes stay, whatever the sessions say: who is alone has no network to come back to."""
+
+
+class Troubles:
+    """What befalls a team from ``begin`` to ``end``.
+
+    Whom a fault befalls is drawn when it comes, from those that are in the network then.
+    """
+
+    def __init__(self, team: Team) -> None:
+        self._team = team
+        self._sessions = team.scenario.sessions
+        self._dice = team.rng("trouble")
+        self._session_dice = team.rng("sessions")
+        self._is_on = False
+        self._undo: dict[int, Callable[[], None]] = {}
+        self._number = 0
+        self._away: dict[int, int] = {}
+        """Places whose node is to come back, each with the number of the life that ended there."""
+        self._befall: dict[str, Callable[[Fault], None]] = {
+            "crash": partial(self._end_lives, kill=True),
+            "leave": partial(self._end_lives, kill=False),
+            "freeze": self._freeze,
+            "cut": partial(self._bar, barrier.cut),
+            "deaf": partial(self._bar, barrier.deaf),
+            "mute": partial(self._bar, barrier.mute),
+            "clog": self._clog,
+            "pairs": self._pairs,
+            "step": self._step,
+            "rate": self._rate,
+            "full": self._full,
+            "crowd": self._crowd,
+            "weather": self._weather,
+            "rebind": self._rebind,
+        }
+
+    def begin(self) -> None:
+        """The team stands: sessions run from now on, and faults come at their time."""
+        team, stays = self._team, self._sessions.stays
+        self._is_on = True
+        if stays is not None:
+            for place in team.alive():
+                self._plan_end(place, stays.left(self._session_dice))
+            team.on_birth.append(self._born)
+        for number, fault in enumerate(team.scenario.faults, 1):
+            team.at(fault.at, partial(self._strike, fault, number))
+
+    def end(self) -> None:
+        """Take back every fault, and let those come back that are to; nothing happens any more."""
+        team = self._team
+        self._is_on = False
+        for number in list(self._undo):
+            self._take_back(number)
+        team.board.barriers.clear()
+        for place, life in sorted(self._away.items()):
+            self._return(place, life)
+        team.tell("healed")
+
+    # -- sessions ---------------------------------------------------------------------------------------------------
+
+    def _born(self, place: int, node: Node) -> None:
+        stays = self._sessions.stays
+        if self._is_on and stays is not None:
+            self._plan_end(place, stays.drawn(self._session_dice))
+
+    def _plan_end(self, place: int, seconds: float) -> None:
+        self._team.at(seconds, partial(self._session_over, place, self._team.place(place).lives))
+
+    def _session_over(self, place: int, life: int) -> None:
+        team, sessions, dice = self._team, self._sessions, self._session_dice
+        if not self._is_on or not self._lives(place, life):
+            return
+        if len(team.nodes) <= FEW:
+            self._plan_end(place, sessions.breaks.drawn(dice))
+            return
+        if dice.random() < sessions.goodbye:
+            team.leave(place)
+        else:
+            team.kill(place)
+        self._away[place] = life
+        team.at(sessions.breaks.drawn(dice), partial(self._return, place, life))
+
+    def _return(self, place: int, life: int) -> None:
+        if self._away.get(place) != life:
+            return
+        del self._away[place]
+        if not self._sessions.same:
+            self._team.replace(place)
+        self._team.start(place)
+
+    def _lives(self, place: int, life: int) -> bool:
+        return place in self._team.nodes and self._team.place(place).lives == life
+
+    # -- faults -----------------------------------------------------------------------------------------------------
+
+    def _strike(self, fault: Fault, number: int) -> None:
+        if self._is_on:
+            self._team.tell("fault", -1, f"{number}: {fault}")
+            self._befall[fault.kind](fault)
+
+    def _whom(self, fault: Fault) -> list[int]:
+        """Those that a fault befalls, in the order in which it comes to them."""
+        here = sorted(self._team.inside())
+        if fault.places:
+            return [place for place in fault.places if place in self._team.nodes]
+        count = fault.count or round(fault.share * len(here))
+        return self._dice.sample(here, min(count, len(here)))
+
+    def _spread(self, fault: Fault, work: list[Callable[[], None]]) -> None:
+        """Do all of it, over the time over which the fault spreads."""
+        for turn, each in enumerate(work):
+            if fault.over:
+                self._team.at(turn * fault.over / len(work), partial(self._if_on, each))
+            else:
+                each()
+
+    def _if_on(self, work: Callable[[], None]) -> None:
+        if self._is_on:
+            work()
+
+    def _for_a_while(self, seconds: float, undo: Callable[[], None]) -> None:
+        """Have something taken back after ``seconds``, or when all is."""
+        self._number += 1
+        self._undo[self._number] = undo
+        self._team.at(seconds, partial(self._take_back, self._number))
+
+    def _take_back(self, number: int) -> None:
+        undo = self._undo.pop(number, None)
+        if undo is not None:
+            undo()
+
+    def _hosts(self, places: list[int]) -> list[str]:
+        """Where those places are seen by others."""
+        here = [self._team.place(place) for place in places]
+        return [place.address.host if place.home is None else place.home.host for place in here]
+
+    def _end_lives(self, fault: Fault, kill: bool) -> None:
+        self._spread(fault, [partial(self._end_life, place, fault.lasts, kill) for place in self._whom(fault)])
+
+    def _end_life(self, place: int, lasts: float, kill: bool) -> None:
+        team = self._team
+        if place not in team.nodes:
+            return
+        life = team.place(place).lives
+        if kill:
+            team.kill(place)
+        else:
+            team.leave(place)
+        if lasts:
+            self._away[place] = life
+            team.at(lasts, partial(self._restart, place, life))
+
+    def _restart(self, place: int, life: int) -> None:
+        if self._away.get(place) == life:
+            del self._away[place]
+            self._team.start(place)
+
+    def _freeze(self, fault: Fault) -> None:
+        self._spread(fault, [partial(self._freeze_one, place, fault.lasts) for place in self._whom(fault)])
+
+    def _freeze_one(self, place: int, lasts: float) -> None:
+        team = self._team
+        machine = team.place(place).machine
+        if place not in team.nodes or machine is None or machine.is_still:
+            return
+        life = team.place(place).lives
+        team.freeze(place)
+        self._for_a_while(lasts, lambda: team.thaw(place) if self._lives(place, life) else None)
+
+    def _bar(self, made: Callable[[list[str]], Barrier], fault: Fault) -> None:
+        self._stand(made(self._hosts(self._whom(fault))), fault.lasts)
+
+    def _clog(self, fault: Fault) -> None:
+        hosts = self._hosts(self._whom(fault))
+        self._spread(fault, [partial(self._stand, barrier.clog(host), fault.lasts) for host in hosts])
+
+    def _pairs(self, fault: Fault) -> None:
+        self._stand(barrier.pairs(fault.share, str(self._dice.random())), fault.lasts)
+
+    def _stand(self, stands: Barrier, lasts: float) -> None:
+        barriers = self._team.board.barriers
+        barriers.append(stands)
+        self._for_a_while(lasts, lambda: barriers.remove(stands))
+
+    def _step(self, fault: Fault) -> None:
+        def step(seconds: float) -> None:
+            for place in whom:
+                self._team.place(place).step += seconds
+
+        whom = self._whom(fault)
+        step(fault.amount)
+        if fault.lasts:
+            self._for_a_while(fault.lasts, partial(step, -fault.amount))
+
+    def _rate(self, fault: Fault) -> None:
+        def run(factor: float) -> None:
+            for place in whom:
+                here = self._team.place(place)
+                here.rate *= factor
+                if here.machine is not None:
+                    here.machine.set_rate(here.rate)
+
+        whom = self._whom(fault)
+        run(fault.amount)
+        self._for_a_while(fault.lasts, partial(run, 1 / fault.amount))
+
+    def _full(self, fault: Fault) -> None:
+        def fill(is_full: bool) -> None:
+            for place in whom:
+                store = self._team.place(place).store
+                if isinstance(store, Disk):
+                    store.is_full = is_full
+
+        whom = self._whom(fault)
+        fill(True)
+        self._for_a_while(fault.lasts, lambda: fill(False))
+
+    def _crowd(self, fault: Fault) -> None:
+        def come() -> None:
+            place = self._team.add()
+            if fault.lasts:
+                self._team.at(fault.lasts, partial(self._end_life_of, place, self._team.place(place).lives))
+
+        self._spread(fault, [come] * fault.count)
+
+    def _end_life_of(self, place: int, life: int) -> None:
+        if self._is_on and self._lives(place, life):
+            self._team.leave(place)
+
+    def _weather(self, fault: Fault) -> None:
+        link = self._team.link
+        link.worse += fault.amount
+
+        def clear() -> None:
+            link.worse -= fault.amount
+
+        self._for_a_while(fault.lasts, clear)
+
+    def _rebind(self, fault: Fault) -> None:
+        for place in self._whom(fault):
+            home = self._team.place(place).home
+            if home is not None:
+                home.rebind()

@@ -1,0 +1,41 @@
+"""Workload: what clients do in a team beside the faults, what must hold of it, and the figures that come of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from sim.team.figure import Figure
+from sim.team.team import Team
+
+
+class Workload(Protocol):
+    """Made before the first node joins; births and deaths are told by ``Team.attend``."""
+
+    def step(self) -> None:
+        """Do something, every ``step`` seconds of the scenario while its faults last."""
+
+    def settled(self) -> None:
+        """The faults are over and the repair interval has passed: ask what is to be asked; 10 s are left for it."""
+
+    def verdict(self) -> list[str]:
+        """Every violation so far, a line each."""
+
+    def figures(self) -> list[Figure]:
+        """What was measured so far; asked now and then while it runs, and at the end."""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A sort of workload: ``settings`` is a frozen dataclass whose fields have rules (``middleware.setting``).
+
+    ``make(team, settings)`` makes one.  ``figures`` names those that it gives, for targets.
+    """
+
+    settings: type[Any]
+    make: Callable[[Team, Any], Workload]
+    figures: tuple[str, ...] = ()
+
+
+Kinds = Mapping[str, Kind]

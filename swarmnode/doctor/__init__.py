@@ -1,0 +1,1 @@
+"""Doctor: what keeps a node from its team, judged from what was measured."""

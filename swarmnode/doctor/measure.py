@@ -1,0 +1,440 @@
+"""Measure: the facts of one node and its surroundings, taken from this machine by sockets of the doctor's own.
+
+Whoever is asked needs no more than to run: a HAIL is answered to anybody, a WHO to a member.  All of it takes about two
+seconds.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import os
+import random
+import select
+import shutil
+import socket
+import stat
+import struct
+import sys
+import time
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from importlib.util import find_spec
+from ipaddress import ip_address
+from pathlib import Path
+from typing import Any
+
+from middleware.entangled.errors import Forged, Malformed
+from middleware.entangled.network.interface import Interface, chosen, interfaces, is_any
+from middleware.entangled.network.multicast import GROUP
+from middleware.entangled.network.network import Address
+from middleware.entangled.wire.greeting import opened_greeting, who
+from middleware.entangled.wire.hail import ECHO, echo_of, hail
+from middleware.entangled.wire.session import derived_key
+from middleware.settings import IN_MEMORY, Settings
+from swarmnode.doctor.facts import Answer, Certificate, Facts, Health, Lan, Probe, Storage, is_local
+from swarmnode.ports import is_free
+
+TRIES = 4
+EACH_S = 0.3
+TCP_S = 1.0
+TUNNEL = 443
+MAX_KNOWN = 32
+_IP_RECVERR, _IP_PKTINFO, _IP_MULTICAST_ALL = 11, 8, 49
+
+
+@dataclass
+class Team:
+    """What the doctor knows of the team: the secrets that seal a WHO, how it shows itself, whom to enter through."""
+
+    secrets: Sequence[bytes]
+    fingerprint: bytes = bytes(8)
+    certificate: Certificate | None = None
+    known: Sequence[Address] = ()
+
+
+@dataclass
+class _Heard:
+    calls: set[bytes] = field(default_factory=set)
+    on_lan: dict[Address, Answer] = field(default_factory=dict)
+    answers: dict[Address, Answer] = field(default_factory=dict)
+    members: set[Address] = field(default_factory=set)
+    errors: dict[Address, str] = field(default_factory=dict)
+    is_sent: bool = False
+    is_own_heard: bool = False
+
+
+def measured(
+    settings: Settings,
+    is_running: bool = False,
+    health: Health | None = None,
+    wall: Callable[[], float] = time.time,
+    team: Team | None = None,
+) -> Facts:
+    """The facts of the node with these settings, whose host names were looked up."""
+    node = settings.node
+    team = team_of(settings) if team is None else team
+    found = tuple(interfaces())
+    named = dict.fromkeys([*node.known_nodes, *team.known])
+    known = [each for each in named if _is_figures(each) and not _is_self(each, node.host, node.port, found)]
+    known = known[:MAX_KNOWN]
+    port_problem = ""
+    if node.port and not is_free(socket.SOCK_DGRAM, _bindable(node.host), node.port):
+        port_problem = f"Another program listens at {node.host}:{node.port}."
+    facts = Facts(
+        node.name,
+        node.host,
+        node.port,
+        wall(),
+        interfaces=found,
+        port_problem=port_problem if settings.is_given("node", "port") else "",
+        is_running=is_running,
+        fingerprint=team.fingerprint,
+        way_out=_way_out([each.host for each in known if not is_local(each.host)]),
+        certificate=team.certificate,
+        storage=_storage(node.store),
+        open_files=tuple(_open(_secret_files(settings))),
+        health=health,
+    )
+    where = chosen(list(found), node.host) if node.lan and not is_local(node.host) else []
+    heard = _asked(node.host, known, team.secrets, where, wall)
+    gateway = _gateway()
+    probes = tuple(_probe(address, heard, found) for address in known)
+    lan = Lan(tuple(heard.on_lan.values()), heard.is_sent, heard.is_own_heard) if where else None
+    return replace(facts, known=probes, lan=lan, is_gateway_resolved=_is_resolved(gateway) if gateway else None)
+
+
+def team_of(settings: Settings) -> Team:
+    """The team that the settings name."""
+    path = getattr(settings.node, "membership", "")
+    if not path:
+        return Team([settings.node.team_secret])
+    if find_spec("middleware.admission") is None:
+        return Team([], certificate=Certificate(problem="this program knows no closed teams; upgrade it"))
+    # What reads it is needed by members of closed teams only.
+    from importlib import import_module
+
+    try:
+        kept: Any = import_module("middleware.admission.membership").MembershipFile(Path(path)).membership
+        member = kept.member
+    except Exception as error:  # whatever is wrong with the file is what the doctor is asked for
+        return Team([], certificate=Certificate(problem=str(error)))
+    mark = hashlib.blake2s(kept.operator, digest_size=8, person=b"team").digest()
+    secrets = [secret for _, secret, _ in kept.secrets]
+    return Team(secrets, mark, Certificate(member.not_before, member.not_after), kept.known)
+
+
+def on_lan(host: str = "*") -> list[Answer]:
+    """Who answers a HAIL to all on the LAN, of whatever team; it takes ``TRIES`` times ``EACH_S`` seconds.
+
+    So one who is of no team yet finds whom to ask.  Of a large team only some answer, others at the next call.
+    """
+    return list(_asked(host, [], [], chosen(interfaces(), host), time.time).on_lan.values())
+
+
+# -- the net ----------------------------------------------------------------------------------------------------------
+
+
+def _asked(
+    host: str,
+    known: Sequence[Address],
+    secrets: Sequence[bytes],
+    where: Sequence[Interface],
+    wall: Callable[[], float],
+) -> _Heard:
+    """Hail and greet everybody by one socket, so that several see the same port; call on the LAN of ``where``."""
+    heard = _Heard()
+    rng = random.SystemRandom()
+    keys = [derived_key(secret, b"greet") for secret in secrets]
+    tokens = {rng.randbytes(16): address for address in known}
+    sockets = _sockets(host, known)
+    ear = _ear(where) if where else None
+    try:
+        for _ in range(TRIES):
+            for token, address in tokens.items():
+                _send(sockets, hail(token), address, heard)
+                if address not in heard.members:
+                    for key in keys:
+                        _send(sockets, who(key, token, rng), address, heard)
+            if where:
+                call = rng.randbytes(16)
+                heard.calls.add(call)
+                _call(sockets, hail(call), where, heard)
+            _listen([*sockets.values(), *([] if ear is None else [ear])], ear, keys, heard, wall)
+            if known and not where and heard.members >= set(known) and heard.answers.keys() >= set(known):
+                break
+    finally:
+        for each in [*sockets.values(), ear]:
+            if each is not None:
+                each.close()
+    return heard
+
+
+def _sockets(host: str, known: Iterable[Address]) -> dict[int, socket.socket]:
+    """One socket of each family that is needed, at the node's address and any port."""
+    made: dict[int, socket.socket] = {}
+    families = {socket.AF_INET6 if ":" in address.host else socket.AF_INET for address in known} | {socket.AF_INET}
+    for family in families:
+        try:
+            opened = socket.socket(family, socket.SOCK_DGRAM)
+            opened.setblocking(False)
+            if family == socket.AF_INET:
+                opened.setsockopt(socket.IPPROTO_IP, _IP_RECVERR, 1)
+                opened.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 1)
+            own = "" if is_any(host) or (":" in host) != (family == socket.AF_INET6) else host
+            try:
+                opened.bind((own, 0))
+            except OSError:
+                opened.bind(("", 0))  # an address that is not of this machine is found out elsewhere
+        except OSError:
+            continue
+        made[family] = opened
+    return made
+
+
+def _ear(where: Sequence[Interface]) -> socket.socket | None:
+    """What hears the group of the LAN, as a node does."""
+    ear = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        ear.setblocking(False)
+        ear.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        ear.setsockopt(socket.IPPROTO_IP, _IP_MULTICAST_ALL, 0)
+        ear.bind(GROUP)
+        for interface in where:
+            with suppress(OSError):
+                request = struct.pack("4s4si", socket.inet_aton(GROUP.host), bytes(4), interface.index)
+                ear.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, request)
+    except OSError:
+        ear.close()
+        return None
+    return ear
+
+
+def _send(sockets: dict[int, socket.socket], datagram: bytes, to: Address, heard: _Heard) -> None:
+    by = sockets.get(socket.AF_INET6 if ":" in to.host else socket.AF_INET)
+    if by is None:
+        heard.errors[to] = "unreachable"
+        return
+    for _ in range(2):  # an error of an earlier datagram comes out at the next one
+        try:
+            by.sendto(datagram, to)
+            return
+        except OSError as error:
+            if error.errno in (errno.ENETUNREACH, errno.EPERM, errno.EACCES, errno.EINVAL):
+                heard.errors[to] = "unreachable"
+
+
+def _call(sockets: dict[int, socket.socket], datagram: bytes, where: Sequence[Interface], heard: _Heard) -> None:
+    by = sockets.get(socket.AF_INET)
+    if by is None:
+        return
+    for interface in where:
+        for address in [each for each in interface.addresses if ":" not in each]:
+            way = struct.pack("i4s4s", interface.index, socket.inet_aton(address), bytes(4))
+            with suppress(OSError):
+                by.sendmsg([datagram], [(socket.IPPROTO_IP, _IP_PKTINFO, way)], 0, GROUP)
+                heard.is_sent = True
+
+
+def _listen(
+    sockets: Sequence[socket.socket],
+    ear: socket.socket | None,
+    keys: Sequence[bytes],
+    heard: _Heard,
+    wall: Callable[[], float],
+) -> None:
+    until = time.monotonic() + EACH_S
+    ours = {each.getsockname()[1] for each in sockets if each is not ear}
+    while (left := until - time.monotonic()) > 0:
+        for ready in select.select(sockets, [], [], left)[0]:
+            _refusals(ready, heard)
+            try:
+                datagram, source = ready.recvfrom(2048)
+            except OSError:
+                continue
+            if ready is ear:
+                heard.is_own_heard = heard.is_own_heard or source[1] in ours
+            elif datagram[:1] == bytes([ECHO]):
+                _echo(datagram, Address(source[0], source[1]), heard, wall())
+            else:
+                _here(datagram, Address(source[0], source[1]), keys, heard)
+
+
+def _echo(datagram: bytes, source: Address, heard: _Heard, now: float) -> None:
+    try:
+        echo = echo_of(datagram)
+    except Malformed:
+        return
+    offset = echo.wall - now if echo.wall else None
+    told = heard.on_lan if echo.token in heard.calls else heard.answers
+    told.setdefault(source, Answer(source, echo.version, echo.fingerprint, offset, echo.seen))
+
+
+def _here(datagram: bytes, source: Address, keys: Sequence[bytes], heard: _Heard) -> None:
+    for key in keys:
+        with suppress(Forged):
+            opened_greeting(key, datagram)
+            heard.members.add(source)
+            return
+
+
+def _refusals(ready: socket.socket, heard: _Heard) -> None:
+    """Read what machines on the way said of datagrams that could not arrive."""
+    while ready.family == socket.AF_INET:
+        try:
+            _, said, _, to = ready.recvmsg(2048, 512, socket.MSG_ERRQUEUE)
+        except OSError:
+            return
+        for level, kind, data in said:
+            if level == socket.IPPROTO_IP and kind == _IP_RECVERR and len(data) >= 4:
+                number = struct.unpack_from("I", data)[0]
+                refused = number == errno.ECONNREFUSED
+                heard.errors[Address(to[0], to[1])] = "refused" if refused else "unreachable"
+
+
+def _probe(address: Address, heard: _Heard, found: Sequence[Interface]) -> Probe:
+    probe = Probe(
+        address,
+        heard.answers.get(address),
+        address in heard.members,
+        heard.errors.get(address, ""),
+        _is_near(address.host, found),
+    )
+    if probe.is_heard:
+        return replace(probe, error="")
+    if probe.is_near:
+        resolved = _is_resolved(address.host)
+        return replace(probe, is_resolved=resolved, error="" if probe.error == "unreachable" else probe.error)
+    return probe if probe.error else replace(probe, is_tcp=_answers_tcp(address))
+
+
+def _answers_tcp(address: Address) -> bool:
+    """Whether the machine there answers to TCP, if only that the port is closed."""
+    for port in (address.port, TUNNEL):
+        try:
+            socket.create_connection((address.host, port), TCP_S).close()
+            return True
+        except ConnectionRefusedError:
+            return True
+        except OSError:
+            continue
+    return False
+
+
+# -- the machine ------------------------------------------------------------------------------------------------------
+
+
+def _is_figures(address: Address) -> bool:
+    """Whether it is an address that datagrams go to; tunnels and relays have others."""
+    try:
+        return ip_address(address.host.partition("%")[0]).version > 0
+    except ValueError:
+        return False
+
+
+def _is_self(address: Address, host: str, port: int, found: Sequence[Interface]) -> bool:
+    mine = {own for interface in found for own in interface.addresses} if is_any(host) else {host}
+    return bool(port) and address.port == port and address.host in mine
+
+
+def _bindable(host: str) -> str:
+    return "" if is_any(host) else host
+
+
+def _way_out(hosts: Sequence[str]) -> str:
+    """The address from which this machine would send to the first of them."""
+    for host in hosts[:1]:
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        with suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as way:
+            way.connect((host, 9))  # sends nothing
+            return str(way.getsockname()[0])
+    return ""
+
+
+def _is_near(host: str, found: Sequence[Interface]) -> bool:
+    """Whether ``host`` is of a subnet of this machine (IPv4: by the routing table, IPv6: of the same /64)."""
+    address = ip_address(host.partition("%")[0])
+    if address.version == 6:
+        mine = [ip_address(each) for i in found for each in i.addresses if ":" in each and not i.is_loopback]
+        return any(int(address) >> 64 == int(own) >> 64 for own in mine)
+    routes = [(network, mask) for _, network, gateway, mask in _routes() if not gateway and mask]
+    return any(int(address) & mask == network for network, mask in routes)
+
+
+def _gateway() -> str:
+    """The router that everything else goes through; empty where there is none."""
+    for _, network, gateway, mask in _routes():
+        if gateway and not network and not mask:
+            return str(ip_address(gateway))
+    return ""
+
+
+def _routes() -> list[tuple[str, int, int, int]]:
+    """(interface, network, gateway, mask) of each route of IPv4."""
+    try:
+        lines = Path("/proc/net/route").read_text(encoding="ascii").splitlines()[1:]
+    except (OSError, ValueError):
+        return []
+    rows = [line.split() for line in lines]
+    return [(row[0], _number(row[1]), _number(row[2]), _number(row[7])) for row in rows if len(row) > 7]
+
+
+def _number(digits: str) -> int:
+    """An address as the kernel prints it: four bytes in the order of this machine."""
+    return int.from_bytes(int(digits, 16).to_bytes(4, sys.byteorder))
+
+
+def _is_resolved(host: str) -> bool | None:
+    """Whether the hardware of a neighbour answered when it was asked for its address; None where nobody asked."""
+    with suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
+        asking.sendto(b"", (host, 9))  # has the system ask now, if it has not yet
+        time.sleep(0.05)
+    try:
+        lines = Path("/proc/net/arp").read_text(encoding="ascii").splitlines()[1:]
+    except (OSError, ValueError):
+        return None
+    rows = [line.split() for line in lines]
+    flags = [int(row[2], 16) for row in rows if len(row) > 2 and row[0] == host]
+    return bool(flags[0] & 0x2) if flags else False
+
+
+def _storage(path: str) -> Storage | None:
+    if path == IN_MEMORY:
+        return None
+    where = Path(path)
+    folder = where.parent
+    problem = ""
+    if where.is_dir():
+        problem = "It is a folder."
+    elif where.exists():
+        problem = "" if os.access(where, os.R_OK | os.W_OK) else "This user may not write it."
+    elif not folder.is_dir():
+        problem = f"There is no folder {folder}."
+    if not problem and not os.access(folder, os.W_OK | os.X_OK):
+        problem = f"This user may not write in {folder}."
+    try:
+        free = shutil.disk_usage(folder).free
+        probe = os.statvfs(folder)
+        if not problem and probe.f_flag & os.ST_RDONLY:
+            problem = "Its disk is read-only."
+    except OSError:
+        free = None
+    if not problem and free == 0:
+        problem = "Its disk is full."
+    return Storage(path, problem, free)
+
+
+def _secret_files(settings: Settings) -> list[str]:
+    paths = [getattr(settings.node, "membership", ""), settings.node.store]
+    if settings.is_given("node", "team_key"):
+        paths.append(settings.origin)
+    return [path for path in paths if path and path != IN_MEMORY]
+
+
+def _open(paths: Iterable[str]) -> Iterable[tuple[str, int]]:
+    for path in paths:
+        with suppress(OSError):
+            mode = stat.S_IMODE(os.stat(path).st_mode)
+            if mode & 0o077:
+                yield path, mode

@@ -1,0 +1,72 @@
+"""Catalogue: the kinds of robot that there are drivers for, a line each, and what has to be installed for them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from importlib.util import find_spec
+
+from drivers.errors import UsageError
+from drivers.foreign import maker, places
+from drivers.registry import KINDS, kinds
+
+NEEDS: Mapping[str, tuple[str, str, str]] = {
+    "bittle": ("serial", "serial", "on a cable"),
+    "camera": ("cv2", "vision", "but for a folder of JPEGs or an address"),
+    "compass": ("serial", "serial", "on a cable"),
+    "create2": ("serial", "serial", ""),
+}
+"""Kind to the library that it needs, the extra that brings it, and when."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One kind; ``is_ready`` where nothing has to be installed first, ``problem`` where it cannot be loaded."""
+
+    kind: str
+    about: str
+    needs: str = ""
+    is_ready: bool = True
+    problem: str = ""
+
+
+def catalogue(is_there: Callable[[str], bool] = lambda library: find_spec(library) is not None) -> list[Entry]:
+    """Every kind there is; a broken one of another distribution is told as such, and the others are as they are."""
+    foreign = places()
+    return [
+        _built_in(kind, is_there) if kind in KINDS else _foreign(kind, foreign[kind])
+        for kind in kinds()
+        if kind in KINDS or kind in foreign
+    ]
+
+
+def lines(entries: list[Entry]) -> list[str]:
+    """The catalogue for a person."""
+    width = max((len(entry.kind) for entry in entries), default=0)
+    told = []
+    for entry in entries:
+        told.append(f"{entry.kind:{width}}  {entry.problem or entry.about}")
+        if entry.needs:
+            told.append(f"{'':{width}}  {entry.needs}")
+    return told
+
+
+def _built_in(kind: str, is_there: Callable[[str], bool]) -> Entry:
+    package = import_module(KINDS[kind].rpartition(".")[0])
+    about = (package.__doc__ or "").strip().split("\n")[0].partition(": ")[0].rstrip(".")
+    if kind not in NEEDS:
+        return Entry(kind, about)
+    library, extra, when = NEEDS[kind]
+    if is_there(library):
+        return Entry(kind, about)
+    return Entry(kind, about, f"pip install 'swarm-node[{extra}]'{when and ', ' + when}", False)
+
+
+def _foreign(kind: str, place: str) -> Entry:
+    try:
+        made: object = getattr(maker(kind, place), "args", (kind, None))[1]
+    except UsageError as error:
+        return Entry(kind, "", "", False, f"broken: {error}")
+    about = (getattr(made, "__doc__", None) or "").strip().split("\n")[0].rstrip(".")
+    return Entry(kind, f"{about or 'a driver of another distribution'} ({place})")

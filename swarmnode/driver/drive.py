@@ -1,0 +1,143 @@
+"""Drive: a robot by the keys of a terminal, with a line that tells how it is."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, Protocol
+
+from twisted.internet.defer import Deferred
+from twisted.internet.interfaces import IReactorTime
+from twisted.python.failure import Failure
+
+from drivers.driver import Driver
+from drivers.reading import Observation
+from swarmnode.driver.pilot import HELP, KEY_S, Pilot
+from swarmnode.driver.probe import PATIENCE_S
+
+TICK_S = 0.05
+LINE_S = 0.1
+"""How often the line is written anew."""
+
+
+class Terminal(Protocol):
+    """Where keys come from and lines go."""
+
+    def start(self, pressed: Callable[[str], None]) -> None:
+        """Hand over each key at once, without echo; an empty one where there will be no more."""
+
+    def line(self, text: str) -> None:
+        """Write the line anew."""
+
+    def say(self, text: str) -> None:
+        """Write a line that stays."""
+
+    def close(self) -> None:
+        """Leave the terminal as it was."""
+
+
+class Drive:
+    """One drive of ``driver``, from connecting until a key ends it; its motors are off again then."""
+
+    def __init__(
+        self, driver: Driver, clock: IReactorTime, terminal: Terminal, problems: Callable[[], list[str]]
+    ) -> None:
+        self.pilot = Pilot(driver)
+        self._driver = driver
+        self._clock = clock
+        self._terminal = terminal
+        self._problems = problems
+        self._told: set[str] = set()
+        self._began = clock.seconds()
+        self._line_at = -math.inf
+        self._timer: Any = None
+        self._is_over = False
+        self._ended: Deferred[int] = Deferred()
+
+    def start(self) -> Deferred[int]:
+        """Begin; fires with the exit code once the robot stands, its motors are off, and it is let go."""
+        self._terminal.say(HELP)
+        self._terminal.say(f"a key counts for {KEY_S:g} s: hold it to go on; let go, and the robot stands")
+        self._driver.connect().addCallbacks(self._on_connected, self._on_refused)
+        self._terminal.start(self._on_key)
+        if not self._is_over:
+            self._on_tick()
+        return self._ended
+
+    def end(self, code: int = 0) -> Deferred[int]:
+        """End: stand still, motors off, let go."""
+        if not self._is_over:
+            self._is_over = True
+            if self._timer is not None and self._timer.active():
+                self._timer.cancel()
+            self.pilot.rest()
+            leaving = self._driver.disable() if self._driver.state == "ready" else self._driver.disconnect()
+            leaving.addErrback(lambda _: None)
+            leaving.addCallback(lambda _: self._driver.disconnect())
+            leaving.addBoth(lambda _: self._finish(code))
+        return self._ended
+
+    def _finish(self, code: int) -> None:
+        self._terminal.close()
+        self._ended.callback(code)
+
+    def _on_connected(self, _: object) -> None:
+        self._enable()
+
+    def _enable(self) -> None:
+        def failed(failure: Failure) -> None:
+            self.pilot.said = " ".join(failure.getErrorMessage().split())
+
+        self._driver.enable().addErrback(failed)
+
+    def _on_refused(self, failure: Failure) -> None:
+        if not self._is_over:
+            self._terminal.say(" ".join(failure.getErrorMessage().split()))
+            self.end(1)
+
+    def _on_key(self, key: str) -> None:
+        if self._is_over:
+            return
+        if key == "m":
+            self._enable()
+        elif not self.pilot.press(key, self._clock.seconds()):
+            self.end()
+            return
+        self._show()
+
+    def _on_tick(self) -> None:
+        self._timer = self._clock.callLater(TICK_S, self._on_tick)
+        self.pilot.tick(self._clock.seconds())
+        if self._clock.seconds() - self._line_at > LINE_S - 1e-9:
+            self._show()
+
+    def _show(self) -> None:
+        self._line_at = self._clock.seconds()
+        problems = self._problems()
+        if self._driver.observe() is None and self._clock.seconds() - self._began > PATIENCE_S:
+            problems = [*problems, f"nothing came within {PATIENCE_S:g} s; swarm driver probe says more"]
+        for problem in problems:
+            if problem not in self._told:
+                self._told.add(problem)
+                self._terminal.say(f"! {problem}")
+        self._terminal.line(state_line(self._driver.state, self._driver.observe(), self.pilot, self._clock.seconds()))
+
+
+def state_line(state: str, newest: Observation | None, pilot: Pilot, now: float) -> str:
+    """How the robot is, on one line: state, what it does, place, nearest range, battery, age; and what was said."""
+    words = [f"{state:10}", " ".join(f"{key[5:]} {value + 0.0:+.2f}" for key, value in pilot.done.items())]
+    if newest is not None:
+        values = newest.values
+        if values.get("estop.engaged") is True:
+            words.append("motors off (m)")
+        if "odom.x" in values:
+            words.append(f"at {float(values['odom.x']):+.2f} {float(values.get('odom.y', 0.0)):+.2f} m")
+        ranges = [(float(v), k) for k, v in values.items() if k.startswith("range.") and not math.isnan(float(v))]
+        if ranges:
+            metres, key = min(ranges)
+            words.append(f"{key[6:]} {metres:.2f} m")
+        words += [key for key, value in values.items() if key.startswith(("bump.", "cliff.")) and value is True]
+        if "power.level" in values:
+            words.append(f"battery {100.0 * float(values['power.level']):.0f} %")
+        words.append(f"age {now - newest.t_host:.2f} s")
+    return "  ".join(word for word in (*words, pilot.said) if word)

@@ -1,0 +1,151 @@
+"""Monitor: the readings of a robot as they come, and its newest picture in a file."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from twisted.internet.defer import Deferred
+from twisted.internet.interfaces import IReactorTime
+from twisted.python.failure import Failure
+
+from drivers.driver import Driver
+from drivers.reading import Frame, Observation
+from swarmnode.driver.probe import PATIENCE_S
+from swarmnode.driver.unit import shown
+
+SHOW_S = 1.0
+"""How often the readings are shown, and a picture saved."""
+
+
+class Monitor:
+    """Shows the readings of ``driver`` through ``show`` until it is ended, or ``seconds`` after the first came.
+
+    The motors stay as they are: nothing is commanded.
+    """
+
+    def __init__(
+        self,
+        driver: Driver,
+        clock: IReactorTime,
+        show: Callable[[list[str]], None],
+        seconds: float = math.inf,
+        picture: Path | None = None,
+        is_json: bool = False,
+        problems: Callable[[], list[str]] = list,
+    ) -> None:
+        self.code = 0
+        self._driver = driver
+        self._clock = clock
+        self._show = show
+        self._seconds = seconds
+        self._picture = picture
+        self._is_json = is_json
+        self._problems = problems
+        self._told: set[str] = set()
+        self._saved = -1
+        self._began = clock.seconds()
+        self._first_at: float | None = None
+        self._timer: Any = None
+        self._is_over = False
+        self._ended: Deferred[int] = Deferred()
+
+    def start(self) -> Deferred[int]:
+        """Begin; fires with the exit code once the robot is let go."""
+        self._driver.connect().addErrback(self._on_refused)
+        if not self._is_over:
+            self._on_time()
+        return self._ended
+
+    def end(self) -> Deferred[int]:
+        """End, and let the robot go."""
+        if not self._is_over:
+            self._is_over = True
+            if self._timer is not None and self._timer.active():
+                self._timer.cancel()
+            newest = self._driver.observe()
+            if newest is None:
+                self.code = 1
+            elif self._picture is not None and self._saved < 0 and self.code == 0:
+                self._fail("no picture came; is its camera on?")
+            leaving = self._driver.disconnect()
+            leaving.addBoth(lambda _: self._ended.callback(self.code))
+        return self._ended
+
+    def _on_refused(self, failure: Failure) -> None:
+        if not self._is_over:
+            self._fail(" ".join(failure.getErrorMessage().split()))
+            self.end()
+
+    def _on_time(self) -> None:
+        now, newest = self._clock.seconds(), self._driver.observe()
+        for problem in self._problems():
+            if problem not in self._told:
+                self._told.add(problem)
+                self._show([f"! {problem}"])
+        if newest is None and now - self._began > PATIENCE_S:
+            self._fail(f"nothing came within {PATIENCE_S:g} s; swarm driver probe says more")
+            self.end()
+            return
+        if newest is not None:
+            self._first_at = now if self._first_at is None else self._first_at
+            self._show(list(self._readings(newest, now)))
+            if self._picture is not None and newest.frame is not None and newest.frame.seq != self._saved:
+                self._save(newest.frame)
+            if self._is_over or now - self._first_at >= self._seconds - 1e-9:
+                self.end()
+                return
+        self._timer = self._clock.callLater(0.1 if newest is None else SHOW_S, self._on_time)
+
+    def _readings(self, newest: Observation, now: float) -> Iterator[str]:
+        if self._is_json:
+            yield json.dumps(as_data(self._driver.state, newest, now))
+        else:
+            yield from readings(self._driver.state, newest, self._driver.diagnostics(), now)
+
+    def _save(self, frame: Frame) -> None:
+        assert self._picture is not None
+        if frame.encoding != "jpeg":
+            self._fail(f"its pictures are {frame.encoding}, not JPEGs; none is saved")
+            self.end()
+            return
+        beside = self._picture.with_name(f".{self._picture.name}.new")
+        try:
+            beside.write_bytes(frame.data)
+            os.replace(beside, self._picture)
+        except OSError as error:
+            self._fail(f"{self._picture} cannot be written: {error.strerror or error}")
+            self.end()
+            return
+        self._saved = frame.seq
+
+    def _fail(self, problem: str) -> None:
+        self.code = 1
+        self._show([f"! {problem}"])
+
+
+def readings(state: str, newest: Observation, counts: dict[str, float], now: float) -> Iterator[str]:
+    """Each reading on a line, under a line about the link."""
+    yield f"{state}, {now - newest.t_host:.2f} s old, {counts['frames']:g} frames, {counts['bad_frames']:g} bad"
+    width = max(map(len, newest.values), default=0)
+    for key in sorted(newest.values):
+        yield f"  {key:{width}}  {shown(key, newest.values[key])}"
+    if newest.frame is not None:
+        frame = newest.frame
+        yield f"  {'camera':{width}}  {frame.width} x {frame.height} {frame.encoding}, number {frame.seq}"
+
+
+def as_data(state: str, newest: Observation, now: float) -> dict[str, Any]:
+    """An observation as plain data, for JSON; a number that is none is None."""
+    values = {
+        key: None if isinstance(value, float) and not math.isfinite(value) else value
+        for key, value in newest.values.items()
+    }
+    told: dict[str, Any] = {"state": state, "age": now - newest.t_host, "t_robot": newest.t_robot, "values": values}
+    if newest.frame is not None:
+        told["picture"] = {"seq": newest.frame.seq, "width": newest.frame.width, "height": newest.frame.height}
+    return told

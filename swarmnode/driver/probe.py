@@ -1,0 +1,190 @@
+"""Probe: connect to a robot for some seconds, move nothing, and say what came, or what is wrong."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from twisted.internet.defer import Deferred
+from twisted.internet.interfaces import IReactorTime
+from twisted.python.failure import Failure
+
+from drivers.driver import Driver
+from drivers.reading import Frame, Observation, Value
+from swarmnode.driver.unit import shown
+
+PATIENCE_S = 8.0
+"""A robot that has not been seen after so long is given up; the slowest to say what is wrong is the AIBO, after 5 s."""
+SURE_S = 3.0
+"""A robot that has not been seen after so long, and of which it is known what is wrong, is given up then."""
+SLOW = 0.7
+"""Below this share of the rate that the description promises, a robot is slow."""
+TOLD = (
+    "mode",
+    "firmware",
+    "skill.running",
+    "safety.event",
+    "estop.engaged",
+    "power.level",
+    "power.volts",
+    "power.charging",
+)
+"""What of the readings goes into the finding, where a robot has it."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What came of a probe.
+
+    ``first`` is how many seconds after the call the first observation came, None where none came; ``rate`` and
+    ``promised`` are observations a second; ``problems`` say what was wrong, and the remedy.
+    """
+
+    kind: str
+    first: float | None
+    state: str = ""
+    rate: float = 0.0
+    promised: float = 0.0
+    keys: tuple[str, ...] = ()
+    readings: Mapping[str, Value] = field(default_factory=dict)
+    picture: str = ""
+    pictures: float = 0.0
+    counts: Mapping[str, float] = field(default_factory=dict)
+    problems: tuple[str, ...] = ()
+
+    @property
+    def is_there(self) -> bool:
+        """Whether the robot was seen, and is seen still."""
+        return self.first is not None and self.state in ("ready", "stopped")
+
+    def as_data(self) -> dict[str, Any]:
+        """As plain data, for JSON; a number that is none is None."""
+        told = {**asdict(self), "is_there": self.is_there}
+        for name in ("readings", "counts"):
+            told[name] = {
+                key: None if isinstance(value, float) and not math.isfinite(value) else value
+                for key, value in told[name].items()
+            }
+        return told
+
+
+class Probe:
+    """One probe of ``driver``, which is disconnected at its end; ``problems`` are asked for what is wrong."""
+
+    def __init__(
+        self,
+        driver: Driver,
+        clock: IReactorTime,
+        seconds: float,
+        problems: Callable[[], Sequence[str]],
+        patience: float = PATIENCE_S,
+    ) -> None:
+        self._driver = driver
+        self._clock = clock
+        self._seconds = seconds
+        self._problems = problems
+        self._patience = patience
+        self._began = clock.seconds()
+        self._first: float | None = None
+        self._seen = 0
+        self._pictures: set[int] = set()
+        self._keys: dict[str, None] = {}
+        self._refusal = ""
+        self._timer: Any = None
+        self._is_over = False
+        self._found: Deferred[Finding] = Deferred()
+
+    def start(self) -> Deferred[Finding]:
+        """Begin; fires with what was found, and does not fail."""
+        self._timer = self._clock.callLater(min(SURE_S, self._patience), self._on_doubt)
+        self._driver.subscribe(self._on_observation)
+        self._driver.connect().addCallbacks(self._on_connected, self._on_refused)
+        return self._found
+
+    def end(self) -> Deferred[Any]:
+        """End now, with what came so far; fires when the robot is let go."""
+        if not self._is_over:
+            self._is_over = True
+            if self._timer is not None and self._timer.active():
+                self._timer.cancel()
+            finding = self._finding()
+            self._driver.disconnect().addBoth(lambda _: self._found.callback(finding))
+        return self._found
+
+    def _on_connected(self, _: object) -> None:
+        self._first = self._clock.seconds() - self._began
+        self._seen = 0
+        self._pictures.clear()
+        if self._timer.active():
+            self._timer.cancel()
+        self._timer = self._clock.callLater(self._seconds, self.end)
+
+    def _on_doubt(self) -> None:
+        if self._problems():
+            self.end()
+        else:
+            self._timer = self._clock.callLater(max(0.0, self._patience - SURE_S), self.end)
+
+    def _on_refused(self, failure: Failure) -> None:
+        if not self._is_over:
+            self._refusal = " ".join(failure.getErrorMessage().split())
+            self.end()
+
+    def _on_observation(self, seen: Observation) -> None:
+        self._seen += 1
+        self._keys |= dict.fromkeys(seen.values)
+        if seen.frame is not None:
+            self._pictures.add(seen.frame.seq)
+
+    def _finding(self) -> Finding:
+        body, newest = self._driver.description, self._driver.observe()
+        lasted = self._clock.seconds() - self._began - (self._first or 0.0)
+        rate = self._seen / lasted if self._first is not None and lasted > 0 else 0.0
+        promised = body.rates.get("state", max(body.rates.values(), default=0.0))
+        values = {} if newest is None else newest.values
+        problems = [*([self._refusal] if self._refusal else []), *self._problems()]
+        if self._first is None and not problems:
+            problems.append(f"nothing came within {self._patience:g} s; is it switched on, and do the options fit?")
+        if self._first is not None and rate < SLOW * promised:
+            problems.append(f"it is slow: {rate:.1f} of {promised:g} observations a second; is it far, or busy?")
+        if "camera" in body.capabilities and self._first is not None and not self._pictures:
+            problems.append("no picture came, though it has a camera")
+        return Finding(
+            kind=body.kind,
+            first=self._first,
+            state=self._driver.state,
+            rate=rate,
+            promised=promised,
+            keys=tuple(sorted(self._keys)),
+            readings={key: values[key] for key in TOLD if key in values},
+            picture="" if newest is None or newest.frame is None else _size(newest.frame),
+            pictures=len(self._pictures) / lasted if lasted > 0 else 0.0,
+            counts=self._driver.diagnostics(),
+            problems=tuple(dict.fromkeys(problems)),
+        )
+
+
+def lines(finding: Finding) -> Iterator[str]:
+    """The finding for a person."""
+    if finding.first is None:
+        yield f"{finding.kind}: not reached"
+    else:
+        yield f"{finding.kind}: the first observation came after {finding.first:.2f} s"
+        promised = f" of {finding.promised:g}" if finding.promised else ""
+        yield f"  state         {finding.state}"
+        yield f"  rate          {finding.rate:.1f}{promised} a second"
+        for key, value in finding.readings.items():
+            yield f"  {key:13} {shown(key, value)}"
+        if finding.picture:
+            yield f"  pictures      {finding.picture}, {finding.pictures:.1f} a second"
+        yield f"  bad frames    {finding.counts.get('bad_frames', 0):g} of {finding.counts.get('frames', 0):g}"
+        yield f"  reconnects    {finding.counts.get('reconnects', 0):g}"
+        yield f"  senses        {' '.join(finding.keys) or 'nothing but pictures'}"
+    for problem in finding.problems:
+        yield f"  ! {problem}"
+
+
+def _size(frame: Frame) -> str:
+    return f"{frame.width} x {frame.height} {frame.encoding}"

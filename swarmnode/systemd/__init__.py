@@ -1,0 +1,1 @@
+"""The node as a service of systemd: the unit, and the verb that installs it."""

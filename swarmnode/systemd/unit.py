@@ -1,0 +1,140 @@
+"""Unit: the text of a systemd unit that runs one node and lets it do no more than a node needs.
+
+A unit of the system runs under a user that systemd makes up and takes away; what the node keeps lies in its own folder.
+A unit of a user's own manager cannot mount, so it has the limits that need no mounts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import PurePosixPath
+
+from middleware.settings import Settings
+
+PREFIX = "swarm-node-"
+MEMORY = "256M"
+"""What one node may have; without page and camera it needs 40 MiB."""
+LOWEST_FREE_PORT = 1024
+SETTINGS = "node.toml"
+
+
+@dataclass(frozen=True)
+class Unit:
+    """What a unit is made of: ``twistd`` and ``settings`` are paths, ``name`` is the node's."""
+
+    name: str
+    twistd: str
+    settings: str
+    is_user: bool = False
+    memory: str = MEMORY
+    devices: tuple[str, ...] = ()
+    is_low: bool = False
+    """Whether it listens at a port below 1024, which only root may otherwise."""
+
+    @property
+    def label(self) -> str:
+        """The unit's name without its ending, and that of its folders."""
+        return PREFIX + self.name
+
+    @property
+    def text(self) -> str:
+        """The unit file."""
+        return "\n".join(self._lines()) + "\n"
+
+    def _lines(self) -> Iterator[str]:
+        yield "[Unit]"
+        yield f"Description=Swarm node {self.name}"
+        if not self.is_user:
+            yield "Wants=network-online.target"
+            yield "After=network-online.target"
+        # Settings that are refused stay refused: whoever mends them starts it again.
+        yield from ("StartLimitIntervalSec=60", "StartLimitBurst=10", "", "[Service]", "Type=exec")
+        yield f"ExecStart={_quoted(self.twistd)} --nodaemon --pidfile= swarm-node --config {_quoted(self._config)}"
+        yield from ("Restart=always", "RestartSec=2", "RestartPreventExitStatus=2", "TimeoutStopSec=10")
+        yield from ("UMask=0077", f"MemoryMax={self.memory}", "TasksMax=128", "LimitCORE=0")
+        yield from _EVERYWHERE
+        if self.is_user:
+            yield f"WorkingDirectory={PurePosixPath(self.settings).parent}"
+        else:
+            yield from self._confined()
+        yield from ("", "[Install]", f"WantedBy={'default' if self.is_user else 'multi-user'}.target")
+
+    def _confined(self) -> Iterator[str]:
+        yield from ("DynamicUser=yes", f"StateDirectory={self.label}", "StateDirectoryMode=0700")
+        yield from (f"WorkingDirectory=%S/{self.label}", f"RuntimeDirectory={self.label}", "RuntimeDirectoryMode=0700")
+        # Where `swarm` finds the node's control socket.
+        yield f"Environment=XDG_RUNTIME_DIR=%t/{self.label}"
+        low = "CAP_NET_BIND_SERVICE" if self.is_low else ""
+        yield from (f"CapabilityBoundingSet={low}", f"AmbientCapabilities={low}")
+        yield f"ProtectHome={'read-only' if _is_at_home(self.twistd) else 'yes'}"
+        yield from _MOUNTED
+        if self.devices:
+            yield from ("DevicePolicy=closed", *(f"DeviceAllow={device} rw" for device in self.devices))
+            yield "SupplementaryGroups=dialout video"
+        else:
+            yield "PrivateDevices=yes"
+
+    @property
+    def _config(self) -> str:
+        return self.settings if self.is_user else f"%S/{self.label}/{SETTINGS}"
+
+
+_EVERYWHERE = (
+    "NoNewPrivileges=yes",
+    # UNIX for the control socket, NETLINK to hear which interfaces there are.
+    "RestrictAddressFamilies=AF_INET AF_INET6 AF_UNIX AF_NETLINK",
+    "RestrictNamespaces=yes",
+    "RestrictRealtime=yes",
+    "RestrictSUIDSGID=yes",
+    "LockPersonality=yes",
+    "MemoryDenyWriteExecute=yes",
+    "SystemCallArchitectures=native",
+    "SystemCallFilter=@system-service",
+    "SystemCallFilter=~@privileged",
+    "SystemCallErrorNumber=EPERM",
+)
+_MOUNTED = (
+    "ProtectSystem=strict",
+    "PrivateTmp=yes",
+    "PrivateMounts=yes",
+    "ProtectProc=invisible",
+    "ProcSubset=all",
+    "ProtectClock=yes",
+    "ProtectControlGroups=yes",
+    "ProtectHostname=yes",
+    "ProtectKernelLogs=yes",
+    "ProtectKernelModules=yes",
+    "ProtectKernelTunables=yes",
+    "RemoveIPC=yes",
+    "KeyringMode=private",
+)
+
+
+def unit_for(settings: Settings, twistd: str, is_user: bool, memory: str = MEMORY) -> Unit:
+    """The unit of the node with these settings, which are in the file ``settings.origin``."""
+    node, web = settings.node, settings.web
+    ports = [node.port, getattr(node, "tunnel_port", 0) or 0]
+    if "web" in node.roles:
+        ports += [web.port, web.tls_port if web.tls else 0]
+    options = [settings.driver.options, *(options for _, options in settings.driver.parts)]
+    devices = tuple(dict.fromkeys(device for each in options for device in _devices(each)))
+    is_low = any(0 < port < LOWEST_FREE_PORT for port in ports)
+    return Unit(node.name, twistd, settings.origin, is_user, memory, devices, is_low)
+
+
+def _devices(options: Mapping[str, object]) -> Iterator[str]:
+    for value in options.values():
+        if isinstance(value, str) and value.startswith("/dev/"):
+            yield value
+
+
+def _is_at_home(path: str) -> bool:
+    return path.startswith(("/home/", "/root/"))
+
+
+def _quoted(path: str) -> str:
+    """A path as systemd reads it: with a percent sign doubled, but for its own specifiers at the beginning."""
+    head, rest = (path[:2], path[2:]) if path.startswith(("%S", "%t")) else ("", path)
+    rest = rest.replace("%", "%%").replace("\\", "\\\\").replace('"', '\\"').replace("$", "$$")
+    return f'"{head}{rest}"' if any(c.isspace() for c in rest) else head + rest

@@ -1,0 +1,59 @@
+"""Members: ``swarm members``, who belongs to the team, and which invitations are open."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import Any
+
+from middleware.entangled.network.url import VIRTUAL
+from swarmnode.team.office import Desk, known, options, run
+
+
+def main(words: Sequence[str] | None = None, desk: Desk | None = None) -> int:
+    """Run the command; returns its exit code."""
+    desk = desk or Desk()
+    wishes = options("members", "Print who belongs to the team.", needs_key=False).parse_args(words)
+
+    def work() -> tuple[Any, list[str]]:
+        now = desk.wall()
+        found = known(wishes.node, desk)
+        rows: list[dict[str, Any]] = [
+            {
+                "name": each.name,
+                "roles": list(each.roles),
+                "until": each.not_after,
+                "at": found.here.get(each.public, ""),
+                "key": each.public.hex(),
+            }
+            for each in found.members(now)
+        ]
+        used = [each.member.invitation for each in found.roll.admissions()]
+        open_: list[dict[str, Any]] = [
+            {"name": each.name, "roles": list(each.roles), "left": each.uses - used.count(each.public)}
+            | {"until": each.not_after, "key": each.public.hex()}
+            for each in found.roll.invites()
+            if now < each.not_after and found.roll.revoked(each.public) is None
+            if used.count(each.public) < each.uses
+        ]
+        revoked = [{"name": each.name, "at": each.at, "key": each.public.hex()} for each in found.roll.revocations()]
+        width = max((len(row["name"]) for row in [*rows, *open_]), default=0)
+        lines = [f"team {found.team}, secret number {found.secret}"]
+        for row in rows:
+            until = time.strftime("%Y-%m-%d", time.gmtime(row["until"]))
+            where = place(row["at"])
+            lines.append(f"  {row['name']:{width}}  {', '.join(row['roles'])}  until {until}  {where}")
+        for row in open_:
+            until = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(row["until"]))
+            lines.append(f"  {row['name']:{width}}  invited, {row['left']} left, until {until}")
+        lines += [f"  {row['name']:{width}}  revoked" for row in revoked]
+        return {"team": found.team, "members": rows, "invitations": open_, "revoked": revoked}, lines
+
+    return run("members", work, wishes.json, desk.out)
+
+
+def place(address: str) -> str:
+    """Where a member is, for people: what stands for a way of this node alone says nothing to them."""
+    if not address.startswith("~"):
+        return address or "not in sight"
+    return "by a tunnel" if address.startswith(VIRTUAL) else "carried by others"

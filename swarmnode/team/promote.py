@@ -1,0 +1,30 @@
+"""Promote: ``swarm promote``, one more role for a member, at once: as bootstrap it lets others in."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from middleware.admission.statement import ROLES
+from swarmnode.team.office import Desk, known, operator_in, options, run, tell
+
+
+def main(words: Sequence[str] | None = None, desk: Desk | None = None) -> int:
+    """Run the command; returns its exit code."""
+    desk = desk or Desk()
+    promote = options("promote", "Give a member one more role; without --role, that of a bootstrap node.")
+    promote.add_argument("name", metavar="NAME", help="of the member")
+    promote.add_argument("--role", choices=ROLES, default="bootstrap", help="which role (bootstrap)")
+    wishes = promote.parse_args(words)
+
+    def work() -> tuple[Any, list[str]]:
+        operator = operator_in(wishes.operator)
+        member = known(wishes.node, desk, operator).member(wishes.name, desk.wall())
+        roles = tuple(dict.fromkeys([*member.roles, wishes.role]))
+        # Later than what it had, or it would not hold; and as long as that.
+        begin = max(int(desk.wall()), member.not_before + 1)
+        life = max(1, member.not_after - begin)
+        tell(wishes.node, desk, operator.grant(member.public, member.name, roles, begin, life))
+        return {"name": member.name, "roles": list(roles)}, [f"{member.name} is now {', '.join(roles)}"]
+
+    return run("promote", work, wishes.json, desk.out)

@@ -1,0 +1,48 @@
+"""Revoke: ``swarm revoke``, which puts a member out of the team, or ends an invitation and puts out who came by it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from swarmnode.asker import Refusal
+from swarmnode.team.office import Desk, Known, known, operator_in, options, run, tell
+
+
+def main(words: Sequence[str] | None = None, desk: Desk | None = None) -> int:
+    """Run the command; returns its exit code."""
+    desk = desk or Desk()
+    revoke = options("revoke", "Put a member out of the team, or end an invitation and put out all that came by it.")
+    revoke.add_argument("name", metavar="NAME", help="of a member, or of an invitation; or its key in hexadecimal")
+    revoke.add_argument("--invitation", action="store_true", help="the invitation of that name, not the member")
+    wishes = revoke.parse_args(words)
+
+    def work() -> tuple[Any, list[str]]:
+        operator = operator_in(wishes.operator)
+        found = known(wishes.node, desk, operator)
+        public, what, came = _meant(found, wishes.name, wishes.invitation, desk.wall())
+        tell(wishes.node, desk, operator.revoke(public, wishes.name[:40], desk.wall()))
+        lines = [f"{what} {wishes.name} is revoked; in force at all that can be reached within 10 seconds"]
+        lines += [f"  with it: {name}" for name in came]
+        lines.append("What it knew stays known to it: give the team a new secret by swarm rotate")
+        return {"revoked": public.hex(), "what": what, "with": came}, lines
+
+    return run("revoke", work, wishes.json, desk.out)
+
+
+def _meant(found: Known, name: str, is_invitation: bool, now: float) -> tuple[bytes, str, list[str]]:
+    """The key that is meant, what it is, and who goes with it; raises ``Refusal``."""
+    invites = [each for each in found.roll.invites() if name in (each.name, each.public.hex())]
+    invites = [each for each in invites if found.roll.revoked(each.public) is None]
+    try:
+        if is_invitation:
+            raise Refusal(f"no invitation is called {name!r}")
+        return found.member(name, now).public, "the member", []
+    except Refusal:
+        if not invites:
+            raise
+    if len(invites) > 1:
+        keys = ", ".join(each.public.hex() for each in invites)
+        raise Refusal(f"several invitations are called {name}; say which by its key: {keys}")
+    came = [each.member.name for each in found.roll.admissions() if each.member.invitation == invites[0].public]
+    return invites[0].public, "the invitation", came

@@ -1,0 +1,56 @@
+"""Tunnels: what a node's settings and its environment say of them, wired around its UDP port."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+from twisted.logger import Logger
+
+from middleware.entangled.network.network import Network
+from middleware.entangled.network.url import Proxy, Url
+from middleware.settings import NodeSettings
+
+_log = Logger()
+
+
+def with_tunnels(
+    settings: NodeSettings,
+    udp: Callable[[], Network],
+    reactor: Any,
+    rng: random.Random,
+    environment: Mapping[str, str],
+) -> Callable[[], Network]:
+    """What makes the node's network; without tunnels it is ``udp`` alone."""
+    urls = settings.tunnel_urls
+    if not (urls or settings.tunnel_port):
+        return udp
+    from middleware.entangled.network.joint import JointNetwork
+    from middleware.entangled.network.tcp import TcpCarrier
+    from middleware.entangled.network.tunnel import TunnelNetwork
+
+    host = settings.host if settings.tunnel_tls else "127.0.0.1"
+    is_served, is_plain = settings.tunnel_port > 0, not settings.tunnel_tls
+    proxies = partial(proxy_for, environment)
+
+    def joint() -> Network:
+        carrier = TcpCarrier(reactor, host, settings.tunnel_port)
+        return JointNetwork(udp(), TunnelNetwork(carrier, reactor, rng, urls, is_served, is_plain, proxies))
+
+    return joint
+
+
+def proxy_for(environment: Mapping[str, str], url: Url) -> Proxy | None:
+    """The HTTP proxy by which ``https_proxy`` and ``no_proxy`` send whoever goes to ``url``; None for none."""
+    said = environment.get("https_proxy") or environment.get("HTTPS_PROXY") or ""
+    spared = environment.get("no_proxy") or environment.get("NO_PROXY") or ""
+    for name in (word.strip().lstrip(".") for word in spared.split(",")):
+        if name and (name == "*" or url.host == name or url.host.endswith("." + name)):
+            return None
+    try:
+        return Proxy.of(said) if said and url.is_tls else None
+    except ValueError as error:
+        _log.warn("https_proxy is not used: {error}", error=error)
+        return None

@@ -1,0 +1,207 @@
+"""Roamer: a robot of any kind in the yard, as its driver describes it, for tests of behaviours without nodes and links.
+
+It does at once what its driver would say that it does, and senses no more than it has.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from random import Random
+
+from agents.context import Context
+from agents.means import Means
+from agents.search import SearchAndApproach
+from drivers.bittle.gait import GAITS, Velocity, chosen
+from drivers.reading import Action, Description, Frame, Observation, Value
+from drivers.registry import describe
+from sim.camera import Camera
+from sim.dog import Motion
+from sim.scene import loaded
+from sim.sensor import Sensors
+from sim.world import SUBSTEP, World
+
+STEPS = 6
+TICK = STEPS * SUBSTEP
+LIT = 0.35
+"""Metres within which the light bumpers of a Create 2 see something."""
+TOUCH = 0.012
+LENS: Mapping[str, float | str] = {"width": 208, "height": 160, "fps": 15, "fov_h_deg": 56.9, "fov_v_deg": 45.2}
+Does = Callable[[Action], Action]
+
+
+def filming(description: Description, fps: float = 15.0) -> Description:
+    """The description with a camera on the robot's back."""
+    capabilities = {**description.capabilities, "camera": {**LENS, "fps": fps}}
+    return replace(description, capabilities=capabilities, rates={**description.rates, "camera": fps})
+
+
+def described(kind: str) -> Description:
+    """A robot with a camera."""
+    if kind == "sim":
+        return describe(kind, {"robot": "dog1"})
+    if kind == "aibo":
+        return describe(kind, {"host": "192.0.2.1"})
+    if kind == "create2":
+        return filming(describe(kind, {"port": "/dev/ttyUSB0"}))
+    if kind == "bittle":
+        return filming(describe(kind, {"port": "/dev/ttyUSB0"}), 5.0)
+    return filming(describe(kind, {"image_topic": "/image", "max_range": 3.5}), 10.0)
+
+
+def clipped(description: Description) -> Does:
+    """Does what it is told, within its limits."""
+    return lambda action: {
+        k: min(max(v, description.limits[k][0]), description.limits[k][1]) for k, v in action.items()
+    }
+
+
+def quantised(description: Description, gaits: Mapping[str, Velocity] = GAITS) -> Does:
+    """Does what the nearest of its gaits does."""
+
+    def does(action: Action) -> Action:
+        wished = clipped(description)(action)
+        _, done = chosen(wished["base.vx"], wished["base.wz"], gaits)
+        return {"base.vx": done.vx, "base.wz": done.wz}
+
+    return does
+
+
+def shared(description: Description) -> Does:
+    """Walks the more slowly the more it turns, as an AIBO does."""
+
+    def does(action: Action) -> Action:
+        done = dict(clipped(description)(action))
+        left = 1.0 - abs(done["base.wz"]) / description.limits["base.wz"][1]
+        for key in ("base.vx", "base.vy"):
+            most = left * description.limits[key][1]
+            done[key] = min(max(done[key], -most), most)
+        return done
+
+    return does
+
+
+class Roamer:
+    """A robot in place of the yard's first dog; ``lag`` seconds pass before it does what it is told."""
+
+    def __init__(
+        self, kind: str, seed: int, does: Does | None = None, lag: float = 0.1, description: Description | None = None
+    ) -> None:
+        self.description = description or described(kind)
+        make = {"bittle": quantised, "aibo": shared}.get(kind, clipped)
+        self.does = does or make(self.description)
+        self.world = World(Random(seed), loaded("three-dogs"))
+        self.camera = Camera(Random(seed + 1), self.world)
+        self.world.scatter(seed)
+        self.world.place_target_at_random()
+        self.dog = self.world.dogs["dog1"]
+        self.dog.shape.unsafe_set_radius(self.description.radius)
+        self.senses = Sensors(Random(seed + 2), self.world, self.dog)
+        self.means = Means(self.description)
+        self.behaviour = SearchAndApproach({}, Random(seed + 3))
+        self.behaviour.embody(self.means)
+        self.now = 0.0
+        self.hardest = 0.0
+        """The highest speed in m/s with which it touched anything."""
+        self.done: Action = {}
+        self.reversals = 0
+        self._kind = kind
+        self._lag = deque([Motion()] * round(lag / TICK))
+        self._speeds: deque[float] = deque([0.0] * 4, 4)
+        self._frames = 0
+        self._frame_at = 0.0
+        self._was_touching = False
+        self._reckoned = [0.0, 0.0, 0.0]
+
+    @property
+    def gap(self) -> float:
+        """Metres between its body and the target."""
+        target = self.world.target
+        assert target is not None
+        away = math.dist((target.x, target.y), (self.dog.x, self.dog.y))
+        return away - target.radius - self.description.radius
+
+    def sense(self) -> Mapping[str, Value]:
+        """What a robot of this kind feels."""
+        told: dict[str, Value] = dict(self.senses.values())
+        if self._kind != "sim":
+            told.pop("compass.heading")
+        if self._kind == "bittle":
+            told |= {f"odom.{axis}": value for axis, value in zip(("x", "y", "yaw"), self._reckoned, strict=True)}
+        near, far = float(told["range.near"]), float(told["range.far"])
+        if self._kind in ("sim", "aibo"):
+            return told
+        told = {key: value for key, value in told.items() if not key.startswith("range.")}
+        if self._kind == "create2":
+            side = self.touched()
+            told |= {"bump.left": side is not None and side >= 0.0, "bump.right": side is not None and side <= 0.0}
+            told |= {f"lightbump.{name}.hit": near < LIT for name in ("center_left", "center_right")}
+        elif "ranger" in self.description.capabilities:
+            told["range.front"] = min((one for one in (near, far) if not math.isnan(one)), default=math.nan)
+        return told
+
+    def touched(self) -> float | None:
+        """On which side it touches something with its front half: radians, left positive; None: nothing."""
+        dog, radius = self.dog, self.description.radius
+        width, height = self.world.scene.width, self.world.scene.height
+        others = [(d.x, d.y, 0.12) for d in self.world.dogs.values() if d is not dog]
+        if self.world.target is not None:
+            others.append((self.world.target.x, self.world.target.y, self.world.target.radius))
+        ways = [(math.dist((x, y), (dog.x, dog.y)) - r, math.atan2(y - dog.y, x - dog.x)) for x, y, r in others]
+        ways += [(dog.x, math.pi), (width - dog.x, 0.0), (dog.y, -math.pi / 2), (height - dog.y, math.pi / 2)]
+        sides = [math.remainder(way - dog.heading, math.tau) for far, way in ways if far < radius + TOUCH]
+        return min((side for side in sides if abs(side) < 1.7), key=abs, default=None)
+
+    def live(self, act: Callable[[float], Action | None]) -> Action | None:
+        """One tick: sense, look, act."""
+        for _ in range(STEPS):
+            self.world.step()
+            self.senses.sample()
+        self.now += TICK
+        is_touching = self.touched() is not None
+        if is_touching and not self._was_touching:
+            self.hardest = max(self.hardest, *self._speeds)
+        self._was_touching = is_touching
+        self._speeds.append(math.hypot(*self.dog.motion[:2]))
+        frame = None
+        if self.now - self._frame_at >= 1.0 / self.description.rates["camera"]:
+            self._frames, self._frame_at = self._frames + 1, self.now
+            frame = Frame(self._frames, 208, 160, self.camera.jpeg(self.dog), self.now)
+        self.behaviour.look(Observation(self.now, self.now, self.sense(), frame=frame), self.now)
+        action = act(self.now)
+        wished = self.means.fitted(action or {"base.vx": 0.0, "base.vy": 0.0, "base.wz": 0.0})
+        unknown = set(wished) - set(self.description.limits)
+        assert not unknown, f"{self._kind} has no {unknown}"
+        before, self.done = self.done, self.does(wished)
+        self.means.did(wished, self.done)
+        self.reversals += self.done.get("base.wz", 0.0) * before.get("base.wz", 0.0) < 0.0
+        self._lag.append(Motion(*(self.done.get(key, 0.0) for key in ("base.vx", "base.vy", "base.wz"))))
+        self._reckon()
+        # Not by way of ``drive``, which knows the limits of an ERS-7 only.
+        self.dog.command = self._lag.popleft()
+        return action
+
+    def _reckon(self) -> None:
+        """Where it is by what it was told to do, as a dog without encoders reckons."""
+        x, y, yaw = self._reckoned
+        way = self.done.get("base.vx", 0.0) * TICK
+        turned = math.remainder(yaw + self.done.get("base.wz", 0.0) * TICK, math.tau)
+        self._reckoned = [x + way * math.cos(yaw), y + way * math.sin(yaw), turned]
+
+    def find(self, limit: float) -> float | None:
+        """Search until it can tell the cost."""
+        while self.behaviour.cost is None and self.now < limit:
+            self.live(self.behaviour.search)
+        return self.behaviour.cost
+
+    def reach(self, limit: float) -> bool:
+        """Go there; whether it says that it is done."""
+        end = self.now + limit
+        while self.now < end:
+            if self.live(lambda now: self.behaviour.execute(Context(now))) is None:
+                for _ in range(10):  # it comes to rest
+                    self.live(lambda now: {"base.vx": 0.0, "base.vy": 0.0, "base.wz": 0.0})
+                return True
+        return False

@@ -1,0 +1,275 @@
+"""Tests of ``agents.search`` with bodies of all kinds, in closed loops over the yard in virtual time."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from random import Random
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from agents.catalogue import DEMO, TASKS
+from agents.context import Context
+from agents.means import WALK, Means
+from agents.search import SearchAndApproach
+from agents.vision import Sighting
+from drivers.bittle.gait import Velocity
+from drivers.reading import Action, Observation, Value
+from middleware.tasks import refusals
+from sim.sensor import NOSE
+from tests.agents.roamer import Roamer, described, quantised
+
+KINDS = ("sim", "aibo", "create2", "bittle", "rosbridge")
+LAG = {"bittle": 0.3}
+ARCS = {"f": Velocity(0.08, 0.0), "b": Velocity(-0.05, 0.0), "l": Velocity(0.06, 0.4), "r": Velocity(0.06, -0.4)}
+JERKS = {"f": Velocity(0.15, 0.0), "b": Velocity(-0.1, 0.0), "l": Velocity(0.0, 1.2), "r": Velocity(0.0, -1.2)}
+
+
+def roamer(kind: str, seed: int) -> Roamer:
+    """A robot of this kind somewhere in the yard, with a target somewhere else."""
+    return Roamer(kind, seed, lag=LAG.get(kind, 0.1))
+
+
+def with_gaits(gaits: dict[str, Velocity], seed: int) -> Roamer:
+    """A robot dog with these gaits and no others."""
+    known = described("bittle")
+    limits = {
+        "base.vx": (min(one.vx for one in gaits.values()), max(one.vx for one in gaits.values())),
+        "base.wz": (min(one.wz for one in gaits.values()), max(one.wz for one in gaits.values())),
+    }
+    known = replace(known, limits=limits)
+    return Roamer("bittle", seed, quantised(known, gaits), 0.3, known)
+
+
+class BodyTests(SynchronousTestCase):
+    def arrived(self, robot: Roamer, limit: float = 60.0) -> None:
+        """It goes to the target, stands before it, and touched nothing harder than at a slow walk."""
+        self.assertTrue(robot.reach(limit), "never done")
+        self.assertLessEqual(robot.gap, 0.15)
+        self.assertLessEqual(robot.hardest, max(WALK, robot.means.walk) + 0.01)
+
+    def test_each_kind_meets_what_the_demonstration_asks_for(self) -> None:
+        """With a camera each kind may take part in the demonstration; without one none may."""
+        asked = TASKS[DEMO].requirements
+        for kind in KINDS:
+            has = described(kind).capabilities
+            self.assertEqual(refusals(has, asked), [], kind)
+            blind = {name: properties for name, properties in has.items() if name != "camera"}
+            self.assertEqual(refusals(blind, asked), ["has no camera"], kind)
+
+    def test_each_kind_finds_and_reaches_the_target(self) -> None:
+        """From several places each kind finds the target, tells its distance to 10 %, and stops before it untouched."""
+        for kind in KINDS:
+            for seed in (1, 2, 3, 4):
+                with self.subTest(kind=kind, seed=seed):
+                    robot = roamer(kind, seed)
+                    cost = robot.find(60.0)
+                    assert cost is not None
+                    target = robot.world.target
+                    assert target is not None
+                    lens = (
+                        robot.dog.x + NOSE * math.cos(robot.dog.heading),
+                        robot.dog.y + NOSE * math.sin(robot.dog.heading),
+                    )
+                    self.assertLess(abs(cost / math.dist(lens, (target.x, target.y)) - 1.0), 0.10)
+                    self.arrived(robot)
+                    self.assertEqual(robot.world.collisions, 0)
+                    self.assertGreater(robot.gap, 0.05)
+
+    def test_robots_that_feel_their_way_find_it_too(self) -> None:
+        """Who ranges nothing walks about for a minute, bumps no harder than it walks, and still gets there."""
+        for kind in ("create2", "bittle"):
+            for seed in (1, 3):
+                with self.subTest(kind=kind, seed=seed):
+                    robot = roamer(kind, seed)
+                    robot.world.clear_target()
+                    while robot.now < 60.0:
+                        robot.live(robot.behaviour.search)
+                    robot.world.place_target_at_random()
+                    self.assertIsNotNone(robot.find(180.0))
+                    self.arrived(robot)
+
+    def test_faster_bodies_are_faster_where_they_see_ahead(self) -> None:
+        """A robot whose ranger sees far walks faster than a dog; one that feels walls with its bumper does not."""
+        walks = {kind: Means(described(kind)).walk for kind in KINDS}
+        self.assertEqual(walks, {"sim": 0.16, "aibo": 0.16, "create2": 0.16, "bittle": 0.15, "rosbridge": 0.22})
+
+    def test_robot_that_turns_in_jerks_does_not_swing_for_ever(self) -> None:
+        """A body that knows 1.2 rad/s or nothing accepts a coarse aim: it gets there, and hardly swings."""
+        for seed in (1, 2, 3, 4, 5):
+            with self.subTest(seed=seed):
+                robot = with_gaits(JERKS, seed)
+                self.assertIsNotNone(robot.find(60.0))
+                self.arrived(robot)
+                self.assertLess(robot.reversals, 10)
+
+    def test_robot_that_turns_only_as_it_walks_gets_there(self) -> None:
+        """A body without a turn on the spot searches and approaches on arcs, and backs off from what is too near."""
+        for seed in (1, 2, 3):
+            with self.subTest(seed=seed):
+                robot = with_gaits(ARCS, seed)
+                self.assertIsNotNone(robot.find(90.0))
+                self.assertAlmostEqual(robot.means.circle, 0.15)
+                self.arrived(robot, 90.0)
+        robot = with_gaits(ARCS, 1)
+        robot.means.circle = 0.15
+        target = robot.world.target
+        assert target is not None
+        robot.find(90.0)
+        robot.world.place_target(
+            robot.dog.x + 0.3 * math.cos(robot.dog.heading + 0.45),
+            robot.dog.y + 0.3 * math.sin(robot.dog.heading + 0.45),
+        )
+        robot.live(robot.behaviour.search)
+        self.assertTrue(robot.reach(90.0))
+
+
+class BumpTests(SynchronousTestCase):
+    def facing(self, seed: int = 1) -> Roamer:
+        """A Create 2 that has found the target."""
+        robot = roamer("create2", seed)
+        self.assertIsNotNone(robot.find(60.0))
+        return robot
+
+    def test_bump_into_the_target_is_an_arrival(self) -> None:
+        """A target smaller than the task says seems farther away than it is: the bump says that it is reached."""
+        robot = roamer("create2", 1)
+        robot.behaviour = SearchAndApproach({"target_radius": 0.16, "target_height": 0.44}, Random(4))
+        robot.behaviour.embody(robot.means)
+        self.assertIsNotNone(robot.find(60.0))
+        self.assertTrue(robot.reach(60.0))
+        self.assertLess(robot.gap, 0.15)
+        self.assertLessEqual(robot.hardest, 0.17)
+
+    def test_bump_on_the_way_is_gone_round(self) -> None:
+        """Something invisible on the way is touched once, backed off from, gone round, and the target is reached."""
+        robot = self.facing()
+        for _ in range(60):
+            robot.live(lambda now: robot.behaviour.execute(Context(now)))
+        sense, until = robot.sense, robot.now + 0.3
+        robot.sense = lambda: {**sense(), "bump.left": robot.now < until}  # type: ignore[method-assign]
+        speeds = []
+        for _ in range(100):
+            robot.live(lambda now: robot.behaviour.execute(Context(now)))
+            speeds.append(robot.done["base.vx"])
+        self.assertLess(min(speeds), 0.0)
+        first = next(n for n, speed in enumerate(speeds) if speed < 0.0)
+        self.assertLess(first, 5)
+        self.assertTrue(robot.reach(60.0))
+        self.assertLessEqual(robot.gap, 0.15)
+
+    def test_body_that_goes_nowhere_has_bumped(self) -> None:
+        """Who has neither bumper nor ranger, and walks without its odometry moving, backs off after two seconds."""
+        robot = roamer("bittle", 1)
+        robot.world.clear_target()
+        behaviour, means = robot.behaviour, robot.means
+        now, backed = 0.0, []
+        yaw = 0.0
+        for _ in range(1200):
+            now += 0.05
+            values = {"odom.x": 1.0, "odom.y": 1.0, "odom.yaw": math.remainder(yaw, math.tau)}
+            behaviour.look(Observation(now, now, values), now)
+            action = means.fitted(behaviour.search(now))
+            done = robot.does(action)
+            means.did(action, done)
+            yaw += done["base.wz"] * 0.05
+            if done["base.vx"] < 0.0:
+                backed.append(now)
+        self.assertTrue(backed)
+
+    def test_robot_of_which_nobody_asks_anything_is_not_stuck(self) -> None:
+        """A pause in which nobody acts is not taken for a wall."""
+        behaviour, means = SearchAndApproach({}, Random(1)), Means(described("bittle"))
+        behaviour.embody(means)
+        values = {"odom.x": 1.0, "odom.y": 1.0, "odom.yaw": 0.0}
+        for now in (0.0, 5.0, 10.0):
+            behaviour.look(Observation(now, now, values), now)
+            behaviour.search(now)
+            means.did(means.go(0.1), {"base.vx": 0.1, "base.wz": 0.0})
+        self.assertFalse(behaviour._detour.is_on(10.0))
+
+
+class Told:
+    """A behaviour in a body of this kind that is told where the target is, instead of seeing it."""
+
+    def __init__(self, kind: str) -> None:
+        self.means = Means(described(kind))
+        self.behaviour = SearchAndApproach({}, Random(1))
+        self.behaviour.embody(self.means)
+        self.now = 0.0
+
+    def see(self, distance: float, bearing: float = 0.0, is_filling: bool = False, **values: Value) -> None:
+        """Look once; ``bump_left`` stands for ``bump.left``."""
+        self.now += 0.05
+        told: dict[str, Value] = {"odom.x": 0.0, "odom.y": 0.0, "odom.yaw": 0.0}
+        told |= {key.replace("_", "."): value for key, value in values.items()}
+        self.behaviour.look(Observation(self.now, self.now, told), self.now)
+        self.behaviour._saw(Sighting(bearing, distance, not is_filling, is_filling), self.now)
+
+    def execute(self) -> Action | None:
+        """What it does next."""
+        return self.behaviour.execute(Context(self.now))
+
+
+class NearTests(SynchronousTestCase):
+    def acts(self, distance: float, bearing: float) -> list[Action | None]:
+        """What a Create 2 does in five ticks with its bumper pressed and the target there."""
+        told, acts = Told("create2"), []
+        for _ in range(5):
+            told.see(distance, bearing, bump_left=True)
+            acts.append(told.execute())
+        return acts
+
+    def test_bump_counts_as_arrival_before_the_target_only(self) -> None:
+        """A bump while the target is near and straight ahead ends it; one aside, or far from it, is backed off from."""
+        self.assertIsNone(self.acts(0.33, 0.05)[-1])
+        for distance, bearing in ((0.33, 0.6), (1.0, 0.05)):
+            acts = self.acts(distance, bearing)
+            self.assertTrue(all(action is not None and action["base.vx"] < 0.0 for action in acts), (distance, bearing))
+
+    def test_who_turns_on_a_circle_backs_off_from_what_is_in_it(self) -> None:
+        """A target aside within the turning circle is backed off from; one farther away is turned to."""
+        told = Told("bittle")
+        told.means.circle = 0.15
+        for distance, sign in ((0.2, -1.0), (1.0, 1.0)):
+            told.see(distance, 0.7)
+            action = told.execute()
+            assert action is not None
+            self.assertGreater(sign * action["base.vx"], 0.0, distance)
+            self.assertEqual(action["base.wz"] > 0.0, sign > 0.0)
+
+    def test_picture_that_is_filled_does_not_push_the_target_away(self) -> None:
+        """A picture that is all target says less than what was seen before and the way walked since."""
+        told = Told("create2")
+        told.see(0.40)
+        told.see(0.38, is_filling=True, odom_x=0.15)
+        self.assertAlmostEqual(told.behaviour._gap, 0.40 - 0.15 - 0.08)
+
+    def test_ranger_of_unknown_place_is_not_believed_to_be_nearer_than_the_eye(self) -> None:
+        """A scanner that sits behind the camera ranges too far: the nearer of picture and scanner counts."""
+        told = Told("rosbridge")
+        told.see(0.40, range_front=0.40)
+        self.assertAlmostEqual(told.behaviour._gap, 0.32)
+        told.see(0.40, range_front=0.28)
+        self.assertAlmostEqual(told.behaviour._gap, 0.28)
+
+
+class WayTests(SynchronousTestCase):
+    def test_robot_that_cannot_step_aside_goes_round(self) -> None:
+        """With another robot in between, one that ranges but cannot step aside goes round it and does not push."""
+        robot = roamer("rosbridge", 1)
+        world = robot.world
+        world.clear_target()
+        world.move_dog("dog3", 2.8, 2.2, 0.0)
+        world.move_dog("dog2", 2.8, 0.2, 0.0)
+        world.move_dog("dog1", 0.4, 1.2, 0.0)
+        world.place_target(2.2, 1.2)
+        self.assertIsNotNone(robot.find(60.0))
+        for _ in range(30):
+            robot.live(lambda now: robot.behaviour.execute(Context(now)))
+        world.move_dog("dog2", 1.4, 1.21, math.pi / 2)
+        before = world.dogs["dog2"].x, world.dogs["dog2"].y
+        self.assertTrue(robot.reach(90.0))
+        self.assertLessEqual(robot.gap, 0.15)
+        after = world.dogs["dog2"].x, world.dogs["dog2"].y
+        self.assertLess(math.dist(before, after), 0.05)

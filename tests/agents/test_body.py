@@ -1,0 +1,51 @@
+"""Tests of ``agents.body``: what reaches a robot of what its behaviour wishes, and what is learned from it."""
+
+from __future__ import annotations
+
+from typing import cast
+
+from twisted.internet.task import Clock
+from twisted.trial.unittest import SynchronousTestCase
+
+from agents.body import Body
+from agents.engagement import Deed
+from agents.means import STAND
+from drivers.driver import Driver, Permit
+from drivers.reading import Action
+from tests.agents.roamer import described, quantised
+
+
+class Robot:
+    """A driver of a Bittle, as far as a body needs one to move."""
+
+    def __init__(self) -> None:
+        self.description = described("bittle")
+        self.state = "ready"
+        self.asked: list[Action] = []
+
+    def act(self, action: Action, permit: Permit) -> Action:
+        """What the nearest gait does."""
+        self.asked.append(action)
+        return quantised(self.description)(action)
+
+
+class BodyTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.robot = Robot()
+        self.body = Body(cast(Driver, self.robot), Clock(), lambda seen: None, lambda why: None)
+
+    def do(self, **wished: float) -> None:
+        """Have it do this, beside what stands."""
+        action = {**STAND, **{f"base.{axis}": value for axis, value in wished.items()}}
+        self.assertTrue(self.body.do(Deed(action, Permit(1, 1.0))))
+
+    def test_robot_is_asked_for_nothing_that_it_has_not(self) -> None:
+        """A robot without a sideways gait is not told to rest sideways, which it would refuse as unknown."""
+        self.do(vx=0.1)
+        self.assertEqual(self.robot.asked, [{"base.vx": 0.1, "base.wz": 0.0}])
+
+    def test_what_it_really_does_is_learned(self) -> None:
+        """A turn that comes out faster than was asked for makes the aim of all its behaviours coarser."""
+        self.assertFalse(self.body.means.is_coarse)
+        self.do(wz=0.15)
+        self.assertTrue(self.body.means.is_coarse)

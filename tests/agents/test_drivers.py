@@ -1,0 +1,137 @@
+"""Tests of ``agents.search`` over the drivers of real robots and their emulators, whose bodies are dogs of the yard."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from random import Random
+from typing import Any
+
+from twisted.internet.task import Clock, LoopingCall
+from twisted.trial.unittest import SynchronousTestCase
+
+from agents.context import Context
+from agents.means import Means
+from agents.search import SearchAndApproach
+from drivers.driver import Driver, Permit
+from drivers.link import MemoryConnector
+from drivers.reading import Frame, Observation, Value
+from drivers.registry import driver_for
+from sim.camera import Camera
+from sim.emulator.aibo import AiboEmulator
+from sim.emulator.bittle import Bittle
+from sim.emulator.create2 import Create2
+from sim.emulator.rosbridge import RosbridgeRobot
+from sim.scene import FOOTPRINT, loaded
+from sim.sensor import Sensors
+from sim.world import SUBSTEP, World
+from tests.agents.roamer import filming
+
+STEPS = 2
+TICK_S = 0.048
+FPS = {"bittle": 5.0}
+TOUCH = 0.15
+"""The gap that counts as having reached the target."""
+
+
+class DogBody:
+    """A dog of a yard of its own, as an emulator moves it and feels with it."""
+
+    def __init__(self, clock: Clock, seed: int) -> None:
+        self.world = World(Random(seed), loaded("three-dogs"))
+        self.world.scatter(seed)
+        self.world.place_target_at_random()
+        self.dog = self.world.dogs["dog1"]
+        self._senses = Sensors(Random(seed + 1), self.world, self.dog)
+        self._camera = Camera(Random(seed + 2), self.world)
+        self._loop = LoopingCall(self._turn)
+        self._loop.clock = clock
+        self._loop.start(STEPS * SUBSTEP)
+
+    def drive(self, vx: float, vy: float, wz: float) -> None:
+        """Walk like this."""
+        self.world.drive("dog1", vx, vy, wz)
+
+    def halt(self) -> None:
+        """Stand still."""
+        self.world.halt("dog1")
+
+    def sense(self) -> Mapping[str, Value]:
+        """What it feels; the chest's ranger looks at the floor, and a scanner does not."""
+        return {key: value for key, value in self._senses.values().items() if key != "range.chest"}
+
+    def picture(self, is_halved: bool = False) -> bytes | None:
+        """What it sees."""
+        return self._camera.jpeg(self.dog, is_halved)
+
+    def _turn(self) -> None:
+        for _ in range(STEPS):
+            self.world.step()
+            self._senses.sample()
+
+
+def driven(kind: str, body: DogBody, clock: Clock) -> Driver:
+    """The driver of a robot of this kind, joined through memory to its emulator, which has this body."""
+    emulator: Any
+    if kind == "aibo":
+        emulator = AiboEmulator(clock, body, Random(1))
+        emulator.start()
+        return driver_for(kind, {"host": "dog"}, "robot", clock, emulator.connector())
+    if kind == "rosbridge":
+        emulator = RosbridgeRobot(clock, body, Random(1))
+        emulator.start()
+        options = {"image_topic": "/camera/image_raw/compressed", "camera_lens": 56.9}
+        return driver_for(kind, options, "robot", clock, MemoryConnector(clock, emulator.accept))
+    emulator = (Create2 if kind == "create2" else Bittle)(body, clock, Random(1))
+    return driver_for(kind, {"port": "memory"}, "robot", clock, MemoryConnector(clock, emulator.accept))
+
+
+class DriverTests(SynchronousTestCase):
+    def reached(self, kind: str, seed: int) -> tuple[DogBody, float]:
+        """The yard after a robot of this kind has found and reached the target, and the seconds that it took."""
+        clock = Clock()
+        body = DogBody(clock, seed)
+        driver = driven(kind, body, clock)
+        fps = FPS.get(kind, 15.0)
+        has_camera = "camera" in driver.description.capabilities
+        means = Means(driver.description if has_camera else filming(driver.description, fps))
+        behaviour = SearchAndApproach({}, Random(seed))
+        behaviour.embody(means)
+        enabled: list[bool] = []
+        driver.connect().addCallback(lambda _: driver.enable()).addCallback(enabled.append)
+        frame, seen_at, began = Frame(0, 208, 160, b"", 0.0), 0.0, math.inf
+        for _ in range(round(120.0 / TICK_S)):
+            for _ in range(12):
+                clock.advance(TICK_S / 12)
+            now = clock.seconds()
+            if not enabled:
+                continue
+            began = min(began, now)
+            if now - seen_at >= 1.0 / fps:
+                frame, seen_at = Frame(frame.seq + 1, 208, 160, body.picture() or b"", now), now
+            seen = driver.observe()
+            assert isinstance(seen, Observation)
+            behaviour.look(seen if has_camera else replace(seen, frame=frame), now)
+            action = behaviour.search(now) if behaviour.cost is None else behaviour.execute(Context(now))
+            if action is None:
+                driver.disconnect()
+                for _ in range(100):
+                    clock.advance(0.01)
+                return body, now - began
+            action = means.fitted(action)
+            means.did(action, driver.act(action, Permit(1, now + 0.5)))
+        self.fail(f"{kind} never reached the target")
+
+    def test_robots_reach_the_target_over_their_own_wire(self) -> None:
+        """Each kind of real robot, as its emulator plays it, finds the target and stops before it, touching nothing."""
+        for kind in ("aibo", "create2", "bittle", "rosbridge"):
+            for seed in (1, 4):
+                with self.subTest(kind=kind, seed=seed):
+                    body, took = self.reached(kind, seed)
+                    target = body.world.target
+                    assert target is not None
+                    away = math.dist((target.x, target.y), (body.dog.x, body.dog.y))
+                    self.assertLess(away - target.radius - FOOTPRINT, TOUCH)
+                    self.assertEqual(body.world.collisions, 0)
+                    self.assertLess(took, 60.0)

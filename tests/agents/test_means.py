@@ -1,0 +1,129 @@
+"""Tests of ``agents.means``: what a body can do, by its description and by what it did."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from agents.means import COARSEST, FACING, STAND, STOP_AT, Means, is_bumped, is_lit
+from drivers.reading import Description
+from tests.agents.roamer import described
+
+WHEELS = Description("w", "", {"camera": {}}, {"base.vx": (-0.2, 0.2), "base.wz": (-2.0, 2.0)}, 0.1)
+
+
+def with_camera(**properties: float) -> Means:
+    """The means of a body on wheels with a camera of these properties."""
+    return Means(replace(WHEELS, capabilities={"camera": properties}))
+
+
+class DescriptionTests(SynchronousTestCase):
+    def test_unknown_body_is_an_ers7(self) -> None:
+        """Who says nothing of itself has the means of the simulated dog, to the last bit."""
+        for name in ("walk", "turn", "look_turn", "strafes", "ranges", "lens", "ahead", "stop_at", "fresh", "aim"):
+            self.assertEqual(getattr(Means(), name), getattr(Means(described("sim")), name), name)
+        self.assertEqual((Means().walk, Means().look_turn, Means().stop_at, Means().aim), (0.16, 1.6, STOP_AT, FACING))
+
+    def test_sideways_gait_is_known_by_its_limit(self) -> None:
+        """Dogs step aside; wheels and the gaits of a Bittle do not."""
+        self.assertEqual(
+            [Means(described(k)).strafes for k in ("sim", "aibo", "create2", "bittle")], [True, True, False, False]
+        )
+
+    def test_lens_is_as_described(self) -> None:
+        """The lens in degrees becomes radians; without a word on its height the pixels are square."""
+        self.assertEqual(with_camera(fov_h_deg=90.0).lens, (math.pi / 2, None))
+        self.assertEqual(with_camera(fov_h_deg=90.0, fov_v_deg=60.0).lens, (math.pi / 2, math.radians(60.0)))
+        self.assertEqual(with_camera().lens, Means().lens)
+
+    def test_numbers_that_cannot_be_are_not_believed(self) -> None:
+        """A lens of no degrees, or of NaN, is as none."""
+        for wrong in (0.0, -5.0, math.nan, math.inf):
+            self.assertEqual(with_camera(fov_h_deg=wrong).lens, Means().lens, wrong)
+
+    def test_slow_camera_slows_the_turn(self) -> None:
+        """With two pictures a second the body turns by no more than half a view between them, and waits longer."""
+        slow = Means(replace(WHEELS, rates={"camera": 2.0}))
+        self.assertLess(slow.look_turn / 2.0, 0.51 * slow.lens[0])
+        self.assertGreater(slow.fresh, 2 / 2.0)
+
+    def test_broad_body_stops_earlier(self) -> None:
+        """Where the body is broader than the camera sits ahead, the camera stays farther away."""
+        self.assertAlmostEqual(Means(described("create2")).stop_at, 0.174 - 0.10 + 0.08)
+        middle = Means(replace(WHEELS, capabilities={"camera": {"ahead": 0.01}}, radius=0.3))
+        self.assertAlmostEqual(middle.stop_at, 0.3 - 0.01 + 0.08)
+
+
+class FittedTests(SynchronousTestCase):
+    def test_rest_on_an_axis_that_is_not_there_is_left_out(self) -> None:
+        """To stand is understood by every body; a motion that it cannot do is left to its driver to refuse."""
+        self.assertEqual(Means(WHEELS).fitted(STAND), {"base.vx": 0.0, "base.wz": 0.0})
+        self.assertEqual(Means().fitted(STAND), STAND)
+        aside = {"base.vy": 0.1}
+        self.assertEqual(Means(WHEELS).fitted(aside), aside)
+
+
+class LearningTests(SynchronousTestCase):
+    def turned(self, means: Means, wished: float, done: float) -> None:
+        """Tell that a turn on the spot was done so."""
+        means.did({"base.vx": 0.0, "base.wz": wished}, {"base.vx": 0.0, "base.wz": done})
+
+    def test_who_does_what_it_is_told_learns_nothing(self) -> None:
+        """Clipped or not, a body that does no more than it was told keeps its fine aim."""
+        means = Means(WHEELS)
+        for wished, done in ((0.5, 0.5), (5.0, 2.0), (0.01, 0.0100001)):
+            self.turned(means, wished, done)
+        self.assertEqual(
+            (means.aim, means.is_coarse, means.circle, means.spin(0.01)),
+            (FACING, False, 0.0, {**STAND, "base.wz": 0.01}),
+        )
+
+    def test_faster_turn_than_asked_for_is_a_coarse_aim(self) -> None:
+        """Who turns in steps aims the more coarsely the larger its smallest step is, and not endlessly so."""
+        means = Means(replace(WHEELS, rates={"camera": 5.0}))
+        self.turned(means, 0.1, 1.0)
+        large = means.aim
+        self.turned(means, 0.1, 0.5)
+        self.assertTrue(FACING < means.aim < large <= COARSEST)
+        self.assertTrue(means.is_coarse)
+
+    def test_turn_that_was_too_slow_is_tried_faster(self) -> None:
+        """A turn so slow that the body stood is asked for faster the next time, on either side."""
+        means = Means(WHEELS)
+        self.turned(means, 0.1, 0.0)
+        self.assertAlmostEqual(means.spin(-0.05)["base.wz"], -0.15)
+        self.assertEqual(means.spin(0.0), STAND)
+
+    def test_who_cannot_turn_on_the_spot_walks_on_arcs(self) -> None:
+        """A body that stands still at its fastest turn walks as it turns, and tells how narrowly it does."""
+        means = Means(WHEELS)
+        self.turned(means, means.look_turn, 0.0)
+        action = means.spin(1.0)
+        self.assertGreater(action["base.vx"], 0.0)
+        means.did(action, {"base.vx": 0.06, "base.wz": 0.4})
+        self.assertAlmostEqual(means.circle, 0.15)
+        self.assertEqual(means.spin(0.0), STAND)
+
+    def test_creep_that_was_too_slow_is_tried_faster(self) -> None:
+        """A walk so slow that the body stood is asked for faster, and a stride too long makes it stop earlier."""
+        means = Means(WHEELS)
+        before = means.stop_at
+        means.did({"base.vx": 0.04, "base.wz": 0.0}, {"base.vx": 0.0, "base.wz": 0.0})
+        self.assertAlmostEqual(means.go(0.04)["base.vx"], 0.06)
+        self.assertAlmostEqual(means.go(-0.04)["base.vx"], -0.06)
+        means.did({"base.vx": 0.06, "base.wz": 0.0}, {"base.vx": 0.15, "base.wz": 0.0})
+        self.assertTrue(before < means.stop_at < before + 0.05)
+
+
+class FeelingTests(SynchronousTestCase):
+    def test_bump_is_any_bumper(self) -> None:
+        """Each bumper counts; what is not pressed, or is another thing, does not."""
+        self.assertTrue(is_bumped({"bump.left": False, "bump.right": True}))
+        self.assertFalse(is_bumped({"bump.left": False, "lightbump.left.hit": True, "button.clean": True}))
+
+    def test_light_bumpers_ahead_count(self) -> None:
+        """Those at the very sides see what the robot passes by."""
+        self.assertTrue(is_lit({"lightbump.center_left.hit": True}))
+        self.assertFalse(is_lit({"lightbump.left.hit": True, "lightbump.center_right.hit": False}))

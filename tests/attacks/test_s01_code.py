@@ -1,0 +1,257 @@
+"""Attack S1: to have code run by what is sent: pickles, marshalled code, YAML tags, format strings."""
+
+from __future__ import annotations
+
+import ast
+import marshal
+import pickle
+import random
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from twisted.logger import formatEvent, globalLogPublisher
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.entangled.record import hashed_key
+from middleware.entangled.wire.message import Answer, Question, Told, decoded, encoded
+from tests.fleet import FleetCase
+
+ROOT = Path(__file__).resolve().parents[2]
+ROOMS = ("middleware", "webnode", "agents", "swarmnode", "drivers")
+UNSAFE = (
+    *("pickle", "cPickle", "_pickle", "marshal", "shelve", "dill", "cloudpickle", "joblib", "yaml", "jsonpickle"),
+    *("code", "codeop", "runpy", "xmlrpc", "imp"),
+)
+CALLS = ("eval", "exec", "compile", "__import__", "execfile", "input")
+ALLOWED = {
+    # What an operator signed and the owner of this node allowed; tests/swarmnode/test_deploy.py has its rules.
+    ("middleware.deployment.module", "exec"),
+    ("middleware.deployment.module", "compile"),
+}
+LOADERS = {
+    # Named by the settings of the node's owner, or by a table in the tree.
+    *("agents.behaviour", "agents.registry", "drivers.registry", "middleware.consensus.servant"),
+    *("middleware.consensus.strategy", "swarmnode.driver.catalogue", "swarmnode.command", "drivers.foreign"),
+}
+HOOKS = {("middleware.entangled.wire.message", hook) for hook in ("ext_hook", "object_hook")}
+"""The first one refuses every extension, the second one counts."""
+LOG = ("debug", "info", "warn", "error", "critical", "failure")
+FIRED: list[str] = []
+
+
+def fire(what: str) -> str:
+    """What the pickles of the corpus would call."""
+    FIRED.append(what)
+    return what
+
+
+class Mine:
+    """An object whose pickle calls ``fire`` when it is read."""
+
+    def __reduce__(self) -> tuple[object, tuple[str]]:
+        return fire, ("a pickle was read",)
+
+
+CORPUS: tuple[bytes, ...] = (
+    *(pickle.dumps(Mine(), protocol) for protocol in range(6)),
+    b"ctests.attacks.test_s01_code\nfire\n(S'by name'\ntR.",
+    marshal.dumps(compile("import tests.attacks.test_s01_code as s; s.fire('code')", "<wire>", "exec")),
+    b"!!python/object/apply:tests.attacks.test_s01_code.fire ['yaml']",
+    b"__import__('tests.attacks.test_s01_code').attacks.test_s01_code.fire('text')",
+    b"{0.__class__.__init__.__globals__} {self} {log_source} %s%n%x ${7*7} {{7*7}} {% raw %}",
+    b'{"py/object": "tests.attacks.test_s01_code.Mine", "__class__": "Mine", "$type": "Mine"}',
+    b"\xc7\x04\x05code",  # an extension of msgpack
+    b"\xd6\xff\x00\x00\x00\x00",
+    b"; DROP TABLE record; --",
+)
+TEXTS = tuple(each.decode("latin-1") for each in CORPUS)
+
+
+def trees() -> Iterator[tuple[str, ast.Module]]:
+    """Every module that runs on a node."""
+    for room in ROOMS:
+        for path in sorted((ROOT / room).rglob("*.py")):
+            parts = path.relative_to(ROOT).with_suffix("").parts
+            yield ".".join(parts), ast.parse(path.read_text(encoding="utf-8"), str(path))
+
+
+def faults_of(module: str, tree: ast.Module) -> list[str]:
+    """What in a module could run content as code."""
+    fixed = _constants(tree)
+    return [
+        f"{module} line {getattr(node, 'lineno', 0)}: {why}"
+        for node in ast.walk(tree)
+        for why in _whys(module, node, fixed)
+    ]
+
+
+def _constants(tree: ast.Module) -> set[str]:
+    """The names that are given nothing but constants in a module."""
+    given: dict[str, bool] = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Assign):
+            for target in node.targets:
+                if isinstance(target, ast.Name):
+                    given[target.id] = given.get(target.id, True) and _is_fixed(node.value, set())
+    return {name for name, is_fixed in given.items() if is_fixed}
+
+
+def _whys(module: str, node: ast.AST, fixed: set[str]) -> Iterator[str]:
+    if isinstance(node, ast.Import):
+        yield from (f"imports {alias.name}" for alias in node.names if alias.name.partition(".")[0] in UNSAFE)
+    elif isinstance(node, ast.ImportFrom):
+        if (node.module or "").partition(".")[0] in UNSAFE:
+            yield f"imports from {node.module}"
+    elif isinstance(node, ast.Name) and node.id in CALLS and (module, node.id) not in ALLOWED:
+        yield f"names {node.id}"
+    elif isinstance(node, ast.Call):
+        yield from _of_call(module, node, fixed)
+
+
+def _of_call(module: str, call: ast.Call, fixed: set[str]) -> Iterator[str]:
+    called = call.func.attr if isinstance(call.func, ast.Attribute) else getattr(call.func, "id", "")
+    of = call.func.value if isinstance(call.func, ast.Attribute) else None
+    first = call.args[0] if call.args else None
+    named = {keyword.arg: keyword.value for keyword in call.keywords}
+    if called == "import_module" and module not in LOADERS and not _is_fixed(first, fixed):
+        yield "loads a module by a name that is no constant"
+    if called in ("system", "popen", "spawnl", "spawnv") and isinstance(of, ast.Name) and of.id == "os":
+        yield f"calls os.{called}"
+    shell = named.get("shell")
+    if shell is not None and not (isinstance(shell, ast.Constant) and shell.value is False):
+        yield "starts a shell"
+    if called in ("format", "format_map") and of is not None and not _is_fixed(of, fixed):
+        yield "formats by a text that is no constant"
+    is_log = called in LOG and isinstance(of, ast.Attribute | ast.Name) and _last(of) in ("_log", "log")
+    if is_log and call.args and not _is_fixed(first, fixed):
+        yield "logs by a format that is no constant"
+    if called in ("unpackb", "Unpacker"):
+        for hook in ("object_hook", "ext_hook", "object_pairs_hook"):
+            if hook in named and (module, hook) not in HOOKS:
+                yield f"unpacks with {hook}"
+        strict = named.get("strict_map_key")
+        if strict is not None and not (isinstance(strict, ast.Constant) and strict.value is True):
+            yield "unpacks with keys of any kind"
+    is_statement = called in ("execute", "executescript", "executemany")
+    if is_statement and isinstance(first, ast.BinOp | ast.JoinedStr) and not _is_fixed(first, fixed):
+        yield "makes SQL of parts"
+
+
+def _is_fixed(node: ast.AST | None, fixed: set[str]) -> bool:
+    """Whether a text is written in the source, as a whole or in parts."""
+    if isinstance(node, ast.IfExp):
+        return _is_fixed(node.body, fixed) and _is_fixed(node.orelse, fixed)
+    if isinstance(node, ast.BinOp):
+        return _is_fixed(node.left, fixed) and _is_fixed(node.right, fixed)
+    if isinstance(node, ast.JoinedStr):
+        return all(_is_fixed(part, fixed) for part in node.values)
+    if isinstance(node, ast.FormattedValue | ast.Subscript):
+        return _is_fixed(node.value, fixed)
+    return isinstance(node, ast.Constant) or (isinstance(node, ast.Name) and (node.id.isupper() or node.id in fixed))
+
+
+def _last(node: ast.AST) -> str:
+    return node.attr if isinstance(node, ast.Attribute) else getattr(node, "id", "")
+
+
+class TreeTests(SynchronousTestCase):
+    """What the tree does not have cannot be called."""
+
+    def test_nothing_in_the_tree_runs_content(self) -> None:
+        """No module of a node evaluates, unpickles, formats by or loads anything that it was sent."""
+        found = [fault for module, tree in trees() for fault in faults_of(module, tree)]
+        self.assertEqual(found, [])
+
+    def test_the_check_bites(self) -> None:
+        """Each forbidden thing is found where it stands."""
+        for source in (
+            "import pickle",
+            "from yaml import load",
+            "import marshal as m",
+            "eval(wire)",
+            "[exec][0](wire)",
+            "__import__(name)",
+            "importlib.import_module(name)",
+            "os.system(wire)",
+            "subprocess.run(wire, shell=True)",
+            "wire.format(self)",
+            "self._log.info(wire)",
+            "_log.warn(wire + '')",
+            "msgpack.unpackb(wire, ext_hook=made)",
+            "msgpack.unpackb(wire, strict_map_key=False)",
+            "db.execute('select ' + name)",
+        ):
+            self.assertEqual(len(faults_of("webnode.x", ast.parse(source))), 1, source)
+        for source in ("'{}'.format(1)", "self._log.info('{text}', text=wire)", "import_module('agents.search')"):
+            self.assertEqual(faults_of("webnode.x", ast.parse(source)), [], source)
+
+
+class ContentTests(FleetCase):
+    """What would run where anything reads it as code, sent as every kind of content."""
+
+    def setUp(self) -> None:
+        """Nothing has fired; what is logged is kept."""
+        super().setUp()
+        FIRED.clear()
+        self.logged: list[str] = []
+        observer: Any = self.note
+        globalLogPublisher.addObserver(observer)
+        self.addCleanup(globalLogPublisher.removeObserver, observer)
+
+    def note(self, event: dict[str, Any]) -> None:
+        """Keep what is logged, as people read it."""
+        self.logged.append(formatEvent(event))
+
+    def test_the_corpus_fires(self) -> None:
+        """The corpus is no dud: read as what it is, it fires."""
+        pickle.loads(CORPUS[0])
+        self.assertEqual(FIRED, ["a pickle was read"])
+
+    def test_values_stay_bytes(self) -> None:
+        """As values of records they come out at another node as they went in, and nothing fires."""
+        fleet = self.fleet(3)
+        for place, value in enumerate(CORPUS):
+            key = hashed_key(f"corpus {place}")
+            self.done(fleet, fleet.nodes[0].put(key, f"{place}", value), 1.0)
+            found = self.done(fleet, fleet.nodes[2].get(key), 1.0)
+            self.assertEqual([record.value for record in found], [value])
+        self.assertEqual(FIRED, [])
+
+    def test_messages_stay_data(self) -> None:
+        """As methods, arguments, answers and reasons they are data or malformed, and nothing fires."""
+        for text, raw in zip(TEXTS, CORPUS, strict=True):
+            for message in (Question(1, text[:60], (raw, text, [raw])), Answer(1, {text: raw}), Told("t", (raw,))):
+                self.assertEqual(decoded(encoded(message)), message)
+            try:
+                decoded(raw)
+            except Exception as error:
+                self.assertEqual(type(error).__name__, "Malformed")
+        self.assertEqual(FIRED, [])
+
+    def test_a_team_hears_them(self) -> None:
+        """As names of devices and texts to people they reach the team as they are; no log line expands them."""
+        swarm = self.swarm(2)
+        heard: list[str] = []
+        swarm.nodes[1].on_message(heard.append)
+        texts = [text[:100] for text in TEXTS if text.isprintable()]
+        for text in texts:
+            self.done(
+                swarm,
+                swarm.nodes[0].entangled.call(swarm.nodes[1].entangled.contact, "device.message", text, changes=True),
+                0.5,
+            )
+        self.assertEqual(heard, texts)
+        self.assertEqual(FIRED, [])
+        self.assertFalse([line for line in self.logged if "<class" in line or "49" in line and "7*7" in line])
+
+    def test_any_bytes_as_methods(self) -> None:
+        """A method that nobody exposed is refused by name, whatever it is called."""
+        fleet = self.fleet(2)
+        dice = random.Random(3)
+        names = ["__class__", "endpoint.stop", "eval", *(dice.randbytes(8).hex() for _ in range(20))]
+        for name in names:
+            asked = fleet.nodes[0].endpoint.ask(fleet.nodes[1].contact, name, CORPUS[0])
+            fleet.run(1.0)
+            self.assertIn("no such method here", str(self.failureResultOf(asked).value))
+        self.assertEqual(FIRED, [])

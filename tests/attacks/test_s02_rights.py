@@ -1,0 +1,217 @@
+"""Attack S2: to do what one has no right to: others' records, older ones, an expired certificate, the wrong role."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from middleware.admission.certificate import pass_of
+from middleware.entangled.errors import NotAdmitted, Refused
+from middleware.entangled.identity import Identity
+from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.record import Record, hashed_key
+from middleware.entangled.replication.replica import FORBIDDEN
+from middleware.roles import KINDS, METHODS, ROLES, VIEWER, kind_of, may_call, may_store
+from tests.attacks.siege import SOURCE, SiegeCase
+from tests.middleware.admission.paper import NOW
+
+KEYS = ("halt", "tasks", "devices", "deployments", "signed-out", "group/7")
+NAMES = ("order", "member", "result", "verdict/1", "source", "anything")
+
+
+class MethodTests(SiegeCase):
+    """Every method, and every role."""
+
+    def test_every_method_by_every_role(self) -> None:
+        """What a role may not call does not run and is refused by its name; what it may is not refused for its role."""
+        team = self.siege()
+        house = team.houses[0]
+        ran: list[str] = []
+        for name in METHODS:
+            house.node.endpoint.expose(name, lambda peer, name=name: ran.append(name))
+        for number, role in enumerate(ROLES):
+            attacker, _ = self.insider(team, role, role, at=SOURCE._replace(port=600 + number))
+            self.every(team, attacker, (role,), ran)
+
+    def every(self, team: Any, attacker: Any, which: tuple[str, ...], ran: list[str]) -> None:
+        """Try every method, and one that nobody put into the table."""
+        contact = team.contact(team.houses[0])
+        refused = team.houses[0].node.endpoint.counters["refused"]
+        team.houses[0].node.endpoint.expose("made.up", lambda peer: ran.append("made.up"))
+        names = [*METHODS, "made.up"]
+        ran.clear()
+        asked = {name: attacker.ask(contact, name, changes=True) for name in names}
+        outcomes = {name: self.outcome(team, each, 0.05) for name, each in asked.items()}
+        team.run(1.0)
+        allowed = [name for name in names if may_call(which, name)]
+        self.assertEqual(sorted(ran), sorted(allowed), which)
+        for name in set(names) - set(allowed):
+            self.assertIsInstance(outcomes[name], Refused, name)
+            self.assertEqual(outcomes[name].code, "role", name)
+        counted = team.houses[0].node.endpoint.counters["refused"] - refused
+        self.assertEqual(counted, len(names) - len(allowed))
+
+    def test_told_by_a_viewer(self) -> None:
+        """What is told without a question is refused as well."""
+        team = self.siege()
+        ran: list[int] = []
+        team.houses[0].node.endpoint.expose("device.halt", lambda peer, number: ran.append(number), changes=True)
+        attacker, _ = self.insider(team, "eye", VIEWER)
+        attacker.tell(team.contact(team.houses[0]), "device.halt", 1)
+        team.run(1.0)
+        self.assertEqual((ran, team.houses[0].node.endpoint.counters["refused"]), ([], 1))
+
+    @settings(max_examples=60, deadline=None, derandomize=True, database=None)
+    @given(st.sets(st.sampled_from(ROLES)), st.sampled_from([*METHODS, "made.up", ""]), st.sampled_from(ROLES))
+    def test_more_roles_allow_no_less(self, which: set[str], method: str, more: str) -> None:
+        """With one role more nobody may do less, and without any nobody may do anything."""
+        self.assertLessEqual(may_call(which, method), may_call(which | {more}, method))
+        self.assertFalse(may_call((), method))
+
+
+class RecordTests(SiegeCase):
+    """Every kind of record, and every role."""
+
+    def test_every_kind_by_every_role(self) -> None:
+        """A record of a kind that its owner's role may not write is not held, and its writer is told why."""
+        team = self.siege()
+        house = team.houses[0]
+        kinds = set()
+        for number, role in enumerate(ROLES):
+            attacker, own = self.insider(team, role, role, at=SOURCE._replace(port=600 + number))
+            for key in KEYS:
+                for name in NAMES:
+                    record = Record(hashed_key(key), name, own.public, 1, "team", 600.0, b"x").signed(own)
+                    kinds.add(kind_of(record.slot))
+                    asked = attacker.ask(team.contact(house), "store", [record.packed()], changes=True)
+                    [verdict] = self.outcome(team, asked, 0.1)
+                    held = house.node.replica.holds(record)
+                    self.assertEqual(held, may_store((role,), record.slot), (role, key, name))
+                    self.assertEqual(verdict == FORBIDDEN, not held, (role, key, name))
+        self.assertEqual(kinds, set(KINDS))
+
+
+class OwnerTests(SiegeCase):
+    """The records of others."""
+
+    def setUp(self) -> None:
+        """A team of three with a record of the first, and a member gone bad."""
+        super().setUp()
+        self.team = self.siege()
+        for name in ("dog", "cat"):
+            self.team.enlist(name)
+        self.key = hashed_key("mine")
+        self.outcome(self.team, self.team.houses[0].node.put(self.key, "slot", b"true"))
+        self.outcome(self.team, self.team.houses[0].node.put(self.key, "slot", b"truer"))
+        [self.record] = self.held()
+        self.bad, self.own = self.insider(self.team, "bad", "device", "operator", "gateway", "bootstrap")
+
+    def held(self) -> list[Record]:
+        """What the record's replicas hold, which is the same everywhere."""
+        found = [house.node.replica.held(self.key) for house in self.team.houses]
+        self.assertTrue(all(each == found[0] for each in found))
+        return found[0]
+
+    def attack(self, record: Record) -> None:
+        """Bring a record in by every method that takes one, at every node."""
+        packed, key = [record.packed()], record.key
+        for house in self.team.houses:
+            contact = self.team.contact(house)
+            for method, arguments in (
+                ("store", (packed,)),
+                ("store", (packed, [600.0])),
+                ("cache", (key, packed, 60.0)),
+                ("push", (key, 1, packed, [])),
+                ("push", (key, 1, [], [[record.owner, record.name]])),
+                ("let_go", ([record.digest()[:8]],)),
+                ("alive", (0.001, bytes(8))),
+                ("goodbye", ()),
+            ):
+                self.bad.ask(contact, method, *arguments, changes=True).addErrback(lambda failure: None)
+        self.team.run(0.5)
+
+    def test_anything_of_it_changed(self) -> None:
+        """With any field changed, with another signature, or signed by another key, it is refused everywhere."""
+        other = Identity(b"z" * 32)
+        newer = replace(self.record, sequence=self.record.sequence + 9)
+        for record in (
+            replace(self.record, value=b"false"),
+            replace(self.record, value=None),
+            newer,
+            replace(newer, value=None).signed(self.own),
+            replace(newer, ttl=0.5),
+            replace(newer, lifetime="leased"),
+            replace(self.record, signature=bytes(64)),
+            newer.signed(other),
+            replace(self.record, name="slot2"),
+        ):
+            self.attack(record)
+            self.assertEqual(self.held(), [self.record])
+
+    def test_an_older_one(self) -> None:
+        """One that its owner did sign once, with a lower number, does not come back."""
+        first = Record(self.key, "slot", self.record.owner, 1, "team", self.record.ttl, b"true")
+        older = first.signed(self.team.houses[0].kept.membership.identity)
+        self.attack(older)
+        self.assertEqual(self.held(), [self.record])
+
+    def test_a_deleted_one(self) -> None:
+        """What its owner removed stays removed, whoever has kept the record."""
+        self.outcome(self.team, self.team.houses[0].node.remove(self.key, "slot"))
+        self.attack(self.record)
+        self.assertEqual([record.value for record in self.held()], [None])
+
+    @settings(max_examples=25, deadline=None, derandomize=True, database=None)
+    @given(st.data())
+    def test_any_mixture(self, data: Any) -> None:
+        """Whatever is changed in whatever way, the record holds."""
+        changed = replace(
+            self.record,
+            name=data.draw(st.sampled_from(["slot", "", "other"])),
+            owner=data.draw(st.sampled_from([self.record.owner, self.team.houses[1].public])),
+            sequence=data.draw(st.integers(0, 2**63 - 1)),
+            lifetime=data.draw(st.sampled_from(["leased", "team"])),
+            ttl=data.draw(st.floats(0.001, 1000.0)),
+            value=data.draw(st.none() | st.binary(max_size=8)),
+        )
+        if changed != self.record:
+            self.attack(changed.signed(self.own) if data.draw(st.booleans()) else changed)
+        self.assertEqual(self.held(), [self.record])
+
+
+class CertificateTests(SiegeCase):
+    """Passes that do not hold."""
+
+    def refusal(self, number: int, shown: bytes, life: Identity, secret: bytes) -> str:
+        """What a member with that pass is told, on both sides."""
+        attacker = self.attacker(self.team, life, secret, shown, SOURCE._replace(port=700 + number))
+        contact: Contact = self.team.contact(self.team.houses[0])
+        error = self.outcome(self.team, attacker.ask(contact, "ping", bytes(8), changes=True), 3.0)
+        self.assertIsInstance(error, NotAdmitted)
+        self.assertNotIn(life.public, [each.public for each in self.team.houses[0].node.overlay.contacts()])
+        return str(error.code)
+
+    def test_passes_that_do_not_hold(self) -> None:
+        """One that is over, not yet valid, somebody else's, another team's, cut short or none is refused by name."""
+        self.team = team = self.siege()
+        other = self.siege(seed=2)
+        secret = team.houses[0].kept.membership.secrets[0][1]
+        own = Identity(b"x" * 32)
+        over = team.signer.grant(own.public, "x", ("device",), NOW - 9000, 8000)
+        early = team.signer.grant(own.public, "x", ("device",), NOW + 90_000)
+        good = team.signer.grant(own.public, "x", ("device",), NOW)
+        foreign = other.signer.grant(own.public, "x", ("device",), NOW)
+        passes = {
+            "over": (pass_of(over), "expired"),
+            "early": (pass_of(early), "early"),
+            "foreign": (pass_of(foreign), "foreign"),
+            "another's": (team.houses[0].kept.membership.shown, "foreign"),
+            "cut short": (pass_of(good)[:-1], "foreign"),
+            "none": (b"", "foreign"),
+            "changed": (pass_of(good).replace(b"\xa1x", b"\xa1y"), "foreign"),
+        }
+        for number, (name, (shown, code)) in enumerate(passes.items()):
+            self.assertEqual(self.refusal(number, shown, own, secret), code, name)

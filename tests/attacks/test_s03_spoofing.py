@@ -1,0 +1,171 @@
+"""Attack S3: datagrams from where they do not come from, answers from elsewhere, with guessed numbers, or unasked."""
+
+from __future__ import annotations
+
+import random
+from typing import Any
+
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule, run_state_machine_as_test
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.entangled.errors import NoAnswer
+from middleware.entangled.identity import Identity
+from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.network.network import Address
+from middleware.entangled.wire.greeting import HERE, WHO, here, who
+from middleware.entangled.wire.hail import ECHO, HAIL
+from middleware.entangled.wire.message import Answer, Failure, Question, encoded
+from middleware.entangled.wire.session import DATA, INIT, RESP, derived_key
+from tests.fuzz.ground import STRANGER, TEAM, Ground
+
+SEQUENCES = settings(max_examples=100, stateful_step_count=25, deadline=None, derandomize=True, database=None)
+KINDS = (INIT, RESP, DATA, WHO, HERE, 0x16, 0x17, 0x18, HAIL, ECHO, 0x03, 0x00, 0xFF)
+PLACES = (STRANGER, Address("10.0.0.2", 2), Address("10.0.0.1", 1), Address("::1", 9), Address("~" + "0" * 40, 1))
+
+
+def member(ground: Ground) -> Contact:
+    """The member that has a session with the target."""
+    return Contact(ground.identity.public, ground.other.address)
+
+
+def sealed(ground: Ground, plain: bytes) -> bytes:
+    """A datagram of that member."""
+    return next(iter(ground.other._sessions.values())).seal(plain)
+
+
+class Spoofing(RuleBasedStateMachine):
+    """A node with a session, and somebody who can write any address on a datagram but knows no key."""
+
+    @initialize(seed=st.integers(0, 99))
+    def begin(self, seed: int) -> None:
+        """A node with a session and a question under way that nobody will answer."""
+        self.ground = Ground()
+        self.dice = random.Random(seed)
+        self.answers: list[Any] = []
+        silent = Contact(Identity(b"s" * 32).public, Address("10.0.0.7", 7))
+        self.ground.target.ask(silent, "echo", 1).addBoth(self.answers.append)
+        self.ground.target.ask(member(self.ground), "ping", changes=True).addBoth(self.answers.append)
+        self.before = self.ground.state()
+
+    def teardown(self) -> None:
+        """Leave nothing."""
+        if hasattr(self, "ground"):
+            self.ground.stop()
+
+    def fire(self, datagram: bytes, source: Address) -> None:
+        """Hand over one datagram; it may be answered with as much as it had."""
+        if self.ground.shoot(datagram, source) > len(datagram):
+            raise AssertionError("more was sent than had come")
+
+    @rule(kind=st.sampled_from(KINDS), size=st.integers(0, 1460), source=st.sampled_from(PLACES))
+    def anything(self, kind: int, size: int, source: Address) -> None:
+        """Random bytes of a kind."""
+        self.fire(bytes([kind]) + self.dice.randbytes(size), source)
+
+    @rule(index=st.integers(0, 39), source=st.sampled_from(PLACES))
+    def recorded(self, index: int, source: Address) -> None:
+        """What came before, from anywhere."""
+        self.fire(self.ground.recorded[index % len(self.ground.recorded)], source)
+
+    @rule(index=st.integers(0, 39), bit=st.integers(0, 11199), source=st.sampled_from(PLACES))
+    def bent(self, index: int, bit: int, source: Address) -> None:
+        """What came before, with one bit turned."""
+        datagram = bytearray(self.ground.recorded[index % len(self.ground.recorded)])
+        datagram[bit // 8 % len(datagram)] ^= 1 << bit % 8
+        if datagram[0] != WHO:  # a nonce that is another one makes no other greeting
+            self.fire(bytes(datagram), source)
+
+    @rule(source=st.sampled_from(PLACES), counter=st.integers(0, 2**64 - 1), size=st.integers(16, 200))
+    def guessed_session(self, source: Address, counter: int, size: int) -> None:
+        """DATA under the true number of a session, which travels in clear."""
+        [index] = list(self.ground.target._sessions)[:1]
+        head = bytes([DATA]) + index.to_bytes(4, "little") + counter.to_bytes(8, "little")
+        self.fire(head + self.dice.randbytes(size), source)
+
+    @rule(source=st.sampled_from(PLACES), size=st.integers(50, 1300))
+    def guessed_handshake(self, source: Address, size: int) -> None:
+        """RESP under the true number of a handshake that is under way."""
+        for index in list(self.ground.target._peers._openings)[:1]:
+            self.fire(bytes([RESP]) + index.to_bytes(4, "little") + self.dice.randbytes(size), source)
+
+    @rule(source=st.sampled_from(PLACES), key=st.booleans())
+    def greeting(self, source: Address, key: bool) -> None:
+        """A HERE that nobody asked for, under another key or even under the team's."""
+        secret = derived_key(TEAM, b"greet") if key else bytes(32)
+        self.fire(here(secret, self.dice.randbytes(16), self.dice.randbytes(32), self.dice), source)
+
+    @invariant()
+    def nothing_changed(self) -> None:
+        """What the node remembers is what it was, and nothing was answered that nobody said."""
+        if hasattr(self, "ground"):
+            assert self.ground.state() == self.before
+            assert self.answers == []
+
+
+class SpoofingTests(SynchronousTestCase):
+    """Whoever knows no key."""
+
+    def test_any_sequence(self) -> None:
+        """No sequence of forged, bent, recorded and guessed datagrams changes what a node remembers."""
+        run_state_machine_as_test(Spoofing, settings=SEQUENCES)
+
+    def test_the_machine_notices(self) -> None:
+        """A node that believed one of them is found out."""
+        ground = Ground()
+        self.addCleanup(ground.stop)
+        before = ground.state()
+        ground.shoot(sealed(ground, encoded(Question(7, "add", (1,)))), member(ground).address)
+        self.assertNotEqual(ground.state(), before)
+
+
+class ElsewhereTests(SynchronousTestCase):
+    """Answers that come from elsewhere, or from the wrong one."""
+
+    def setUp(self) -> None:
+        """A node with a session to another one."""
+        self.ground = Ground()
+        self.addCleanup(self.ground.stop)
+        self.counters = self.ground.target.counters
+
+    def test_answer_of_another_member(self) -> None:
+        """A member that guessed the number of a question to somebody else does not get its answer believed."""
+        ground = self.ground
+        silent = Contact(Identity(b"s" * 32).public, Address("10.0.0.7", 7))
+        asked = ground.target.ask(silent, "echo", 1)
+        [number] = list(ground.target._asker._inquiries)
+        for message in (Answer(number, "lie"), Failure(number, "refused", "lie")):
+            ground.shoot(sealed(ground, encoded(message)), member(ground).address)
+        self.assertNoResult(asked)
+        ground.clock.advance(5.0)
+        self.failureResultOf(asked, NoAnswer)
+
+    def test_greeting_from_elsewhere(self) -> None:
+        """A HERE from another address than was greeted is dropped and counted, though its token be right."""
+        ground = self.ground
+        greeted = ground.target.greet(Address("10.0.0.8", 8))
+        [token] = list(ground.target._greeter._pending)
+        key = derived_key(TEAM, b"greet")
+        ground.shoot(here(key, token, Identity(b"e" * 32).public, random.Random(1)), STRANGER)
+        self.assertNoResult(greeted)
+        self.assertEqual(self.counters["misdirected"], 1)
+        ground.clock.advance(5.0)
+        self.failureResultOf(greeted, NoAnswer)
+
+    def test_greeting_with_a_guessed_token(self) -> None:
+        """One from the right address with another token is dropped as well."""
+        ground = self.ground
+        at = Address("10.0.0.8", 8)
+        greeted = ground.target.greet(at)
+        key = derived_key(TEAM, b"greet")
+        ground.shoot(here(key, bytes(16), Identity(b"e" * 32).public, random.Random(1)), at)
+        self.assertNoResult(greeted)
+        ground.clock.advance(5.0)
+        self.failureResultOf(greeted, NoAnswer)
+
+    def test_who_of_a_stranger(self) -> None:
+        """Who does not hold the team's key hears nothing on a WHO."""
+        datagram = who(bytes(32), bytes(16), random.Random(1))
+        self.assertEqual(self.ground.shoot(datagram), 0)
+        self.assertEqual(self.counters["forged"], 1)

@@ -1,0 +1,194 @@
+"""Attack S4: to play a recording: at once, later, after a restart, to others, from elsewhere, to other teams."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from typing import Any
+
+from twisted.internet.defer import Deferred
+
+from middleware.entangled.network.network import Address
+from middleware.entangled.network.switchboard import SwitchboardNetwork
+from middleware.entangled.record import hashed_key
+from middleware.entangled.wire.door import Noted
+from middleware.entangled.wire.session import MAX_RESPONSES, MAX_UNCONFIRMED
+from tests.attacks.siege import ClosedTeam, SiegeCase, Tape, network_of
+from tests.fuzz.ground import state_of
+
+ELSEWHERE = Address("10.9.9.9", 99)
+HOUR = 3600.0
+
+
+class ReplayCase(SiegeCase):
+    """A team of four whose work of some seconds was recorded whole."""
+
+    def setUp(self) -> None:
+        """Record joins, writes, reads, watches, calls and a removal."""
+        super().setUp()
+        self.tape = Tape()
+        self.runs: list[int] = []
+        self.sent: Counter[int] = Counter()
+        self.team = self.siege()
+        self.tape.tap(network_of(self.team.houses[0]))
+        self.team.tape = self.tape
+        self.expose()
+        for name in ("dog", "cat", "pig"):
+            self.team.enlist(name, "device", "operator")
+        self.work(self.team)
+        self.team.tape = None
+
+    def expose(self) -> None:
+        """A method that counts how often it ran."""
+
+        def add(peer: object, number: int) -> int:
+            self.runs.append(number)
+            return number
+
+        self.team.houses[0].node.endpoint.expose("add", add, changes=True)
+
+    def work(self, team: ClosedTeam) -> None:
+        """What a team does: write, read, watch, remove, call."""
+        first, second = team.houses[1].node, team.houses[2].node
+        key = hashed_key("task")
+        team.houses[3].node.watch(key, lambda records: None)
+        done: list[Deferred[Any]] = [first.put(key, "a", b"1"), second.put(key, "b", b"2" * 3000)]
+        team.run(1.0)
+        done += [first.get(key), second.remove(key, "b"), first.put(hashed_key("here"), "dog", b"x", "leased")]
+        team.run(1.0)
+        done += [first.call(team.contact(team.houses[0]), "add", number, changes=True) for number in range(5)]
+        team.run(2.0)
+        for each in done:
+            self.successResultOf(each)
+
+    def states(self, team: ClosedTeam) -> list[str]:
+        """The hash of what each node remembers that lasts."""
+        found = []
+        for house in team.houses:
+            endpoint = house.node.endpoint
+            half = endpoint._half_open
+            self.assertLessEqual(len(half._unconfirmed), MAX_UNCONFIRMED)
+            self.assertLessEqual(len(half._responses), MAX_RESPONSES)
+            # What an INIT that is fresh enough opens and nobody can confirm: bounded, and nothing is sent by it.
+            for session in list(half._unconfirmed.values()):
+                half.forget(session)
+            half.clear()
+            # A recording of an earlier life looks like a copy of that node: said once for each member, and no more.
+            self.assertLessEqual(len(endpoint._noted._said), len(team.houses))
+            timers = sorted(call.getTime() for call in team.clock.getDelayedCalls())
+            noted, endpoint._noted = endpoint._noted, Noted()
+            found.append(state_of([house.node, house.node.store, house.team.roll, timers]))
+            endpoint._noted = noted
+        return found
+
+    def replay(
+        self,
+        team: ClosedTeam,
+        to: Callable[[int], SwitchboardNetwork] | None = None,
+        source: Address | None = None,
+    ) -> None:
+        """Send the whole tape again in no time; nobody may run, log or remember anything because of it."""
+        places = [house.node._network for house in team.houses]
+        known: list[Any] = [network for network, _, _ in self.tape.heard]
+        number = {id(network): place for place, network in enumerate(dict.fromkeys(known))}
+        before, ran = self.states(team), list(self.runs)
+        received = sum(len(datagram) for _, datagram, _ in self.tape.heard)
+        bytes_out = self.bytes_out(team)
+        for network, datagram, came_from in list(self.tape.heard):
+            place: Any = to(number[id(network)]) if to is not None else places[number[id(network)]]
+            if place.receiver is not None:
+                place.receiver(datagram, source or came_from)
+        self.assertEqual(self.states(team), before)
+        self.assertEqual(self.runs, ran)
+        self.assertLessEqual(self.bytes_out(team) - bytes_out, received)
+
+    def bytes_out(self, team: ClosedTeam) -> int:
+        """Bytes that a team's nodes have sent since it was frozen."""
+        return self.sent[id(team)]
+
+    def freeze(self, team: ClosedTeam) -> None:
+        """Let nothing that is sent arrive: an answer to a recording would be the work of the one who plays it."""
+        for house in team.houses:
+            network: Any = house.node._network
+
+            def count(datagram: bytes, to: Address) -> None:
+                self.sent[id(team)] += len(datagram)
+
+            network.send = count
+
+
+class ReplayTests(ReplayCase):
+    """The tape, whole."""
+
+    def test_the_tape_is_rich(self) -> None:
+        """The recording has each kind of datagram that a team sends, and many of them."""
+        kinds = {datagram[0] for _, datagram, _ in self.tape.heard}
+        self.assertGreaterEqual(kinds, {0x11, 0x12, 0x13, 0x14, 0x15})
+        self.assertGreater(len(self.tape.heard), 200)
+        self.assertEqual(self.runs, [0, 1, 2, 3, 4])
+
+    def test_at_once(self) -> None:
+        """Played to the same nodes at once, from where it came."""
+        self.freeze(self.team)
+        self.replay(self.team)
+
+    def test_from_elsewhere(self) -> None:
+        """Played at once from another address: no session moves there."""
+        self.freeze(self.team)
+        self.replay(self.team, source=ELSEWHERE)
+        for house in self.team.houses:
+            sessions = house.node.endpoint._sessions.values()
+            self.assertNotIn(ELSEWHERE, [session.contact.address for session in sessions])
+
+    def test_an_hour_later(self) -> None:
+        """Played after an hour, when no response is remembered any more."""
+        self.team.run(HOUR)
+        self.freeze(self.team)
+        self.replay(self.team)
+
+    def test_to_others(self) -> None:
+        """Played to other members of the team than it was sent to."""
+        self.freeze(self.team)
+        count = len(self.team.houses)
+        self.replay(self.team, to=lambda place: network_of(self.team.houses[(place + 1) % count]))
+
+    def test_after_a_restart(self) -> None:
+        """Played to the next life of each node, which shares no session with the one before."""
+        for house in self.team.houses:
+            self.team.close(house, is_sudden=True)
+        self.team.run(1.0)
+        for house in self.team.houses:
+            self.team.open(house)
+            self.team.run(0.5)
+        self.expose()
+        self.team.run(5.0)
+        self.freeze(self.team)
+        self.replay(self.team)
+
+    def test_to_another_team(self) -> None:
+        """Played to another team, which answers nothing at all."""
+        other = self.siege(seed=2)
+        for name in ("dog", "cat", "pig"):
+            other.enlist(name)
+        other.run(3.0)
+        self.freeze(other)
+        self.replay(other, to=lambda place: network_of(other.houses[place]))
+        self.assertEqual(self.bytes_out(other), 0)
+
+    def test_after_a_rotation(self) -> None:
+        """Played when the team has another secret and nobody goes by the one before: nobody answers a single one."""
+        members = [house.public for house in self.team.houses]
+        self.team.tell(self.team.signer.rotate(2, members, self.team.wall(), 5.0, self.team.dice))
+        self.team.run(60.0)
+        for house in self.team.houses:
+            self.assertEqual(len(house.node.endpoint._peers.ring), 1)
+        self.freeze(self.team)
+        self.replay(self.team)
+
+    def test_the_hash_notices(self) -> None:
+        """One datagram that nobody played before does change the hash."""
+        before = self.states(self.team)
+        asked = self.team.houses[1].node.call(self.team.contact(self.team.houses[0]), "add", 9, changes=True)
+        self.team.run(0.1)
+        self.successResultOf(asked)
+        self.assertNotEqual(self.states(self.team), before)

@@ -1,0 +1,162 @@
+"""Attack S5: parts that never make a whole, overlap, claim to be many, or come from a thousand members at once."""
+
+from __future__ import annotations
+
+import random
+import tracemalloc
+from collections import Counter
+from typing import Any
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.entangled.clock import HeapClock
+from middleware.entangled.identity import Identity
+from middleware.entangled.wire.courier import MAX_IN, MAX_IN_OF_PEER, Courier
+from middleware.entangled.wire.flow import IDLE_S
+from middleware.entangled.wire.message import MAX_MESSAGE, MAX_PARTS, PART, PART_BYTES, Key
+from tests.attacks.siege import OneSession
+from tests.fuzz.ground import Ground
+
+KIB = 1024
+HALF = MAX_MESSAGE // 2
+
+
+def part(number: int, total: int, place: int, data: bytes, is_wanted: bool = False) -> bytes:
+    """A PART as anybody can make it."""
+    head = bytes([PART, 2 if is_wanted else 0]) + number.to_bytes(8, "little")
+    return head + total.to_bytes(4, "little") + place.to_bytes(2, "little") + data
+
+
+class CourierCase(SynchronousTestCase):
+    """A courier, and members by their keys."""
+
+    def setUp(self) -> None:
+        """A courier that delivers to a list."""
+        self.clock = HeapClock()
+        self.counters: Counter[str] = Counter()
+        self.delivered: list[tuple[bytes, int]] = []
+        self.receipts: list[bytes] = []
+        self.courier = Courier(
+            self.clock,
+            lambda public, plain: self.receipts.append(plain),
+            lambda session, key, data: self.delivered.append((session.contact.public, len(data))),
+            lambda public: 0.3,
+            lambda number, public: False,
+            lambda number, public: None,
+            self.counters,
+        )
+        self.addCleanup(self.courier.stop)
+
+    def take(self, member: int, plain: bytes) -> None:
+        """Let a part of a member come in."""
+        session: Any = OneSession(member.to_bytes(32, "little"))
+        self.courier.on_part(session, plain)
+
+    def bytes_in(self) -> int:
+        """What is reserved for parcels that come in."""
+        return self.courier._bytes_in.total()
+
+    def send_whole(self, member: int, number: int, size: int) -> None:
+        """A lawful message in its parts, in order."""
+        for place in range(-(-size // PART_BYTES)):
+            here = min(PART_BYTES, size - place * PART_BYTES)
+            self.take(member, part(number, size, place, bytes(here), True))
+
+
+class FragmentTests(CourierCase):
+    """What one or many may pile up."""
+
+    def test_never_completed(self) -> None:
+        """One member has at most its own share in assembly, and after ten seconds nothing any more."""
+        for number in range(2000):
+            self.take(1, part(number, HALF, 0, bytes(PART_BYTES)))
+        self.assertLessEqual(self.bytes_in(), MAX_IN_OF_PEER)
+        self.assertGreater(self.counters["crowded"], 1900)
+        self.clock.advance(IDLE_S + 2.0)
+        self.assertEqual((self.bytes_in(), len(self.courier._assemblies)), (0, 0))
+
+    def test_lies_about_its_size(self) -> None:
+        """Parts beyond the end, 65,535 of them, too large ones and other totals are malformed and reserve nothing."""
+        wrong = (
+            part(1, 2**32 - 1, 0, bytes(PART_BYTES)),
+            part(1, MAX_MESSAGE + 1, 0, bytes(PART_BYTES)),
+            part(1, HALF, 65535, bytes(PART_BYTES)),
+            part(1, HALF, MAX_PARTS, bytes(PART_BYTES)),
+            part(1, HALF, 0, bytes(PART_BYTES - 1)),
+            part(1, 0, 0, b""),
+            part(1, 10, 1, b""),
+        )
+        for plain in wrong:
+            self.take(1, plain)
+        self.assertEqual((self.counters["malformed"], self.bytes_in()), (len(wrong), 0))
+        self.take(1, part(1, HALF, 0, bytes(PART_BYTES)))
+        self.take(1, part(1, HALF - 5, 1, bytes(PART_BYTES)))
+        self.assertEqual(self.counters["malformed"], len(wrong) + 1)
+
+    def test_overlapping(self) -> None:
+        """Of two parts for one place the message is as long as it said, and it is delivered once."""
+        size = 3 * PART_BYTES
+        for fill in (b"a", b"b", b"a"):
+            for place in (0, 2):
+                self.take(1, part(1, size, place, fill * PART_BYTES))
+        self.take(1, part(1, size, 1, b"c" * PART_BYTES))
+        self.take(1, part(1, size, 1, b"d" * PART_BYTES))
+        self.assertEqual(self.delivered, [((1).to_bytes(32, "little"), size)])
+        self.assertEqual(self.counters["repeated"], 1)
+
+    def test_interleaved_from_a_thousand(self) -> None:
+        """A thousand members with parcels that they never finish stay within the cap, also in real memory."""
+        tracemalloc.start()
+        self.addCleanup(tracemalloc.stop)
+        base, _ = tracemalloc.get_traced_memory()
+        for round_ in range(8):
+            for member in range(1000):
+                self.take(member, part(round_ // 4, 64 * KIB, round_ % 4, bytes(PART_BYTES)))
+        used, _ = tracemalloc.get_traced_memory()
+        self.assertLessEqual(self.bytes_in(), MAX_IN)
+        self.assertLess(used - base, MAX_IN * 1.1)
+
+    def test_others_get_through(self) -> None:
+        """With all the room taken by parcels that hardly grow, one of 64 KiB comes in within two seconds."""
+        for member in range(2, 200):
+            self.take(member, part(1, 64 * KIB, 0, bytes(PART_BYTES)))
+        self.assertGreater(self.bytes_in(), MAX_IN - 64 * KIB)
+        for second in range(20):
+            self.clock.advance(0.1)
+            for member in range(2, 200):
+                if second % 5 == 0:
+                    self.take(member, part(1, 64 * KIB, second + 1, bytes(PART_BYTES)))
+            self.send_whole(1, 1, 64 * KIB)
+            if self.delivered:
+                break
+        self.assertEqual(self.delivered, [((1).to_bytes(32, "little"), 64 * KIB)])
+
+    def test_busy_ones_are_not_pushed_out(self) -> None:
+        """A parcel that grows quickly is not what makes room for others."""
+        for member in range(2, 120):
+            self.take(member, part(1, 64 * KIB, 0, bytes(PART_BYTES)))
+        size = 60 * KIB
+        for place in range(30):
+            self.take(1, part(1, size, place, bytes(PART_BYTES)))
+        self.clock.advance(1.5)
+        for member in range(200, 300):
+            self.take(member, part(1, 64 * KIB, 0, bytes(PART_BYTES)))
+        self.assertTrue(((1).to_bytes(32, "little"), Key(False, 1)) in self.courier._assemblies)
+
+
+class EndToEndTests(SynchronousTestCase):
+    """A member that sends parts by hand, and a node that goes on working."""
+
+    def test_a_transfer_beside(self) -> None:
+        """While a member fills its share with parcels that never end, another message of 64 KiB of its own passes."""
+        ground = Ground()
+        self.addCleanup(ground.stop)
+        session = next(iter(ground.other._sessions.values()))
+        dice = random.Random(1)
+        for number in range(500):
+            plain = part(dice.getrandbits(60), HALF, number % 300, bytes(PART_BYTES))
+            ground.shoot(session.seal(plain), ground.other.address)
+        asked = ground.other.ask(ground.contact, "echo", bytes(64 * KIB), timeout=30.0)
+        ground.clock.advance(IDLE_S + 20.0)
+        self.assertEqual(len(self.successResultOf(asked)), 64 * KIB)
+        self.assertEqual(Identity(b"o" * 32).public, ground.identity.public)

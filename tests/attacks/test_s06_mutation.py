@@ -1,0 +1,90 @@
+"""Attack S6: whatever bytes there are, wherever bytes are taken: a bounded run of every target of ``tests/fuzz``."""
+
+from __future__ import annotations
+
+import random
+import time
+from collections.abc import Callable
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from twisted.trial.unittest import SynchronousTestCase
+
+from tests.fuzz import carried, decoder, envelope, handshake, paper, raw
+from tests.fuzz.ground import Violation
+from tests.fuzz.runner import mutated, seeds
+
+TARGETS: dict[str, tuple[Callable[[bytes], None], int]] = {
+    "raw": (raw.check, 150),
+    "envelope": (envelope.check, 150),
+    "handshake": (handshake.check, 100),
+    "decoder": (decoder.check, 1000),
+    "paper": (paper.check, 3000),
+    "carried": (carried.check, 600),
+}
+BOUNDED = settings(max_examples=300, deadline=None, derandomize=True, database=None)
+SLOWEST_S = 0.25
+"""For one input: the promise is a millisecond on a quiet machine; this is for a busy one, with the checks around."""
+
+
+class MutationTests(SynchronousTestCase):
+    """Nothing raises, nothing is logged, what is refused leaves no trace, and no answer is longer than its question."""
+
+    def fire(self, name: str, seed: int) -> None:
+        """Fire the kept inputs and some mutations of them."""
+        check, count = TARGETS[name]
+        inputs, dice = seeds(name), random.Random(f"s6/{name}/{seed}")
+        self.assertGreater(len(inputs), 5)
+        for data in inputs + [mutated(dice, inputs) for _ in range(count)]:
+            check(data)
+
+    def test_open_port(self) -> None:
+        """Whatever a stranger sends to a port."""
+        self.fire("raw", 1)
+
+    def test_sealed(self) -> None:
+        """Whatever a member seals."""
+        self.fire("envelope", 1)
+
+    def test_handshakes(self) -> None:
+        """Whatever stands in a handshake."""
+        self.fire("handshake", 1)
+
+    def test_decoders(self) -> None:
+        """Whatever a decoder is given."""
+        self.fire("decoder", 1)
+
+    def test_certificates_knocks_rolls(self) -> None:
+        """Whatever is shown as a pass, told as a statement, knocked or welcomed with."""
+        self.fire("paper", 1)
+
+    def test_carried(self) -> None:
+        """Whatever is to be carried, was carried, or is asked of the mirror."""
+        self.fire("carried", 1)
+
+    @BOUNDED
+    @given(st.integers(0, 255), st.binary(max_size=200))
+    def test_any_paper(self, kind: int, data: bytes) -> None:
+        """Any bytes at all, and any change of what is lawful."""
+        paper.check(bytes([kind]) + data)
+
+    def test_paper_is_quick(self) -> None:
+        """No statement, pass, knock or welcome of any kind takes long to refuse, not even a large one."""
+        dice = random.Random(8)
+        large = [bytes([kind]) + dice.randbytes(65_000) for kind in range(4)]
+        large += [bytes([kind]) + b"\x91" * 65_000 for kind in range(4)]
+        large += [bytes([kind]) + b"\xdd\xff\xff\xff\xff" * 10_000 for kind in range(4)]
+        for data in large:
+            began = time.thread_time()
+            paper.check(data)
+            self.assertLess(time.thread_time() - began, SLOWEST_S)
+
+    def test_the_targets_notice(self) -> None:
+        """The lawful ones are believed, so that a target which refuses everything would be found out."""
+        for kind, each in paper.LAWFUL.items():
+            for place, whole in enumerate(each):
+                paper.check(bytes([paper.KINDS.index(kind) + 4 * place]) + whole)
+        self.patch(paper, "GENUINE", set())
+        for kind in ("statement", "pass", "knock", "welcome"):
+            whole = paper.LAWFUL[kind][0]
+            self.assertRaises(Violation, paper.check, bytes([paper.KINDS.index(kind)]) + whole)

@@ -1,0 +1,236 @@
+"""Attack S7: to make a node work more than it costs: floods of handshakes, knocks, greetings, hails."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from typing import Any
+
+from twisted.logger import LogLevel, globalLogPublisher
+
+from middleware.admission import certificate, knock, reception
+from middleware.admission.code import drawn
+from middleware.admission.roll import invitation_id
+from middleware.entangled.identity import Identity, exchange_key
+from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.network.network import Address
+from middleware.entangled.wire import answerer
+from middleware.entangled.wire import endpoint as wire
+from middleware.entangled.wire.endpoint import Endpoint
+from middleware.entangled.wire.greeting import MOST_RATE, QUIET_RATE
+from middleware.entangled.wire.hail import HAIL_BYTES, RATE, hail
+from middleware.entangled.wire.message import Question, encoded
+from middleware.entangled.wire.session import (
+    INIT,
+    MAC,
+    MAX_RESPONSES,
+    MAX_UNCONFIRMED,
+    Acceptance,
+    Credentials,
+    Hello,
+    Invitation,
+)
+from tests.attacks.siege import SOURCE, ClosedTeam, SiegeCase, network_of
+
+PER_SECOND = 2000
+SECONDS = 3
+
+
+class FloodCase(SiegeCase):
+    """A node of a closed team whose costly deeds are counted while it is flooded."""
+
+    def setUp(self) -> None:
+        """Count exchanges of keys, signatures checked, bytes and log lines."""
+        super().setUp()
+        self.team: ClosedTeam = self.siege()
+        self.house = self.team.houses[0]
+        port: Any = network_of(self.house)
+        self.network = port
+        self.exchanges: list[float] = []
+        self.checked: list[float] = []
+        self.lines: list[str] = []
+        self.sent: list[tuple[bytes, Address]] = []
+        accept, is_proof, send = Acceptance, certificate.is_proof, self.network.send
+
+        def accepted(*arguments: Any) -> Acceptance:
+            self.exchanges.append(self.team.clock.seconds())
+            return accept(*arguments)
+
+        def proved(*arguments: Any) -> bool:
+            self.checked.append(self.team.clock.seconds())
+            return is_proof(*arguments)
+
+        def sends(datagram: bytes, to: Address) -> None:
+            self.sent.append((datagram, to))
+            send(datagram, to)
+
+        self.patch(wire, "Acceptance", accepted)
+        self.patch(reception, "is_proof", proved)
+        port.send = sends
+        observer: Any = self.note
+        globalLogPublisher.addObserver(observer)
+        self.addCleanup(globalLogPublisher.removeObserver, observer)
+
+    def note(self, event: dict[str, Any]) -> None:
+        """Keep what is logged."""
+        if event["log_level"] >= LogLevel.info:
+            self.lines.append(str(event.get("log_format")))
+
+    def flood(self, made: Callable[[int], bytes], seconds: int = SECONDS) -> int:
+        """Send what ``made`` makes from a thousand addresses; the bytes that were sent by the flood."""
+        total = 0
+        for number in range(PER_SECOND * seconds):
+            datagram = made(number)
+            total += len(datagram)
+            assert self.network.receiver is not None
+            self.network.receiver(datagram, Address(f"127.{number % 1000 // 250}.0.{number % 250}", 999))
+            if not number % 100:
+                self.team.run(100 / PER_SECOND)
+        return total
+
+
+class FloodTests(FloodCase):
+    """What each flood costs."""
+
+    def test_forged_handshakes(self) -> None:
+        """INITs of a good form and a wrong mac cost a hash each: no keys are exchanged, nothing is sent or kept."""
+        dice = random.Random(1)
+        before = len(self.sent)
+        self.flood(lambda number: bytes([INIT]) + dice.randbytes(1300))
+        self.assertEqual((len(self.exchanges), self.lines), (0, []))
+        self.assertEqual([to for _, to in self.sent[before:] if to.port == 999], [])
+
+    def handshakes(self) -> Callable[[int], bytes]:
+        """INITs of who holds the team's secret (a member gone bad), with ever new ephemeral keys."""
+        own = Credentials.of(Identity(b"i" * 32), self.house.team.secret)
+        remote, dice = exchange_key(self.house.public), random.Random(2)
+        hello = Hello(room=640)
+        kept: list[bytes] = []
+
+        def made(number: int) -> bytes:
+            if len(kept) < 1500:
+                kept.append(Invitation(own, remote, dice.randbytes(32), number + 1, b"", hello).datagram())
+            return kept[number % len(kept)]
+
+        return made
+
+    def test_handshakes_of_a_member(self) -> None:
+        """From a member that floods without reading what comes back, as many keys are exchanged as one second has."""
+        received = self.flood(self.handshakes())
+        self.assertLessEqual(len(self.exchanges), QUIET_RATE * (SECONDS + 2))
+        back = sum(len(datagram) for datagram, to in self.sent if to.port == 999)
+        self.assertLessEqual(back, received)
+        half = self.house.node.endpoint._half_open
+        self.assertLessEqual(len(half._responses), MAX_RESPONSES)
+        self.assertLessEqual(len(half._unconfirmed), MAX_UNCONFIRMED)
+        self.assertGreater(self.house.node.endpoint.counters["crowded"], PER_SECOND / 2)
+        self.assertLess(len(self.lines), 5)
+        self.assertLess(QUIET_RATE, MOST_RATE)
+
+    def test_others_still_come_in(self) -> None:
+        """While a member floods, another one opens a session in one more round trip, by the cookie."""
+        made = self.handshakes()
+        self.flood(made, 1)
+        friend, _ = self.insider(self.team, "friend")
+        asked = friend.ask(self.team.contact(self.house), "ping", bytes(8), changes=True)
+        self.flood(made, 1)
+        self.assertEqual(len(self.successResultOf(asked)), 8)
+
+    def test_knocks(self) -> None:
+        """KNOCKs that name no invitation cost a look into a table; few are answered and few lines are logged."""
+        dice = random.Random(3)
+        before = len(self.sent)
+        received = self.flood(lambda number: bytes([knock.KNOCK]) + dice.randbytes(knock.KNOCK_BYTES - 1))
+        answers = [datagram for datagram, to in self.sent[before:] if to.port == 999]
+        self.assertLessEqual(len(answers), reception.HINTS * (SECONDS + 1))
+        self.assertLessEqual(sum(map(len, answers)), received)
+        self.assertEqual((self.checked, len(self.exchanges)), ([], 0))
+        self.assertLessEqual(len(self.lines), 20 + SECONDS)
+
+    def test_knocks_of_who_knows_the_id(self) -> None:
+        """KNOCKs that name a true invitation and do not open are dropped; no signature is checked for any."""
+        code = self.team.invite("dog")
+        [invite] = self.team.houses[0].team.roll.invites()
+        self.assertTrue(code)
+        dice = random.Random(4)
+        head = bytes([knock.KNOCK]) + invitation_id(invite.public)
+        before = len(self.sent)
+        self.flood(lambda number: head + dice.randbytes(knock.KNOCK_BYTES - len(head)), 1)
+        self.assertEqual(self.checked, [])
+        self.assertEqual([to for _, to in self.sent[before:] if to.port == 999], [])
+
+    def test_knocks_of_who_has_the_code(self) -> None:
+        """Of KNOCKs with a true code, each by another key, so many signatures are checked as one second has."""
+        code, packed = self.team.signer.invite("pig", ("device",), 1, self.team.wall(), 900.0, random.Random(5))
+        self.team.tell(packed)
+        self.team.run(1.0)
+        dice = random.Random(6)
+        kept = [
+            knock.knock(code.key, Identity(dice.randbytes(32)).public, dice.randbytes(32), "", dice) for _ in range(400)
+        ]
+        received = self.flood(lambda number: kept[number % 400], 2)
+        self.assertLessEqual(len(self.checked), reception.RATE * 4)
+        back = sum(len(datagram) for datagram, to in self.sent if to.port == 999)
+        self.assertLessEqual(back, received)
+        self.team.run(3.0)
+        self.assertEqual(len(self.team.members()), 2)
+        self.assertNotEqual(drawn(self.team.signer.public, dice).text, code.text)
+
+    def test_hails(self) -> None:
+        """Of HAILs twenty a second are answered, each with as much as came."""
+        before = len(self.sent)
+        self.flood(lambda number: hail(number.to_bytes(16, "little")))
+        answers = [datagram for datagram, to in self.sent[before:] if to.port == 999]
+        self.assertLessEqual(len(answers), RATE * (SECONDS + 1))
+        self.assertLessEqual({len(datagram) for datagram in answers}, {HAIL_BYTES})
+
+    def test_questions_of_a_member(self) -> None:
+        """Of questions without end a member gets so many answered as it may ask; the others are refused as busy."""
+        bad, _ = self.insider(self.team, "bad")
+        contact = self.team.contact(self.house)
+        self.outcome(self.team, bad.ask(contact, "ping", bytes(8), changes=True))
+        ran: list[float] = []
+        self.house.node.endpoint.expose("device.settings", lambda peer: ran.append(self.team.clock.seconds()))
+        session = next(iter(bad._sessions.values()))
+        began = self.team.clock.seconds()
+        for number in range(15_000):
+            plain = encoded(Question(number, "device.settings", ()))
+            assert self.network.receiver is not None
+            self.network.receiver(session.seal(plain), SOURCE)
+            if not number % 1000:
+                self.team.run(0.1)
+        seconds = self.team.clock.seconds() - began
+        self.assertLessEqual(len(ran), answerer.QUESTIONS_AT_ONCE + answerer.QUESTIONS * seconds)
+        self.assertGreater(len(ran), answerer.QUESTIONS_AT_ONCE)
+        self.assertGreater(self.house.node.endpoint.counters["busy"], 2000)
+        self.assertIn(b"busy", b"".join(map(str.encode, self.failures(bad, contact))))
+        friend, _ = self.insider(self.team, "friend", at=SOURCE._replace(port=667))
+        self.outcome(self.team, friend.ask(contact, "device.settings"))
+        self.assertEqual(ran[-1], max(ran))
+        self.team.run(10.0)
+        self.outcome(self.team, bad.ask(contact, "device.settings"))
+        self.assertGreater(ran[-1], began + seconds + 5.0)
+
+    def failures(self, bad: Endpoint, contact: Contact) -> list[str]:
+        """The code of what is refused just now."""
+        outcome = self.outcome(self.team, bad.ask(contact, "device.settings"), 0.01)
+        return [str(getattr(outcome, "code", ""))]
+
+    def test_a_cookie_of_another(self) -> None:
+        """A cookie pays for the address that it was given to, and for no other."""
+        made = self.handshakes()
+        self.flood(made, 1)
+        self.assertEqual(made(1)[-MAC:], bytes(MAC))
+        cookies = self.house.node.endpoint._cookies
+        here, there = Address("127.0.0.1", 1), Address("127.0.0.1", 2)
+        paid = Invitation(
+            Credentials.of(Identity(b"i" * 32), self.house.team.secret),
+            exchange_key(self.house.public),
+            bytes(31) + b"\x01",
+            7,
+            b"",
+            Hello(room=640),
+        ).datagram(cookies._cookie(here, int(self.team.clock.seconds() / 120)))
+        now = self.team.clock.seconds()
+        self.assertTrue(cookies.is_lawful(paid, here, now))
+        self.assertFalse(cookies.is_lawful(paid, there, now))

@@ -1,0 +1,237 @@
+"""Attack S8: to have a node send more than was sent to it, to somebody else, or for strangers."""
+
+from __future__ import annotations
+
+import random
+from collections import Counter
+from typing import Any
+
+from middleware.admission import knock
+from middleware.entangled.clock import HeapClock
+from middleware.entangled.identity import Identity, exchange_key
+from middleware.entangled.network.network import MAX_DATAGRAM, Address, relayed
+from middleware.entangled.reach.relay import (
+    ALL_BURST,
+    ALL_RATE,
+    CARRY,
+    MAX_PAIRS,
+    PAIR_BURST,
+    PAIR_RATE,
+    Relay,
+)
+from middleware.entangled.wire.greeting import who
+from middleware.entangled.wire.hail import hail
+from middleware.entangled.wire.message import Question, encoded
+from middleware.entangled.wire.session import Credentials, Hello, Invitation, derived_key
+from tests.attacks.siege import OneSession, SiegeCase, network_of
+
+VICTIM = Address("10.7.7.7", 77)
+
+
+class AmplificationTests(SiegeCase):
+    """What comes back to an address that has not proved itself."""
+
+    def setUp(self) -> None:
+        """A team of eight, so that answers are long, and a count of what one of them sends to whom."""
+        super().setUp()
+        self.team = self.siege()
+        for name in ("dog", "cat", "pig", "cow", "hen", "fox", "owl"):
+            self.team.enlist(name)
+        self.house = self.team.houses[0]
+        port: Any = network_of(self.house)
+        self.network = port
+        self.sent: Counter[Address] = Counter()
+        send = self.network.send
+
+        def sends(datagram: bytes, to: Address) -> None:
+            self.sent[to] += len(datagram)
+            send(datagram, to)
+
+        port.send = sends
+        self.dice = random.Random(1)
+
+    def back(self, datagram: bytes, seconds: float = 2.0) -> int:
+        """The bytes that a victim gets because of one datagram that claims to come from it."""
+        self.sent.clear()
+        self.network.receiver(datagram, VICTIM)
+        self.team.run(seconds)
+        return self.sent[VICTIM]
+
+    def test_every_kind(self) -> None:
+        """Of everything that is answered before an address is proved the answer is no longer than the question."""
+        secret = self.house.team.secret
+        own = Credentials.of(Identity(b"i" * 32), secret)
+        remote = exchange_key(self.house.public)
+        question = encoded(Question(1, "find_node", (bytes(20),)))
+        paper = self.team.paper("ape")
+        passes = {"no": b"", "good": paper.shown, "long": paper.shown.ljust(640, b"x")}
+        code, packed = self.team.signer.invite("cub", ("device",), 1, self.team.wall(), 900.0, self.dice)
+        self.team.tell(packed)
+        self.team.run(2.0)
+        cub = Identity(b"c" * 32)
+        sent = {
+            "who": who(derived_key(secret, b"greet"), bytes(16), self.dice),
+            "hail": hail(bytes(16)),
+            "knock": knock.knock(code.key, cub.public, exchange_key(cub.public), "", self.dice),
+            "strange knock": bytes([knock.KNOCK]) + self.dice.randbytes(knock.KNOCK_BYTES - 1),
+        }
+        for name, shown in passes.items():
+            member = Credentials.of(paper.identity, secret) if shown == paper.shown else own
+            for rider in (b"", question):
+                hello = Hello(self.house.team.door.life, shown, 640)
+                made = Invitation(member, remote, self.dice.randbytes(32), self.dice.getrandbits(31), rider, hello)
+                sent[f"init with {name} pass{', asks' * bool(rider)}"] = made.datagram()
+        ratios = {name: self.back(datagram) / len(datagram) for name, datagram in sent.items()}
+        answered = [name for name, ratio in ratios.items() if ratio]
+        self.assertGreater(len(answered), 7, ratios)
+        self.assertLessEqual(max(ratios.values()), 1.0, ratios)
+
+    def test_again_and_again(self) -> None:
+        """A recorded INIT that is sent a hundred times is answered by no more than came."""
+        own = Credentials.of(Identity(b"i" * 32), self.house.team.secret)
+        made = Invitation(own, exchange_key(self.house.public), bytes(31) + b"\x02", 9, b"", Hello(room=640))
+        datagram = made.datagram()
+        back = sum(self.back(datagram, 0.01) for _ in range(100))
+        self.assertLessEqual(back, 100 * len(datagram))
+
+    def test_others_are_not_drawn_in(self) -> None:
+        """A stranger's datagram makes a node write to nobody else either, beyond what it does by itself."""
+        self.team.run(10.0)
+        self.sent.clear()
+        self.team.run(5.0)
+        usual = sum(self.sent.values())
+        self.sent.clear()
+        for _ in range(500):
+            self.network.receiver(self.dice.randbytes(1200), VICTIM)
+            self.network.receiver(hail(self.dice.randbytes(16)), VICTIM)
+        self.team.run(5.0)
+        self.sent.pop(VICTIM, None)
+        self.assertLessEqual(sum(self.sent.values()), 1.2 * usual + 2000)
+
+
+class IntroductionTests(SiegeCase):
+    """A member that has others knock where it likes."""
+
+    def test_knocks_at_a_victim(self) -> None:
+        """However many introductions a member makes, a node writes no more to an address that it names than a share."""
+        team = self.siege()
+        bad, _ = self.insider(team, "bad")
+        self.outcome(team, bad.ask(team.contact(team.houses[0]), "ping", bytes(8), changes=True))
+        network: Any = network_of(team.houses[0])
+        sent = [0]
+        send = network.send
+
+        def sends(datagram: bytes, to: Address) -> None:
+            if to.host == VICTIM.host:
+                sent[0] += len(datagram)
+            send(datagram, to)
+
+        network.send = sends
+        dice = random.Random(1)
+        for _ in range(100):
+            for _ in range(10):
+                public = Identity(dice.randbytes(32)).public
+                found = [[VICTIM.host, 1 + dice.randrange(60000)] for _ in range(6)]
+                asked = bad.ask(team.contact(team.houses[0]), "reach.meet", public, found, 0, changes=True)
+                asked.addErrback(lambda failure: None)
+            team.run(0.1)
+        self.assertGreater(sent[0], 0)
+        first, sent[0] = sent[0], 0
+        for _ in range(100):
+            for _ in range(10):
+                public = Identity(dice.randbytes(32)).public
+                asked = bad.ask(team.contact(team.houses[0]), "reach.meet", public, found, 0, changes=True)
+                asked.addErrback(lambda failure: None)
+            team.run(0.1)
+        self.assertLess(sent[0] / 10, 250_000)
+        self.assertLess(first, 15_000_000)
+
+
+class RelayTests(SiegeCase):
+    """Those who carry for others."""
+
+    def test_a_stranger_is_not_carried_for(self) -> None:
+        """Only in a session anything is carried: the same bytes in the open are dropped."""
+        team = self.siege()
+        team.enlist("dog")
+        network: Any = network_of(team.houses[0])
+        to = team.houses[1].node.contact.node_id
+        before = team.houses[0].node.endpoint.counters["carried"]
+        network.receiver(bytes([CARRY]) + to + bytes(500), VICTIM)
+        team.run(1.0)
+        self.assertEqual(team.houses[0].node.endpoint.counters["carried"], before)
+
+    def test_a_revoked_one_is_not_carried_for(self) -> None:
+        """When a member is revoked nobody carries for it any more."""
+        team = self.siege()
+        team.enlist("dog")
+        paper = team.paper("bad")
+        bad = self.attacker(team, paper.identity, paper.secrets[0][1], paper.shown)
+        self.outcome(team, bad.ask(team.contact(team.houses[0]), "ping", bytes(8), changes=True))
+        counters = team.houses[0].node.endpoint.counters
+
+        def carry() -> int:
+            before = counters["carried"]
+            session = next(iter(bad._sessions.values()), None)
+            if session is not None:
+                to = team.houses[1].node.contact.node_id
+                bad._network.send(session.seal(bytes([CARRY]) + to + bytes(200)), team.address(0))
+                team.run(0.1)
+            return counters["carried"] - before
+
+        self.assertEqual(carry(), 1)
+        session = next(iter(bad._sessions.values()))
+        team.tell(team.signer.revoke(paper.identity.public, "bad", team.wall()))
+        team.run(2.0)
+        bad._sessions.setdefault(session.local_index, session)  # it does not listen to what it was told
+        self.assertEqual(carry(), 0)
+
+    def relay(self) -> tuple[Any, Any, list[int]]:
+        """A relay to whom every id is somebody, its clock, and what it sent."""
+        clock, sent = HeapClock(), [0]
+
+        def send(session: object, plain: bytes) -> None:
+            sent[0] += len(plain)
+
+        def session_of(wanted: bytes) -> Any:
+            return OneSession(wanted.ljust(32, b"\0"))
+
+        return Relay(session_of, send, clock, Counter()), clock, sent
+
+    def test_quota_of_a_pair(self) -> None:
+        """One pair gets a burst and then 64 kbit/s, and where only one of them speaks, two minutes."""
+        relay, clock, sent = self.relay()
+        session: Any = OneSession(b"a" * 32)
+        plain = bytes([CARRY]) + b"b" * 20 + bytes(1000)
+        for _ in range(60):
+            for _ in range(50):
+                relay.on_carry(session, plain, VICTIM)
+            clock.advance(1.0)
+        self.assertLessEqual(sent[0], 1.05 * (PAIR_BURST + 60 * PAIR_RATE))
+        self.assertGreater(sent[0], PAIR_BURST)
+        clock.advance(90.0)
+        before = sent[0]
+        relay.on_carry(session, plain, VICTIM)
+        self.assertEqual(sent[0], before)
+
+    def test_quota_of_all(self) -> None:
+        """All pairs together get no more than a node has to spare, and there are not more than 256 of them."""
+        relay, clock, sent = self.relay()
+        for _ in range(10):
+            for number in range(400):
+                session: Any = OneSession(number.to_bytes(32, "big"))
+                relay.on_carry(session, bytes([CARRY]) + b"b" * 20 + bytes(1300), VICTIM)
+            clock.advance(1.0)
+        self.assertLessEqual(sent[0], 1.05 * (ALL_BURST + 10 * ALL_RATE))
+        self.assertLessEqual(len(relay), MAX_PAIRS)
+
+    def test_no_carrying_in_circles(self) -> None:
+        """What comes to a node by others is not carried on, nor is what is too long, empty or for the sender."""
+        relay, _, sent = self.relay()
+        session: Any = OneSession(b"a" * 32)
+        far: Any = OneSession(b"c" * 32, relayed(b"d" * 20))
+        relay.on_carry(far, bytes([CARRY]) + b"b" * 20 + b"x", VICTIM)
+        relay.on_carry(session, bytes([CARRY]) + b"b" * 20, VICTIM)
+        relay.on_carry(session, bytes([CARRY]) + b"b" * 20 + bytes(MAX_DATAGRAM + 1), VICTIM)
+        relay.on_carry(session, bytes([CARRY]) + session.contact.node_id + b"x", VICTIM)
+        self.assertEqual(sent, [0])

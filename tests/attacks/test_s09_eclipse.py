@@ -1,0 +1,164 @@
+"""Attack S9: to surround a key or a node by identities of one's own, to poison tables, to lie in lookups."""
+
+from __future__ import annotations
+
+import random
+from typing import Any
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.entangled.errors import NotAdmitted
+from middleware.entangled.identity import Identity, node_id
+from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.kademlia.routing import RoutingTable
+from middleware.entangled.network.network import Address
+from middleware.entangled.record import hashed_key
+from tests.attacks.siege import SOURCE, ClosedTeam, SiegeCase
+from tests.fleet import Fleet, FleetCase
+
+K = 8
+
+
+def sybils(count: int, seed: int = 1) -> list[Contact]:
+    """Identities that somebody made up, each at an address of its own."""
+    dice = random.Random(seed)
+    return [
+        Contact(dice.randbytes(32), Address(f"10.{6 + n // 65025}.{n // 255 % 255}.{1 + n % 254}", 666))
+        for n in range(count)
+    ]
+
+
+class OutsiderTests(SiegeCase):
+    """Those without a certificate, of whom there may be any number."""
+
+    def everybody(self, team: ClosedTeam) -> set[bytes]:
+        """The keys that anybody in the team takes for a member's."""
+        nodes = [house.node for house in team.houses]
+        return {contact.public for node in nodes for contact in node.overlay.contacts()}
+
+    def test_ten_thousand_around_a_key(self) -> None:
+        """Ten thousand identities next to a key, named by all that was ever asked, enter no table; the key is read."""
+        team = self.siege()
+        for name in ("dog", "cat", "pig", "cow"):
+            team.enlist(name)
+        key = hashed_key("task")
+        self.outcome(team, team.houses[1].node.put(key, "x", b"kept"))
+        members = self.everybody(team)
+        crowd = sorted(sybils(10_000), key=lambda each: int.from_bytes(node_id(each.public)) ^ int.from_bytes(key))
+        for house in team.houses:
+            self.assertFalse(crowd[0] in house.node.overlay.contacts())
+        bad, _ = self.insider(team, "bad")  # one that got in, and names all the others
+        page = [contact.packed() for contact in crowd[:K]]
+        bad.expose("find_node", lambda peer, target: page)
+        bad.expose("members", lambda peer, after: page)
+        bad.expose("ping", lambda peer, digest: bytes(8), changes=True)
+        bad.expose("known", lambda peer: [[fields, 0] for fields in page])
+        for house in team.houses:
+            self.outcome(team, bad.ask(team.contact(house), "ping", bytes(8), changes=True))
+        team.run(20.0)
+        found = [self.outcome(team, house.node.get(key), 5.0) for house in team.houses]
+        self.assertEqual([[record.value for record in each] for each in found], [[b"kept"]] * len(team.houses))
+        self.assertFalse({each.public for each in crowd} & self.everybody(team))
+        self.assertLessEqual(members, self.everybody(team))
+
+    def test_identities_without_certificates(self) -> None:
+        """Who has the team's secret and invents identities is refused, each time by name, and is in no table."""
+        team = self.siege()
+        secret = team.houses[0].team.secret
+        refused = 0
+        for number in range(60):
+            own = Identity(random.Random(number).randbytes(32))
+            bad = self.attacker(team, own, secret, b"", SOURCE._replace(port=1000 + number))
+            asked = bad.ask(team.contact(team.houses[0]), "ping", bytes(8), changes=True)
+            refused += isinstance(self.outcome(team, asked, 0.2), NotAdmitted)
+        self.assertEqual(refused, 60)
+        self.assertEqual(self.everybody(team), set())
+        self.assertEqual(len(team.houses[0].node.endpoint._sessions), 0)
+
+
+class TableTests(SynchronousTestCase):
+    """The routing table alone."""
+
+    def test_flushed_by_ever_new_ids(self) -> None:
+        """Ten thousand newcomers displace nobody who keeps answering."""
+        old, [me] = sybils(40, 3), sybils(1, 2)
+        table = RoutingTable(me.node_id, K)
+        for contact in old:
+            table.saw(contact, 0.0)
+        before = set(table.contacts())
+        for moment, contact in enumerate(sybils(10_000)):
+            doubtful = table.saw(contact, 10.0 + moment / 100)
+            if doubtful is not None and doubtful in before:
+                table.saw(doubtful, 10.0 + moment / 100)  # it answers
+        self.assertLessEqual(before, set(table.contacts()))
+        self.assertLess(len(table), 40 * K)
+
+    def test_own_id(self) -> None:
+        """Nobody enters as the node itself."""
+        [contact] = sybils(1)
+        table = RoutingTable(contact.node_id, K)
+        table.saw(contact, 0.0)
+        self.assertEqual(len(table), 0)
+
+
+class InsiderTests(FleetCase):
+    """Members that lie, ten to thirty of a hundred."""
+
+    def lied(self, fleet: Fleet, share: float) -> list[int]:
+        """Let some members name only each other, hold nothing back and find nothing; gives the honest places."""
+        dice = random.Random(4)
+        count = round(share * len(fleet.nodes))
+        liars = sorted(dice.sample(range(1, len(fleet.nodes)), count))
+        page = [fleet.nodes[place].contact.packed() for place in liars][:K]
+        page += [contact.packed() for contact in sybils(K)]
+        for place in liars:
+            methods: dict[str, Any] = {
+                "find_node": lambda peer, target: page[:K],
+                "members": lambda peer, after: page[:K],
+                "find_value": lambda peer, key, *rest: [[], None, 1, page[:K]],
+                "store": lambda peer, packed, *rest: [0] * len(packed),
+                "watch": lambda peer, key, digest: [0, [[], None]],
+            }
+            for name, answer in methods.items():
+                fleet.nodes[place].endpoint.expose(name, answer, changes=name in ("store", "watch"))
+        return [place for place in range(len(fleet.nodes)) if place not in liars]
+
+    def share_read(self, share: float) -> float:
+        """The share of 60 keys that honest members read as they were written, written before anybody lied."""
+        fleet = self.fleet(20)
+        fleet.run(10.0)
+        values = {hashed_key(f"k{number}"): b"%d" % number for number in range(60)}
+        for number, (key, value) in enumerate(values.items()):
+            self.done(fleet, fleet.nodes[number % 20].put(key, "x", value), 0.5)
+        honest = self.lied(fleet, share)
+        fleet.run(5.0)
+        right = 0
+        for number, (key, value) in enumerate(values.items()):
+            reader = fleet.nodes[honest[number % len(honest)]]
+            found: list[Any] = []
+            reader.get(key).addBoth(found.append)
+            fleet.run(3.0)
+            right += bool(found) and isinstance(found[0], list) and [r.value for r in found[0]] == [value]
+        return right / len(values)
+
+    def test_ten_of_a_hundred(self) -> None:
+        """With 10 % of the members lying every key is read as it was written."""
+        self.assertEqual(self.share_read(0.10), 1.0)
+
+    def test_twenty_of_a_hundred(self) -> None:
+        """With 20 % at least 99 of 100 are."""
+        self.assertGreaterEqual(self.share_read(0.20), 0.99)
+
+    def test_thirty_of_a_hundred(self) -> None:
+        """With 30 % at least 95 of 100 are."""
+        self.assertGreaterEqual(self.share_read(0.30), 0.95)
+
+    def test_liars_bring_nobody_in(self) -> None:
+        """Whom liars name enters no table before it has proved its key at its address."""
+        fleet = self.fleet(12)
+        fleet.run(5.0)
+        self.lied(fleet, 0.3)
+        fleet.run(30.0)
+        made_up = {each.public for each in sybils(K)}
+        for node in fleet.nodes:
+            self.assertFalse(made_up & {contact.public for contact in node.overlay.contacts()})

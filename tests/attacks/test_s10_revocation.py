@@ -1,0 +1,153 @@
+"""Attack S10: a member that was stolen or went bad; the operator revokes it, and within ten seconds it is out."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from middleware.admission.membership import Membership
+from middleware.entangled.errors import NotAdmitted
+from middleware.entangled.record import hashed_key
+from tests.attacks.siege import SOURCE, ClosedTeam, SiegeCase, network_of
+from tests.middleware.admission.village import House
+
+IN_FORCE = 10.0
+
+
+class RevocationCase(SiegeCase):
+    """A team, one of whom is not what it was."""
+
+    members = 9
+
+    def setUp(self) -> None:
+        """Everybody knows everybody."""
+        super().setUp()
+        self.team: ClosedTeam = self.siege(bootstraps=2)
+        for number in range(2, self.members):
+            self.team.enlist(f"dog{number}", "device", "operator", "bootstrap")
+        self.team.run(10.0)
+        self.bad: House = self.team.houses[7]
+        self.others = [house for house in self.team.houses if house is not self.bad]
+
+    def revoke(self) -> None:
+        """The operator says it at the first house."""
+        self.team.tell(self.team.signer.revoke(self.bad.public, self.bad.name, self.team.wall()))
+
+    def out(self, among: list[House]) -> list[str]:
+        """Who of these still has anything to do with it."""
+        return [
+            house.name
+            for house in among
+            if self.bad.public in [contact.public for contact in house.node.overlay.contacts()]
+            or house.node.endpoint.is_met(self.team.contact(self.bad))
+            or self.bad.name in [member.name for member in house.team.members()]
+        ]
+
+    def refusals(self, bare: Any, among: list[House]) -> set[str]:
+        """What hands that go on with the stolen identity are told."""
+        asked = [bare.ask(self.team.contact(house), "ping", bytes(8), changes=True) for house in among]
+        outcomes = [self.outcome(self.team, each, 0.5) for each in asked]
+        return {each.code if isinstance(each, NotAdmitted) else "LET IN" for each in outcomes}
+
+    def bare(self, at: int = 1, life: int = 2**62) -> Any:
+        """Hands with the identity, the pass and the secret of the stolen store, on another machine, in a later life."""
+        paper: Membership = self.bad.kept.membership
+        where = SOURCE._replace(port=600 + at)
+        return self.attacker(self.team, paper.identity, paper.secrets[0][1], paper.shown, where, life)
+
+
+class TwentyTests(RevocationCase):
+    """A team of twenty."""
+
+    members = 20
+
+    def test_out_within_ten_seconds(self) -> None:
+        """After ten seconds nobody of a connected team knows it, and whoever it asks says ``revoked``."""
+        self.revoke()
+        self.team.run(IN_FORCE)
+        self.assertEqual(self.out(self.others), [])
+        self.team.close(self.bad, is_sudden=True)
+        self.assertEqual(self.refusals(self.bare(), self.others), {"revoked"})
+
+    def test_after_a_cut(self) -> None:
+        """Those behind a cut hear of it within ten seconds after it heals, wherever the revoked one is."""
+        near = self.team.houses[:12]
+        far = self.team.houses[12:]
+        self.team.board.partition([self.team.address_of(each) for each in near])
+        self.team.run(30.0)
+        self.revoke()
+        self.team.run(IN_FORCE)
+        self.assertEqual(self.out([house for house in near if house is not self.bad]), [])
+        self.team.board.heal()
+        self.team.run(IN_FORCE)
+        self.assertEqual(self.out(far), [])
+
+
+class RevocationTests(RevocationCase):
+    """A smaller team."""
+
+    def test_across_a_restart(self) -> None:
+        """Nodes that were restarted since still refuse it, with nobody there to ask."""
+        self.revoke()
+        self.team.run(IN_FORCE)
+        self.team.close(self.bad, is_sudden=True)
+        for house in self.others:
+            self.team.close(house, is_sudden=True)
+        first = self.others[3]
+        self.team.open(first)
+        self.team.run(1.0)
+        self.assertEqual(self.refusals(self.bare(), [first]), {"revoked"})
+        for house in self.others:
+            if house is not first:
+                self.team.open(house)
+        self.team.run(10.0)
+        self.assertEqual(self.refusals(self.bare(2), self.others[:4]), {"revoked"})
+
+    def test_a_copy_of_its_store(self) -> None:
+        """A copy of its store on another machine gets no further, in whatever life."""
+        self.revoke()
+        self.team.run(IN_FORCE)
+        for number, life in enumerate((1, 2**62)):  # of an older life it is told as well that there is a newer one
+            told = self.refusals(self.bare(number, life), self.others[:3])
+            self.assertLessEqual(told, {"revoked", "doubled"} if life == 1 else {"revoked"})
+
+    def test_its_bootstrap_days_are_over(self) -> None:
+        """A revoked bootstrap lets nobody in: whom it lets in afterwards is refused by all."""
+        code = self.team.invite("pup")
+        self.revoke()
+        self.team.run(IN_FORCE)
+        knocked = self.team.knock(code, (self.bad.place,), timeout=6.0)
+        self.team.run(8.0)
+        knocked.addErrback(lambda failure: None)
+        self.assertNotIn("pup", self.team.members())
+
+    def test_what_it_wrote_on_lease_goes(self) -> None:
+        """What it said of itself on lease is gone when it is; what it wrote for the team stays, as signed."""
+        key = hashed_key("devices")
+        self.outcome(self.team, self.bad.node.put(key, "dog7", b"here", "leased"))
+        self.assertEqual(len(self.outcome(self.team, self.others[0].node.get(key))), 1)
+        self.revoke()
+        self.team.run(IN_FORCE + 3.0)
+        self.assertEqual(self.outcome(self.team, self.others[0].node.get(key)), [])
+
+    def test_after_the_secret_is_rotated(self) -> None:
+        """With another secret it cannot even open a handshake: nobody answers a thing."""
+        self.revoke()
+        members = [house.public for house in self.others]
+        self.team.run(2.0)
+        self.team.tell(self.team.signer.rotate(2, members, self.team.wall(), 5.0, self.team.dice))
+        self.team.run(30.0)
+        self.team.close(self.bad, is_sudden=True)
+        bare = self.bare()
+        sent: list[Any] = []
+        for house in self.others:
+            network: Any = network_of(house)
+            send = network.send
+
+            def sends(datagram: bytes, to: Any, send: Any = send) -> None:
+                if to.host == SOURCE.host:
+                    sent.append(datagram)
+                send(datagram, to)
+
+            network.send = sends
+        outcome = self.outcome(self.team, bare.ask(self.team.contact(self.others[0]), "ping", bytes(8)), 3.0)
+        self.assertEqual((type(outcome).__name__, sent), ("NoAnswer", []))

@@ -1,0 +1,171 @@
+"""Attack S12: to come by keys: from files that others can read, from logs, from what a node says of itself."""
+
+from __future__ import annotations
+
+import base64
+import os
+import random
+import stat
+from pathlib import Path
+from typing import Any
+
+from twisted.logger import formatEvent, globalLogPublisher
+
+from middleware.admission import keyfile, membership, operator
+from middleware.admission.errors import BadKeyFile
+from middleware.admission.membership import Membership, MembershipFile
+from middleware.admission.operator import Operator
+from middleware.entangled.data.sqlite import SqliteStore
+from middleware.entangled.identity import Identity
+from tests.attacks.siege import SOURCE, SiegeCase
+from tests.middleware.admission.paper import NOW
+from tests.middleware.admission.paper import operator as drawn
+
+
+class FileTests(SiegeCase):
+    """The files."""
+
+    def setUp(self) -> None:
+        """A membership and an operator's key, each in its file."""
+        super().setUp()
+        self.folder = Path(self.mktemp())
+        self.folder.mkdir()
+        self.signer: Operator = drawn(1)
+        self.paper: Membership = self.signer.founded("vaio", ("device",), NOW, random.Random(1))
+        self.files = {self.folder / "membership": MembershipFile, self.folder / "operator": operator.load}
+        membership.made(self.folder / "membership", self.paper)
+        operator.made(self.folder / "operator", self.signer)
+
+    def test_made_for_the_owner_alone(self) -> None:
+        """New files have the mode 0600, whatever the process lets others read by default, and so have replaced ones."""
+        before = os.umask(0)
+        self.addCleanup(os.umask, before)
+        membership.made(self.folder / "other", self.paper)
+        found = MembershipFile(self.folder / "other")
+        found.keep(self.paper.with_secret(2, bytes(32), 0))
+        for path in (*self.files, self.folder / "other"):
+            self.assertEqual(stat.S_IMODE(path.stat().st_mode), 0o600, path)
+
+    def test_readable_by_others(self) -> None:
+        """With any right for anybody else each of them is refused, and the remedy is named."""
+        for path, load in self.files.items():
+            for mode in (0o640, 0o604, 0o660, 0o606, 0o620, 0o602, 0o601, 0o610, 0o777):
+                path.chmod(mode)
+                error = self.assertRaises(BadKeyFile, load, path)
+                self.assertIn(f"chmod 600 {path}", str(error))
+            path.chmod(0o600)
+            load(path)
+
+    def test_no_file_at_all(self) -> None:
+        """A folder, a pipe, a link to nowhere and rubbish are refused by name, and no content of them is said."""
+        pipe = self.folder / "pipe"
+        (self.folder / "dir").mkdir()
+        (self.folder / "nowhere").symlink_to(self.folder / "gone")
+        (self.folder / "rubbish").write_bytes(b'{"seed": "topsecretseed"')
+        (self.folder / "rubbish").chmod(0o600)
+        self.assertFalse(pipe.exists())
+        for name in ("dir", "nowhere", "rubbish", "gone"):
+            for load in self.files.values():
+                error = self.assertRaises(BadKeyFile, load, self.folder / name)
+                self.assertNotIn("topsecretseed", str(error))
+
+    def test_one_for_the_other(self) -> None:
+        """An operator's key is no membership, and a membership is no operator's key."""
+        self.assertRaises(BadKeyFile, MembershipFile, self.folder / "operator")
+        self.assertRaises(BadKeyFile, operator.load, self.folder / "membership")
+
+    def test_a_member_has_no_operators_key(self) -> None:
+        """The operator's secret stands in no member's file."""
+        self.assertNotIn(self.signer.seed.hex(), (self.folder / "membership").read_text())
+        self.assertNotIn(self.signer.seed.hex(), str(keyfile.read(self.folder / "membership")))
+
+    def test_the_store_is_for_the_owner_alone(self) -> None:
+        """The file of records, and what the database keeps beside it, are mode 0600, too."""
+        before = os.umask(0)
+        self.addCleanup(os.umask, before)
+        store = SqliteStore.open(self.folder / "store.db", 0.0)
+        store.note("x", b"y")
+        store.close()
+        for path in self.folder.glob("store.db*"):
+            self.assertEqual(stat.S_IMODE(path.stat().st_mode), 0o600, path)
+
+
+class SaidTests(SiegeCase):
+    """What is logged, shown and told."""
+
+    def setUp(self) -> None:
+        """Everything that is logged is kept, with its fields."""
+        super().setUp()
+        self.logged: list[str] = []
+        observer: Any = self.note
+        globalLogPublisher.addObserver(observer)
+        self.addCleanup(globalLogPublisher.removeObserver, observer)
+
+    def note(self, event: dict[str, Any]) -> None:
+        """Keep an event as text, and all its fields."""
+        self.logged.append(formatEvent(event))
+        self.logged.append(" ".join(f"{value!r} {value}" for name, value in event.items() if name != "log_logger"))
+
+    def secrets(self, team: Any) -> list[str]:
+        """Every secret of a team, in the forms that a text may have."""
+        raw = [team.signer.seed]
+        for house in team.houses:
+            kept = house.kept.membership
+            raw += [kept.seed, kept.identity.exchange_secret, *(secret for _, secret, _ in kept.secrets)]
+        return [form for each in raw for form in (each.hex(), repr(each)[2:-1], base64.b64encode(each).decode()[:-1])]
+
+    def test_nothing_in_logs(self) -> None:
+        """A team joins, invites, admits, refuses, revokes, rotates and restarts, and no secret or code is logged."""
+        team = self.siege()
+        dog = team.welcome("dog")
+        code = team.invite("cat")
+        team.knock(code, timeout=3.0).addErrback(lambda failure: None)
+        team.knock(code, timeout=3.0).addErrback(lambda failure: None)
+        team.run(4.0)
+        stranger = self.attacker(team, Identity(b"x" * 32), dog.team.secret, b"", SOURCE)
+        stranger.ask(team.contact(dog), "ping", bytes(8), changes=True).addErrback(lambda failure: None)
+        team.run(2.0)
+        team.tell(team.signer.revoke(dog.public, "dog", team.wall()))
+        team.tell(team.signer.rotate(2, [team.houses[0].public], team.wall(), 5.0, team.dice))
+        team.run(10.0)
+        team.close(team.houses[0])
+        team.open(team.houses[0])
+        team.run(5.0)
+        text = "\n".join(self.logged)
+        self.assertGreater(len(self.logged), 20)
+        self.assertIn("revoked", text)
+        self.assertEqual([each for each in (*self.secrets(team), code) if each in text], [])
+
+    def test_nothing_in_representations(self) -> None:
+        """What stands for an identity, a membership, an operator or a welcome in a traceback shows no secret."""
+        team = self.siege()
+        house = team.houses[0]
+        shown = [
+            *(repr(each) + str(each) for each in (house.kept.membership, house.kept, team.signer, house.team)),
+            repr(house.kept.membership.identity) + str(house.kept.membership.identity),
+            repr(house.node.endpoint) + repr(house.team.door) + repr(house.team.roll),
+            repr(house.node.endpoint._own),
+            repr(house.team._given(house.kept.membership.shown)),
+        ]
+        self.assertEqual([each for each in self.secrets(team) if each in "\n".join(shown)], [])
+
+    def test_nothing_is_told_to_members(self) -> None:
+        """What any member may ask for holds neither another's seed nor the operator's key."""
+        team = self.siege()
+        team.enlist("dog")
+        bare, _ = self.insider(team, "eye", "viewer")
+        contact = team.contact(team.houses[0])
+        answers = []
+        for method, arguments in (
+            ("roll.compare", (bytes(8),)),
+            ("roll.fetch", (team.houses[0].team.roll.digests,)),
+            ("known", ()),
+            ("members", (b"",)),
+            ("find_node", (bytes(20),)),
+        ):
+            answers.append(repr(self.outcome(team, bare.ask(contact, method, *arguments))))
+        text = "\n".join(answers)
+        self.assertGreater(len(text), 300)
+        seeds = [house.kept.membership.seed for house in team.houses] + [team.signer.seed]
+        forms = [form for each in seeds for form in (each.hex(), repr(each)[2:-1])]
+        self.assertEqual([each for each in forms if each in text], [])

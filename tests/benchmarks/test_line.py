@@ -1,0 +1,72 @@
+"""What one line of the internet of namespaces does to frames; dice and moments are handed in."""
+
+from __future__ import annotations
+
+import statistics
+from random import Random
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from benchmarks.nat.line import Line, Weather
+
+MANY = 20_000
+
+
+def line(**figures: float) -> Line:
+    """A line with that weather."""
+    made = Line(Random(7))
+    made.weather = Weather(**figures)
+    return made
+
+
+class LineTests(SynchronousTestCase):
+    def test_a_fair_line_carries_all_at_once(self) -> None:
+        """Without bad weather a frame comes out at the moment at which it came in, once and whole."""
+        fair = line()
+        self.assertEqual(fair.fates(100, 3.0), [3.0])
+        self.assertEqual(fair.spoiled(b"frame", 0), b"frame")
+        self.assertEqual(fair.counts, {"passed": 1, "lost": 0, "bytes": 100})
+
+    def test_losses_are_as_many_as_said(self) -> None:
+        """A tenth, a third and all are lost where that is said; each of them counts."""
+        for percent in (10.0, 33.0, 100.0):
+            lossy = line(loss=percent)
+            lost = sum(not lossy.fates(100, 0.0) for _ in range(MANY))
+            self.assertApproximates(100 * lost / MANY, percent, 1.5)
+            self.assertEqual((lossy.lost, lossy.passed), (lost, MANY - lost))
+
+    def test_losses_come_in_bursts(self) -> None:
+        """With bursts of five as many are lost as without, but about five in a row."""
+        bursty = line(loss=20.0, burst=5.0)
+        fates = [not bursty.fates(100, 0.0) for _ in range(MANY)]
+        self.assertApproximates(sum(fates) / MANY, 0.2, 0.03)
+        begun = sum(lost and not before for before, lost in zip([False, *fates], fates, strict=False))
+        self.assertApproximates(sum(fates) / begun, 5.0, 0.6)
+
+    def test_delay_and_jitter(self) -> None:
+        """Frames are late by the delay on the average, spread as far as the jitter says, and never early."""
+        slow = line(delay=50.0, jitter=10.0)
+        late = [1000 * (slow.fates(100, 2.0)[0] - 2.0) for _ in range(MANY)]
+        self.assertApproximates(statistics.mean(late), 50.0, 0.5)
+        self.assertApproximates(statistics.stdev(late), 10.0, 0.5)
+        self.assertGreaterEqual(min(late), 0.0)
+
+    def test_a_narrow_line_queues_and_overflows(self) -> None:
+        """At 80 kbit/s frames of 1000 bytes come out a tenth of a second apart; what waits too long is lost."""
+        narrow = line(rate=80.0, queue=250.0)
+        fates = [narrow.fates(1000, 0.0) for _ in range(5)]
+        self.assertEqual([round(fate[0], 3) for fate in fates if fate], [0.1, 0.2, 0.3])
+        self.assertEqual(narrow.lost, 2)
+
+    def test_doubles_reordered_and_corrupt_frames(self) -> None:
+        """Every frame is doubled, overtakes, or has one bit turned behind its header, where that is said of all."""
+        self.assertEqual(line(dup=100.0).fates(100, 1.0), [1.0, 1.0])
+        self.assertEqual(line(delay=50.0, reorder=100.0).fates(100, 1.0), [1.0])
+        spoiled = line(corrupt=100.0).spoiled(bytes(40), 34)
+        self.assertEqual(spoiled[:34], bytes(34))
+        self.assertEqual(sum(byte.bit_count() for byte in spoiled), 1)
+
+    def test_senseless_weather_is_refused(self) -> None:
+        """Percentages above 100, negative times and bursts of less than one frame are refused."""
+        for figures in ({"loss": 101.0}, {"delay": -1.0}, {"burst": 0.5}, {"rate": float("nan")}):
+            self.assertRaises(ValueError, Weather, **figures)

@@ -1,0 +1,47 @@
+"""The plan of the demonstration across namespaces, as text; no namespace is made."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from benchmarks.nat.demo import HOSTS, NODE_PORT, SITES, planned
+from benchmarks.nat.kind import Kind
+from middleware.settings import Settings
+from sim.demo.cast import CASTS, LOOPBACK
+from sim.demo.configuration import DOGS, JUDGE, Place
+
+
+def places() -> dict[str, Place]:
+    """Each process at an address of its own."""
+    return {
+        name: Place(f"198.19.1.{number}", "198.18.1.1", f"198.19.255.{number}", ("nsenter",))
+        for number, name in enumerate(HOSTS, start=2)
+    }
+
+
+class NatDemoTests(SynchronousTestCase):
+    def test_nobody_is_told_of_this_machine(self) -> None:
+        """With every cast, no configuration and no robot names the loopback, and each is one that a node takes."""
+        for cast in CASTS:
+            plan = planned(Path("/nowhere"), cast, places(), "over-there")
+            for name, text in plan.texts().items():
+                self.assertNotIn(LOOPBACK, text, (cast, name))
+                settings = Settings.from_mapping(tomllib.loads(text), name)
+                self.assertEqual(settings.node.host, plan.place(name).host)
+            self.assertNotIn(LOOPBACK, plan.played)
+
+    def test_everybody_enters_by_the_router(self) -> None:
+        """The dogs name the address at which their own side finds the bootstrap; the judge's is one as well."""
+        plan = planned(Path("/nowhere"), "sim", places(), "over-there")
+        for name in DOGS:
+            self.assertIn(f'known_nodes = ["198.18.1.1:{NODE_PORT}"]', plan.texts()[name])
+        self.assertEqual(plan.place(JUDGE).entry, "198.18.1.1")
+
+    def test_two_dogs_are_behind_different_routers(self) -> None:
+        """dog1 and dog2 are alone behind routers of different kinds, dog3 is where the bootstrap is."""
+        kinds = {f"{site.name}{number}": site.kind for site in SITES for number in range(1, site.hosts + 1)}
+        self.assertEqual([kinds[HOSTS[name]] for name in DOGS[:2]], [Kind.PORT, Kind.SYM])
+        self.assertEqual(HOSTS[DOGS[2]][:-1], HOSTS["vaio"][:-1])

@@ -1,0 +1,95 @@
+"""What ``benchmarks.nat`` makes of its trials: promises, table, document and picture; nothing is run."""
+
+from __future__ import annotations
+
+import math
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from benchmarks.nat.kind import Kind
+from benchmarks.nat.matrix import plain_pairs, sites, special_pairs
+from benchmarks.nat.outcome import LOSS, MATRIX, PLAIN, Outcome, cell, is_punchable, percentile, promises
+from benchmarks.nat.picture import drawn
+from benchmarks.nat.report import BEGIN, END, table, written
+
+
+def good(part: str = PLAIN) -> list[Outcome]:
+    """A round in which all is as it should be."""
+    outcomes = []
+    for pair in plain_pairs(part):
+        is_direct = is_punchable(Kind(pair.a), Kind(pair.b))
+        path = "direct" if is_direct else "tunnel" if "noudp" in (pair.a, pair.b) else "relayed"
+        outcomes.append(Outcome(part, pair.a, pair.b, [0.1, 0.2 if is_direct else 2.1], path, joined_s=[0.1, 2.0]))
+    return outcomes
+
+
+class OutcomeTests(SynchronousTestCase):
+    def test_thirteen_of_fifteen_pairs_can_be_punched(self) -> None:
+        """All pairs but those of symmetric with port restricted or symmetric, and those without UDP."""
+        pairs = [(a, b) for n, a in enumerate(MATRIX) for b in MATRIX[n:] if Kind.NOUDP not in (a, b)]
+        self.assertEqual(len(pairs), 15)
+        closed = [(a.value, b.value) for a, b in pairs if not is_punchable(a, b)]
+        self.assertEqual(closed, [("port", "sym"), ("sym", "sym")])
+
+    def test_the_slower_side_counts(self) -> None:
+        """A pair needs as long as the slower of the two, and for ever where one never got an answer."""
+        self.assertEqual(Outcome(PLAIN, "none", "none", [0.1, 0.4]).seconds, 0.4)
+        self.assertEqual(Outcome(PLAIN, "none", "none", [0.1, None]).seconds, math.inf)
+
+    def test_a_good_round_keeps_every_promise(self) -> None:
+        """With all as it should be nothing is broken; with what can be punched relayed, or slow, something is."""
+        self.assertEqual([one for one in promises([*good(), *good(LOSS)]) if not one.is_kept], [])
+        relayed = good()
+        relayed[0].path = "relayed"
+        self.assertFalse(promises(relayed)[0].is_kept)
+        slow = good()
+        for outcome in slow[:2]:
+            outcome.took_s = [1.1, 0.1]
+        self.assertEqual([one.is_kept for one in promises(slow)], [True, False, True, True])
+        late = good()
+        late[-1].joined_s = [0.1, 2.6]
+        self.assertEqual([one.is_kept for one in promises(late)], [True, True, True, False])
+
+    def test_one_of_twenty_may_fail_under_loss(self) -> None:
+        """With losses 95 percent are promised, of all, of those with UDP and of those without: one of 21 is borne."""
+        lossy = good(LOSS)
+        lossy[0].took_s = [None, None]
+        self.assertEqual([one.is_kept for one in promises(lossy)], [True, False, True])  # 14 of 15 are no 95 percent
+        lossy[1].took_s = [5.1, 0.1]
+        self.assertEqual([one.is_kept for one in promises(lossy)], [False, False, True])
+        blocked = good(LOSS)
+        for outcome in [one for one in blocked if "noudp" in one.pair][:2]:
+            outcome.took_s = [None, None]
+        self.assertEqual([one.is_kept for one in promises(blocked)], [False, True, False])
+
+    def test_percentile_and_cell(self) -> None:
+        """A percentile is one of the values; a cell names ways, median, worst, and how many failed."""
+        self.assertEqual(percentile([3.0, 1.0, 2.0, 4.0], 0.5), 2.0)
+        some = [Outcome(PLAIN, "port", "port", [took], "direct") for took in (0.1, 0.3, None)]
+        self.assertEqual(cell(some), "direct 0.20 (0.30), 1 of 3 fail")
+        self.assertEqual((cell(some[2:]), cell([])), ("fails", ""))
+
+    def test_report_and_document(self) -> None:
+        """The table has each kind; the document is changed between its marks only, and refused without them."""
+        self.assertIn("noudp", table(good()))
+        text = written(f"before\n{BEGIN}\nold\n{END}\nafter\n", good())
+        self.assertTrue(text.startswith("before\n") and text.endswith("\nafter\n"))
+        self.assertNotIn("old", text)
+        self.assertIn("| none | direct 0.20 (0.20) |", text)
+        self.assertEqual(written(text, good()), text)
+        self.assertRaises(ValueError, written, "no marks", good())
+
+    def test_picture_has_a_square_for_each_pair(self) -> None:
+        """21 squares, a frame and a key; what failed is said."""
+        bad = good()
+        bad[3].took_s = [None, None]
+        picture = drawn(bad, "a < b")
+        self.assertEqual(picture.count("<rect"), 21 + 1 + 4)
+        self.assertIn("a &lt; b", picture)
+        self.assertEqual(picture.count(">fails<"), 1)
+
+    def test_every_host_of_a_pair_exists(self) -> None:
+        """The sites of a run have each host that a pair names."""
+        hosts = {f"{site.name}{number}" for site in sites() for number in range(1, site.hosts + 1)}
+        pairs = [*plain_pairs(PLAIN), *special_pairs()]
+        self.assertEqual({host for pair in pairs for host in (pair.host_a, pair.host_b)} - hosts, set())

@@ -1,0 +1,349 @@
+"""Tests of what the dog's wire looks like: ``drivers.aibo.codec``, ``menu``, ``picture`` and ``sense``.
+
+Golden vectors are from Tekkotsu 4.0 and 5.x (``WorldStateSerializerBehavior.cc``, ``WalkControllerBehavior.cc``,
+``RawCamBehavior.cc``) and from two clients of Tekkotsu 2.x.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import struct
+from dataclasses import replace
+from typing import Any
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from twisted.trial.unittest import SynchronousTestCase
+
+from drivers.aibo import menu, picture, sense
+from drivers.aibo.codec import (
+    MAX_LINE,
+    T2,
+    T4,
+    CommandReader,
+    GainReader,
+    Gains,
+    LineReader,
+    StateReader,
+    WorldState,
+    command,
+    encoded,
+    encoded_gains,
+    pose,
+)
+from drivers.aibo.cursor import string
+from drivers.aibo.menu import Item, Load, MenuReader, Refresh
+from drivers.aibo.picture import Block, Closing, Picture, PictureReader, Posture
+from drivers.errors import BadFrame
+
+FELT: dict[str, float | bool | str] = {"range.near": 0.25, "imu.ax": 0.5, "imu.az": 9.75, "power.level": 0.5}
+JPEG = b"\xff\xd8" + bytes(2543) + b"\xff\xd9"
+HEADER = picture.header(0, 1, 104, 80, 121465, 3185)
+COLOUR = HEADER + picture.block(Block(104, 80, "JPEGColor", JPEG))
+BARE = picture.header(0, 0, 104, 80, 7, 8) + b"".join(
+    picture.block(Block(width, height, "RawImage", bytes([channel]) * (width * height), channel))
+    for channel, (width, height) in enumerate(((104, 80), (52, 40), (52, 40)))
+)
+
+
+def felt(dialect: str = T4, t: int = 1000) -> WorldState:
+    """A world state of an ERS-7."""
+    return sense.state(FELT, [0.0] * 18, dialect, t, 4)
+
+
+class CommandTests(SynchronousTestCase):
+    """Walk, head, joints."""
+
+    def test_golden_vectors(self) -> None:
+        """Walk and head commands are these five bytes."""
+        for letter, value, golden in (
+            ("f", 0.5, "66 00 00 00 3f"),
+            ("r", -0.25, "72 00 00 80 be"),
+            ("s", 1.0, "73 00 00 80 3f"),
+            ("t", -0.5, "74 00 00 00 bf"),
+            ("p", 1.0, "70 00 00 80 3f"),
+        ):
+            self.assertEqual(command(letter, value).hex(" "), golden)
+
+    def test_reads_commands_cut_anyhow(self) -> None:
+        """Commands that arrive byte by byte are the commands that were sent."""
+        reader = CommandReader()
+        stream = command("f", 0.5) + command("r", -0.25)
+        seen = [one for at in range(len(stream)) for one in reader.read(stream[at : at + 1])]
+        self.assertEqual(seen, [("f", 0.5), ("r", -0.25)])
+
+    def test_writes_a_pose_of_all_joints(self) -> None:
+        """A pose is 72 bytes without any frame, and nothing else than 18 joints is one."""
+        self.assertEqual(pose([1.0] * 18), bytes.fromhex("0000803f") * 18)
+        self.assertRaises(ValueError, pose, [1.0])
+
+
+class LineTests(SynchronousTestCase):
+    """Lines of text."""
+
+    def test_drops_a_line_that_never_ends(self) -> None:
+        """A line beyond all measure is counted and thrown away, ended or not; what follows is read."""
+        reader = LineReader()
+        self.assertEqual(list(reader.read(b"on\r\noff")), ["on"])
+        self.assertEqual(list(reader.read(b"x" * MAX_LINE)), [])
+        self.assertEqual(list(reader.read(b"y" * (MAX_LINE + 1) + b"\non\n")), ["on"])
+        self.assertEqual(reader.bad_lines, 2)
+
+
+class StateTests(SynchronousTestCase):
+    """World state and gains."""
+
+    def test_sizes_and_places(self) -> None:
+        """The packets of an ERS-7 have 374, 244 and 224 bytes, and their fields lie where the dog puts them."""
+        new, old = encoded(felt()), encoded(felt(T2))
+        self.assertEqual((len(new), len(old)), (374, 244))
+        self.assertEqual(len(encoded_gains(Gains(1, ((1.0, 2.0, 3.0),) * 18))), 224)
+        self.assertEqual(new[:6], b"ERS-7\0")
+        self.assertEqual(struct.unpack_from("<3I", new, 6), (1000, 4, 47))
+        self.assertEqual(struct.unpack_from("<If", new, 206), (11, 250.0))
+        self.assertEqual([struct.unpack_from("<I", new, at)[0] for at in (254, 298)], [10, 18])
+        self.assertEqual(struct.unpack_from("<2I", old, 0), (1000, 18))
+        self.assertEqual([struct.unpack_from("<I", old, at)[0] for at in (80, 128)], [11, 10])
+
+    def test_reads_both_dialects_byte_by_byte(self) -> None:
+        """Either dialect is told by its first bytes and read back, however the stream is cut."""
+        for dialect in (T4, T2):
+            stream = encoded(felt(dialect)) + encoded(felt(dialect, 1032))
+            for step in (1, 7, len(stream)):
+                reader = StateReader()
+                seen = [one for at in range(0, len(stream), step) for one in reader.read(stream[at : at + step])]
+                self.assertEqual([(one.dialect, one.t) for one in seen], [(dialect, 1000), (dialect, 1032)])
+                self.assertEqual(encoded(seen[0]), stream[: len(stream) // 2])
+
+    def test_takes_counts_from_the_stream(self) -> None:
+        """A model with other counts is read as it is."""
+        other = WorldState(T4, "ERS-210", 5, 6, (1.0,) * 40, (2.0,) * 8, (0.0,) * 8, (0.5,) * 18)
+        reader, stream = StateReader(), encoded(replace(other, model="ERS-210 in red"))
+        seen = [one for at in range(len(stream)) for one in reader.read(stream[at : at + 1])]
+        self.assertEqual(seen, [replace(other, model="ERS-210 in red")])
+        self.assertFalse(sense.is_known(other))
+        self.assertTrue(sense.is_known(felt()) and sense.is_known(felt(T2)))
+
+    def test_refuses_what_is_neither_dialect(self) -> None:
+        """Wild counts, a model without an end, and bytes of neither dialect are bad frames."""
+        wild = bytearray(encoded(felt()))
+        wild[14] = wild[15] = 0xFF
+        for data in (bytes(wild), b"ERS-" * 20, bytes(40), struct.pack("<II", 5, 17)):
+            self.assertRaises(BadFrame, list, StateReader().read(data))
+
+    def test_reads_gains_byte_by_byte(self) -> None:
+        """Gains come back as they were written."""
+        gains = Gains(5, tuple((float(n), 0.5, 0.25) for n in range(18)))
+        stream, reader = encoded_gains(gains), GainReader()
+        self.assertEqual([one for at in range(224) for one in reader.read(stream[at : at + 1])], [gains])
+        self.assertRaises(BadFrame, list, GainReader().read(b"\xff" * 8))
+
+    @settings(deadline=None, max_examples=200)
+    @given(st.binary(max_size=600), st.integers(0, 374))
+    def test_survives_any_bytes(self, noise: bytes, keep: int) -> None:
+        """Whatever follows a good beginning is a state or a bad frame."""
+        for start in (encoded(felt())[:keep], encoded(felt(T2))[:keep]):
+            for reader in (StateReader(), GainReader()):
+                try:
+                    list(reader.read(start + noise))
+                except BadFrame:
+                    continue
+
+
+class SenseTests(SynchronousTestCase):
+    """Numbers and what they mean."""
+
+    def test_names_and_units(self) -> None:
+        """Ranges are metres, the accelerometer points up, currents are amperes, and all 18 joints have names."""
+        seen = sense.values(next(StateReader().read(encoded(felt()))))
+        self.assertEqual(seen["range.near"], 0.25)
+        self.assertTrue(math.isnan(float(seen["range.far"])))
+        self.assertEqual((seen["imu.ax"], seen["imu.az"], seen["power.level"]), (0.5, 9.75, 0.5))
+        self.assertAlmostEqual(float(seen["power.amps"]), -1.2)
+        self.assertEqual(len([key for key in seen if key.startswith("joint.")]), 36)
+        self.assertEqual(len([key for key in seen if key.startswith("button.")]), 10)
+
+    def test_refuses_what_cannot_be(self) -> None:
+        """One NaN, infinite or absurd number spoils the packet, wherever it stands."""
+        good = felt()
+        for bad in (math.nan, math.inf, -math.inf, 1e9):
+            for field in ("outputs", "sensors", "buttons", "duties"):
+                changed: dict[str, Any] = {field: (bad, *getattr(good, field)[1:])}
+                self.assertRaises(BadFrame, sense.values, replace(good, **changed))
+        self.assertRaises(BadFrame, sense.values, replace(good, outputs=(0.0,) * 3))
+
+
+class MenuTests(SynchronousTestCase):
+    """Main control."""
+
+    MESSAGES: tuple[menu.Message, ...] = (
+        menu.Hello(3),
+        menu.Push(),
+        Load("org.tekkotsu.mon.WalkGUI", "WalkGUI", 10050),
+        Load("org.tekkotsu.mon.VisionGUI", "RawVisionGUI", 10011, '"raw" "10011" "udp"'),
+        menu.Pop(),
+        Refresh("Root", (Item(2, True, "TekkotsuMon", "one\ntwo\nthree"), Item(0, False, "----------"))),
+        menu.Status("walking\nagain"),
+        menu.Close("WalkGUI"),
+        menu.Stack(("Root", "TekkotsuMon")),
+        menu.Goodbye(),
+    )
+
+    def test_commands(self) -> None:
+        """Starting, stopping and setting are lines that the dog knows."""
+        self.assertEqual(menu.select("Raw Cam Server"), '!select "Raw Cam Server"')
+        self.assertEqual(menu.unselect("Raw Cam Server"), '!select "#Raw Cam Server"')
+        self.assertEqual(menu.setting("vision.rawcam.transport", "TCP"), "!set vision.rawcam.transport=TCP")
+
+    def test_golden_lines(self) -> None:
+        """Starting a server and an empty slot look like this on the wire."""
+        self.assertEqual(menu.encoded(self.MESSAGES[2]), b"load\norg.tekkotsu.mon.WalkGUI\nWalkGUI\n10050\n\n")
+        self.assertEqual(
+            menu.encoded(Refresh("Root", (Item(0, False, menu.EMPTY_SLOT),))),
+            b"refresh\nRoot\n1\n0\n0\n----------\n0\n\n",
+        )
+
+    def test_reads_every_message_byte_by_byte(self) -> None:
+        """Every message is read back as it was written."""
+        stream = b"".join(menu.encoded(one) for one in self.MESSAGES)
+        for step in (1, len(stream)):
+            reader = MenuReader()
+            seen = [one for at in range(0, len(stream), step) for one in reader.read(stream[at : at + step])]
+            self.assertEqual(tuple(seen), self.MESSAGES)
+            self.assertEqual(reader.bad_lines, 0)
+
+    def test_reads_the_menu_of_old_tekkotsu(self) -> None:
+        """A menu of four fields an item shows in its first item, and is read to its end."""
+        shown = Refresh(
+            "Root", (Item(2, True, "Mon", "all servers"), Item(0, False, "7", ""), Item(0, False, "x", "5"))
+        )
+        stream = menu.encoded(shown, has_four_fields=True) + menu.encoded(menu.Pop())
+        self.assertEqual(list(MenuReader().read(stream)), [shown, menu.Pop()])
+
+    def test_drops_what_is_no_message(self) -> None:
+        """Unknown words, wrong counts and endless lines are counted, and the next message is read."""
+        for bad in (
+            "warp",
+            "hello\nmany",
+            "hello\n" + "9" * 30,
+            "refresh\nRoot\n9999",
+            "load\na\nb\n99999\nc",
+            "\u0663",
+        ):
+            reader = MenuReader()
+            stream = bad.encode() + b"\n" + menu.encoded(menu.Pop())
+            self.assertEqual(list(reader.read(stream)), [menu.Pop()])
+            self.assertEqual(reader.bad_lines, 1, bad)
+        reader = MenuReader()
+        self.assertEqual(list(reader.read(b"x" * 9999 + b"\npop\n")), [menu.Pop()])
+        self.assertEqual(reader.bad_lines, 1)
+
+    def test_drops_a_menu_without_an_end(self) -> None:
+        """A menu that would fill the memory is dropped, and what follows is read again."""
+        item = "0\n0\nx\n200\n" + "y\n" * 201
+        reader = MenuReader()
+        list(reader.read(("refresh\nRoot\n200\n" + item * 30).encode()))
+        self.assertGreater(reader.bad_lines, 0)
+        self.assertEqual(list(reader.read(b"pop\n")), [menu.Pop()])
+
+    @settings(deadline=None, max_examples=200)
+    @given(st.lists(st.sampled_from(["refresh", "status", "load", "0", "1", "5", "", "pop", "x", "\x00"]), max_size=60))
+    def test_survives_any_lines(self, lines: list[str]) -> None:
+        """Whatever the lines are, the reader goes on."""
+        list(MenuReader().read("\n".join([*lines, ""]).encode()))
+
+
+class PictureTests(SynchronousTestCase):
+    """The camera."""
+
+    def test_golden_vectors(self) -> None:
+        """Names, header and block are these bytes; bare channels make a packet of 12648 bytes."""
+        name = "0d 00 00 00 54 65 6b 6b 6f 74 73 75 49 6d 61 67 65 00"
+        self.assertEqual(string("TekkotsuImage").hex(" "), name)
+        self.assertEqual(picture.CLOSING.hex(" "), "0f 00 00 00 43 6c 6f 73 65 43 6f 6e 6e 65 63 74 69 6f 6e 00")
+        self.assertEqual(
+            HEADER.hex(" "),
+            name + " 00 00 00 00 01 00 00 00 68 00 00 00 50 00 00 00 79 da 01 00 71 0c 00 00",
+        )
+        self.assertEqual(
+            picture.block(Block(104, 80, "JPEGColor", b""), 2547).hex(" "),
+            "08 00 00 00 46 62 6b 49 6d 61 67 65 00 68 00 00 00 50 00 00 00 03 00 00 00 00 00 00 00 "
+            "09 00 00 00 4a 50 45 47 43 6f 6c 6f 72 00 f3 09 00 00",
+        )
+        self.assertEqual(len(BARE), 12648)
+        self.assertEqual(picture.REQUEST, b"connection request")
+
+    def test_reads_every_kind_byte_by_byte(self) -> None:
+        """JPEGs, bare channels, one channel, blanks, text and the end are read, however the stream is cut."""
+        single = picture.header(1, 0, 4, 2, 9, 10) + picture.block(Block(4, 2, "RawImage", bytes(8)))
+        jpegs = b"".join(picture.block(Block(4, 2, "JPEGGrayscale", JPEG, n)) for n in range(3))
+        blank = picture.block(Block(0, 0, "blank", b"", 1, 0xFFFFFFFF))
+        half = picture.header(0, 0, 2, 1, 1, 2) + picture.block(Block(2, 1, "RawImage", b"ab")) + blank + blank
+        stream = COLOUR + string("#POS x") + BARE + single + picture.header(0, 1, 4, 2, 11, 12) + jpegs
+        stream += half + picture.CLOSING
+        for step in (1, 1000, len(stream)):
+            reader = PictureReader()
+            seen = [one for at in range(0, len(stream), step) for one in reader.read(stream[at : at + step])]
+            self.assertEqual(seen[0], Picture(104, 80, 121465, 3185, "jpeg", JPEG))
+            self.assertEqual(seen[1], Posture("#POS x"))
+            plane = 104 * 80
+            planes = bytes(plane) + b"\1" * plane + b"\2" * plane
+            self.assertEqual(seen[2], Picture(104, 80, 7, 8, "yuv444", planes))
+            self.assertEqual(seen[3], Picture(4, 2, 9, 10, "mono8", bytes(8)))
+            self.assertEqual(seen[4], Picture(4, 2, 11, 12, "jpeg", JPEG))
+            self.assertEqual(seen[5], Picture(2, 1, 1, 2, "yuv444", b"ab\x80\x80\x80\x80"))
+            self.assertEqual(seen[6:], [Closing()])
+            self.assertEqual(reader.bad_frames, 0)
+
+    def test_grows_small_channels(self) -> None:
+        """Each pixel of a small channel covers the pixels of the large one that it stands for."""
+        parts = (Block(4, 2, "RawImage", b"abcdefgh"), Block(2, 1, "RawImage", b"xy"), Block(2, 1, "RawImage", b"uv"))
+        data = picture.header(0, 0, 4, 2, 0, 0) + b"".join(picture.block(one) for one in parts)
+        seen = picture.decoded(data)
+        assert isinstance(seen, Picture)
+        self.assertEqual(seen.data, b"abcdefgh" + b"xxyyxxyy" + b"uuvvuuvv")
+
+    def test_refuses_datagrams_that_are_no_packet(self) -> None:
+        """A datagram too short, too long, or wrong in any field is a bad frame."""
+        raw = Block(4, 2, "RawImage", bytes(8))
+        head = picture.header(1, 0, 4, 2, 0, 0)
+        for data in (
+            b"",
+            COLOUR[:-1],
+            COLOUR + b"\0",
+            string("Warp"),
+            struct.pack("<I", 2**31),
+            string("TekkotsuImage")[:-1] + b"x",
+            picture.header(7, 0, 4, 2, 0, 0) + picture.block(raw),
+            picture.header(1, 0, 0, 2, 0, 0) + picture.block(raw),
+            picture.header(1, 0, 4, 9999, 0, 0) + picture.block(raw),
+            head + string("Block"),
+            head + picture.block(Block(4, 2, "Warp", b"")),
+            head + picture.block(Block(4, 9999, "RawImage", b"")),
+            head + picture.block(Block(4, 2, "JPEGColor", b"no picture")),
+            head + picture.block(Block(4, 2, "JPEGColor", JPEG), 2**31),
+            picture.header(0, 0, 4, 2, 0, 0)
+            + picture.block(raw) * 2
+            + picture.block(Block(4, 2, "JPEGGrayscale", JPEG)),
+        ):
+            self.assertRaises(BadFrame, picture.decoded, data)
+
+    def test_finds_its_way_after_garbage(self) -> None:
+        """After bytes that are no packet the next whole packet is read, byte by byte as well."""
+        broken = bytearray(COLOUR)
+        broken[18] = 9
+        stream = bytes(broken) + b"garbage garbage garbage" + COLOUR
+        for step in (1, len(stream)):
+            reader = PictureReader()
+            seen = [one for at in range(0, len(stream), step) for one in reader.read(stream[at : at + step])]
+            self.assertEqual([type(one) for one in seen], [Picture])
+            self.assertGreater(reader.bad_frames, 0)
+
+    @settings(deadline=None, max_examples=200)
+    @given(st.binary(max_size=300), st.integers(0, 200))
+    def test_survives_any_bytes(self, noise: bytes, keep: int) -> None:
+        """Whatever follows a good beginning, a stream is read on, and a datagram is a packet or a bad frame."""
+        list(PictureReader().read(COLOUR[:keep] + noise))
+        with contextlib.suppress(BadFrame):
+            picture.decoded(COLOUR[:keep] + noise)

@@ -1,0 +1,242 @@
+"""Tests of ``drivers.aibo.option``, of its lines for main control, and of how its links are opened again."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from twisted.internet.defer import Deferred
+from twisted.internet.error import ConnectionDone, ConnectionRefusedError
+from twisted.internet.task import Clock
+from twisted.internet.testing import MemoryReactorClock
+from twisted.python.failure import Failure
+from twisted.trial.unittest import SynchronousTestCase
+
+from drivers.aibo import recipe
+from drivers.aibo.link import WAITS, Port
+from drivers.aibo.option import PORTS, checked
+from drivers.errors import UsageError
+from drivers.link import Link, TcpConnector
+from drivers.registry import describe, driver_for
+from swarmnode.driver.witness import Ear
+
+
+class AiboOptionTests(SynchronousTestCase):
+    """What may stand in the configuration."""
+
+    def test_makes_a_driver(self) -> None:
+        """The registry makes an idle driver whose description is known before."""
+        driver = driver_for("aibo", {"host": "192.168.0.51"}, "dog1", Clock())
+        self.assertEqual(driver.state, "idle")
+        self.assertEqual(driver.description, describe("aibo", {"host": "192.168.0.51"}))
+        self.assertEqual(driver.description.limits["base.vx"], (-0.156, 0.160))
+
+    def test_names_the_wrong_option(self) -> None:
+        """Each wrong option is refused in one line that names its key and what to write."""
+        for key, value in (
+            ("host", 7),
+            ("host", ""),
+            ("camera", "no"),
+            ("camera_fps", 31),
+            ("camera_fps", True),
+            ("camera_fps", float("nan")),
+            ("camera_transport", "pigeon"),
+            ("speed", [1.0]),
+            ("speed", [0.0, 1.0, 1.0, 1.0]),
+            ("speed", "fast"),
+            ("ports", 7),
+            ("ports", {"walk": 0}),
+            ("ports", {"warp": 1}),
+            ("colour", "red"),
+        ):
+            line = str(self.assertRaises(UsageError, describe, "aibo", {"host": "dog1", key: value}))
+            self.assertIn(key, line)
+            self.assertNotIn("\n", line)
+        self.assertIn("host", str(self.assertRaises(UsageError, describe, "aibo", {})))
+        line = str(self.assertRaises(UsageError, checked, {"host": "dog1.local", "camera_transport": "udp"}))
+        self.assertIn("numeric", line)
+        self.assertEqual(checked({"host": "10.0.0.1", "camera_transport": "udp"}).camera_transport, "udp")
+
+    def test_overrides_what_is_given(self) -> None:
+        """A port that is given replaces that one alone; without a camera none is described."""
+        self.assertEqual(checked({"host": "dog1", "ports": {"walk": 5}}).ports, {**PORTS, "walk": 5})
+        self.assertIn("camera", describe("aibo", {"host": "dog1"}).capabilities)
+        self.assertNotIn("camera", describe("aibo", {"host": "dog1", "camera": False}).capabilities)
+        self.assertEqual(describe("aibo", {"host": "d", "speed": [1, 2, 3, 4]}).limits["base.vx"], (-2.0, 1.0))
+
+
+class RecipeTests(SynchronousTestCase):
+    """What main control is told."""
+
+    def test_sends_every_name(self) -> None:
+        """A server is started and stopped under each of its names, after the settings in both spellings."""
+        lines = recipe.started(["walk", "camera"], "tcp", 30.0)
+        self.assertEqual(
+            lines,
+            [
+                "!set main.worldState_interval=0",
+                "!set vision.rawcam.transport=TCP",
+                "!set vision.rawcam.encoding=color",
+                "!set vision.rawcam.compression=jpeg",
+                "!set vision.rawcam.y_skip=2",
+                "!set vision.rawcam.uv_skip=3",
+                "!set vision.rawcam_y_skip=2",
+                "!set vision.rawcam_uv_skip=3",
+                "!set vision.rawcam.interval=0",
+                "!set vision.rawcam_interval=0",
+                '!select "Walk Remote Control"',
+                '!select "WalkController"',
+                '!select "Raw Cam Server"',
+                '!select "RawCam"',
+                "!hello",
+            ],
+        )
+        self.assertEqual(recipe.stopped(["walk"]), ['!select "#Walk Remote Control"', '!select "#WalkController"'])
+        self.assertEqual(recipe.greeting(), ["!hello", "!dump_stack", "!refresh"])
+
+    def test_size(self) -> None:
+        """The width that is asked for is described, and is the layer that the dog is told to send."""
+        self.assertEqual(recipe.sized(208)[:2], ["!set vision.rawcam.y_skip=1", "!set vision.rawcam.uv_skip=2"])
+        camera = describe("aibo", {"host": "d", "camera_width": 208}).capabilities["camera"]
+        self.assertEqual((camera["width"], camera["height"]), (208, 160))
+        with self.assertRaisesRegex(UsageError, "camera_width is 416, but must be 104 or 208"):
+            checked({"host": "d", "camera_width": 416})
+
+    def test_waits_between_pictures(self) -> None:
+        """Fifteen pictures a second are a wait of 50 ms, as it is counted from the end of the one before."""
+        for fps, wait in ((30.0, 0), (0.0, 0), (15.0, 50), (10.0, 83)):
+            self.assertEqual(recipe.paced(fps)[0], f"!set vision.rawcam.interval={wait}")
+
+
+class _Caller:
+    def link_up(self, link: Link) -> None:
+        """Nothing to say."""
+
+    def link_down(self) -> None:
+        """Nothing to do."""
+
+    def received(self, data: bytes) -> None:
+        """Nothing to hear."""
+
+
+class WaitTests(SynchronousTestCase):
+    """How long a port is left alone."""
+
+    def test_waits_as_the_dogs_own_clients_do(self) -> None:
+        """A port that refuses is called again after 0.5, 1, 2, 5 and 5 s, and after 0.5 s once it has answered."""
+        reactor: Any = MemoryReactorClock()
+        line = TcpConnector(reactor, WAITS).call("dog1", 10050, _Caller())
+        for wait in (0.5, 1.0, 2.0, 5.0, 5.0):
+            self.refuse(reactor)
+            self.assertEqual([call.getTime() - reactor.seconds() for call in reactor.getDelayedCalls()], [wait])
+            reactor.advance(wait)
+        factory = reactor.tcpClients[0][2]
+        factory.buildProtocol(None).dataReceived(b"off\n")
+        self.lose(reactor)
+        self.assertEqual([call.getTime() - reactor.seconds() for call in reactor.getDelayedCalls()], [0.5])
+        line.hang_up()
+        self.assertEqual(reactor.getDelayedCalls(), [])
+
+    def test_does_not_pester_what_hangs_up_at_once(self) -> None:
+        """Who takes each call and hangs up is called ever less often, and named; a link that lasted ends that."""
+        for waits, wanted in ((WAITS, [0.5, 1.0, 2.0, 5.0, 5.0]), ((), [0.1, 0.16, 0.256, 0.4096, 0.65536])):
+            reactor: Any = MemoryReactorClock()
+            line: Any = TcpConnector(reactor, waits).call("dog1", 10050, _Caller())
+            factory = reactor.tcpClients[0][2]
+            found = []
+            for _ in wanted:
+                factory.buildProtocol(None)
+                self.assertEqual(line.problem, "")
+                self.lose(reactor)
+                self.assertIn("hangs up as soon as it is called", line.problem)
+                (call,) = reactor.getDelayedCalls()
+                found.append(round(call.getTime() - reactor.seconds(), 6))
+                reactor.advance(found[-1] + 1e-5)
+            self.assertEqual(found, wanted)
+            factory.buildProtocol(None)
+            reactor.advance(3.0)
+            self.lose(reactor)
+            self.assertEqual(line.problem, "")
+            (call,) = reactor.getDelayedCalls()
+            self.assertAlmostEqual(call.getTime() - reactor.seconds(), wanted[0])
+            line.hang_up()
+            factory.buildProtocol(None).dataReceived(b"x")
+            self.lose(reactor)
+            self.assertEqual(reactor.getDelayedCalls(), [])
+
+    def test_says_once_what_keeps_a_link_from_being_opened(self) -> None:
+        """Where nobody else says it, a robot that cannot be reached is one line in the log, after some calls."""
+        ear = Ear()
+        self.addCleanup(ear.close)
+        for says in (False, True):
+            reactor: Any = MemoryReactorClock()
+            line = TcpConnector(reactor, says=says).call("dog1", 9090, _Caller())
+            for _ in range(4):
+                self.refuse(reactor)
+            self.assertEqual(ear.heard, [])
+            for _ in range(50):
+                self.refuse(reactor)
+            self.assertEqual(len(ear.heard), int(says))
+            line.hang_up()
+        self.assertIn("dog1:9090: it is there, but nothing listens at this port", ear.heard[0])
+
+    def lose(self, reactor: Any) -> None:
+        """The port hangs up."""
+        reactor.tcpClients[0][2].clientConnectionLost(_Retried(), Failure(ConnectionDone()))
+
+    def refuse(self, reactor: Any) -> None:
+        """The port does not listen."""
+        reactor.tcpClients[0][2].clientConnectionFailed(_Retried(), Failure(ConnectionRefusedError()))
+
+
+class _Dead:
+    """A line, and its link, of a network that is gone: what was said last never leaves."""
+
+    is_busy = False
+
+    def __init__(self) -> None:
+        self.hung_up: Deferred[None] = Deferred()
+
+    def call(self, host: str, port: int, caller: Port) -> _Dead:
+        """Open at once."""
+        caller.link_up(self)
+        return self
+
+    def send(self, data: bytes) -> None:
+        """Keep it for ever."""
+
+    def hang_up(self) -> Deferred[None]:
+        """Wait for what was said to leave."""
+        return self.hung_up
+
+    def close(self) -> None:
+        """Leave at once."""
+        self.hung_up.callback(None)
+
+
+class PortTests(SynchronousTestCase):
+    """One port of a dog."""
+
+    def test_leaves_a_dead_link_after_a_second(self) -> None:
+        """Closing waits for what was said to leave, but no longer than a second."""
+        clock = Clock()
+        port = Port(_Dead(), clock, ("dog1", 10050), lambda: None, lambda: None, lambda _: None)  # type: ignore[arg-type]
+        port.open()
+        self.assertTrue(port.is_up)
+        closed = port.close()
+        clock.advance(0.9)
+        self.assertNoResult(closed)
+        clock.advance(0.2)
+        self.successResultOf(closed)
+        self.successResultOf(port.close())
+
+
+class _Retried:
+    """What is called again."""
+
+    state = "disconnected"
+
+    def connect(self) -> None:
+        """Call again."""
+
+    def stopConnecting(self) -> None:  # noqa: N802 (Twisted's)
+        """Call no more."""

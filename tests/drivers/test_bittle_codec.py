@@ -1,0 +1,311 @@
+"""Tests of ``drivers.bittle.codec``, ``gait``, ``dialogue`` and ``option``."""
+
+from __future__ import annotations
+
+import math
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from twisted.internet.task import Clock
+from twisted.trial.unittest import SynchronousTestCase
+
+from drivers.bittle import codec
+from drivers.bittle.codec import LineReader, ResponseReader
+from drivers.bittle.dialogue import MAX_LINES, Dialogue
+from drivers.bittle.gait import GAITS, REST, STAND, Velocity, chosen
+from drivers.errors import BadFrame, LinkLost, NoReply, RobotError, Unsupported, UsageError
+from drivers.registry import describe
+
+INDICES = "\t".join(str(one) for one in range(16))
+
+
+class CommandTests(SynchronousTestCase):
+    """What is said to the robot."""
+
+    def test_golden_vectors(self) -> None:
+        """Each command has the bytes that the firmware reads."""
+        self.assertEqual(codec.skill("wkF"), bytes.fromhex("6b 77 6b 46 0a"))
+        self.assertEqual(codec.binary("I", (8, -20, 9, -20)), bytes.fromhex("49 08 ec 09 ec 7e"))
+        self.assertEqual(codec.ultrasonic(16, 17), bytes.fromhex("58 55 10 11 7e"))
+        self.assertEqual(codec.binary("L", [0] * 8 + [30] * 8), bytes.fromhex("4c" + "00" * 8 + "1e" * 8 + "7e"))
+        self.assertEqual(codec.text("i", 8, -20.4, 9, 130), b"i8 -20 9 130\n")
+
+    def test_refuses_what_would_be_another_command(self) -> None:
+        """A name with a line feed in it, and an angle that is the end of a command, are refused."""
+        for name in ("", "wk\nd", "8", "a" * 17):
+            self.assertRaises(ValueError, codec.skill, name)
+        self.assertRaises(ValueError, codec.binary, "I", (0, 126))
+
+
+class LineTests(SynchronousTestCase):
+    """What the robot says."""
+
+    def test_reads_lines_however_they_are_cut(self) -> None:
+        """One byte at a time gives the same lines as all at once."""
+        said = b"wkF\r\nk\r\n\r\n=\r\n0\t1\t\r\n"
+        whole, pieces = LineReader(), LineReader()
+        lines = list(whole.read(said))
+        self.assertEqual(lines, ["wkF", "k", "=", "0\t1"])
+        self.assertEqual([one for at in range(len(said)) for one in pieces.read(said[at : at + 1])], lines)
+
+    def test_drops_and_counts_what_is_no_text(self) -> None:
+        """Lines with other bytes, and lines that never end, are dropped, and cost no line after them."""
+        reader = LineReader()
+        self.assertEqual(list(reader.read(b"\xffk\r\nd\r\n")), ["d"])
+        self.assertEqual(list(reader.read(b"x" * 600)), [])
+        self.assertEqual(list(reader.read(b"yz\r\nk\r\n")), ["k"])
+        self.assertEqual(list(reader.read(b"x" * 513 + b"\nk\n")), ["k"])
+        self.assertEqual(reader.bad_lines, 3)
+
+    @given(st.binary(max_size=300))
+    @settings(max_examples=200, deadline=None)
+    def test_takes_any_bytes(self, data: bytes) -> None:
+        """No bytes make a reader or a parser fail in another way than by ``BadFrame``."""
+        lines = list(LineReader().read(data + b"\n"))
+        for parse in (codec.joints, codec.attitude, codec.attitude_old, codec.volts, codec.distance):
+            try:
+                parse(lines)
+            except BadFrame:
+                continue
+        codec.board_of(lines)
+
+    @given(st.lists(st.integers(-125, 125), min_size=16, max_size=16))
+    @settings(max_examples=50, deadline=None)
+    def test_joints_of_both_boards(self, angles: list[int]) -> None:
+        """Any angles come back in radians, as either board writes them."""
+        row = "".join(f"{angle},\t" for angle in angles)
+        wanted = {joint: math.radians(angle) for joint, angle in enumerate(angles)}
+        self.assertEqual(codec.joints(["=", INDICES, row]), wanted)
+        self.assertEqual(codec.joints([f"={INDICES}", row]), wanted)
+
+    def test_refuses_what_are_no_joints(self) -> None:
+        """Too few angles, other indices, and angles that no joint has, are no joints."""
+        for lines in ([], ["=", "0\t1", "5,\t"], ["=", "1\t0", "5,\t6,"], ["=", "0", "271,"]):
+            self.assertRaises(BadFrame, codec.joints, lines)
+
+    def test_attitude_of_both_boards(self) -> None:
+        """Columns that touch are read; yaw, pitch, roll have their places; a NyBoard tells pitch first."""
+        told = codec.attitude(["ICM:   0.1  -0.2   9.8-179.9 -10.0  20.0"])
+        self.assertAlmostEqual(told["yaw"], math.radians(-179.9))
+        self.assertAlmostEqual(told["pitch"], math.radians(-10.0))
+        self.assertAlmostEqual(told["roll"], math.radians(20.0))
+        self.assertEqual(codec.attitude(["ICM: 0 0 9 1 2 3\tMCU: 0 0 9 4 5 6"]), codec.attitude(["MCU: 0 0 9 1 2 3"]))
+        old = codec.attitude_old(["-10.00000\t20.00000\t0.1\t0.2\t9.8"])
+        self.assertAlmostEqual(old["pitch"], math.radians(-10.0))
+        self.assertAlmostEqual(old["roll"], math.radians(20.0))
+        for lines in (["ICM: 1 2 3"], ["hello"], ["ICM: 0 0 9 1 2 999"]):
+            self.assertRaises(BadFrame, codec.attitude, lines)
+        self.assertRaises(BadFrame, codec.attitude_old, ["1.0"])
+
+    def test_volts_and_distance(self) -> None:
+        """A voltage that two cells can have, centimetres as metres, 0 as nothing; all else is refused."""
+        self.assertEqual(codec.volts(["Voltage: 7.95 V"]), 7.95)
+        self.assertRaises(BadFrame, codec.volts, ["Voltage: 79.5 V"])
+        self.assertRaises(BadFrame, codec.volts, ["7.95"])
+        self.assertEqual(codec.distance(["=", "42"]), 0.42)
+        self.assertTrue(math.isnan(codec.distance(["=", "0"])))
+        for lines in (["="], ["=", "1 2"], ["=", "-5"], ["=", "999"]):
+            self.assertRaises(BadFrame, codec.distance, lines)
+
+    def test_says_who_it_is(self) -> None:
+        """Banner, board by version, unknown skills, and the token alone in either case are known."""
+        self.assertTrue(codec.is_banner("* Start *"))
+        self.assertEqual(codec.board_of(["Bittle", "Software version: B10_250712"]), "biboard")
+        self.assertEqual(codec.board_of(["Bittle", "Software version: N_250224"]), "nyboard")
+        self.assertEqual(codec.board_of(["Bittle"]), "")
+        self.assertEqual(
+            (codec.unknown_of("?fly?"), codec.unknown_of("?"), codec.unknown_of("fly")), ("fly", None, None)
+        )
+        self.assertTrue(codec.is_end("G", "g") and not codec.is_end("gp", "g"))
+
+
+class HttpTests(SynchronousTestCase):
+    """Over Wi-Fi."""
+
+    def test_paths(self) -> None:
+        """Commands become paths of either board, bytes and all; the line feed stays away."""
+        self.assertEqual(codec.command_path("biboard", b"kwkF\n"), "/cmd?cmd=kwkF")
+        self.assertEqual(codec.command_path("nyboard", b"I\x08\xec~"), "/action?name=I%08%EC~")
+        self.assertEqual(codec.status_path("12"), "/status?taskId=12")
+        self.assertTrue(codec.request("10.0.0.1", "/cmd").startswith(b"GET /cmd HTTP/1.1\r\nHost: 10.0.0.1\r\n"))
+
+    def test_tasks(self) -> None:
+        """A task has a number; it runs, is done with text, or fails with the robot's words."""
+        self.assertEqual(codec.task_of(b"TASK_ID:17"), "17")
+        self.assertRaises(BadFrame, codec.task_of, b"busy")
+        self.assertIsNone(codec.result_of(b"pending"))
+        self.assertIsNone(codec.result_of(b"running\nabc"))
+        self.assertEqual(codec.result_of(b"completed\nwkF\r\nk"), b"wkF\r\nk")
+        self.assertIn("time", str(self.assertRaises(BadFrame, codec.result_of, b"error\nERROR: time out")))
+
+    def test_reads_a_response_one_byte_at_a_time(self) -> None:
+        """A body is whole with its length, or with the end of the link; half of one is none."""
+        said = b"HTTP/1.1 200 OK\r\nContent-Length: 3\r\n\r\nabc"
+        reader = ResponseReader()
+        got = [reader.read(said[at : at + 1]) for at in range(len(said))]
+        self.assertEqual((set(got[:-1]), got[-1]), ({None}, b"abc"))
+        open_end = ResponseReader()
+        self.assertIsNone(open_end.read(b"HTTP/1.0 200 OK\r\n\r\nabc"))
+        self.assertEqual(open_end.ended(), b"abc")
+        for half in (b"", b"HTTP/1.1 200", said[:-1]):
+            reader = ResponseReader()
+            reader.read(half)
+            self.assertRaises(BadFrame, reader.ended)
+
+    @given(st.binary(max_size=200))
+    @settings(max_examples=100, deadline=None)
+    def test_other_responses_are_refused(self, data: bytes) -> None:
+        """Another status, no HTTP, and more than a robot has to say, are refused; no bytes do worse than that."""
+        self.assertRaises(BadFrame, ResponseReader().read, b"HTTP/1.1 404 Not Found\r\n\r\n" + data)
+        self.assertRaises(BadFrame, ResponseReader().read, b"x" * 9000 + data)
+        reader = ResponseReader()
+        try:
+            reader.read(data)
+            reader.ended()
+        except BadFrame:
+            return
+
+
+class GaitTests(SynchronousTestCase):
+    """Which gait comes nearest."""
+
+    def test_chooses(self) -> None:
+        """Slow, fast, back, turns and arcs each have their gait, and almost nothing is standing."""
+        for wish, name in (
+            ((0.0, 0.0), STAND),
+            ((0.01, 0.05), STAND),
+            ((0.03, 0.0), "wkF"),
+            ((0.14, 0.0), "trF"),
+            ((-0.1, 0.0), "bk"),
+            ((0.0, 0.2), "vtL"),
+            ((0.0, -2.0), "vtR"),
+            ((0.06, 0.4), "wkL"),
+            ((0.06, -0.4), "wkR"),
+        ):
+            self.assertEqual(chosen(*wish, GAITS)[0], name)
+        self.assertEqual(chosen(0.0, 0.0, GAITS)[1], REST)
+
+    def test_never_goes_where_it_shall_not(self) -> None:
+        """Where no gait goes that way, the dog stands; a gait that does nothing is none."""
+        self.assertEqual(chosen(-1.0, 1.0, {"wkF": Velocity(0.1, 0.0), "hlw": REST}), (STAND, REST))
+        for wish in ((0.1, 0.0), (-0.1, 0.0), (0.0, 0.15), (0.0, -1.0), (0.03, -0.4), (-0.05, 0.4)):
+            _, real = chosen(*wish, GAITS)
+            self.assertNotEqual(real, REST)
+            for wished, done in zip(wish, real, strict=True):
+                self.assertGreaterEqual(wished * done, 0.0)
+                self.assertFalse(done and not wished)
+
+
+class DialogueTests(SynchronousTestCase):
+    """Answers find their questions."""
+
+    def setUp(self) -> None:
+        self.clock = Clock()
+        self.sent: list[bytes] = []
+        self.dialogue = Dialogue(self.clock, self.sent.append)
+
+    def hear(self, *lines: str) -> None:
+        """The robot says lines."""
+        for line in lines:
+            self.dialogue.heard(line)
+
+    def test_answers_come_in_order(self) -> None:
+        """A stop leaves at once behind a question, and both get their own answers."""
+        asked = self.dialogue.ask(b"j\n", 1.0)
+        stop = self.dialogue.ask(b"kup\n", 1.0)
+        self.assertEqual(self.sent, [b"j\n", b"kup\n"])
+        self.hear("=", "0", "5,", "j", "up", "k")
+        self.assertEqual(self.successResultOf(asked), ["=", "0", "5,"])
+        self.assertEqual(self.successResultOf(stop), ["up"])
+        self.assertEqual(self.clock.getDelayedCalls(), [])
+
+    def test_a_command_too_long_has_failed(self) -> None:
+        """What the robot could not take whole is not done, though its token follows; what was asked next is."""
+        long, next_one = self.dialogue.ask(b"i8 10 9 10\n", 1.0), self.dialogue.ask(b"j\n", 1.0)
+        self.hear("OVF", "i", "=", "0", "5,", "j")
+        self.failureResultOf(long, RobotError)
+        self.assertEqual(self.successResultOf(next_one)[-3:], ["=", "0", "5,"])
+        self.hear("OVF")
+
+    def test_a_lost_answer_shifts_no_other(self) -> None:
+        """Where an answer is lost, the next one goes to its own question, also between skills."""
+        lost, got = self.dialogue.ask(b"gp\n", 1.0), self.dialogue.ask(b"j\n", 1.0)
+        self.hear("j")
+        self.failureResultOf(lost, NoReply)
+        self.successResultOf(got)
+        lost, got = self.dialogue.ask(b"kwkF\n", 1.0), self.dialogue.ask(b"kup\n", 1.0)
+        self.hear("up", "k")
+        self.failureResultOf(lost, NoReply)
+        self.successResultOf(got)
+
+    def test_a_rest_says_that_the_gyroscope_is_off(self) -> None:
+        """The ``g`` before the ``d`` of a rest is no answer to a question about the attitude."""
+        rest, attitude = self.dialogue.ask(b"d\n", 1.0), self.dialogue.ask(b"gp\n", 1.0)
+        self.hear("g", "d")
+        self.successResultOf(rest)
+        self.assertNoResult(attitude)
+        self.hear("ICM: 0 0 9 1 2 3", "g")
+        self.assertEqual(len(self.successResultOf(attitude)), 1)
+
+    def test_may_be_ended_while_it_fails_a_question(self) -> None:
+        """Who is told of one failure may end the dialogue, and no question fails twice."""
+        first, second = self.dialogue.ask(b"gp\n", 1.0), self.dialogue.ask(b"P~", 1.0)
+        third = self.dialogue.ask(b"j\n", 1.0)
+        first.addErrback(lambda _: self.dialogue.end(LinkLost("gone")))
+        self.hear("j")
+        self.failureResultOf(second, LinkLost)
+        self.failureResultOf(third, LinkLost)
+        self.successResultOf(first)
+        self.assertEqual(self.clock.getDelayedCalls(), [])
+
+    def test_late_unknown_and_ended(self) -> None:
+        """No answer in time, an unknown skill, and an end each fail the question; unasked lines are nothing."""
+        self.hear("k")
+        late = self.dialogue.ask(b"j\n", 1.0)
+        self.clock.advance(1.0)
+        self.failureResultOf(late, NoReply)
+        unknown = self.dialogue.ask(b"kfly\n", 1.0)
+        self.hear("?swim?", "?fly?", "k")
+        self.failureResultOf(unknown, Unsupported)
+        ended = self.dialogue.ask(b"j\n", 1.0)
+        self.hear(*["chatter"] * (MAX_LINES + 5))
+        self.dialogue.end(LinkLost("gone"))
+        self.failureResultOf(ended, LinkLost)
+        self.assertEqual(self.clock.getDelayedCalls(), [])
+
+
+class OptionTests(SynchronousTestCase):
+    """Options of the kind."""
+
+    def test_names_the_wrong_option(self) -> None:
+        """Each wrong option is refused in one line that names its key and what to write."""
+        for key, value in (
+            ("port", 7),
+            ("host", 7),
+            ("host", "10.0.0.1"),
+            ("baud", 9600),
+            ("http_port", 0),
+            ("board", "esp"),
+            ("ultrasonic", [16]),
+            ("gaits", {}),
+            ("gaits", {"w f": [0.1, 0]}),
+            ("gaits", {"wkF": [0.1]}),
+            ("gaits", {"wkF": [math.nan, 0]}),
+            ("gaits", {"vtL": [0, 1]}),
+            ("colour", "red"),
+        ):
+            line = str(self.assertRaises(UsageError, describe, "bittle", {"port": "/dev/ttyUSB0", key: value}))
+            self.assertIn(key, line)
+            self.assertNotIn("\n", line)
+        self.assertIn("port", str(self.assertRaises(UsageError, describe, "bittle", {})))
+        self.assertIn("board", str(self.assertRaises(UsageError, describe, "bittle", {"host": "10.0.0.1"})))
+
+    def test_describes_what_the_gaits_can_do(self) -> None:
+        """Limits are those of the gaits; a dog that cannot turn has no key to turn; sensors only where they are."""
+        told = describe("bittle", {"port": "/dev/ttyUSB0", "gaits": {"wkF": [0.1, 0]}, "board": "nyboard"})
+        self.assertEqual(told.limits, {"base.vx": (0.0, 0.1)})
+        self.assertNotIn("ranger", told.capabilities)
+        self.assertNotIn("power", told.capabilities)
+        told = describe("bittle", {"port": "/dev/ttyUSB0", "ultrasonic": [16, 17]})
+        self.assertIn("ranger", told.capabilities)
+        self.assertEqual(told.limits["base.vx"], (-0.05, 0.15))

@@ -1,0 +1,185 @@
+"""Tests of ``drivers.camera.codec``: streams as cameras send them, whole, byte by byte, spoilt, and anything at all."""
+
+from __future__ import annotations
+
+import base64
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from twisted.trial.unittest import SynchronousTestCase
+
+from drivers.camera import codec
+from drivers.camera.codec import StreamReader, answer, chunk, part
+from drivers.errors import BadFrame
+
+FIRST, SECOND = b"\xff\xd8one\r\n--fram\xff\xd9", b"\xff\xd8two--\n\xff\xd9"
+
+# As the camera server of Espressif's examples writes them: each piece is a chunk of its own.
+ESP32 = (
+    b"HTTP/1.1 200 OK\r\nContent-Type: multipart/x-mixed-replace;boundary=123456789000000000000987654321\r\n"
+    b"Transfer-Encoding: chunked\r\nAccess-Control-Allow-Origin: *\r\n\r\n"
+    + b"".join(
+        chunk(piece)
+        for picture in (FIRST, SECOND)
+        for piece in (
+            b"\r\n--123456789000000000000987654321\r\n",
+            b"Content-Type: image/jpeg\r\nContent-Length: %d\r\nX-Timestamp: 12.345678\r\n\r\n" % len(picture),
+            picture,
+        )
+    )
+    + b"0\r\n\r\n"
+)
+# As mjpg-streamer does: HTTP/1.0, and lengths.
+STREAMER = b"HTTP/1.0 200 OK\r\nContent-Type: multipart/x-mixed-replace;boundary=boundarydonotcross\r\n\r\n" + b"".join(
+    b"--boundarydonotcross\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n" % len(picture) + picture + b"\r\n"
+    for picture in (FIRST, SECOND)
+)
+# The boundary told with its dashes, in quotes, lines ended by LF alone, no lengths, and an end.
+PLAIN = (
+    b'HTTP/1.1 200 Fine\nServer: x\ncontent-type: Multipart/X-Mixed-Replace; a=b; Boundary="--cut"\n\n'
+    b"\n--cut\ncontent-type: image/jpeg\n\n" + FIRST + b"\n--cut \n\n" + SECOND + b"\n--cut--\n"
+)
+# The same as RFC 2046 wants it: the dashes are there twice.
+DOUBLE = (
+    b"HTTP/1.1 200 OK\r\nContent-Type: multipart/x-mixed-replace; boundary=--cut\r\n\r\npreamble\r\n"
+    b"----cut\r\n\r\n" + FIRST + b"\r\n----cut\r\n\r\n" + SECOND + b"\r\n----cut--\r\n"
+)
+STREAMS = {"esp32": ESP32, "streamer": STREAMER, "plain": PLAIN, "double": DOUBLE}
+
+
+def read(data: bytes, size: int = 0) -> tuple[list[bytes], StreamReader]:
+    """What a fresh reader finds in ``data``, given in pieces of ``size``."""
+    reader, found = StreamReader(), list[bytes]()
+    for place in range(0, len(data), size or len(data)):
+        found += reader.read(data[place : place + (size or len(data))])
+    return found, reader
+
+
+class StreamReaderTests(SynchronousTestCase):
+    def test_reads_what_cameras_send(self) -> None:
+        """The pictures of each way to write a stream come out as they went in, however the bytes are cut."""
+        for name, data in STREAMS.items():
+            for size in (0, 1, 2, 3, 7, 64):
+                found, reader = read(data, size)
+                self.assertEqual(found, [FIRST, SECOND], (name, size))
+                self.assertEqual(reader.is_over, name != "streamer", (name, size))
+                self.assertEqual(read(data + b"anything", size)[0], [FIRST, SECOND])
+
+    def test_reads_what_the_emulator_says(self) -> None:
+        """What is written here is read here: with lengths and without, in chunks and without."""
+        for is_chunked in (False, True):
+            for has_length in (False, True):
+                said = [part(picture, has_length) for picture in (FIRST, SECOND, FIRST)]
+                data = answer(is_chunked=is_chunked) + b"".join(map(chunk, said) if is_chunked else said)
+                # Without a length a picture is whole when the next one begins.
+                self.assertEqual(read(data, 5)[0], [FIRST, SECOND, FIRST][: 3 if has_length else 2])
+
+    def test_finds_its_way_back(self) -> None:
+        """A wrong length, and a boundary inside of a line, spoil a picture or two, and not those behind them."""
+        short = b"--frame\r\nContent-Length: 3\r\n\r\n" + FIRST
+        strange = b"--frames of a film\r\n--frame" + bytes(90) + b"\r\nContent-Length: x\r\n"
+        found, _ = read(answer() + short + b"\r\n" + strange + part(SECOND) + part(FIRST), 1)
+        self.assertEqual(found, [FIRST[:3], SECOND, FIRST])
+        self.assertEqual(
+            read(answer() + b"--frame\r\nContent-Length: none\r\n\r\n" + FIRST + b"\r\n--frame")[0], [FIRST]
+        )
+
+    def test_names_what_is_no_stream(self) -> None:
+        """Each answer that is no stream of pictures is refused in one plain line with what it was, or what to do."""
+        ok = b"HTTP/1.1 200 OK\r\n"
+        for data, word in (
+            (b"HTTP/1.1 401 Unauthorized\r\n\r\n", "NAME:PASSWORD"),
+            (b"HTTP/1.1 403 Forbidden\r\n\r\n", "NAME:PASSWORD"),
+            (b"HTTP/1.1 404 Not Found\r\n\r\n", "path"),
+            (b"HTTP/1.1 503 Busy\r\n\r\n", "others"),
+            (b"HTTP/1.1 500 \x00\x1b[1mOops\r\n\r\n", "500 ??[1mOops; look"),
+            (b"HTTP/1.1 302 Found\r\nLocation: http://a/b\r\n\r\n", "url = http://a/b"),
+            (b"SSH-2.0-OpenSSH\r\n\r\n", "SSH-2.0-OpenSSH"),
+            (b"HTTP/1.1 2000 OK\r\n\r\n", "HTTP"),
+            (b"HTTP/1.1 abc\r\n\r\n", "HTTP"),
+            (b"\r\n\r\n", "HTTP"),
+            (ok + b"Content-Type: text/html\r\n\r\n", "text/html"),
+            (ok + b"\r\n", "nothing that is named"),
+            (ok + b"Content-Type: multipart/x-mixed-replace\r\n\r\n", "boundary"),
+            (ok + b'Content-Type: multipart/x-mixed-replace; boundary="--"\r\n\r\n', "boundary"),
+            (ok + b"Content-Type: multipart/x-mixed-replace; boundary=" + b"b" * 71 + b"\r\n\r\n", "boundary"),
+            (b"x" * (codec.MOST_HEAD + 1), "fields"),
+            (ok + b"A: " + b"x" * codec.MOST_HEAD + b"\r\n\r\n", "fields"),
+            (answer() + b"--frame\r\n" + b"A: b\r\n" * 2000, "fields"),
+            (answer() + b"--frame\r\n" + b"A" * 9000, "fields"),
+            (answer(is_chunked=True) + b"five\r\n", "chunk"),
+            (answer(is_chunked=True) + b"\n\n", "chunk"),
+            (answer(is_chunked=True) + b"x" * 101, "chunk"),
+            (answer() + b"--frame\r\nContent-Length: 1048577\r\n\r\n", "more than 1048576 bytes"),
+            (answer() + b"--frame\r\nContent-Length: %s\r\n\r\n" % (b"9" * 5000), "more than 1048576 bytes"),
+            (answer() + b"--frame\r\n\r\n" + bytes(codec.MOST_BYTES + 100), "more than 1048576 bytes"),
+            (
+                answer() + b"--frame\r\n\r\n" + bytes(codec.MOST_BYTES + 1) + b"\r\n--frame\r\n",
+                "more than 1048576 bytes",
+            ),
+        ):
+            for size in (0, 1) if len(data) < 20_000 else (0, 50_000):
+                line = str(self.assertRaises(BadFrame, read, data, size))
+                self.assertIn(word, line)
+                self.assertTrue(line.isprintable() and len(line) < 200, line)
+
+    def test_takes_the_largest(self) -> None:
+        """A picture of exactly 1 MiB is taken, with its length and without."""
+        large = bytes(codec.MOST_BYTES)
+        for has_length in (True, False):
+            data = answer() + part(large, has_length) + b"--frame"
+            self.assertEqual(read(data, 40_000)[0], [large])
+
+    def test_keeps_no_more_than_it_needs(self) -> None:
+        """What stands between pictures is thrown away as it comes."""
+        reader = StreamReader()
+        reader.read(answer())
+        for _ in range(100):
+            self.assertEqual(reader.read(bytes(10_000)), [])
+        self.assertLess(len(reader._rest), 20)
+        self.assertEqual(reader.read(part(FIRST)), [FIRST])
+
+    @settings(derandomize=True, database=None, deadline=None, max_examples=300)
+    @given(st.lists(st.binary(max_size=60), max_size=6), st.booleans(), st.integers(1, 80))
+    def test_any_bytes_as_a_stream(self, pieces: list[bytes], is_chunked: bool, size: int) -> None:
+        """Whatever stands behind a head, there are pictures in it, or none, or it is refused; nothing else happens."""
+        data = answer(is_chunked=is_chunked) + b"\r\n--frame\r\n".join(pieces)
+        try:
+            found, _ = read(data, size)
+        except BadFrame:
+            return
+        self.assertTrue(all(len(one) <= len(data) for one in found))
+
+    @settings(derandomize=True, database=None, deadline=None, max_examples=300)
+    @given(st.sampled_from(sorted(STREAMS)), st.data())
+    def test_spoilt_streams(self, name: str, data: st.DataObject) -> None:
+        """A stream with some bytes changed or lost is read or refused, the same whether it comes whole or in bytes."""
+        stream = bytearray(STREAMS[name])
+        for _ in range(data.draw(st.integers(1, 4))):
+            place = data.draw(st.integers(0, len(stream) - 1))
+            stream[place : place + data.draw(st.integers(0, 3))] = data.draw(st.binary(max_size=2))
+        outcomes = []
+        for size in (0, 1):
+            try:
+                outcomes.append(read(bytes(stream), size)[0])
+            except BadFrame as error:
+                outcomes.append([str(error).encode()])
+        self.assertEqual(*outcomes)
+
+
+class RequestTests(SynchronousTestCase):
+    def test_asks(self) -> None:
+        """The request names host and path, and the login only where there is one."""
+        plain = codec.request("cam:81", "/stream?a=1")
+        self.assertTrue(plain.startswith(b"GET /stream?a=1 HTTP/1.1\r\nHost: cam:81\r\n"))
+        self.assertTrue(plain.endswith(b"\r\n\r\n"))
+        self.assertNotIn(b"Authorization", plain)
+        login = base64.b64encode(b"anna:s p")
+        self.assertIn(b"\r\nAuthorization: Basic " + login + b"\r\n", codec.request("cam", "/", "anna:s p"))
+
+    def test_is_heard_when_whole(self) -> None:
+        """The method of a request is told when its last line is there, and not before."""
+        whole = codec.request("cam", "/")
+        self.assertIsNone(codec.method_of(whole[:-1]))
+        self.assertEqual(codec.method_of(whole), "GET")
+        self.assertEqual(codec.method_of(b"POST / HTTP/1.1\n\n"), "POST")

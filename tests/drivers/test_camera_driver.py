@@ -1,0 +1,286 @@
+"""Tests of ``drivers.camera``: pictures of a folder on a turned clock, OpenCV's part by a stand-in, and faults."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from twisted.internet.task import Clock
+from twisted.trial.unittest import SynchronousTestCase
+
+from drivers.camera.driver import CameraDriver
+from drivers.camera.maker import film_of
+from drivers.camera.option import Options, checked
+from drivers.camera.shots import CaptureShots, FolderShots, Shot, Shots
+from drivers.camera.thread import ClockFilm, Reel, ThreadFilm
+from drivers.errors import BadFrame, LinkLost, NotEnabled, Unsupported, UsageError
+from drivers.registry import describe, driver_for
+from tests.drivers.contract import SensingContract
+
+HEAD = b"\xff\xd8\xff\xe0\x00\x04ab\xff\xc0\x00\x0b\x08\x00\x60\x00\x80\x01\x11\x00\x00"
+
+
+def jpeg(mark: int) -> bytes:
+    """One of 128 x 96, as far as its head goes."""
+    return HEAD + bytes([mark]) + b"\xff\xd9"
+
+
+class CameraDriverTests(SensingContract, SynchronousTestCase):
+    """A camera keeps the contract of what senses, and what is its own."""
+
+    def setUp(self) -> None:
+        """A folder of three pictures and a clock that is turned by hand."""
+        self.clock = Clock()
+        self.folder = Path(self.mktemp())
+        self.folder.mkdir()
+        for mark in (1, 2, 3):
+            (self.folder / f"{mark}.jpg").write_bytes(jpeg(mark))
+        (self.folder / "notes.txt").write_text("no picture", encoding="utf-8")
+        self.drivers: list[CameraDriver] = []
+
+    def tearDown(self) -> None:
+        """Nothing is left on the clock once all have gone."""
+        for driver in self.drivers:
+            driver.disconnect()
+        self.assertEqual(self.clock.getDelayedCalls(), [])
+
+    def make_driver(self, **options: object) -> CameraDriver:
+        """A driver of the folder."""
+        wanted = checked({"source": str(self.folder), "fps": 20, **options})
+        driver = CameraDriver(wanted, film_of(wanted, self.clock), self.clock, "cam")
+        self.drivers.append(driver)
+        return driver
+
+    def pass_time(self, seconds: float) -> None:
+        """Turn the clock."""
+        self.clock.pump([0.01] * round(seconds / 0.01))
+
+    def now(self) -> float:
+        """The turned clock."""
+        return self.clock.seconds()
+
+    def test_shows_a_folder_by_the_clock(self) -> None:
+        """The pictures come in the order of their names at their rate, over and over, the same in each run."""
+        runs = []
+        for _ in range(2):
+            driver, seen = self.make_driver(fps=10), list[int]()
+            driver.subscribe(lambda one, seen=seen: seen.append(one.frame.data[-3]))  # type: ignore[misc]
+            driver.connect()
+            self.pass_time(1.0)
+            driver.disconnect()
+            runs.append(seen)
+        self.assertEqual(runs[0], runs[1])
+        self.assertEqual(runs[0], [1, 2, 3, 1, 2, 3, 1, 2, 3, 1])
+        newest = driver.observe()
+        assert newest is not None and newest.frame is not None
+        self.assertEqual((newest.frame.width, newest.frame.height, newest.frame.seq), (128, 96, 10))
+
+    def test_takes_as_many_pictures_as_are_wanted(self) -> None:
+        """Another rate holds at once; with none wanted no picture is taken, and the device stays ready."""
+        driver = self.ready()
+        assert isinstance(driver, CameraDriver)
+        driver.set_camera_fps(0)
+        before = driver.diagnostics()["pictures"]
+        self.pass_time(3.0)
+        self.assertEqual((driver.state, driver.diagnostics()["pictures"]), ("ready", before))
+        driver.set_camera_fps(5)
+        self.pass_time(2.0)
+        self.assertEqual(driver.camera_fps, 5)
+        self.assertIn(driver.diagnostics()["pictures"] - before, (9, 10))
+        resting = self.make_driver()
+        resting.set_camera_fps(0)
+        connected = resting.connect()
+        self.pass_time(2.0)
+        self.successResultOf(connected)
+        self.assertEqual(resting.state, "ready")
+
+    def test_drops_what_is_no_picture(self) -> None:
+        """A spoilt file is counted and passed over; the others go on."""
+        (self.folder / "2.jpg").write_bytes(jpeg(2)[:-1])
+        driver = self.make_driver()
+        driver.connect()
+        self.pass_time(1.0)
+        counts = driver.diagnostics()
+        self.assertGreater(counts["bad_frames"], 5)
+        self.assertGreater(counts["pictures"], 2 * counts["bad_frames"] - 2)
+        self.assertEqual(driver.state, "ready")
+
+    def test_comes_back_with_its_pictures(self) -> None:
+        """Without pictures the driver is stale and tries again, ever more slowly; then it is ready as before."""
+        driver = self.ready()
+        for mark in (1, 2, 3):
+            (self.folder / f"{mark}.jpg").unlink()
+        self.pass_time(0.2)
+        self.assertEqual(driver.state, "stale")
+        self.failureResultOf(driver.enable(), LinkLost)
+        self.assertRaises(NotEnabled, driver.act, {}, self.permit())
+        self.pass_time(30.0)
+        self.assertLess(driver.diagnostics()["refused"], 12)
+        (self.folder / "4.jpeg").write_bytes(jpeg(4))
+        self.pass_time(5.2)
+        self.assertEqual((driver.state, driver.diagnostics()["reconnects"]), ("ready", 1.0))
+        self.assertEqual(driver.act({}, self.permit()), {})
+        self.assertRaises(Unsupported, driver.act, {"base.vx": 0.1}, self.permit())
+
+    def test_waits_for_a_camera_that_is_not_there(self) -> None:
+        """A video that does not exist is no error of the node: connect waits, and leaving says why."""
+        driver = self.make_driver(source=str(self.folder / "none.avi"))
+        connected = driver.connect()
+        self.pass_time(10.0)
+        self.assertNoResult(connected)
+        self.assertGreater(driver.diagnostics()["refused"], 2)
+        driver.disconnect()
+        self.failureResultOf(connected, LinkLost)
+
+    def test_is_made_by_the_registry(self) -> None:
+        """The kind is known and described without a camera; wrong options are refused with key and remedy."""
+        self.assertIsInstance(driver_for("camera", {"source": str(self.folder)}, "cam", self.clock), CameraDriver)
+        body = describe("camera", {"lens": 70, "ahead": -0.05})
+        self.assertEqual(body.capabilities["camera"]["ahead"], -0.05)
+        self.assertEqual((list(body.capabilities), body.limits), (["camera"], {}))
+        self.assertEqual(body.capabilities["camera"]["fov_h_deg"], 70)
+        wrong: tuple[tuple[str, object], ...] = (
+            *(("source", -1), ("source", ""), ("source", True), ("source", "a\nb"), ("width", 8), ("width", 20.5)),
+            *(
+                ("fps", 0),
+                ("fps", "10"),
+                ("fps", float("nan")),
+                ("lens", True),
+                ("quality", 96),
+                ("ahead", 6),
+                ("colour", "red"),
+            ),
+        )
+        for key, value in wrong:
+            self.assertIn(key, str(self.assertRaises(UsageError, describe, "camera", {key: value})))
+
+    def test_asks_a_device_in_a_thread(self) -> None:
+        """Cameras get a thread of their own, by number and by device file; files are read by the clock."""
+
+        class Reactor(Clock):
+            def callFromThread(self, call: Any) -> None:  # noqa: N802 (Twisted's)
+                call()
+
+        for source in (0, "/dev/video1"):
+            self.assertIsInstance(film_of(Options(source), Reactor()), ThreadFilm)
+        self.assertIsInstance(film_of(Options("a.avi"), self.clock), ClockFilm)
+
+
+class Picture:
+    """What OpenCV would give."""
+
+    def __init__(self, width: int, height: int) -> None:
+        self.shape = (height, width, 3)
+
+    def tobytes(self) -> bytes:
+        return jpeg(self.shape[1] % 256)
+
+
+class Lens:
+    """A stand-in for the module cv2, with one camera."""
+
+    CAP_PROP_FRAME_WIDTH, CAP_PROP_FRAME_HEIGHT, CAP_PROP_BUFFERSIZE, CAP_PROP_POS_FRAMES = range(4)
+    INTER_AREA = IMWRITE_JPEG_QUALITY = 0
+
+    def __init__(self, *pictures: Picture | None, is_open: bool = True) -> None:
+        self.pictures = list(pictures)
+        self.set_to: dict[int, float] = {}
+        self.is_open = is_open
+        self.can_encode = True
+        self.released = 0
+
+    def VideoCapture(self, _source: object) -> Lens:  # noqa: N802 (OpenCV's)
+        return self
+
+    def isOpened(self) -> bool:  # noqa: N802 (OpenCV's)
+        return self.is_open
+
+    def set(self, what: int, value: float) -> None:
+        self.set_to[what] = value
+
+    def release(self) -> None:
+        self.released += 1
+
+    def read(self) -> tuple[bool, Picture | None]:
+        picture = self.pictures.pop(0) if self.pictures else None
+        return picture is not None, picture
+
+    def resize(self, _picture: Picture, size: tuple[int, int], interpolation: int) -> Picture:
+        return Picture(*size)
+
+    def imencode(self, _kind: str, picture: Picture, _how: object) -> tuple[bool, Picture]:
+        return self.can_encode, picture
+
+
+class ShotsTests(SynchronousTestCase):
+    def capture(self, lens: Lens, **options: Any) -> CaptureShots:
+        """A video that the stand-in shows."""
+        with tempfile.NamedTemporaryFile(suffix=".avi", delete=False) as file:
+            self.addCleanup(Path(file.name).unlink)
+        return CaptureShots(Options(file.name, **options), lambda: lens)
+
+    def test_reduces_large_pictures(self) -> None:
+        """A picture that is larger than wanted is reduced with its shape kept; a smaller one stays."""
+        shots = self.capture(Lens(Picture(1280, 720), Picture(100, 50)), width=320, height=240)
+        shots.open()
+        first, second = shots.shoot(), shots.shoot()
+        self.assertEqual((first.width, first.height), (320, 180))
+        self.assertEqual((second.width, second.height), (100, 50))
+
+    def test_begins_a_video_anew(self) -> None:
+        """At its end a video begins again; one that shows nothing even so is lost, and closed once."""
+        lens = Lens(Picture(10, 10), None, Picture(20, 20))
+        shots = self.capture(lens)
+        shots.open()
+        self.assertEqual([shots.shoot().width, shots.shoot().width], [10, 20])
+        self.assertEqual(lens.set_to[Lens.CAP_PROP_POS_FRAMES], 0)
+        self.assertRaises(LinkLost, shots.shoot)
+        shots.close()
+        shots.close()
+        self.assertEqual(lens.released, 1)
+        self.assertRaises(LinkLost, shots.shoot)
+
+    def test_names_why_there_are_no_pictures(self) -> None:
+        """No OpenCV, no such camera or file, one in use and a picture that is none: each in its words."""
+
+        def missing() -> Any:
+            raise ImportError("cv2")
+
+        self.assertIn('"vision"', str(self.assertRaises(LinkLost, CaptureShots(Options(0), missing).open)))
+        none = CaptureShots(Options("/dev/video62"), lambda: Lens())
+        self.assertIn("plugged", str(self.assertRaises(LinkLost, none.open)))
+        self.assertIn("no such", str(self.assertRaises(LinkLost, CaptureShots(Options("x"), lambda: Lens()).open)))
+        busy = self.capture(Lens(is_open=False))
+        self.assertIn("else may be using", str(self.assertRaises(LinkLost, busy.open)))
+        lens = Lens(Picture(10, 10))
+        lens.can_encode = False
+        shots = self.capture(lens)
+        shots.open()
+        self.assertRaises(BadFrame, shots.shoot)
+        self.assertRaises(LinkLost, FolderShots("/nowhere").open)
+        self.assertRaises(LinkLost, FolderShots("/nowhere").shoot)
+
+    def test_reel_outlives_what_opencv_throws(self) -> None:
+        """An exception of OpenCV's own closes the camera, is told with its name, and the next round opens it again."""
+
+        class Moody(Shots):
+            rounds = 0
+
+            def open(self) -> None:
+                self.rounds += 1
+
+            def shoot(self) -> Shot:
+                if self.rounds == 1:
+                    raise RuntimeError("cv2.error: (-215)")
+                return Shot(b"", 1, 1)
+
+            def close(self) -> None:
+                pass
+
+        told: list[tuple[str, Any]] = []
+        reel = Reel(Moody(), lambda what, said: told.append((what, said)))
+        self.assertGreater(reel.turn(), 0.0)
+        self.assertEqual(reel.turn(), 0.0)
+        self.assertEqual(told[0], ("gone", "RuntimeError: cv2.error: (-215)"))
+        self.assertEqual(told[1], ("shown", Shot(b"", 1, 1)))

@@ -1,0 +1,307 @@
+"""Tests of ``drivers.camera.stream`` against ``sim.emulator.mjpeg``, joined through memory."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from twisted.internet.task import Clock
+from twisted.trial.unittest import SynchronousTestCase
+
+import drivers
+from drivers.camera.codec import part
+from drivers.camera.driver import CameraDriver
+from drivers.camera.option import place_of
+from drivers.camera.stream import SILENCE_S, StreamFilm
+from drivers.driver import Driver, Filming
+from drivers.errors import LinkLost, UsageError
+from drivers.link import MemoryConnector
+from drivers.registry import describe, driver_for
+from sim.emulator.body import MemoryBody
+from sim.emulator.foul import Foul
+from sim.emulator.mjpeg import MjpegCamera
+from tests.drivers.contract import SensingContract
+from tests.drivers.test_camera_driver import jpeg
+
+URL = "http://10.0.0.7:81/stream"
+
+
+class StreamTests(SensingContract, SynchronousTestCase):
+    """A camera on the network keeps the contract of what senses, and what is its own."""
+
+    def setUp(self) -> None:
+        """A camera board, a network of memory, and a clock that is turned by hand."""
+        self.clock = Clock()
+        self.body = MemoryBody(jpeg=jpeg(1))
+        self.foul = Foul()
+        self.camera = MjpegCamera(self.clock, self.body, 30.0, foul=self.foul)
+        self.camera.start()
+        self.connector = MemoryConnector(self.clock, self.camera.accept)
+        self.drivers: list[Driver] = []
+
+    def tearDown(self) -> None:
+        """Nothing is left on the clock once all have gone."""
+        for driver in self.drivers:
+            driver.disconnect()
+        self.camera.stop()
+        self.clock.advance(1.0)
+        self.assertEqual(self.clock.getDelayedCalls(), [])
+
+    def make_driver(self, **options: object) -> CameraDriver:
+        """A driver of that camera, as the registry makes it."""
+        table = {"url": URL, "fps": 30, "width": 128, "height": 96, **options}
+        driver = driver_for("camera", table, "cam", self.clock, self.connector)
+        assert isinstance(driver, CameraDriver)
+        self.drivers.append(driver)
+        return driver
+
+    def pass_time(self, seconds: float) -> None:
+        """Turn the clock."""
+        self.clock.pump([0.005] * round(seconds / 0.005))
+
+    def now(self) -> float:
+        """The turned clock."""
+        return self.clock.seconds()
+
+    def logged(self, driver: CameraDriver) -> list[str]:
+        """What the driver will have logged as warnings."""
+        lines: list[str] = []
+        log = type("Log", (), {})()
+        log.warn = lambda text, **facts: lines.append(text.format(**facts))
+        log.debug = lambda text, **facts: None
+        driver.log = log
+        return lines
+
+    def test_shows_what_the_camera_sees(self) -> None:
+        """The newest picture is the camera's, with its size; its numbers leave no gap; each way to write works."""
+        for has_length in (True, False):
+            for is_chunked in (True, False):
+                self.camera.has_length, self.camera.is_chunked = has_length, is_chunked
+                self.foul.split = is_chunked
+                driver, numbers = self.make_driver(), list[int]()
+                driver.subscribe(lambda seen, numbers=numbers: numbers.append(seen.frame.seq))  # type: ignore[misc]
+                driver.connect()
+                self.pass_time(0.5)
+                self.body.jpeg = jpeg(2)
+                self.pass_time(0.5)
+                seen = driver.observe()
+                assert seen is not None and seen.frame is not None
+                self.assertEqual((seen.frame.width, seen.frame.height, seen.frame.data), (128, 96, jpeg(2)))
+                self.assertEqual(numbers, list(range(1, len(numbers) + 1)))
+                self.assertIn(len(numbers), (28, 29, 30))
+                driver.disconnect()
+
+    def test_takes_as_many_pictures_as_are_wanted(self) -> None:
+        """What comes above the wanted rate is dropped; with none wanted the camera is hung up on, and called again."""
+        driver = self.ready()
+        assert isinstance(driver, CameraDriver)
+        self.assertIsInstance(driver, Filming)
+        driver.set_camera_fps(10)
+        before = driver.diagnostics()
+        self.pass_time(2.0)
+        after = driver.diagnostics()
+        self.assertIn(after["pictures"] - before["pictures"], (19, 20, 21))
+        self.assertIn(after["dropped"] - before["dropped"], (39, 40, 41))
+        driver.set_camera_fps(0)
+        self.pass_time(3.0)
+        self.assertEqual((driver.state, len(self.camera.clients)), ("ready", 0))
+        self.assertEqual(driver.diagnostics()["pictures"], after["pictures"])
+        driver.set_camera_fps(30)
+        self.pass_time(1.0)
+        self.assertGreater(driver.diagnostics()["pictures"], after["pictures"] + 20)
+        self.assertEqual((driver.diagnostics()["refused"], len(self.camera.clients)), (0, 1))
+
+    def test_looks_once_where_no_pictures_are_wanted(self) -> None:
+        """A camera from which no pictures are wanted is called for one, which says that it is there."""
+        driver = self.make_driver()
+        driver.set_camera_fps(0)
+        connected = driver.connect()
+        self.pass_time(8.0)
+        self.successResultOf(connected)
+        self.assertEqual((driver.state, driver.diagnostics()["pictures"], len(self.camera.clients)), ("ready", 1, 0))
+
+    def test_takes_every_picture_of_an_uneven_camera(self) -> None:
+        """Pictures that come a little early or late at the wanted rate are not dropped."""
+        driver = self.make_driver(fps=10)
+        driver.connect()
+        self.camera.stop()
+        self.pass_time(0.1)
+        film: Any = driver._film
+        for moment in (0.0, 0.09, 0.21, 0.29, 0.41, 0.49):
+            self.clock.advance(10.0 + moment - self.now() if moment else 10.0 - self.now())
+            film._timer = self.clock.callLater(100.0, lambda: None) if film._timer is None else film._timer
+            film._on_picture(jpeg(1))
+        self.assertEqual((film.dropped, driver.diagnostics()["pictures"]), (0, 6))
+
+    def test_drops_what_is_no_picture(self) -> None:
+        """A part that is no JPEG is counted and passed over; the stream goes on."""
+        driver = self.ready()
+        self.body.jpeg = b"no picture"
+        self.pass_time(0.2)
+        self.body.jpeg = jpeg(3)
+        self.pass_time(0.2)
+        counts = driver.diagnostics()
+        self.assertIn(counts["bad_frames"], (5, 6, 7))
+        self.assertEqual((driver.state, counts["reconnects"]), ("ready", 0))
+
+    def test_comes_back_with_the_camera(self) -> None:
+        """A link that is lost is named once and tried again, ever more slowly; then the camera is ready as before."""
+        driver = self.ready()
+        assert isinstance(driver, CameraDriver)
+        lines = self.logged(driver)
+        self.connector.is_open = False
+        self.connector.cut()
+        self.pass_time(0.1)
+        self.assertEqual((driver.state, driver.problem), ("stale", "it has hung up"))
+        self.failureResultOf(driver.enable(), LinkLost)
+        self.pass_time(60.0)
+        self.assertLess(driver.diagnostics()["refused"], 12)
+        self.assertEqual(
+            lines,
+            [
+                "cam: it has hung up; trying again",
+                "cam: nothing answers at 10.0.0.7:81; is it on, and in this network?; trying again",
+            ],
+        )
+        self.connector.is_open = True
+        self.pass_time(7.5)
+        self.assertEqual((driver.state, driver.diagnostics()["reconnects"], driver.problem), ("ready", 1.0, ""))
+        self.connector.cut()
+        self.pass_time(1.0)
+        self.assertEqual((driver.state, driver.diagnostics()["reconnects"]), ("ready", 2.0))
+
+    def test_comes_back_while_no_pictures_are_wanted(self) -> None:
+        """Of a camera that was lost one picture is wanted in any case, which says that it is there again."""
+        driver = self.ready()
+        assert isinstance(driver, CameraDriver)
+        self.connector.is_open = False
+        self.connector.cut()
+        self.pass_time(0.1)
+        driver.set_camera_fps(0)
+        self.pass_time(10.0)
+        self.assertEqual(driver.state, "stale")
+        self.connector.is_open = True
+        self.pass_time(7.5)
+        self.assertEqual((driver.state, len(self.camera.clients)), ("ready", 0))
+
+    def test_notices_a_camera_that_fell_silent(self) -> None:
+        """A camera that is connected and sends nothing is hung up on and called again, until it sends."""
+        driver = self.ready()
+        assert isinstance(driver, CameraDriver)
+        self.foul.half_open = True
+        self.pass_time(1.0)
+        self.assertEqual(driver.state, "stale")
+        self.pass_time(SILENCE_S)
+        self.assertIn("no pictures come", driver.problem)
+        self.foul.half_open = False
+        self.pass_time(2.0)
+        self.assertEqual(driver.state, "ready")
+
+    def test_names_what_is_no_camera(self) -> None:
+        """What answers otherwise is named with the remedy and asked again with back-off; a node lives on with it."""
+        self.camera.status = "401 Unauthorized"
+        driver = self.make_driver()
+        connected = driver.connect()
+        self.pass_time(20.0)
+        self.assertNoResult(connected)
+        self.assertIn("NAME:PASSWORD", driver.problem)
+        self.assertIn(driver.diagnostics()["refused"], (5, 6, 7))
+        self.camera.status = "200 OK"
+        self.camera.kind = "text/html"
+        self.pass_time(6.0)
+        self.assertIn("text/html", driver.problem)
+        self.camera.kind = "multipart/x-mixed-replace; boundary=frame"
+        self.body.jpeg = bytes(1024 * 1024 + 1)
+        self.pass_time(6.0)
+        self.assertIn("more than 1048576 bytes", driver.problem)
+        self.body.jpeg = jpeg(4)
+        self.pass_time(6.0)
+        self.successResultOf(connected)
+        self.assertEqual(driver.state, "ready")
+
+    def test_survives_a_foul_network(self) -> None:
+        """Lost, spoilt, late and cut pieces cost pictures, and are over when the network is well again."""
+        driver = self.make_driver()
+        driver.connect()
+        self.foul.drop, self.foul.garbage, self.foul.split, self.foul.delay = 0.1, 0.2, True, 0.03
+        self.pass_time(30.0)
+        self.assertGreater(driver.diagnostics()["pictures"], 50)
+        self.foul.drop = self.foul.garbage = 0.0
+        self.pass_time(12.0)
+        before = driver.diagnostics()
+        self.pass_time(1.0)
+        after = driver.diagnostics()
+        self.assertGreater(after["pictures"] - before["pictures"], 25)
+        self.assertEqual(after["bad_frames"], before["bad_frames"])
+
+    def test_says_that_the_pictures_have_another_size(self) -> None:
+        """Pictures of another size than described are shown as they are, and what to write is logged once."""
+        lines = list[str]()
+        driver = self.make_driver(width=320, height=240)
+        log = type("Log", (), {})()
+        log.warn = lambda text, **facts: lines.append(text.format(**facts))
+        film: Any = driver._film
+        film.log = log
+        driver.connect()
+        self.pass_time(1.0)
+        self.assertEqual(lines, ["10.0.0.7:81: its pictures are 128 x 96: write width = 128, height = 96"])
+        self.assertEqual(driver.description.capabilities["camera"]["width"], 320)
+
+    def test_hears_no_more_of_a_call_that_is_over(self) -> None:
+        """What an earlier connection still brings while it closes is no word of the new one."""
+        driver = self.ready()
+        assert isinstance(driver, CameraDriver)
+        film: Any = driver._film
+        old = film._call
+        driver.set_camera_fps(0)
+        driver.set_camera_fps(30)
+        count = driver.diagnostics()["pictures"]
+        old.received(part(jpeg(2)))
+        old.link_down()
+        self.assertEqual((driver.diagnostics()["pictures"], driver.problem, driver.state), (count, "", "ready"))
+
+    def test_is_told_where_it_is(self) -> None:
+        """A url says host, port, path and login; one that cannot be is refused, and never shown: it may be secret."""
+        place = place_of("http://anna:s%20p@cam.lan/a/b?c=1")
+        self.assertEqual((place.host, place.port, place.path, place.login), ("cam.lan", 80, "/a/b?c=1", "anna:s p"))
+        self.assertEqual((place.name, place_of("http://[::1]:81").name), ("cam.lan:80", "[::1]:81"))
+        self.assertEqual(place_of("http://[::1]:81").path, "/")
+        body = describe("camera", {"url": URL, "width": 104, "height": 80, "lens": 50})
+        self.assertEqual(body.model, "a camera on the network")
+        lens = {"fov_h_deg": 50, "ahead": 0.1}
+        self.assertEqual(body.capabilities["camera"], {"width": 104, "height": 80, "fps": 10.0, **lens})
+        for url in (
+            *(7, "", "cam", "http://", "http://cam:0/", "http://cam:port/", "http://cam:99999/", "ftp://cam/"),
+            *("http://anna:secret@/", "http://cam/a b", "http://cam/\n", "http://cäm/", "http://[::1", "https://cam/"),
+            "http://cam/" + "x" * 500,
+        ):
+            line = str(self.assertRaises(UsageError, describe, "camera", {"url": url}))
+            self.assertIn("option url", line)
+            self.assertNotIn("secret", line)
+        both = {"url": URL, "source": 0}
+        self.assertIn("exclude", str(self.assertRaises(UsageError, describe, "camera", both)))
+
+    def test_needs_no_opencv(self) -> None:
+        """A camera on the network is driven without OpenCV, NumPy and pyserial, and without a thread."""
+        script = (
+            "import sys, threading; from twisted.internet.task import Clock\n"
+            "from drivers.registry import driver_for; from drivers.link import MemoryConnector\n"
+            "clock = Clock()\n"
+            f"driver = driver_for('camera', {{'url': {URL!r}}}, 'cam', clock, MemoryConnector(clock, None))\n"
+            "driver.connect()\n"
+            "assert not {'cv2', 'numpy', 'serial', 'twisted.internet.reactor'} & set(sys.modules)\n"
+            "assert threading.active_count() == 1"
+        )
+        root = Path(drivers.__file__).parents[1]
+        done = subprocess.run(
+            [sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=False, cwd=root
+        )
+        self.assertEqual((done.returncode, done.stderr), (0, ""))
+
+    def test_stops_before_it_starts(self) -> None:
+        """A film that was never started takes a rate and an end."""
+        film = StreamFilm(place_of(URL), (1, 1), self.connector, self.clock)
+        film.set_fps(5)
+        self.successResultOf(film.stop())

@@ -1,0 +1,249 @@
+"""Tests of ``drivers.compass`` against ``sim.emulator.nmea``, joined through memory."""
+
+from __future__ import annotations
+
+import math
+
+from twisted.internet.task import Clock
+from twisted.trial.unittest import SynchronousTestCase
+
+from drivers.compass.driver import HEADING, SILENCE_S, CompassDriver
+from drivers.driver import Driver
+from drivers.errors import LinkLost, NotEnabled, Unsupported, UsageError
+from drivers.link import MemoryConnector
+from drivers.registry import describe, driver_for
+from sim.dog import Dog
+from sim.emulator.body import MemoryBody
+from sim.emulator.nmea import NmeaCompass
+from sim.scene import Kennel
+from tests.drivers.contract import SensingContract
+
+
+class CompassDriverTests(SensingContract, SynchronousTestCase):
+    """A compass keeps the contract of what senses, and what is its own."""
+
+    def setUp(self) -> None:
+        """A compass that looks along the x axis, a network of memory, and a clock that is turned by hand."""
+        self.clock = Clock()
+        self.body = MemoryBody(values={HEADING: 0.0})
+        self.compass = NmeaCompass(self.clock, self.body, 20.0)
+        self.compass.start()
+        self.compass.start()
+        self.foul = self.compass.foul
+        self.connector = MemoryConnector(self.clock, self.compass.accept)
+        self.drivers: list[Driver] = []
+
+    def tearDown(self) -> None:
+        """Nothing is left on the clock once all have gone."""
+        for driver in self.drivers:
+            driver.disconnect()
+        self.compass.stop()
+        self.clock.advance(1.0)
+        self.assertEqual(self.clock.getDelayedCalls(), [])
+
+    def make_driver(self, **options: object) -> CompassDriver:
+        """A driver of that compass, as the registry makes it."""
+        place = {} if "device" in options else {"host": "10.0.0.8"}
+        driver = driver_for("compass", {"rate": 20, **place, **options}, "dog", self.clock, self.connector)
+        assert isinstance(driver, CompassDriver)
+        self.drivers.append(driver)
+        return driver
+
+    def pass_time(self, seconds: float) -> None:
+        """Turn the clock."""
+        self.clock.pump([0.005] * round(seconds / 0.005))
+
+    def now(self) -> float:
+        """The turned clock."""
+        return self.clock.seconds()
+
+    def heading(self, driver: Driver) -> float:
+        """Degrees of what the newest observation says."""
+        seen = driver.observe()
+        assert seen is not None
+        return math.degrees(float(seen.values[HEADING]))
+
+    def test_turns_as_the_yard_does(self) -> None:
+        """The heading is the body's own, counter-clockwise from the x axis: as a dog of the yard tells it."""
+        driver = self.make_driver()
+        driver.connect()
+        for degrees in (0.0, 45.0, 90.0, 179.9, -179.9, -90.0, -0.04):
+            # What a dog of the yard calls its heading is what its compass tells (sim.sensor).
+            dog = Dog(Kennel("dog1", 0.0, 0.0, math.radians(degrees), 1), 1)
+            self.body.values[HEADING] = dog.heading
+            self.pass_time(0.2)
+            self.assertTrue(abs(math.remainder(self.heading(driver) - degrees, 360.0)) < 0.06, degrees)
+
+    def test_counts_from_the_yards_axis(self) -> None:
+        """Degrees clockwise from north become radians from the x axis, which lies east unless it is said."""
+        north = self.make_driver()
+        turned = self.make_driver(mounted_deg=30)
+        other = self.make_driver(x_axis_deg=0)
+        for driver in (north, turned, other):
+            driver.connect()
+        self.body.values[HEADING] = math.radians(90.0)  # the compass reads 0: north
+        self.pass_time(0.2)
+        for driver, degrees in ((north, 90.0), (turned, 60.0), (other, 0.0)):
+            self.assertAlmostEqual(self.heading(driver), degrees, 6)
+
+    def test_allows_for_the_place(self) -> None:
+        """Deviation and variation are allowed for where they are told; else the variation of the options is."""
+        self.compass.deviation, self.compass.variation = 3.0, -12.0
+        self.body.values[HEADING] = math.radians(20.0)
+        for kinds, options in (
+            (("HDG",), {"variation_deg": 50.0}),
+            (("HDT",), {"variation_deg": 50.0}),
+            (("HDM",), {"variation_deg": -12.0}),
+        ):
+            self.compass.kinds = kinds
+            driver = self.make_driver(**options)
+            driver.connect()
+            self.pass_time(0.2)
+            self.assertAlmostEqual(self.heading(driver), 20.0, 6)
+
+    def test_believes_the_best_sentence(self) -> None:
+        """Of a compass that sends several sentences the best is believed; when it ceases, the next best."""
+        self.compass.variation = 10.0
+        self.compass.kinds = ("HDM", "HDT")
+        driver, seen = self.make_driver(), set[float]()
+        driver.connect()
+        self.pass_time(0.2)
+        driver.subscribe(lambda one: seen.add(round(math.degrees(float(one.values[HEADING])))))
+        self.pass_time(0.5)
+        self.assertEqual(seen, {0})
+        self.compass.kinds = ("HDM",)
+        self.pass_time(1.0)
+        self.assertEqual(driver.state, "stale")
+        self.pass_time(3.0)
+        self.assertEqual((driver.state, seen), ("ready", {0, 10}))
+
+    def test_is_stale_without_headings(self) -> None:
+        """A lost link is opened again and the compass is ready as before; in between nothing of it is believed."""
+        driver = self.ready()
+        self.connector.cut()
+        self.assertEqual(driver.state, "stale")
+        self.failureResultOf(driver.enable(), LinkLost)
+        self.assertRaises(NotEnabled, driver.act, {}, self.permit())
+        self.pass_time(1.0)
+        self.assertEqual((driver.state, driver.diagnostics()["reconnects"]), ("ready", 1.0))
+        self.assertEqual(driver.act({}, self.permit()), {})
+        self.assertRaises(Unsupported, driver.act, {"base.vx": 0.1}, self.permit())
+
+    def test_names_why_there_is_no_heading(self) -> None:
+        """No answer, silence, noise and other sentences are each named once; what was heard again is forgotten."""
+        lines: list[str] = []
+        log = type("Log", (), {})()
+        log.warn = lambda text, **facts: lines.append(text.format(**facts))
+        self.connector.is_open = False
+        driver = self.make_driver()
+        driver.log = log
+        connected = driver.connect()
+        self.pass_time(SILENCE_S + 0.1)
+        self.assertEqual(driver.problem, "nothing answers at 10.0.0.8:10110; is it on, and in this network?")
+        self.connector.is_open, self.foul.half_open = True, True
+        self.pass_time(60.0)
+        self.assertIn("sends nothing", driver.problem)
+        self.foul.half_open = False
+        self.body.values.clear()
+        self.pass_time(60.0)
+        self.assertIn("no sentences", driver.problem)
+        self.assertGreater(driver.diagnostics()["bad_frames"], 100)
+        self.compass.kinds = ("VHW",)
+        self.pass_time(60.0)
+        self.assertIn("no heading", driver.problem)
+        self.assertNoResult(connected)
+        self.compass.kinds = ("HDT",)
+        self.body.values[HEADING] = 0.0
+        self.pass_time(1.0)
+        self.successResultOf(connected)
+        self.assertEqual((driver.problem, len(lines), len(set(lines))), ("", 4, 4))
+
+    def test_hangs_up_on_silence(self) -> None:
+        """A link on which nothing comes any more is closed and opened anew, for the other end may be long gone."""
+        driver = self.ready()
+        silent = self.compass.clients[0]
+        self.foul.half_open = True
+        self.pass_time(SILENCE_S + 0.5)
+        self.assertNotIn(silent, self.compass.clients)
+        self.foul.half_open = False
+        self.pass_time(1.0)
+        self.assertEqual((driver.state, driver.diagnostics()["reconnects"]), ("ready", 1.0))
+
+    def test_asks_for_the_baud_rate(self) -> None:
+        """On a cable, noise is a matter of the baud rate, and a device that is not open is named."""
+        self.compass.kinds = ()
+        driver = self.make_driver(device="/dev/ttyUSB1", baud=9600)
+        connected = driver.connect()
+        self.connector.is_open = False
+        self.pass_time(SILENCE_S + 0.1)
+        self.assertEqual(driver.problem, "/dev/ttyUSB1 is not open")
+        self.connector.is_open = True
+        for _ in range(600):
+            for client in self.compass.clients:
+                client.outlet.send(b"\x00\xf8\x80\x0d")
+            self.pass_time(0.1)
+        self.assertEqual(driver.problem, "it sends, but no sentences; is 9600 baud right?")
+        self.assertGreater(driver.diagnostics()["bad_frames"], 500)
+        driver.disconnect()
+        self.failureResultOf(connected, LinkLost)
+
+    def test_drops_what_is_spoilt(self) -> None:
+        """No spoilt sentence becomes a heading, however the bytes are cut, and headings flow on between them."""
+        driver, seen = self.make_driver(), set[float]()
+        driver.connect()
+        self.foul.garbage, self.foul.split, self.foul.drop = 0.3, True, 0.1
+        self.pass_time(0.5)
+        driver.subscribe(lambda one: seen.add(round(math.degrees(float(one.values[HEADING])), 3)))
+        self.pass_time(60.0)
+        self.assertEqual(seen, {0.0})
+        counts = driver.diagnostics()
+        self.assertTrue(counts["bad_frames"] > 200 and counts["frames"] > 600, counts)
+
+    def test_is_described_by_its_options(self) -> None:
+        """A compass has its one capability and no motor; wrong options are refused with key and remedy."""
+        body = describe("compass", {"device": "/dev/ttyUSB1", "rate": 5})
+        self.assertEqual((body.kind, list(body.capabilities), body.limits), ("compass", ["compass"], {}))
+        self.assertEqual(body.rates, {"compass": 5})
+        for table, word in (
+            ({}, "either"),
+            ({"host": "a", "device": "b"}, "either"),
+            ({"host": ""}, "host"),
+            ({"device": 7}, "device"),
+            ({"host": "a", "port": 0}, "port"),
+            ({"host": "a", "port": True}, "port"),
+            ({"device": "a", "baud": 300}, "baud"),
+            ({"device": "a", "baud": "4800"}, "baud"),
+            ({"host": "a", "mounted_deg": 361}, "mounted_deg"),
+            ({"host": "a", "mounted_deg": float("nan")}, "mounted_deg"),
+            ({"host": "a", "variation_deg": True}, "variation_deg"),
+            ({"host": "a", "rate": 0}, "rate"),
+            ({"host": "a", "colour": "red"}, "colour"),
+        ):
+            line = str(self.assertRaises(UsageError, describe, "compass", table))
+            self.assertIn(word, line)
+            self.assertNotIn("\n", line)
+
+    def test_serves_whoever_listens(self) -> None:
+        """The emulated compass tells all its clients, but one that does not listen; what they say it does not hear."""
+
+        class Wire:
+            said = b""
+            is_busy = False
+
+            def send(self, data: bytes) -> None:
+                self.said += data
+
+            def close(self) -> None:
+                self.is_busy = True
+
+        slow, quick = Wire(), Wire()
+        one, _ = self.compass.accept(slow), self.compass.accept(quick)
+        one.received(b"$PXYZ,1\r\n")
+        slow.is_busy = True
+        self.pass_time(1.0)
+        self.assertEqual(slow.said, b"")
+        self.assertGreater(quick.said.count(b"$HCHDG,90.0,0.0,E,0.0,E*"), 15)
+        one.link_down()
+        one.link_down()
+        self.compass.stop()
+        self.assertTrue(quick.is_busy)

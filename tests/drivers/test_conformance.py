@@ -1,0 +1,368 @@
+"""The conformance kit sees what does not conform: for each rule a driver that breaks this very rule."""
+
+from __future__ import annotations
+
+import math
+import runpy
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from twisted.internet.defer import Deferred, fail, succeed
+from twisted.trial.unittest import SynchronousTestCase
+
+from drivers.conformance import CHECKS, Faulty, MemoryBench, broken
+from drivers.driver import Driver, Permit
+from drivers.errors import LinkLost, NotEnabled
+from drivers.reading import Action, Description, Observation, Value
+
+FOLDER = Path(__file__).resolve().parents[2] / "examples" / "driver"
+EXAMPLE: Any = runpy.run_path(str(FOLDER / "robot.py"))
+ROVER: Description = EXAMPLE["ROVER"]
+EMULATOR: Any = runpy.run_path(str(FOLDER / "emulator.py"))["Emulator"]
+
+if TYPE_CHECKING:
+    from drivers.base import BaseDriver
+
+    class Rover(BaseDriver):
+        """What the examples have of it."""
+
+        _line: Any
+        _newest: Any
+
+        def link_up(self, link: Any) -> None: ...
+        def link_down(self) -> None: ...
+else:
+    Rover = EXAMPLE["Rover"]
+
+
+class Shy(Rover):
+    """Describes itself once it is connected."""
+
+    @property
+    def description(self) -> Description:
+        return replace(ROVER, skills=() if self._newest is None else ("late",))
+
+
+class Boundless(Rover):
+    """Has a limit on one side."""
+
+    @property
+    def description(self) -> Description:
+        return replace(ROVER, limits={"base.vx": (-math.inf, 0.3), "base.wz": (-2.0, 2.0)})
+
+
+class Hasty(Rover):
+    """Counts as connected as soon as there is a link."""
+
+    def link_up(self, link: Any) -> None:
+        super().link_up(link)
+        connecting, self._connecting = self._connecting, None
+        if connecting is not None:
+            connecting.callback(self.description)
+
+
+class Eager(Rover):
+    """Moves with its motors off."""
+
+    def act(self, action: Action, permit: Permit) -> Action:
+        try:
+            return dict(super().act(action, permit))
+        except NotEnabled:
+            return dict(action)
+
+
+class Restless(Rover):
+    """Goes on moving when it is disabled."""
+
+    def disable(self) -> Deferred[bool]:
+        self._wants_motors = False
+        return succeed(True)
+
+
+class Boastful(Rover):
+    """Says that it does what it was asked for, not what it does."""
+
+    def act(self, action: Action, permit: Permit) -> Action:
+        super().act(action, permit)
+        return {**self._motion, **action}
+
+
+class Forgetful(Rover):
+    """Takes what an action leaves out for zero."""
+
+    def act(self, action: Action, permit: Permit) -> Action:
+        return dict(super().act({**dict.fromkeys(self.description.limits, 0.0), **action}, permit))
+
+
+class Nostalgic(Rover):
+    """Remembers a motion beyond its stop."""
+
+    def _rest(self) -> None:
+        self._cancel_end()
+        self._gate.close()
+
+    def stop(self) -> Action:
+        super().stop()
+        return dict.fromkeys(self._motion, 0.0)
+
+
+class Credulous(Rover):
+    """Takes any number, and passes over what it does not know."""
+
+    def act(self, action: Action, permit: Permit) -> Action:
+        known = {key: value for key, value in action.items() if key in self._motion and value is not None}
+        return dict(super().act({k: 0.0 if not _is_number(v) else v for k, v in known.items()}, permit))
+
+
+class Endless(Rover):
+    """Moves on after its deadline."""
+
+    def _on_end(self) -> None:
+        self._end = None
+
+
+class Abrupt(Rover):
+    """Keeps the deadline of the first command though a later one renews it."""
+
+    def _cancel_end(self) -> None:
+        self._kept, self._end = getattr(self, "_kept", None) or self._end, None
+
+    def stop(self) -> Action:
+        kept, self._kept = getattr(self, "_kept", None), None
+        if kept is not None and kept.active():
+            kept.cancel()
+        return dict(super().stop())
+
+
+class Lawless(Rover):
+    """Obeys any token."""
+
+    def act(self, action: Action, permit: Permit) -> Action:
+        self._gate._token = None
+        return dict(super().act(action, permit))
+
+
+class Amnesic(Rover):
+    """Forgets the highest token when it stops."""
+
+    def stop(self) -> Action:
+        self._gate._token = None
+        return dict(super().stop())
+
+
+class Stubborn(Rover):
+    """Refuses to stop what does not move."""
+
+    def stop(self) -> Action:
+        if self.state != "ready":
+            raise NotEnabled("it is not ready")
+        return dict(super().stop())
+
+
+class Deaf(Rover):
+    """Says that it stopped, and goes on."""
+
+    def stop(self) -> Action:
+        self._rest()
+        return dict(self._motion)
+
+
+class Undying(Rover):
+    """Can be connected again after it was disconnected."""
+
+    def connect(self) -> Deferred[Description]:
+        self._is_closed = self._is_open = False
+        connected: Deferred[Description] = super().connect()
+        return connected
+
+
+class Clumsy(Rover):
+    """Cannot be disconnected twice."""
+
+    def disconnect(self) -> Deferred[None]:
+        if self._is_closed:
+            return fail(LinkLost("it is closed"))
+        gone: Deferred[None] = super().disconnect()
+        return gone
+
+
+class Haunting(Rover):
+    """Leaves a timer behind."""
+
+    def _open(self) -> None:
+        super()._open()
+        self._clock.callLater(60.0, print)
+
+
+class Faithless(Rover):
+    """Does not come back after a lost link."""
+
+    def link_down(self) -> None:
+        super().link_down()
+        self._line.hang_up()
+
+
+class Rash(Rover):
+    """Takes up its motion again when the link is back."""
+
+    def link_up(self, link: Any) -> None:
+        super().link_up(link)
+        if self._wants_motors:
+            link.send(b"V 0.1 0\n")
+
+
+class Unmoved(Rover):
+    """Takes itself for ready though the link is gone."""
+
+    def link_down(self) -> None:
+        self._is_up = True
+        self._newest = replace(self._newest, t_host=math.inf)
+
+
+class Backward(Rover):
+    """Lets the robot's clock run backwards."""
+
+    def _observed(self, values: Mapping[str, Value], t_robot: float, *rest: Any) -> None:
+        super()._observed(values, -t_robot, *rest)
+
+
+class Prophetic(Rover):
+    """Observes what is to come."""
+
+    def _observed(self, values: Mapping[str, Value], t_robot: float, *rest: Any) -> None:
+        super()._observed(values, t_robot, *rest)
+        self._newest = replace(self._newest, t_host=self._newest.t_host + 0.1)
+
+
+class Infinite(Rover):
+    """Tells of an infinite range where it sees nothing."""
+
+    def _observed(self, values: Mapping[str, Value], t_robot: float, *rest: Any) -> None:
+        super()._observed({**values, "range.front": math.inf}, t_robot, *rest)
+
+
+class Clinging(Rover):
+    """Goes on telling who has left."""
+
+    def subscribe(self, seen: Callable[[Observation], None]) -> Callable[[], None]:
+        super().subscribe(seen)
+        return lambda: None
+
+
+class Fragile(Rover):
+    """Tells nobody any more once one subscriber has raised."""
+
+    def _observed(self, values: Mapping[str, Value], t_robot: float, *rest: Any) -> None:
+        seen, self._seen = self._seen, []
+        super()._observed(values, t_robot, *rest)
+        self._seen = seen
+        try:
+            for each in seen:
+                each(self._newest)
+        except Faulty:
+            self._seen = []
+
+
+class Silent(Rover):
+    """Counts nothing of what it refuses, under no name that others know."""
+
+    def diagnostics(self) -> dict[str, float]:
+        return {"frames": 1.0, "age": super().diagnostics()["age"]}
+
+
+class Ageless(Rover):
+    """Is always young."""
+
+    def diagnostics(self) -> dict[str, float]:
+        return {**super().diagnostics(), "age": 0.0}
+
+
+class Obliging(Rover):
+    """Does any skill."""
+
+    def invoke(self, name: str, **arguments: float | str) -> Deferred[Mapping[str, Value]]:
+        return succeed({})
+
+
+class Rude(Rover):
+    """Raises where a Deferred should fail."""
+
+    def invoke(self, name: str, **arguments: float | str) -> Deferred[Mapping[str, Value]]:
+        raise KeyError(name)
+
+
+class Abandoned(Rover):
+    """Does not close its link when its connect is cancelled."""
+
+    def _on_cancelled_connecting(self, _connecting: object) -> None:
+        self._shut()
+
+
+BREACHES: dict[str, list[Any]] = {
+    "describes": [Shy, Boundless],
+    "connects": [Hasty],
+    "motors": [Eager, Restless],
+    "clips": [Boastful],
+    "keeps": [Forgetful, Nostalgic],
+    "refuses": [Credulous],
+    "deadline": [Endless, Abrupt],
+    "token": [Lawless, Amnesic],
+    "stops": [Stubborn, Deaf],
+    "ends": [Undying, Clumsy],
+    "leaves": [Haunting, Abandoned],
+    "link": [Faithless, Rash, Unmoved],
+    "times": [Backward, Prophetic, Infinite],
+    "subscribers": [Clinging, Fragile],
+    "counts": [Silent, Ageless],
+    "invoke": [Obliging, Rude],
+}
+
+
+def bench(driver: Callable[..., Driver]) -> Callable[[], MemoryBench]:
+    """A bench with that driver and an honest robot."""
+    return partial(MemoryBench, driver, EMULATOR, {"host": "rover"})
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, float) and math.isfinite(value)
+
+
+def _pairs() -> Iterator[tuple[str, Any]]:
+    for rule, classes in BREACHES.items():
+        yield from ((rule, each) for each in classes)
+
+
+class KitTests(SynchronousTestCase):
+    def tearDown(self) -> None:
+        self.flushLoggedErrors(Faulty)
+
+    def test_every_rule_sees_its_breach(self) -> None:
+        """A driver that breaks a rule fails the check of this very rule."""
+        self.assertEqual(set(BREACHES), set(CHECKS))
+        found = {each.__name__: broken(bench(each)) for _, each in _pairs()}
+        self.assertEqual([(rule, each.__name__) for rule, each in _pairs() if rule not in found[each.__name__]], [])
+
+    def test_only_what_is_broken(self) -> None:
+        """A breach of one rule is not told as one of all."""
+        for rule, driver in (("clips", Boastful), ("refuses", Credulous), ("leaves", Haunting), ("times", Backward)):
+            self.assertEqual(list(broken(bench(driver))), [rule], driver.__name__)
+
+    def test_template_conforms(self) -> None:
+        """The robot of one's own to be copied passes as it is, and has fewer than 50 lines of code."""
+        self.assertEqual(broken(bench(Rover)), {})
+        lines = (FOLDER / "robot.py").read_text(encoding="utf-8").splitlines()
+        self.assertLess(len([line for line in lines if line.strip()]), 50)
+
+    def test_document_names_every_rule(self) -> None:
+        """The table of rules in the document is the suite's, in its order."""
+        text = (FOLDER.parents[1] / "docs" / "drivers.md").read_text(encoding="utf-8")
+        table = text.partition("| rule | what it tries |\n|---|---|\n")[2].partition("\n\n")[0]
+        self.assertEqual([row.split(" | ")[0].strip("| ") for row in table.splitlines()], list(CHECKS))
+
+    def test_tells_what_is_wrong(self) -> None:
+        """A breach says what was asked and what came; a driver that raises breaks the rule by its error."""
+        self.assertIn("after its deadline the robot moves at 0.15", broken(bench(Endless))["deadline"])
+        self.assertIn("KeyError", broken(bench(Rude))["invoke"])

@@ -1,0 +1,261 @@
+"""Tests of ``drivers.create2.codec``, ``odometry``, ``sense`` and ``option``."""
+
+from __future__ import annotations
+
+import math
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from twisted.trial.unittest import SynchronousTestCase
+
+from drivers.create2 import codec
+from drivers.create2.codec import GROUPS, PACKETS, Command, CommandReader, StreamReader, packed, stream_frame
+from drivers.create2.odometry import MM_PER_COUNT, WHEEL_BASE, Odometry
+from drivers.create2.option import BAUDS
+from drivers.create2.sense import IDS, event_of, seen
+from drivers.errors import UsageError
+from drivers.registry import describe
+
+SPECIFIED = bytes((19, 5, 29, 2, 25, 13, 0, 163))
+"""The frame of the vendor's own specification (page of opcode 148)."""
+
+
+def values_of(ids: tuple[int, ...]) -> st.SearchStrategy[dict[str, int]]:
+    """Any values that a robot can mean by these packets."""
+    packets = [PACKETS[one] for one in ids]
+    return st.fixed_dictionaries({packet.name: st.integers(packet.low, packet.high) for packet in packets})
+
+
+class CommandTests(SynchronousTestCase):
+    """What is said to the robot."""
+
+    def test_golden_vectors(self) -> None:
+        """Each command has the bytes of the Open Interface specification."""
+        self.assertEqual(codec.drive_direct(200, 200), bytes((145, 0, 200, 0, 200)))
+        self.assertEqual(codec.drive_direct(-100, 100), bytes((145, 255, 156, 0, 100)))
+        self.assertEqual(codec.drive(200, codec.STRAIGHT), bytes((137, 0, 200, 128, 0)))
+        self.assertEqual(codec.drive(150, 1), bytes((137, 0, 150, 0, 1)))
+        self.assertEqual(codec.drive(150, -1), bytes((137, 0, 150, 255, 255)))
+        self.assertEqual(codec.stream((29, 13)), bytes((148, 2, 29, 13)))
+        self.assertEqual(codec.query((29, 13)), bytes((149, 2, 29, 13)))
+        self.assertEqual(codec.pause(False) + codec.pause(True), bytes((150, 0, 150, 1)))
+        self.assertEqual(codec.song(0, [(69, 32)]) + codec.play(0), bytes((140, 0, 1, 69, 32, 141, 0)))
+
+    def test_robot_hears_each_command_however_it_is_cut(self) -> None:
+        """A reader fed one byte at a time gives the same commands as one fed all at once."""
+        said = bytes((128, 131)) + codec.drive(-300, 1000) + codec.song(1, [(60, 8), (62, 8)]) + codec.stream(IDS)
+        said += codec.query((100,)) + bytes((142, 7, 139, 1, 2, 3, 255, 173))
+        whole = CommandReader()
+        commands = list(whole.read(said))
+        pieces = CommandReader()
+        self.assertEqual([one for at in range(len(said)) for one in pieces.read(said[at : at + 1])], commands)
+        self.assertEqual(commands[2], Command(137, said[3:7]))
+        self.assertEqual(commands[2].words, (-300, 1000))
+        self.assertEqual([one.opcode for one in commands], [128, 131, 137, 140, 148, 149, 142, 139, 173])
+        self.assertEqual((whole.unknown, pieces.unknown), (1, 1))
+
+    def test_robot_waits_for_missing_data(self) -> None:
+        """A command cut short swallows what follows, as the real robot does; five starts get it out of that."""
+        reader = CommandReader()
+        self.assertEqual(list(reader.read(codec.drive_direct(100, 100)[:1])), [])
+        self.assertEqual([one.opcode for one in reader.read(bytes((128,)) * 5)], [145, 128])
+
+    @given(st.binary(max_size=200))
+    @settings(max_examples=200, deadline=None)
+    def test_robot_takes_any_bytes(self, data: bytes) -> None:
+        """No bytes make the robot's reader fail, and no byte is lost or taken twice."""
+        reader = CommandReader()
+        heard = sum(1 + len(one.data) for one in reader.read(data))
+        self.assertLessEqual(heard + reader.unknown, len(data))
+
+
+class StreamTests(SynchronousTestCase):
+    """What the robot says."""
+
+    def test_golden_frame_of_the_specification(self) -> None:
+        """The specification's own frame reads as 2 * 256 + 25 = 537 and is written byte for byte."""
+        reader = StreamReader((29, 13))
+        self.assertEqual(list(reader.read(SPECIFIED)), [{"cliff_front_left_signal": 537, "virtual_wall": 0}])
+        self.assertEqual(stream_frame((29, 13), {"cliff_front_left_signal": 537}), SPECIFIED)
+        self.assertEqual((reader.frames, reader.bad_frames), (1, 0))
+
+    def test_sizes_of_packets_and_groups(self) -> None:
+        """Groups have the lengths that the specification tells, so every packet has the right size at its place."""
+        sizes = {0: 26, 1: 10, 2: 6, 3: 10, 4: 14, 5: 12, 6: 52, 100: 80, 101: 28, 106: 12, 107: 9}
+        self.assertEqual({one: len(packed(one, {})) for one in GROUPS}, sizes)
+        offsets = {7: 0, 17: 10, 19: 12, 22: 17, 27: 26, 34: 39, 35: 40, 43: 52, 46: 57, 52: 69, 58: 79}
+        for one, offset in offsets.items():
+            self.assertEqual(sum(PACKETS[before].size for before in range(7, one)), offset)
+
+    def test_what_is_streamed_fits_the_line(self) -> None:
+        """The frame that the driver asks for is 81 bytes, below what passes the line in 15 ms."""
+        self.assertEqual(len(stream_frame(IDS, {})), 81)
+        self.assertLess(81, codec.MAX_FRAME)
+
+    @given(values_of(IDS), st.integers(1, 90))
+    @settings(max_examples=100, deadline=None)
+    def test_reads_what_is_written(self, values: dict[str, int], size: int) -> None:
+        """Any frame comes back as it was, also in pieces, and where a 19 stands within it."""
+        data = stream_frame(IDS, values) * 2
+        reader = StreamReader(IDS)
+        got = [frame for at in range(0, len(data), size) for frame in reader.read(data[at : at + size])]
+        self.assertEqual(got, [values, values])
+        self.assertEqual(reader.bad_frames, 0)
+
+    def test_fed_one_byte_at_a_time_with_heads_within(self) -> None:
+        """Frames whose data is full of the head's bytes are found one byte at a time, begun in their middle."""
+        values = {"left_encoder": 19 * 256 + 78, "right_encoder": 19 * 256 + 78, "charge": 19 * 256 + 78}
+        data = stream_frame(IDS, values)
+        reader = StreamReader(IDS)
+        stream = data[30:] + data * 3
+        got = [frame for at in range(len(stream)) for frame in reader.read(stream[at : at + 1])]
+        self.assertEqual(len(got), 3)
+        self.assertEqual(reader.bad_frames, 1)
+
+    def test_counts_and_skips_what_is_no_frame(self) -> None:
+        """A spoilt byte costs one frame, text of a reboot none; frames after it are read."""
+        data = stream_frame((29, 13), {"virtual_wall": 1})
+        reader = StreamReader((29, 13))
+        spoilt = data[:3] + bytes((data[3] ^ 8,)) + data[4:]
+        self.assertEqual(len(list(reader.read(data + spoilt + data))), 2)
+        self.assertEqual((reader.frames, reader.bad_frames), (2, 1))
+        self.assertEqual(len(list(reader.read(b"bl-start\r\nrelease-3.5.4\r\n" + data))), 1)
+        self.assertEqual((reader.frames, reader.bad_frames), (3, 2))
+
+    def test_refuses_other_packets_with_a_right_checksum(self) -> None:
+        """A frame as long as expected, and whole, but of other packets, is none."""
+        reader = StreamReader((29, 13))
+        self.assertEqual(list(reader.read(stream_frame((28, 13), {}))), [])
+        self.assertEqual(reader.bad_frames, 1)
+
+    def test_refuses_what_no_robot_can_mean(self) -> None:
+        """A whole frame that tells mode 9, or a battery of 60 V, is dropped and counted."""
+        reader = StreamReader((35, 22))
+        for values in ({"mode": 9}, {"voltage": 60_000}):
+            self.assertEqual(list(reader.read(stream_frame((35, 22), values))), [])
+        self.assertEqual((reader.frames, reader.bad_frames), (0, 2))
+        self.assertEqual(len(list(reader.read(stream_frame((35, 22), {"mode": 2})))), 1)
+
+    @given(st.lists(st.one_of(st.binary(max_size=40), st.just(SPECIFIED), st.just(SPECIFIED[:5])), max_size=12))
+    @settings(max_examples=200, deadline=None)
+    def test_takes_any_bytes(self, pieces: list[bytes]) -> None:
+        """No bytes make the reader fail, and two whole frames after them are never both lost."""
+        reader = StreamReader((29, 13))
+        for piece in pieces:
+            list(reader.read(piece))
+        self.assertTrue(list(reader.read(SPECIFIED * 2)))
+
+
+class SenseTests(SynchronousTestCase):
+    """What a frame means."""
+
+    def frame(self, **values: int) -> dict[str, int]:
+        """A frame as it is read."""
+        return next(StreamReader(IDS).read(stream_frame(IDS, {"capacity": 2000, **values})))
+
+    def test_each_bit_has_its_side(self) -> None:
+        """Bits of bumpers, drops, lights and buttons are those of the specification: right before left."""
+        felt = seen(self.frame(bumps=0b0101, light_bumper=0b100001, buttons=0b00000100))
+        self.assertEqual((felt["bump.right"], felt["bump.left"]), (True, False))
+        self.assertEqual((felt["wheeldrop.right"], felt["wheeldrop.left"]), (True, False))
+        self.assertEqual((felt["lightbump.left.hit"], felt["lightbump.right.hit"]), (True, True))
+        self.assertIs(felt["lightbump.front_left.hit"], False)
+        self.assertEqual((felt["button.dock"], felt["button.clean"]), (1.0, 0.0))
+
+    def test_power_in_si_units(self) -> None:
+        """Volts, amperes (negative: draining), degrees and a level; no level without a capacity."""
+        felt = seen(self.frame(voltage=14400, current=-250, temperature=-5, charge=500, charging_state=2))
+        self.assertEqual((felt["power.volts"], felt["power.amps"], felt["power.celsius"]), (14.4, -0.25, -5.0))
+        self.assertEqual((felt["power.level"], felt["power.charging"]), (0.25, True))
+        self.assertNotIn("power.level", seen(self.frame(capacity=0)))
+
+    def test_names_the_causes_of_a_safety_event(self) -> None:
+        """What made it leave safe mode is named by the keys of the observation."""
+        felt = seen(self.frame(bumps=8, cliff_left=1))
+        self.assertEqual(event_of(felt), "cliff.left, wheeldrop.left")
+        self.assertEqual(event_of(seen(self.frame(charger=2))), "charger")
+        self.assertEqual(event_of(seen(self.frame())), "mode")
+
+
+class OdometryTests(SynchronousTestCase):
+    """Where the wheels say that the robot is."""
+
+    def test_goes_straight_and_turns(self) -> None:
+        """A metre of counts on both wheels is a metre ahead; opposite counts turn to the left on the spot."""
+        where = Odometry()
+        metre = round(1000.0 / MM_PER_COUNT)
+        for step in range(101):
+            where.count(metre * step // 100, metre * step // 100, step * 0.03)
+        self.assertAlmostEqual(where.x, 1.0, places=3)
+        self.assertAlmostEqual(where.vx, 1.0 / 3.0, places=1)
+        quarter = round(math.pi / 4.0 * WHEEL_BASE / MM_PER_COUNT)
+        for step in range(101):
+            where.count((metre - quarter * step // 100) % 65536, metre + quarter * step // 100, 4.0 + step * 0.03)
+        self.assertAlmostEqual(where.yaw, math.pi / 2.0, places=2)
+        self.assertAlmostEqual(where.x, 1.0, places=2)
+        self.assertGreater(where.wz, 0.4)
+
+    def test_counters_wrap(self) -> None:
+        """Over the end of 16 bits, in both directions, is a small step and no jump."""
+        where = Odometry()
+        where.count(65530, 65530, 0.0)
+        where.count(4, 4, 0.1)
+        self.assertAlmostEqual(where.x, 10 * MM_PER_COUNT / 1000.0)
+        where.count(65530, 65530, 0.2)
+        self.assertAlmostEqual(where.x, 0.0)
+        self.assertEqual(where.jumps, 0)
+
+    def test_draws_arcs(self) -> None:
+        """A half circle of a metre's radius ends two metres to the left, in few steps as in many."""
+        where = Odometry()
+        for step in range(33):
+            left, right = (math.pi * (1.0 + side * 0.1175) * step / 32 / MM_PER_COUNT * 1000.0 for side in (-1, 1))
+            where.count(round(left), round(right), step * 1.0)
+        self.assertAlmostEqual(where.x, 0.0, places=2)
+        self.assertAlmostEqual(where.y, 2.0, places=2)
+        self.assertAlmostEqual(abs(where.yaw), math.pi, places=2)
+
+    def test_jumps_move_nothing(self) -> None:
+        """Counters that leap further than a wheel can roll, as after a reboot, are counted and begun from anew."""
+        where = Odometry()
+        where.count(20_000, 20_000, 0.0)
+        where.count(0, 0, 0.015)
+        self.assertEqual((where.x, where.jumps), (0.0, 1))
+        where.count(10, 10, 0.03)
+        self.assertAlmostEqual(where.x, 10 * MM_PER_COUNT / 1000.0)
+
+
+class OptionTests(SynchronousTestCase):
+    """Options of the kind."""
+
+    def test_names_the_wrong_option(self) -> None:
+        """Each wrong option is refused in one line that names its key and what to write."""
+        for key, value in (
+            ("port", 7),
+            ("port", ""),
+            ("baud", 9600),
+            ("baud", "fast"),
+            ("mode", "passive"),
+            ("mode", ["safe"]),
+            ("max_speed", 0.6),
+            ("max_speed", True),
+            ("max_turn", float("nan")),
+            ("colour", "red"),
+        ):
+            line = str(self.assertRaises(UsageError, describe, "create2", {"port": "/dev/ttyUSB0", key: value}))
+            self.assertIn(key, line)
+            self.assertNotIn("\n", line)
+        self.assertIn("/dev/ttyUSB0", str(self.assertRaises(UsageError, describe, "create2", {})))
+
+    def test_every_baud_carries_the_stream(self) -> None:
+        """At each rate that can be chosen a frame, 10 bits a byte, has left before the robot sends the next."""
+        size = len(stream_frame(IDS, {}))
+        for baud in BAUDS:
+            self.assertLess(size * 10 / baud, codec.FRAME_S, str(baud))
+        self.assertRaises(UsageError, describe, "create2", {"port": "/dev/ttyUSB0", "baud": 19200})
+
+    def test_describes_limits(self) -> None:
+        """The description has the limits of the options."""
+        told = describe("create2", {"port": "/dev/ttyUSB0", "max_speed": 0.2})
+        self.assertEqual(told.limits, {"base.vx": (-0.2, 0.2), "base.wz": (-4.25, 4.25)})
+        self.assertEqual(told.kind, "create2")

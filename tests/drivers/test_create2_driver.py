@@ -1,0 +1,348 @@
+"""Tests of ``drivers.create2.driver`` against ``sim.emulator.create2``, joined through memory."""
+
+from __future__ import annotations
+
+import math
+from random import Random
+
+from twisted.internet.task import Clock
+from twisted.trial.unittest import SynchronousTestCase
+
+from drivers.create2 import codec
+from drivers.create2.driver import Create2Driver
+from drivers.create2.option import checked
+from drivers.errors import LinkLost, NoReply, NotEnabled, Unsupported, UsageError
+from drivers.link import MemoryConnector
+from drivers.reading import Value
+from drivers.registry import driver_for
+from sim.emulator.body import MemoryBody
+from sim.emulator.create2 import Create2
+from sim.emulator.foul import Foul
+from tests.drivers.contract import BodyContract
+
+STEP = 0.005
+
+
+class Create2DriverTests(BodyContract, SynchronousTestCase):
+    """A Create 2 keeps the contract, and what is its own."""
+
+    def setUp(self) -> None:
+        """A robot on an endless floor, with a cable of memory, on a clock that is turned by hand."""
+        self.clock = Clock()
+        self.body = MemoryBody()
+        self.foul = Foul()
+        self.robot = Create2(self.body, self.clock, Random(1), self.foul)
+        self.connector = MemoryConnector(self.clock, self.robot.accept)
+        self.drivers: list[Create2Driver] = []
+
+    def tearDown(self) -> None:
+        """Nothing is left on the clock once all have gone."""
+        for driver in self.drivers:
+            driver.disconnect()
+        self.robot.stop()
+        self.clock.advance(0.1)
+        self.clock.advance(0.1)
+        self.assertEqual(self.clock.getDelayedCalls(), [])
+
+    def make_driver(self, **options: object) -> Create2Driver:
+        """A driver of that robot."""
+        driver = Create2Driver(checked({"port": "memory", **options}), "vacuum", self.connector, self.clock)
+        self.drivers.append(driver)
+        return driver
+
+    def ready(self) -> Create2Driver:
+        """One that is connected and enabled."""
+        driver = super().ready()
+        assert isinstance(driver, Create2Driver)
+        return driver
+
+    def value(self, driver: Create2Driver, key: str) -> Value:
+        """What the newest observation says."""
+        newest = driver.observe()
+        assert newest is not None
+        return newest.values[key]
+
+    def test_is_made_by_the_registry(self) -> None:
+        """The registry knows the kind."""
+        driver = driver_for("create2", {"port": "/dev/ttyUSB0"}, "vacuum", self.clock, self.connector)
+        self.assertEqual((driver.state, driver.description.kind), ("idle", "create2"))
+
+    def test_tells_what_it_feels(self) -> None:
+        """Bumpers, ledges, drops, light, battery and mode arrive under the keys of their capabilities."""
+        self.body.values |= {"bump.left": True, "cliff.front_right": True, "power.level": 0.5, "range.near": 0.1}
+        driver = self.make_driver()
+        driver.connect()
+        self.pass_time(0.2)
+        self.assertEqual((self.value(driver, "bump.left"), self.value(driver, "bump.right")), (True, False))
+        self.assertIs(self.value(driver, "cliff.front_right"), True)
+        self.assertAlmostEqual(float(self.value(driver, "power.level")), 0.5, places=3)
+        self.assertEqual((self.value(driver, "mode"), self.value(driver, "estop.engaged")), ("passive", True))
+        self.assertGreater(float(self.value(driver, "lightbump.center_left")), 0.5)
+        self.assertEqual(self.value(driver, "lightbump.left"), 0.0)
+
+    def test_counts_its_way_over_the_end_of_the_counters(self) -> None:
+        """Odometry from the counters follows the body, though they wrap on the way."""
+        self.robot.left = self.robot.right = 65_500.0
+        driver = self.ready()
+        driver.act({"base.vx": 0.2, "base.wz": 0.5}, self.permit(seconds=3.0))
+        self.pass_time(2.0)
+        self.assertTrue(math.isclose(float(self.value(driver, "odom.x")), self.body.x, abs_tol=0.01))
+        self.assertTrue(math.isclose(float(self.value(driver, "odom.y")), self.body.y, abs_tol=0.01))
+        self.assertTrue(math.isclose(float(self.value(driver, "odom.yaw")), self.body.yaw, abs_tol=0.02))
+        self.assertTrue(math.isclose(float(self.value(driver, "base.vx")), 0.2, abs_tol=0.01))
+        self.assertTrue(math.isclose(float(self.value(driver, "base.wz")), 0.5, abs_tol=0.05))
+        self.assertEqual(driver.diagnostics()["jumps"], 0)
+
+    def test_slows_both_wheels_where_one_would_be_too_fast(self) -> None:
+        """A curve at top speed keeps its shape: both wheels are slowed, and act says so."""
+        driver = self.ready()
+        done = driver.act({"base.vx": 0.5, "base.wz": 2.0}, self.permit())
+        self.assertLess(done["base.vx"], 0.4)
+        self.assertTrue(math.isclose(done["base.wz"] / done["base.vx"], 4.0, abs_tol=0.05))
+        self.pass_time(0.05)
+        self.assertAlmostEqual(self.body.motion[0], done["base.vx"])
+        self.assertAlmostEqual(self.body.motion[2], done["base.wz"])
+
+    def test_stays_off_after_a_safety_event(self) -> None:
+        """A lifted wheel stops it, is named, and leaves the motors off until they are enabled again."""
+        driver = self.ready()
+        driver.act({"base.vx": 0.2}, self.permit(seconds=5.0))
+        self.pass_time(0.2)
+        self.body.values["wheeldrop.left"] = True
+        self.pass_time(0.1)
+        self.assertLess(self.true_speed(), 0.01)
+        self.assertEqual(self.value(driver, "safety.event"), "wheeldrop.left")
+        self.assertEqual((driver.state, driver.diagnostics()["safety_events"]), ("stopped", 1))
+        self.body.values["wheeldrop.left"] = False
+        self.pass_time(1.0)
+        self.assertEqual(self.robot.mode, 1)
+        self.assertRaises(NotEnabled, driver.act, {"base.vx": 0.1}, self.permit())
+        self.cut_link()
+        self.pass_time(1.0)
+        self.assertEqual(self.robot.mode, 1)
+        enabled = driver.enable()
+        self.pass_time(0.1)
+        self.assertIs(self.successResultOf(enabled), True)
+        self.assertEqual(self.value(driver, "safety.event"), "")
+        driver.act({"base.vx": 0.1}, self.permit())
+
+    def test_full_mode_has_no_guards(self) -> None:
+        """In full mode, asked for by an option, a ledge does not stop it."""
+        self.body.values["cliff.left"] = True
+        driver = self.make_driver(mode="full")
+        driver.connect()
+        self.pass_time(0.2)
+        driver.enable()
+        self.pass_time(0.1)
+        self.assertEqual(self.value(driver, "mode"), "full")
+        driver.act({"base.vx": 0.1}, self.permit())
+        self.pass_time(0.1)
+        self.assertGreater(self.true_speed(), 0.05)
+
+    def test_says_when_it_cannot_be_enabled(self) -> None:
+        """With a wheel in the air the robot does not go to safe mode: enable fails with NoReply."""
+        self.body.values["wheeldrop.right"] = True
+        driver = self.make_driver()
+        driver.connect()
+        self.pass_time(0.2)
+        enabled = driver.enable()
+        self.pass_time(1.1)
+        self.failureResultOf(enabled, NoReply)
+
+    def test_docks(self) -> None:
+        """The skill dock fires when the robot charges at its base; it is off then, which is no safety event."""
+        driver = self.ready()
+        docked = driver.invoke("dock")
+        self.pass_time(0.5)
+        self.assertNoResult(docked)
+        self.assertGreater(self.true_speed(), 0.05)
+        self.assertEqual(self.value(driver, "skill.running"), "dock")
+        self.failureResultOf(driver.invoke("dock"), UsageError)
+        self.body.values["power.charging"] = True
+        self.pass_time(0.1)
+        self.assertEqual(self.successResultOf(docked), {"dock.on": True})
+        self.assertLess(self.true_speed(), 0.01)
+        self.assertEqual((driver.state, self.value(driver, "safety.event")), ("stopped", ""))
+        self.assertIs(self.value(driver, "power.charging"), True)
+
+    def test_docking_can_be_stopped(self) -> None:
+        """Stop ends the search for the dock, and so do cancelling it, a lost link and its own time."""
+        driver = self.ready()
+        docking = driver.invoke("dock")
+        self.pass_time(0.2)
+        driver.stop()
+        self.pass_time(0.1)
+        self.failureResultOf(docking, NotEnabled)
+        self.assertLess(self.true_speed(), 0.01)
+        self.assertEqual(self.robot.mode, 1)
+        for end, error in ((lambda: self.pass_time(121.0), NoReply), (self.connector.cut, LinkLost)):
+            driver.enable()
+            self.pass_time(0.1)
+            docking = driver.invoke("dock")
+            self.pass_time(0.1)
+            end()
+            self.failureResultOf(docking, error)
+            self.pass_time(0.5)
+            self.assertLess(self.true_speed(), 0.01)
+        driver.enable()
+        self.pass_time(0.1)
+        docking = driver.invoke("dock")
+        docking.addErrback(lambda _: None)
+        docking.cancel()
+        self.pass_time(0.1)
+        self.assertLess(self.true_speed(), 0.01)
+
+    def test_beeps(self) -> None:
+        """It plays the nearest note and says which; wrong arguments and unknown skills are refused."""
+        driver = self.make_driver()
+        self.failureResultOf(driver.invoke("beep"), LinkLost)
+        driver.connect()
+        self.pass_time(0.2)
+        self.failureResultOf(driver.invoke("beep"), NotEnabled)
+        self.failureResultOf(driver.invoke("dock"), NotEnabled)
+        driver.enable()
+        self.pass_time(0.1)
+        self.assertAlmostEqual(float(self.successResultOf(driver.invoke("beep", hz=445.0))["beep.hz"]), 440.0)
+        self.pass_time(0.05)
+        self.assertEqual(self.robot.played, [0])
+        self.failureResultOf(driver.invoke("beep", hz="high"), Unsupported)
+        self.failureResultOf(driver.invoke("beep", tune="march"), Unsupported)
+        self.failureResultOf(driver.invoke("dock", fast=1.0), Unsupported)
+        self.failureResultOf(driver.invoke("fly"), Unsupported)
+
+    def test_leaves_the_robot_off(self) -> None:
+        """Disconnect ends the interface, so that the robot sleeps and charges as if nobody had asked it."""
+        driver = self.ready()
+        driver.disconnect()
+        self.pass_time(0.1)
+        self.assertEqual(self.robot.mode, 0)
+
+    def test_starts_a_rebooted_robot_again(self) -> None:
+        """A robot that loses its power while it drives is started again, at rest, and its counters cause no leap."""
+        driver = self.ready()
+        driver.act({"base.vx": 0.2}, self.permit(seconds=9.0))
+        self.pass_time(1.0)
+        x = float(self.value(driver, "odom.x"))
+        self.robot.reboot()
+        self.pass_time(0.4)
+        self.assertEqual(driver.state, "stale")
+        self.pass_time(4.0)
+        self.assertEqual((driver.state, driver.problem), ("ready", ""))
+        self.assertLess(self.true_speed(), 0.01)
+        self.assertTrue(math.isclose(float(self.value(driver, "odom.x")), x, abs_tol=0.05))
+        driver.act({"base.vx": 0.1}, self.permit())
+
+    def test_stops_a_robot_that_it_no_longer_hears(self) -> None:
+        """Where the robot hears and says nothing, it is stopped within a second, and the silence has a name."""
+        driver = self.ready()
+        driver.act({"base.vx": 0.2}, self.permit(seconds=9.0))
+        self.pass_time(0.2)
+        self.foul.half_open = True
+        self.pass_time(1.0)
+        self.assertEqual(driver.state, "stale")
+        self.assertLess(self.true_speed(), 0.01)
+        self.assertIn("switched on", driver.problem)
+        self.foul.half_open = False
+        self.pass_time(5.0)
+        self.assertEqual(driver.state, "ready")
+
+    def test_names_a_wrong_baud_rate(self) -> None:
+        """Bytes that never are a frame are named as what they are probably caused by."""
+        self.foul.garbage = 1.0
+        driver = self.make_driver()
+        connected = driver.connect()
+        self.pass_time(2.0)
+        self.assertNoResult(connected)
+        self.assertIn("115200 baud", driver.problem)
+        self.foul.garbage = 0.0
+        self.pass_time(5.0)
+        self.successResultOf(connected)
+        self.assertGreater(driver.diagnostics()["bad_frames"], 2)
+
+    def test_lives_with_a_foul_wire(self) -> None:
+        """With a tenth of the frames lost, a tenth spoilt, all late and cut anyhow, it goes on and counts them."""
+        driver = self.ready()
+        self.foul.drop = self.foul.garbage = 0.1
+        self.foul.split, self.foul.delay = True, 0.02
+        driver.act({"base.vx": 0.2}, self.permit(seconds=9.0))
+        self.pass_time(3.0)
+        self.assertEqual(driver.state, "ready")
+        self.assertTrue(math.isclose(float(self.value(driver, "odom.x")), self.body.x, abs_tol=0.05))
+        numbers = driver.diagnostics()
+        self.assertGreater(numbers["bad_frames"], 5)
+        self.assertGreater(numbers["frames"], 100)
+        self.assertEqual(numbers["reconnects"], 0)
+
+
+class EmulatorTests(SynchronousTestCase):
+    """What the emulator does that this driver never asks for."""
+
+    def setUp(self) -> None:
+        self.clock = Clock()
+        self.body = MemoryBody()
+        self.robot = Create2(self.body, self.clock, Random(1))
+        self.said = b""
+        self.connector = MemoryConnector(self.clock, self.robot.accept)
+        self.link = self.connector.opened(self)
+        self.addCleanup(self.robot.stop)
+
+    def received(self, data: bytes) -> None:
+        """Hear the robot."""
+        self.said += data
+
+    def link_down(self) -> None:
+        """Nothing."""
+
+    def tell(self, data: bytes) -> bytes:
+        """What the robot answers within 10 ms."""
+        assert self.link is not None
+        self.said = b""
+        self.link.send(data)
+        self.clock.pump([0.001] * 10)
+        return self.said
+
+    def test_is_off_until_it_is_started(self) -> None:
+        """Before a start it hears nothing; after one it is in passive mode and its wheels do not obey."""
+        self.assertEqual(self.tell(bytes((142, 35))), b"")
+        self.assertEqual(self.tell(bytes((128, 142, 35))), b"\x01")
+        self.tell(codec.drive_direct(100, 100))
+        self.assertEqual(self.body.motion, (0.0, 0.0, 0.0))
+        self.assertEqual(self.tell(bytes((131, 142, 35))), b"\x02")
+        self.assertEqual(self.tell(bytes((132, 142, 35))), b"\x03")
+        self.assertEqual(self.tell(bytes((135, 142, 35))), b"\x01")
+
+    def test_answers_groups_and_lists(self) -> None:
+        """Group 100 is 80 bytes, a list comes without ids, unknown packets are left out."""
+        self.assertEqual(len(self.tell(bytes((128, 142, 100)))), 80)
+        self.assertEqual(len(self.tell(codec.query((35, 22, 200, 43)))), 5)
+
+    def test_drives_on_arcs(self) -> None:
+        """Straight, spin and arc move the body as the specification says."""
+        self.tell(bytes((128, 131)) + codec.drive(200, codec.STRAIGHT))
+        self.assertEqual(self.body.motion, (0.2, 0.0, 0.0))
+        self.tell(codec.drive(235, 1))
+        self.assertEqual(self.body.motion, (0.0, 0.0, 2.0))
+        self.tell(codec.drive(235, -1))
+        self.assertEqual(self.body.motion, (0.0, 0.0, -2.0))
+        self.tell(codec.drive(100, 1000))
+        self.assertTrue(math.isclose(self.body.motion[2], 0.1, abs_tol=0.01))
+
+    def test_a_ledge_stops_it_ahead_only(self) -> None:
+        """In safe mode a ledge ends driving ahead, and lets it back off."""
+        self.body.values["cliff.left"] = True
+        self.tell(bytes((128, 131)) + codec.drive_direct(-100, -100))
+        self.assertEqual(self.body.motion[0], -0.1)
+        self.tell(codec.drive_direct(100, 100))
+        self.assertEqual((self.body.motion[0], self.robot.mode), (0.0, 1))
+
+    def test_reset_says_its_firmware(self) -> None:
+        """After a reset it says its boot text, is off, and streams no more."""
+        self.tell(bytes((128,)) + codec.stream((35,)))
+        self.clock.pump([0.015] * 4)
+        self.assertIn(b"\x13\x02\x23\x01", self.said)
+        self.tell(bytes((7,)))
+        self.said = b""
+        self.clock.pump([0.01] * 110)
+        self.assertIn(b"release-3.5.4", self.said)
+        self.assertEqual(self.robot.mode, 0)
+        self.assertNotIn(b"\x13\x02\x23", self.said)

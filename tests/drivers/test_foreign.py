@@ -1,0 +1,76 @@
+"""Tests of ``drivers.foreign``: drivers of other distributions, found by entry points and by their place."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from shutil import copy
+
+from twisted.internet.task import Clock
+from twisted.trial.unittest import SynchronousTestCase
+
+from drivers.errors import UsageError
+from drivers.registry import describe, driver_for, kinds
+
+EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "driver" / "robot.py"
+ENTRIES = """[swarm_node.drivers]
+rover = rover_of_tests:Rover
+torn = torn_of_tests:Torn
+gone = no_such_module_of_tests:Gone
+sim = torn_of_tests:Torn
+"""
+MODULES = ("rover_of_tests", "torn_of_tests", "plain_of_tests")
+
+
+class ForeignTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        """A distribution with a good driver and broken ones on this process's path, as pip would put it there."""
+        folder = Path(self.mktemp()).resolve()
+        (folder / "rovers-1.dist-info").mkdir(parents=True)
+        (folder / "rovers-1.dist-info" / "METADATA").write_text("Name: rovers\nVersion: 1\n")
+        (folder / "rovers-1.dist-info" / "entry_points.txt").write_text(ENTRIES)
+        copy(EXAMPLE, folder / "rover_of_tests.py")
+        (folder / "torn_of_tests.py").write_text("raise RuntimeError('torn\\nin two')\n")
+        (folder / "plain_of_tests.py").write_text("class Plain:\n    def __init__(self, *_): pass\n\nNUMBER = 7\n")
+        self.patch(sys, "path", [str(folder), *sys.path])
+        self.addCleanup(lambda: [sys.modules.pop(name, None) for name in MODULES])
+
+    def refused(self, kind: str) -> str:
+        """The one line with which a kind is refused."""
+        lines = {
+            str(self.assertRaises(UsageError, driver_for, kind, {"host": "x"}, "dog1", Clock())),
+            str(self.assertRaises(UsageError, describe, kind, {"host": "x"})),
+        }
+        self.assertEqual(len(lines), 1)
+        line = lines.pop()
+        self.assertNotIn("\n", line)
+        self.assertIn(kind, line)
+        return line
+
+    def test_kinds_of_others_are_known(self) -> None:
+        """An installed entry point is a kind like any other, and is not imported by being known."""
+        self.assertLess({"rover", "torn", "gone", "aibo", "sim"}, set(kinds()))
+        self.assertNotIn("rover_of_tests", sys.modules)
+        driver = driver_for("rover", {"host": "rover"}, "dog1", Clock())
+        self.assertEqual((driver.state, driver.description.kind), ("idle", "rover"))
+        self.assertEqual(describe("rover", {"host": "rover"}), driver.description)
+
+    def test_place_is_a_kind(self) -> None:
+        """``module:Class`` needs no entry point."""
+        driver = driver_for("rover_of_tests:Rover", {"host": "rover"}, "dog1", Clock())
+        self.assertEqual(driver.description, describe("rover_of_tests:Rover", {"host": "rover"}))
+
+    def test_broken_ones_are_named_and_harm_nothing(self) -> None:
+        """What cannot be imported, called or made is refused in a line that names it; the others are as before."""
+        self.assertIn("RuntimeError: torn in two", self.refused("torn"))
+        self.assertIn("no_such_module_of_tests", self.refused("gone"))
+        self.assertIn("AttributeError", self.refused("rover_of_tests:Nobody"))
+        self.assertIn("cannot be called", self.refused("plain_of_tests:NUMBER"))
+        self.assertIn("it lacks description, state", self.refused("plain_of_tests:Plain"))
+        self.assertIn("KeyError: 'host'", str(self.assertRaises(UsageError, describe, "rover", {})))
+        self.assertEqual(describe("rover", {"host": "rover"}).kind, "rover")
+
+    def test_built_in_kinds_stay(self) -> None:
+        """An entry point with the name of a built-in kind does not take its place."""
+        self.assertEqual(driver_for("sim", {}, "dog1", Clock()).description.kind, "aibo-ers7")
+        self.assertEqual(kinds().count("sim"), 1)

@@ -1,0 +1,362 @@
+"""Tests of ``drivers.joined``: a Create 2 with parts on its back keeps the contract, and what is its own."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from random import Random
+
+from twisted.internet.defer import Deferred, succeed
+from twisted.internet.interfaces import IReactorTime
+from twisted.internet.task import Clock
+from twisted.trial.unittest import SynchronousTestCase
+
+from drivers.base import BaseDriver
+from drivers.create2.driver import Create2Driver
+from drivers.create2.option import checked
+from drivers.driver import Driver, Filming, Permit
+from drivers.errors import LinkLost, Unsupported, UsageError
+from drivers.joined import Joined, described, joined
+from drivers.link import Caller, Line, MemoryConnector
+from drivers.reading import Action, Description, Frame, Observation, Value
+from drivers.registry import describe, driver_for
+from sim.emulator.body import MemoryBody
+from sim.emulator.create2 import Create2
+from sim.emulator.mjpeg import MjpegCamera
+from sim.emulator.nmea import NmeaCompass
+from tests.drivers.contract import BodyContract
+from tests.drivers.test_camera_driver import jpeg
+
+STEP = 0.005
+
+
+class Part(BaseDriver):
+    """Something that senses what the test says, and knows one skill."""
+
+    def __init__(
+        self,
+        clock: IReactorTime,
+        kind: str = "compass",
+        capability: str = "",
+        limits: Mapping[str, object] | None = None,
+    ) -> None:
+        rates = {capability or kind: 5.0}
+        capabilities: dict[str, Mapping[str, float | str]] = {capability or kind: {"mine": 1}}
+        super().__init__(
+            Description(kind, kind, capabilities, limits or {}, 0.01, rates, ("hum",)),  # type: ignore[arg-type]
+            kind,
+            clock,
+        )
+        self.opened = self.closed = 0
+        self.t = 100.0
+        """The part's own clock begins elsewhere."""
+
+    def tell(self, frame: Frame | None = None, **values: Value) -> None:
+        """Sense."""
+        if not self._is_up:
+            self._up()
+        self._observed({key.replace("_", "."): value for key, value in values.items()}, self.t, frame=frame)
+
+    def refuse(self) -> None:
+        """Be no such part, for good."""
+        self._refused(Unsupported("there is no such part"))
+
+    def lose(self) -> None:
+        """Lose the link."""
+        self._down()
+
+    def invoke(self, name: str, **arguments: float | str) -> Deferred[Mapping[str, Value]]:
+        """Hum."""
+        return succeed({"hummed": True}) if name == "hum" else super().invoke(name, **arguments)
+
+    def _open(self) -> None:
+        self.opened += 1
+
+    def _close(self) -> Deferred[None]:
+        self.closed += 1
+        return succeed(None)
+
+    def _drive(self, motion: Action, permit: Permit) -> Action:
+        return motion
+
+
+class Lens(Part):
+    """One whose pictures can be asked for."""
+
+    camera_fps = 5.0
+
+    def set_camera_fps(self, fps: float) -> None:
+        """So many."""
+        self.camera_fps = fps
+
+
+class JoinedTests(BodyContract, SynchronousTestCase):
+    """A Create 2 with a camera on its back keeps the contract."""
+
+    def setUp(self) -> None:
+        """A robot on an endless floor, a folder of pictures, and a clock that is turned by hand."""
+        self.clock = Clock()
+        self.body = MemoryBody()
+        self.robot = Create2(self.body, self.clock, Random(1))
+        self.connector = MemoryConnector(self.clock, self.robot.accept)
+        self.folder = Path(self.mktemp())
+        self.folder.mkdir()
+        for mark in (1, 2, 3):
+            (self.folder / f"{mark}.jpg").write_bytes(jpeg(mark))
+        self.drivers: list[Driver] = []
+
+    def tearDown(self) -> None:
+        """Nothing is left on the clock once all have gone."""
+        for driver in self.drivers:
+            driver.disconnect()
+        self.robot.stop()
+        self.pass_time(0.2)
+        self.assertEqual(self.clock.getDelayedCalls(), [])
+
+    def make_driver(self) -> Driver:
+        """A Create 2 with a camera, as the registry makes it."""
+        camera = ("camera", {"source": str(self.folder), "fps": 10})
+        driver = driver_for("create2", {"port": "memory"}, "vacuum", self.clock, self.connector, [camera])
+        self.drivers.append(driver)
+        return driver
+
+    def with_parts(self, *parts: Driver) -> Joined:
+        """A Create 2 with these parts."""
+        main = Create2Driver(checked({"port": "memory"}), "vacuum", self.connector, self.clock)
+        driver = joined(main, parts, "vacuum")
+        self.drivers.append(driver)
+        return driver
+
+    def newest(self, driver: Driver) -> Observation:
+        """The newest observation, which there is."""
+        seen = driver.observe()
+        assert seen is not None
+        return seen
+
+    def test_shows_what_its_parts_see(self) -> None:
+        """The device has the camera's capability before it connects, and its pictures in the robot's observations."""
+        driver = self.make_driver()
+        self.assertIn("camera", driver.description.capabilities)
+        self.assertEqual(
+            (driver.description.kind, driver.description.radius, driver.description.limits["base.vx"]),
+            ("create2", 0.174, (-0.5, 0.5)),
+        )
+        driver = self.ready()
+        numbers = []
+        driver.subscribe(lambda seen: numbers.append(-1 if seen.frame is None else seen.frame.seq))
+        self.pass_time(1.0)
+        self.assertEqual(sorted(set(numbers)), list(range(numbers[0], numbers[0] + len(set(numbers)))))
+        self.assertIn(len(set(numbers)), (10, 11))
+        self.assertGreater(len(numbers), 50)
+        self.assertLess(driver.diagnostics()["camera.age"], 0.2)
+        self.assertIn("bump.left", self.newest(driver).values)
+
+    def test_rides_with_a_camera_board_and_a_compass(self) -> None:
+        """Robot, camera board and compass are one device; each is lost and comes back alone."""
+        self.body.jpeg = jpeg(9)
+        self.body.values["compass.heading"] = 0.5
+        camera, compass = MjpegCamera(self.clock, self.body), NmeaCompass(self.clock, self.body)
+        ports = {81: MemoryConnector(self.clock, camera.accept), 10110: MemoryConnector(self.clock, compass.accept)}
+
+        class Network:
+            def call(_self, host: str, port: int, caller: Caller) -> Line:  # noqa: N805
+                line: Line = ports.get(port, self.connector).call(host, port, caller)
+                return line
+
+        parts = [("camera", {"url": "http://board:81/stream"}), ("compass", {"host": "board"})]
+        driver = driver_for("create2", {"port": "memory"}, "vacuum", self.clock, Network(), parts)
+        self.drivers.append(driver)
+        self.assertTrue({"camera", "compass", "bumper"} <= set(driver.description.capabilities))
+        connected = driver.connect()
+        self.pass_time(0.3)
+        self.successResultOf(connected)
+        self.assertEqual((self.newest(driver).frame, driver.state), (None, "ready"))
+        camera.start()
+        compass.start()
+        self.pass_time(1.0)
+        frame = self.newest(driver).frame
+        assert frame is not None
+        self.assertEqual(frame.data, jpeg(9))
+        self.assertAlmostEqual(float(self.newest(driver).values["compass.heading"]), 0.5, 2)
+        ports[81].cut()
+        self.pass_time(0.1)
+        self.assertIsNone(self.newest(driver).frame)
+        self.assertIn("compass.heading", self.newest(driver).values)
+        self.pass_time(2.0)
+        self.assertIsNotNone(self.newest(driver).frame)
+        counts = driver.diagnostics()
+        self.assertEqual((counts["reconnects"], counts["camera.reconnects"], counts["compass.reconnects"]), (0, 1, 0))
+        driver.disconnect()
+        camera.stop()
+        compass.stop()
+
+    def test_leaves_out_what_is_not_ready(self) -> None:
+        """What a part told vanishes when it falls silent, and is there again with its next word; the robot goes on."""
+        compass = Part(self.clock)
+        driver = self.with_parts(compass)
+        driver.connect()
+        self.pass_time(0.2)
+        self.assertNotIn("compass.heading", self.newest(driver).values)
+        compass.tell(compass_heading=1.5)
+        self.pass_time(0.1)
+        self.assertEqual(self.newest(driver).values["compass.heading"], 1.5)
+        self.pass_time(0.5)
+        self.assertNotIn("compass.heading", self.newest(driver).values)
+        self.assertEqual(driver.state, "ready")
+        self.assertGreater(driver.diagnostics()["compass.age"], 0.4)
+        compass.tell(compass_heading=1.0)
+        self.pass_time(0.1)
+        self.assertEqual(self.newest(driver).values["compass.heading"], 1.0)
+        compass.lose()
+        self.pass_time(0.1)
+        self.assertNotIn("compass.heading", self.newest(driver).values)
+
+    def test_says_why_its_robot_is_not_heard(self) -> None:
+        """What keeps the robot from being heard is told as its own driver tells it."""
+        main = Create2Driver(checked({"port": "memory"}), "vacuum", self.connector, self.clock)
+        driver = joined(main, [Part(self.clock)], "vacuum")
+        self.connector.is_open = False
+        driver.connect().addErrback(lambda _: None)
+        main._name_problem("the cable is out")
+        self.assertEqual((driver.problem, driver.token), ("the cable is out", 0))
+        driver.disconnect()
+
+    def test_is_as_fresh_as_its_robot(self) -> None:
+        """Words of a part make no observation, and none of a robot that is silent looks fresh because of them."""
+        compass = Part(self.clock)
+        driver, seen = self.with_parts(compass), list[Observation]()
+        driver.subscribe(seen.append)
+        connected = driver.connect()
+        compass.tell(compass_heading=1.0)
+        self.assertEqual((seen, driver.observe(), driver.state), ([], None, "connecting"))
+        self.assertNoResult(connected)
+        self.pass_time(0.3)
+        self.assertEqual(self.successResultOf(connected), driver.description)
+        self.connector.is_open = False
+        self.connector.cut()
+        count, age = len(seen), driver.diagnostics()["age"]
+        for _ in range(10):
+            self.pass_time(0.1)
+            compass.tell(compass_heading=1.0)
+        self.assertEqual((len(seen), driver.state), (count, "stale"))
+        self.assertGreater(driver.diagnostics()["age"], age + 0.9)
+
+    def test_keeps_what_is_the_robots(self) -> None:
+        """A key and a capability that the robot has stay its own; of two parts, the first that is ready tells."""
+        robot, part = Part(self.clock), Part(self.clock)
+        alone = joined(robot, [part], "post")
+        alone.connect()
+        robot.tell(compass_heading=1.0)
+        part.tell(compass_heading=9.0, hum_hz=50.0)
+        robot.tell(power_level=1.0)  # and not where north is, this time
+        self.assertEqual(self.newest(alone).values, {"power.level": 1.0, "hum.hz": 50.0})
+        first, second, vain = Part(self.clock), Part(self.clock), Part(self.clock, "case", "power")
+        driver = self.with_parts(first, second, vain)
+        self.assertEqual(driver.description.capabilities["power"], {})
+        self.assertEqual(driver.description.capabilities["compass"], {"mine": 1})
+        self.assertEqual(driver.description.rates["compass"], 5.0)
+        driver.connect()
+        self.pass_time(0.2)
+        vain.tell(power_level=0.01)
+        second.tell(compass_heading=2.0)
+        self.pass_time(0.05)
+        seen = self.newest(driver).values
+        self.assertEqual((seen["power.level"], seen["compass.heading"]), (1.0, 2.0))
+        first.tell(compass_heading=1.0)
+        self.pass_time(0.05)
+        self.assertEqual(self.newest(driver).values["compass.heading"], 1.0)
+        self.assertIn("compass.frames", driver.diagnostics())
+        self.assertIn("compass2.frames", driver.diagnostics())
+
+    def test_dates_a_picture_by_the_robots_clock(self) -> None:
+        """However the part's clock stands, the picture of an observation is as old as it really is."""
+        lens = Lens(self.clock, "camera")
+        driver = self.with_parts(lens)
+        driver.connect()
+        self.pass_time(0.2)
+        lens.tell(Frame(7, 4, 3, b"", lens.t - 0.02))
+        self.pass_time(0.1)
+        seen = self.newest(driver)
+        assert seen.frame is not None
+        age = seen.t_robot - seen.frame.t_robot + self.now() - seen.t_host
+        self.assertTrue(math.isclose(age, 0.12, abs_tol=1e-6), age)
+        self.assertEqual(seen.frame.seq, 7)
+
+    def test_films_where_somebody_does(self) -> None:
+        """The rate of pictures is asked of whoever has the camera; without a camera nobody can be asked."""
+        lens = Lens(self.clock, "camera")
+        driver: object = self.with_parts(Part(self.clock), lens)
+        assert isinstance(driver, Filming)
+        driver.set_camera_fps(2.0)
+        self.assertEqual((lens.camera_fps, driver.camera_fps), (2.0, 2.0))
+        self.assertNotIsInstance(self.with_parts(Part(self.clock)), Filming)
+        self.assertNotIsInstance(self.with_parts(Part(self.clock, "camera")), Filming)
+
+    def test_asks_who_knows_the_skill(self) -> None:
+        """A skill is had from the robot or from the part that knows it; what nobody knows is named with what is."""
+        driver = self.with_parts(Part(self.clock))
+        self.assertEqual(driver.description.skills, ("dock", "beep", "hum"))
+        self.assertEqual(self.successResultOf(driver.invoke("hum")), {"hummed": True})
+        self.failureResultOf(driver.invoke("beep"), LinkLost)
+        error = self.failureResultOf(driver.invoke("sing"), Unsupported).value
+        self.assertIn("dock, beep, hum", str(error))
+
+    def test_outlives_a_part_that_is_none(self) -> None:
+        """A part that is refused for good is named once, and the robot goes on; one that never came is no news."""
+        compass, absent = Part(self.clock), Part(self.clock, "camera")
+        driver, lines = self.with_parts(compass, absent), list[str]()
+        driver.log = type("Log", (), {"error": lambda _self, text, **facts: lines.append(text.format(**facts))})()
+        connected = driver.connect()
+        compass.refuse()
+        self.pass_time(0.3)
+        self.successResultOf(connected)
+        self.assertEqual(driver.state, "ready")
+        self.successResultOf(driver.disconnect())
+        self.successResultOf(driver.disconnect())
+        self.assertEqual(lines, ["vacuum: its part compass is given up: there is no such part"])
+        self.assertEqual((compass.opened, absent.opened, absent.closed), (1, 1, 1))
+
+    def test_leaves_its_parts_with_its_robot(self) -> None:
+        """Where the connection to the robot is given up, the parts are left as well."""
+        main, part = Part(self.clock), Part(self.clock)
+        driver = joined(main, [part], "post")
+        connected = driver.connect()
+        main.refuse()
+        self.failureResultOf(connected, Unsupported)
+        self.assertEqual((part.opened, part.closed, driver.state), (1, 1, "closed"))
+
+    def test_is_gone_when_all_are(self) -> None:
+        """Disconnect waits for the parts' links as well, also where the robot never came and it is called twice."""
+
+        class Slow(Part):
+            gone: Deferred[None]
+
+            def _close(self) -> Deferred[None]:
+                self.gone = Deferred()
+                return self.gone
+
+        part = Slow(self.clock)
+        driver = joined(Part(self.clock), [part], "post")
+        connected = driver.connect()
+        first, second = driver.disconnect(), driver.disconnect()
+        self.failureResultOf(connected, LinkLost)
+        for leaving in (first, second):
+            self.assertNoResult(leaving)
+        part.gone.callback(None)
+        for leaving in (first, second):
+            self.assertIsNone(self.successResultOf(leaving))
+
+    def test_refuses_a_second_robot(self) -> None:
+        """What moves is no part, whether it is described or made; what is wrong with a part says with which."""
+        robot = ("bittle", {"port": "/dev/x"})
+        compass = describe("camera", {})
+        self.assertIn("part 2", str(self.assertRaises(UsageError, described, compass, [compass, describe(*robot)])))
+        arguments = "create2", {"port": "memory"}, "vacuum"
+        for parts, word in (([robot], "only sense"), ([("warp", {})], "warp"), ([("camera", {"fps": 0})], "fps")):
+            for ask in (
+                lambda parts=parts: driver_for(*arguments, self.clock, self.connector, parts),
+                lambda parts=parts: describe(*arguments, parts),
+            ):
+                line = str(self.assertRaises(UsageError, ask))
+                self.assertTrue(line.startswith("part 1: ") and word in line, line)

@@ -1,0 +1,137 @@
+"""Tests that no driver says a motion again whose deadline has passed, though its timers were late.
+
+A node that was frozen finds all of its timers overdue, and is called by them in the order in which they were due: what
+repeats a motion comes before what ends it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from random import Random
+from typing import Any
+
+from twisted.internet.task import Clock
+from twisted.trial.unittest import SynchronousTestCase
+
+from drivers.driver import Driver, Permit
+from drivers.link import MemoryConnector
+from drivers.registry import driver_for
+from sim.emulator.aibo import AiboEmulator
+from sim.emulator.bittle import Bittle
+from sim.emulator.body import MemoryBody
+from sim.emulator.create2 import Create2
+from sim.emulator.rosbridge import RosbridgeRobot
+from swarmnode.driver.witness import Ear
+
+STEP = 0.005
+FROZEN_S = 2.0
+
+
+@dataclass
+class WatchedBody(MemoryBody):
+    """A body that keeps what it was told."""
+
+    told: list[tuple[float, float, float]] = field(default_factory=list)
+
+    def drive(self, vx: float, vy: float, wz: float) -> None:
+        """Move, and keep it."""
+        self.told.append((vx, vy, wz))
+        super().drive(vx, vy, wz)
+
+
+class LateTests(SynchronousTestCase):
+    """Each driver whose robot does not look at deadlines itself, frozen for a while after a command."""
+
+    def setUp(self) -> None:
+        """A body, and a clock that can jump."""
+        self.clock = Clock()
+        self.body = WatchedBody()
+
+    def pass_time(self, seconds: float) -> None:
+        """Turn the clock as it turns when nothing is late."""
+        for _ in range(round(seconds / STEP)):
+            self.clock.advance(STEP)
+
+    def enabled(self, kind: str, connector: Any, settle: float = 1.0, **options: object) -> Driver:
+        """A driver whose robot may move."""
+        driver = driver_for(kind, options, "robot", self.clock, connector)
+        connected = driver.connect()
+        self.pass_time(settle)
+        self.successResultOf(connected)
+        enabled = driver.enable()
+        self.pass_time(settle)
+        self.assertIs(self.successResultOf(enabled), True)
+        return driver
+
+    def freeze(self, driver: Driver, permitted: float, before: float = 0.0) -> None:
+        """Permit a motion, let time jump beyond its deadline, and see that the robot is told to halt and no more."""
+        driver.act({"base.vx": 0.1}, Permit(1, self.clock.seconds() + permitted))
+        self.pass_time(before)
+        self.body.told.clear()
+        self.clock.advance(FROZEN_S)
+        self.pass_time(2.5)
+        self.assertEqual([one for one in self.body.told if any(one)], [])
+        self.assertEqual(self.body.motion, (0.0, 0.0, 0.0))
+
+    def test_aibo(self) -> None:
+        """The walk that is said every half second is not said again after its deadline."""
+        for phase in range(10):
+            self.setUp()
+            dog = AiboEmulator(self.clock, self.body, Random(1))
+            dog.start()
+            self.freeze(self.enabled("aibo", dog.connector(), host="dog", camera=False), 0.7, 0.4 + 2 * phase * STEP)
+
+    def test_rosbridge(self) -> None:
+        """The velocity that is published ten times a second is not published after its deadline."""
+        robot = RosbridgeRobot(self.clock, self.body, Random(1))
+        robot.start()
+        connector = MemoryConnector(self.clock, robot.accept)
+        self.freeze(self.enabled("rosbridge", connector, host="robot"), 0.5, before=0.12)
+
+    def test_create2(self) -> None:
+        """Nothing but the halt leaves after the deadline."""
+        robot = Create2(self.body, self.clock, Random(1))
+        connector = MemoryConnector(self.clock, robot.accept)
+        self.freeze(self.enabled("create2", connector, port="memory"), 0.5, before=0.1)
+
+    def test_silence_of_a_frozen_node_is_not_the_robots(self) -> None:
+        """A robot that has spoken all the while is not taken for silent by a node that was frozen and did not hear."""
+        ear = Ear()
+        self.addCleanup(ear.close)
+        for phase in range(5):
+            self.setUp()
+            vacuum, dog = Create2(self.body, self.clock, Random(1)), AiboEmulator(self.clock, self.body, Random(1))
+            bridge = RosbridgeRobot(self.clock, self.body, Random(1))
+            dog.start()
+            bridge.start()
+            drivers = [
+                self.enabled("create2", MemoryConnector(self.clock, vacuum.accept), port="memory"),
+                self.enabled("aibo", dog.connector(), host="dog", camera=False),
+                self.enabled("rosbridge", MemoryConnector(self.clock, bridge.accept), host="robot"),
+            ]
+            for _ in range(2):
+                self.pass_time(1.0 + 0.06 * phase)
+                self.clock.advance(10.0)
+                self.pass_time(0.1)
+                self.assertEqual(
+                    [(one.state, one.diagnostics()["reconnects"]) for one in drivers], [("ready", 0.0)] * 3
+                )
+        self.assertEqual(ear.heard, [])
+
+    def test_bittle_without_an_answer(self) -> None:
+        """A gait that was not answered is not asked for again after its deadline."""
+        robot = Bittle(self.body, self.clock, Random(1))
+        driver = self.enabled("bittle", MemoryConnector(self.clock, robot.accept), port="memory")
+        robot.foul.half_open = True
+        self.freeze(driver, 1.2, before=0.1)
+
+    def test_bittle_over_wifi(self) -> None:
+        """A gait that waits for the request before it, or for its own connection, leaves no more after its deadline."""
+        for board in ("biboard", "nyboard"):
+            for phase in range(30):
+                self.setUp()
+                robot = Bittle(self.body, self.clock, Random(1), board=board)
+                connector = MemoryConnector(self.clock, robot.accept_http)
+                driver = self.enabled("bittle", connector, 1.5, host="10.0.0.5", board=board)
+                self.pass_time(phase * STEP)
+                self.freeze(driver, 0.5)

@@ -1,0 +1,420 @@
+"""Tests of ``drivers.pyro``: a robot as brains of 2011 knew it, over the drivers and emulators of today."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from random import Random
+from typing import Any
+
+import cv2
+import numpy as np
+from twisted.internet.task import Clock
+from twisted.trial.unittest import SynchronousTestCase
+
+from drivers.aibo.driver import AiboDriver
+from drivers.create2.driver import Create2Driver
+from drivers.create2.option import checked
+from drivers.driver import Driver, Permit
+from drivers.errors import StaleCommand, Unsupported, UsageError
+from drivers.link import MemoryConnector
+from drivers.pyro.brain import Brain, Engine
+from drivers.pyro.camera import Camera
+from drivers.pyro.device import Rows, ranger_of
+from drivers.pyro.robot import TTL_S, PyroRobot
+from drivers.pyro.sensorvalue import Geometry, SensorValue
+from drivers.reading import Frame, Value
+from drivers.registry import describe
+from sim.emulator.aibo import AiboEmulator
+from sim.emulator.body import MemoryBody
+from sim.emulator.create2 import Create2
+
+STEP_S = 0.004
+
+
+def picture(left: int, colour: tuple[int, int, int] = (190, 32, 42)) -> bytes:
+    """A grey picture of 104 by 80 with a patch of 16 by 16 in this colour (red, green, blue), ``left`` pixels in."""
+    image = np.full((80, 104, 3), 128, np.uint8)
+    image[32:48, left : left + 16] = colour[::-1]
+    return cv2.imencode(".png", image)[1].tobytes()
+
+
+class _Lab(SynchronousTestCase):
+    """A robot of memory on a clock that is turned by hand."""
+
+    def setUp(self) -> None:
+        self.clock = Clock()
+        self.body = MemoryBody()
+        self.emulator: Any = self.emulated()
+        self.driver = self.driven()
+        self.robot = PyroRobot(self.driver, self.clock)
+        self.addCleanup(self.end)
+        connected: list[bool] = []
+        self.robot.connect().addCallback(connected.append)
+        self.pass_time(2.0)
+        self.assertEqual(connected, [True])
+
+    def emulated(self) -> Any:
+        """A dog."""
+        dog = AiboEmulator(self.clock, self.body, Random(1))
+        dog.start()
+        return dog
+
+    def driven(self) -> Driver:
+        """Its driver."""
+        return AiboDriver({"host": "dog"}, "dog", self.emulator.connector(), self.clock)
+
+    def end(self) -> None:
+        """Leave nothing on the clock."""
+        self.robot.disconnect()
+        self.pass_time(0.1)
+        self.emulator.stop()
+        self.pass_time(0.1)
+        self.assertEqual(self.clock.getDelayedCalls(), [])
+
+    def pass_time(self, seconds: float) -> None:
+        """Turn the clock, and move the body."""
+        for _ in range(round(seconds / STEP_S)):
+            self.clock.advance(STEP_S)
+            self.body.pass_time(STEP_S)
+
+    def moved(self) -> tuple[float, ...]:
+        """The body's motion a moment later, rounded."""
+        self.pass_time(0.06)
+        return tuple(round(speed, 3) for speed in self.body.motion)
+
+
+class MotionTests(_Lab):
+    def test_shares_become_speeds(self) -> None:
+        """A share is one of the robot's own limit, which differs ahead and back; left is positive."""
+        self.robot.move(0.5, 0.0)
+        self.assertEqual(self.moved(), (0.08, 0.0, 0.0))
+        self.robot.move(-0.5, 0.0)
+        self.assertEqual(self.moved(), (-0.078, 0.0, 0.0))
+        self.robot.move(0.0, 0.5)
+        self.assertEqual(self.moved(), (0.0, 0.0, 1.015))
+        self.robot.motors(-1.0, 1.0)
+        self.assertEqual(self.moved(), (0.0, 0.0, 2.03))
+
+    def test_one_axis_leaves_the_others(self) -> None:
+        """``translate``, ``rotate`` and ``strafe`` go on with what the others were told."""
+        self.robot.translate(0.25)
+        self.robot.rotate(0.5)
+        self.robot.strafe(-0.25)
+        vx, vy, wz = self.moved()
+        self.assertTrue(vx > 0.0 and vy < 0.0 and wz > 0.0, (vx, vy, wz))
+        self.robot.stop()
+        self.assertEqual(self.moved(), (0.0, 0.0, 0.0))
+
+    def test_too_much_is_all_there_is(self) -> None:
+        """A share beyond 1 is 1, and what is no number is refused before anything moves."""
+        self.robot.move(7.0, 0.0)
+        self.assertEqual(self.moved(), (0.16, 0.0, 0.0))
+        for wrong in (math.nan, math.inf, "fast", True):
+            self.assertRaises(UsageError, self.robot.move, wrong, 0.0)
+
+    def test_robot_stops_when_its_brain_falls_silent(self) -> None:
+        """Half a second after the last word the robot stands; whoever updates goes on moving it."""
+        self.robot.move(0.5, 0.0)
+        for _ in range(20):
+            self.pass_time(0.1)
+            self.robot.update()
+        self.assertNotEqual(self.body.motion, (0.0, 0.0, 0.0))
+        self.pass_time(TTL_S + 0.1)
+        self.assertEqual(self.body.motion, (0.0, 0.0, 0.0))
+
+    def test_robot_of_a_team_is_not_taken(self) -> None:
+        """A robot that has obeyed a team refuses the lab's commands, and can be stopped all the same."""
+        self.driver.act({"base.vx": 0.1}, Permit(7, self.clock.seconds() + 2.0))
+        self.assertRaises(StaleCommand, self.robot.move, 0.5, 0.0)
+        self.robot.stop()
+        self.assertEqual(self.moved(), (0.0, 0.0, 0.0))
+
+    def test_pressed_switch_is_no_error_of_the_brain(self) -> None:
+        """A dog whose back is pressed stands, and nothing is raised; it moves when connected again, not by itself."""
+        self.robot.move(0.5, 0.0)
+        self.emulator.press()
+        self.pass_time(0.2)
+        self.robot.update()
+        self.robot.move(0.5, 0.0)
+        self.assertEqual(self.moved(), (0.0, 0.0, 0.0))
+        self.emulator.press()
+        self.pass_time(0.2)
+        self.robot.update()
+        self.robot.move(0.5, 0.0)
+        self.assertEqual(self.moved(), (0.0, 0.0, 0.0))
+        self.robot.connect()
+        self.pass_time(0.2)
+        self.robot.update()
+        self.robot.move(0.5, 0.0)
+        self.assertEqual(self.moved(), (0.08, 0.0, 0.0))
+
+    def test_place_is_counted_from_where_it_was_localized(self) -> None:
+        """``localize`` says where the robot is; from there its odometry goes on, turned with it."""
+        self.robot.move(0.0, 0.5)
+        self.pass_time(0.3)
+        self.robot.stop()
+        self.pass_time(0.2)
+        self.robot.update()
+        self.robot.localize(1.0, 2.0, math.pi / 2)
+        self.assertEqual((self.robot.x, self.robot.y, round(self.robot.th, 6)), (1.0, 2.0, 90.0))
+        self.robot.move(1.0, 0.0)
+        self.pass_time(0.4)
+        self.robot.update()
+        self.assertLess(abs(self.robot.x - 1.0), 0.02)
+        self.assertTrue(2.04 < self.robot.y < 2.08, self.robot.y)
+
+
+class ThreadTests(_Lab):
+    def test_every_call_goes_where_the_driver_lives(self) -> None:
+        """What moves, updates, stops and sounds goes through ``call``; another thread touches no driver."""
+        calls: list[Callable[[], Any]] = []
+        robot = PyroRobot(self.driver, self.clock, calls.append)
+        robot.move(0.5, 0.0)
+        self.assertEqual(self.moved(), (0.0, 0.0, 0.0))
+        calls[0]()
+        self.assertEqual(self.moved(), (0.08, 0.0, 0.0))
+        robot.update()
+        robot.stop()
+        robot.playSound("bark")
+        robot.disconnect()
+        self.assertEqual((len(calls), self.driver.state), (6, "ready"))
+
+
+class DeviceTests(_Lab):
+    def feel(self, **values: Value) -> None:
+        """The body feels this; ``range_near`` stands for ``range.near``."""
+        self.body.values |= {key.replace("_", ".", 1): value for key, value in values.items()}
+        self.pass_time(0.1)
+        self.robot.update()
+
+    def test_range_sensor_has_values_groups_and_units(self) -> None:
+        """The rangers of a dog are readings in robots' diameters, metres and shares, alone, in groups and by angle."""
+        self.feel(range_near=0.3, range_far=0.36)
+        far = self.robot.range
+        self.assertEqual([round(v, 3) for v in far.distance("M")], [0.3, 0.36, 1.5])
+        self.assertAlmostEqual(far[0].value, 0.3 / 0.24)
+        self.assertAlmostEqual(far[1].distance("SCALED"), 0.36 / 1.5)
+        self.assertEqual([one.pos for one in far["front-all"]], [0, 1])
+        self.assertEqual((far["left"], len(far["all"]), len(far[0:2]), len(far[0, 2])), ([], 3, 2, 2))
+        self.assertEqual([one.pos for one in far.span(10, -10)], [0, 1])
+        self.assertEqual([round(v, 3) for v in far[0].hit if v is not None], [0.42, 0.0, 0.0])
+
+    def test_nothing_in_reach_is_as_far_as_it_sees(self) -> None:
+        """A reading without an echo is the farthest that the sensors measure, and never NaN."""
+        self.feel(range_near=math.nan)
+        self.assertEqual(self.robot.range[0].distance("M"), 1.5)
+
+    def test_devices_and_features_in_the_words_of_brains(self) -> None:
+        """What the robot has is named as brains ask for it; what it has not is named in what is raised."""
+        robot = self.robot
+        self.assertEqual(robot.builtinDevices, ["battery", "camera", "ir", "position", "ptz"])
+        self.assertEqual(robot.supportedFeatures, ["continuous-movement", "range-sensor", "odometry", "mono-sound"])
+        self.assertEqual((robot.hasA("camera"), robot.hasA("sonar"), robot.supports("odometry")), (1, 0, True))
+        self.assertEqual(robot.requires(["range-sensor", "ptz"]), 1)
+        self.assertIn(
+            "gripper, sonar", str(self.assertRaises(ImportError, robot.requires, ["gripper", "ptz", "sonar"]))
+        )
+        self.assertIn("it has battery, camera", str(self.assertRaises(AttributeError, getattr, robot, "gripper")))
+        self.assertIs(robot.startDevice("camera0"), robot.camera[0])
+
+    def test_device_that_is_removed_tells_nothing_new(self) -> None:
+        """A removed device is not among the devices and keeps what it told; started again it follows the robot."""
+        self.feel(power_level=0.5)
+        battery = self.robot.battery[0]
+        self.robot.removeDevice("battery")
+        self.assertEqual((self.robot.hasA("battery"), battery.state), (0, "stopped"))
+        self.feel(power_level=0.4)
+        self.assertAlmostEqual(battery.level, 0.5, 2)
+        self.robot.startDevice("battery")
+        self.robot.update()
+        self.assertAlmostEqual(battery.level, 0.4, 2)
+
+    def test_joints_buttons_and_sensors_by_their_old_names(self) -> None:
+        """Names of the old interface find what the dog tells; a wrong one is answered with those there are."""
+        self.feel(button_chin=1.0, range_near=0.2)
+        robot = self.robot
+        self.assertEqual(robot.getButton("chin"), 1.0)
+        self.assertAlmostEqual(robot.getSensor("ir near"), 0.2)
+        self.assertEqual(robot.getJoint("left front leg knee"), robot.getJoint("LFr:knee"))
+        self.assertEqual(len(robot.getJoint("head pan")), 2)
+        self.assertIn("chin", str(self.assertRaises(AttributeError, robot.getButton, "nose")))
+        self.assertIn("NECK:pan", str(self.assertRaises(AttributeError, robot.getJoint, "left wing")))
+        self.assertRaises(Unsupported, robot.setWalk, "trot")
+        robot.playSound("bark")
+
+    def test_head_turns_in_shares(self) -> None:
+        """Pan to one side and tilt arrive at the dog as radians of its joints, and the pose says where it looks."""
+        ptz = self.robot.ptz[0]
+        ptz.setPose(0.5, -0.5, 0.0, 0.5)
+        self.pass_time(0.3)
+        self.robot.update()
+        for told, wished in zip(ptz.pose, (0.5, -0.5, 0.0, 0.5), strict=True):
+            self.assertLess(abs(told - wished), 0.03, ptz.pose)
+        ptz.center()
+        self.pass_time(0.3)
+        self.robot.update()
+        self.assertLess(max(abs(one) for one in ptz.pose), 0.03)
+
+    def test_picture_goes_through_the_filters(self) -> None:
+        """A red patch is matched and framed; with no patch the frame is all zeros; bytes that are none are counted."""
+        camera = self.robot.camera[0]
+        camera.addFilter("match", 190, 32, 42)
+        camera.addFilter("blobify", 0, 255, 255, 0, 1, 1, 1)
+        for n, (data, blob) in enumerate(
+            ((picture(70), (70, 32, 85, 47, 256)), (picture(5, (0, 0, 0)), (0, 0, 0, 0, 0)))
+        ):
+            camera.see(Frame(900 + n, 104, 80, data, 0.0))
+            self.assertEqual(camera.filterResults, [blob[4], [blob]])
+        self.assertEqual((camera.width, camera.height, camera.depth, len(camera.data)), (104, 80, 3, 104 * 80 * 3))
+        bad = camera.bad_pictures
+        camera.see(Frame(950, 104, 80, b"noise", 0.0))
+        self.assertEqual(camera.bad_pictures, bad + 1)
+        self.assertRaises(AttributeError, camera.addFilter, "fid")
+        camera.clearFilters()
+        self.assertEqual(camera.filterResults, [])
+
+
+class FilterTests(SynchronousTestCase):
+    def test_function_as_a_filter(self) -> None:
+        """A function may apply filters itself, and sees each picture once; two matches mark both colours."""
+        camera = Camera(104, 80)
+
+        def process(one: Camera) -> Any:
+            one.apply("match", 190, 32, 42)
+            one.apply("match", 0, 0, 250)
+            return one.apply("blobify", 0, 255, 255, 0, 1, 1, 2)
+
+        camera.addFilter(process)
+        image = np.full((80, 104, 3), 128, np.uint8)
+        image[10:20, 10:20] = (42, 32, 190)
+        image[40:60, 40:60] = (250, 0, 0)
+        frame = Frame(1, 104, 80, cv2.imencode(".png", image)[1].tobytes(), 0.0)
+        camera.see(frame)
+        camera.see(frame)
+        self.assertEqual(camera.pictures, 1)
+        self.assertEqual(camera.filterResults, [[(40, 40, 59, 59, 400), (10, 10, 19, 19, 100)]])
+
+    def test_brightness_without_a_match(self) -> None:
+        """Without a match ``blobify`` takes what is as bright in its channel as it is told."""
+        camera = Camera(104, 80)
+        camera.addFilter("blobify", 0, 180, 200)
+        camera.see(Frame(1, 104, 80, picture(20), 0.0))
+        self.assertEqual(camera.filterResults, [[(20, 32, 35, 47, 256)]])
+
+
+class Create2Tests(_Lab):
+    def emulated(self) -> Any:
+        """A robot on wheels."""
+        return Create2(self.body, self.clock, Random(1))
+
+    def driven(self) -> Driver:
+        """Its driver."""
+        connector = MemoryConnector(self.clock, self.emulator.accept)
+        return Create2Driver(checked({"port": "memory"}), "vacuum", connector, self.clock)
+
+    def test_robot_without_ranger_has_bumpers(self) -> None:
+        """Bumpers count from the left; a range sensor that is not there is named as such, and so is a walk sideways."""
+        self.assertEqual(self.robot.builtinDevices, ["battery", "bumper", "position"])
+        self.assertEqual((self.robot.bumper[0].value, self.robot.stall), ([0.0, 0.0], 0))
+        self.body.values["bump.right"] = True
+        self.pass_time(0.1)
+        self.robot.update()
+        self.assertEqual((self.robot.bumper[0].value, self.robot.stall), ([0.0, 1.0], 1))
+        self.assertEqual([one.pos for one in self.robot.bumper[0]["right"]], [1])
+        error = self.assertRaises(AttributeError, getattr, self.robot, "range")
+        self.assertIn("it has battery, bumper, position", str(error))
+        self.assertRaises(Unsupported, self.robot.strafe, 0.5)
+        self.robot.move(0.2, 0.0)
+        self.assertEqual(self.moved(), (0.1, 0.0, 0.0))
+
+
+class ScanTests(SynchronousTestCase):
+    def test_scan_counts_from_the_left(self) -> None:
+        """The sectors of a scanner are a row from the left round to behind, with the groups that brains ask for."""
+        names = ("front", "front_left", "left", "back", "right", "front_right")
+        values: dict[str, Value] = {f"range.{name}": 0.1 * n for n, name in enumerate(names)}
+        scan = ranger_of(describe("rosbridge", {}), values)
+        assert isinstance(scan, Rows)
+        scan.update(values, 0.0)
+        self.assertEqual((scan.type, len(scan)), ("laser", 6))
+        self.assertEqual(scan.angle(), sorted(scan.angle(), key=lambda angle: -(angle or 0.0)))
+        told = {
+            name: [round(one.distance("M"), 1) for one in scan[name]] for name in ("front", "left", "right", "back")
+        }
+        self.assertEqual(told, {"front": [0.0], "left": [0.2], "right": [0.4], "back": [0.3]})
+        self.assertEqual(len(scan["front-all"]), 3)
+        self.assertEqual(len(scan["back-all"]), 1)
+        self.assertRaises(AttributeError, scan.__getitem__, "above")
+
+    def test_units(self) -> None:
+        """Each unit is told from metres; a unit or an angle that nobody knows is refused with those there are."""
+        one = SensorValue(0.5, 2.0, 0, Geometry(0.1, 0.0, 0.0, math.pi / 2, 0.3), 0.125)
+        rows = {"ROBOTS": 2.0, "METERS": 0.5, "m": 0.5, "CM": 50.0, "MM": 500.0, "SCALED": 0.25, "RAW": 0.5}
+        self.assertEqual({unit: one.distance(unit) for unit in rows}, rows)
+        self.assertEqual((one.angle(), one.angle("radians")), (90.0, math.pi / 2))
+        self.assertRaises(AttributeError, one.distance, "feet")
+        self.assertRaises(AttributeError, one.angle, "turns")
+
+
+class BrainTests(_Lab):
+    def run_for(self, brain: type[Brain], seconds: float) -> tuple[Brain, list[Any]]:
+        """Let a brain of this kind run."""
+        made: list[Brain] = []
+
+        def init(engine: Engine) -> Brain:
+            made.append(brain("one", engine))
+            return made[0]
+
+        engine = Engine(self.robot, self.clock)
+        ended: list[Any] = []
+        engine.run(init).addBoth(ended.append)
+        self.pass_time(seconds)
+        engine.stop()
+        return made[0], ended
+
+    def test_brain_steps_ten_times_a_second(self) -> None:
+        """In a second a brain makes ten steps, each after an update; the robot stands when it ends."""
+
+        class Walk(Brain):
+            def step(self) -> None:
+                self.move(0.5, 0.0)
+
+        brain, ended = self.run_for(Walk, 1.0)
+        self.assertIn(brain.stepCount, (10, 11))
+        self.assertEqual((ended, self.moved()), ([None], (0.0, 0.0, 0.0)))
+
+    def test_brain_that_raises_stops_its_robot(self) -> None:
+        """An error in a step ends the brain, gives back what it took, stands the robot still, and is told."""
+        given: list[int] = []
+
+        class Fall(Brain):
+            def step(self) -> None:
+                self.move(1.0, 0.0)
+                if self.stepCount == 3:
+                    raise ValueError("tripped")
+
+            def destroy(self) -> None:
+                given.append(1)
+
+        _, ended = self.run_for(Fall, 1.0)
+        self.assertEqual((str(ended[0].value), given, self.moved()), ("tripped", [1], (0.0, 0.0, 0.0)))
+
+    def test_brain_pauses_and_quits(self) -> None:
+        """A paused brain takes no step and its robot stands; one that quits ends by itself."""
+
+        class Nap(Brain):
+            def step(self) -> None:
+                self.translate(0.5)
+                if self.stepCount == 2:
+                    self.pleaseStop()
+
+        brain, ended = self.run_for(Nap, 1.0)
+        self.assertEqual((brain.stepCount, self.body.motion), (3, (0.0, 0.0, 0.0)))
+
+        class Quit(Brain):
+            def step(self) -> None:
+                self.quit()
+
+        _, ended = self.run_for(Quit, 0.5)
+        self.assertEqual(ended, [None])

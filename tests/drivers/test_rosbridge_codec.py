@@ -1,0 +1,256 @@
+"""Tests of ``drivers.rosbridge.codec``."""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+from typing import Any
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from twisted.trial.unittest import SynchronousTestCase
+
+from drivers.errors import BadFrame
+from drivers.rosbridge import codec
+from drivers.rosbridge.codec import Answered, Published, Status, decoded, encoded
+
+settings.register_profile("rosbridge", derandomize=True, database=None, deadline=None, max_examples=120)
+settings.load_profile("rosbridge")
+
+JPEG = b"\xff\xd8\xff\xc0\x00\x0b\x08\x00\x60\x00\x80\x01\x11\x00\x00\xff\xd9"
+STILL = {"linear": {"x": 0, "y": 0, "z": 0}, "angular": {"x": 0, "y": 0, "z": 0}}
+ODOMETRY: dict[str, Any] = {
+    "header": {"stamp": {"sec": 12, "nanosec": 500_000_000}, "frame_id": "odom"},
+    "pose": {"pose": {"position": {"x": 1, "y": -2.5, "z": 0}, "orientation": {"x": 0, "y": 0, "z": 1, "w": 0}}},
+    "twist": {"twist": {"linear": {"x": 0.1, "y": 0, "z": 0}, "angular": {"x": 0, "y": 0, "z": -0.5}}},
+}
+SCAN: dict[str, Any] = {
+    "angle_min": -math.pi / 2,
+    "angle_increment": math.pi / 4,
+    "range_min": 0.1,
+    "range_max": 3.0,
+    "ranges": [1.0, None, 0.5, 0.0, 9.0],
+}
+SECTORS = {"right": (-math.pi / 2, 0.1), "front": (0.0, math.pi / 2 + 0.1), "left": (math.pi / 2, 0.1)}
+ANY = st.recursive(
+    st.none() | st.booleans() | st.floats() | st.integers() | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner, max_size=4),
+    max_leaves=12,
+)
+
+
+def spoilt(message: Any, path: tuple[Any, ...], value: Any) -> Any:
+    """A copy of ``message`` with another value at ``path``."""
+    copy = json.loads(json.dumps(message))
+    at = copy
+    for step in path[:-1]:
+        at = at[step]
+    at[path[-1]] = value
+    return copy
+
+
+def paths(message: Any, start: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    """Every place of a message."""
+    steps = message.items() if isinstance(message, dict) else enumerate(message) if isinstance(message, list) else ()
+    return [path for key, value in steps for path in ((*start, key), *paths(value, (*start, key)))]
+
+
+class SayingTests(SynchronousTestCase):
+    """What is said to rosbridge, byte for byte as its protocol has it."""
+
+    def test_writes_the_operations_of_the_protocol(self) -> None:
+        """Advertise, publish, subscribe and call_service are written as ROSBRIDGE_PROTOCOL.md shows them."""
+        vectors = (
+            (
+                encoded("advertise", topic="/cmd_vel", type="geometry_msgs/Twist"),
+                b'{"op":"advertise","topic":"/cmd_vel","type":"geometry_msgs/Twist"}',
+            ),
+            (
+                encoded("publish", topic="/cmd_vel", msg=codec.twist(0.1, 0.0, -0.5)),
+                b'{"op":"publish","topic":"/cmd_vel","msg":{"linear":{"x":0.1,"y":0.0,"z":0.0},'
+                b'"angular":{"x":0.0,"y":0.0,"z":-0.5}}}',
+            ),
+            (
+                encoded("publish", topic="/cmd_vel", msg=codec.twist_stamped(0.1, 0.0, 0.0)),
+                b'{"op":"publish","topic":"/cmd_vel","msg":{"header":{"stamp":{"sec":0,"nanosec":0},'
+                b'"frame_id":"base_link"},"twist":{"linear":{"x":0.1,"y":0.0,"z":0.0},'
+                b'"angular":{"x":0.0,"y":0.0,"z":0.0}}}}',
+            ),
+            (
+                encoded("subscribe", topic="/odom", type="nav_msgs/Odometry", throttle_rate=50, queue_length=1),
+                b'{"op":"subscribe","topic":"/odom","type":"nav_msgs/Odometry","throttle_rate":50,"queue_length":1}',
+            ),
+            (
+                encoded("call_service", id="1", service="/rosapi/topic_type", args={"topic": "/cmd_vel"}),
+                b'{"op":"call_service","id":"1","service":"/rosapi/topic_type","args":{"topic":"/cmd_vel"}}',
+            ),
+        )
+        for said, wanted in vectors:
+            self.assertEqual(said, wanted)
+
+    def test_never_says_what_is_no_number(self) -> None:
+        """NaN is no JSON: it does not leave this machine."""
+        self.assertRaises(ValueError, encoded, "publish", msg=codec.twist(math.nan, 0.0, 0.0))
+
+
+class HearingTests(SynchronousTestCase):
+    """What rosbridge says."""
+
+    def test_reads_the_operations_of_the_protocol(self) -> None:
+        """Publications, answers that succeed and fail, and the status are told apart."""
+        self.assertEqual(decoded(b'{"op":"publish","topic":"/a","msg":{"b":1}}'), Published("/a", {"b": 1}))
+        said = b'{"op":"service_response","id":"7","service":"/s","values":{"type":"x"},"result":true}'
+        self.assertEqual(decoded(said), Answered("7", {"type": "x"}, True))
+        said = b'{"op":"service_response","id":"7","values":"no such service","result":false}'
+        self.assertEqual(decoded(said), Answered("7", {"error": "no such service"}, False))
+        said = b'{"op":"service_response","id":"7"}'
+        self.assertEqual(decoded(said), Answered("7", {"error": "no reason given"}, True))
+        self.assertEqual(decoded(b'{"op":"status","level":"error","msg":"oh"}'), Status("error", "oh"))
+
+    def test_refuses_what_is_no_operation(self) -> None:
+        """Bytes, JSON and operations that make no sense are bad frames, however deep or large they are."""
+        for said in (
+            *(b"", b"\xff\xfe", b"{", b"[]", b"3", b"null", b"{}", b'{"op":"png"}', b'{"op":["publish"]}'),
+            *(b'{"op":"publish","topic":1,"msg":{}}', b'{"op":"publish","topic":"/a","msg":[]}'),
+            *(b'{"op":"service_response","id":7,"values":{}}', b"[" * 100_000, b'{"op":' + b"9" * 5000 + b"}"),
+        ):
+            self.assertRaises(BadFrame, decoded, said)
+
+    @given(st.binary(max_size=60))
+    def test_any_bytes(self, data: bytes) -> None:
+        """Whatever arrives is a message or a bad frame, and nothing else is raised."""
+        try:
+            decoded(data)
+        except BadFrame:
+            return
+
+    @given(ANY)
+    def test_any_json(self, said: Any) -> None:
+        """So is any JSON, NaN and Infinity as old rosbridges write them included."""
+        for whole in (said, {"op": "publish", "topic": "/a", "msg": said}, {"op": "service_response", "id": said}):
+            try:
+                decoded(json.dumps(whole).encode())
+            except BadFrame:
+                continue
+
+
+class ReadingTests(SynchronousTestCase):
+    """ROS messages in SI values."""
+
+    def test_odometry(self) -> None:
+        """Place, heading from the quaternion, and the speed; slow enough is standing."""
+        values = codec.odometry(ODOMETRY)
+        self.assertEqual((values["odom.x"], values["odom.y"], values["base.moving"]), (1.0, -2.5, True))
+        self.assertAlmostEqual(abs(float(values["odom.yaw"])), math.pi)
+        self.assertEqual((values["base.vx"], values["base.vy"], values["base.wz"]), (0.1, 0.0, -0.5))
+        still = spoilt(ODOMETRY, ("twist", "twist"), STILL)
+        self.assertIs(codec.odometry(still)["base.moving"], False)
+
+    def test_absurd_odometry(self) -> None:
+        """Null, NaN, infinite, enormous, missing, and an orientation that is no rotation: all of it is dropped."""
+        for path in (
+            ("pose", "pose", "position", "x"),
+            ("pose", "pose", "orientation", "w"),
+            ("twist", "twist", "linear", "x"),
+        ):
+            values: tuple[Any, ...] = (None, math.nan, math.inf, -math.inf, 1e9, 10**400, True, "1", [], {})
+            for value in values:
+                self.assertRaises(BadFrame, codec.odometry, spoilt_python(ODOMETRY, path, value))
+        zero = {"x": 0, "y": 0, "z": 0, "w": 0}
+        self.assertRaises(BadFrame, codec.odometry, spoilt(ODOMETRY, ("pose", "pose", "orientation"), zero))
+
+    def test_scan(self) -> None:
+        """The nearest echo of each sector; null, 0.0 and beyond the range are none; the scanner may stand turned."""
+        values = codec.scan(SCAN, SECTORS)
+        self.assertEqual((values["range.right"], values["range.front"]), (1.0, 0.5))
+        self.assertTrue(math.isnan(float(values["range.left"])))
+        turned = codec.scan(SCAN, SECTORS, math.pi / 2)
+        self.assertEqual((turned["range.front"], turned["range.left"]), (1.0, 0.5))
+        raw = {**SCAN, "ranges": [math.nan, math.inf, -math.inf, 0.7, 0.2]}
+        self.assertEqual([codec.scan(raw, SECTORS)[f"range.{name}"] for name in ("front", "left")], [0.7, 0.2])
+
+    def test_absurd_scan(self) -> None:
+        """A scan without ranges, with too many, with words among them or absurd limits is dropped."""
+        for key, value in (
+            *(("ranges", None), ("ranges", []), ("ranges", "0.5"), ("ranges", [0.5, "x"]), ("ranges", [True])),
+            *(("ranges", [1.0] * (codec.MOST_READINGS + 1)), ("angle_increment", 0.0), ("angle_min", None)),
+            *(("range_min", -1.0), ("range_max", 0.05), ("range_max", None)),
+        ):
+            self.assertRaises(BadFrame, codec.scan, {**SCAN, key: value}, SECTORS)
+
+    def test_imu(self) -> None:
+        """Acceleration always, the attitude unless the message says that it is unknown."""
+        turn = math.sin(math.pi / 12), math.cos(math.pi / 12)
+        said = {
+            "linear_acceleration": {"x": 0.1, "y": 0, "z": 9.8},
+            "orientation": {"x": turn[0], "y": 0, "z": 0, "w": turn[1]},
+        }
+        values = codec.imu(said)
+        self.assertEqual((values["imu.ax"], values["imu.az"]), (0.1, 9.8))
+        self.assertAlmostEqual(float(values["imu.roll"]), math.pi / 6)
+        self.assertAlmostEqual(float(values["imu.pitch"]), 0.0)
+        self.assertNotIn("imu.yaw", codec.imu({**said, "orientation_covariance": [-1, 0, 0]}))
+        self.assertRaises(BadFrame, codec.imu, {"linear_acceleration": {"x": 0, "y": 0, "z": 2000}})
+
+    def test_battery(self) -> None:
+        """What is known of it; null and NaN are not; a level beyond full is dropped and names the option."""
+        said = {"voltage": 11.5, "current": None, "percentage": 0.8, "power_supply_status": 1}
+        self.assertEqual(codec.battery(said), {"power.volts": 11.5, "power.level": 0.8, "power.charging": True})
+        self.assertEqual(codec.battery({"percentage": 80.0}, 100.0)["power.level"], 0.8)
+        self.assertEqual(codec.battery({"percentage": 1.005})["power.level"], 1.0)
+        self.assertIn("battery_full", str(self.assertRaises(BadFrame, codec.battery, {"percentage": 80.0})))
+        wrong: tuple[dict[str, Any], ...] = ({}, {"percentage": math.nan}, {"percentage": -1}, {"voltage": 1e9})
+        for each in wrong:
+            self.assertRaises(BadFrame, codec.battery, each)
+
+    def test_picture(self) -> None:
+        """A whole JPEG out of base64 with its size; anything else is a bad frame that says what it was."""
+        said = {"format": "jpeg", "data": base64.b64encode(JPEG).decode()}
+        self.assertEqual(codec.picture(said), (JPEG, 128, 96))
+        png = base64.b64encode(b"\x89PNG").decode()
+        self.assertIn("png", str(self.assertRaises(BadFrame, codec.picture, {"format": "png", "data": png})))
+        cut = base64.b64encode(JPEG[:-1]).decode()
+        for data in (None, [255, 216], "&&", "\u20ac", "/9j", cut):
+            self.assertRaises(BadFrame, codec.picture, {"format": "jpeg", "data": data})
+
+    def test_stamp(self) -> None:
+        """ROS 1 and 2 name the parts of a stamp differently; what is none is not taken for one."""
+        self.assertEqual(codec.stamp(ODOMETRY), 12.5)
+        self.assertEqual(codec.stamp({"header": {"stamp": {"secs": 3, "nsecs": 0}}}), 3.0)
+        for at in (None, 3, {"sec": 1.5, "nanosec": 0}, {"sec": -1, "nanosec": 0}, {"sec": 1, "nanosec": 10**9}):
+            self.assertIsNone(codec.stamp({"header": {"stamp": at}}))
+        self.assertIsNone(codec.stamp({"header": None}))
+
+    @given(st.data(), ANY)
+    def test_any_field(self, data: st.DataObject, value: Any) -> None:
+        """With any value at any place a message is finite numbers, truths and text, or a bad frame."""
+        readers = (
+            (codec.odometry, ODOMETRY),
+            (lambda said: codec.scan(said, SECTORS), SCAN),
+            (codec.battery, {"voltage": 11.5, "percentage": 0.8, "power_supply_status": 1}),
+        )
+        read, message = data.draw(st.sampled_from(readers))
+        said = spoilt_python(message, data.draw(st.sampled_from(paths(message))), value)
+        codec.stamp(said)
+        try:
+            values = read(said)
+        except BadFrame:
+            return
+        for key, each in values.items():
+            self.assertFalse(isinstance(each, float) and math.isinf(each), key)
+            self.assertTrue(key.startswith("range.") or not (isinstance(each, float) and math.isnan(each)), key)
+
+
+def spoilt_python(message: Any, path: tuple[Any, ...], value: Any) -> Any:
+    """As ``spoilt``, with values that JSON does not have."""
+    marked = spoilt(message, path, "\0here")
+
+    def put(at: Any) -> Any:
+        if at == "\0here":
+            return value
+        if isinstance(at, dict):
+            return {key: put(inner) for key, inner in at.items()}
+        return [put(inner) for inner in at] if isinstance(at, list) else at
+
+    return put(marked)

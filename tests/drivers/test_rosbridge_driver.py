@@ -1,0 +1,358 @@
+"""Tests of ``drivers.rosbridge.driver`` against its emulator, joined through memory."""
+
+from __future__ import annotations
+
+import math
+from random import Random
+from typing import Any
+
+from twisted.internet.task import Clock
+from twisted.trial.unittest import SynchronousTestCase
+
+from drivers.errors import LinkLost, NoReply, RobotError, Unsupported, UsageError
+from drivers.link import Link, MemoryConnector
+from drivers.registry import describe, driver_for
+from drivers.rosbridge.driver import CALL_S, SOURCE_S, RosbridgeDriver
+from drivers.rosbridge.link import SILENCE_S
+from sim.emulator.body import MemoryBody
+from sim.emulator.rosbridge import RosbridgeRobot
+from tests.drivers.contract import BodyContract
+
+STEP = 0.005
+JPEG = b"\xff\xd8\xff\xc0\x00\x0b\x08\x00\x60\x00\x80\x01\x11\x00\x00\xff\xd9"
+"""128 x 96, as far as its head goes."""
+IMAGE = "/camera/image_raw/compressed"
+
+
+class Told:
+    """A log that keeps the warnings."""
+
+    def __init__(self, warnings: list[str]) -> None:
+        self.warnings = warnings
+
+    def warn(self, _format: str, text: str, **_rest: object) -> None:
+        self.warnings.append(text)
+
+
+class RosbridgeDriverTests(BodyContract, SynchronousTestCase):
+    """A ROS robot keeps the contract, and what is its own."""
+
+    def setUp(self) -> None:
+        """A robot on a clock that is turned by hand."""
+        self.clock = Clock()
+        self.body = MemoryBody(jpeg=JPEG, values={"power.level": 0.8, "range.near": 0.5, "range.left": math.nan})
+        # The floor is no obstacle.
+        self.body.values["range.chest"] = 0.2
+        self.robot = RosbridgeRobot(self.clock, self.body, Random(1))
+        self.robot.start()
+        self.connector = MemoryConnector(self.clock, self.robot.accept)
+        self.drivers: list[RosbridgeDriver] = []
+
+    def tearDown(self) -> None:
+        """Nothing is left on the clock once all have gone."""
+        for driver in self.drivers:
+            driver.disconnect()
+        self.robot.stop()
+        self.pass_time(0.02)
+        self.assertEqual(self.clock.getDelayedCalls(), [])
+
+    def make_driver(self, **options: object) -> RosbridgeDriver:
+        """A driver of the robot."""
+        driver = RosbridgeDriver(options, self.connector, self.clock, "turtle", Random(2).randbytes)
+        self.drivers.append(driver)
+        return driver
+
+    def connected(self, **options: object) -> RosbridgeDriver:
+        """A driver that is connected and enabled."""
+        driver = self.make_driver(**options)
+        driver.connect()
+        self.pass_time(0.4)
+        driver.enable()
+        self.pass_time(0.4)
+        return driver
+
+    def values(self, driver: RosbridgeDriver) -> dict[str, Any]:
+        """What it sees."""
+        seen = driver.observe()
+        assert seen is not None
+        return dict(seen.values)
+
+    def heard(self, op: str) -> list[dict[str, Any]]:
+        """What the robot was told."""
+        return [said for said in self.robot.heard if said["op"] == op]
+
+    def test_drives_with_the_type_that_the_robot_listens_to(self) -> None:
+        """Both Twist and TwistStamped robots move, of ROS 1 and 2, with nothing set: the robot is asked."""
+        for kind in ("geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped", "geometry_msgs/Twist"):
+            self.robot.velocity_type = kind
+            driver = self.connected()
+            driver.act({"base.vx": 0.2, "base.wz": -0.5}, self.permit())
+            self.pass_time(0.1)
+            self.assertEqual(self.body.motion, (0.2, 0.0, -0.5), kind)
+            self.assertEqual(self.robot.ignored, 0)
+            driver.disconnect()
+            self.pass_time(0.1)
+
+    def test_takes_twist_where_nobody_can_be_asked(self) -> None:
+        """Without rosapi it waits one second, takes Twist, and says so once; a set type waits for nothing."""
+        self.robot.has_rosapi = False
+        driver = self.make_driver()
+        connected = driver.connect()
+        self.pass_time(0.9)
+        self.assertNoResult(connected)
+        self.pass_time(0.3)
+        self.successResultOf(connected)
+        self.assertTrue(self.heard("advertise")[-1]["type"].endswith("/Twist"))
+        told = self.make_driver(velocity_type="twist_stamped")
+        connected = told.connect()
+        self.pass_time(0.2)
+        self.successResultOf(connected)
+        self.assertEqual(self.heard("advertise")[-1]["type"], "geometry_msgs/msg/TwistStamped")
+
+    def test_takes_an_answer_that_comes_late(self) -> None:
+        """Where rosapi answers after Twist was taken, the type is changed; the next link begins with what it said."""
+        self.robot.velocity_type = "geometry_msgs/msg/TwistStamped"
+        self.robot.rosapi_s = 1.5
+        driver = self.make_driver()
+        driver.connect()
+        self.pass_time(2.0)
+        driver.enable()
+        self.pass_time(0.2)
+        driver.act({"base.vx": 0.1}, self.permit())
+        self.pass_time(0.1)
+        self.assertEqual(self.true_speed(), 0.1)
+        self.assertTrue(self.heard("advertise")[-1]["type"].endswith("/TwistStamped"))
+        self.assertIn("Twist", {one["type"].rpartition("/")[2] for one in self.heard("advertise")})
+        self.robot.has_rosapi = False
+        self.cut_link()
+        self.robot.heard.clear()
+        self.pass_time(2.0)
+        self.assertTrue(self.heard("advertise")[0]["type"].endswith("/TwistStamped"))
+
+    def test_waits_for_a_base_that_is_still_starting(self) -> None:
+        """While nobody listens to the velocity the robot is not ready; it is asked again until somebody does."""
+        self.robot.velocity_type = ""
+        driver = self.make_driver()
+        connected = driver.connect()
+        self.pass_time(3.0)
+        self.assertNoResult(connected)
+        self.assertEqual(driver.state, "connecting")
+        self.robot.velocity_type = "geometry_msgs/msg/Twist"
+        self.pass_time(1.2)
+        self.successResultOf(connected)
+
+    def test_warns_of_a_type_that_the_robot_ignores(self) -> None:
+        """A type that is set wrongly does not move the robot, and the warning names the option."""
+        warnings: list[str] = []
+        driver = self.make_driver(velocity_type="twist_stamped")
+        driver._warn = warnings.append  # type: ignore[assignment,method-assign]
+        driver.connect()
+        self.pass_time(0.3)
+        self.assertIn('velocity_type = "twist"', warnings[0])
+        self.assertGreater(self.robot.ignored, 0)
+
+    def test_says_the_velocity_again_and_zero_at_the_end(self) -> None:
+        """While it is in force it is published ten times a second; at the deadline zero is, once, and then nothing."""
+        driver = self.connected()
+        self.robot.heard.clear()
+        driver.act({"base.vx": 0.1}, self.permit(seconds=1.0))
+        self.pass_time(1.5)
+        said = [one["msg"]["linear"]["x"] for one in self.heard("publish")]
+        self.assertEqual(said[-1], 0.0)
+        self.assertEqual(set(said[:-1]), {0.1})
+        self.assertIn(len(said), (11, 12))
+        self.assertLess(abs(self.body.x - 0.1), 0.01)
+
+    def test_stops_at_its_base_when_the_link_is_lost(self) -> None:
+        """With nobody left to say zero, the base stops by itself; the new link begins with zero."""
+        driver = self.connected()
+        driver.act({"base.vx": 0.2}, self.permit(seconds=5.0))
+        self.pass_time(0.2)
+        self.connector.is_open = False
+        self.connector.cut()
+        self.pass_time(0.3)
+        self.assertGreater(self.true_speed(), 0.1)
+        self.pass_time(0.3)
+        self.assertEqual(self.true_speed(), 0.0)
+        self.robot.heard.clear()
+        self.connector.is_open = True
+        self.pass_time(2.0)
+        self.assertEqual([one["msg"]["linear"]["x"] for one in self.heard("publish")], [0.0])
+
+    def test_sees_what_its_topics_say(self) -> None:
+        """Place, speed, sectors of the scan, battery, attitude and picture are observed in SI."""
+        driver = self.connected(imu_topic="/imu", image_topic=IMAGE)
+        driver.act({"base.vx": 0.1, "base.wz": 0.5}, self.permit(seconds=1.0))
+        self.pass_time(0.5)
+        seen, values = driver.observe(), self.values(driver)
+        assert seen is not None and seen.frame is not None
+        self.assertEqual((values["base.vx"], values["base.wz"], values["base.moving"]), (0.1, 0.5, True))
+        self.assertLess(abs(values["odom.yaw"] - self.body.yaw), 0.05)
+        self.assertEqual(values["range.front"], 0.5)
+        self.assertTrue(math.isnan(values["range.left"]))
+        self.assertEqual((values["power.level"], values["power.charging"]), (0.8, False))
+        self.assertNotIn("power.amps", values)
+        self.assertEqual(values["imu.az"], 9.8)
+        self.assertEqual((seen.frame.width, seen.frame.height, seen.frame.data), (128, 96, JPEG))
+        self.assertEqual(driver.description.capabilities["camera"]["fps"], 10.0)
+
+    def test_asks_for_as_many_pictures_as_are_wanted(self) -> None:
+        """More or fewer pictures are subscribed to anew, none is unsubscribed; without a topic there is no camera."""
+        driver = self.connected(image_topic=IMAGE, camera_fps=5)
+        driver.set_camera_fps(0)
+        self.pass_time(0.1)
+        before = driver.diagnostics()["pictures"]
+        self.pass_time(1.0)
+        self.assertEqual((driver.diagnostics()["pictures"], driver.camera_fps), (before, 0.0))
+        driver.set_camera_fps(5)
+        self.pass_time(2.0)
+        self.assertIn(driver.diagnostics()["pictures"] - before, range(8, 11))
+        blind = self.connected()
+        blind.set_camera_fps(5)
+        self.assertEqual((blind.camera_fps, "camera" in blind.description.capabilities), (0.0, False))
+
+    def test_leaves_out_what_a_silent_topic_said(self) -> None:
+        """A scanner that falls silent ages visibly; after two seconds its distances are no longer shown as new."""
+        driver = self.connected()
+        for client in self.robot._clients:
+            client._topics.pop("/scan")
+        self.pass_time(SOURCE_S - 0.5)
+        self.assertIn("range.front", self.values(driver))
+        self.assertGreater(driver.diagnostics()["age.scan"], 1.0)
+        self.pass_time(1.0)
+        self.assertNotIn("range.front", self.values(driver))
+        self.assertEqual((driver.state, self.values(driver)["power.level"]), ("ready", 0.8))
+
+    def test_switches_motors_that_there_are(self) -> None:
+        """With a motor service, enable and disable are the robot's own word; one that is missing answers nothing."""
+        self.robot.has_motor_power = False
+        driver = self.connected(motor_service="/motor_power")
+        self.assertTrue(self.robot.has_motor_power)
+        driver.disable()
+        self.pass_time(0.2)
+        self.assertFalse(self.robot.has_motor_power)
+        other = self.make_driver(motor_service="/nothing")
+        other.connect()
+        self.pass_time(0.4)
+        enabled = other.enable()
+        self.pass_time(1.2)
+        self.failureResultOf(enabled, NoReply)
+        self.assertIs(self.values(other)["estop.engaged"], True)
+
+    def test_has_the_skills_that_are_set(self) -> None:
+        """A skill calls its service and fires with its answer; unknown, failing, lost and late ones fail by name."""
+        driver = self.connected(services={"dock": "/dock", "sing": "/sing"})
+        self.assertEqual(driver.description.skills, ("dock", "sing"))
+        docked, sung = driver.invoke("dock"), driver.invoke("sing")
+        self.pass_time(0.1)
+        self.assertEqual(self.successResultOf(docked), {"success": True, "message": "docked"})
+        self.assertIn("does not exist", str(self.failureResultOf(sung, RobotError).value))
+        self.failureResultOf(driver.invoke("fly"), Unsupported)
+        lost = driver.invoke("dock")
+        self.cut_link()
+        self.failureResultOf(lost, LinkLost)
+        self.failureResultOf(driver.invoke("dock"), LinkLost)
+        self.pass_time(1.0)
+        self.robot.foul.half_open = True
+        late = driver.invoke("dock")
+        self.pass_time(SILENCE_S + CALL_S + 1.0)
+        self.failureResultOf(late, LinkLost)
+
+    def test_counts_what_rosbridge_complains_about(self) -> None:
+        """An error that rosbridge states is counted and warned of once; other topics and late answers are nothing."""
+        warnings: list[str] = []
+        driver = self.connected()
+        driver.log = Told(warnings)  # type: ignore[assignment]
+        for _ in range(2):
+            driver.bridge_said(b'{"op":"status","level":"error","msg":"no such type"}')
+            driver.bridge_said(b'{"op":"status","level":"info","msg":"hello"}')
+            driver.bridge_said(b'{"op":"publish","topic":"/rosout","msg":{}}')
+            driver.bridge_said(b'{"op":"service_response","id":"call:99","values":{}}')
+        self.assertEqual((driver.diagnostics()["refused"], driver.diagnostics()["bad_frames"]), (2, 0))
+        self.assertEqual(warnings, ["rosbridge says: no such type"])
+
+    def test_calls_what_speaks_no_rosbridge_ever_more_slowly(self) -> None:
+        """Another server at that port is left alone ever longer, to five seconds; connect goes on waiting."""
+        calls: list[float] = []
+
+        class Web:
+            def __init__(self, link: Link) -> None:
+                self.link = link
+
+            def received(self, data: bytes) -> None:
+                calls.append(self_.clock.seconds())
+                self.link.send(b"HTTP/1.1 404 Not Found\r\n\r\n")
+                if is_curt:
+                    self.link.close()
+
+            def link_down(self) -> None:
+                pass
+
+        self_ = self
+        for is_curt in (False, True):
+            calls.clear()
+            driver = RosbridgeDriver({}, MemoryConnector(self.clock, Web), self.clock)
+            connected = driver.connect()
+            self.pass_time(30.0)
+            self.assertNoResult(connected)
+            self.assertIn(len(calls), range(6, 11), is_curt)
+            self.assertGreater(calls[-1] - calls[-2], 4.9)
+            driver.disconnect()
+            self.failureResultOf(connected, LinkLost)
+
+    def test_lives_with_a_foul_wire(self) -> None:
+        """Garbage, losses, delay and cuts anywhere cost frames and links, and never the driver."""
+        driver = self.connected(image_topic=IMAGE)
+        self.robot.foul.garbage, self.robot.foul.drop = 0.1, 0.05
+        self.robot.foul.split, self.robot.foul.delay = True, 0.02
+        self.pass_time(20.0)
+        counts = driver.diagnostics()
+        self.assertGreater(counts["bad_frames"] + counts["faults"], 0)
+        self.robot.foul.garbage = self.robot.foul.drop = 0.0
+        self.pass_time(12.0)
+        self.assertEqual(driver.state, "ready")
+        driver.act({"base.vx": 0.1}, self.permit())
+        self.robot.foul.delay = 0.0
+
+    def test_notices_a_link_that_is_half_open(self) -> None:
+        """A robot that says nothing more over an open link is stale at once, and called again after three seconds."""
+        driver = self.connected()
+        self.robot.foul.half_open = True
+        self.pass_time(0.7)
+        self.assertEqual(driver.state, "stale")
+        self.pass_time(SILENCE_S + 2.0)
+        self.assertGreater(driver.diagnostics()["faults"], 0)
+        self.robot.foul.half_open = False
+        self.pass_time(9.0)
+        self.assertEqual(driver.state, "ready")
+
+    def test_survives_a_reboot(self) -> None:
+        """A robot that reboots comes back at rest, and its clock may begin again."""
+        driver = self.connected()
+        driver.act({"base.vx": 0.2}, self.permit(seconds=5.0))
+        self.pass_time(0.5)
+        self.robot.reboot()
+        self.pass_time(1.0)
+        seen = driver.observe()
+        assert seen is not None
+        self.assertEqual((driver.state, self.true_speed()), ("ready", 0.0))
+        self.assertLess(seen.t_robot, 1.5)
+
+    def test_is_made_by_the_registry(self) -> None:
+        """The kind is known, described without a link, and its wrong options are refused in one line with a remedy."""
+        self.assertIsInstance(driver_for("rosbridge", {}, "turtle", self.clock, self.connector), RosbridgeDriver)
+        holonomic = describe("rosbridge", {"max_vy": 0.3, "model": "Omni", "imu_topic": "/imu"})
+        self.assertEqual(holonomic.limits["base.vy"], (-0.3, 0.3))
+        self.assertIn("imu", holonomic.capabilities)
+        wrong: tuple[tuple[str, object], ...] = (
+            *(("colour", 1), ("host", ""), ("port", 0), ("port", True), ("path", "x"), ("path", "/a b"), ("ros", 3)),
+            *(("velocity_topic", ""), ("velocity_type", "x"), ("odometry_topic", "odom"), ("camera_fps", 31)),
+            *(("max_vx", math.nan), ("max_vx", 0), ("max_wz", "2"), ("battery_full", True), ("battery_full", 10)),
+            *(("services", {"a b": "/x"}), ("services", {"a": "x"}), ("services", 1), ("scan_turn", 1e3)),
+        )
+        for key, value in wrong:
+            line = str(self.assertRaises(UsageError, describe, "rosbridge", {key: value}))
+            self.assertIn(key, line)
+            self.assertNotIn("\n", line)
+        none = {"odometry_topic": "", "scan_topic": ""}
+        self.assertIn("odometry_topic", str(self.assertRaises(UsageError, describe, "rosbridge", none)))

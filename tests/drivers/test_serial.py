@@ -1,0 +1,179 @@
+"""Tests of ``drivers.serial`` with devices that are only opened in words."""
+
+from __future__ import annotations
+
+import errno
+from typing import Any
+
+from twisted.internet.protocol import Protocol
+from twisted.internet.task import Clock
+from twisted.internet.testing import StringTransport
+from twisted.python.failure import Failure
+from twisted.trial.unittest import SynchronousTestCase
+
+from drivers.link import LAST_RETRY_S, Link
+from drivers.serial import BACKLOG, FLUSH_S, SerialConnector, SerialLine, problem_of
+
+
+class Device(StringTransport):
+    """A serial port as Twisted's: what is written waits in ``dataBuffer`` until ``flush``."""
+
+    def __init__(self, link: Protocol) -> None:
+        super().__init__()
+        self.dataBuffer = b""
+        self._tempDataLen = 0
+        self.link = link
+        self.is_leaving = False
+
+    def write(self, data: bytes) -> None:
+        self.dataBuffer += data
+
+    def flush(self) -> None:
+        """Let everything leave."""
+        super().write(self.dataBuffer)
+        self.dataBuffer = b""
+        if self.is_leaving:
+            self.connectionLost(Failure(OSError("closed")))
+
+    def loseConnection(self) -> None:  # noqa: N802 (Twisted's)
+        self.is_leaving = True
+        if not self.dataBuffer:
+            self.connectionLost(Failure(OSError("closed")))
+
+    def stopReading(self) -> None:  # noqa: N802 (Twisted's)
+        """Nothing."""
+
+    def stopWriting(self) -> None:  # noqa: N802 (Twisted's)
+        """Nothing."""
+
+    def connectionLost(self, reason: Failure) -> None:
+        self.link.connectionLost(reason)
+
+
+class SerialTests(SynchronousTestCase):
+    """A line over a device."""
+
+    def setUp(self) -> None:
+        self.clock = Clock()
+        self.error: Exception | None = None
+        self.asked: list[tuple[str, int, float]] = []
+        self.devices: list[Device] = []
+        self.heard: list[bytes] = []
+        self.links: list[Link] = []
+        self.downs = 0
+
+    def opened(self, link: Protocol, device: str, baud: int, reactor: Any) -> Any:
+        """Open a device, or fail as told."""
+        self.asked.append((device, baud, reactor.seconds()))
+        if self.error is not None:
+            raise self.error
+        self.devices.append(Device(link))
+        link.makeConnection(self.devices[-1])
+        return self.devices[-1]
+
+    def link_up(self, link: Link) -> None:
+        """A link opens."""
+        self.links.append(link)
+
+    def link_down(self) -> None:
+        """A link is lost."""
+        self.downs += 1
+
+    def received(self, data: bytes) -> None:
+        """Bytes come."""
+        self.heard.append(data)
+
+    def line(self) -> SerialLine:
+        """A line to a device."""
+        line = SerialConnector(self.clock, self.opened).call("/dev/robot", 115200, self)
+        assert isinstance(line, SerialLine)
+        return line
+
+    def test_carries_bytes_both_ways(self) -> None:
+        """Once open, bytes go both ways, and the link knows when too many wait."""
+        self.line()
+        self.clock.advance(0.0)
+        self.assertEqual(self.asked, [("/dev/robot", 115200, 0.0)])
+        self.devices[0].link.dataReceived(b"hello")
+        self.links[0].send(b"there")
+        self.assertIs(self.links[0].is_busy, False)
+        self.links[0].send(b"." * BACKLOG)
+        self.assertIs(self.links[0].is_busy, True)
+        self.devices[0].flush()
+        self.assertEqual((self.heard, self.devices[0].value()[:5]), ([b"hello"], b"there"))
+
+    def test_tries_again_with_back_off_and_names_why(self) -> None:
+        """A device that cannot be opened is asked for less and less often, each reason in one line, until it opens."""
+        line = self.line()
+        for number, words in (
+            (errno.ENOENT, "no such device"),
+            (errno.EACCES, "no permission"),
+            (errno.EAGAIN, "busy"),
+            (errno.EBUSY, "busy"),
+            (errno.EISDIR, "no serial device"),
+            (errno.ENOTTY, "no serial device"),
+        ):
+            self.error = OSError(number, "as the system says")
+            self.clock.pump([0.1] * 30)
+            self.assertIn(words, line.problem)
+            self.assertNotIn("\n", line.problem)
+        times = [at for _, _, at in self.asked]
+        self.assertLess(times[1] - times[0], 0.2)
+        self.assertTrue(1.8 < times[-1] - times[-2] <= LAST_RETRY_S + 0.2)
+        self.error = None
+        self.clock.pump([0.1] * 30)
+        self.assertEqual((line.problem, len(self.links)), ("", 1))
+
+    def test_names_errors_without_a_number(self) -> None:
+        """An unknown error is told in its own words; one that wraps the system's is told as that."""
+        self.assertIn("strange baud", problem_of(ValueError("strange\nbaud")))
+        try:
+            try:
+                raise OSError(errno.EACCES, "no")
+            except OSError:
+                raise ValueError("could not open") from None
+        except ValueError as error:
+            self.assertIn("no permission", problem_of(error))
+
+    def test_opens_again_after_a_pulled_cable(self) -> None:
+        """A lost device is told, and opened again; what is sent meanwhile is lost."""
+        self.line()
+        self.clock.advance(0.0)
+        self.devices[0].connectionLost(Failure(OSError("gone")))
+        self.links[0].send(b"lost")
+        self.links[0].close()
+        self.assertEqual((self.downs, len(self.links)), (1, 1))
+        self.clock.advance(0.2)
+        self.assertEqual((self.downs, len(self.links)), (1, 2))
+
+    def test_hangs_up_after_what_was_sent(self) -> None:
+        """Hanging up lets the last bytes leave, closes, and leaves nothing on the clock; twice is one."""
+        line = self.line()
+        self.clock.advance(0.0)
+        self.links[0].send(b"stop")
+        gone = line.hang_up()
+        line.hang_up()
+        self.assertNoResult(gone)
+        self.devices[0].flush()
+        self.successResultOf(gone)
+        self.assertEqual((self.devices[0].value(), self.downs), (b"stop", 1))
+        self.successResultOf(line.hang_up())
+        self.assertEqual(self.clock.getDelayedCalls(), [])
+
+    def test_hangs_up_on_a_device_that_takes_nothing(self) -> None:
+        """A device that never takes the last bytes is closed after a second all the same."""
+        line = self.line()
+        self.clock.advance(0.0)
+        self.links[0].send(b"stop")
+        gone = line.hang_up()
+        self.clock.advance(FLUSH_S)
+        self.successResultOf(gone)
+        self.assertEqual(self.clock.getDelayedCalls(), [])
+
+    def test_hangs_up_before_it_is_open(self) -> None:
+        """A line that waits for its device can be ended."""
+        self.error = OSError(errno.ENOENT, "none")
+        line = self.line()
+        self.clock.advance(0.0)
+        self.successResultOf(line.hang_up())
+        self.assertEqual((self.clock.getDelayedCalls(), self.links), ([], []))

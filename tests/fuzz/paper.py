@@ -1,0 +1,144 @@
+"""Paper: whatever may be shown as a pass, told as a statement, knocked or welcomed with; changed, cut or made up.
+
+The first byte of an input names the kind (see ``KINDS``), and from 128 on a lawful one is taken, of which each three
+bytes after it say where to change it and how.  Every reader gives what it promises or raises ``Malformed`` or
+``Forged``; the roll believes nothing that its operator, or who stands for it, did not sign; and a bootstrap node
+answers a knock with no more than came, without an exception or a line in the log.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import random
+
+from twisted.internet.defer import Deferred, succeed
+
+from middleware.admission import knock
+from middleware.admission.certificate import member_of, pass_of
+from middleware.admission.knock import Welcome, opened_knock, opened_welcome
+from middleware.admission.reception import Reception
+from middleware.admission.roll import Roll, packed_admission
+from middleware.admission.statement import Invite, opened
+from middleware.entangled.errors import Full, RemoteError
+from middleware.entangled.identity import exchange_key
+from middleware.entangled.network.network import Address
+from tests.fuzz.ground import STRANGER, Violation
+from tests.fuzz.raw import RECORDED
+from tests.fuzz.runner import main
+from tests.middleware.admission.paper import NOW, admitted, granted, identity, invited, operator
+
+KINDS = ("statement", "pass", "knock", "welcome")
+SIGNER = operator(1)
+CODE, PACKED, INVITE = invited(SIGNER, "dog")
+NEWCOMER = identity("dog")
+DICE = random.Random(9)
+EPHEMERAL = bytes(range(32))
+
+
+def lawful() -> dict[str, list[bytes]]:
+    """What a team says, of each kind."""
+    grant = granted(SIGNER, "vaio", "bootstrap")
+    chain = admitted(SIGNER, "dog")
+    secret = SIGNER.rotate(2, [NEWCOMER.public], NOW, 60, random.Random(2))
+    end = SIGNER.revoke(identity("cat").public, "cat", NOW)
+    knocked = knock.knock(CODE.key, NEWCOMER.public, exchange_key(NEWCOMER.public), "", random.Random(3))
+    given = Welcome(SIGNER.public, "yard", chain, ((1, bytes(32), 0),), (), {"port": 7})
+    shared = exchange_key(NEWCOMER.public)
+    told = [knock.welcome(INVITE.public, shared, given, random.Random(4))]
+    told += [knock.refusal(INVITE.public, shared, "used", random.Random(5)), knock.unknown(knock.id_of(knocked))]
+    admission = packed_admission(NEWCOMER.public, chain)
+    return {
+        "statement": [PACKED, grant, secret, end, admission],
+        "pass": [chain, pass_of(granted(SIGNER, "dog"))],
+        "knock": [knocked],
+        "welcome": told,
+    }
+
+
+LAWFUL = lawful()
+GENUINE = {each for kind in LAWFUL.values() for each in kind}
+
+
+def changed(base: bytes, data: bytes) -> bytes:
+    """``base``, changed as the bytes say."""
+    found = bytearray(base)
+    for place in range(0, len(data) - 2, 3):
+        where = int.from_bytes(data[place : place + 2], "little")
+        if where >= 0xF000:
+            del found[where - 0xF000 :]
+        elif found:
+            found[where % len(found)] ^= data[place + 2]
+    return bytes(found)
+
+
+def check(data: bytes) -> None:
+    """Read one input with everything that reads its kind; raises ``Violation``."""
+    first = data[0] if data else 0
+    kind = KINDS[first % len(KINDS)]
+    base = LAWFUL[kind][first // len(KINDS) % len(LAWFUL[kind])]
+    whole = changed(base, data[1:]) if first >= RECORDED else data[1:]
+    {"statement": _statement, "pass": _pass, "knock": _knock, "welcome": _welcome}[kind](whole)
+
+
+def _statement(whole: bytes) -> None:
+    with contextlib.suppress(RemoteError):
+        opened(SIGNER.public, whole)
+        if whole not in GENUINE:
+            raise Violation("a statement that nobody signed")
+    roll = Roll(SIGNER.public)
+    roll.add(LAWFUL["statement"][0], NOW)
+    before = (roll.digest, len(roll))
+    try:
+        entry = roll.add(whole, NOW)
+    except (RemoteError, Full):
+        entry = None
+    if entry is None and (roll.digest, len(roll)) != before:
+        raise Violation("a refused statement changed the roll")
+    if entry is not None and whole not in GENUINE:
+        raise Violation("the roll believes what nobody signed")
+
+
+def _pass(whole: bytes) -> None:
+    with contextlib.suppress(RemoteError):
+        member = member_of(SIGNER.public, NEWCOMER.public, whole)
+        if whole not in GENUINE:
+            raise Violation(f"a pass that nobody signed makes {member.name} a member")
+
+
+def _knock(whole: bytes) -> None:
+    sent: list[tuple[bytes, Address]] = []
+    admissions: list[bytes] = []
+    roll = Roll(SIGNER.public)
+    for each in (PACKED, LAWFUL["statement"][1]):
+        roll.add(each, NOW)
+
+    def take(invite: Invite) -> Deferred[bool]:
+        return succeed(True)
+
+    def send(datagram: bytes, to: Address) -> None:
+        sent.append((datagram, to))
+
+    def given(shown: bytes) -> Welcome:
+        return Welcome(SIGNER.public, "yard", shown, ((1, bytes(32), 0),))
+
+    bootstrap = Reception(
+        roll, identity("vaio"), take, admissions.append, given, send, lambda: 1.0, lambda: float(NOW), DICE
+    )
+    bootstrap.on_knock(whole, STRANGER)
+    if sum(len(datagram) for datagram, _ in sent) > len(whole):
+        raise Violation("a knock was answered with more than it had")
+    if admissions and whole not in GENUINE:
+        raise Violation("somebody was let in by a knock that was changed")
+    with contextlib.suppress(RemoteError):
+        opened_knock(whole, INVITE.public)
+
+
+def _welcome(whole: bytes) -> None:
+    with contextlib.suppress(RemoteError):
+        found = opened_welcome(whole, INVITE.public, NEWCOMER.exchange_secret)
+        if isinstance(found, Welcome) and whole not in GENUINE:
+            raise Violation("a welcome that nobody said")
+
+
+if __name__ == "__main__":
+    main("paper", check)

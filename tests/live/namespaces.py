@@ -1,0 +1,36 @@
+"""Namespaces: the case for tests that need network namespaces; where there are none they are skipped, and that loudly.
+
+With ``SWARM_CI=1`` a machine without them is a failure: there a test that was not run proves nothing.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from functools import cache
+
+from twisted.trial.unittest import SkipTest, SynchronousTestCase
+
+from benchmarks.nat.room import refusal
+
+
+class NamespaceCase(SynchronousTestCase):
+    """A test that needs namespaces."""
+
+    def setUp(self) -> None:
+        super().setUp()
+        why = refused()
+        if why and os.environ.get("SWARM_CI") == "1":
+            self.fail(f"SWARM_CI=1, and the tests in namespaces cannot run: {why}")
+        if why:
+            raise SkipTest(why)
+
+
+@cache
+def refused() -> str:
+    """Why there are none, told once in large letters; empty where there are."""
+    why = refusal()
+    if why:
+        stream = sys.__stderr__ or sys.stderr
+        stream.write(f"\n!!!\n!!! THE TESTS IN NETWORK NAMESPACES ARE SKIPPED: {why}\n!!!\n")
+    return why

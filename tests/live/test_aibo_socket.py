@@ -1,0 +1,73 @@
+"""An emulated dog and its driver over real loopback sockets, pictures over TCP and over UDP."""
+
+from __future__ import annotations
+
+import random
+import socket
+
+from twisted.internet import reactor
+from twisted.internet.defer import Deferred
+from twisted.internet.interfaces import IReactorTime
+from twisted.internet.task import deferLater
+from twisted.trial.unittest import TestCase
+
+from drivers.aibo.driver import AiboDriver
+from drivers.driver import Permit
+from drivers.registry import driver_for
+from sim.emulator.aibo import EMULATED, AiboEmulator
+from sim.emulator.aibo_server import AiboServer
+from sim.emulator.body import MemoryBody
+
+
+def free_ports() -> dict[str, int]:
+    """Numbers that nobody uses at the moment, one for each of the dog's ports."""
+    sockets = {service: socket.socket() for service in EMULATED}
+    for one in sockets.values():
+        one.bind(("127.0.0.1", 0))
+    numbers = {service: int(one.getsockname()[1]) for service, one in sockets.items()}
+    for one in sockets.values():
+        one.close()
+    return numbers
+
+
+class AiboSocketTests(TestCase):
+    """The whole way, socket to socket."""
+
+    timeout = 30
+
+    def test_drives_and_films(self) -> Deferred[None]:
+        """Over either transport a dog connects, films, walks, stops, survives a reboot, and leaves its ports free."""
+        return Deferred.fromCoroutine(self._drive_and_film())
+
+    async def _drive_and_film(self) -> None:
+        for transport in ("tcp", "udp"):
+            await self._drive(transport)
+
+    async def _drive(self, transport: str) -> None:
+        clock = IReactorTime(reactor)
+        body = MemoryBody(jpeg=b"\xff\xd8dog\xff\xd9")
+        ports = free_ports()
+        dog = AiboEmulator(clock, body, random.Random(1), ports=ports)
+        server = AiboServer(reactor, dog)
+        server.start()
+        named = {service: number for service, number in ports.items() if service != "gains"}
+        options = {"host": "127.0.0.1", "ports": named, "camera_transport": transport, "camera_fps": 30}
+        driver = driver_for("aibo", options, "dog1", clock)
+        assert isinstance(driver, AiboDriver)
+        await driver.connect()
+        self.assertTrue(await driver.enable())
+        driver.act({"base.vx": 0.1}, Permit(1, clock.seconds() + 0.5))
+        await deferLater(clock, 0.2, lambda: None)
+        self.assertGreater(body.motion[0], 0.05)
+        await deferLater(clock, 1.0, lambda: None)
+        self.assertEqual(body.motion, (0.0, 0.0, 0.0))
+        self.assertGreater(driver.diagnostics()["pictures"], 20, transport)
+        self.assertEqual(driver.diagnostics()["bad_frames"], 0)
+        dog.reboot()
+        await deferLater(clock, 2.5, lambda: None)
+        self.assertEqual((driver.state, driver.diagnostics()["reconnects"]), ("ready", 1))
+        await driver.disconnect()
+        await deferLater(clock, 0.2, lambda: None)
+        self.assertTrue(dog.is_engaged)
+        self.assertEqual(dog.clients, {})
+        await server.stop()

@@ -1,0 +1,74 @@
+"""S8: nobody gets more bytes out of a node than he put in, before he has proved his address."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from pathlib import Path
+from random import Random
+
+from benchmarks.nat.capture import Capture, datagrams
+from benchmarks.nat.fleet import Fleet
+from benchmarks.nat.internet import PUB, PUBS, Internet, Site
+from benchmarks.nat.kind import Kind
+from benchmarks.nat.matrix import Pair, Trial
+from tests.live.namespaces import NamespaceCase
+
+STRANGER = """
+import socket, sys, time
+target, pause = (sys.argv[1], int(sys.argv[2])), float(sys.argv[3])
+held = []
+for line in sys.stdin:
+    held.append(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+    held[-1].sendto(bytes.fromhex(line), target)
+    time.sleep(pause)
+"""
+PAUSE_S = 0.002
+
+
+class AmplificationTests(NamespaceCase):
+    """A node at ``pub``, a member that joined it, and a stranger who has recorded everything and makes up more."""
+
+    def test_a_stranger_gets_no_more_than_he_sends(self) -> None:
+        """Recordings sent again from elsewhere, and noise of every first byte and length, bring back fewer bytes."""
+        folder = Path(self.mktemp()).absolute()
+        folder.mkdir(parents=True)
+        with Internet([Site("a", Kind.PORT), Site("b", Kind.PORT), Site("stranger", Kind.NONE)]) as net:
+            port = asyncio.run(self._attacked(net, folder))
+            self.assertGreater(port, 0)
+
+    async def _attacked(self, net: Internet, folder: Path) -> int:
+        async with Fleet(net, [PUB, "a1", "b1"], folder) as fleet:
+            trial = Trial(fleet, Pair("plain", "port", "port", "a1", "b1"), 1, Random(1))
+            net.record(folder / "join.pcap")
+            await trial.run(5.0, 5.0)
+            net.record(None)
+            self.assertEqual(trial.outcome.trouble, "")
+            heard = list(datagrams(folder / "join.pcap"))
+            asked = [(int(to.rpartition(":")[2]), held) for _, to, held in heard if to.startswith(PUBS[0] + ":")]
+            port = asked[0][0]
+            rng = Random(2)
+            noise = [bytes([first]) + rng.randbytes(rng.choice((0, 7, 40, 200, 900, 1399))) for first in range(256)]
+            sent = [held for _, held in asked] + noise + [held for _, held in asked]
+            with Capture(net, PUB, folder / "attack.pcap") as seen:
+                process = net.start(
+                    "stranger1", [sys.executable, "-c", STRANGER, PUBS[0], str(port), str(PAUSE_S)], **IN
+                )
+                assert process.stdin is not None
+                process.stdin.write("".join(held.hex() + "\n" for held in sent))
+                process.stdin.close()
+                while process.poll() is None:
+                    await asyncio.sleep(0.05)
+            traffic = seen.from_host(net.address("stranger1"))
+            self.assertEqual(traffic.received, len(sent))
+            # Something came back, so that there was something to count.
+            self.assertGreater(traffic.sent, 0)
+            self.assertLessEqual(traffic.amplification, 1.0)
+            # Each datagram has a port of its own: no answer was paid for by another question.
+            for peer, each in seen.traffic.items():
+                if peer.startswith(net.address("stranger1") + ":"):
+                    self.assertLessEqual(each.amplification, 1.0)
+            return port
+
+
+IN = {"stdin": -1, "text": True}

@@ -1,0 +1,111 @@
+"""The camera's real thread, over a lens that makes it wait, and a real video through OpenCV."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Generator
+from importlib.util import find_spec
+from typing import Any
+
+from twisted.internet import reactor as running
+from twisted.internet.defer import Deferred, inlineCallbacks
+from twisted.internet.task import Clock, deferLater
+from twisted.trial.unittest import TestCase
+
+from drivers.camera.driver import CameraDriver
+from drivers.camera.maker import film_of
+from drivers.camera.option import checked
+from drivers.camera.shots import Shot
+from drivers.camera.thread import ThreadFilm
+from drivers.errors import LinkLost
+
+reactor: Any = running
+
+
+class SlowLens:
+    """A source that is lost once, and blocks while ``gate`` is closed."""
+
+    def __init__(self) -> None:
+        self.gate = threading.Event()
+        self.threads: set[str] = set()
+        self.taken = self.opened = self.closed = 0
+
+    def open(self) -> None:
+        self.opened += 1
+
+    def shoot(self) -> Shot:
+        self.threads.add(threading.current_thread().name)
+        self.taken += 1
+        if self.taken == 5:
+            raise LinkLost("it was unplugged")
+        self.gate.wait(5.0)
+        return Shot(b"\xff\xd8%d\xff\xd9" % self.taken, 4, 3)
+
+    def close(self) -> None:
+        self.closed += 1
+
+
+class LiveCameraTests(TestCase):
+    """A real thread, real time."""
+
+    timeout = 30
+
+    @inlineCallbacks
+    def until(self, is_so: Any) -> Generator[Deferred[Any], Any, None]:
+        """Fires when it is so, or fails the test."""
+        for _ in range(500):
+            if is_so():
+                return
+            yield deferLater(reactor, 0.02)
+        self.fail("it did not come to that")
+
+    @inlineCallbacks
+    def test_camera_never_holds_the_reactor_up(self) -> Generator[Deferred[Any], Any, None]:
+        """A camera that blocks does so in its own thread; one that is lost comes back; the end frees it."""
+        lens = SlowLens()
+        film = ThreadFilm(lens, reactor.callFromThread)
+        driver = CameraDriver(checked({"fps": 30}), film, reactor, "cam")
+        connected = driver.connect()
+        yield deferLater(reactor, 0.1)
+        self.assertNoResult(connected)
+        lens.gate.set()
+        yield connected
+        yield self.until(lambda: driver.diagnostics()["reconnects"] == 1)
+        self.assertEqual((lens.threads, lens.opened), ({"camera"}, 2))
+        driver.set_camera_fps(0)
+        yield deferLater(reactor, 0.1)
+        before = lens.taken
+        yield deferLater(reactor, 0.2)
+        self.assertEqual((lens.taken, driver.state), (before, "ready"))
+        yield driver.disconnect()
+        self.assertNotIn("camera", [thread.name for thread in threading.enumerate()])
+        self.assertEqual(lens.closed, 2)
+
+    def test_shows_a_video_by_the_clock(self) -> None:
+        """A video's pictures come whole, reduced to the wanted size, and begin again at its end."""
+        import cv2
+        import numpy
+
+        path = f"{self.mktemp()}.avi"
+        video = cv2.VideoWriter(path, cv2.VideoWriter.fourcc(*"MJPG"), 10, (64, 48))
+        for shade in (0, 128, 255):
+            video.write(numpy.full((48, 64, 3), shade, numpy.uint8))
+        video.release()
+        clock, shades = Clock(), list[int]()
+        wanted = checked({"source": path, "fps": 10, "width": 32, "height": 24})
+        driver = CameraDriver(wanted, film_of(wanted, clock), clock, "cam")
+        sizes = set()
+
+        def look(seen: Any) -> None:
+            picture: Any = cv2.imdecode(numpy.frombuffer(seen.frame.data, numpy.uint8), cv2.IMREAD_GRAYSCALE)
+            shades.append(round(float(picture.mean()) / 128))
+            sizes.add((seen.frame.width, seen.frame.height, *picture.shape))
+
+        driver.subscribe(look)
+        driver.connect()
+        clock.pump([0.05] * 13)
+        driver.disconnect()
+        self.assertEqual((shades[:6], sizes), ([0, 1, 2, 0, 1, 2], {(32, 24, 24, 32)}))
+
+    if find_spec("cv2") is None:
+        test_shows_a_video_by_the_clock.skip = "NO VIDEO IS SHOWN: install the extra vision"  # type: ignore[attr-defined]

@@ -1,0 +1,167 @@
+"""The page about deployment, word by word: its blocks are run on computers that are network namespaces."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+
+from benchmarks.nat.internet import PUB, Internet, Site
+from benchmarks.nat.kind import Kind
+from benchmarks.nat.room import environment
+from tests.live.namespaces import NamespaceCase
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGE = ROOT / "docs" / "deploy.md"
+BLOCK = re.compile(r"^```sh (\w+)( again)?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+CODE = re.compile(r"\b[0-9A-Z]{5}(?:-[0-9A-Z]{5}){3}\b")
+AT_HOME, RENTED = "192.168.1.10", "203.0.113.7"
+"""The addresses of the first laptop and of the rented computer, on the page."""
+PATIENCE_S = 40.0
+FIREWALL = """table inet filter {
+  chain input {
+    type filter hook input priority 0; policy drop;
+    ct state established,related accept
+    iifname "lo" accept
+  }
+}"""
+
+Block = tuple[str, bool, list[str]]
+
+
+class DeployTests(NamespaceCase):
+    """A computer has the name that the page gives it, a home of its own, and nothing that the page does not give it."""
+
+    def setUp(self) -> None:
+        super().setUp()
+        # Trial's own folders are deeper than the path of a socket may be.
+        self.folder = Path(tempfile.mkdtemp())
+        self.addCleanup(shutil.rmtree, self.folder)
+        self.programs = self.folder / "bin"
+        self.programs.mkdir()
+        starts = {
+            "swarm": "from swarmnode.command import main",
+            "twistd": "from twisted.scripts.twistd import run as main",
+        }
+        for name, start in starts.items():
+            path = self.programs / name
+            path.write_text(f'#!/bin/sh\nexec {sys.executable} -c "import sys; {start}; sys.exit(main())" "$@"\n')
+            path.chmod(0o755)
+        self.codes: dict[str, str] = {}
+        self.nodes: dict[str, subprocess.Popen[bytes]] = {}
+
+    def blocks(self, first: str, last: str) -> Iterator[Block]:
+        """Computer, whether its node is to be ended before, and lines, from one heading of the page to another."""
+        text = PAGE.read_text(encoding="utf-8")
+        part = text[text.index(f"## {first}") : text.index(f"## {last}") if last else len(text)]
+        for name, again, lines in BLOCK.findall(part):
+            yield name, bool(again), lines.splitlines()
+
+    def home(self, name: str) -> Path:
+        """The home of a computer."""
+        path = self.folder / name
+        path.mkdir(exist_ok=True)
+        return path
+
+    def surroundings(self, name: str) -> dict[str, str]:
+        """The environment of whoever sits at a computer."""
+        home = self.home(name)
+        inherited = {key: value for key, value in environment().items() if not key.startswith(("SWARM_", "XDG_"))}
+        here = {"HOME": str(home), "XDG_RUNTIME_DIR": str(home), "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
+        return {**inherited, **here, "PATH": f"{self.programs}:{inherited['PATH']}"}
+
+    def follow(self, net: Internet, places: dict[str, str], blocks: Iterable[Block]) -> dict[str, str]:
+        """Do what the page says; returns what each line last said, by computer and line."""
+        said: dict[str, str] = {}
+        for name, again, lines in blocks:
+            host = places[name]
+            if again:
+                self.nodes[name].terminate()
+                self.nodes[name].wait()
+            for line in lines:
+                if line.startswith("twistd "):
+                    self.start(net, host, name, line)
+                else:
+                    said[f"{name}: {line}"] = self.run_line(net, host, name, self.meant(line, name, net))
+                invited = re.match(r"swarm invite (\w+)", line)
+                if invited:
+                    found = CODE.search(said[f"{name}: {line}"])
+                    assert found is not None
+                    self.codes[invited[1]] = found[0]
+        return said
+
+    def meant(self, line: str, name: str, net: Internet) -> str:
+        """A line of the page with the code and the addresses that are real here."""
+        if "swarm join " in line:
+            line = CODE.sub(self.codes[name], line)
+        if "w1" in net.hosts:
+            line = line.replace(AT_HOME, net.address("w1"))
+        return line.replace(RENTED, net.address(PUB))
+
+    def run_line(self, net: Internet, host: str, name: str, line: str) -> str:
+        """What a line says, which must succeed."""
+        done = subprocess.run(
+            net.command(host, ["sh", "-c", line]),
+            cwd=self.home(name),
+            env=self.surroundings(name),
+            capture_output=True,
+            text=True,
+            timeout=PATIENCE_S,
+        )
+        self.assertEqual(done.returncode, 0, f"{name}$ {line}\n{done.stdout}{done.stderr}\n{self.logs()}")
+        return done.stdout
+
+    def start(self, net: Internet, host: str, name: str, line: str) -> None:
+        """Start a node, and wait until it is in its team."""
+        log = self.home(name) / "log"
+        with open(log, "wb") as file:
+            options = {"cwd": self.home(name), "env": self.surroundings(name), "stdout": file, "stderr": file}
+            self.nodes[name] = net.start(host, line.split(), **options)
+        self.until(lambda: " joined as number " in log.read_text(), f"{name} joins")
+
+    def until(self, condition: Callable[[], bool], what: str) -> None:
+        """Wait for a condition."""
+        end = time.monotonic() + PATIENCE_S
+        while not condition():
+            self.assertLess(time.monotonic(), end, f"{what}\n{self.logs()}")
+            time.sleep(0.05)
+
+    def logs(self) -> str:
+        """What all nodes have said."""
+        return "\n".join(f"-- {path.parent.name}\n{path.read_text()}" for path in self.folder.glob("*/log"))
+
+    def test_three_laptops(self) -> None:
+        """Three laptops behind one router become a team by the lines of the page, and its page opens on another one."""
+        with Internet([Site("w", Kind.PORT, hosts=3)]) as net:
+            places = {"vaio": "w1", "dog1": "w2", "dog2": "w3"}
+            said = self.follow(net, places, self.blocks("Three laptops on one Wi-Fi", "Over the internet"))
+            members = said["vaio: swarm members"]
+            for name, host in places.items():
+                self.assertRegex(members, rf"{name} .*{re.escape(net.address(host))}:8484")
+            asking = "from urllib.request import urlopen; print(urlopen('http://%s:8080/', timeout=10).status)"
+            command = f'{sys.executable} -c "{asking % net.address("w1")}"'
+            self.assertEqual(self.run_line(net, "w2", "dog1", command).strip(), "200")
+
+    def test_over_the_internet(self) -> None:
+        """A rented computer with a firewall, laptops behind routers, one of which blocks UDP; and all that follows."""
+        sites = [Site("o", Kind.PORT), Site("h", Kind.PORT), Site("u", Kind.NOUDP)]
+        with Internet(sites) as net:
+            net.room(PUB).run(f"nft -f - <<'END'\n{FIREWALL}\nEND\n")
+            places = {"boss": "o1", "host1": PUB, "cam1": "h1", "cam2": "u1"}
+            making, *rest = self.blocks("Over the internet", "")
+            self.follow(net, places, [making])
+            for ending in ("toml", "membership"):  # by scp, on the page
+                shutil.move(self.home("boss") / f"host1.{ending}", self.home("host1"))
+            said = self.follow(net, places, rest)
+            gone = self.home("cam2") / "log"
+            self.until(lambda: "revoked the certificate" in gone.read_text(), "the one that was put out is told")
+            members = said["boss: swarm members"]
+            self.assertRegex(members, r"cam2 +revoked")
+            self.assertRegex(members, r"cam1 .*bootstrap")
+            self.assertRegex(members, rf"host1 .*{re.escape(net.address(PUB))}:8484")
+            self.assertFalse((self.home("host1") / ".config").exists(), "the operator's key is on no other computer")

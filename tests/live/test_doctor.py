@@ -1,0 +1,221 @@
+"""The doctor in an internet of namespaces: each cause is made for real, and named."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmarks.nat.internet import PUBS, Internet, Site
+from benchmarks.nat.kind import Kind
+from tests.live.namespaces import NamespaceCase
+
+LIMIT_S = 30.0
+TEAM = "of the test"
+NODE = [sys.executable, "-c", "from twisted.scripts.twistd import run; run()", "-n", "--pidfile=", "swarm-node"]
+DOCTOR = """
+import sys, time
+from functools import partial
+from swarmnode.doctor.command import main
+from swarmnode.doctor.measure import measured
+late = float(sys.argv[1])
+sys.exit(main(sys.argv[2:], measure=partial(measured, wall=lambda: time.time() - late)))
+"""
+OTHER_VERSION = """
+import socket, sys
+from middleware.entangled.network.network import Address
+from middleware.entangled.wire.hail import echo
+own = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+own.bind((sys.argv[1], int(sys.argv[2])))
+print("ready", flush=True)
+while True:
+    data, source = own.recvfrom(2048)
+    if data[0] == 0x19:
+        answer = bytearray(echo(data, bytes(8), 0.0, Address(*source)))
+        answer[17] = 9
+        own.sendto(bytes(answer), source)
+"""
+
+
+class DoctorCase(NamespaceCase):
+    """An internet with nodes, and a doctor."""
+
+    def setUp(self) -> None:
+        super().setUp()
+        self.folder = Path(self.mktemp()).absolute()
+        self.folder.mkdir()
+
+    def internet(self, *sites: Site) -> Internet:
+        """One that is gone after the test."""
+        net = Internet(sites)
+        net.__enter__()
+        self.addCleanup(net.close)
+        self.net = net
+        return net
+
+    def settings(self, name: str, host: str, known: Sequence[str] = (), **others: object) -> Path:
+        """The settings of a node."""
+        node = {"name": name, "host": host, "port": 8484, "team_key": TEAM, "known_nodes": list(known), **others}
+        lines = "".join(f"{key} = {json.dumps(value)}\n" for key, value in node.items())
+        file = self.folder / f"{name}.toml"
+        file.write_text(f"[node]\n{lines}", encoding="utf-8")
+        file.chmod(0o600)
+        return file
+
+    def node(self, at: str, settings: Path) -> subprocess.Popen[Any]:
+        """Run a node at a host until it has its control socket."""
+        log = open(settings.with_suffix(".log"), "w", encoding="utf-8")  # noqa: SIM115 (the process has it)
+        self.addCleanup(log.close)
+        home = self.home(settings)
+        words = ["env", f"XDG_RUNTIME_DIR={home}", *NODE, "--config", str(settings)]
+        process = self.net.start(at, words, stdout=log, stderr=log)
+        until = time.monotonic() + LIMIT_S
+        while not list(home.glob("swarm-node/*.control")):
+            self.assertLess(time.monotonic(), until, settings.with_suffix(".log").read_text(encoding="utf-8"))
+            self.assertIsNone(process.poll(), settings.with_suffix(".log").read_text(encoding="utf-8"))
+            time.sleep(0.02)
+        return process
+
+    def home(self, settings: Path) -> Path:
+        """Where the control socket of a node lies: hosts of namespaces share their disk."""
+        home = Path("/tmp") / f"doctor-{abs(hash((str(self.folder), settings.stem))) % 10**9}"
+        if not home.exists():
+            home.mkdir(mode=0o700)
+            self.addCleanup(self.emptied, home)
+        return home
+
+    def emptied(self, home: Path) -> None:
+        """Take away a folder of sockets."""
+        self.net.close()
+        for file in sorted(home.rglob("*"), reverse=True):
+            file.rmdir() if file.is_dir() else file.unlink()
+        home.rmdir()
+
+    def asked(self, at: str, settings: Path, late: float = 0.0) -> Mapping[str, Any]:
+        """What the doctor says at a host."""
+        words = ["env", f"XDG_RUNTIME_DIR={self.home(settings)}", sys.executable, "-c", DOCTOR, str(late)]
+        done = self.net.run(at, [*words, "--json", str(settings)], timeout=LIMIT_S)
+        self.assertIn(done.returncode, (0, 1), done.stderr)
+        said: Mapping[str, Any] = json.loads(done.stdout)
+        self.assertEqual(done.returncode, int(any(each["weight"] != "note" for each in said["findings"])))
+        return said
+
+    def causes(self, at: str, settings: Path, late: float = 0.0) -> list[str]:
+        """The names of what the doctor found."""
+        return [finding["cause"] for finding in self.asked(at, settings, late)["findings"]]
+
+
+class WayTests(DoctorCase):
+    """What lies between a node and those on the internet."""
+
+    def test_routers_and_firewalls(self) -> None:
+        """Each kind of router is named by who is behind it, a firewall against UDP too, and a cut as no bootstrap."""
+        net = self.internet(
+            Site("c", Kind.PORT), Site("s", Kind.SYM), Site("n", Kind.NOUDP), Site("o", Kind.NONE), Site("x", Kind.PORT)
+        )
+        known = [f"{address}:8484" for address in PUBS]
+        for number, address in enumerate(PUBS):
+            self.node("pub", self.settings(f"pub{number}", address, known[:number]))
+        for host, causes in (("c1", ["nat-cone"]), ("s1", ["nat-symmetric"]), ("n1", ["udp-blocked"]), ("o1", [])):
+            settings = self.settings(host, net.address(host), known, lan=False)
+            self.assertEqual(self.causes(host, settings), causes, host)
+        net.cut("x")
+        settings = self.settings("x1", net.address("x1"), known, lan=False)
+        self.assertEqual(self.causes("x1", settings), ["no-bootstrap"])
+
+
+class LanTests(DoctorCase):
+    """What goes wrong on one LAN."""
+
+    def setUp(self) -> None:
+        super().setUp()
+        net = self.internet(Site("a", Kind.PORT, hosts=2))
+        self.other = f"{net.address('a2')}:8484"
+        self.node("a2", self.settings("other", net.address("a2")))
+        self.own = self.settings("own", net.address("a1"), [self.other])
+
+    def test_well(self) -> None:
+        """Two nodes that were told nothing of each other meet; the doctor finds nothing, and the link is good."""
+        settings = self.settings("own", self.net.address("a1"))
+        self.node("a1", settings)
+        said = self.asked("a1", settings)
+        self.assertEqual(said["findings"], [])
+        self.assertEqual([link["address"] for link in said["links"]], [self.other])
+        self.assertGreaterEqual(said["links"][0]["score"], 80)
+
+    def test_one_of_no_team_finds_whom_to_ask(self) -> None:
+        """Who is of no team yet learns by a HAIL to all on the LAN where nodes are."""
+        program = "from swarmnode.doctor.measure import on_lan; print(*[each.address for each in on_lan()])"
+        done = self.net.run("a1", [sys.executable, "-c", program], timeout=LIMIT_S)
+        self.assertEqual((done.stdout.strip(), done.stderr), (self.other, ""))
+
+    def test_multicast_blocked(self) -> None:
+        """A LAN that carries no multicast is named, though the node is reached by its address."""
+        self.assertEqual(self.causes("a1", self.own), [])
+        for port in ("h1", "h2"):
+            self.net.room("a-gw").run(f"ip link set {port} type bridge_slave mcast_flood off mcast_router 0\n")
+        self.net.room("a-gw").run("ip link set lan type bridge mcast_snooping 0\n")
+        self.assertEqual(self.causes("a1", self.own), ["multicast-blocked"])
+
+    def test_firewall_of_this_machine(self) -> None:
+        """A firewall here that lets no multicast in is named as this machine's."""
+        self.net.room("a1").run(_DROP.format(port=8483))
+        said = self.asked("a1", self.own)["findings"]
+        self.assertEqual([finding["cause"] for finding in said], ["multicast-blocked"])
+        self.assertIn("This machine", said[0]["what"])
+
+    def test_firewall_of_the_other(self) -> None:
+        """A firewall of the neighbour that drops its port is named as the neighbour's."""
+        self.net.room("a2").run(_DROP.format(port=8484))
+        self.assertIn("peer-firewall", self.causes("a1", self.own))
+
+    def test_client_isolation(self) -> None:
+        """An access point that keeps its clients from each other is named."""
+        for port in ("h1", "h2"):
+            self.net.room("a-gw").run(f"ip link set {port} type bridge_slave isolated on\n")
+        self.assertEqual(self.causes("a1", self.own), ["client-isolation"])
+
+    def test_nobody_listens(self) -> None:
+        """A neighbour without a node at that port is named."""
+        settings = self.settings("own", self.net.address("a1"), [f"{self.net.address('a2')}:9999"], lan=False)
+        self.assertEqual(self.causes("a1", settings), ["nobody-listens"])
+
+    def test_wrong_interface(self) -> None:
+        """An address that this machine does not have, and one that no other machine reaches, are named."""
+        for host in ("198.19.77.7", "127.0.0.1"):
+            settings = self.settings("own", host, [self.other])
+            self.assertIn("wrong-interface", self.causes("a1", settings))
+
+    def test_wrong_team(self) -> None:
+        """A neighbour of another team is named."""
+        settings = self.settings("own", self.net.address("a1"), [self.other], team_key="of others")
+        self.assertEqual(self.causes("a1", settings), ["wrong-team"])
+
+    def test_clock(self) -> None:
+        """A clock that is an hour behind is named."""
+        self.assertEqual(self.causes("a1", self.own, late=3600.0), ["clock-off"])
+
+    def test_version(self) -> None:
+        """A node of another version of the protocol is named."""
+        words = [sys.executable, "-c", OTHER_VERSION, self.net.address("a2"), "8499"]
+        process = self.net.start("a2", words, stdout=subprocess.PIPE, text=True)
+        assert process.stdout is not None
+        self.assertEqual(process.stdout.readline(), "ready\n")
+        settings = self.settings("own", self.net.address("a1"), [f"{self.net.address('a2')}:8499"], lan=False)
+        self.assertEqual(self.causes("a1", settings), ["version-skew"])
+
+    def test_machine(self) -> None:
+        """A port that is held, a store that cannot be, and settings that others can read are named, all at once."""
+        settings = self.settings("taken", self.net.address("a2"), [], store="nowhere/a.sqlite", lan=False)
+        settings.chmod(0o644)
+        self.assertEqual(self.causes("a2", settings), ["port-in-use", "store-unwritable", "key-readable"])
+
+
+_DROP = """nft add table ip test
+nft 'add chain ip test input {{ type filter hook input priority 0; }}'
+nft add rule ip test input udp dport {port} drop
+"""

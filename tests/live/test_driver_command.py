@@ -1,0 +1,149 @@
+"""``swarm driver`` as a process, against an emulated dog on real sockets, with a pseudo-terminal for its keys."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import pty
+import random
+import signal
+import struct
+import subprocess
+import sys
+import tempfile
+import termios
+from pathlib import Path
+from typing import Any
+
+from twisted.internet import reactor
+from twisted.internet.defer import Deferred
+from twisted.internet.interfaces import IReactorTime
+from twisted.internet.task import deferLater
+from twisted.trial.unittest import TestCase
+
+from sim.emulator.aibo import AiboEmulator
+from sim.emulator.aibo_server import AiboServer
+from sim.emulator.body import MemoryBody
+from tests.live.test_aibo_socket import free_ports
+
+ROOT = Path(__file__).resolve().parents[2]
+JPEG = b"\xff\xd8dog\xff\xd9"
+COMMAND = [sys.executable, "-c", "import sys; from swarmnode.command import main; sys.exit(main())", "driver"]
+
+
+class DriverCommandTests(TestCase):
+    """The command, the sockets and the terminal are real; the dog is not."""
+
+    timeout = 60
+
+    def setUp(self) -> None:
+        """A dog on ports of this machine."""
+        clock = IReactorTime(reactor)
+        self.body = MemoryBody(jpeg=JPEG, values={"power.level": 0.8})
+        ports = free_ports()
+        self.dog = AiboEmulator(clock, self.body, random.Random(1), ports=ports)
+        server = AiboServer(reactor, self.dog)
+        server.start()
+        self.addCleanup(server.stop)
+        named = [f"ports.{service}={number}" for service, number in ports.items() if service != "gains"]
+        options = [word for option in ("host=127.0.0.1", *named) for word in ("--option", option)]
+        self.robot = ["--kind", "aibo", *options]
+        self.folder = tempfile.TemporaryDirectory()
+        self.addCleanup(self.folder.cleanup)
+
+    def started(self, *words: str, **more: Any) -> subprocess.Popen[bytes]:
+        """The command with these words, which is ended with the test."""
+        child = subprocess.Popen([*COMMAND, *words, *self.robot], cwd=ROOT, **more)
+        self.addCleanup(child.wait)
+        self.addCleanup(child.kill)
+        return child
+
+    async def ended(self, child: subprocess.Popen[bytes], seconds: float = 20.0) -> int:
+        """The exit code of a child, once it has ended."""
+        until = IReactorTime(reactor).seconds() + seconds
+        while child.poll() is None and IReactorTime(reactor).seconds() < until:
+            await self.wait(0.02)
+        self.assertIsNotNone(child.poll(), "it does not end")
+        return int(child.returncode)
+
+    async def set_off(self, keyboard: int) -> None:
+        """Hold "w" until the dog walks."""
+        until = IReactorTime(reactor).seconds() + 10.0
+        while self.body.motion[0] < 0.03 and IReactorTime(reactor).seconds() < until:
+            os.write(keyboard, b"w")
+            await self.wait(0.1)
+        self.assertGreater(self.body.motion[0], 0.03)
+
+    async def wait(self, seconds: float) -> None:
+        """Let the dog live."""
+        await deferLater(IReactorTime(reactor), seconds, lambda: None)
+
+    def test_probe_and_monitor(self) -> Deferred[None]:
+        """Probe says what came over TCP, monitor saves the dog's picture; a port where nothing listens is named."""
+        return Deferred.fromCoroutine(self._probe_and_monitor())
+
+    async def _probe_and_monitor(self) -> None:
+        out = Path(self.folder.name) / "out"
+        with out.open("wb") as file:
+            self.assertEqual(await self.ended(self.started("probe", "--seconds", "1", stdout=file)), 0)
+        self.assertIn("mode          T4", out.read_text())
+        self.assertIn("power.level   80 %", out.read_text())
+        picture = Path(self.folder.name) / "dog.jpg"
+        words = ("monitor", "--seconds", "2", "--picture", str(picture))
+        self.assertEqual(await self.ended(self.started(*words, stdout=subprocess.DEVNULL)), 0)
+        self.assertEqual(picture.read_bytes(), JPEG)
+        self.robot = ["--kind", "aibo", "--option", "host=127.0.0.1", "--option", "ports.main=1"]
+        with out.open("wb") as file:
+            self.assertEqual(await self.ended(self.started("probe", stdout=file)), 1)
+        self.assertIn("! 127.0.0.1:1: it is there, but nothing listens at this port", out.read_text())
+
+    def test_interrupted(self) -> Deferred[None]:
+        """Ctrl-C ends monitor and drive in order: without a traceback, the dog at rest, its motors off."""
+        return Deferred.fromCoroutine(self._interrupted())
+
+    async def _interrupted(self) -> None:
+        out = Path(self.folder.name) / "out"
+        with out.open("wb") as file:
+            child = self.started("monitor", stdout=file, stderr=file)
+            while b"ready" not in out.read_bytes():
+                await self.wait(0.05)
+            child.send_signal(signal.SIGINT)
+            self.assertEqual(await self.ended(child), 0)
+        self.assertNotIn("Traceback", out.read_text())
+        ours, theirs = pty.openpty()
+        self.addCleanup(os.close, ours)
+        self.addCleanup(os.close, theirs)
+        child = self.started("drive", stdin=theirs, stdout=theirs, stderr=theirs)
+        await self.set_off(ours)
+        child.send_signal(signal.SIGINT)
+        self.assertEqual(await self.ended(child), 0)
+        self.assertEqual((self.body.motion, self.dog.is_engaged), ((0.0, 0.0, 0.0), True))
+        self.assertNotIn("Traceback", os.read(ours, 65536).decode())
+
+    def test_drive(self) -> Deferred[None]:
+        """Keys in a terminal move the dog; let go, it stands; x ends, and the terminal is as it was before."""
+        return Deferred.fromCoroutine(self._drive())
+
+    async def _drive(self) -> None:
+        ours, theirs = pty.openpty()
+        self.addCleanup(os.close, ours)
+        self.addCleanup(os.close, theirs)
+        fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 100, 0, 0))
+        before = termios.tcgetattr(theirs)
+        child = self.started("drive", stdin=theirs, stdout=theirs, stderr=theirs)
+        await self.set_off(ours)
+        moved = []
+        for _ in range(8):
+            os.write(ours, b"w")
+            await self.wait(0.1)
+            moved.append(self.body.motion[0])
+        self.assertGreater(sum(vx > 0.03 for vx in moved), 4)
+        await self.wait(0.8)
+        self.assertEqual(self.body.motion, (0.0, 0.0, 0.0))
+        os.write(ours, b"wx")
+        self.assertEqual(await self.ended(child), 0)
+        self.assertEqual((self.body.motion, self.dog.is_engaged), ((0.0, 0.0, 0.0), True))
+        self.assertEqual(termios.tcgetattr(theirs), before)
+        shown = os.read(ours, 65536).decode()
+        self.assertIn("battery 80 %", shown)
+        self.assertIn("space: stop", shown)

@@ -1,0 +1,40 @@
+"""Both experiments of the thesis, with dogs behind routers: a run of ``make demo NAT=1``."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+from benchmarks.nat.capture import datagrams as datagrams_of
+from benchmarks.nat.capture import readable
+from benchmarks.nat.internet import ROOT
+from tests.live.namespaces import NamespaceCase
+
+LIMIT_S = 150.0
+WORDS = (b"red target", b"EXECUTING", b"capabilities", b"camera")
+"""What the team talks about; a word of four letters stands in six million random bytes by chance, now and then."""
+
+
+class ExperimentsBehindRoutersTests(NamespaceCase):
+    """dog1 behind a port restricted router, dog2 behind a symmetric one, dog3 on the LAN of the bootstrap."""
+
+    def test_both_experiments_hold(self) -> None:
+        """The nearest dog comes, another one when that is lost, as the page tells; who listens reads nothing."""
+        folder = Path(self.mktemp()).absolute()
+        report = folder.parent / "report.json"
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        command = [sys.executable, "-m", "benchmarks.nat.demo", "--robot", "sim", "--run-dir", str(folder)]
+        record = folder.parent / "wide.pcap"
+        command += ["--report", str(report), "--record", str(record)]
+        ran = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=LIMIT_S)
+        self.assertEqual(ran.returncode, 0, ran.stdout + ran.stderr)
+        verdicts = json.loads(report.read_text())
+        self.assertIn("takeover", json.dumps(verdicts))
+        self.assertEqual(ran.stdout.count("PASS"), 2, ran.stdout)
+        # The page was asked for without TLS, which shows that words in the open would have been found.
+        self.assertEqual(readable(record.read_bytes(), WORDS), list(WORDS))
+        datagrams = [held for _, _, held in datagrams_of(record)]
+        self.assertGreater(len(datagrams), 500)
+        self.assertEqual(readable(b"\n".join(datagrams), WORDS), [])

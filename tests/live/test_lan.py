@@ -1,0 +1,85 @@
+"""Tests of the LAN's group over real sockets: on the loopback, and between network namespaces that the test makes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from twisted.internet import reactor as _reactor
+from twisted.internet.defer import Deferred
+from twisted.internet.protocol import DatagramProtocol
+from twisted.internet.task import deferLater
+from twisted.trial.unittest import TestCase
+
+from middleware.entangled.network.interface import Interface, interfaces
+from middleware.entangled.network.lan import LanMulticast
+from middleware.entangled.network.network import Address
+
+reactor: Any = _reactor
+
+
+class LoopbackTests(TestCase):
+    """Two places in the group on the loopback."""
+
+    def group(
+        self, host: str = "127.0.0.1", look: Any = interfaces
+    ) -> tuple[LanMulticast, list[tuple[bytes, Address]]]:
+        """A place in the group, and what it hears."""
+        heard: list[tuple[bytes, Address]] = []
+        group = LanMulticast(reactor, host, look)
+        group.listen(lambda datagram, source: heard.append((datagram, source)))
+        self.addCleanup(group.close)
+        return group, heard
+
+    def soon(self, heard: list[Any], count: int = 1, tries: int = 200) -> Deferred[None]:
+        """Fire when so many were heard."""
+
+        async def wait() -> None:
+            for _ in range(tries):
+                if len(heard) >= count:
+                    return
+                await deferLater(reactor, 0.01)
+            self.fail(f"heard {heard}")
+
+        return Deferred.fromCoroutine(wait())
+
+    async def test_all_in_the_group_hear_a_call_and_can_answer(self) -> None:
+        """A call reaches every place in the group on one machine, and an answer reaches the caller."""
+        a, heard_a = self.group()
+        _, heard_b = self.group()
+        a.send(b"who?")
+        await self.soon(heard_b)
+        self.assertEqual(heard_b[0][0], b"who?")
+        source = heard_b[0][1]
+        self.assertEqual(source.host, "127.0.0.1")
+        await self.soon(heard_a)  # its own call
+        answering = reactor.listenUDP(0, DatagramProtocol(), "127.0.0.1")
+        self.addCleanup(answering.stopListening)
+        answering.write(b"here", tuple(source))
+        await self.soon(heard_a, 2)
+        self.assertEqual(heard_a[1], (b"here", Address("127.0.0.1", answering.getHost().port)))
+
+    async def test_a_change_is_told(self) -> None:
+        """When the interfaces change the node is told, after the first look and not at it."""
+        loopback = Interface(1, "lo", ("127.0.0.1",), is_loopback=True)
+        found = [[loopback], [loopback], [Interface(1, "lo", ("127.0.0.1", "::1"), is_loopback=True)]]
+        changes: list[int] = []
+        group, _ = self.group("", lambda: found.pop(0) if len(found) > 1 else found[0])
+        group.on_change = lambda: changes.append(len(found))
+        group._look_again()
+        self.assertEqual(changes, [])
+        group._look_again()
+        self.assertEqual(changes, [1])
+
+    def test_the_loopback_is_an_interface(self) -> None:
+        """The machine's interfaces are read, the loopback among them with its address."""
+        loopback = [each for each in interfaces() if each.is_loopback]
+        self.assertIn("127.0.0.1", loopback[0].addresses)
+
+    async def test_no_interface_is_no_error(self) -> None:
+        """Where there is no interface a call is lost, and closing twice does no harm."""
+        group, heard = self.group("192.0.2.77", lambda: [])
+        group.send(b"who?")
+        await deferLater(reactor, 0.05)
+        self.assertEqual(heard, [])
+        group.close()
+        group.close()

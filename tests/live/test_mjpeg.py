@@ -1,0 +1,129 @@
+"""Pictures over a real network: our driver and OpenCV's own client at the emulated camera, and a server of others."""
+
+from __future__ import annotations
+
+import http.server
+import threading
+from collections.abc import Generator
+from importlib.util import find_spec
+from typing import Any
+
+from twisted.internet import reactor as running
+from twisted.internet.defer import Deferred, inlineCallbacks
+from twisted.internet.task import deferLater
+from twisted.internet.threads import deferToThread
+from twisted.trial.unittest import TestCase
+
+from drivers.driver import Driver
+from drivers.link import TcpLinkFactory
+from drivers.registry import driver_for
+from sim.emulator.body import MemoryBody
+from sim.emulator.mjpeg import MjpegCamera
+from tests.drivers.test_camera_driver import jpeg
+
+reactor: Any = running
+
+
+class LiveMjpegTests(TestCase):
+    """Real sockets, real time."""
+
+    timeout = 60
+
+    def setUp(self) -> None:
+        """A camera on a free port."""
+        self.body = MemoryBody(jpeg=jpeg(1))
+        self.camera = MjpegCamera(reactor, self.body, 30.0)
+        self.camera.start()
+        self.port = reactor.listenTCP(0, TcpLinkFactory(self.camera.accept), interface="127.0.0.1")
+        self.number = self.port.getHost().port
+
+        self.addCleanup(self.close)
+
+    @inlineCallbacks
+    def close(self) -> Generator[Deferred[Any], Any, None]:
+        """The camera is off, and its port closed."""
+        self.camera.stop()
+        yield self.port.stopListening()
+        yield deferLater(reactor, 0.05)
+
+    def driver(self, port: int, **options: object) -> Driver:
+        """A driver of the camera at ``port``."""
+        url = f"http://127.0.0.1:{port}/stream"
+        return driver_for("camera", {"url": url, "width": 128, "height": 96, "fps": 30, **options}, "cam", reactor)
+
+    @inlineCallbacks
+    def until(self, is_so: Any) -> Generator[Deferred[Any], Any, None]:
+        """Fires when it is so, or fails the test."""
+        for _ in range(800):
+            if is_so():
+                return
+            yield deferLater(reactor, 0.02)
+        self.fail("it did not come to that")
+
+    @inlineCallbacks
+    def test_comes_back_over_real_sockets(self) -> Generator[Deferred[Any], Any, None]:
+        """Pictures flow, a broken connection is opened again, and the end leaves no connection behind."""
+        driver = self.driver(self.number)
+        yield driver.connect()
+        yield self.until(lambda: driver.diagnostics()["pictures"] > 10)
+        self.camera.clients[0].link.close()
+        yield self.until(lambda: driver.state == "stale")
+        yield self.until(lambda: driver.state == "ready")
+        self.assertEqual(driver.diagnostics()["reconnects"], 1)
+        yield driver.disconnect()
+        yield self.until(lambda: not self.camera.clients)
+
+    @inlineCallbacks
+    def test_watches_a_server_of_others(self) -> Generator[Deferred[Any], Any, None]:
+        """A stream that Python's own HTTP server writes, in HTTP/1.0 and without lengths, is watched."""
+
+        class Page(http.server.BaseHTTPRequestHandler):
+            def do_GET(self) -> None:  # noqa: N802 (its own)
+                self.send_response(200)
+                self.send_header("Content-Type", 'multipart/x-mixed-replace; boundary="--edge"')
+                self.end_headers()
+                for mark in range(20):
+                    self.wfile.write(b"--edge\nContent-Type: image/jpeg\n\n" + jpeg(mark) + b"\n")
+                self.wfile.write(b"--edge--\n")
+
+            def log_message(self, *_: Any) -> None:
+                """Say nothing."""
+
+        server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Page)
+        thread = threading.Thread(target=server.serve_forever, daemon=True)
+        thread.start()
+        driver = self.driver(server.server_port)
+        try:
+            yield driver.connect()
+            yield self.until(lambda: driver.diagnostics()["refused"] >= 1)
+            seen = driver.diagnostics()
+            self.assertEqual(seen["pictures"] + seen["dropped"], 20)
+        finally:
+            yield driver.disconnect()
+            yield deferToThread(server.shutdown)
+            server.server_close()
+            thread.join(5.0)
+
+    @inlineCallbacks
+    def test_other_clients_watch_the_emulator(self) -> Generator[Deferred[Any], Any, None]:
+        """OpenCV's own client reads the emulated camera like any other, in chunks and without."""
+        import cv2
+        import numpy
+
+        made, data = cv2.imencode(".jpg", numpy.full((96, 128, 3), 200, numpy.uint8))
+        self.assertTrue(made)
+        self.body.jpeg = data.tobytes()
+
+        def watch() -> list[tuple[int, ...]]:
+            capture = cv2.VideoCapture(f"http://127.0.0.1:{self.number}/stream.mjpg")
+            shapes = [tuple(capture.read()[1].shape) for _ in range(5)]
+            capture.release()
+            return shapes
+
+        for is_chunked in (False, True):
+            self.camera.is_chunked = is_chunked
+            shapes = yield deferToThread(watch)
+            self.assertEqual(shapes, [(96, 128, 3)] * 5)
+
+    if find_spec("cv2") is None:
+        test_other_clients_watch_the_emulator.skip = "NOBODY ELSE WATCHES: install the extra vision"  # type: ignore[attr-defined]

@@ -1,0 +1,182 @@
+"""The internet of namespaces: what its routers and lines do to datagrams, and that nothing is left of it."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+from benchmarks.nat.capture import Capture
+from benchmarks.nat.internet import PUBS, ROOT, Internet, Site
+from benchmarks.nat.kind import Kind
+from tests.live.namespaces import NamespaceCase
+
+LIMIT_S = 60.0
+TARGETS = (f"{PUBS[0]}:4000", f"{PUBS[0]}:4001", f"{PUBS[1]}:4000")
+"""Two ports of one address, and another address."""
+ECHO = """
+import select, socket, sys
+held = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in sys.argv[1:]]
+for one, (host, port) in zip(held, [each.split(":") for each in sys.argv[1:]]):
+    one.bind((host, int(port)))
+print("ready", flush=True)
+while True:
+    for one in select.select(held, [], [])[0]:
+        data, source = one.recvfrom(2048)
+        one.sendto(repr(source).encode(), source)
+"""
+ASK = """
+import socket, sys
+own = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+own.bind(("0.0.0.0", 5000))
+own.settimeout(0.5)
+seen = []
+for host, port in [each.split(":") for each in sys.argv[1:]]:
+    own.sendto(b"who am I", (host, int(port)))
+    try:
+        seen.append(eval(own.recv(2048)))
+    except OSError:
+        seen.append(None)
+print(seen)
+"""
+
+
+class InternetTests(NamespaceCase):
+    """What ``Internet`` promises."""
+
+    def internet(self, *sites: Site, seed: int = 1) -> Internet:
+        """One that is gone after the test."""
+        net = Internet(sites, seed)
+        net.__enter__()
+        self.addCleanup(net.close)
+        return net
+
+    def seen(self, net: Internet, host: str) -> list[tuple[str, int] | None]:
+        """As which addresses the public host sees one socket of ``host`` at its three echoes."""
+        done = net.run(host, [sys.executable, "-c", ASK, *TARGETS], timeout=LIMIT_S)
+        self.assertEqual(done.returncode, 0, done.stderr)
+        found: list[tuple[str, int] | None] = json.loads(
+            done.stdout.replace("(", "[").replace(")", "]").replace("'", '"').replace("None", "null")
+        )
+        return [None if each is None else (each[0], each[1]) for each in found]
+
+    def echo(self, net: Internet) -> None:
+        """Let the public host tell everybody its address."""
+        process = net.start("pub", [sys.executable, "-c", ECHO, *TARGETS], stdout=subprocess.PIPE, text=True)
+        assert process.stdout is not None
+        self.assertEqual(process.stdout.readline(), "ready\n")
+
+    def test_mappings_are_of_their_kind(self) -> None:
+        """One outside port for all peers, or another one for each, or none at all: as the kind of the router says."""
+        kinds = list(Kind)
+        net = self.internet(*(Site(kind.value, kind) for kind in kinds))
+        self.echo(net)
+        for kind in kinds:
+            seen = self.seen(net, f"{kind.value}1")
+            if kind is Kind.NOUDP:
+                self.assertEqual(seen, [None] * 3)
+                continue
+            outside = net.address("none1") if kind is Kind.NONE else net.outside(kind.value)
+            self.assertEqual({each[0] for each in seen if each is not None}, {outside}, kind)
+            ports = {each[1] for each in seen if each is not None}
+            self.assertEqual(len(ports), 3 if kind is Kind.SYM else 1, (kind, seen))
+
+    def test_lines_lose_what_is_said(self) -> None:
+        """A cut lets nothing pass in its one direction, losses are counted, and a healed line is good again."""
+        net = self.internet(Site("a", Kind.PORT))
+        self.echo(net)
+        self.assertNotIn(None, self.seen(net, "a1"))
+        net.cut("a", "in")
+        self.assertEqual(self.seen(net, "a1"), [None] * 3)
+        counts = net.counted()["a-gw"]
+        self.assertEqual((counts["up"]["lost"], counts["down"]["lost"]), (0, 3))
+        self.assertEqual(counts["up"]["passed"], 6)
+        net.heal("a")
+        self.assertNotIn(None, self.seen(net, "a1"))
+
+    def test_routers_get_another_address(self) -> None:
+        """A renumbered site is seen at its new address, and only there; a moved host behind its new router."""
+        net = self.internet(Site("a", Kind.PORT), Site("b", Kind.FULL))
+        self.echo(net)
+        before, new = net.outside("a"), net.renumber("a")
+        self.assertNotEqual(before, new)
+        self.assertEqual({each[0] for each in self.seen(net, "a1") if each}, {new})
+        net.move("a1", "b")
+        self.assertEqual({each[0] for each in self.seen(net, "a1") if each}, {net.outside("b")})
+
+    def test_captures_hold_and_count(self) -> None:
+        """A capture counts datagrams and bytes of each peer, and finds words that were sent in the open."""
+        net = self.internet(Site("a", Kind.PORT))
+        self.echo(net)
+        file, whole = Path(self.mktemp()), Path(self.mktemp())
+        net.record(whole)
+        with Capture(net, "pub", file) as seen:
+            self.seen(net, "a1")
+        net.record(None)
+        traffic = seen.from_host(net.outside("a"))
+        self.assertEqual((traffic.received, traffic.sent), (3, 3))
+        self.assertEqual(traffic.received_bytes, 3 * len("who am I"))
+        self.assertGreater(traffic.amplification, 1.0)
+        self.assertEqual(seen.found([b"who am I", b"red target"]), [b"who am I"])
+        self.assertIn(b"who am I", whole.read_bytes())
+
+    def test_nothing_is_left(self) -> None:
+        """After an exception, and after a kill of whoever made it, no process of an internet is left."""
+        program = (
+            "import os, sys, time\n"
+            "from benchmarks.nat.internet import Internet, Site\nfrom benchmarks.nat.kind import Kind\n"
+            "with Internet([Site('a', Kind.PORT)]) as net:\n"
+            "    started = net.start('a1', ['sleep', '600'])\n"
+            "    print(started.pid, *[net.room(name).pid for name in ('', 'a1', 'a-gw')], flush=True)\n"
+            "    if sys.argv[1] == 'raise': raise SystemExit(3)\n"
+            "    time.sleep(600)\n"
+        )
+        for end in ("raise", "kill"):
+            child = subprocess.Popen([sys.executable, "-c", program, end], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+            assert child.stdout is not None
+            pids = [int(word) for word in child.stdout.readline().split()]
+            self.assertEqual(len(pids), 4)
+            if end == "kill":
+                child.send_signal(signal.SIGKILL)
+            child.wait(LIMIT_S)
+            child.stdout.close()
+            for pid in pids:
+                # Woken by the end of its input, or by the kernel's signal: either is a moment, not a wait of ours.
+                descriptor = _opened(pid)
+                if descriptor >= 0:
+                    self.assertTrue(_ended(descriptor), f"process {pid} is left after {end}")
+
+
+def _opened(pid: int) -> int:
+    try:
+        return os.pidfd_open(pid)
+    except ProcessLookupError:
+        return -1
+
+
+def _ended(descriptor: int) -> bool:
+    import select
+
+    try:
+        return bool(select.select([descriptor], [], [], 10.0)[0])
+    finally:
+        os.close(descriptor)
+
+
+class MatrixTests(NamespaceCase):
+    """A small run of ``make live-nat``."""
+
+    def test_whoever_can_reach_each_other_does(self) -> None:
+        """One round of the matrix: nodes without a router meet at once, and table, JSON and picture are written."""
+        folder = Path(self.mktemp()).absolute()
+        command = [sys.executable, "-m", "benchmarks.nat", "--count", "1", "--lossy", "0", "--out", str(folder)]
+        ran = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
+        self.assertIn(ran.returncode, (0, 1), ran.stderr)
+        found = json.loads((folder / "live-nat.json").read_text())["trials"]
+        (open_one,) = [one for one in found if (one["part"], one["a"], one["b"]) == ("plain", "none", "none")]
+        self.assertEqual(open_one["path"], "direct", ran.stdout)
+        self.assertLess(max(open_one["took_s"]), 1.0)
+        self.assertTrue((folder / "live-nat.svg").read_text().startswith("<svg"))

@@ -1,0 +1,91 @@
+"""A robot on a cable with a camera board and a compass on the network: one device, as a settings file says."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from importlib.util import find_spec
+from random import Random
+from typing import Any
+
+from twisted.internet import reactor as running
+from twisted.internet.defer import Deferred, inlineCallbacks
+from twisted.internet.task import deferLater
+from twisted.trial.unittest import TestCase
+
+from drivers.driver import Permit
+from drivers.link import TcpLinkFactory
+from drivers.reading import Observation
+from drivers.registry import driver_for
+from middleware.settings import Settings
+from sim.emulator.body import MemoryBody
+from sim.emulator.create2 import Create2
+from sim.emulator.mjpeg import MjpegCamera
+from sim.emulator.nmea import NmeaCompass
+from sim.emulator.pty import PtyPort
+from tests.drivers.test_camera_driver import jpeg
+
+reactor: Any = running
+
+NODE = {"name": "vacuum"}
+
+
+class LivePartsTests(TestCase):
+    """Real sockets, a real terminal, real time."""
+
+    timeout = 30
+
+    @inlineCallbacks
+    def test_is_one_device(self) -> Generator[Deferred[Any], Any, None]:
+        """All three are reached by their own sort of link; the camera is lost and comes back while the robot drives."""
+        body = MemoryBody(jpeg=jpeg(5), values={"compass.heading": 0.5})
+        robot, camera, compass = (
+            Create2(body, reactor, Random(1)),
+            MjpegCamera(reactor, body),
+            NmeaCompass(reactor, body),
+        )
+        cable = PtyPort(reactor, robot.accept)
+        ports = [reactor.listenTCP(0, TcpLinkFactory(one.accept), interface="127.0.0.1") for one in (camera, compass)]
+        camera.start()
+        compass.start()
+        watching, listening = (port.getHost().port for port in ports)
+        parts = [
+            {"kind": "camera", "options": {"url": f"http://127.0.0.1:{watching}/stream"}},
+            {"kind": "compass", "options": {"host": "127.0.0.1", "port": listening}},
+        ]
+        table = {"kind": "create2", "options": {"port": cable.path}, "parts": parts}
+        wanted = Settings.from_mapping({"node": NODE, "driver": table}, "vacuum.toml").driver
+        driver = driver_for(wanted.kind, wanted.options, "vacuum", reactor, parts=wanted.parts)
+
+        def newest() -> Observation:
+            seen = driver.observe()
+            assert seen is not None
+            return seen
+
+        try:
+            yield driver.connect()
+            yield driver.enable()
+            while newest().frame is None or "compass.heading" not in newest().values:
+                yield deferLater(reactor, 0.02)
+            self.assertAlmostEqual(float(newest().values["compass.heading"]), 0.5, 2)
+            driver.act({"base.vx": 0.2}, Permit(1, reactor.seconds() + 5.0))
+            camera.clients[0].link.close()
+            while newest().frame is not None:
+                yield deferLater(reactor, 0.02)
+            self.assertEqual((driver.state, driver.diagnostics()["camera.reconnects"]), ("ready", 0))
+            self.assertGreater(body.motion[0], 0.1)
+            while newest().frame is None:
+                yield deferLater(reactor, 0.02)
+            self.assertEqual(driver.diagnostics()["camera.reconnects"], 1)
+        finally:
+            yield driver.disconnect()
+            camera.stop()
+            compass.stop()
+            robot.stop()
+            cable.close()
+            for port in ports:
+                yield port.stopListening()
+            yield deferLater(reactor, 0.05)
+        self.assertEqual(body.motion, (0.0, 0.0, 0.0))
+
+    if find_spec("serial") is None:
+        test_is_one_device.skip = "NO ROBOT HAS PARTS: install the extra serial"  # type: ignore[attr-defined]

@@ -1,0 +1,77 @@
+"""Tests of ``drivers.pyro`` with a brain on a thread of its own, and of the examples as commands."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from functools import partial
+from pathlib import Path
+from random import Random
+from typing import Any
+
+from twisted.internet import reactor as running
+from twisted.internet.defer import Deferred
+from twisted.internet.task import deferLater
+from twisted.internet.threads import blockingCallFromThread, deferToThread
+from twisted.trial.unittest import SynchronousTestCase, TestCase
+
+from drivers.pyro.robot import PyroRobot
+from drivers.registry import driver_for
+from sim.emulator.aibo import AiboEmulator
+from sim.emulator.body import MemoryBody
+
+ROOT = Path(__file__).parents[2]
+reactor: Any = running
+
+
+class ThreadTests(TestCase):
+    timeout = 20
+
+    def test_brain_on_a_thread_of_its_own(self) -> Deferred[None]:
+        """A plain script on another thread connects, drives, reads and leaves, each call done when it returns."""
+        body = MemoryBody()
+        dog = AiboEmulator(reactor, body, Random(1))
+        dog.start()
+        driver = driver_for("aibo", {"host": "dog", "camera": False}, "dog", reactor, dog.connector())
+        robot = PyroRobot(driver, reactor, partial(blockingCallFromThread, reactor))
+
+        def script() -> tuple[Any, Any, Any]:
+            robot.connect()
+            robot.move(0.5, 0.0)
+            until = time.monotonic() + 5.0
+            while body.motion[0] == 0.0 and time.monotonic() < until:
+                robot.update()
+                time.sleep(0.02)
+            moving = body.motion
+            level = robot.battery[0].level
+            robot.stop()
+            robot.disconnect()
+            return moving, level, driver.state
+
+        def told(result: tuple[Any, Any, Any]) -> None:
+            self.assertEqual(result, ((0.08, 0.0, 0.0), 1.0, "closed"))
+
+        def end(result: Any) -> Any:
+            dog.stop()
+            # What closes the links in memory takes a moment to arrive.
+            return deferLater(reactor, 0.05, lambda: result)
+
+        done: Deferred[None] = deferToThread(script).addCallback(told).addBoth(end)
+        return done
+
+
+class CommandTests(SynchronousTestCase):
+    def test_examples_run_as_commands(self) -> None:
+        """Each of the two brains runs by one command for a second, says what its robot has, and ends well."""
+        for name in ("avoid", "track_ball"):
+            done = subprocess.run(
+                [sys.executable, f"examples/pyro/{name}.py", "--seconds", "1"],
+                cwd=ROOT,
+                env={"PYTHONPATH": str(ROOT)},
+                capture_output=True,
+                text=True,
+                timeout=60,
+            )
+            self.assertEqual((done.returncode, done.stderr), (0, ""), name)
+            self.assertIn("aibo-ers7: has battery, camera, ir", done.stdout)

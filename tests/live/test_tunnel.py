@@ -1,0 +1,348 @@
+"""Real tunnels over the loopback interface: TLS, crowds, slow readers and dead ends; and two real nodes without UDP."""
+
+from __future__ import annotations
+
+import random
+import selectors
+import socket
+import ssl
+import sys
+import time
+from collections.abc import Callable, Generator
+from pathlib import Path
+from typing import Any
+
+from twisted.internet import reactor, task
+from twisted.internet.defer import Deferred, inlineCallbacks
+from twisted.protocols import portforward
+from twisted.trial.unittest import TestCase
+
+from middleware.entangled.errors import TunnelPortInUse
+from middleware.entangled.identity import Identity
+from middleware.entangled.network.tcp import TcpCarrier
+from middleware.entangled.network.tunnel import MAX_BEGUN, MAX_OF_HOST, TunnelNetwork
+from middleware.entangled.network.url import Url
+from middleware.entangled.wire.endpoint import Endpoint
+from sim.demo import port
+from tests.live.test_bad_input import PATIENCE_S, LiveTests
+
+REACTOR: Any = reactor
+HOST = "127.0.0.1"
+REQUEST = (
+    b"GET /swarm HTTP/1.1\r\nHost: a\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+    b"Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Version: 13\r\n"
+    b"Sec-WebSocket-Protocol: swarm-tunnel-1\r\n\r\n"
+)
+
+
+class Forwarder(portforward.ProxyServer):
+    """A TCP proxy that can stop to hand on, without a word to either end."""
+
+    is_stuck = False
+
+    def dataReceived(self, data: bytes) -> None:
+        """Hand on to the server."""
+        if not Forwarder.is_stuck:
+            super().dataReceived(data)
+
+
+class TunnelTests(TestCase):
+    timeout = 90
+
+    def setUp(self) -> None:
+        self.ports: list[Any] = []
+        Forwarder.is_stuck = False
+
+    def made(self, *urls: Url) -> tuple[TunnelNetwork, TcpCarrier]:
+        """An end, served at a free port where it has no URL."""
+        carrier = TcpCarrier(reactor, HOST, 0)
+        tunnel = TunnelNetwork(carrier, REACTOR, random.SystemRandom(), urls, not urls)
+
+        def close() -> Deferred[Any]:
+            tunnel.close()
+            return task.deferLater(REACTOR, 0.05, lambda: carrier.closed)
+
+        self.addCleanup(close)
+        return tunnel, carrier
+
+    def served(self) -> tuple[Endpoint, TunnelNetwork, Url]:
+        """An endpoint behind a tunnel, and where it begins."""
+        tunnel, carrier = self.made()
+        end = self.endpoint(1, tunnel)
+        return end, tunnel, Url("wss", HOST, carrier.number)
+
+    def endpoint(self, seed: int, tunnel: TunnelNetwork) -> Endpoint:
+        """A started endpoint of the team."""
+        end = Endpoint(Identity(bytes([seed]) * 32), b"k" * 32, tunnel, REACTOR, random.SystemRandom())
+        end.expose("echo", lambda peer, value: value)
+        end.start()
+        self.addCleanup(end.stop)
+        return end
+
+    def until(self, is_so: Callable[[], bool], seconds: float = 15.0) -> Deferred[float]:
+        """Wait until something is so; fires with the seconds that it took."""
+        began = time.monotonic()
+        done: Deferred[float] = Deferred()
+
+        def look() -> None:
+            took = time.monotonic() - began
+            if is_so() or took > seconds:
+                loop.stop()
+                done.callback(took)
+
+        loop = task.LoopingCall(look)
+        loop.start(0.05, now=False)
+        return done
+
+    def dialled(self, url: Url) -> ssl.SSLSocket:
+        """A blocking client that has spoken TLS and the greeting, and reads nothing after it."""
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+        context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+        plain = socket.create_connection((url.host, url.port), 5.0)
+        plain.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 8192)
+        plain.setblocking(False)
+        client = context.wrap_socket(plain, do_handshake_on_connect=False)
+        self.addCleanup(client.close)
+        return client
+
+    @inlineCallbacks
+    def greet(self, url: Url) -> Generator[Deferred[Any], Any, ssl.SSLSocket]:
+        """One that has greeted by hand."""
+        client = self.dialled(url)
+        for step in (client.do_handshake, lambda: client.send(REQUEST), lambda: client.recv(4096)):
+            while True:
+                try:
+                    step()
+                    break
+                except (ssl.SSLWantReadError, ssl.SSLWantWriteError):
+                    yield task.deferLater(REACTOR, 0.01)
+        return client
+
+    @inlineCallbacks
+    def test_endpoints_talk(self) -> Generator[Deferred[Any], Any, None]:
+        """Two endpoints greet, ask and answer through TLS, 1 MiB included; the first answer comes within a second."""
+        server, _, url = self.served()
+        tunnel, _ = self.made(url)
+        client = self.endpoint(2, tunnel)
+        began = time.monotonic()
+        contact = yield client.greet(url.address, 4.0)
+        answer = yield client.ask(contact, "echo", 42)
+        self.assertEqual((contact.public, answer), (Identity(b"\x01" * 32).public, 42))
+        self.assertLess(time.monotonic() - began, 1.0)
+        large = random.Random(1).randbytes(2**20 - 100)
+        answer = yield client.ask(contact, "echo", large, timeout=30.0)
+        self.assertTrue(answer == large, "1 MiB comes back as it went")
+        self.assertEqual(tunnel.counters["opened"], 1, "where nothing is lost one connection is enough")
+
+    @inlineCallbacks
+    def test_bear_a_crowd(self) -> Generator[Deferred[Any], Any, None]:
+        """Of five hundred dribblers few are borne, all are let go in time, and a member is served in between."""
+        server, tunnel, url = self.served()
+        client_tunnel, _ = self.made(url)
+        client = self.endpoint(2, client_tunnel)
+        contact = yield client.greet(url.address, 4.0)
+        crowd: set[socket.socket] = set()
+        selector = selectors.DefaultSelector()
+        for number in range(500):
+            each = socket.socket()
+            each.bind((f"127.0.{1 + number // 10 % 25}.{1 + number // 250}", 0))
+            each.setblocking(False)
+            each.connect_ex((url.host, url.port))
+            crowd.add(each)
+            selector.register(each, selectors.EVENT_READ)
+            self.addCleanup(each.close)
+            if number % 25 == 0:
+                yield task.deferLater(REACTOR, 0.0)
+        slowest, most = 0.0, 0
+        began = time.monotonic()
+        while crowd and time.monotonic() - began < 20.0:
+            for each in list(crowd):
+                try:
+                    each.send(b"\x16")
+                except BlockingIOError:
+                    pass
+                except OSError:
+                    crowd.discard(each)
+            for key, _ in selector.select(0):
+                gone = key.fileobj
+                assert isinstance(gone, socket.socket)
+                try:
+                    is_over = not gone.recv(4096)
+                except OSError:
+                    is_over = True
+                if is_over:
+                    selector.unregister(gone)
+                    crowd.discard(gone)
+            asked = time.monotonic()
+            yield client.ask(contact, "echo", 1)
+            slowest = max(slowest, time.monotonic() - asked)
+            most = max(most, len(tunnel._links))
+            yield task.deferLater(REACTOR, 0.1)
+        selector.close()
+        self.assertEqual(len(crowd), 0)
+        self.assertLess(time.monotonic() - began, 15.0)
+        self.assertLess(slowest, 0.5)
+        self.assertLessEqual(most, MAX_BEGUN + 2)
+
+    @inlineCallbacks
+    def test_bear_one_address(self) -> Generator[Deferred[Any], Any, None]:
+        """Of one address no more are borne than a large team needs, and the rest is hung up on at once."""
+        _, tunnel, url = self.served()
+        crowd = [socket.create_connection((url.host, url.port), 5.0) for _ in range(100)]
+        for each in crowd:
+            self.addCleanup(each.close)
+        yield self.until(lambda: tunnel.counters["crowded"] >= 100 - MAX_OF_HOST)
+        self.assertEqual(tunnel.counters["crowded"], 100 - MAX_OF_HOST)
+
+    @inlineCallbacks
+    def test_garbage(self) -> Generator[Deferred[Any], Any, None]:
+        """Garbage instead of TLS, of the greeting, and of frames ends its own link alone; nothing is raised."""
+        server, tunnel, url = self.served()
+        client_tunnel, _ = self.made(url)
+        client = self.endpoint(2, client_tunnel)
+        contact = yield client.greet(url.address, 4.0)
+        dice = random.Random(3)
+        for _ in range(20):
+            plain = socket.create_connection((url.host, url.port), 5.0)
+            self.addCleanup(plain.close)
+            plain.send(dice.randbytes(dice.randrange(1, 3000)))
+        for _ in range(10):
+            greeted = yield self.greet(url)
+            greeted.send(dice.randbytes(dice.randrange(20, 3000)))
+        yield self.until(lambda: len(tunnel._links) == 1)
+        self.assertEqual(len(tunnel._links), 1)
+        answer = yield client.ask(contact, "echo", 1)
+        self.assertEqual(answer, 1)
+
+    @inlineCallbacks
+    def test_slow_reader(self) -> Generator[Deferred[Any], Any, None]:
+        """For who reads nothing little is kept, the rest is dropped, and others are served as fast as before."""
+        server, tunnel, url = self.served()
+        client_tunnel, _ = self.made(url)
+        client = self.endpoint(2, client_tunnel)
+        contact = yield client.greet(url.address, 4.0)
+        others = set(tunnel.peers)
+        yield self.greet(url)
+        yield self.until(lambda: len(tunnel.peers) == 2)
+        (slow,) = set(tunnel.peers) - others
+        slowest = 0.0
+        for _ in range(50):
+            for _ in range(100):
+                tunnel.send(bytes(1400), slow)
+            asked = time.monotonic()
+            yield client.ask(contact, "echo", 1)
+            slowest = max(slowest, time.monotonic() - asked)
+        (link,) = (each for each in tunnel._links if each.address == slow)
+        transport: Any = link.transport
+        held = link.waiting + len(transport.dataBuffer) + transport._tempDataLen - transport.offset
+        self.assertLess(held, 64 * 1024)
+        self.assertGreater(link.dropped, 4000)
+        self.assertLess(slowest, 0.3)
+
+    @inlineCallbacks
+    def test_strain(self) -> Generator[Deferred[Any], Any, None]:
+        """Linux tells how a stream does: nothing held or repeated where all is confirmed, much where nobody reads."""
+        if sys.platform != "linux":
+            self.skipTest("only Linux tells")
+        server, tunnel, url = self.served()
+        client_tunnel, carrier = self.made(url)
+        client = self.endpoint(2, client_tunnel)
+        contact = yield client.greet(url.address, 4.0)
+        yield client.ask(contact, "echo", 1)
+        yield task.deferLater(REACTOR, 0.3)
+        (link,) = client_tunnel._links
+        strain = carrier.strain(link.transport)
+        assert strain is not None
+        self.assertEqual((strain.held, strain.repeated), (0, 0))
+        self.assertGreater(strain.acked, 1000)
+        yield self.greet(url)
+        (deaf,) = (each for each in tunnel._links if each.address != tunnel.peers[0])
+        for _ in range(400):
+            tunnel.send(bytes(1400), deaf.address)
+            yield task.deferLater(REACTOR, 0.001)
+        strain = carrier.strain(deaf.transport)
+        assert strain is not None
+        self.assertGreater(strain.held, 8192)
+        deaf.end("the test is over", is_rude=True)
+        self.assertIsNone(carrier.strain(None))
+        server.stop()
+
+    @inlineCallbacks
+    def test_dead_end(self) -> Generator[Deferred[Any], Any, None]:
+        """A connection that stays up and carries nothing is given up, and another one dialled, within 12 s."""
+        server, tunnel, url = self.served()
+
+        factory = portforward.ProxyFactory(HOST, url.port)
+        factory.protocol = Forwarder
+        factory.noisy = False
+        front = REACTOR.listenTCP(0, factory, interface=HOST)
+        self.addCleanup(front.stopListening)
+        through = Url("wss", HOST, front.getHost().port)
+        client_tunnel, _ = self.made(through)
+        client = self.endpoint(2, client_tunnel)
+        contact = yield client.greet(through.address, 4.0)
+        yield client.ask(contact, "echo", 1)
+        Forwarder.is_stuck = True
+        calls = task.LoopingCall(client_tunnel.send, b"there?", through.address)
+        calls.start(0.2)
+        took = yield self.until(lambda: not client_tunnel.peers)
+        Forwarder.is_stuck = False
+        calls.stop()
+        self.assertLess(took, 12.0)
+        yield task.deferLater(REACTOR, 1.0)
+        again = yield client.greet(through.address, 4.0)
+        self.assertEqual(again.public, contact.public)
+        client.stop()
+        server.stop()
+        yield task.deferLater(REACTOR, 0.2)
+
+    def test_port_in_use(self) -> None:
+        """A port that another program holds is refused in one line that names the setting and says what to do."""
+        with socket.socket() as taken:
+            taken.bind((HOST, 0))
+            taken.listen()
+            carrier = TcpCarrier(reactor, HOST, taken.getsockname()[1])
+            error = self.assertRaises(TunnelPortInUse, carrier.listen, lambda host: None)
+        self.assertIn("choose another port", str(error))
+        self.assertNotIn("\n", str(error))
+
+
+class NodeTests(LiveTests):
+    def node(self, name: str, text: str) -> Any:
+        """A real node with these settings."""
+        path = self.folder / f"{name}.toml"
+        path.write_text(f'[node]\nname = "{name}"\nteam_key = "of these tests"\n{text}', encoding="utf-8")
+        child = self.start("--config", str(path))
+        self.addCleanup(child.communicate)
+        self.addCleanup(child.kill)
+        return child
+
+    def test_enter_without_udp(self) -> None:
+        """A real node whose known node is silent by UDP enters by TLS within 2.5 s of trying."""
+        (number,) = port.free("tcp", HOST, 1)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as silent:
+            silent.bind((HOST, 0))
+            known = f'known_nodes = ["{HOST}:{silent.getsockname()[1]}"]\n'
+            self.node("b", f'roles = ["bootstrap"]\ntunnel_port = {number}\n')
+            end = time.monotonic() + PATIENCE_S
+            while True:
+                try:
+                    socket.create_connection((HOST, number), 1.0).close()
+                    break
+                except OSError:
+                    self.assertLess(time.monotonic(), end, "the bootstrap does not listen")
+                    time.sleep(0.1)
+            child = self.node("a", f'{known}tunnels = ["wss://{HOST}:{number}"]\n')
+            silent.settimeout(PATIENCE_S)
+            silent.recv(2000)
+            began, lines = time.monotonic(), []
+            for line in child.stdout:
+                lines.append(line)
+                if "joined" in line:
+                    break
+            took = time.monotonic() - began
+            maps = Path(f"/proc/{child.pid}/maps").read_text(encoding="ascii")
+        text = "".join(lines)
+        self.assertLess(took, 2.5)
+        self.assertIn(f"a tunnel to wss://{HOST}:{number}/swarm is open", text)
+        self.assertNotIn("cryptography", maps, "Python's own TLS is enough")

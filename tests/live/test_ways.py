@@ -1,0 +1,101 @@
+"""The ways of the team in a real browser: how each device is reached, who is in the team, and who was turned away."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from tests.live.page import DESK, PHONE, PageCase
+
+
+class WaysTests(PageCase):
+    def looked(self, screen: dict[str, Any], scheme: str = "light") -> Any:
+        """The network's view, when both panels have come."""
+        page = self.opened(screen, scheme)
+        self.view(page, "network")
+        page.locator("#ways li").nth(2).wait_for()
+        page.locator("#team-kind").scroll_into_view_if_needed()
+        page.locator("#members li").nth(2).wait_for()
+        return page
+
+    def test_tell_the_ways(self) -> None:
+        """Each way has its number, a word, how and since when; the worst of the others comes first, unmeasured last."""
+        page = self.looked(PHONE)
+        rows = [item.inner_text().split("\n") for item in page.locator("#ways li").all()]
+        self.assertEqual(
+            [(row[0], row[1], row[2]) for row in rows],
+            [
+                ("dog1", "98 \N{EN DASH} well", "LAN, for 2 min"),
+                ("dog2", "63 \N{EN DASH} fair", "punched through routers, for 2 min"),
+                ("dog3", "24 \N{EN DASH} poor", "carried by dog1, for 2 min"),
+            ],
+        )
+        self.assertEqual(rows[2][3], "110 ms, jitter 11 ms, 20 % lost")
+        lit = "e => [...e.querySelectorAll('rect')].filter(bar => bar.dataset.lit === 'true').length"
+        self.assertEqual([page.locator("#ways .score").nth(n).evaluate(lit) for n in range(3)], [4, 3, 2])
+        page.locator("#ways-others summary").tap()
+        others = [item.inner_text().split("\n")[:2] for item in page.locator("#ways-between li").all()]
+        self.assertEqual(
+            others, [["dog2 \N{EN DASH} dog1", "70 \N{EN DASH} fair"], ["dog2 \N{EN DASH} dog3", "measuring"]]
+        )
+        self.assertEqual(page.locator("#ways-line").inner_text(), "5 links: 1 poor, 2 fair. 1 did not answer.")
+
+    def test_tell_who_was_turned_away(self) -> None:
+        """What several tell of one refusal is one line, with who, by whom, why and the remedy."""
+        page = self.looked(DESK)
+        told = [item.inner_text().split("\n") for item in page.locator("#refusals li").all()]
+        self.assertEqual(
+            told,
+            [
+                [
+                    "dog9 is not let in by vaio, dog1; 3 min ago, 6 times",
+                    "revoked: the operator revoked the certificate",
+                    "Do: only a new invitation lets it in",
+                ],
+                [
+                    "a newcomer at 192.0.2.66:8484 is not let in by vaio; 3 min ago",
+                    "used: this code was used as often as it may be",
+                    "Do: ask the operator for another one",
+                ],
+            ],
+        )
+
+    def test_tell_the_team(self) -> None:
+        """A closed team has its name, fingerprint and members; whose certificate ends soon is first, and stands out."""
+        page = self.looked(PHONE)
+        self.assertEqual(page.locator("#team-kind").inner_text(), "Closed team yard")
+        self.assertIn("Fingerprint 1a2b 3c4d 5e6f 7081", page.locator("#team-about").inner_text())
+        first, second, third = (item.inner_text() for item in page.locator("#members li").all())
+        self.assertIn("! ends in 9 d", first)
+        self.assertIn("device, bootstrap", second)
+        self.assertIn("not here", third)
+        self.assertNotIn("!", second + third)
+
+    def test_show_commands_to_operators_alone(self) -> None:
+        """An operator reads by which command a member is put out; a viewer sees the members without, and no button."""
+        page = self.looked(DESK)
+        self.assertEqual(page.locator("#members code").all_inner_texts(), [f"swarm revoke dog{n}" for n in (2, 1, 7)])
+        self.assertEqual(page.locator("#place-network button").count(), 0)
+        page.evaluate("import('/static/model.js').then(({ model }) => { model.me = { name: '', role: 'viewer' }; })")
+        page.wait_for_function("() => !document.querySelector('#members code:not(:empty)')")
+        self.assertEqual(page.locator("#members li").count(), 3)
+
+    def test_ask_while_somebody_looks(self) -> None:
+        """What is measured for the page is asked for while it is in sight, and no longer."""
+        page = self.opened(PHONE)
+        page.wait_for_timeout(300)
+        self.assertFalse([url for url in self.asked if url.endswith(("/links", "/team"))])
+        self.view(page, "network")
+        page.locator("#ways li").first.wait_for()
+        self.view(page, "devices")
+        page.wait_for_timeout(300)
+        self.asked.clear()
+        page.wait_for_timeout(3000)
+        self.assertFalse([url for url in self.asked if url.endswith(("/links", "/team"))])
+
+    def test_sound(self) -> None:
+        """On phone and desk, light and dark, axe finds nothing, and nothing is wider than the screen."""
+        for screen, scheme in ((PHONE, "light"), (PHONE, "dark"), (DESK, "light"), (DESK, "dark")):
+            page = self.looked(screen, scheme)
+            page.locator("#ways-others summary").click()
+            self.sound(page)
+            page.context.close()

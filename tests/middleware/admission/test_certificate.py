@@ -1,0 +1,118 @@
+"""Tests of passes."""
+
+from __future__ import annotations
+
+import msgpack
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.admission.certificate import (
+    GUEST_LIFE,
+    ROOM,
+    SKEW,
+    Member,
+    chained,
+    guest_pass,
+    member_of,
+    pass_of,
+    proof,
+)
+from middleware.entangled.errors import Forged, Malformed
+from tests.middleware.admission.paper import LATER, NOW, admitted, granted, identity, invited, operator, roll
+
+OPERATOR = operator()
+DOG = identity("dog")
+
+
+class CertificateTests(SynchronousTestCase):
+    """What a member shows, and what is believed."""
+
+    def test_granted_by_the_operator(self) -> None:
+        """A grant of the operator makes a member, of the key that it names and no other."""
+        shown = pass_of(granted(OPERATOR, "dog", "device", "gateway"))
+        member = member_of(OPERATOR.public, DOG.public, shown)
+        self.assertEqual((member.name, member.roles), ("dog", ("device", "gateway")))
+        self.assertRaises(Forged, member_of, OPERATOR.public, identity("cat").public, shown)
+        self.assertRaises(Forged, member_of, operator(2).public, DOG.public, shown)
+
+    def test_let_in_by_a_bootstrap_node(self) -> None:
+        """Invitation, proof and admission together make a member with the invitation's roles and its life."""
+        member = member_of(OPERATOR.public, DOG.public, admitted(OPERATOR, "dog"))
+        _, _, invite = invited(OPERATOR)
+        expected = Member(
+            DOG.public, "dog", ("device",), NOW, NOW + invite.life, invite.public, identity("vaio").public
+        )
+        self.assertEqual(member, expected)
+
+    def test_it_takes_two(self) -> None:
+        """A bootstrap node without the code, and the code with a node that is no bootstrap, admit nobody."""
+        code, packed, invite = invited(OPERATOR)
+        grant, plain = granted(OPERATOR, "vaio", "bootstrap"), granted(OPERATOR, "vaio", "device")
+        vaio = identity("vaio")
+        made_up = chained(vaio, grant, (packed, invite), (DOG.public, "", proof(vaio, DOG.public, "")), "dog", NOW)
+        came = (DOG.public, "", proof(code.key, DOG.public, ""))
+        not_allowed = chained(vaio, plain, (packed, invite), came, "dog", NOW)
+        by_itself = chained(DOG, grant, (packed, invite), came, "dog", NOW)
+        for shown in (made_up, not_allowed, by_itself):
+            self.assertRaises(Forged, member_of, OPERATOR.public, DOG.public, shown)
+
+    def test_admission_needs_a_living_invitation(self) -> None:
+        """Nobody is let in by an invitation that had run out, and none for longer than it says."""
+        late = admitted(OPERATOR, "dog", now=NOW + int(LATER) + 1)
+        self.assertRaises(Malformed, member_of, OPERATOR.public, DOG.public, late)
+        fields = msgpack.unpackb(admitted(OPERATOR, "dog"))
+        fields[6] += 1
+        self.assertRaises(Malformed, member_of, OPERATOR.public, DOG.public, msgpack.packb(fields))
+
+    def test_it_has_its_time(self) -> None:
+        """A pass is early before its time, allowing for clocks that differ, and expired after it."""
+        member = member_of(OPERATOR.public, DOG.public, pass_of(granted(OPERATOR, "dog")))
+        self.assertEqual(member.trouble(NOW - SKEW - 1), "early")
+        self.assertEqual(member.trouble(NOW - SKEW), "")
+        self.assertEqual(member.trouble(member.not_after), "expired")
+
+    def test_guest(self) -> None:
+        """A gateway vouches for a guest for a day; a member without that role, and a guest, vouch for nobody."""
+        page, phone, friend = identity("page"), identity("phone"), identity("friend")
+        own = pass_of(granted(OPERATOR, "page", "gateway"))
+        shown = guest_pass(page, own, phone.public, "phone", NOW)
+        member = member_of(OPERATOR.public, phone.public, shown)
+        mine = roll(OPERATOR)
+        self.assertEqual((member.name, member.roles, mine.refusal(member, NOW)), ("phone", ("device",), ""))
+        self.assertEqual(mine.refusal(member, NOW + GUEST_LIFE), "expired")
+        self.assertRaises(Forged, member_of, OPERATOR.public, friend.public, shown)
+        again = guest_pass(phone, shown, friend.public, "friend", NOW)
+        self.assertRaises(Forged, member_of, OPERATOR.public, friend.public, again)
+        plain = guest_pass(page, pass_of(granted(OPERATOR, "page")), phone.public, "phone", NOW)
+        self.assertEqual(mine.refusal(member_of(OPERATOR.public, phone.public, plain), NOW), "role")
+        mine.add(OPERATOR.revoke(page.public, "page", NOW), NOW)
+        self.assertEqual(mine.refusal(member, NOW), "revoked")
+
+    def test_guest_of_one_who_came_by_code(self) -> None:
+        """A gateway that came by an invitation has room to vouch, unless all the names in its pass are long."""
+        page, phone = identity("page"), identity("phone")
+        shown = guest_pass(page, admitted(OPERATOR, "page"), phone.public, "phone-of-a-visitor", NOW)
+        voucher = member_of(OPERATOR.public, phone.public, shown).voucher
+        self.assertEqual(None if voucher is None else voucher.name, "page")
+        long = admitted(OPERATOR, "n" * 40, bootstrap="b" * 40, wish="w" * 40)
+        self.assertRaises(Malformed, guest_pass, page, long, phone.public, "phone", NOW)
+
+    def test_longest_fits(self) -> None:
+        """A chain whose names are as long as names may be stays within the room of a pass."""
+        long = "n" * 40
+        shown = admitted(OPERATOR, long, bootstrap="b" * 40, wish="w" * 40)
+        self.assertLessEqual(len(shown), ROOM)
+        self.assertEqual(member_of(OPERATOR.public, identity(long).public, shown).name, long)
+
+    @given(st.data())
+    @settings(max_examples=200, deadline=None)
+    def test_reads_anything(self, data: st.DataObject) -> None:
+        """Whatever is shown, cut and changed in any way, is refused by name and never raises anything else."""
+        whole = bytearray(admitted(OPERATOR, "dog"))
+        place = data.draw(st.integers(0, len(whole) - 1))
+        whole[place] ^= data.draw(st.integers(1, 255))
+        cut = bytes(whole[: data.draw(st.integers(0, len(whole)) | st.just(len(whole)))])
+        self.assertRaises((Forged, Malformed), member_of, OPERATOR.public, DOG.public, cut)
+        anything = data.draw(st.binary(max_size=100))
+        self.assertRaises((Forged, Malformed), member_of, OPERATOR.public, DOG.public, anything)

@@ -1,0 +1,68 @@
+"""Tests of the code of an invitation."""
+
+from __future__ import annotations
+
+import random
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.admission import code
+from middleware.admission.errors import BadCode
+from tests.middleware.admission.paper import operator
+
+
+class CodeTests(SynchronousTestCase):
+    """What is read out, and what is typed."""
+
+    def setUp(self) -> None:
+        self.code = code.drawn(operator().public, random.Random(1))
+
+    def test_what_is_read_out_is_what_is_typed(self) -> None:
+        """The text of a code has four groups of five characters, and reading it gives the code and its key again."""
+        self.assertEqual([len(group) for group in self.code.text.split("-")], [5, 5, 5, 5])
+        again = code.read(self.code.text)
+        self.assertEqual((again, again.key.public), (self.code, self.code.key.public))
+
+    def test_hands_are_forgiven(self) -> None:
+        """Small letters, other groups, and letters that look like digits are read as they were meant."""
+        meant = code.Code(0x1_0001, 0x10)
+        self.assertEqual(code.read(meant.text.replace("0", "o").replace("1", "l").replace("-", " ").lower()), meant)
+
+    def test_every_slip_is_noticed(self) -> None:
+        """Any single wrong character, and any two that changed places, is called mistyped before anything is sent."""
+        letters = self.code.text.replace("-", "")
+        slips = [letters[:at] + other + letters[at + 1 :] for at in range(20) for other in code.LETTERS]
+        for first in range(20):
+            for second in range(first):
+                swapped = list(letters)
+                swapped[first], swapped[second] = swapped[second], swapped[first]
+                slips.append("".join(swapped))
+        for slip in slips:
+            if slip != letters:
+                self.assertIn("mistyped", str(self.assertRaises(BadCode, code.read, slip)))
+
+    def test_length_and_letters_are_named(self) -> None:
+        """A code that is too short, or has a letter that no code has, says so."""
+        self.assertIn("has 19", str(self.assertRaises(BadCode, code.read, self.code.text[:-1])))
+        self.assertIn("'U'", str(self.assertRaises(BadCode, code.read, "u" + self.code.text[1:])))
+
+    def test_code_names_its_operator(self) -> None:
+        """A code fits the operator that made it and not another one."""
+        self.assertTrue(self.code.fits(operator().public))
+        self.assertFalse(self.code.fits(operator(2).public))
+
+    def test_secret_is_not_shown(self) -> None:
+        """What a log prints of a code does not let anybody in."""
+        self.assertNotIn(str(self.code.secret), repr(self.code))
+
+    @given(st.text(max_size=30) | st.text("0123456789ABCDEFGHJKMNPQRSTVWXYZ-oil", min_size=18, max_size=24))
+    @settings(max_examples=300, deadline=None)
+    def test_reads_anything(self, text: str) -> None:
+        """Whatever is typed is a code or refused by name."""
+        try:
+            found = code.read(text)
+        except BadCode:
+            return
+        self.assertEqual(code.read(found.text), found)

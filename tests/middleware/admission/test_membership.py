@@ -1,0 +1,94 @@
+"""Tests of the files that members and operators keep."""
+
+from __future__ import annotations
+
+import os
+import random
+from pathlib import Path
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.admission import keyfile, membership
+from middleware.admission import operator as operators
+from middleware.admission.errors import BadKeyFile
+from middleware.admission.membership import Membership, MembershipFile
+from tests.middleware.admission.paper import NOW, identity, operator
+
+
+class MembershipTests(SynchronousTestCase):
+    """What lies on a member's disk, and on the operator's."""
+
+    def setUp(self) -> None:
+        self.path = Path(self.mktemp())
+        self.membership = operator().founded("vaio", ("device", "bootstrap"), NOW, random.Random(1))
+
+    def refusal(self, path: Path) -> str:
+        """What is said of the membership at ``path``."""
+        return str(self.assertRaises(BadKeyFile, MembershipFile, path))
+
+    def test_read_as_it_was_kept(self) -> None:
+        """A membership is the same after it was written, and nobody else can read its file."""
+        membership.made(self.path, self.membership)
+        self.assertEqual(MembershipFile(self.path).membership, self.membership)
+        self.assertEqual(self.path.stat().st_mode & 0o777, 0o600)
+
+    def test_readable_by_others_is_refused(self) -> None:
+        """A membership or an operator's key that others can read is refused, and the remedy named."""
+        membership.made(self.path, self.membership)
+        for mode in (0o640, 0o604, 0o620):
+            self.path.chmod(mode)
+            self.assertIn(f"say chmod 600 {self.path}", self.refusal(self.path))
+        key = Path(self.mktemp())
+        operators.made(key, operator())
+        self.assertEqual(operators.load(key), operator())
+        key.chmod(0o644)
+        self.assertIn("chmod 600", str(self.assertRaises(BadKeyFile, operators.load, key)))
+
+    def test_what_is_no_membership(self) -> None:
+        """A missing file, other content, another kind and another team's pass are each refused by name and path."""
+        self.assertIn("cannot be read", self.refusal(self.path))
+        foreign = operator(2).founded("vaio", ("device",), NOW, random.Random(1))
+        wrong = self.membership.packed() | {"pass": foreign.shown.hex()}
+        for content in (wrong, {"kind": "other"}, self.membership.packed() | {"secrets": []}):
+            keyfile.write(self.path, content)
+            self.assertIn(str(self.path), self.refusal(self.path))
+        self.path.write_text("not JSON")
+        self.assertIn(str(self.path), self.refusal(self.path))
+
+    def test_nothing_is_overwritten(self) -> None:
+        """To make a file where there is one is refused: a team's key is not lost by a slip."""
+        operators.made(self.path, operator())
+        self.assertRaises(BadKeyFile, operators.made, self.path, operator(2))
+        self.assertEqual(operators.load(self.path), operator())
+
+    def test_replaced_whole(self) -> None:
+        """A new secret replaces the file, leaves nothing beside it, and a folder that cannot be written says so."""
+        membership.made(self.path, self.membership)
+        kept = MembershipFile(self.path)
+        kept.keep(self.membership.with_secret(2, b"2" * 32, NOW + 60))
+        self.assertEqual(MembershipFile(self.path).membership, kept.membership)
+        leftover = [name for name in os.listdir(self.path.parent) if name.startswith(f".{self.path.name}")]
+        self.assertEqual(leftover, [])
+        nowhere = Path(self.mktemp()) / "folder" / "file"
+        self.assertIn(
+            "cannot be written", str(self.assertRaises(BadKeyFile, membership.made, nowhere, kept.membership))
+        )
+
+    def test_old_secrets_run_out(self) -> None:
+        """After a rotation the secret before is accepted for its grace and no longer, in whatever order they came."""
+        first = self.membership.secrets[0][1]
+        second, third = (2, b"2" * 32, NOW + 60), (3, b"3" * 32, NOW + 90)
+        for order in ((second, third), (third, second)):
+            held: Membership = self.membership
+            for each in order:
+                held = held.with_secret(*each)
+            self.assertEqual([s for _, s, _ in held.accepted(NOW)], [third[1], second[1], first])
+            self.assertEqual([s for _, s, _ in held.accepted(NOW + 60)], [third[1], second[1]])
+            self.assertEqual([s for _, s, _ in held.accepted(NOW + 90)], [third[1]])
+
+    def test_secrets_are_not_shown(self) -> None:
+        """What a log prints of a membership or an operator holds no secret."""
+        shown = repr(self.membership) + repr(operator())
+        for secret in (self.membership.seed, self.membership.secrets[0][1], operator().seed):
+            self.assertNotIn(repr(secret)[2:-1], shown)
+        self.assertNotEqual(identity("dog"), self.membership.identity)

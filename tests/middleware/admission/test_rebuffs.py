@@ -1,0 +1,57 @@
+"""Tests of what is remembered of refusals in a closed team: who, by whom, why, and what to do."""
+
+from __future__ import annotations
+
+from middleware.admission.errors import NotWelcome
+from middleware.entangled.wire.rebuff import Rebuff
+from tests.middleware.admission.village import House, VillageCase
+
+
+class RebuffTests(VillageCase):
+    """What ``rebuffs`` has after refusals."""
+
+    def met(self, house: House, side: str) -> list[Rebuff]:
+        """The refusals that a house met on one side."""
+        now = house.node.endpoint.rebuffs.newest(1e9, 1e10)
+        return [each for each in now if each.side == side]
+
+    def test_revoked_member(self) -> None:
+        """A revoked member stands with those who put it out, and they with it, each with the remedy."""
+        village = self.village()
+        dog = village.welcome("dog")
+        village.run(3.0)
+        village.tell(village.signer.revoke(dog.public, "dog", village.wall()))
+        village.run(10.0)
+        (ours, *_), (theirs, *_) = self.met(village.houses[0], "we"), self.met(dog, "they")
+        self.assertEqual((ours.who, ours.code), (dog.public, "revoked"))
+        self.assertEqual((theirs.who, theirs.code), (village.houses[0].public, "revoked"))
+        for each in (ours, theirs):
+            self.assertIn("; only a new code lets that node in again", each.reason)
+
+    def test_newcomers(self) -> None:
+        """A used code stands with its holder's key; codes that nobody knows are one, however many there were."""
+        village = self.village()
+        code = village.invite()
+        first, second = village.knock(code), village.knock(code)
+        others = [village.knock(self.village(seed=seed).invite(), timeout=3.0) for seed in (2, 3, 4)]
+        village.run(4.0)
+        self.successResultOf(first)
+        self.failureResultOf(second, NotWelcome)
+        for each in others:
+            self.failureResultOf(each, NotWelcome)
+        found = {each.code: each for each in self.met(village.houses[0], "code")}
+        self.assertEqual(sorted(found), ["unknown", "used"])
+        self.assertEqual((len(found["used"].who), found["unknown"].who), (32, b""))
+        self.assertGreaterEqual(found["unknown"].count, 3)
+
+    def test_copy_of_a_store(self) -> None:
+        """A copy that was started later takes the place of the first, whose peers and itself say that it was so."""
+        village = self.village()
+        dog = village.welcome("dog")
+        village.run(3.0)
+        copy = village.move_in(dog.kept.membership)
+        village.run(5.0)
+        self.assertEqual({each.code for each in self.met(dog, "they")}, {"superseded"})
+        ours = [(each.who, each.code) for each in self.met(village.houses[0], "we")]
+        self.assertEqual(ours, [(dog.public, "superseded")])
+        self.assertEqual(self.met(copy, "they"), [])

@@ -1,0 +1,148 @@
+"""Tests of the bootstrap node's side of admission, with nothing around it."""
+
+from __future__ import annotations
+
+import random
+from typing import Any
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from nacl import bindings
+from twisted.internet.defer import Deferred, fail, succeed
+from twisted.logger import capturedLogs, formatEvent
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.admission import knock
+from middleware.admission.knock import Welcome
+from middleware.admission.reception import HINTS, RATE, Reception
+from middleware.admission.roll import Roll
+from middleware.entangled.errors import Full, NoAnswer
+from middleware.entangled.network.network import Address
+from tests.middleware.admission.paper import NOW, granted, identity, invited, operator, roll
+
+OPERATOR = operator()
+CODE, PACKED, INVITE = invited(OPERATOR)
+DOOR = Address("10.0.0.2", 9000)
+SECRET = b"e" * 32
+DOG = identity("dog").public
+
+
+class ReceptionTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.now = 0.0
+        self.sent: list[tuple[bytes, Address]] = []
+        self.roll: Roll = roll(OPERATOR, granted(OPERATOR, "vaio", "bootstrap"), PACKED)
+        self.taken: Deferred[bool] = succeed(True)
+        self.admit: Any = lambda packed: self.roll.add(packed, NOW)
+        self.reception = Reception(
+            self.roll,
+            identity("vaio"),
+            lambda invite: self.taken,
+            lambda packed: self.admit(packed),
+            lambda shown: Welcome(OPERATOR.public, "yard", shown, ((1, b"s" * 32, 0),)),
+            lambda datagram, to: self.sent.append((datagram, to)),
+            lambda: self.now,
+            lambda: NOW,
+            random.Random(1),
+        )
+
+    def knocked(self, dice: int = 1, name: str = "dog", secret: bytes = SECRET) -> bytes:
+        """A lawful KNOCK, other bytes for other dice."""
+        shared = bindings.crypto_scalarmult_base(secret)
+        return knock.knock(CODE.key, identity(name).public, shared, "", random.Random(dice))
+
+    def answer(self) -> Welcome | str:
+        """What the last answer says."""
+        return knock.opened_welcome(self.sent[-1][0], INVITE.public, SECRET)
+
+    def test_let_in(self) -> None:
+        """A lawful knock is answered once, to where it came from, and never with more bytes than it has."""
+        said = self.knocked()
+        self.reception.on_knock(said, DOOR)
+        self.assertIsInstance(self.answer(), Welcome)
+        self.assertEqual([to for _, to in self.sent], [DOOR])
+        self.assertLessEqual(len(self.sent[0][0]), len(said))
+        assert self.roll.admitted(DOG) is not None
+
+    def test_repeated_knock_costs_nothing(self) -> None:
+        """The same datagram again gets the same bytes again, wherever it comes from, and uses no code."""
+        said = self.knocked()
+        self.reception.on_knock(said, DOOR)
+        self.taken = Deferred()  # who asked for another use would wait for it
+        self.reception.on_knock(said, Address("10.0.0.3", 1))
+        self.assertEqual(self.sent[0][0], self.sent[1][0])
+
+    def test_answer_under_way(self) -> None:
+        """While a use is being taken the same newcomer's knocks wait; then it is answered once."""
+        self.taken = Deferred()
+        for dice in range(3):
+            self.reception.on_knock(self.knocked(dice), DOOR)
+        self.assertEqual(self.sent, [])
+        self.taken.callback(True)
+        self.assertEqual(len(self.sent), 1)
+
+    def test_nobody_can_tell(self) -> None:
+        """Where too few are in sight, or the roll is full, the newcomer is told to come again, and nobody is let in."""
+        self.taken = fail(NoAnswer("too few"))
+        self.reception.on_knock(self.knocked(1), DOOR)
+        self.assertEqual(self.answer(), "later")
+        self.taken = succeed(True)
+
+        def full(packed: bytes) -> None:
+            raise Full("no room")
+
+        self.admit = full
+        with capturedLogs() as said:
+            self.reception.on_knock(self.knocked(2), DOOR)
+        self.assertEqual(self.answer(), "later")
+        self.assertIn("no room", "".join(formatEvent(event) for event in said))
+        self.assertIsNone(self.roll.admitted(DOG))
+
+    def test_strangers_get_nothing(self) -> None:
+        """What names a known invitation and does not open gets no answer, and keeps nobody with the code from one."""
+        said = self.knocked()
+        for number in range(int(RATE) * 3):
+            forged = bytearray(said)
+            forged[40 + number] ^= 1
+            self.reception.on_knock(bytes(forged), DOOR)
+        self.assertEqual(self.sent, [])
+        self.reception.on_knock(said, DOOR)
+        self.assertIsInstance(self.answer(), Welcome)
+
+    def test_key_that_is_none(self) -> None:
+        """A newcomer whose ephemeral key is none gets no answer, and no log is filled for it."""
+        bad = knock.knock(CODE.key, DOG, bytes(32), "", random.Random(1))
+        self.reception.on_knock(bad, DOOR)
+        self.assertEqual((self.sent, self.flushLoggedErrors()), ([], []))
+
+    def test_hints_are_few_and_short(self) -> None:
+        """Unknown codes are answered by nine bytes, at most so many a second, and logged once."""
+        strange = bytearray(self.knocked())
+        strange[1] ^= 1
+        with capturedLogs() as said:
+            for _ in range(1000):
+                self.reception.on_knock(bytes(strange), DOOR)
+        self.assertEqual((len(self.sent), {len(each) for each, _ in self.sent}), (int(HINTS), {9}))
+        self.assertEqual(len(said), 1)
+
+    def test_checks_are_few(self) -> None:
+        """Of many that have the code only so many a second are looked at; a second later others are."""
+        for number in range(int(RATE) + 10):
+            self.reception.on_knock(self.knocked(name=f"dog{number}"), DOOR)
+        self.assertEqual(len(self.sent), int(RATE))
+        self.now = 1.0
+        self.reception.on_knock(self.knocked(name="another"), DOOR)
+        self.assertEqual(len(self.sent), int(RATE) + 1)
+
+    @given(st.data())
+    @settings(max_examples=150, deadline=None)
+    def test_takes_anything(self, data: st.DataObject) -> None:
+        """Whatever comes raises nothing, and is answered with fewer bytes than it has, or not at all."""
+        said = bytearray(self.knocked())
+        for place in data.draw(st.lists(st.integers(0, len(said) - 1), max_size=3)):
+            said[place] ^= data.draw(st.integers(0, 255))
+        cut = bytes(said[: data.draw(st.integers(1, len(said)) | st.just(len(said)))])
+        before = len(self.sent)
+        self.now += 1.0
+        self.reception.on_knock(cut, DOOR)
+        self.assertLessEqual(sum(len(each) for each, _ in self.sent[before:]), len(cut))

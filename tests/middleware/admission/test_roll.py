@@ -1,0 +1,109 @@
+"""Tests of the roll."""
+
+from __future__ import annotations
+
+import random
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.admission.certificate import member_of
+from middleware.admission.roll import MAX_SECRETS, Roll, invitation_id, packed_admission
+from middleware.admission.statement import REMEMBERED
+from middleware.entangled.errors import Forged, Malformed
+from tests.middleware.admission.paper import LATER, NOW, admitted, granted, identity, invited, operator, roll
+
+OPERATOR = operator()
+DOG, VAIO = identity("dog").public, identity("vaio").public
+
+
+def entries() -> list[bytes]:
+    """Statements of every kind, some of them about the same thing."""
+    dice = random.Random(1)
+    found = [granted(OPERATOR, "vaio", "bootstrap"), OPERATOR.grant(DOG, "dog", ("viewer",), NOW + 1)]
+    found += [granted(OPERATOR, "dog"), invited(OPERATOR)[1], packed_admission(DOG, admitted(OPERATOR, "dog"))]
+    found += [OPERATOR.revoke(DOG, "dog", NOW + n) for n in (5, 4)]
+    return found + [OPERATOR.rotate(n, [DOG], NOW, 60, dice) for n in range(1, MAX_SECRETS + 3)]
+
+
+ENTRIES = entries()
+
+
+class RollTests(SynchronousTestCase):
+    """What a node knows of its team."""
+
+    def test_foreign_statements_are_refused(self) -> None:
+        """What another team's operator signed, or nobody, never enters."""
+        mine = Roll(OPERATOR.public)
+        self.assertRaises(Forged, mine.add, granted(operator(2), "dog"), NOW)
+        self.assertRaises(Forged, mine.add, packed_admission(DOG, admitted(operator(2), "dog")), NOW)
+        self.assertRaises(Malformed, mine.add, b"junk", NOW)
+        self.assertEqual((len(mine), mine.digest), (0, bytes(8)))
+
+    def test_known_is_not_new(self) -> None:
+        """What is known already is not told on: adding it again gives nothing."""
+        mine = Roll(OPERATOR.public)
+        self.assertIsNotNone(mine.add(ENTRIES[0], NOW))
+        self.assertIsNone(mine.add(ENTRIES[0], NOW))
+
+    def test_later_word_holds(self) -> None:
+        """Of two grants for one key the later holds, whichever comes first; a revocation keeps its first moment."""
+        for order in (ENTRIES, ENTRIES[::-1]):
+            mine = roll(OPERATOR, *order)
+            found, revocation = mine.granted(DOG), mine.revoked(DOG)
+            assert found is not None and revocation is not None
+            self.assertEqual((found[0].roles, revocation.at), (("viewer",), NOW + 4))
+
+    @given(st.permutations(ENTRIES))
+    @settings(max_examples=60, deadline=None)
+    def test_order_does_not_matter(self, order: list[bytes]) -> None:
+        """Two rolls that heard the same in any order know the same, and have one digest."""
+        self.assertEqual(roll(OPERATOR, *order).digest, roll(OPERATOR, *ENTRIES).digest)
+
+    def test_revoked_key(self) -> None:
+        """Who is revoked is refused for good, whatever is granted to the same key afterwards."""
+        shown = admitted(OPERATOR, "dog")
+        member = member_of(OPERATOR.public, DOG, shown)
+        mine = roll(OPERATOR, OPERATOR.revoke(DOG, "dog", NOW), OPERATOR.grant(DOG, "dog", ("device",), NOW + 9))
+        self.assertEqual(mine.refusal(member, NOW + 9), "revoked")
+        self.assertEqual(mine.members(NOW + 9), [])
+
+    def test_revoked_invitation(self) -> None:
+        """With an invitation all that came by it are revoked, and nobody else."""
+        mine = roll(OPERATOR, granted(OPERATOR, "vaio", "bootstrap"))
+        for seed, name in enumerate(("dog", "cat")):
+            shown = admitted(OPERATOR, name, seed=seed)
+            mine.add(packed_admission(identity(name).public, shown), NOW)
+        mine.add(OPERATOR.revoke(invited(OPERATOR, "dog", seed=0)[2].public, "dog", NOW), NOW)
+        self.assertEqual([each.name for each in mine.members(NOW)], ["cat", "vaio"])
+
+    def test_whom_a_revoked_bootstrap_lets_in(self) -> None:
+        """Whom a bootstrap node let in before it was revoked stays; whom it lets in afterwards does not."""
+        mine = roll(OPERATOR, OPERATOR.revoke(VAIO, "vaio", NOW + 10))
+        for now, refusal in ((NOW + 9, ""), (NOW + 10, "revoked")):
+            member = member_of(OPERATOR.public, DOG, admitted(OPERATOR, "dog", now=now))
+            self.assertEqual(mine.refusal(member, NOW + 20), refusal)
+
+    def test_what_has_run_out_goes(self) -> None:
+        """An invitation that ran out is remembered for a week, so that it is refused by name, and then forgotten."""
+        _, packed, invite = invited(OPERATOR)
+        mine = roll(OPERATOR, packed)
+        name = invitation_id(invite.public)
+        self.assertEqual(mine.expire(NOW + LATER + REMEMBERED - 1), 0)
+        self.assertIsNotNone(mine.invited(name))
+        self.assertEqual(mine.expire(NOW + LATER + REMEMBERED), 1)
+        self.assertEqual((mine.invited(name), mine.digest), (None, bytes(8)))
+        self.assertIsNone(mine.add(packed, NOW + LATER + REMEMBERED))
+
+    def test_newest_secrets_stay(self) -> None:
+        """Of the team's secrets the newest few are remembered."""
+        numbers = [secret.number for secret in roll(OPERATOR, *ENTRIES).secrets()]
+        self.assertEqual(numbers, [6, 5, 4, 3])
+
+    def test_name_of_a_member(self) -> None:
+        """Members are listed by the operator's latest word: a promotion shows, and the admission is remembered."""
+        mine = roll(OPERATOR, packed_admission(DOG, admitted(OPERATOR, "dog")))
+        mine.add(OPERATOR.grant(DOG, "dog", ("device", "bootstrap"), NOW + 1), NOW)
+        [member] = mine.members(NOW + 2)
+        self.assertEqual((member.roles, member.admitter), (("device", "bootstrap"), VAIO))

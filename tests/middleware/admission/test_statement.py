@@ -1,0 +1,97 @@
+"""Tests of what an operator signs."""
+
+from __future__ import annotations
+
+import random
+from typing import Any
+
+import msgpack
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.admission.statement import (
+    MAX_LIFE,
+    MAX_SEALED,
+    Grant,
+    Invite,
+    Revoke,
+    Secret,
+    opened,
+    sealed_secret,
+    signed,
+)
+from middleware.entangled.errors import Forged, Malformed
+from tests.middleware.admission.paper import NOW, identity, operator
+
+DOG, CAT = identity("dog"), identity("cat")
+GRANT = Grant(DOG.public, "dog", ("device", "bootstrap"), NOW, NOW + 10)
+INVITE = Invite(DOG.public, "dog", ("viewer",), 3, NOW, NOW + 10, 1000)
+REVOKE = Revoke(DOG.public, "dog", NOW, NOW + MAX_LIFE)
+
+
+class StatementTests(SynchronousTestCase):
+    """Packing, signing, checking."""
+
+    def setUp(self) -> None:
+        self.operator = operator().identity
+        self.secret = sealed_secret(b"s" * 32, 2, [DOG.public], NOW, 60, random.Random(1))
+
+    def test_each_is_read_as_it_was_signed(self) -> None:
+        """Every kind of statement comes out of its packed form as it went in."""
+        for each in (GRANT, INVITE, REVOKE, self.secret):
+            self.assertEqual(opened(self.operator.public, signed(self.operator, each)), each)
+
+    def test_only_this_operator_counts(self) -> None:
+        """What another operator signed is forged here, and so is what was changed by one bit anywhere."""
+        packed = signed(self.operator, GRANT)
+        self.assertRaises(Forged, opened, operator(2).public, packed)
+        for place in range(len(packed)):
+            changed = packed[:place] + bytes([packed[place] ^ 1]) + packed[place + 1 :]
+            self.assertRaises((Forged, Malformed), opened, self.operator.public, changed)
+
+    def test_secret_opens_for_those_that_stay(self) -> None:
+        """The team's new secret can be read by whom it was sealed for and by nobody else."""
+        self.assertEqual(self.secret.opened(DOG), b"s" * 32)
+        self.assertIsNone(self.secret.opened(CAT))
+        stolen = Secret(2, NOW, 60, NOW + 100, self.secret.mark, ((CAT.public, self.secret.sealed[0][1]),))
+        self.assertIsNone(stolen.opened(CAT))
+
+    def test_secret_for_many(self) -> None:
+        """The fullest secret can be signed and read."""
+        keys = [identity(str(number)).public for number in range(MAX_SEALED)]
+        secret = sealed_secret(b"s" * 32, 2**40, keys, NOW, MAX_LIFE, random.Random(1))
+        self.assertEqual(opened(self.operator.public, signed(self.operator, secret)), secret)
+
+    def test_unlawful_is_not_signed(self) -> None:
+        """An operator's slip is refused before it is signed: an empty name, no role, no time, too many uses."""
+        wrong: list[Any] = [
+            Grant(DOG.public, "", ("device",), NOW, NOW + 1),
+            Grant(DOG.public, "dog", (), NOW, NOW + 1),
+            Grant(DOG.public, "dog", ("device",), NOW, NOW),
+            Grant(DOG.public[:-1], "dog", ("device",), NOW, NOW + 1),
+            Invite(DOG.public, "dog", ("device",), 0, NOW, NOW + 1, 1),
+            Invite(DOG.public, "dog", ("device",), 101, NOW, NOW + 1, 1),
+            Secret(1, NOW, 1, NOW + 1, bytes(16), ()),
+        ]
+        for each in wrong:
+            self.assertRaises(ValueError, signed, self.operator, each)
+
+    def test_one_form_only(self) -> None:
+        """The same statement packed in a longer way is malformed, or two digests would name one thing."""
+        packed = signed(self.operator, REVOKE)
+        fields = msgpack.unpackb(packed)
+        longer = b"\xdc" + len(fields).to_bytes(2) + packed[1:]
+        self.assertEqual(msgpack.unpackb(longer), fields)
+        self.assertRaises(Malformed, opened, self.operator.public, longer)
+
+    @given(
+        st.binary(max_size=300)
+        | st.lists(st.integers() | st.binary(max_size=70) | st.text(max_size=8), max_size=9).map(
+            lambda fields: msgpack.packb([f % 2**63 if isinstance(f, int) else f for f in fields])
+        )
+    )
+    @settings(max_examples=400, deadline=None)
+    def test_reads_anything(self, packed: bytes) -> None:
+        """Whatever bytes come are malformed or forged, and never anything else."""
+        self.assertRaises((Forged, Malformed), opened, operator().public, packed)

@@ -1,0 +1,346 @@
+"""Tests of whole teams: joining by code, revoking, rotating, promoting."""
+
+from __future__ import annotations
+
+from twisted.logger import capturedLogs, formatEvent
+
+from middleware.admission.errors import NotWelcome
+from middleware.admission.membership import Membership
+from middleware.entangled.errors import NoAnswer, NotAcknowledged, NotAdmitted
+from middleware.entangled.network.network import Address
+from tests.middleware.admission.paper import operator
+from tests.middleware.admission.village import VillageCase
+
+
+class JoiningTests(VillageCase):
+    """By a code into a team."""
+
+    def test_join_by_code(self) -> None:
+        """A newcomer with a code gets certificate, secret and contacts, and is then a member that others talk to."""
+        village = self.village()
+        dog = village.welcome("dog")
+        self.assertEqual((dog.name, dog.team.door.me.roles), ("dog", ("device",)))
+        village.run(3.0)
+        self.assertEqual(village.members(), ["dog", "vaio"])
+        answer = village.houses[0].node.call(village.contact(dog), "ping", bytes(8), changes=True)
+        village.run(1.0)
+        self.successResultOf(answer)
+
+    def test_used_code(self) -> None:
+        """A code for one newcomer lets in one; the next hears that it was used."""
+        village = self.village()
+        code = village.invite()
+        first, second = village.knock(code), village.knock(code)
+        village.run(3.0)
+        outcomes = [str(getattr(self.failureResultOf(second, NotWelcome).value, "code", ""))]
+        self.assertIsInstance(self.successResultOf(first), Membership)
+        self.assertEqual(outcomes, ["used"])
+        self.assertEqual(village.members(), ["dog", "vaio"])
+
+    def test_same_newcomer_again(self) -> None:
+        """Who lost the answer and knocks again, at another bootstrap node, gets the same pass for one use."""
+        village = self.village(bootstraps=2)
+        code, seed = village.invite(), b"d" * 32
+        passes = []
+        for door in (0, 1):
+            knocked = village.knock(code, (door,), seed=seed)
+            village.run(3.0)
+            passes.append(self.successResultOf(knocked).shown)
+        self.assertEqual(passes[0], passes[1])
+
+    def test_expired_and_unknown_code(self) -> None:
+        """A code that ran out, and one of another team, are each refused by name."""
+        village = self.village()
+        code = village.invite(expires=10.0)
+        village.run(10.0)
+        late, foreign = village.knock(code), village.knock(self.village(seed=2).invite(), timeout=3.0)
+        village.run(4.0)
+        self.assertEqual(self.failureResultOf(late, NotWelcome).value.code, "expired")
+        self.assertEqual(self.failureResultOf(foreign, NotWelcome).value.code, "unknown")
+
+    def test_nobody_there(self) -> None:
+        """Where nobody answers the newcomer says so, and which address it tried."""
+        village = self.village()
+        knocked = village.knock(village.invite(), (77,), timeout=2.0)
+        village.run(2.5)
+        self.assertIn(str(village.address(77)), str(self.failureResultOf(knocked, NoAnswer).value))
+
+    def test_second_bootstrap(self) -> None:
+        """Where the first bootstrap node is gone, the newcomer comes in by the second."""
+        village = self.village(bootstraps=3)
+        code = village.invite()
+        village.close(village.houses[1], is_sudden=True)
+        knocked = village.knock(code, (1, 2))
+        village.run(15.0)
+        self.assertEqual(self.successResultOf(knocked).member.name, "dog")
+
+    def test_member_that_is_no_bootstrap(self) -> None:
+        """A plain member lets nobody in and says so; promoted by the operator it does, without a restart."""
+        village = self.village()
+        dog = village.welcome("dog")
+        code = village.invite("cat")
+        village.run(2.0)
+        refused = village.knock(code, (1,), timeout=2.0)
+        village.run(3.0)
+        self.assertEqual(self.failureResultOf(refused, NotWelcome).value.code, "role")
+        village.tell(village.signer.grant(dog.public, "dog", ("device", "bootstrap"), village.wall()))
+        village.run(2.0)
+        knocked = village.knock(code, (1,))
+        village.run(3.0)
+        cat = village.move_in(self.successResultOf(knocked))
+        village.run(2.0)
+        self.assertEqual((cat.team.door.me.admitter, village.members()), (dog.public, ["cat", "dog", "vaio"]))
+
+    def test_many_by_one_code(self) -> None:
+        """A code for three lets in three, by the names they wish for or numbered, and no name twice."""
+        village = self.village()
+        code = village.invite("pupil", uses=3)
+        names: list[str] = []
+        for wish in ("", "kim", "", "kim"):
+            knocked = village.knock(code, wish=wish)
+            village.run(2.0)
+            knocked.addCallbacks(lambda came: names.append(came.member.name), lambda no: names.append(no.value.code))
+        self.assertEqual(names, ["pupil-1", "kim", "pupil-2", "used"])
+
+    def test_code_made_while_the_others_are_gone(self) -> None:
+        """Who is left alone suddenly can make no code yet, and is told in one line what to wait for."""
+        village = self.village(bootstraps=3)
+        village.run(5.0)
+        for house in village.houses[1:]:
+            village.close(house, is_sudden=True)
+        _, packed = village.signer.invite("dog", ("device",), 2, village.wall(), 3600.0, village.dice)
+        told = village.tell(packed)
+        village.run(20.0)
+        text = str(self.failureResultOf(told, NotAcknowledged).value)
+        self.assertIn("in two minutes", text)
+        self.assertEqual(len(text.splitlines()), 1)
+
+    def test_uses_across_a_cut(self) -> None:
+        """While bootstrap nodes are cut off from each other no code is used more often than it says, on both sides."""
+        village = self.village(bootstraps=5)
+        village.run(5.0)
+        code = village.invite(uses=2)
+        village.run(2.0)
+        sides = [[village.address(place) for place in side] for side in ((0, 1, 2), (3, 4))]
+        village.board.partition([*sides[0], *self._newcomers(1, 4)], [*sides[1], *self._newcomers(4, 7)])
+        village.lives = 0
+        knocks = [village.knock(code, (0,), timeout=8.0) for _ in range(3)]
+        knocks += [village.knock(code, (4,), timeout=8.0) for _ in range(3)]
+        came: list[str] = []
+        for each in knocks:
+            each.addCallbacks(lambda found: came.append("in"), lambda no: came.append(no.value.code))
+        village.run(10.0)
+        village.board.heal()
+        village.run(10.0)
+        more = [village.knock(code, (place,), timeout=8.0) for place in range(5)]
+        for each in more:
+            each.addCallbacks(lambda found: came.append("in"), lambda no: came.append(no.value.code))
+        village.run(20.0)
+        self.assertEqual(came.count("in"), 2, came)
+        self.assertIn("used", came)
+
+    @staticmethod
+    def _newcomers(first: int, last: int) -> list[Address]:
+        return [Address("10.0.0.2", 9000 + number) for number in range(first, last)]
+
+
+class RevocationTests(VillageCase):
+    """Out of a team again."""
+
+    def test_revoked_member(self) -> None:
+        """Who is revoked is parted with at once by everybody, is told why, and does not come in again."""
+        village = self.village()
+        dog, cat = village.welcome("dog"), village.welcome("cat")
+        village.run(3.0)
+        village.tell(village.signer.revoke(dog.public, "dog", village.wall()))
+        village.run(2.0)
+        for house in (village.houses[0], cat):
+            asked = house.node.call(village.contact(dog), "ping", bytes(8), changes=True)
+            other = dog.node.call(village.contact(house), "ping", bytes(8), changes=True)
+            village.run(2.0)
+            self.assertEqual(self.failureResultOf(asked, NotAdmitted).value.code, "revoked")
+            self.assertEqual(self.failureResultOf(other, NotAdmitted).value.code, "revoked")
+        self.assertEqual(village.members(), ["cat", "vaio"])
+
+    def test_revoked_invitation(self) -> None:
+        """With an invitation all that came by it go, and the code opens no more."""
+        village = self.village()
+        code = village.invite("pupil", uses=3)
+        knocked = village.knock(code)
+        village.run(2.0)
+        pupil = village.move_in(self.successResultOf(knocked))
+        village.run(2.0)
+        invitation = village.houses[0].team.roll.invites()[0].public
+        village.tell(village.signer.revoke(invitation, "pupil", village.wall()))
+        village.run(2.0)
+        again = village.knock(code)
+        asked = village.houses[0].node.call(village.contact(pupil), "ping", bytes(8), changes=True)
+        village.run(3.0)
+        self.assertEqual(self.failureResultOf(again, NotWelcome).value.code, "revoked")
+        self.assertEqual(self.failureResultOf(asked, NotAdmitted).value.code, "revoked")
+
+    def test_restart_remembers(self) -> None:
+        """A node that starts anew, alone, still refuses who was revoked in its last life."""
+        village = self.village()
+        dog = village.welcome("dog")
+        village.run(2.0)
+        village.tell(village.signer.revoke(dog.public, "dog", village.wall()))
+        village.run(2.0)
+        village.close(village.houses[0], is_sudden=True)
+        village.run(2.0)
+        village.open(village.houses[0])
+        village.run(2.0)
+        asked = dog.node.call(village.contact(village.houses[0]), "ping", bytes(8), changes=True)
+        village.run(3.0)
+        self.assertEqual(self.failureResultOf(asked, NotAdmitted).value.code, "revoked")
+
+    def test_team_of_twenty_with_cuts(self) -> None:
+        """In a team of 20 a revocation is in force within 10 s, and behind a cut within 10 s of its end."""
+        village = self.village(bootstraps=20)
+        village.run(10.0)
+        thief = village.houses[19]
+        far = [village.address(place) for place in range(12, 19)]
+        village.board.partition(far)
+        village.run(5.0)
+        village.tell(village.signer.revoke(thief.public, "boot19", village.wall()))
+        village.run(10.0)
+        knows = [house.team.roll.revoked(thief.public) is not None for house in village.houses]
+        self.assertEqual(knows[:12], [True] * 12)
+        self.assertEqual(knows[12:19], [False] * 7)
+        village.board.heal()
+        village.run(10.0)
+        knows = [house.team.roll.revoked(thief.public) is not None for house in village.houses[:19]]
+        self.assertEqual(knows, [True] * 19)
+        for place in (3, 15):
+            asked = thief.node.call(village.contact(village.houses[place]), "ping", bytes(8), changes=True)
+            village.run(3.0)
+            self.assertEqual(self.failureResultOf(asked, NotAdmitted).value.code, "revoked")
+
+
+class RotationTests(VillageCase):
+    """A new secret for those that stay."""
+
+    def test_rotation(self) -> None:
+        """After a rotation all members go by the new secret, sessions and new ones work, and newcomers get it."""
+        village = self.village()
+        houses = [village.houses[0], village.welcome("dog"), village.welcome("cat")]
+        village.run(3.0)
+        members = [member.public for member in houses[0].team.members()]
+        village.tell(village.signer.rotate(2, members, village.wall(), 60.0, village.dice))
+        village.run(3.0)
+        self.assertEqual({house.kept.membership.secrets[0][0] for house in houses}, {2})
+        pig = village.welcome("pig", doors=(0,))
+        self.assertEqual(pig.kept.membership.secrets[0], houses[0].kept.membership.secrets[0])
+        asked = pig.node.call(village.contact(houses[2]), "ping", bytes(8), changes=True)
+        village.run(2.0)
+        self.successResultOf(asked)
+
+    def slept(self, grace: float, seconds: float) -> int:
+        """The number of the secret of a member that was off during a rotation and for so long after it."""
+        village = self.village()
+        dog = village.welcome("dog")
+        village.run(2.0)
+        village.close(dog)
+        members = [member.public for member in village.houses[0].team.members()]
+        village.tell(village.signer.rotate(2, members, village.wall(), grace, village.dice))
+        village.run(seconds)
+        village.open(dog)
+        village.run(8.0)
+        return int(dog.kept.membership.secrets[0][0])
+
+    def test_who_slept_through_it(self) -> None:
+        """A member that was off during a rotation comes back by the old secret and is given the new one."""
+        self.assertEqual(self.slept(grace=600.0, seconds=5.0), 2)
+
+    def test_who_came_meanwhile(self) -> None:
+        """A member for whom the new secret was not sealed asks another one for it."""
+        village = self.village()
+        dog = village.welcome("dog")
+        village.run(2.0)
+        village.tell(village.signer.rotate(2, [village.houses[0].public], village.wall(), 600.0, village.dice))
+        village.run(12.0)
+        self.assertEqual(dog.kept.membership.secrets, village.houses[0].kept.membership.secrets)
+
+    def test_old_secret_ends(self) -> None:
+        """When the grace is over the old secret opens nothing any more."""
+        self.assertEqual(self.slept(grace=30.0, seconds=40.0), 1)
+
+
+class StrangersTests(VillageCase):
+    """Who looks like a member and is none."""
+
+    def test_certificate_of_another_team(self) -> None:
+        """Who knows the secret and shows a pass of another operator is refused as foreign, and both say so once."""
+        village = self.village()
+        first = village.houses[0].kept.membership
+        stranger = operator(9).founded("spy", ("device",), village.wall(), village.dice, first.secrets[0][1])
+        with capturedLogs() as said:
+            spy = village.move_in(stranger)
+            for _ in range(5):
+                asked = spy.node.call(village.contact(village.houses[0]), "ping", bytes(8), changes=True)
+                village.run(2.0)
+                self.assertEqual(self.failureResultOf(asked, NotAdmitted).value.code, "foreign")
+        lines = [formatEvent(event) for event in said]
+        for words in ("is not let in: ", "does not let this node in: "):
+            self.assertEqual(sum(f"{words}the certificate is not one of this team" in line for line in lines), 1)
+        self.assertEqual(village.members(), ["vaio"])
+
+    def test_stranger_is_told_where_to_look(self) -> None:
+        """Who does not know the team's secret hears no answer at all, and its log says once who can tell why."""
+        village = self.village()
+        with capturedLogs() as said:
+            village.move_in(operator(9).founded("spy", ("device",), village.wall(), village.dice))
+            village.run(40.0)
+        self.assertEqual(sum("swarm doctor SETTINGS" in formatEvent(event) for event in said), 1)
+
+    def test_stolen_membership(self) -> None:
+        """Of two nodes with one membership only the later one is let in, and the other is told why."""
+        village = self.village()
+        dog = village.welcome("dog")
+        village.run(5.0)
+        village.move_in(dog.kept.membership)
+        village.run(3.0)
+        asked = dog.node.call(village.contact(village.houses[0]), "ping", bytes(8), changes=True)
+        village.run(3.0)
+        self.assertIn(self.failureResultOf(asked, NotAdmitted).value.code, ("superseded", "doubled"))
+
+    def test_expired_member(self) -> None:
+        """When the time of a certificate is over its member is parted with, though a session is open."""
+        village = self.village()
+        code, packed = village.signer.invite("dog", ("device",), 1, village.wall(), 3600.0, village.dice, life=30.0)
+        village.tell(packed)
+        village.run(1.0)
+        knocked = village.knock(code.text)
+        village.run(2.0)
+        dog = village.move_in(self.successResultOf(knocked))
+        village.run(20.0)
+        self.assertEqual(village.members(), ["dog", "vaio"])
+        village.run(20.0)
+        self.assertEqual(village.members(), ["vaio"])
+        asked = village.houses[0].node.call(village.contact(dog), "ping", bytes(8), changes=True)
+        village.run(3.0)
+        self.assertEqual(self.failureResultOf(asked, NotAdmitted).value.code, "expired")
+
+    def test_expired_by_its_own_clock(self) -> None:
+        """A node whose certificate does not hold by its own clock says so when it starts, with both remedies."""
+        village = self.village()
+        old = village.signer.founded("dog", ("device",), village.wall() - 366 * 86_400.0, village.dice)
+        with capturedLogs() as events:
+            village.move_in(old)
+        lines = [formatEvent(event) for event in events]
+        [line] = [line for line in lines if "of this node" in line]
+        for words in ("expired", "clock", "swarm invite"):
+            self.assertIn(words, line)
+
+    def test_refusals_are_logged_once(self) -> None:
+        """Who knocks again and again with a used code fills no log."""
+        village = self.village()
+        code, seed = village.invite(), b"s" * 32
+        village.knock(code)
+        village.run(2.0)
+        with capturedLogs() as said:
+            for _ in range(5):
+                refused = village.knock(code, seed=seed)
+                village.run(2.0)
+                self.failureResultOf(refused, NotWelcome)
+        self.assertEqual(sum("not let in by the invitation" in formatEvent(event) for event in said), 1)

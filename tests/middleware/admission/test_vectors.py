@@ -1,0 +1,73 @@
+"""Tests of the eighth section of ``docs/protocol.md`` by one of each thing with fixed keys: byte for byte."""
+
+from __future__ import annotations
+
+import json
+import random
+from pathlib import Path
+
+from nacl import bindings
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.admission import knock
+from middleware.admission.certificate import chained, guest_pass, pass_of, proof
+from middleware.admission.code import Code
+from middleware.admission.roll import digest_of, packed_admission
+from middleware.admission.statement import Grant, Invite, Revoke, sealed_secret, signed
+from middleware.entangled.identity import Identity
+from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.network.network import Address
+
+VECTORS = Path(__file__).parents[1] / "vectors" / "admission.json"
+NOW = 1_800_000_000
+
+
+class Counted(random.Random):
+    """Dice whose bytes count up, for the ephemeral keys and nonces of the vectors."""
+
+    def randbytes(self, n: int) -> bytes:
+        """``n`` bytes from 0 on."""
+        return bytes(range(n))
+
+
+def made() -> dict[str, str]:
+    """All of it, in hexadecimal but for the code."""
+    operator, vaio, dog, phone = (Identity(bytes([number]) * 32) for number in (1, 2, 3, 4))
+    code, dice = Code(0x123456789ABCDEF0123, 0x7D3A1), Counted()
+    grant = signed(operator, Grant(vaio.public, "vaio", ("gateway", "bootstrap"), NOW, NOW + 1000))
+    invite = Invite(code.key.public, "dog", ("device",), 2, NOW, NOW + 100, 500)
+    packed = signed(operator, invite)
+    secret = sealed_secret(b"s" * 32, 2, [vaio.public], NOW, 60, dice)
+    came = (dog.public, "rex", proof(code.key, dog.public, "rex"))
+    chain = chained(vaio, grant, (packed, invite), came, "rex", NOW + 1)
+    ephemeral = b"e" * 32
+    shared = bindings.crypto_scalarmult_base(ephemeral)
+    contact = Contact(vaio.public, Address("10.0.0.1", 7000))
+    given = knock.Welcome(operator.public, "yard", chain, ((2, b"s" * 32, NOW + 60),), (contact,), {"lan": True})
+    found = {
+        "grant": grant,
+        "invitation": packed,
+        "revocation": signed(operator, Revoke(dog.public, "rex", NOW, NOW + 2000)),
+        "secret": signed(operator, secret),
+        "pass by the operator": pass_of(grant),
+        "pass by a code": chain,
+        "pass of a guest": guest_pass(vaio, pass_of(grant), phone.public, "phone", NOW),
+        "admission": packed_admission(dog.public, chain),
+        "digest of the admission": digest_of(packed_admission(dog.public, chain)),
+        "KNOCK": knock.knock(code.key, dog.public, shared, "rex", dice),
+        "WELCOME": knock.welcome(code.key.public, shared, given, dice),
+        "WELCOME that refuses": knock.refusal(code.key.public, shared, "used", dice),
+    }
+    return {"code": code.text, **{name: whole.hex() for name, whole in found.items()}}
+
+
+class VectorTests(SynchronousTestCase):
+    """What is written down is what is made."""
+
+    def test_made_again(self) -> None:
+        """Code, statements, passes and both datagrams are made again byte for byte."""
+        self.assertEqual(made(), json.loads(VECTORS.read_text(encoding="utf-8")))
+
+
+if __name__ == "__main__":
+    VECTORS.write_text(json.dumps(made(), indent=1) + "\n", encoding="utf-8")

@@ -1,0 +1,166 @@
+"""Village: whole nodes of a closed team on one turned clock and one switchboard."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Sequence
+
+from twisted.internet.defer import Deferred
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.admission.code import Code, read
+from middleware.admission.doorkeeper import Anything
+from middleware.admission.membership import Membership, MemoryMembership
+from middleware.admission.newcomer import Newcomer
+from middleware.admission.operator import Operator
+from middleware.admission.team import Team
+from middleware.entangled.errors import NotRunning
+from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.network.network import Address
+from middleware.entangled.network.switchboard import CALM, Weather
+from middleware.entangled.node import EntangledNode
+from tests.fleet import World
+from tests.middleware.admission.paper import NOW, operator
+
+FIRST = ("device", "operator", "gateway", "bootstrap")
+
+
+class House:
+    """One node, its team, and what it keeps between its lives."""
+
+    def __init__(self, place: int, kept: MemoryMembership) -> None:
+        self.place = place
+        self.kept = kept
+        self.team: Team
+        self.node: EntangledNode
+
+    @property
+    def name(self) -> str:
+        """What the team calls it."""
+        return self.team.door.me.name
+
+    @property
+    def public(self) -> bytes:
+        """Its key."""
+        return self.kept.membership.identity.public
+
+
+class Village(World):
+    """A closed team; ``signer`` is its operator, whose words are told to the first house unless another is named."""
+
+    def __init__(self, seed: int = 1, weather: Weather = CALM, bootstraps: int = 1) -> None:
+        super().__init__(seed, weather)
+        self.signer: Operator = operator(seed)
+        self.houses: list[House] = []
+        self.dice = random.Random(f"{seed}/village")
+        first = self.signer.founded("vaio", FIRST, self.wall(), self.dice)
+        for number in range(bootstraps):
+            secret = first.secrets[0][1]
+            other = self.signer.founded(f"boot{number}", FIRST, self.wall(), self.dice, secret)
+            self.move_in(other if number else first)
+
+    def wall(self) -> float:
+        """The wall clock of every node."""
+        return NOW + self.clock.seconds()
+
+    def move_in(self, membership: Membership) -> House:
+        """A node of that membership, which joins."""
+        house = House(len(self.houses), MemoryMembership(membership))
+        self.houses.append(house)
+        self.open(house)
+        self.run(0.5)
+        return house
+
+    def open(self, house: House) -> None:
+        """Begin a life of a node."""
+        place = house.place
+        house.team = Team(house.kept, self.store(place), self.wall, self.rng(place), Anything())
+        network = self.board.network(*self.address(place))
+        house.node = EntangledNode(
+            house.team.identity,
+            house.team.secret,
+            network,
+            self.store(place),
+            self.clock,
+            self.rng(place),
+            wall=self.wall,
+            door=house.team.door,
+        )
+        house.team.attach(house.node, self.clock)
+        house.node.start()
+        house.team.start()
+        known = [self.address(0)] if place else []
+        # Who is not let in may be closed before it is in.
+        house.node.join(known).addErrback(lambda failure: failure.trap(NotRunning))
+
+    def close(self, house: House, is_sudden: bool = False) -> None:
+        """End a life of a node."""
+        house.team.stop()
+        if is_sudden:
+            house.node.vanish()
+        else:
+            house.node.stop()
+
+    def tell(self, packed: bytes, house: int = 0) -> Deferred[str]:
+        """Let the operator tell the team something at a house."""
+        return Deferred.fromCoroutine(self.houses[house].team.tell(packed))
+
+    def invite(self, name: str = "dog", uses: int = 1, expires: float = 3600.0, house: int = 0) -> str:
+        """A code that is good from now on."""
+        code, packed = self.signer.invite(name, ("device",), uses, self.wall(), expires, self.dice)
+        told: list[str] = []
+        self.tell(packed, house).addCallback(told.append)
+        self.run(1.0)
+        assert told == ["invite"]
+        return code.text
+
+    def knock(
+        self, code: str, doors: Sequence[int] = (0,), wish: str = "", seed: bytes = b"", timeout: float = 20.0
+    ) -> Deferred[Membership]:
+        """A newcomer who knocks at these houses."""
+        self.lives += 1
+        network = self.board.network("10.0.0.2", 9000 + self.lives)
+        read_code: Code = read(code)
+        newcomer = Newcomer(read_code, seed or self.dice.randbytes(32), network, self.clock, self.dice, wish)
+        return newcomer.join([self.address(door) for door in doors], timeout)
+
+    def welcome(self, name: str = "dog", doors: Sequence[int] = (0,)) -> House:
+        """One more member, who came by a code of its own."""
+        found: list[Membership] = []
+        self.knock(self.invite(name), doors).addCallback(found.append)
+        self.run(1.5)
+        return self.move_in(found[0])
+
+    def members(self, house: int = 0) -> list[str]:
+        """Whom a house takes for members."""
+        return [member.name for member in self.houses[house].team.members()]
+
+    def address_of(self, house: House) -> Address:
+        """Where a house is."""
+        return self.address(house.place)
+
+    def contact(self, house: House) -> Contact:
+        """How to ask a house."""
+        return Contact(house.public, self.address(house.place))
+
+    def stop(self) -> None:
+        """End everything."""
+        for house in self.houses:
+            self.close(house)
+
+
+class VillageCase(SynchronousTestCase):
+    """A test with a village; afterwards nothing may be left on its clock."""
+
+    def village(self, seed: int = 1, weather: Weather = CALM, bootstraps: int = 1) -> Village:
+        """A village that is stopped when the test ends."""
+        village = Village(seed, weather, bootstraps)
+        self.addCleanup(self.left, village)
+        self.addCleanup(village.stop)
+        return village
+
+    def left(self, village: Village) -> None:
+        """Nothing but datagrams may be under way."""
+        village.run(1.0)  # what is under way arrives
+        calls = village.clock.getDelayedCalls()
+        self.assertEqual(calls, [], "a node left a timer behind")

@@ -1,0 +1,39 @@
+"""Gate: a door for tests; what it lets in and allows is written down by the test."""
+
+from __future__ import annotations
+
+from middleware.entangled.record import Slot
+from middleware.entangled.wire.door import FOREIGN, NONCE, Life
+
+ROOM = 640
+
+
+class Gate:
+    """Lets in who shows a pass that begins with ``pass``, unless its key is among ``refused``.
+
+    ``forbidden`` are pairs of a public key and a method, ``unwritable`` pairs of a public key and a slot's name.
+    """
+
+    fingerprint = b"the team"
+
+    def __init__(self, life: int = 1, nonce: int = 1, shown: bytes = b"pass".ljust(ROOM, b"!")) -> None:
+        self.room = ROOM
+        self.shown = shown
+        self.life = Life(life, bytes([nonce]) * NONCE)
+        self.refused: dict[bytes, str] = {}
+        self.forbidden: set[tuple[bytes, str]] = set()
+        self.unwritable: set[tuple[bytes, str]] = set()
+        self.judged: list[bytes] = []
+
+    def judge(self, public: bytes, shown: bytes) -> str:
+        """As the test says."""
+        self.judged.append(public)
+        return self.refused.get(public, "" if shown.startswith(b"pass") else FOREIGN)
+
+    def may(self, public: bytes, method: str) -> bool:
+        """As the test says."""
+        return (public, method) not in self.forbidden
+
+    def may_store(self, slot: Slot) -> bool:
+        """As the test says."""
+        return (slot.owner, slot.name) not in self.unwritable

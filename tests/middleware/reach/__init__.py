@@ -1,0 +1,1 @@
+"""Tests of how nodes reach each other through routers."""

@@ -1,0 +1,136 @@
+"""Ground: sites behind routers, one public node that all know, and nodes at the sites, on one turned clock."""
+
+from __future__ import annotations
+
+import random
+from typing import Any
+
+from twisted.internet.defer import Deferred
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.entangled.clock import HeapClock
+from middleware.entangled.data.memory import MemoryStore
+from middleware.entangled.identity import Identity
+from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.network.nat import Nat, NatKind
+from middleware.entangled.network.network import Address
+from middleware.entangled.network.switchboard import Switchboard, SwitchboardNetwork, Weather
+from middleware.entangled.node import EntangledNode
+
+TEAM = b"t" * 32
+LINK = Weather(delay_s=0.015)
+"""One crossing of a site's uplink: two sites are 60 ms apart, there and back."""
+
+
+class Ground:
+    """``weather`` is that of each site's uplink, ``nets`` the first bytes of the net outside and of those inside."""
+
+    def __init__(
+        self,
+        seed: int = 1,
+        weather: Weather = LINK,
+        lifetime: float = 30.0,
+        nets: tuple[str, str] = ("203.0.113", "192.168"),
+    ) -> None:
+        self.seed = seed
+        self.weather = weather
+        self.lifetime = lifetime
+        self.clock = HeapClock()
+        self.board = Switchboard(self.clock, random.Random(f"{seed}/board"))
+        self.nodes: dict[str, EntangledNode] = {}
+        self.networks: dict[str, SwitchboardNetwork] = {}
+        self.routers: dict[str, Nat] = {}
+        self.outside, self.inside = nets
+        self.public = Address(f"{self.outside}.1", 7000)
+        self.node("pub", self.public)
+
+    def site(self, name: str, kind: str) -> None:
+        """A site named so, behind a router of that kind ("none": on the public net)."""
+        if kind != "none":
+            host, rng = f"{self.outside}.{10 + len(self.routers)}", random.Random(f"{self.seed}/{name}")
+            nat: NatKind = kind  # type: ignore[assignment]
+            self.routers[name] = self.board.router(Nat(nat, host, rng, self.lifetime), self.weather)
+
+    def node(self, name: str, address: Address, site: str = "") -> EntangledNode:
+        """A node, at a site or on the public net, started and joined by the public one."""
+        identity = Identity(random.Random(f"{self.seed}/{name}").randbytes(32))
+        network = self.board.network(*address, home=self.routers.get(site))
+        rng = random.Random(f"{self.seed}/{name}/dice")
+        node = EntangledNode(identity, TEAM, network, MemoryStore(), self.clock, rng)
+        node.rpc("echo")(lambda peer, value: value)
+        node.start()
+        node.join([self.public] if address != self.public else []).addErrback(lambda failure: None)
+        self.nodes[name], self.networks[name] = node, network
+        return node
+
+    def at(self, site: str, kind: str, host: int = 2) -> EntangledNode:
+        """The node ``site`` + number of a new or known site; it joins within half a second."""
+        if site not in self.routers:
+            self.site(site, kind)
+        name = f"{site}{host}"
+        if site in self.routers:
+            return self.node(name, Address(f"{self.inside}.{ord(site) % 200}.{host}", 7000), site)
+        address = Address(f"{self.outside}.{100 + len(self.nodes)}", 7000)
+        for other in self.networks.values():
+            self.board.set_weather(address, other.address, self.weather)
+        return self.node(name, address)
+
+    def met_at(self, of: EntangledNode) -> Contact:
+        """A node as the public one sees it."""
+        peer = self.nodes["pub"].endpoint.peers.known(of.identity.public)
+        assert peer is not None and peer.session is not None
+        return peer.session.contact
+
+    def way(self, a: EntangledNode, b: EntangledNode) -> str:
+        """How ``a`` reaches ``b`` now."""
+        return a.reach.way(b.contact)
+
+    def call(self, a: EntangledNode, contact: Contact, timeout: float | None = None) -> tuple[Any, float]:
+        """What ``a`` is answered, and after how many seconds."""
+        began, ended = self.clock.seconds(), [float("nan")]
+        outcome: Deferred[Any] = a.call(contact, "echo", 7, timeout=timeout)
+        outcome.addBoth(self._note, ended)
+        got: list[Any] = []
+        outcome.addBoth(got.append)
+        while not got and self.clock.seconds() < began + 30.0:
+            self.clock.advance(0.01)
+        return (got[0] if got else None), ended[0] - began
+
+    def _note(self, result: Any, ended: list[float]) -> Any:
+        ended[0] = self.clock.seconds()
+        return result
+
+    def run(self, seconds: float) -> None:
+        """Let time pass."""
+        self.clock.advance(seconds)
+
+    def stop(self) -> None:
+        """End every node."""
+        for node in self.nodes.values():
+            node.vanish()
+
+
+class GroundCase(SynchronousTestCase):
+    """A test with a ground; afterwards no timer of a node may be left."""
+
+    def ground(
+        self,
+        seed: int = 1,
+        weather: Weather = LINK,
+        lifetime: float = 30.0,
+        nets: tuple[str, str] = ("203.0.113", "192.168"),
+    ) -> Ground:
+        """A ground whose nodes end with the test."""
+        ground = Ground(seed, weather, lifetime, nets)
+        self.addCleanup(self._end, ground)
+        return ground
+
+    def _end(self, ground: Ground) -> None:
+        ground.stop()
+        left = [call for call in ground.clock.getDelayedCalls() if not _is_delivery(call)]
+        self.assertEqual(left, [], "a node left a timer behind")
+
+
+def _is_delivery(call: object) -> bool:
+    """Whether a call is a datagram on its way, which nobody can take back."""
+    return getattr(getattr(call, "_function", None), "__self__", None).__class__ is Switchboard

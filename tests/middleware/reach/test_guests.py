@@ -1,0 +1,160 @@
+"""Tests of what nodes may do to each other by introductions, and of those that need none."""
+
+from __future__ import annotations
+
+import random
+from typing import Any
+
+from middleware.entangled.errors import Refused
+from middleware.entangled.identity import Identity
+from middleware.entangled.kademlia.contact import Contact, unpacked
+from middleware.entangled.network.network import Address, relayed
+from middleware.entangled.network.switchboard import Weather
+from middleware.entangled.reach.reach import MAX_KNOWN, MEETS, MEETS_AT_ONCE
+from middleware.entangled.wire.peer import KNOCKS, MAX_DOORS
+from tests.middleware.reach.ground import GroundCase
+
+INTRODUCE, MEET = "reach.introduce", "reach.meet"
+
+
+class QuietTests(GroundCase):
+    """Who needs no help causes no traffic."""
+
+    def test_neighbours_ask_nobody(self) -> None:
+        """On one LAN nobody is introduced, mirrored or carried, also when a node dies, and nobody ticks for it."""
+        ground = self.ground(weather=Weather(delay_s=0.001))
+        asked: list[bytes] = []
+        ground.nodes["pub"].vanish()
+        nodes = [ground.node(f"n{n}", Address(f"192.168.7.{9 + n}", 7000)) for n in range(4)]
+        first = nodes[0]
+        for node in nodes:
+            node.join([first.contact.address])
+            node.endpoint.expose(INTRODUCE, lambda peer, *rest: asked.append(b""), changes=True)
+        ground.run(5.0)
+        self.assertEqual(len(first.overlay.contacts()), 3)
+        nodes[3].vanish()
+        ground.run(30.0)
+        self.assertEqual(asked, [])
+        for node in nodes[:3]:
+            self.assertFalse(node.reach._upgrades or node.reach._further or node.reach._is_ticking)
+            self.assertEqual(len(node.reach.relay), 0)
+
+    def test_answered_at_once(self) -> None:
+        """Whoever answers at once is never introduced, however far away."""
+        ground = self.ground()
+        a = ground.at("a", "none")
+        b = ground.at("b", "none")
+        asked: list[bytes] = []
+        ground.nodes["pub"].endpoint.expose(INTRODUCE, lambda peer, *rest: asked.append(b""), changes=True)
+        ground.run(20.0)
+        self.assertEqual((ground.way(a, b), asked), ("direct", []))
+
+
+class HostileTests(GroundCase):
+    """What members who lie, and those who overdo it, can do."""
+
+    def setUp(self) -> None:
+        """A public node and two that know it."""
+        self.g = self.ground()
+        self.a, self.b = self.g.at("a", "none"), self.g.at("b", "none")
+        self.g.run(3.0)
+
+    def asked(self, method: str, *arguments: object) -> Any:
+        """What ``a`` gets when it asks ``b``."""
+        got: list[Any] = []
+        self.a.call(self.g.met_at(self.b), method, *arguments, changes=True).addBoth(got.append)
+        self.g.run(1.5)
+        return getattr(got[0], "value", got[0])
+
+    def test_odd_questions(self) -> None:
+        """What makes no sense is refused by name or answered with nothing, and raises nothing."""
+        stranger = Identity(b"s" * 32)
+        odd: list[tuple[object, ...]] = [(b"", [], 0), (b"x", [], 0), (bytes(20), "x", 0), (bytes(20), [], None)]
+        for arguments in odd:
+            self.assertIsInstance(self.asked(INTRODUCE, *arguments), Refused)
+        self.assertIsNone(self.asked(INTRODUCE, stranger.node_id, [[7], None, ["x", 1]], 77))
+        self.assertIsInstance(self.asked(MEET, self.b.identity.public, [["203.0.113.77", 7]], 0), Refused)
+        for public in (b"", b"x", bytes(32), b"\xff" * 32):
+            answer = self.asked(MEET, public, [["203.0.113.77", 7], 3, ["0.0.0.0", 1]], 3)
+            self.assertTrue(isinstance(answer, Refused | list), repr(answer))
+        for host, port in (("x", 1), ("203.0.113.5", -1), ("~" + "0" * 40, 1), ("203.0.113.5", 70000)):
+            self.a.endpoint.tell(self.g.met_at(self.b), "reach.seen", host, port)
+        self.g.run(1.0)
+        self.assertEqual(self.flushLoggedErrors(), [])
+        self.assertEqual(self.asked("echo", 3), 3)
+
+    def test_knocking_for_others_is_bounded(self) -> None:
+        """One who introduces strangers without end makes a node knock at a few addresses, some times a second."""
+        sent = self.g.board.counters["unheard"]
+        rng = random.Random(1)
+        for _ in range(200):
+            hosts = [[f"203.0.114.{rng.randrange(1, 255)}", 7000] for _ in range(50)]
+            stranger = Identity(rng.randbytes(32)).public
+            self.a.call(self.g.met_at(self.b), MEET, stranger, hosts, 0, changes=True).addErrback(lambda failure: None)
+            self.g.run(0.005)
+        self.g.run(30.0)
+        reach = self.b.reach
+        for table in (reach._ids, reach._namers, reach._carriers, reach._upgrades, reach._buckets, reach._seen):
+            self.assertLessEqual(len(table), MAX_KNOWN)
+        knocks = self.g.board.counters["unheard"] - sent
+        self.assertLess(knocks, (MEETS_AT_ONCE + 30 * MEETS) * MAX_DOORS * 2 * KNOCKS)
+        self.assertGreater(knocks, 0)
+        self.assertEqual(len(self.b.endpoint.peers._openings), 0)
+
+    def test_liars_are_outdone(self) -> None:
+        """An introducer that makes up addresses keeps nobody from those that the others tell."""
+        made_up = [[f"203.0.114.{n}", 7000] for n in range(20)]
+        self.a.endpoint.expose(INTRODUCE, lambda peer, *rest: [made_up, [], True], changes=True)
+        c = self.g.at("c", "port")
+        d = self.g.at("d", "port")
+        self.g.run(6.0)
+        self.assertNotEqual((self.g.way(c, d), self.g.way(d, c)), ("none", "none"))
+        contact = c.overlay.roster.get(d.identity.node_id)
+        assert contact is not None
+        self.assertEqual(self.g.call(c, contact)[0], 7)
+
+    def test_ways_of_others(self) -> None:
+        """An address that means something only to who says it arrives as the way that others carry."""
+        public = self.b.identity.public
+        for host in ("~wss-0123456789ab", relayed(bytes(20)).host, "~"):
+            contact = unpacked([public, host, 1])
+            self.assertEqual(contact, Contact(public, relayed(self.b.identity.node_id)))
+
+    def test_nobody_to_ask(self) -> None:
+        """A carried way that nobody knows fails as any silence does, and leaves nothing behind."""
+        stranger = Identity(b"s" * 32)
+        answer, seconds = self.g.call(self.a, Contact(stranger.public, relayed(stranger.node_id)))
+        self.assertIn("no answer", str(answer))
+        self.assertLess(seconds, 2.0)
+        odd = Contact(stranger.public, Address("~" + "z" * 40, 1))
+        self.assertIn("no answer", str(self.g.call(self.a, odd)[0]))
+        self.g.run(6.0)
+        self.assertEqual(len(self.a.endpoint.peers._openings), 0)
+
+    def test_own_address(self) -> None:
+        """A node learns from a peer how it looks from outside."""
+        c = self.g.at("c", "full")
+        self.g.run(1.0)
+        self.assertEqual(c.reach.seen_as(self.g.nodes["pub"].contact), Address(self.g.routers["c"].host, 7000))
+        self.assertEqual(self.a.reach.outside, [self.a.contact.address])
+
+    def test_noise_inside_sessions(self) -> None:
+        """Whatever a member puts behind the first bytes of carrying and mirrors, nothing is raised."""
+        peer = self.a.endpoint.peers.known(self.b.identity.public)
+        assert peer is not None and peer.session is not None
+        rng = random.Random(7)
+        for kind in (0x03, 0x05, 0x06, 0x07):
+            for length in range(80):
+                self.a.endpoint.send_inside(peer.session, bytes([kind]) + rng.randbytes(length))
+                self.g.run(0.01)
+        self.g.run(5.0)
+        self.assertEqual(self.flushLoggedErrors(), [])
+        self.assertEqual(self.asked("echo", 3), 3)
+
+    def test_outside(self) -> None:
+        """Behind a symmetric router two peers see two ports, behind others one and the same."""
+        for site, kind, ports in (("c", "port", 1), ("d", "sym", 2)):
+            c = self.g.at(site, kind)
+            self.g.run(2.0)
+            self.assertGreaterEqual(len({address.port for address in c.reach.outside}), ports)
+            self.assertEqual({address.host for address in c.reach.outside}, {self.g.routers[site].host})

@@ -1,0 +1,128 @@
+"""Tests of the routers in memory: each kind maps and lets in as it says."""
+
+from __future__ import annotations
+
+import random
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.entangled.clock import HeapClock
+from middleware.entangled.network.nat import Nat, NatKind
+from middleware.entangled.network.network import Address
+from middleware.entangled.network.switchboard import Switchboard, Weather
+
+INSIDE = Address("192.168.1.2", 7000)
+HOST = "203.0.113.9"
+A, A2, B = Address("203.0.113.1", 1), Address("203.0.113.1", 2), Address("203.0.113.2", 1)
+
+
+def nat(kind: NatKind, lifetime: float = 30.0) -> Nat:
+    """A router of that kind."""
+    return Nat(kind, HOST, random.Random(3), lifetime)
+
+
+class NatTests(SynchronousTestCase):
+    """Behaviour of ``Nat``."""
+
+    def test_what_each_kind_lets_in(self) -> None:
+        """After one datagram to A each kind lets in whom it should: A, its other port, another host."""
+        let_in = {}
+        kinds: list[NatKind] = ["full", "addr", "port", "leaky", "sym", "noudp"]
+        for kind in kinds:
+            router = nat(kind)
+            outside = router.out(INSIDE, A, 0.0)
+            port = outside.port if outside is not None else INSIDE.port
+            let_in[kind] = [router.into(source, port, 0.0) == INSIDE for source in (A, A2, B)]
+        self.assertEqual(
+            let_in,
+            {
+                "full": [True, True, True],
+                "addr": [True, True, False],
+                "port": [True, False, False],
+                "leaky": [True, False, False],
+                "sym": [True, False, False],
+                "noudp": [False, False, False],
+            },
+        )
+
+    def test_symmetric_ports_differ(self) -> None:
+        """A symmetric router shows another port to each target, and the same again; the others show one to all."""
+        shown = {kind: [nat_.out(INSIDE, to, 0.0) for to in (A, B, A)] for kind, nat_ in _two()}
+        a, b, again = shown["sym"]
+        self.assertEqual((a == again, a == b), (True, False))
+        self.assertEqual(len(set(shown["port"])), 1)
+
+    def test_mappings_end(self) -> None:
+        """A mapping lives as long as something passes it within its lifetime, from either side; then it is gone."""
+        router = nat("port", 10.0)
+        outside = router.out(INSIDE, A, 0.0)
+        assert outside is not None
+        self.assertEqual(router.into(A, outside.port, 9.0), INSIDE)
+        self.assertEqual(router.into(A, outside.port, 18.0), INSIDE)
+        self.assertIsNone(router.into(A, outside.port, 29.0))
+
+    def test_rebinding(self) -> None:
+        """A router that was restarted lets nothing in by the old port, and shows another one."""
+        router = nat("port")
+        before = router.out(INSIDE, A, 0.0)
+        router.rebind()
+        assert before is not None
+        self.assertIsNone(router.into(A, before.port, 1.0))
+        self.assertNotEqual(router.out(INSIDE, A, 1.0), before)
+
+    def test_leaky_ports_are_burnt(self) -> None:
+        """Whoever is written to after it knocked too early sees another port of a leaky router; others do not."""
+        router = nat("leaky")
+        before = router.out(INSIDE, A, 0.0)
+        assert before is not None
+        self.assertIsNone(router.into(B, before.port, 1.0))
+        self.assertNotEqual(router.out(INSIDE, B, 1.0), before)
+        self.assertEqual(router.out(INSIDE, A, 1.0), before)
+
+    def test_on_the_board(self) -> None:
+        """Behind one router neighbours reach each other by their own addresses, but not by its outer one."""
+        clock = HeapClock()
+        board = Switchboard(clock, random.Random(1))
+        router = board.router(nat("full"), Weather(delay_s=0.5))
+        got: list[tuple[float, bytes, Address]] = []
+        one, other = (board.network(f"192.168.1.{n}", 7000, home=router) for n in (2, 3))
+        far = board.network(*B)
+        for network in (one, other, far):
+            network.listen(lambda datagram, source: got.append((clock.seconds(), datagram, source)))
+        one.send(b"near", other.address)
+        one.send(b"far", B)
+        clock.advance(1.0)
+        shown = Address(HOST, 7000)
+        self.assertEqual(got, [(0.0, b"near", one.address), (0.5, b"far", shown)])
+        other.send(b"hairpin", shown)
+        far.send(b"back", shown)
+        far.send(b"private", one.address)
+        clock.advance(1.0)
+        self.assertEqual([datagram for _, datagram, _ in got[2:]], [b"back"])
+        self.assertEqual((board.counters["blocked"], board.counters["unheard"]), (1, 1))
+
+    def test_further_ports_on_the_board(self) -> None:
+        """A further port is a mapping of its own; who comes in there first is answered from there."""
+        clock = HeapClock()
+        board = Switchboard(clock, random.Random(1))
+        router = board.router(nat("full"))
+        one, far = board.network(*INSIDE, home=router), board.network(*B)
+        sources: list[Address] = []
+        one.listen(lambda datagram, source: one.send(datagram, source))
+        far.listen(lambda datagram, source: sources.append(source))
+        port = one.open_port()
+        self.assertEqual(one.lead(B, port), 0)
+        one.send(b"x", B)
+        clock.advance(0.0)
+        self.assertEqual(sources, [Address(HOST, port)])
+        third = board.network(*A)
+        third.listen(lambda datagram, source: sources.append(source))
+        third.send(b"y", Address(HOST, port))
+        clock.advance(0.0)
+        one.shut_port(port)
+        self.assertEqual(sources[1:], [Address(HOST, port)])
+        self.assertEqual((one.lead(B, 0), one.local(B)), (0, INSIDE))
+
+
+def _two() -> list[tuple[str, Nat]]:
+    return [("sym", nat("sym")), ("port", nat("port"))]

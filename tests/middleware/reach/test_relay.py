@@ -1,0 +1,119 @@
+"""Tests of carrying for others: what is carried, for whom, and how much."""
+
+from __future__ import annotations
+
+import random
+from collections import Counter
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.entangled.clock import HeapClock
+from middleware.entangled.identity import Identity
+from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.network.network import MAX_CARRIED, MAX_DATAGRAM, Address, relayed
+from middleware.entangled.reach.relay import (
+    CARRIED,
+    CARRY,
+    MAX_PAIRS,
+    ONE_SIDED_S,
+    PAIR_BURST,
+    PAIR_RATE,
+    Bucket,
+    Relay,
+)
+from middleware.entangled.wire.noise import TransportKeys
+from middleware.entangled.wire.session import Session
+
+
+class RelayTests(SynchronousTestCase):
+    """Behaviour of ``Relay``, with sessions made by hand."""
+
+    def setUp(self) -> None:
+        """A relay with three peers."""
+        self.clock = HeapClock()
+        self.counters: Counter[str] = Counter()
+        self.sent: list[tuple[bytes, bytes]] = []
+        self.sessions = {session.contact.node_id: session for session in map(self.session, range(3))}
+        self.a, self.b, self.c = self.sessions
+        self.relay = Relay(self.sessions.get, self.send, self.clock, self.counters)
+
+    def session(self, number: int) -> Session:
+        """A session with a peer."""
+        public = Identity(number.to_bytes(32)).public
+        keys = TransportKeys(bytes(32), bytes(32), bytes(32))
+        return Session(Contact(public, Address("203.0.113.1", 1 + number)), number, number, keys, 0.0, True)
+
+    def send(self, session: Session, plain: bytes) -> None:
+        """Keep what is sent; it must fit into a datagram."""
+        self.assertLessEqual(len(session.seal(plain)), MAX_CARRIED)
+        self.sent.append((session.contact.node_id, plain))
+
+    def carry(self, sender: bytes, to: bytes, inner: bytes = b"inner") -> int:
+        """How many datagrams come of one that ``sender`` wants carried."""
+        before = len(self.sent)
+        self.relay.on_carry(self.sessions[sender], bytes([CARRY]) + to + inner, Address("203.0.113.1", 1))
+        return len(self.sent) - before
+
+    def test_carries(self) -> None:
+        """What is carried comes with the id of its sender, whole datagrams included."""
+        self.assertEqual(self.carry(self.a, self.b, bytes(MAX_DATAGRAM)), 1)
+        self.assertEqual(self.sent, [(self.b, bytes([CARRIED]) + self.a + bytes(MAX_DATAGRAM))])
+
+    def test_what_is_not_carried(self) -> None:
+        """Nothing goes to strangers, to the sender itself, empty, too long, cut short, or over two nodes."""
+        self.assertEqual(self.carry(self.a, bytes(20)), 0)
+        self.assertEqual(self.carry(self.a, self.a), 0)
+        self.assertEqual(self.carry(self.a, self.b, b""), 0)
+        self.assertEqual(self.carry(self.a, self.b, bytes(MAX_DATAGRAM + 1)), 0)
+        self.assertEqual(self.carry(self.a, self.b[:10], b""), 0)
+        session = self.sessions[self.a]
+        session.contact = Contact(session.contact.public, relayed(self.a))
+        self.assertEqual(self.carry(self.a, self.b), 0)
+        self.assertEqual(self.counters["uncarried"] + self.counters["malformed"], 6)
+
+    def test_a_pair_has_its_share(self) -> None:
+        """A pair gets its burst at once and its rate for long; another pair is none the worse for it."""
+        full = bytes(MAX_DATAGRAM)
+        self.assertEqual(sum(self.carry(self.a, self.b, full) for _ in range(200)), PAIR_BURST // MAX_DATAGRAM)
+        self.assertEqual(self.carry(self.b, self.a, full), 0)
+        self.assertEqual(self.carry(self.a, self.c, full), 1)
+        carried = 0
+        for _ in range(1000):
+            self.clock.advance(0.1)
+            carried += len(full) * (self.carry(self.a, self.b, full) + self.carry(self.b, self.a, full))
+        self.assertApproximates(carried / 100.0, PAIR_RATE, PAIR_RATE * 0.05)
+
+    def test_one_sided_pairs_end(self) -> None:
+        """One who sends without a word from the other is not carried any more after two minutes; a word helps."""
+        for _ in range(int(ONE_SIDED_S)):
+            self.assertEqual(self.carry(self.a, self.b), 1)
+            self.clock.advance(1.0)
+        self.clock.advance(1.0)
+        self.assertEqual(self.carry(self.a, self.b), 0)
+        self.assertEqual(self.carry(self.b, self.a), 1)
+        self.assertEqual(self.carry(self.a, self.b), 1)
+
+    def test_pairs_are_bounded(self) -> None:
+        """With as many pairs as there may be no other is carried for, until some have been idle."""
+        many = [self.session(number) for number in range(3, 4 + MAX_PAIRS)]
+        self.sessions.update({session.contact.node_id: session for session in many})
+        carried = [self.carry(self.a, session.contact.node_id) for session in many]
+        self.assertEqual((sum(carried), carried[-1], len(self.relay)), (MAX_PAIRS, 0, MAX_PAIRS))
+        self.clock.advance(ONE_SIDED_S + 1.0)
+        self.assertTrue(self.relay.has_room)
+        self.assertEqual((self.carry(self.a, many[-1].contact.node_id), len(self.relay)), (1, 1))
+
+    def test_bucket(self) -> None:
+        """A bucket gives what came into it, and never more than it holds."""
+        bucket = Bucket(2.0, 4.0)
+        self.assertEqual([bucket.take(1.0, 0.0) for _ in range(5)], [True] * 4 + [False])
+        self.assertTrue(bucket.take(2.0, 1.0))
+        self.assertFalse(bucket.take(5.0, 100.0))
+
+    def test_noise_raises_nothing(self) -> None:
+        """Whatever a peer sends, nothing is raised."""
+        rng = random.Random(1)
+        session = self.sessions[self.a]
+        for length in range(64):
+            self.relay.on_carry(session, bytes([CARRY]) + rng.randbytes(length), session.contact.address)
+        self.assertEqual(self.sent, [])

@@ -1,0 +1,327 @@
+"""Tests of the ways between two nodes behind routers, over routers in memory."""
+
+from __future__ import annotations
+
+import random
+from typing import Any
+
+from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.network.network import Address, relayed
+from middleware.entangled.network.switchboard import Weather
+from middleware.entangled.node import EntangledNode
+from middleware.entangled.wire.noise import TransportKeys
+from middleware.entangled.wire.peer import Peer
+from middleware.entangled.wire.session import Session
+from tests.middleware.reach.ground import Ground, GroundCase
+
+KINDS = ("none", "full", "addr", "port", "sym")
+UNPUNCHABLE = {frozenset({"port", "sym"}), frozenset({"sym"})}
+
+
+def ways(ground: Ground, one: str, other: str) -> tuple[str, float]:
+    """How two nodes behind routers of these kinds reach each other at first, and how long after either knew the other.
+
+    They come one after the other and meet as members of any team do: by the list of the public node.
+    """
+    a = ground.at("a", one)
+    ground.run(2.0)
+    b = ground.at("b", other)
+    known, since = 0.0, ground.clock.seconds()
+    while ground.clock.seconds() < since + 8.0:
+        ground.run(0.01)
+        to_b, to_a = a.endpoint.peers.known(b.identity.public), b.endpoint.peers.known(a.identity.public)
+        if not known and (to_b or to_a):
+            known = ground.clock.seconds()
+        if to_b and to_a and to_b.session and to_a.session:
+            return ground.way(a, b), ground.clock.seconds() - known
+    return "none", float("inf")
+
+
+class WayTests(GroundCase):
+    """What comes of each pair of routers."""
+
+    def test_punchable_pairs_are_direct(self) -> None:
+        """13 of the 15 pairs of routers are punched within a second, and calls go straight from then on."""
+        for one in KINDS:
+            for other in KINDS:
+                if frozenset({one, other}) not in UNPUNCHABLE:
+                    way, seconds = ways(self.ground(), one, other)
+                    self.assertEqual((one, other, way), (one, other, "direct"))
+                    self.assertLess(seconds, 1.0, f"{one} and {other}")
+
+    def test_other_pairs_are_carried(self) -> None:
+        """Where no hole can be punched the public node carries, after 1.5 s at most."""
+        for one, other in (("port", "sym"), ("sym", "port"), ("sym", "sym")):
+            ground = self.ground()
+            way, seconds = ways(ground, one, other)
+            self.assertEqual((one, other, way), (one, other, "carried"))
+            self.assertLess(seconds, 1.5, f"{one} and {other}")
+            a, b = ground.nodes["a2"], ground.nodes["b2"]
+            for asker, asked in ((a, b), (b, a)):
+                self.assertEqual(ground.call(asker, ground.met_at(asked))[0], 7)
+
+
+class WeatherTests(GroundCase):
+    """Ways in bad weather and behind bad routers."""
+
+    def test_lossy_links(self) -> None:
+        """With 30 % loss on both links each of 40 pairs reaches each other within 5 s, punched or carried."""
+        late = []
+        pairs = [("port", "port"), ("full", "addr"), ("port", "sym"), ("none", "port")]
+        for seed in range(10):
+            for one, other in pairs:
+                ground = self.ground(seed, Weather(delay_s=0.015, loss=0.3))
+                way, seconds = ways(ground, one, other)
+                if seconds > 5.0:
+                    late.append((seed, one, other, way, seconds))
+        self.assertLessEqual(len(late), 2, late)
+
+    def test_leaky_routers(self) -> None:
+        """Routers that early knocks spoil are reached within 5 s, punched from fresh ports."""
+        for one, other in (("leaky", "leaky"), ("leaky", "port"), ("port", "leaky")):
+            ground = self.ground()
+            way, seconds = ways(ground, one, other)
+            self.assertLess(seconds, 5.0, f"{one} and {other}")
+            ground.run(5.0)
+            a, b = ground.nodes["a2"], ground.nodes["b2"]
+            self.assertEqual((one, other, ground.way(a, b)), (one, other, "direct"))
+
+    def test_staggered_start(self) -> None:
+        """One a quarter of a second farther away, so that knocks come early: reached within 5 s all the same."""
+        for one, other in (("leaky", "leaky"), ("leaky", "port"), ("port", "leaky")):
+            ground = self.ground()
+            ground.site("b", other)
+            ground.board.router_weather[ground.routers["b"]] = Weather(delay_s=0.25)
+            _, seconds = ways(ground, one, other)
+            self.assertLess(seconds, 5.0, f"{one} and {other}")
+
+    def test_late_words(self) -> None:
+        """One side hears half a second late of the other: reached at once by who carries, and directly later on."""
+        for one, other in (("leaky", "port"), ("port", "leaky")):
+            for late in "ab":
+                ground = self.ground()
+                ground.site("a", one)
+                ground.site("b", other)
+                host = ground.routers[late].host
+                for port in range(6990, 7010):
+                    ground.board.set_weather(ground.public, Address(host, port), Weather(delay_s=0.5), one_way=True)
+                ways_seen = set()
+                ways(ground, one, other)
+                ground.run(20.0)
+                for _ in range(20):
+                    ground.run(1.0)
+                    ways_seen.add(ground.way(ground.nodes["a2"], ground.nodes["b2"]))
+                self.assertEqual((one, other, late, ways_seen), (one, other, late, {"direct"}))
+
+    def test_neighbours_behind_one_router(self) -> None:
+        """Two nodes behind one router that has no hairpin find each other by their own addresses."""
+        for kind in ("full", "port", "sym"):
+            ground = self.ground()
+            a = ground.at("a", kind, 2)
+            ground.run(2.0)
+            b = ground.at("a", kind, 3)
+            ground.run(1.5)
+            for one, other in ((a, b), (b, a)):
+                peer = one.endpoint.peers.known(other.identity.public)
+                assert peer is not None and peer.session is not None
+                self.assertEqual(peer.session.contact.address, other.contact.address)
+
+    def test_routers_within_a_private_net(self) -> None:
+        """Routers whose outside is a private net too, of the same first bytes as the inside, are punched as others."""
+        for one, other, way in (("port", "port", "direct"), ("sym", "full", "direct"), ("sym", "sym", "carried")):
+            ground = self.ground(nets=("10.0.9", "10.0"))
+            self.assertEqual((one, other, ways(ground, one, other)[0]), (one, other, way))
+
+    def test_a_router_restarts(self) -> None:
+        """Whose router forgot all, and shows another port from now on, is reached again within 5 s, though idle."""
+        for one, other in (("port", "port"), ("full", "addr"), ("sym", "sym"), ("port", "none"), ("leaky", "port")):
+            ground = self.ground()
+            a = ground.at("a", one)
+            ground.run(1.0)
+            b = ground.at("b", other)
+            ground.run(10.0)
+            ground.routers["a"].rebind()
+            self.assertLess(_reached_again(ground, a, b), 5.0, f"{one} and {other}")
+
+    def test_mappings_are_held(self) -> None:
+        """Behind routers that forget after 15 s two idle nodes stay in touch: the first call is answered at once."""
+        for one, other in (("port", "port"), ("sym", "sym")):
+            ground = self.ground(lifetime=15.0)
+            a, b = ground.at("a", one), ground.at("b", other)
+            ground.run(60.0)
+            to_b = a.overlay.roster.get(b.identity.node_id)
+            assert to_b is not None
+            answer, seconds = ground.call(a, to_b)
+            self.assertEqual(answer, 7)
+            self.assertLess(seconds, 0.2)
+
+    def test_everybody_hears_of_it(self) -> None:
+        """In a team where pings are rare, too, everybody has the new address of an idle node after 5 s."""
+        ground = self.ground()
+        others = [ground.node(f"x{n}", Address(f"203.0.113.{150 + n}", 7000)) for n in range(32)]
+        a = ground.at("a", "port")
+        ground.run(21.0)
+        ground.routers["a"].rebind()
+        ground.run(5.0)
+        seen = {peer.session.contact.address for other in others if (peer := _peer(other, a)) and peer.session}
+        self.assertEqual(seen, {ground.met_at(a).address})
+        self.assertNotEqual(seen, {Address(ground.routers["a"].host, 7000)})
+
+    def test_fresh_ports_are_quiet(self) -> None:
+        """Two who met at fresh ports stay there: no handshake follows, and it is no sign of another address."""
+        ground = self.ground()
+        ways(ground, "leaky", "leaky")
+        a, b = ground.nodes["a2"], ground.nodes["b2"]
+        ground.run(10.0)
+        before = [peer and peer.session for peer in (_peer(a, b), _peer(b, a))]
+        ground.run(30.0)
+        self.assertEqual([peer and peer.session for peer in (_peer(a, b), _peer(b, a))], before)
+        self.assertEqual((ground.way(a, b), ground.way(b, a)), ("direct", "direct"))
+        peer = _peer(a, b)
+        assert peer is not None and peer.session is not None
+        at_b = peer.session.contact.address
+        port = ground.networks["a2"].local(at_b).port
+        self.assertIn(port, a.reach._further)
+        a.reach._saw(peer.session.contact, Address(ground.routers["a"].host, 3), is_told=True)
+        self.assertEqual(len(a.endpoint.peers._openings), 0)
+        a.reach._lead(peer, [at_b], 0)
+        self.assertEqual(ground.networks["a2"].local(at_b).port, port)
+
+    def test_direct_before_carried(self) -> None:
+        """A session that others carry does not take the place of a direct one that works, and does when it is dead."""
+        ground = self.ground()
+        a, b = ground.at("a", "none"), ground.at("b", "none")
+        ground.run(3.0)
+        a.call(b.contact, "echo", 1)
+        ground.run(0.1)
+        carried = Contact(b.identity.public, relayed(b.identity.node_id))
+        for later, way in ((0.0, "direct"), (10.0, "carried")):
+            if later:
+                b.vanish()
+                ground.run(later)
+            keys = TransportKeys(bytes(32), bytes(32), bytes(32))
+            session = Session(carried, 77 + int(later), 78, keys, ground.clock.seconds(), is_confirmed=True)
+            a.endpoint.peers.established(session)
+            self.assertEqual(ground.way(a, b), way)
+
+    def test_another_address(self) -> None:
+        """A node that moves to another network keeps its key, and is reached there within 5 s."""
+        ground = self.ground()
+        a, b = ground.at("a", "port"), ground.at("b", "port")
+        ground.run(5.0)
+        ground.site("c", "port")
+        ground.networks["a2"].home = ground.routers["c"]
+        ground.board._ports[ground.routers["c"], a.contact.address] = ground.networks["a2"]
+        self.assertLess(_reached_again(ground, b, a), 5.0)
+        self.assertEqual(ground.met_at(a).address.host, ground.routers["c"].host)
+
+
+class CarriedTests(GroundCase):
+    """Pairs that others carry for."""
+
+    def carried(self, ground: Ground) -> tuple[EntangledNode, EntangledNode]:
+        """Two nodes that cannot reach each other directly, and have been carried for some seconds."""
+        a = ground.at("a", "sym")
+        ground.run(1.0)
+        b = ground.at("b", "sym")
+        ground.run(4.0)
+        self.assertEqual((ground.way(a, b), ground.way(b, a)), ("carried", "carried"))
+        return a, b
+
+    def test_direct_as_soon_as_it_can_be(self) -> None:
+        """When the routers get better, a carried pair goes direct by itself, and nothing is carried any more."""
+        ground = self.ground()
+        a, b = self.carried(ground)
+        for router in ground.routers.values():
+            router.kind = "port"
+        ground.run(70.0)
+        self.assertEqual((ground.way(a, b), ground.way(b, a)), ("direct", "direct"))
+        carried = ground.nodes["pub"].endpoint.counters["carried"]
+        self.assertEqual(ground.call(a, ground.met_at(b))[0], 7)
+        ground.run(10.0)
+        self.assertEqual(ground.nodes["pub"].endpoint.counters["carried"], carried)
+
+    def test_any_member_carries(self) -> None:
+        """When the node that carries dies, whatever is under way, another member carries on within 5 s."""
+        for moment in range(8):
+            ground = self.ground()
+            ground.node("other", Address("203.0.113.200", 7000))
+            a, b = self.carried(ground)
+            to_b = a.overlay.roster.get(b.identity.node_id)
+            assert to_b is not None
+            ground.run(moment / 4)
+            ground.nodes["pub"].vanish()
+            began = ground.clock.seconds()
+            while ground.call(a, to_b)[0] != 7:
+                self.assertLess(ground.clock.seconds() - began, 5.0)
+            self.assertLess(ground.clock.seconds() - began, 5.0)
+
+    def test_parcels_are_carried(self) -> None:
+        """What fills whole datagrams is carried as well: 20 kB come back as they went."""
+        ground = self.ground()
+        a, b = self.carried(ground)
+        peer = a.endpoint.peers.known(b.identity.public)
+        assert peer is not None and peer.session is not None
+        large = random.Random(1).randbytes(20_000)
+        got: list[Any] = []
+        a.call(peer.session.contact, "echo", large).addBoth(got.append)
+        ground.run(5.0)
+        self.assertEqual(got, [large])
+
+    def test_who_hears_of_it_reaches_it(self) -> None:
+        """A carried peer that others are told of is reached by them: directly where they can be seen, else carried."""
+        ground = self.ground()
+        _, b = self.carried(ground)
+        for site, kind, way in (("c", "none", "direct"), ("d", "sym", "carried")):
+            c = ground.at(site, kind)
+            ground.run(2.5)
+            self.assertEqual((kind, ground.way(c, b)), (kind, way))
+
+    def test_who_named_it_is_asked(self) -> None:
+        """Of a peer that is known by its carried way alone, the one who named it is asked, and it is met."""
+        ground = self.ground()
+        others = [ground.node(f"x{n}", Address(f"203.0.113.{150 + n}", 7000)) for n in range(16)]
+        a = ground.at("a", "sym")
+        ground.run(1.0)
+        c = others[0]
+        asked: list[bytes] = []
+        for other in [ground.nodes["pub"], *others[1:]]:
+            other.endpoint.expose("reach.introduce", _listening(other, asked), changes=True)
+        b = ground.node("b", Address("203.0.113.220", 7000))
+        ground.run(2.0)
+        peers = c.endpoint.peers
+        known = peers.known(b.identity.public)
+        assert known is not None
+        peers.evict(known)
+        c.reach.named(Contact(b.identity.public, relayed(b.identity.node_id)), others[3].contact)
+        asked.clear()
+        answer, _ = ground.call(c, Contact(b.identity.public, relayed(b.identity.node_id)))
+        self.assertEqual(answer, 7)
+        self.assertIn(others[3].identity.node_id, asked[:3])
+        self.assertEqual(ground.way(a, b), "direct")
+
+
+def _peer(of: EntangledNode, other: EntangledNode) -> Peer | None:
+    return of.endpoint.peers.known(other.identity.public)
+
+
+def _listening(node: EntangledNode, asked: list[bytes]) -> Any:
+    """The node's method, which notes that it was asked."""
+    answer = node.reach._answer_introduce
+
+    def introduce(peer: Contact, wanted: bytes, candidates: list[object], order: int) -> Any:
+        asked.append(node.identity.node_id)
+        return answer(peer, wanted, candidates, order)
+
+    return introduce
+
+
+def _reached_again(ground: Ground, asked: EntangledNode, asker: EntangledNode) -> float:
+    """Seconds until a call of ``asker`` to where it knows ``asked`` is answered, asked anew each second."""
+    began = ground.clock.seconds()
+    while ground.clock.seconds() < began + 20.0:
+        contact = asker.overlay.roster.get(asked.identity.node_id) or ground.met_at(asked)
+        if ground.call(asker, contact)[0] == 7:
+            return ground.clock.seconds() - began
+        ground.run(0.2)
+    return float("inf")

@@ -1,0 +1,199 @@
+"""Tests of ``middleware.entangled.network.bundle``: tunnels of several connections, on a turned clock."""
+
+from __future__ import annotations
+
+import random
+
+from middleware.entangled.network.bundle import AT_ONCE, DEAD_S, HARD, HELD, MOST, OPENING_S, ROUGH_S, STILL_S
+from middleware.entangled.network.network import Address
+from middleware.entangled.network.pipes import Pipe
+from middleware.entangled.network.tunnel import MAX_LINKS, MAX_OF_HOST, TunnelNetwork
+from middleware.entangled.network.websocket import TOKEN
+from tests.middleware.test_tunnel import GREETING, HOST, PLAIN, URL, Heard, TunnelCase
+
+STEP = 0.1
+WHOLE = GREETING.replace(b"\r\n\r\n", b"\r\n" + TOKEN.encode() + b": %s\r\n\r\n")
+
+
+class BundleTests(TunnelCase):
+    def talk(self, client: TunnelNetwork, served: Heard, seconds: float, size: int = 100) -> tuple[list[float], float]:
+        """Send ten datagrams a second; how often each that arrived did, and the longest gap in which none did."""
+        number, last, gap = 0, self.clock.seconds(), 0.0
+        served.clear()
+        seen: dict[bytes, int] = {}
+        while number * STEP < seconds:
+            number += 1
+            client.send(number.to_bytes(4, "big") + bytes(size), PLAIN.address)
+            self.clock.advance(STEP)
+            for datagram, _ in served:
+                if datagram not in seen:
+                    gap, last = max(gap, self.clock.seconds() - last), self.clock.seconds()
+                seen[datagram] = seen.get(datagram, 0) + 1
+            served.clear()
+        return [float(times) for times in seen.values()], max(gap, self.clock.seconds() - last)
+
+    def three(self) -> tuple[TunnelNetwork, Heard, TunnelNetwork, Heard, Pipe]:
+        """Two ends whose tunnel has three connections, and that of these which stood still for a moment."""
+        client, came, server, served = self.pair()
+        (first,) = self.pipes.streams
+        first.is_still = True
+        self.talk(client, served, 1.0)
+        first.is_still = False
+        self.talk(client, served, 0.5)
+        came.clear()
+        served.clear()
+        self.assertEqual(len(self.pipes.streams), MOST)
+        return client, came, server, served, first
+
+    def test_one_while_all_is_well(self) -> None:
+        """A tunnel in use, or idle, on a line that delays but loses nothing has one connection; all goes once."""
+        client, _, _, served = self.pair()
+        self.pipes.delay_s = 0.2
+        self.talk(client, served, 1.0)
+        times, gap = self.talk(client, served, 60.0, 1000)
+        self.clock.advance(30.0)
+        self.assertEqual(set(times), {1.0})
+        self.assertLess(gap, 2 * STEP)
+        self.assertEqual((len(self.pipes.dialled), len(self.pipes.streams)), (1, 1))
+
+    def test_one_on_a_long_line(self) -> None:
+        """A round trip of 0.8 s, and a short wait for one repetition after a silence, are no reason for another one."""
+        client, _, _, _ = self.pair()
+        self.pipes.delay_s = 0.4
+        for _ in range(50):
+            client.send(b"x", PLAIN.address)
+            self.clock.advance(0.35)
+        self.assertEqual(len(self.pipes.dialled), 1)
+        self.pipes.delay_s = 0.0
+        (only,) = self.pipes.streams
+        for _ in range(5):
+            self.clock.advance(5.0)
+            only.is_still = True
+            client.send(b"x", PLAIN.address)
+            self.clock.advance(0.25)
+            client.send(b"x", PLAIN.address)
+            only.is_still = False
+        self.assertEqual(len(self.pipes.dialled), 1)
+
+    def test_stream_that_stands_still(self) -> None:
+        """When a stream stands still two more are dialled, and in half a second all goes by two of those that move."""
+        client, _, server, served = self.pair()
+        (address,) = server.peers
+        (first,) = self.pipes.streams
+        first.is_still = True
+        _, gap = self.talk(client, served, 1.0)
+        self.assertLess(gap, STILL_S + 0.25)
+        self.assertEqual(len(self.pipes.streams), MOST)
+        times, gap = self.talk(client, served, 20.0)
+        self.assertLess(gap, 2 * STEP)
+        self.assertEqual(set(times), {float(AT_ONCE)})
+        self.assertEqual((server.peers, client.peers), ([address], [PLAIN.address]))
+
+    def test_dial_the_dead_anew(self) -> None:
+        """A connection that stands still while another moves is dialled anew soon; one that all share is left."""
+        client, _, server, served = self.pair()
+        (first,) = self.pipes.streams
+        first.is_still = True
+        self.talk(client, served, DEAD_S + 1.5)
+        self.assertTrue(first.is_lost)
+        self.assertEqual(len(self.pipes.streams), MOST)
+        dialled = len(self.pipes.dialled)
+        for stream in self.pipes.streams:
+            stream.is_still = True
+        self.talk(client, served, 4.0)
+        self.assertEqual(len(self.pipes.dialled), dialled)
+
+    def test_way_back(self) -> None:
+        """What the server sends goes by two connections, too, and passes one that stands still on its side."""
+        client, came, server, served, first = self.three()
+        (address,) = server.peers
+        first.other.is_still = True
+        for number in range(100):
+            server.send(bytes([number]), address)
+            self.clock.advance(STEP)
+        self.assertEqual({datagram[0] for datagram, _ in came}, set(range(100)))
+        self.assertEqual({source for _, source in came}, {PLAIN.address})
+
+    def test_one_again(self) -> None:
+        """Half a minute after the last stream stood still there is one connection again, at both ends."""
+        client, _, server, served, _ = self.three()
+        self.talk(client, served, ROUGH_S - 4.0)
+        self.assertEqual(len(self.pipes.streams), MOST)
+        self.talk(client, served, 6.0)
+        self.assertEqual((len(self.pipes.streams), len(server._links)), (1, 1))
+        times, _ = self.talk(client, served, 5.0)
+        self.assertEqual((set(times), len(times)), ({1.0}, 50))
+
+    def test_little_waits_in_what_stands_still(self) -> None:
+        """A stream that stands still takes a few datagrams and drops the rest: it would all be late."""
+        client, _, _, served = self.pair()
+        (only,) = self.pipes.streams
+        self.pipes.cut(HOST)
+        only.is_still = True
+        self.talk(client, served, 4.0, 1000)
+        self.assertLess(only.held, 2 * HELD)
+        self.assertGreater(client.counters["dropped"], 20)
+
+    def test_open_by_another(self) -> None:
+        """When a connection does not open another one is dialled beside it, and the tunnel opens by that."""
+        _, served = self.made(is_plain=True)
+        client, _ = self.made("10.0.0.2", PLAIN)
+        self.pipes.cut(HOST)
+        client.send(b"x", PLAIN.address)
+        self.clock.advance(OPENING_S / 2)
+        self.pipes.heal()
+        _, gap = self.talk(client, served, 3.0)
+        self.assertLess(gap, OPENING_S + 1.5)
+        self.clock.advance(5.0)
+        self.assertEqual(len(self.pipes.streams), 1)
+
+    def test_hard_to_open(self) -> None:
+        """Whose greeting had to be repeated has three connections from the beginning."""
+        self.made(is_plain=True)
+        client, _ = self.made("10.0.0.2", PLAIN)
+        measured = client._carrier.strain
+        client._carrier.strain = lambda transport: (  # type: ignore[method-assign]
+            None if (seen := measured(transport)) is None else type(seen)(seen.held, seen.acked, HARD)
+        )
+        client.send(b"x", PLAIN.address)
+        self.clock.advance(0.1)
+        client.send(b"x", PLAIN.address)
+        self.clock.advance(0.1)
+        self.assertEqual(len(self.pipes.streams), MOST)
+
+    def test_tokens(self) -> None:
+        """Connections that name one tunnel are one peer, at most three; others, and those without a name, are not."""
+        server, served = self.made(is_plain=True)
+        one, other = b"a" * 32, b"b" * 32
+        crowd = [self.dribble(WHOLE % (1, token)) for token in (one, one, other, b"", b"", b"a" * 31)]
+        self.clock.advance(0.1)
+        self.assertEqual((len(server.peers), len(server._links)), (5, 6))
+        crowd += [self.dribble(WHOLE % (1, one)) for _ in range(5)]
+        self.clock.advance(0.1)
+        self.assertEqual((len(server.peers), len(server._links)), (5, 4 + MOST))
+        self.assertFalse(crowd[-1].is_lost)
+
+    def test_caps_allow_for_it(self) -> None:
+        """A team behind one address has three connections each; those make room before a newcomer is turned away."""
+        server, served = self.made()
+        members = [self.member(server, served, "10.0.0.2") for _ in range(MAX_OF_HOST)]
+        for member in members:
+            member._bundles[URL.address]._rough_until = 1e9
+            member.send(b"m", URL.address)
+            self.clock.advance(0.01)
+        self.assertEqual((len(server.peers), len(server._links)), (MAX_OF_HOST, MOST * MAX_OF_HOST))
+        self.assertTrue(self.dribble(host="10.0.0.2").is_lost)
+        for number in range(MAX_LINKS - MOST * MAX_OF_HOST + 10):
+            self.member(server, served, f"10.2.{number // 250}.{number % 250}")
+        self.assertEqual(len(server._links), MAX_LINKS)
+        self.assertEqual(len(server.peers), MAX_LINKS - (MOST - 1) * MAX_OF_HOST + 10)
+
+    def member(self, server: TunnelNetwork, served: Heard, host: str) -> TunnelNetwork:
+        """One more that the server answers."""
+        member, _ = self.made(host, URL)
+        member._rng = random.Random(len(self.ends))
+        member.send(b"m", URL.address)
+        self.clock.advance(0.01)
+        address: Address = served.pop()[1]
+        server.send(b"hello", address)
+        return member

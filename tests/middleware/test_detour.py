@@ -1,0 +1,228 @@
+"""Tests of ``middleware.entangled.kademlia.detour``: nodes to which UDP is blocked enter by tunnels, and leave them."""
+
+from __future__ import annotations
+
+import random
+
+from twisted.internet.defer import Deferred
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.entangled.identity import Identity
+from middleware.entangled.kademlia.contact import Contact, unpacked
+from middleware.entangled.network.foul import FoulNetwork
+from middleware.entangled.network.joint import JointNetwork
+from middleware.entangled.network.network import Address, relayed
+from middleware.entangled.network.pipes import Pipes
+from middleware.entangled.network.tunnel import TunnelNetwork
+from middleware.entangled.network.url import Url
+from middleware.entangled.node import EntangledNode
+from tests.fleet import TEAM, World
+
+BOOTSTRAP, LATE = 0, 9
+
+
+class Site:
+    """A node and what lies between it and the world."""
+
+    def __init__(self, world: TunnelWorld, place: int, urls: list[Url], is_served: bool = False) -> None:
+        rng = world.rng(place)
+        udp = world.board.network(*world.address(place))
+        self.udp = FoulNetwork(udp, world.clock, random.Random(place))
+        carrier = world.pipes.carrier(f"10.2.0.{place}", 443)
+        self.tunnel = TunnelNetwork(carrier, world.clock, rng, urls, is_served)
+        network = JointNetwork(self.udp, self.tunnel)
+        identity, store = world.identity(place), world.store(place)
+        self.node = EntangledNode(identity, TEAM, network, store, world.clock, rng, 1.0)
+        self.node.endpoint.expose("who", lambda peer: place)
+
+    def block(self, is_blocked: bool = True) -> None:
+        """Let no UDP pass, as a firewall does."""
+        self.udp.is_deaf = self.udp.is_mute = is_blocked
+
+
+class TunnelWorld(World):
+    """A bootstrap node that serves tunnels, and others."""
+
+    def __init__(self) -> None:
+        super().__init__(1)
+        self.pipes = Pipes(self.clock, 0.025)
+        self.sites: list[Site] = []
+
+    def address(self, place: int) -> Address:
+        """Where the node of this place listens: each in a network of its own."""
+        return Address(f"198.18.{place}.1", 7000)
+
+    def url(self, place: int = BOOTSTRAP) -> Url:
+        """Where the tunnel of a node begins."""
+        return Url("wss", f"10.2.0.{place}", 443)
+
+    def add(self, place: int, is_blocked: bool = False, is_served: bool = False) -> tuple[Site, Deferred[None]]:
+        """A node that joins through the bootstrap, by whatever way."""
+        site = Site(self, place, [] if is_served else [self.url()], is_served)
+        site.block(is_blocked)
+        known = [] if is_served else [self.address(BOOTSTRAP)]
+        site.node.start()
+        self.sites.append(site)
+        return site, site.node.join(known)
+
+    def stop(self) -> None:
+        """End every node."""
+        for site in self.sites:
+            site.node.stop()
+
+
+class DetourTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.world = TunnelWorld()
+        self.addCleanup(self.end)
+        self.bootstrap, _ = self.world.add(BOOTSTRAP, is_served=True)
+        self.world.run(0.1)
+
+    def end(self) -> None:
+        """Stop all; nothing is left on the clock."""
+        self.world.stop()
+        self.world.run(10.0)
+        self.assertEqual(self.world.clock.getDelayedCalls(), [])
+
+    def call(self, asker: Site, asked: Site) -> object:
+        """What one node is answered by another, whom it knows by whatever address."""
+        (contact,) = (c for c in asker.node.overlay.contacts() if c.public == asked.node.identity.public)
+        answer = asker.node.call(contact, "who")
+        self.world.run(2.0)
+        return self.successResultOf(answer)
+
+    def test_enter_by_tunnel(self) -> None:
+        """A node to which all UDP is blocked is in within 2.5 s at 50 ms of round trip, and is answered and asked."""
+        site, joined = self.world.add(1, is_blocked=True)
+        self.world.run(1.4)
+        self.assertEqual(self.world.pipes.dialled, [])
+        self.world.run(1.1)
+        self.successResultOf(joined)
+        self.assertEqual(self.call(site, self.bootstrap), BOOTSTRAP)
+        self.assertEqual(self.call(self.bootstrap, site), 1)
+        (contact,) = self.bootstrap.node.overlay.contacts()
+        self.assertRegex(contact.address.host, "^~wss-")
+
+    def test_no_tunnel_where_udp_works(self) -> None:
+        """A node that its known node answers by UDP dials nothing, and is in as fast as one without tunnels."""
+        _, joined = self.world.add(1)
+        self.world.run(0.2)
+        self.successResultOf(joined)
+        self.world.run(120.0)
+        self.assertEqual(self.world.pipes.dialled, [])
+
+    def test_records_through_the_tunnel(self) -> None:
+        """A record that a tunnelled node puts is read by another member, and its large answers arrive."""
+        other, _ = self.world.add(2)
+        site, _ = self.world.add(1, is_blocked=True)
+        self.world.run(4.0)
+        key = bytes(20)
+        put = site.node.put(key, "a", b"x" * 4000, concern="one")
+        self.world.run(2.0)
+        self.successResultOf(put)
+        site.node.endpoint.expose("large", lambda peer: b"y" * 200_000)
+        (contact,) = (c for c in self.bootstrap.node.overlay.contacts() if c.address.is_virtual)
+        answer = self.bootstrap.node.call(contact, "large", timeout=20.0)
+        self.world.run(20.0)
+        self.assertEqual(self.successResultOf(answer), b"y" * 200_000)
+        read = self.bootstrap.node.get(key, "fast")
+        self.world.run(2.0)
+        self.assertEqual([record.value for record in self.successResultOf(read)], [b"x" * 4000])
+        del other
+
+    def test_others_are_told_no_tunnel(self) -> None:
+        """Third parties hear of a tunnelled member by the address that says: others carry; so does who lies."""
+        other, _ = self.world.add(2)
+        site, _ = self.world.add(1, is_blocked=True)
+        self.world.run(4.0)
+        asked = other.node.call(Contact(self.bootstrap.node.identity.public, self.world.address(0)), "members", b"")
+        self.world.run(0.5)
+        named = [unpacked(fields) for fields in self.successResultOf(asked)]
+        self.assertIn(Contact(site.node.identity.public, relayed(site.node.identity.node_id)), named)
+        public = Identity(b"z" * 32).public
+        for host in ("~wss-aabbccddeeff", "~" + "0" * 40, "~"):
+            told = unpacked([public, host, 443])
+            assert told is not None
+            self.assertEqual(told.address, relayed(told.node_id))
+            self.assertEqual(Contact(public, Address(host, 1)).packed(), [public, *relayed(told.node_id)])
+
+    def test_everybody_reaches_everybody(self) -> None:
+        """Two blocked members and two others: each reaches each, 4 s after the last one began to join."""
+        sites = [self.bootstrap]
+        for place, is_blocked in ((1, True), (2, False), (3, True), (4, False)):
+            sites.append(self.world.add(place, is_blocked)[0])
+            self.world.run(4.0)
+        for asker in sites:
+            self.assertEqual(len(asker.node.overlay.contacts()), 4)
+            for asked in sites:
+                if asked is not asker:
+                    self.assertEqual(self.call(asker, asked), self.sites_place(asked))
+
+    def sites_place(self, site: Site) -> int:
+        """The place of a site."""
+        return [self.world.identity(place).public for place in range(5)].index(site.node.identity.public)
+
+    def test_leave_the_tunnel(self) -> None:
+        """When UDP works again the session moves to it within 16 s, and the tunnel closes a minute later."""
+        site, _ = self.world.add(1, is_blocked=True)
+        self.world.run(10.0)
+        site.block(False)
+        self.world.run(16.0)
+        (contact,) = site.node.overlay.contacts()
+        self.assertEqual(contact.address, self.world.address(BOOTSTRAP))
+        (contact,) = self.bootstrap.node.overlay.contacts()
+        self.assertEqual(contact.address, self.world.address(1))
+        self.assertEqual(self.call(site, self.bootstrap), BOOTSTRAP)
+        self.world.run(65.0)
+        self.assertEqual((site.tunnel.peers, self.bootstrap.tunnel.peers), ([], []))
+        self.assertEqual(self.call(self.bootstrap, site), 1)
+
+    def test_fall_back_when_contact_is_lost(self) -> None:
+        """A member to which UDP is blocked later on comes back by a tunnel when it has lost all contact."""
+        site, _ = self.world.add(1)
+        self.world.run(5.0)
+        site.block()
+        self.world.run(15.0)
+        self.assertEqual(len(site.tunnel.peers), 1)
+        self.assertEqual(self.call(site, self.bootstrap), BOOTSTRAP)
+        self.assertEqual(self.call(self.bootstrap, site), 1)
+
+    def test_bootstrap_restarts(self) -> None:
+        """When the tunnel's server is gone for 20 s its tunnelled members come back by themselves within 15 s."""
+        site, _ = self.world.add(1, is_blocked=True)
+        self.world.run(5.0)
+        self.bootstrap.node.vanish()
+        self.world.run(20.0)
+        self.bootstrap, _ = self.world.add(BOOTSTRAP, is_served=True)
+        self.world.run(15.0)
+        self.assertEqual(self.call(site, self.bootstrap), BOOTSTRAP)
+
+    def test_remember_no_tunnel(self) -> None:
+        """A bootstrap node that remembers tunnelled members only does not wait for them when it starts again."""
+        self.world.add(1, is_blocked=True)
+        self.world.run(40.0)
+        self.bootstrap.node.vanish()
+        self.bootstrap, joined = self.world.add(BOOTSTRAP, is_served=True)
+        self.world.run(0.5)
+        self.successResultOf(joined)
+
+    def test_late_bootstrap(self) -> None:
+        """A blocked newcomer that nobody answers goes on trying, and is in soon after the tunnel is there."""
+        self.bootstrap.node.vanish()
+        _, joined = self.world.add(1, is_blocked=True)
+        self.world.run(20.0)
+        self.assertNoResult(joined)
+        self.world.add(BOOTSTRAP, is_served=True)
+        self.world.run(20.0)
+        self.successResultOf(joined)
+
+    def test_tunnel_alone(self) -> None:
+        """A node that knows nothing but a tunnel enters by it at once, and never takes itself for the first."""
+        site = Site(self.world, 3, [self.world.url()])
+        site.block()
+        self.world.sites.append(site)
+        site.node.start()
+        joined = site.node.join([])
+        self.world.run(0.6)
+        self.successResultOf(joined)
+        self.assertEqual(len(site.node.overlay.contacts()), 1)

@@ -1,0 +1,220 @@
+"""Tests of finding the team on a LAN in memory."""
+
+from __future__ import annotations
+
+import random
+
+from middleware.entangled.kademlia.discovery import ANSWERS, LISTEN
+from middleware.entangled.network.multicast import Segment, SegmentMulticast
+from middleware.entangled.network.network import Address
+from middleware.entangled.network.switchboard import CALM, Weather
+from middleware.entangled.node import EntangledNode
+from tests.fleet import TEAM, Fleet, FleetCase
+
+
+class Lan(Fleet):
+    """Nodes that were told no address, on one segment."""
+
+    def __init__(self, seed: int = 1, weather: Weather = CALM) -> None:
+        super().__init__(0, seed, weather)
+        self.segment = Segment(self.board)
+        self.groups: list[SegmentMulticast] = []
+
+    def on(self, place: int, segment: Segment | None = None, team: bytes = TEAM) -> EntangledNode:
+        """A node of this place on ``segment``, which starts."""
+        group = (segment or self.segment).group()
+        network = self.board.network(*self.address(place))
+        identity, store, rng = self.identity(place), self.store(place), self.rng(place)
+        node = EntangledNode(identity, team, network, store, self.clock, rng, lan=group)
+        self.groups.append(group)
+        self.nodes.append(node)
+        self.enter(node, [])
+        return node
+
+    def traffic(self) -> dict[str, int]:
+        """What all nodes together counted."""
+        counted = [node.discovery.counters for node in self.nodes if node.discovery is not None]
+        return {name: sum(each[name] for each in counted) for name in ("calls", "answered", "left", "greeted")}
+
+
+class DiscoveryTests(FleetCase):
+    """Behaviour of ``Discovery``."""
+
+    def lan(self, seed: int = 1, weather: Weather = CALM) -> Lan:
+        """A LAN that is stopped when the test ends."""
+        lan = Lan(seed, weather)
+        self.worlds.append(lan)
+        return lan
+
+    def test_two_find_each_other(self) -> None:
+        """Two nodes without known nodes, started at one moment, are one network half a second later."""
+        lan = self.lan()
+        a, b = lan.on(0), lan.on(1)
+        lan.run(0.5)
+        self.assertEqual(a.overlay.contacts(), [b.contact])
+        self.assertEqual(b.overlay.contacts(), [a.contact])
+
+    def test_newcomer_reads_what_the_team_wrote(self) -> None:
+        """Who joins by the LAN knows everybody and reads what was written before it came."""
+        lan = self.lan()
+        first = lan.on(0)
+        lan.run(2.0)
+        key = bytes(20)
+        self.done(lan, first.put(key, "", b"value", concern="one"))
+        for place in range(1, 6):
+            lan.on(place)
+            lan.run(1.0)
+        last = lan.nodes[-1]
+        self.assertEqual(len(last.overlay.contacts()), 5)
+        self.assertEqual([record.value for record in self.done(lan, last.get(key))], [b"value"])
+
+    def test_newcomer_is_not_whole_before_it_met_all(self) -> None:
+        """Who entered through the LAN takes its team for whole only when it has met everybody in it."""
+        lan = self.lan()
+        for place in range(6):
+            lan.on(place)
+            lan.run(1.0)
+        newcomer = lan.on(6)
+        while not newcomer.overlay.contacts():
+            lan.run(0.001)
+        self.assertFalse(newcomer.overlay.is_whole)
+        while not newcomer.overlay.is_whole:
+            lan.run(0.001)
+        self.assertEqual(len(newcomer.overlay.contacts()), 6)
+
+    def test_first_of_a_network_waits_a_moment(self) -> None:
+        """Where nobody answers a node takes itself for the first of its network, after ``LISTEN`` and not before."""
+        lan = self.lan()
+        lan.nodes.append(node := lan.made(0))
+        node.stop()
+        alone = lan.on(1)
+        joined = alone.join([])
+        lan.run(LISTEN - 0.05)
+        self.assertFalse(joined.called)
+        self.done(lan, joined, 0.1)
+        self.assertTrue(alone.overlay.is_whole)
+
+    def test_storm_of_a_hundred_stays_small(self) -> None:
+        """A hundred nodes that start at one moment are one network, with a few answers to each call."""
+        lan = self.lan()
+        for place in range(100):
+            lan.on(place)
+        lan.run(20.0)
+        self.assertGreaterEqual(min(len(node.overlay.contacts()) for node in lan.nodes), 8)
+        self.assertEqual({(node.overlay.is_whole, node.overlay.is_large) for node in lan.nodes}, {(False, True)})
+        last, first = lan.nodes[-1], lan.nodes[0]
+        self.assertEqual(self.done(lan, last.find_node(first.identity.node_id))[0], first.contact)
+        traffic = lan.traffic()
+        self.assertLess(traffic["calls"], 120)
+        self.assertLess(traffic["answered"], 2 * ANSWERS * traffic["calls"])
+        self.assertLess(traffic["greeted"], 350)
+
+    def test_team_in_company_is_quiet(self) -> None:
+        """Ten nodes that know each other call about twice a minute, all together."""
+        lan = self.lan()
+        for place in range(10):
+            lan.on(place)
+        lan.run(30.0)
+        before = lan.traffic()["calls"]
+        lan.run(600.0)
+        self.assertLess(lan.traffic()["calls"] - before, 30)
+
+    def test_two_halves_become_one(self) -> None:
+        """Two networks of one team, each whole for itself, become one soon after their LANs are joined."""
+        lan = self.lan()
+        other = Segment(lan.board)
+        for place in range(3):
+            lan.on(place)
+            lan.on(place + 3, other)
+        lan.run(5.0)
+        self.assertEqual({len(node.overlay.contacts()) for node in lan.nodes}, {2})
+        lan.segment.groups += other.groups
+        other.groups = lan.segment.groups
+        lan.run(150.0)
+        self.assertEqual({len(node.overlay.contacts()) for node in lan.nodes}, {5})
+
+    def test_new_interface_is_called_at_once(self) -> None:
+        """A node that comes to another LAN calls there at once, however long it would have waited."""
+        lan = self.lan()
+        lan.segment.is_blocked = True
+        a, b = lan.on(0), lan.on(1)
+        lan.run(60.0)
+        self.assertEqual(a.overlay.contacts(), [])
+        lan.segment.is_blocked = False
+        lan.groups[0].on_change()
+        lan.run(0.3)
+        self.assertEqual(a.overlay.contacts(), [b.contact])
+
+    def test_weather(self) -> None:
+        """With three datagrams of ten lost, five nodes find each other within ten seconds."""
+        lan = self.lan(seed=4, weather=Weather(loss=0.3, delay_s=0.005))
+        for place in range(5):
+            lan.on(place)
+        lan.run(10.0)
+        self.assertEqual({len(node.overlay.contacts()) for node in lan.nodes}, {4})
+
+    def test_another_team_is_not_met(self) -> None:
+        """A node of another team on the same LAN hears nothing from this one, and is counted."""
+        lan = self.lan()
+        a, b = lan.on(0), lan.on(1, team=b"o" * 32)
+        lan.run(5.0)
+        self.assertEqual([*a.overlay.contacts(), *b.overlay.contacts()], [])
+        assert a.discovery is not None
+        self.assertGreater(a.discovery.counters["foreign"], 0)
+        self.assertEqual(a.discovery.counters["answered"], 0)
+
+    def test_recording_is_answered_once(self) -> None:
+        """A call that somebody plays again and again is answered the first time only."""
+        lan = self.lan()
+        a = lan.on(0)
+        lan.run(1.0)
+        call = a.endpoint.call()
+        thief = lan.segment.group()
+        got: list[bytes] = []
+        thief.listen(lambda datagram, source: got.append(datagram))
+        for _ in range(50):
+            thief.send(call)
+            lan.run(0.2)
+        thief.close()
+        self.assertEqual(len([datagram for datagram in got if datagram[0] == 0x15]), 1)
+
+    def test_garbage_changes_nothing(self) -> None:
+        """Forged, cut and empty datagrams raise nothing; forged answers lead a node to greet a few addresses only."""
+        lan = self.lan()
+        a = lan.on(0)
+        lan.run(1.0)
+        noise = random.Random(5)
+        thief = lan.segment.group()
+        thief.listen(lambda datagram, source: None)
+        for kind in (0, 0x11, 0x14, 0x15, 0x19):
+            for size in (0, 1, 88, 89, 400):
+                thief.send((bytes([kind]) + noise.randbytes(size))[:size])
+        lan.run(5.0)
+        thief.close()
+        assert a.discovery is not None
+        self.assertEqual(a.overlay.contacts(), [])
+        self.assertLessEqual(a.discovery.counters["greeted"], 2)
+
+    def test_known_node_that_is_gone_is_no_bar(self) -> None:
+        """A node whose known node is dead enters through whoever it finds on the LAN."""
+        lan = self.lan()
+        first = lan.on(0)
+        lan.run(1.0)
+        network, group = lan.board.network(*lan.address(1)), lan.segment.group()
+        node = EntangledNode(lan.identity(1), TEAM, network, lan.store(1), lan.clock, lan.rng(1), lan=group)
+        lan.nodes.append(node)
+        joined = lan.enter(node, [Address("10.0.0.99", 7000)])
+        self.done(lan, joined, 2.0)
+        self.assertEqual(node.overlay.contacts(), [first.contact])
+
+    def test_lost_team_is_looked_for_soon(self) -> None:
+        """A node that lost everybody calls again within seconds, and finds who came meanwhile."""
+        lan = self.lan()
+        a, b = lan.on(0), lan.on(1)
+        lan.run(2.0)
+        b.vanish()
+        lan.run(30.0)
+        lan.segment.is_blocked = False
+        c = lan.on(2)
+        lan.run(1.0)
+        self.assertIn(c.contact, a.overlay.contacts())

@@ -1,0 +1,656 @@
+"""Tests of the door: who is let in, what both sides hear of a refusal, and two nodes with one identity."""
+
+from __future__ import annotations
+
+import random
+from typing import Any
+
+from twisted.internet.defer import Deferred
+from twisted.logger import ILogObserver, LogEvent, LogLevel, formatEvent, globalLogPublisher
+from twisted.trial.unittest import SynchronousTestCase
+from zope.interface import implementer
+
+from middleware.entangled.errors import NoAnswer, NotAdmitted, Refused
+from middleware.entangled.identity import Identity, exchange_key
+from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.network.address import address_of, packed_address
+from middleware.entangled.network.network import MAX_DATAGRAM, Address
+from middleware.entangled.node import EntangledNode
+from middleware.entangled.record import Slot, hashed_key
+from middleware.entangled.wire import door
+from middleware.entangled.wire.door import (
+    DOUBLED,
+    EXPIRED,
+    FOREIGN,
+    LINES,
+    REVOKED,
+    ROLE,
+    SUPERSEDED,
+    Life,
+    Lives,
+    Noted,
+    meaning,
+    next_life,
+)
+from middleware.entangled.wire.endpoint import Endpoint
+from middleware.entangled.wire.session import ANSWER_ROOM, DATA, INIT, RESP, Credentials, Hello, Invitation
+from tests.fleet import TEAM as FLEET_TEAM
+from tests.fleet import Fleet, FleetCase
+from tests.middleware.gate import ROOM, Gate
+from tests.middleware.test_endpoint import DELAY, TEAM, EndpointCase, Tap
+
+
+class LogCase(SynchronousTestCase):
+    """A test that reads the log."""
+
+    def listened(self) -> list[str]:
+        """The warnings that are logged from now on."""
+        lines: list[str] = []
+
+        @implementer(ILogObserver)
+        def seen(event: LogEvent) -> None:
+            if event["log_level"] >= LogLevel.warn:
+                lines.append(formatEvent(event))
+
+        globalLogPublisher.addObserver(seen)
+        self.addCleanup(globalLogPublisher.removeObserver, seen)
+        return lines
+
+
+class ClosedCase(EndpointCase, LogCase):
+    """Two endpoints of a closed team, each with a ``Gate``."""
+
+    def setUp(self) -> None:
+        self.gates: list[Gate] = []
+        super().setUp()
+        self.at_a, self.at_b = self.gates
+        self.log = self.listened()
+
+    def endpoint(
+        self, seed: int, team: bytes = TEAM, port: int = 0, identity: int | None = None, gate: Gate | None = None
+    ) -> tuple[Endpoint, Contact]:
+        own = Identity(bytes([identity or seed]) * 32)
+        tap = Tap(self.board.network("127.0.0.1", port))
+        self.gates.append(gate or Gate())
+        endpoint = Endpoint(own, team, tap, self.clock, random.Random(seed), self.gates[-1])
+        endpoint.start()
+        self.taps[tap.address] = tap
+        return endpoint, Contact(own.public, tap.address)
+
+    def refused(self, asked: Deferred[Any], code: str, seconds: float = 3.0) -> str:
+        """The text with which a question fails, for the reason ``code``."""
+        self.clock.advance(seconds)
+        error = self.failureResultOf(asked, NotAdmitted).value
+        self.assertEqual(error.code, code)
+        return str(error)
+
+
+class PassTests(ClosedCase):
+    """What is shown in a handshake, and what becomes of it."""
+
+    def test_first_answer_still_takes_one_round_trip(self) -> None:
+        """With the largest passes a first question still rides in the handshake and is answered in one round trip."""
+        answer = bytes(ANSWER_ROOM - 20)
+        asked = self.a.ask(self.to_b, "echo", answer)
+        self.clock.advance(2 * DELAY)
+        self.assertEqual(self.successResultOf(asked), answer)
+        self.assertEqual((self.at_a.judged, self.at_b.judged), ([self.to_b.public], [self.to_a.public]))
+
+    def test_resp_is_never_longer_than_its_init(self) -> None:
+        """However long the answer is, the RESP with its pass is no longer than the INIT, and that is one datagram."""
+        self.b.expose("zeros", lambda peer, padding, count: bytes(count))
+        sizes = ((0, 0), (0, ANSWER_ROOM - 20), (0, ANSWER_ROOM + 10), (500, 600), (800, 0), (2000, 2000))
+        for seed, (asked, answered) in enumerate(sizes, start=11):
+            asker, to_asker = self.endpoint(seed)
+            self.assertEqual(self.got(asker.ask(self.to_b, "zeros", bytes(asked), answered)), bytes(answered))
+            inits = [d for d, source in self.kept(self.to_b, INIT) if source == to_asker.address]
+            self.assertEqual(len(inits), 1)
+            for response, _ in self.kept(to_asker, RESP):
+                self.assertLessEqual(len(response), len(inits[0]))
+                self.assertLessEqual(len(inits[0]), MAX_DATAGRAM)
+
+    def test_an_init_without_room_for_a_pass(self) -> None:
+        """An INIT that leaves no room for the responder's pass is dropped for the price of a length."""
+        own = Credentials.of(Identity(b"m" * 32), TEAM)
+        init = Invitation(own, exchange_key(self.to_b.public), bytes(range(32)), 5, b"").datagram()
+        self.taps[self.to_b.address].receiver(init, self.to_a.address)
+        self.clock.advance(1)
+        self.assertEqual((self.b.counters["forged"], self.kept(self.to_a, RESP)), (1, []))
+
+    def test_both_are_told_where_they_are_seen(self) -> None:
+        """Who opens a session learns from which address its INIT came."""
+        seen: list[tuple[Contact, Address]] = []
+        self.a.on_seen = lambda contact, address: seen.append((contact, address))
+        self.got(self.a.ask(self.to_b, "echo", 1))
+        self.assertEqual(seen, [(self.to_b, self.to_a.address)])
+
+    def test_refused_by_the_responder(self) -> None:
+        """Who shows no lawful pass is told why, nothing that it asked runs, and no session is left on either side."""
+        self.at_b.refused[self.to_a.public] = EXPIRED
+        self.b.expose("look", lambda peer: self.runs.append(peer))
+        text = self.refused(self.a.ask(self.to_b, "look"), EXPIRED, 2 * DELAY)
+        self.assertIn(meaning(EXPIRED), text)
+        self.assertEqual((self.runs, self.a._sessions, self.b._sessions), ([], {}, {}))
+
+    def test_refused_by_the_initiator(self) -> None:
+        """Who answers with no lawful pass is told so in the first DATA; neither counts the other as met."""
+        self.at_a.refused[self.to_b.public] = REVOKED
+        met: list[Contact] = []
+        refusals: list[tuple[Contact, str]] = []
+        self.a.on_contact = self.b.on_contact = met.append
+        self.b.on_refused = lambda contact, code: refusals.append((contact, code))
+        self.refused(self.a.ask(self.to_b, "echo", 1), REVOKED)
+        self.assertEqual((met, refusals), ([], [(self.to_a, REVOKED)]))
+        self.assertEqual((self.a._sessions, self.b._sessions), ({}, {}))
+        self.assertEqual(len(self.kept(self.to_b, DATA)), 1)
+
+    def test_said_once(self) -> None:
+        """However often a node knocks in vain, each side logs it once, with what to do about it."""
+        self.at_b.refused[self.to_a.public] = REVOKED
+        for _ in range(5):
+            self.refused(self.a.ask(self.to_b, "echo", 1), REVOKED)
+        self.assertEqual(len(self.kept(self.to_b, INIT)), 5)
+        self.assertEqual(len(self.log), 2)
+        self.assertTrue(all(meaning(REVOKED) in line for line in self.log), self.log)
+
+    def test_another_refusal_is_said_again(self) -> None:
+        """A refusal with another name is another line of the log."""
+        for code in (EXPIRED, REVOKED):
+            self.at_b.refused[self.to_a.public] = code
+            self.refused(self.a.ask(self.to_b, "echo", 1), code)
+        self.assertEqual(len(self.log), 4)
+
+    def test_let_in_again(self) -> None:
+        """Who was refused and has a new pass is let in at its next question."""
+        self.at_b.refused[self.to_a.public] = EXPIRED
+        self.refused(self.a.ask(self.to_b, "echo", 1), EXPIRED)
+        del self.at_b.refused[self.to_a.public]
+        self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 2)), 2)
+
+    def test_an_open_node_is_no_member(self) -> None:
+        """A node that shows no pass at all is foreign, though it holds the team's secret."""
+        stranger, _ = self.endpoint(9, gate=Gate(shown=b""))
+        self.refused(stranger.ask(self.to_b, "echo", 1), FOREIGN)
+
+    def test_a_pass_that_is_too_long(self) -> None:
+        """A pass of more bytes than this team's may have is foreign, whatever is in it, and costs no signature."""
+        self.at_a.shown += b"!"
+        self.refused(self.a.ask(self.to_b, "echo", 1), FOREIGN)
+        self.assertEqual(self.at_b.judged, [])
+
+    def test_a_repeated_init_is_refused_without_a_key_exchange(self) -> None:
+        """The same INIT again gets the same refusal again, and the door is not asked a second time."""
+        self.at_b.refused[self.to_a.public] = REVOKED
+        self.refused(self.a.ask(self.to_b, "echo", 1), REVOKED)
+        (init, source), judged = self.kept(self.to_b, INIT)[0], len(self.at_b.judged)
+        self.taps[self.to_b.address].receiver(init, source)
+        self.clock.advance(1)
+        self.assertEqual((len(self.at_b.judged), self.b.counters["repeated"]), (judged, 1))
+        first, second = (datagram for datagram, _ in self.kept(self.to_a, RESP))
+        self.assertEqual(first, second)
+
+    def test_a_forged_init_reaches_no_door(self) -> None:
+        """Without the team's secret an INIT costs a hash: no key is exchanged and the door is not asked."""
+        own = Credentials.of(Identity(b"m" * 32), b"x" * 32)
+        hello = Hello(self.at_a.life, self.at_a.shown, ROOM)
+        init = Invitation(own, exchange_key(self.to_b.public), bytes(range(32)), 5, b"", hello).datagram()
+        self.taps[self.to_b.address].receiver(init, self.to_a.address)
+        self.assertEqual((self.at_b.judged, self.b.counters["forged"]), ([], 1))
+
+    def test_a_refusal_that_is_none(self) -> None:
+        """A member that sends a refusal without a lawful name is counted, and its session lives on."""
+        self.got(self.a.ask(self.to_b, "echo", 1))
+        session = next(iter(self.a._sessions.values()))
+        for rubbish in (b"\x04", b"\x04\xff\xfe", b"\x04" + b"x" * 33):
+            self.a._send(session, rubbish)
+        self.clock.advance(1)
+        self.assertEqual(self.b.counters["malformed"], 3)
+        self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 2)), 2)
+
+
+class EvictionTests(ClosedCase):
+    """Members that are members no more."""
+
+    def test_evicted_at_runtime(self) -> None:
+        """Who is evicted is told so, what it asked is stopped, and what is asked of it fails; it stays outside."""
+        never: Deferred[None] = Deferred()
+        stopped: list[object] = []
+        self.b.expose("wait", lambda peer: Deferred(lambda _: stopped.append(1)), changes=True)
+        self.a.expose("wait", lambda peer: never, changes=True)
+        mine = self.a.ask(self.to_b, "wait", timeout=60.0, changes=True)
+        self.clock.advance(1)
+        theirs = self.b.ask(self.to_a, "wait", timeout=60.0, changes=True)
+        self.clock.advance(1)
+        self.at_b.refused[self.to_a.public] = REVOKED
+        self.b.evict(self.to_a.public)
+        self.refused(theirs, REVOKED, 0.0)
+        self.refused(mine, REVOKED, 2 * DELAY)
+        self.assertEqual((stopped, self.a._sessions, self.b._sessions), ([1], {}, {}))
+        self.refused(self.a.ask(self.to_b, "echo", 1), REVOKED)
+        self.refused(self.b.ask(self.to_a, "echo", 1), REVOKED)
+        self.assertEqual(len(self.log), 2)
+
+    def test_evicted_in_the_middle_of_a_parcel(self) -> None:
+        """A large question under way ends with the eviction, and nothing of it is kept on either side."""
+        asked = self.a.ask(self.to_b, "echo", bytes(500_000))
+        self.clock.advance(6 * DELAY)
+        self.b.evict(self.to_a.public)
+        self.refused(asked, REVOKED)
+        for end in (self.a, self.b):
+            self.assertEqual((end._courier._assemblies, dict(end._courier._bytes_in)), ({}, {}))
+            self.assertEqual(dict(end._courier._bytes_out), {})
+
+    def test_evicted_before_it_confirmed(self) -> None:
+        """A session whose initiator has not confirmed it yet goes with its initiator."""
+        self.a.ask(self.to_b, "add", 1, changes=True).addErrback(lambda failure: None)
+        self.clock.advance(1.5 * DELAY)
+        self.b.evict(self.to_a.public)
+        self.clock.advance(0.5 * DELAY)
+        self.assertEqual((self.b._sessions, self.runs), ({}, []))
+
+    def test_nobody_to_evict(self) -> None:
+        """To evict somebody who was never met does nothing."""
+        self.b.evict(Identity(b"n" * 32).public)
+        self.assertEqual(self.log, [])
+
+
+class LifeTests(ClosedCase):
+    """Two nodes with one identity."""
+
+    def life(self, number: int, nonce: int) -> tuple[Endpoint, Contact]:
+        """One more node with the identity of ``a``."""
+        end, contact = self.endpoint(50 + nonce, identity=1, gate=Gate(number, nonce))
+        self.equip(end)
+        return end, contact
+
+    def test_a_restart_is_welcome(self) -> None:
+        """A higher life is let in at once, and nobody hears of a refusal."""
+        self.got(self.a.ask(self.to_b, "echo", 1))
+        self.a.stop()
+        again, _ = self.life(2, 2)
+        self.assertEqual(self.got(again.ask(self.to_b, "echo", 2)), 2)
+        self.assertEqual((self.log, self.b.counters["refused"]), ([], 0))
+
+    def test_the_older_one_is_told(self) -> None:
+        """While a later life goes on, the older one is told once that it is superseded, in its session and after."""
+        self.got(self.a.ask(self.to_b, "echo", 1))
+        later, _ = self.life(2, 2)
+        self.got(later.ask(self.to_b, "echo", 2))
+        self.refused(self.a.ask(self.to_b, "echo", 3), SUPERSEDED)
+        self.refused(self.a.ask(self.to_b, "echo", 3), SUPERSEDED)
+        self.assertEqual(self.got(later.ask(self.to_b, "echo", 4)), 4)
+        self.assertEqual(len(self.log), 2)
+        self.assertTrue(all(meaning(SUPERSEDED) in line for line in self.log))
+
+    def test_a_copy_is_doubled(self) -> None:
+        """The same life with other dice, or an unknown lower one, is refused, and the first one goes on."""
+        self.at_a.life = Life(5, self.at_a.life.nonce)
+        self.got(self.a.ask(self.to_b, "echo", 1))
+        for number, nonce in ((5, 2), (4, 3)):
+            copy, _ = self.life(number, nonce)
+            self.refused(copy.ask(self.to_b, "echo", 2), DOUBLED)
+        self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 3)), 3)
+
+    def test_a_copy_that_answers(self) -> None:
+        """A question that reaches a copy fails by name, and the copy is told; the session with the first one lives."""
+        self.equip(self.a)
+        self.got(self.a.ask(self.to_b, "echo", 1))
+        copy, to_copy = self.life(1, 2)
+        session = self.b._peers.known(self.to_a.public).session  # type: ignore[union-attr]
+        assert session is not None
+        self.b._peers.open(self.b._peers.peer(to_copy), to_copy.address)
+        self.clock.advance(1)
+        self.assertEqual(copy._sessions, {})
+        self.assertIs(self.b._peers.known(self.to_a.public).session, session)  # type: ignore[union-attr]
+        self.assertEqual(self.got(self.b.ask(self.to_a, "echo", 2)), 2)
+        self.assertEqual(len(self.log), 2)
+
+    def test_two_that_knock_at_once(self) -> None:
+        """Of two with one life whose INITs cross, the one that confirms first is in; the other one is told."""
+        copy, _ = self.life(1, 2)
+        first, second = self.a.ask(self.to_b, "add", 1, changes=True), copy.ask(self.to_b, "add", 2, changes=True)
+        self.clock.advance(3)
+        results = [one.result for one in (first, second)]
+        self.assertEqual(results[0], 1)
+        self.assertEqual(self.failureResultOf(second, NotAdmitted).value.code, DOUBLED)
+        self.assertEqual(self.runs, [1])
+
+    def test_a_recording_sets_no_life(self) -> None:
+        """A recorded INIT of an earlier life changes nothing that is remembered of lives."""
+        self.got(self.a.ask(self.to_b, "echo", 1))
+        recorded = self.kept(self.to_b, INIT)[0]
+        later, _ = self.life(2, 2)
+        self.got(later.ask(self.to_b, "echo", 2))
+        self.clock.advance(60)
+        self.taps[self.to_b.address].receiver(*recorded)
+        self.clock.advance(1)
+        self.assertEqual(self.got(later.ask(self.to_b, "echo", 4)), 4)
+
+    def test_lives(self) -> None:
+        """A later life holds, the one before it is superseded, any other one doubled; who counts none is let in."""
+        lives, one, two = Lives(), Life(1, b"1" * 8), Life(2, b"2" * 8)
+        self.assertFalse(lives.met(b"a", one))
+        self.assertEqual(lives.judge(b"a", two), "")
+        self.assertTrue(lives.met(b"a", two))
+        answers = [lives.judge(b"a", life) for life in (one, two, Life(2, b"3" * 8), Life(1, b"3" * 8), Life())]
+        self.assertEqual(answers, [SUPERSEDED, "", DOUBLED, DOUBLED, ""])
+        self.assertEqual(lives.judge(b"b", one), "")
+        lives.forget(b"a")
+        self.assertEqual(lives.judge(b"a", one), "")
+
+    def test_tables_are_bounded(self) -> None:
+        """Lives and noted refusals are remembered up to a number; the oldest go first."""
+        self.patch(door, "MAX_LIVES", 3)
+        self.patch(door, "MAX_NOTED", 3)
+        lives, noted = Lives(), Noted()
+        for number in range(10):
+            lives.met(bytes([number]), Life(1, b"1" * 8))
+            self.assertTrue(noted.is_new(0.0, bytes([number]), EXPIRED))
+        self.assertEqual(len(lives), 3)
+        self.assertFalse(noted.is_new(0.0, b"\x09", EXPIRED))
+        self.assertTrue(noted.is_new(0.0, b"\x00", EXPIRED))
+
+    def test_the_log_is_no_target(self) -> None:
+        """Who invents keys gets a few lines at once and one a second, and what was not said is said later."""
+        noted = Noted()
+        self.assertEqual(sum(noted.is_new(0.0, number, FOREIGN) for number in range(1000)), LINES)
+        self.assertEqual(sum(noted.is_new(3.0, number, FOREIGN) for number in range(1000)), 3)
+
+    def test_next_life(self) -> None:
+        """A life has a higher number than the last one and, where that was lost, than those begun before in time."""
+        self.assertEqual([next_life(0, 0.0), next_life(7, 5.0), next_life(7, 1e9)], [1, 8, 10**9])
+
+
+class SecretTests(ClosedCase):
+    """The team's secret is succeeded by another one."""
+
+    NEW, NEWER = b"n" * 32, b"N" * 32
+
+    def test_both_are_good_for_a_while(self) -> None:
+        """While the old secret still counts, who has the new one and who has not reach each other, both ways."""
+        self.b.rekey(self.NEW, TEAM)
+        self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 1), 4 * DELAY), 1)
+        old, to_old = self.endpoint(7)
+        self.equip(old)
+        self.b.ask(to_old, "echo", 2).addErrback(lambda failure: failure.trap(NoAnswer))
+        self.clock.advance(3)
+        self.assertEqual(self.got(self.b.ask(to_old, "echo", 3)), 3)
+        new, _ = self.endpoint(8, team=self.NEW)
+        self.assertEqual(self.got(new.ask(self.to_b, "echo", 4), 4 * DELAY), 4)
+
+    def test_greetings_while_both_are_good(self) -> None:
+        """A greeting goes out under each secret in turn, and who is found by the old one is asked under it at once."""
+        self.b.rekey(self.NEW, TEAM)
+        self.equip(self.a)
+        found = self.got(self.b.greet(self.to_a.address), 1.0)
+        self.assertEqual(found, self.to_a)
+        self.assertEqual(self.got(self.b.ask(found, "echo", 1), 2 * DELAY), 1)
+
+    def test_sessions_live_on(self) -> None:
+        """A session outlives the secret under which it was opened."""
+        self.got(self.a.ask(self.to_b, "echo", 1))
+        for end in (self.a, self.b):
+            end.rekey(self.NEW)
+        self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 2), 2 * DELAY), 2)
+
+    def test_the_old_one_is_over(self) -> None:
+        """Who has only a secret that counts no more is answered by nothing."""
+        self.b.rekey(self.NEWER, self.NEW)
+        self.b.rekey(self.NEWER)
+        sent = len(self.kept(self.to_a, RESP))
+        self.clock.advance(1)
+        self.failed(self.a.ask(self.to_b, "echo", 1), NoAnswer)
+        self.failed(self.a.greet(self.to_b.address), NoAnswer)
+        self.assertEqual(len(self.kept(self.to_a, RESP)), sent)
+
+    def test_cookies_under_each_secret(self) -> None:
+        """Under load a member that has only the old secret can read its cookie, and so can one with only the new."""
+        self.b.rekey(self.NEW, TEAM)
+        new, _ = self.endpoint(8, team=self.NEW)
+        for asker in (self.a, new):
+            self.b._cookies._quiet._tokens = -1e6
+            self.assertEqual(self.got(asker.ask(self.to_b, "echo", 1), 4 * DELAY), 1)
+
+    def test_nobody_is_remembered_by_an_old_one(self) -> None:
+        """Who was met under the old secret is asked under the new one as soon as the old one counts no more."""
+        self.equip(self.a)
+        self.b.rekey(self.NEW, TEAM)
+        self.got(self.b.greet(self.to_a.address), 1.0)
+        self.a.rekey(self.NEW)
+        self.b.rekey(self.NEW)
+        self.assertEqual(self.got(self.b.ask(self.to_a, "echo", 1), 2 * DELAY), 1)
+
+    def test_what_is_no_secret(self) -> None:
+        """A secret of another length is refused, and what was before still counts."""
+        self.assertRaises(ValueError, self.b.rekey, b"short")
+        self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 1)), 1)
+
+
+class RoleTests(ClosedCase):
+    """What a member may not do."""
+
+    def test_a_method_that_is_not_for_it(self) -> None:
+        """A call that a role does not allow is refused by name, however it comes, and does not run; it is said once."""
+        self.b.expose("told", lambda peer: self.runs.append("told"))
+        self.at_b.forbidden = {(self.to_a.public, name) for name in ("add", "whole", "told")}
+        for asked in (
+            self.a.ask(self.to_b, "whole", 1),
+            self.a.ask(self.to_b, "add", 1, changes=True),
+            self.a.ask(self.to_b, "add", 1),
+            self.a.ask(self.to_b, "whole", 1, "x" * 3000),
+        ):
+            self.clock.advance(3)
+            self.assertEqual(self.failureResultOf(asked, Refused).value.code, ROLE)
+        self.a.tell(self.to_b, "told")
+        self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 1)), 1)
+        self.assertEqual((self.runs, len(self.log)), ([], 1))
+        self.assertIn(meaning(ROLE), self.log[0])
+
+
+class RouteTests(EndpointCase):
+    """Datagrams of other kinds."""
+
+    def test_a_kind_has_one_receiver(self) -> None:
+        """Datagrams of a routed kind go where they belong; a kind that is taken cannot be routed."""
+        got: list[tuple[bytes, Address]] = []
+        self.b.route(0x17, lambda datagram, source: got.append((datagram, source)))
+        self.a.post(b"\x17 knock", self.to_b.address)
+        self.clock.advance(1)
+        self.assertEqual(got, [(b"\x17 knock", self.to_a.address)])
+        for kind in (0x17, INIT):
+            self.assertRaises(ValueError, self.b.route, kind, print)
+        self.a.stop()
+        self.a.post(b"\x17 knock", self.to_b.address)
+        self.assertEqual(self.board.counters["sent"], 1)
+
+
+class AddressTests(SynchronousTestCase):
+    """Addresses in bytes."""
+
+    def test_there_and_back(self) -> None:
+        """Addresses of both families come back as they were; the zone of a local one stays behind."""
+        for address in (Address("10.0.0.1", 8470), Address("255.255.255.255", 65535), Address("2001:db8::1", 1)):
+            self.assertEqual(address_of(packed_address(address)), address)
+        self.assertEqual(address_of(packed_address(Address("fe80::1%eth0", 7))), Address("fe80::1", 7))
+
+    def test_what_is_no_address(self) -> None:
+        """Names and rubbish are packed as nothing, which reads as no address; so does what is cut short."""
+        for host, port in (
+            ("robot.local", 1),
+            ("~0102", 1),
+            ("10.0.0", 1),
+            ("10.0.0.256", 1),
+            ("::x", 1),
+            ("1.2.3.4", -1),
+        ):
+            packed = packed_address(Address(host, port))
+            self.assertEqual((len(packed), address_of(packed)), (18, None))
+        self.assertIsNone(address_of(bytes([1]) * 17))
+
+
+class GatedFleet(Fleet):
+    """A fleet of a closed team; ``gates`` are its doors, by place."""
+
+    def __init__(self, n: int) -> None:
+        self.gates: dict[int, Gate] = {}
+        super().__init__(n)
+
+    def made(self, place: int, lease: float = 1.0) -> EntangledNode:
+        gate = self.gates[place] = Gate(self.lives + 1, place + 1)
+        network = self.board.network(*self.address(place))
+        identity, store, dice = self.identity(place), self.store(place), self.rng(place)
+        return EntangledNode(identity, FLEET_TEAM, network, store, self.clock, dice, lease, self.clock.seconds, gate)
+
+    def evict(self, place: int, by: tuple[int, ...]) -> None:
+        """Have some members evict the one of a place."""
+        public = self.identity(place).public
+        for other in by:
+            self.gates[other].refused[public] = REVOKED
+            self.nodes[other].evict(public)
+
+
+KEY = hashed_key("somewhere")
+
+
+class MemberTests(FleetCase, LogCase):
+    """Nodes with a door."""
+
+    def gated(self, n: int) -> GatedFleet:
+        """A fleet that is stopped when the test ends."""
+        fleet = GatedFleet(n)
+        self.worlds.append(fleet)
+        return fleet
+
+    def test_evicted_from_a_team(self) -> None:
+        """Who is evicted leaves every table, its leases end at once, nobody looks for it, and it does not come back."""
+        fleet = self.gated(4)
+        node, gone = fleet.nodes[0], fleet.nodes[3].identity
+        told: list[list[bytes | None]] = []
+        self.done(fleet, fleet.nodes[3].put(KEY, "here", b"3", "leased"))
+        self.done(fleet, fleet.nodes[3].put(KEY, "stays", b"4", "team"))
+        node.watch(KEY, lambda records: told.append([r.value for r in records]))
+        fleet.run(1.0)
+        self.assertEqual(told[-1], [b"3", b"4"])
+        fleet.evict(3, by=(0, 1, 2))
+        fleet.run(0.5)
+        self.assertEqual(told[-1], [b"4"])
+        fleet.run(60.0)
+        for place in range(3):
+            overlay = fleet.nodes[place].overlay
+            self.assertNotIn(gone.node_id, [c.node_id for c in [*overlay.contacts(), *overlay.roster.absent()]])
+            self.assertEqual(len(overlay.contacts()), 2)
+        self.assertEqual(fleet.nodes[3].overlay.contacts(), [])
+        self.assertGreaterEqual(self.done(fleet, node.put(KEY, "after", b"5", concern="all")), 3)
+
+    def test_the_last_one_left_does_not_look_for_it(self) -> None:
+        """Who evicted the only other member does not look for it where it was."""
+        fleet = self.gated(2)
+        fleet.evict(1, by=(0,))
+        fleet.kill(1)
+        fleet.run(3.0)  # what was under way just then is over
+        sent = fleet.board.counters["sent"]
+        fleet.run(30.0)
+        self.assertEqual(fleet.board.counters["sent"], sent)
+
+    def test_a_copy_of_a_member(self) -> None:
+        """A copy that is refused, or that takes the place of the first one, costs nobody the member."""
+        for number, is_in in ((0, False), (99, True)):
+            fleet = self.gated(3)
+            public, life = fleet.identity(2).public, fleet.gates[2].life
+            gate = Gate(number or life.number, 77)
+            network = fleet.board.network("10.0.0.3", 3)
+            copy = Endpoint(fleet.identity(2), FLEET_TEAM, network, fleet.clock, random.Random(5), gate)
+            copy.start()
+            self.addCleanup(copy.stop)
+            node = fleet.nodes[0]
+            peer = node.endpoint._peers.known(public)
+            assert peer is not None
+            node.endpoint._peers.open(peer, network.address)
+            for _ in range(200):
+                fleet.run(0.01)
+                self.assertEqual(len(node.overlay.contacts()), 2)
+            self.assertEqual(bool(copy._sessions), is_in)
+
+    def test_the_evicted_one_is_no_majority_by_itself(self) -> None:
+        """Who is turned away by all counts them as absent, so it does not take itself for the team."""
+        fleet = self.gated(4)
+        fleet.evict(3, by=(0, 1, 2))
+        fleet.run(5.0)
+        self.assertEqual(len(fleet.nodes[3].overlay.roster.absent()), 3)
+        stored = fleet.nodes[3].put(KEY, "alone", b"1")
+        fleet.run(5.0)
+        self.failureResultOf(stored, NoAnswer)
+
+    def test_a_recording_parts_nobody(self) -> None:
+        """A recorded INIT whose pass counts no more is refused, and its sender stays a member with all it leased."""
+        fleet = self.gated(3)
+        init = [d for d, to in self.recorded(fleet, 2) if d[0] == INIT][0]
+        self.done(fleet, fleet.nodes[2].put(KEY, "here", b"2", "leased"))
+        public = fleet.identity(2).public
+        fleet.run(60.0)
+        fleet.gates[0].refused[public] = EXPIRED
+        stranger = fleet.board.network("10.0.0.9", 9)
+        stranger.listen(lambda datagram, source: None)
+        stranger.send(init, fleet.address(0))
+        lost: list[Contact] = []
+        fleet.nodes[0].overlay.on_lost = lost.append
+        fleet.run(1.0)
+        self.assertEqual((fleet.nodes[0].endpoint.counters["refused"], lost), (1, []))
+        self.assertEqual([r.value for r in self.done(fleet, fleet.nodes[1].get(KEY))], [b"2"])
+
+    def recorded(self, fleet: GatedFleet, place: int) -> list[tuple[bytes, Address]]:
+        """What a new life of the node of a place sends to enter."""
+        sent: list[tuple[bytes, Address]] = []
+        fleet.kill(place)
+        fleet.run(3.0)
+        node = fleet.nodes[place] = fleet.made(place)
+        network: Any = node._network
+        send = network.send
+
+        def noted(datagram: bytes, to: Address) -> None:
+            sent.append((datagram, to))
+            send(datagram, to)
+
+        network.send = noted
+        fleet.enter(node, [fleet.address(0)])
+        fleet.run(2.0)
+        return [one for one in sent if one[1] == fleet.address(0)]
+
+    def test_a_restart_in_a_closed_team(self) -> None:
+        """A member that was restarted is let in and known again, and nobody logs a refusal."""
+        log = self.listened()
+        fleet = self.gated(3)
+        fleet.kill(2)
+        fleet.run(1.0)
+        fleet.restart(2)
+        fleet.run(3.0)
+        self.assertEqual([len(node.overlay.contacts()) for node in fleet.nodes], [2, 2, 2])
+        self.assertEqual(log, [])
+
+    def test_a_slot_that_is_not_for_it(self) -> None:
+        """What its own role forbids a node does not write: the writer is told at once, and nothing is sent."""
+        fleet = self.gated(3)
+        fleet.gates[2].unwritable.add((fleet.identity(2).public, "order"))
+        sent = fleet.board.counters["sent"]
+        error = self.failureResultOf(fleet.nodes[2].put(KEY, "order", b"x"), Refused).value
+        self.assertEqual((error.code, fleet.board.counters["sent"]), (ROLE, sent))
+
+    def test_replicas_do_not_take_it_either(self) -> None:
+        """Where a node writes against its role, no replica holds it, no reader sees it, and the refusal reaches it."""
+        fleet = self.gated(4)
+        for place in range(3):
+            fleet.gates[place].unwritable.add((fleet.identity(3).public, "order"))
+        stored = fleet.nodes[3].put(KEY, "order", b"x")
+        fleet.run(2.0)
+        error = self.failureResultOf(stored, Refused).value
+        self.assertEqual(error.code, ROLE)
+        self.assertIn(meaning(ROLE), str(error))
+        self.assertFalse(fleet.nodes[3]._owner.owns(Slot(KEY, fleet.identity(3).public, "order")))
+        told: list[list[bytes | None]] = []
+        fleet.nodes[1].watch(KEY, lambda records: told.append([r.value for r in records]))
+        fleet.run(60.0)
+        for place in range(3):
+            self.assertEqual(fleet.nodes[place].replica.held(KEY), [])
+            self.assertEqual(self.done(fleet, fleet.nodes[place].get(KEY)), [])
+        self.assertEqual([found for found in told if found], [])
+        self.assertGreaterEqual(self.done(fleet, fleet.nodes[3].put(KEY, "other", b"y")), 3)

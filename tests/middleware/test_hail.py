@@ -1,0 +1,76 @@
+"""Tests of HAIL and ECHO: who is there at all."""
+
+from __future__ import annotations
+
+import random
+
+from middleware.entangled.errors import Malformed, NoAnswer, NotRunning
+from middleware.entangled.network.network import Address
+from middleware.entangled.wire.hail import ECHO, HAIL, HAIL_BYTES, RATE, VERSION, Echo, Hailer, echo, echo_of, hail
+from tests.middleware.gate import Gate
+from tests.middleware.test_endpoint import DELAY, EndpointCase
+
+TOKEN = b"0123456789abcdef"
+HOME, ELSEWHERE = Address("10.0.0.1", 1), Address("10.0.0.1", 2)
+
+
+class HailTests(EndpointCase):
+    """Behaviour of ``Endpoint.hail`` and of what answers it."""
+
+    def test_who_is_there(self) -> None:
+        """An echo tells the team's fingerprint, the version, the clock, and from where the hail was seen."""
+        self.b.echoer.wall = lambda: 1_700_000_000.25
+        self.b.echoer._fingerprint = lambda: Gate.fingerprint
+        found = self.got(self.a.hail(self.to_b.address), 2 * DELAY)
+        self.assertEqual(found[1:], Echo(b"", VERSION, b"the team", 1_700_000_000.25, self.to_a.address)[1:])
+
+    def test_another_team(self) -> None:
+        """A node of another team echoes too, with no name of its own where it is an open one."""
+        _, to_other = self.endpoint(3, team=b"o" * 32)
+        found = self.got(self.a.hail(to_other.address))
+        self.assertEqual((found.fingerprint, found.wall), (bytes(8), 0.0))
+
+    def test_nobody_is_there(self) -> None:
+        """Where nobody listens the hail fails in time, and one that is cancelled leaves nothing behind."""
+        self.failed(self.a.hail(HOME, 1.0), NoAnswer, 1.0)
+        self.a.hail(HOME, 1.0).addErrback(lambda failure: None).cancel()
+        self.assertEqual(self.a.hailer._pending, {})
+        pending = self.a.hail(HOME)
+        self.a.stop()
+        self.failureResultOf(pending, NotRunning)
+        self.failureResultOf(self.a.hail(HOME), NotRunning)
+
+    def test_no_amplifier(self) -> None:
+        """An echo is as long as its hail, and a flood of hails gets a few echoes in a second only."""
+        answers: list[bytes] = []
+        stranger = self.board.network("10.0.0.1", 1)
+        stranger.listen(lambda datagram, source: answers.append(datagram))
+        for _ in range(1000):
+            self.taps[self.to_b.address].receiver(hail(TOKEN), HOME)
+        self.clock.advance(0.5)
+        self.assertEqual({(len(answer), answer[0]) for answer in answers}, {(HAIL_BYTES, ECHO)})
+        self.assertEqual((len(answers), self.b.counters["crowded"]), (RATE, 1000 - RATE))
+
+    def test_what_is_none(self) -> None:
+        """Hails and echoes of a wrong length or for no question are counted and answered by nothing."""
+        receiver = self.taps[self.to_b.address].receiver
+        before = self.board.counters["sent"]
+        for datagram in (hail(TOKEN)[:-1], hail(TOKEN) + b"x", bytes([HAIL]), bytes([ECHO]) + bytes(7)):
+            receiver(datagram, HOME)
+        receiver(echo(hail(TOKEN), bytes(8), 0.0, HOME), HOME)
+        self.assertEqual(self.b.counters, {"malformed": 4, "unasked": 1})
+        self.assertEqual(self.board.counters["sent"], before)
+        self.assertRaises(Malformed, echo, b"", bytes(8), 0.0, HOME)
+        self.assertRaises(Malformed, echo_of, hail(TOKEN))
+
+    def test_an_echo_from_elsewhere(self) -> None:
+        """An echo from another address than was hailed is no answer, but those who hail a group hear of it."""
+        sent: list[bytes] = []
+        others: list[Address] = []
+        hailer = Hailer(lambda datagram, to: sent.append(datagram), self.clock, random.Random(1))
+        hailer.on_other = lambda answer, source: others.append(source)
+        asked = hailer.hail(HOME)
+        hailer.on_echo(echo(sent[0], bytes(8), 0.0, ELSEWHERE), ELSEWHERE)
+        self.assertNoResult(asked)
+        hailer.on_echo(echo(sent[0], bytes(8), 0.0, ELSEWHERE), HOME)
+        self.assertEqual((self.successResultOf(asked).seen, others), (ELSEWHERE, [ELSEWHERE]))

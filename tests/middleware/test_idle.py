@@ -1,0 +1,83 @@
+"""Tests of what a node does while nothing happens: what need not be looked at is not looked at."""
+
+from __future__ import annotations
+
+from middleware.entangled.data.memory import MemoryStore
+from middleware.entangled.identity import Identity
+from middleware.entangled.record import Record, hashed_key
+from middleware.entangled.replication.replica import LONGEST_SWEEP, SWEEP
+from tests.fleet import Fleet, FleetCase
+
+KEY = hashed_key("a")
+OWNER = Identity(bytes([7]) * 32)
+
+
+def record(name: str, ttl: float) -> Record:
+    """A record that lives for so many seconds."""
+    return Record(KEY, name, OWNER.public, 1, "team", ttl, b"x").signed(OWNER)
+
+
+class IdleTests(FleetCase):
+    def looks(self, fleet: Fleet) -> list[float]:
+        """The moments at which the first node looks from now on for what ran out."""
+        moments: list[float] = []
+        store = fleet.nodes[0].store
+        expire = store.expire
+
+        def looked(now: float) -> list[Record]:
+            moments.append(now)
+            return expire(now)
+
+        self.patch(store, "expire", looked)
+        return moments
+
+    def test_an_empty_store_is_not_swept(self) -> None:
+        """Where nothing is held hardly anything is done; what is taken in then goes in time, at a multiple of 0.1 s."""
+        fleet = self.fleet(1)
+        node, moments = fleet.nodes[0], self.looks(fleet)
+        fleet.run(10.0)
+        self.assertEqual(moments, [])
+        began = fleet.clock.seconds()
+        node.replica.keep(record("long", 5.0))
+        node.replica.keep(record("short", 0.25))
+        fleet.run(0.25 + SWEEP)
+        self.assertEqual([r.name for r in node.store.records()], ["long"])
+        fleet.run(4.0)
+        self.assertEqual(len(moments), 1)
+        fleet.run(1.0)
+        self.assertEqual(len(node.store), 0)
+        self.assertLessEqual(moments[-1] - began, 5.0 + SWEEP)
+        for moment in moments:
+            self.assertApproximates(moment / SWEEP, round(moment / SWEEP), 1e-6)
+        fleet.run(2 * LONGEST_SWEEP)
+        self.assertLess(len(moments), 6)
+
+    def test_who_leases_nothing_says_nothing(self) -> None:
+        """The beat of leases rests while there are none, and goes on, in its old measure, with the first one."""
+        fleet = self.fleet(2)
+        node = fleet.nodes[0]
+        beats: list[float] = []
+        extend = node.store.extend
+
+        def extended(owner: bytes, expires_at: float) -> int:
+            if owner == node.identity.public:
+                beats.append(fleet.clock.seconds())
+            return extend(owner, expires_at)
+
+        self.patch(node.store, "extend", extended)
+        fleet.run(30.0)
+        self.assertLess(len(beats), 2)
+        self.done(fleet, node.put(KEY, "a", b"1", "leased"), 0.5)
+        fleet.run(10.0)
+        self.assertGreater(len(beats), 25)
+        self.assertEqual(len(self.done(fleet, fleet.nodes[1].get(KEY), 0.5)), 1)
+
+    def test_a_store_knows_what_is_due(self) -> None:
+        """A store says when something may run out first, and that never is where it holds nothing."""
+        store = MemoryStore()
+        self.assertEqual(store.due(), float("inf"))
+        store.put(record("b", 60.0), 60.0)
+        store.put(record("a", 20.0), 20.0)
+        self.assertEqual(store.due(), 20.0)
+        store.expire(20.0)
+        self.assertEqual(store.due(), 60.0)

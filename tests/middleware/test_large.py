@@ -1,0 +1,240 @@
+"""Tests of a network that is too large to be known whole; here it is so from thirteen nodes on."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+from twisted.internet.defer import Deferred
+
+from middleware.entangled.kademlia import membership, overlay, roster
+from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.kademlia.distance import closest
+from middleware.entangled.kademlia.membership import LARGE_FOR, NEAR_SILENCE, SESSION_S
+from middleware.entangled.kademlia.overlay import MOST_HEDGE, K
+from middleware.entangled.kademlia.pace import FIRST
+from middleware.entangled.network.network import Address
+from middleware.entangled.network.switchboard import SwitchboardNetwork
+from middleware.entangled.node import EntangledNode
+from middleware.entangled.wire.congestion import FIRST_GUESS
+from middleware.entangled.wire.session import INIT
+from tests.fleet import Fleet, FleetCase
+
+MANY = 12
+
+
+class LargeTests(FleetCase):
+    def setUp(self) -> None:
+        super().setUp()
+        for module in (membership, overlay, roster):
+            self.patch(module, "MAX_MEMBERS", MANY)
+
+    def large(self, n: int = 24) -> Fleet:
+        """A network that has found itself."""
+        fleet = self.fleet(n, seed=3)
+        fleet.run(20.0)
+        self.assertTrue(all(node.overlay.is_large for node in fleet.nodes))
+        return fleet
+
+    def pings(self, node: EntangledNode) -> Counter[bytes]:
+        """Whom a node asks from now on whether it is there, and how often."""
+        asked: Counter[bytes] = Counter()
+        ask, greet = node.overlay.ask, node.endpoint.greet
+
+        def counted(contact: Contact, method: str, *arguments: object, **how: Any) -> Any:
+            asked[contact.node_id] += method == "ping"
+            return ask(contact, method, *arguments, **how)
+
+        def greeted(address: Address, *arguments: Any) -> Any:
+            asked[next(c.node_id for c in node.overlay.contacts() if c.address == address)] += 1
+            return greet(address, *arguments)
+
+        self.patch(node.overlay, "ask", counted)
+        self.patch(node.endpoint, "greet", greeted)
+        return asked
+
+    def far(self, node: EntangledNode) -> Contact:
+        """A contact of the node that is none of its neighbours."""
+        near = node.overlay.neighbours()
+        return next(c for c in reversed(node.overlay.contacts()) if c not in near)
+
+    def found(self, fleet: Fleet, node: EntangledNode, target: bytes) -> list[Contact]:
+        """What a node finds closest to an id."""
+        return self.done(fleet, node.find_node(target), 2.0)
+
+    def test_lookups_are_exact(self) -> None:
+        """Every node finds just the k closest nodes, though hardly any knows all of them."""
+        fleet = self.large()
+        for node in fleet.nodes[::5]:
+            target = fleet.nodes[7].identity.node_id
+            others = [other.contact for other in fleet.nodes if other is not node]
+            self.assertEqual(self.found(fleet, node, target), closest(others, target, K))
+
+    def test_neighbours_are_asked_often_and_others_rarely(self) -> None:
+        """No neighbour is silent for much longer than twelve seconds; of the others one is asked when its time came."""
+        fleet = self.large()
+        node = fleet.nodes[0]
+        near = {contact.node_id for contact in node.overlay.neighbours()}
+        asked = self.pings(node)
+        fleet.run(FIRST / 2)
+        self.assertGreater(sum(asked[node_id] for node_id in near), K)
+        self.assertEqual(sum(asked.values()), sum(asked[node_id] for node_id in near))
+        silent = max(node.overlay.silence(contact) for contact in node.overlay.neighbours())
+        self.assertLess(silent, NEAR_SILENCE + 1.5)
+        asked.clear()
+        fleet.run(5 * FIRST)
+        far = [contact.node_id for contact in node.overlay.contacts() if contact.node_id not in near]
+        self.assertTrue(far and all(asked[node_id] <= 5 for node_id in far), asked)
+        self.assertGreater(sum(asked[node_id] for node_id in far), 0)
+
+    def test_ways_through_routers_are_used(self) -> None:
+        """A far contact whose way is open for only so long as it is used is asked as often as a neighbour."""
+        fleet = self.large()
+        node = fleet.nodes[0]
+        far = self.far(node)
+        node._membership.needs_use = lambda contact: contact == far
+        asked = self.pings(node)
+        fleet.run(FIRST)
+        self.assertGreater(asked[far.node_id], 1)
+
+    def test_the_dead_cost_no_handshakes(self) -> None:
+        """A far contact that died is let go of after one question, and no handshake is tried with it."""
+        fleet = self.large()
+        node = fleet.nodes[0]
+        far = self.far(node)
+        next(other for other in fleet.nodes if other.contact == far).vanish()
+        knocked: list[Address] = []
+        send = SwitchboardNetwork.send
+
+        def sent(network: SwitchboardNetwork, datagram: bytes, to: Address) -> None:
+            knocked.extend([to] if datagram[0] == INIT and network.address == node.contact.address else [])
+            send(network, datagram, to)
+
+        self.patch(SwitchboardNetwork, "send", sent)
+        fleet.run(4 * FIRST)
+        self.assertNotIn(far.node_id, [contact.node_id for contact in node.overlay.contacts()])
+        self.assertNotIn(far.address, knocked)
+
+    def test_one_without_a_radio_keeps_its_contacts(self) -> None:
+        """Who hears nobody at all for a while takes itself for out of touch, and not all others for dead."""
+        fleet = self.large()
+        before = len(fleet.nodes[5].overlay.contacts())
+        fleet.nodes[5]._membership._pace.wait = 1.0
+        fleet.board.partition([fleet.address(5)])
+        fleet.run(6.0)
+        self.assertGreater(len(fleet.nodes[5].overlay.contacts()), before - K)
+        fleet.board.heal()
+        fleet.run(20.0)
+        target = fleet.nodes[7].identity.node_id
+        others = [other.contact for other in fleet.nodes if other is not fleet.nodes[5]]
+        self.assertEqual(self.found(fleet, fleet.nodes[5], target), closest(others, target, K))
+
+    def test_silent_sessions_are_let_go_and_come_back(self) -> None:
+        """A session on which nothing was heard for long is forgotten; a question opens another one, and is answered."""
+        fleet = self.large()
+        node = fleet.nodes[0]
+        fleet.run(FIRST)
+        far = self.far(node)
+        node._membership._pace.wait = 10 * SESSION_S
+        other = next(other for other in fleet.nodes if other.contact == far)
+        other._membership._pace.wait = 10 * SESSION_S
+        fleet.run(SESSION_S + 60.0)
+        self.assertFalse(node.endpoint.is_met(far))
+        self.assertIn(far, node.overlay.contacts())
+        self.assertTrue(node.endpoint.is_met(node.overlay.neighbours()[0]))
+        self.done(fleet, node.call(far, "ping", b"", changes=True), 1.0)
+        self.assertTrue(node.endpoint.is_met(far))
+
+    def test_a_stranger_without_a_place_is_let_be(self) -> None:
+        """Who asks, and would find no place among the contacts, is not asked in turn."""
+        fleet = self.large()
+        node = fleet.nodes[0]
+        asked = self.pings(node)
+        stranger = Contact(bytes([9]) * 32, Address("10.0.0.9", 9))
+        self.patch(node.overlay.table, "has_place", lambda node_id: False)
+        node.overlay.heard(stranger)
+        self.assertNotIn(stranger.node_id, asked)
+        self.patch(node.overlay.table, "has_place", lambda node_id: True)
+        node.overlay.heard(stranger)
+        self.assertIn(stranger.node_id, asked)
+
+    def test_a_newcomer_says_what_it_was_told(self) -> None:
+        """Who knows few hands on for how long others' word holds that there are many, and renews nothing."""
+        fleet = self.large()
+        node = fleet.nodes[3]
+        answer = node._membership._answer_members
+        self.assertIsNone(answer(fleet.nodes[0].contact, b""))
+        self.patch(overlay, "MAX_MEMBERS", 100)
+        node._membership._large_until = fleet.clock.seconds() + 7.5
+        self.assertEqual(answer(fleet.nodes[0].contact, b""), 7)
+
+    def test_a_newcomer_hears_it_with_the_first_answer(self) -> None:
+        """Who joins a large network knows before it looks around that it need not wait for a list of all."""
+        fleet = self.large()
+        node = fleet.made(30)
+        fleet.nodes.append(node)
+        fleet.enter(node, [fleet.address(2)])
+        fleet.run(0.01)
+        self.assertTrue(node.overlay.is_large)
+        self.assertFalse(node.overlay.is_placed)
+
+    def test_who_failed_a_lookup_is_asked_at_once(self) -> None:
+        """A far contact that did not answer a lookup is passed over, and back in its place as soon as it answers."""
+        fleet = self.large()
+        node = fleet.nodes[0]
+        far = self.far(node)
+        for bucket in node.overlay.table._buckets:
+            bucket.waiting.clear()  # else one of them takes its place
+        node.overlay.missed(far)
+        self.assertNotIn(far, node.overlay.table.closest(far.node_id))
+        fleet.run(3.0)
+        self.assertFalse(node.overlay.is_doubted(far))
+        self.assertIn(far, node.overlay.table.closest(far.node_id))
+
+    def test_strangers_are_given_the_time_that_others_take(self) -> None:
+        """Where answers take long, a stranger of a large network is not asked again sooner than they take."""
+        fleet = self.large()
+        node, stranger = fleet.nodes[0], Contact(fleet.identity(99).public, Address("10.0.0.9", 9))
+        for _ in range(9):
+            node.endpoint.peers.usual.measured(0.3)
+        self.assertGreaterEqual(node.endpoint.peers.peer(stranger).round_trip.wait, 0.3)
+        self.assertGreaterEqual(node.overlay.hedge(), MOST_HEDGE)
+        self.assertGreater(node.overlay.patience_of_lookups or 0.0, 0.6)
+        node.overlay.shrank()
+        other = Contact(fleet.identity(98).public, Address("10.0.0.9", 8))
+        self.assertEqual(node.endpoint.peers.peer(other).round_trip.wait, FIRST_GUESS)
+        self.assertIsNone(node.overlay.patience_of_lookups)
+
+    def test_a_network_that_shrank_is_known_whole_again(self) -> None:
+        """When nobody has seen many for two minutes, each begins to know all members, as in any small team."""
+        fleet = self.large(16)
+        for place in range(8, 16):
+            fleet.nodes[place].stop()
+        fleet.run(2 * LARGE_FOR)
+        self.assertFalse(any(node.overlay.is_complete for node in fleet.nodes[:8]))
+        fleet.run(2 * LARGE_FOR)
+        self.assertTrue(all(node.overlay.is_complete for node in fleet.nodes[:8]))
+        self.assertEqual({len(node.overlay.roster) for node in fleet.nodes[:8]}, {7})
+
+    def test_what_is_known_is_not_taken_for_all(self) -> None:
+        """In five minutes nobody of a large network takes those it knows for the whole team."""
+        fleet = self.large(20)
+        for _ in range(30):
+            fleet.run(10.0)
+            self.assertFalse(any(node.overlay.is_complete for node in fleet.nodes))
+
+    def test_values_are_kept(self) -> None:
+        """What was stored is read by others after a quarter of the nodes is gone, and others hold it now."""
+        fleet = self.large()
+        key = fleet.nodes[2].identity.node_id
+        self.assertGreaterEqual(self.done(fleet, fleet.nodes[1].put(key, "a", b"1"), 2.0), 5)
+        for place in (4, 8, 12, 16, 20, 23):
+            fleet.nodes[place].vanish()
+        fleet.run(60.0)
+        [record] = self.done(fleet, fleet.nodes[6].get(key), 3.0)
+        self.assertEqual(record.value, b"1")
+        live = [n for n in fleet.nodes if n._running]
+        holders = closest([node.contact for node in live], key, K)
+        held = sum(bool(n.store.get(key)) for n in live if n.contact in holders)
+        self.assertGreaterEqual(held, K - 1)
+        self.assertIsInstance(fleet.nodes[6].find_node(key), Deferred)

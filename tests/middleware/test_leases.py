@@ -1,0 +1,151 @@
+"""Tests of leases that differ: each record lives as long as its own, and signs of life go out when they are due."""
+
+from __future__ import annotations
+
+from middleware.entangled.record import hashed_key
+from tests.fleet import Fleet, FleetCase
+
+KEY = hashed_key("leases")
+OTHER = hashed_key("others")
+
+
+class LeaseTests(FleetCase):
+    def names(self, fleet: Fleet, key: bytes = KEY, place: int = 0) -> list[str]:
+        """What one node holds there."""
+        return [record.name for record in fleet.nodes[place].store.get(key, tombstones=True)]
+
+    def alive(self, fleet: Fleet, place: int) -> list[float]:
+        """The leases that the node of ``place`` is told from now on, one for each sign of life."""
+        told: list[float] = []
+        replica = fleet.nodes[place].replica
+        answer = replica.answer_alive
+
+        def heard(peer: object, lease: float, digest: bytes) -> None:
+            told.append(lease)
+            answer(peer, lease, digest)  # type: ignore[arg-type]
+
+        fleet.nodes[place].endpoint.expose("alive", heard, changes=True, idempotent=True)
+        return told
+
+    def test_each_its_own(self) -> None:
+        """With its owner a lease of 1 s is gone within that, and one of 12 s lasts as long as it says."""
+        fleet = self.fleet(3)
+        fleet.nodes[2].put(KEY, "short", b"x", "leased")
+        fleet.nodes[1].put(KEY, "long", b"x", "leased", lease=12.0)
+        fleet.run(30.0)
+        self.assertEqual(sorted(self.names(fleet)), ["long", "short"])
+        fleet.nodes[1].vanish()
+        fleet.nodes[2].vanish()
+        fleet.run(1.2)
+        self.assertEqual(self.names(fleet), ["long"])
+        fleet.run(6.7)
+        self.assertEqual(self.names(fleet), ["long"])
+        fleet.run(4.2)
+        self.assertEqual(self.names(fleet), [])
+
+    def test_signs_are_as_seldom_as_the_lease_is_long(self) -> None:
+        """A node that leases for 60 s says three times a minute that it lives, not 180 times."""
+        fleet = self.fleet(2)
+        fleet.nodes[1].put(KEY, "long", b"x", "leased", lease=60.0)
+        fleet.run(30.0)
+        told = self.alive(fleet, 0)
+        fleet.run(60.0)
+        self.assertEqual(told, [60.0] * 3)
+
+    def test_the_shorter_one_is_told(self) -> None:
+        """Who holds a long lease and a short one is told the short one, and after it has ended the long one again."""
+        fleet = self.fleet(2)
+        fleet.nodes[1].put(KEY, "long", b"x", "leased", lease=60.0)
+        fleet.nodes[1].put(OTHER, "short", b"x", "leased")
+        fleet.run(30.0)
+        told = self.alive(fleet, 0)
+        fleet.run(6.0)
+        self.assertEqual(told, [1.0] * 18)
+        fleet.nodes[1].release(OTHER, "short")
+        fleet.run(30.0)
+        del told[:]
+        fleet.run(60.0)
+        self.assertEqual(told, [60.0] * 3)
+
+    def test_who_has_the_long_one_only(self) -> None:
+        """Who holds only the long lease of an owner is told of it as seldom as it is long."""
+        fleet = self.fleet(10)
+        fleet.run(3.0)
+        owner = fleet.nodes[1]
+        others = (hashed_key(f"other {n}") for n in range(100))
+        places = [n for n in range(10) if n != 1 and owner.overlay.belongs(KEY, fleet.nodes[n].contact)]
+        key, place = next(
+            (other, n) for other in others for n in places if not owner.overlay.belongs(other, fleet.nodes[n].contact)
+        )
+        owner.put(KEY, "long", b"x", "leased", lease=60.0)
+        owner.put(key, "short", b"x", "leased")
+        fleet.run(30.0)
+        told = self.alive(fleet, place)
+        fleet.run(60.0)
+        self.assertEqual(told, [60.0] * 3)
+
+    def test_a_short_one_comes_later(self) -> None:
+        """A short lease that begins between two far signs of a long one is kept alive from its first moment on."""
+        fleet = self.fleet(3)
+        fleet.nodes[1].put(KEY, "long", b"x", "leased", lease=60.0)
+        fleet.run(25.0)
+        fleet.nodes[1].put(KEY, "short", b"x", "leased")
+        for _ in range(100):
+            fleet.run(0.3)
+            self.assertEqual(sorted(self.names(fleet)), ["long", "short"])
+
+    def test_release(self) -> None:
+        """What is released leaves its owner at once, the others within its lease, and no trace; all else stays."""
+        fleet = self.fleet(3)
+        fleet.nodes[1].put(KEY, "stays", b"x", "leased", lease=6.0)
+        fleet.nodes[1].put(OTHER, "goes", b"x", "leased", lease=6.0)
+        fleet.run(10.0)
+        fleet.nodes[1].release(OTHER, "goes")
+        self.assertEqual(self.names(fleet, OTHER, 1), [])
+        fleet.run(6.5)
+        for place in range(3):
+            self.assertEqual((self.names(fleet, KEY, place), self.names(fleet, OTHER, place)), (["stays"], []), place)
+
+    def test_release_and_back(self) -> None:
+        """A slot that was released can be filled again at once."""
+        fleet = self.fleet(3)
+        fleet.nodes[1].put(KEY, "slot", b"x", "leased", lease=6.0)
+        fleet.run(3.0)
+        fleet.nodes[1].release(KEY, "slot")
+        fleet.run(1.0)
+        fleet.nodes[1].put(KEY, "slot", b"y", "leased", lease=6.0)
+        fleet.run(30.0)
+        self.assertEqual([r.value for r in fleet.nodes[0].store.get(KEY)], [b"y"])
+
+    def test_what_the_team_keeps_is_not_released(self) -> None:
+        """A record that outlives its owner has no lease to let go of."""
+        fleet = self.fleet(2)
+        self.done(fleet, fleet.nodes[1].put(KEY, "kept", b"x"), 1.0)
+        fleet.nodes[1].release(KEY, "kept")
+        fleet.run(5.0)
+        self.assertEqual(self.names(fleet), ["kept"])
+
+    def test_never_shorter_than_the_nodes(self) -> None:
+        """A lease of its own that is shorter than the node's is the node's."""
+        fleet = self.fleet(2)
+        fleet.nodes[1].put(KEY, "short", b"x", "leased", lease=0.1)
+        fleet.run(5.0)
+        told = self.alive(fleet, 0)
+        fleet.run(3.0)
+        self.assertEqual(told, [1.0] * 9)
+
+    def test_the_nodes_lease_changes(self) -> None:
+        """A node whose lease becomes longer than a record's own keeps that record for the longer one."""
+        fleet = self.fleet(2)
+        fleet.nodes[1].put(KEY, "long", b"x", "leased", lease=6.0)
+        fleet.run(3.0)
+        fleet.nodes[1].set_lease(30.0)
+        fleet.run(1.0)
+        told = self.alive(fleet, 0)
+        fleet.run(60.0)
+        self.assertEqual(told, [30.0] * 6)
+        fleet.nodes[1].set_lease(1.0)
+        fleet.run(3.0)
+        del told[:]
+        fleet.run(12.0)
+        self.assertEqual(told, [6.0] * 6)

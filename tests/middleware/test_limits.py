@@ -1,0 +1,154 @@
+"""Tests of ``docs/limits.md``: its figures are those of the code, and a crowd of made-up members stays within them."""
+
+from __future__ import annotations
+
+import ast
+import operator
+import random
+import re
+from collections import deque
+from pathlib import Path
+from typing import Any
+
+from middleware.entangled.identity import Identity
+from middleware.entangled.kademlia import overlay
+from middleware.entangled.reach import reach
+from middleware.entangled.record import Record, hashed_key
+from middleware.entangled.replication import overlap, replica
+from middleware.entangled.wire import answerer, door, method, peer
+from middleware.entangled.wire.endpoint import Endpoint
+from tests.fleet import TEAM, FleetCase
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGE = ROOT / "docs" / "limits.md"
+ROW = re.compile(r"([\d]+)[^`\d]*`([\w/]+\.py)::([A-Z_]+)`")
+SMALL = 24
+CROWD = 60
+PATCHED = (
+    *((answerer, "MAX_ASKING"), (method, "MAX_ACCOUNTS"), (overlay, "MAX_HEARD"), (overlap, "MAX_ASKED")),
+    *((replica, "MAX_DOUBTFUL"), (reach, "MAX_KNOWN"), (reach, "MAX_PEERS"), (door, "MAX_LIVES"), (peer, "MAX_PEERS")),
+)
+
+# Bounded by caps of their own, which are larger than this crowd.
+OTHERS: tuple[str, ...] = (
+    "_members",
+    "_listed_at",
+    "_inquiries",
+    "_peers",
+    "sessions",
+    "_responses",
+    "_unconfirmed",
+    "_contacts",
+)
+OTHERS += ("_store", "_entries", "_live", "_absent")
+OTHERS += ("_board._names", "_board._untraced")  # of the simulation
+
+
+def constant(path: Path, name: str) -> float:
+    """A number that a module defines, also among others or as a product."""
+    for node in ast.parse(path.read_text(encoding="utf-8")).body:
+        if not isinstance(node, ast.Assign) or len(node.targets) != 1:
+            continue
+        [target] = node.targets
+        pairs = [(target, node.value)]
+        if isinstance(target, ast.Tuple) and isinstance(node.value, ast.Tuple):
+            pairs = list(zip(target.elts, node.value.elts, strict=True))
+        for left, right in pairs:
+            if isinstance(left, ast.Name) and left.id == name:
+                return _number(path, right)
+    raise AssertionError(f"{path} has no {name}")
+
+
+def _number(path: Path, node: ast.AST) -> float:
+    signs = {ast.Mult: operator.mul, ast.Add: operator.add, ast.Sub: operator.sub, ast.Pow: operator.pow}
+    if isinstance(node, ast.Constant):
+        assert isinstance(node.value, int | float)
+        return float(node.value)
+    if isinstance(node, ast.BinOp):
+        return float(signs[type(node.op)](_number(path, node.left), _number(path, node.right)))
+    assert isinstance(node, ast.Name)
+    home = path if re.search(rf"^{node.id}\b.* = ", path.read_text(encoding="utf-8"), re.M) else None
+    return constant(home or path.with_name("message.py"), node.id)
+
+
+class PageTests(FleetCase):
+    """The page."""
+
+    def test_figures(self) -> None:
+        """Every cap that the page names is that of the code."""
+        rows = ROW.findall(PAGE.read_text(encoding="utf-8"))
+        self.assertGreater(len(rows), 60)
+        for figure, place, name in rows:
+            self.assertEqual(constant(ROOT / place, name), float(figure), f"{place}::{name}")
+
+
+class CrowdTests(FleetCase):
+    """An open team, one of whom invents identities."""
+
+    def test_tables_stay_small(self) -> None:
+        """However many identities a member invents, with all they can ask, no table of a node outgrows its cap."""
+        for module, name in PATCHED:
+            self.patch(module, name, SMALL)
+        team = self.swarm(1)
+        node = team.nodes[0]
+        _ = node.entangled.seat, node.councils, node.dissemination
+        for number in range(CROWD):
+            self.visit(team, node, number)
+        team.run(5.0)
+        sizes: dict[str, int] = {}
+        walk(node, "node", sizes, set())
+        over = {
+            path: size
+            for path, size in sizes.items()
+            if size > 2 * SMALL and not path.startswith(("node.store", "node.clock")) and not path.endswith(OTHERS)
+        }
+        self.assertEqual(over, {})
+        self.assertGreater(max(sizes.values()), SMALL)
+
+    def visit(self, team: Any, node: Any, number: int) -> None:
+        """One made-up member asks for everything once, and is gone."""
+        own = Identity(random.Random(f"crowd {number}").randbytes(32))
+        network = team.board.network(f"10.9.{number}.1", 7)
+        crowd = Endpoint(own, TEAM, network, team.clock, random.Random(number))
+        crowd.start()
+        crowd.expose("ping", lambda peer, digest: bytes(8), changes=True)
+        key = hashed_key(f"{number}")
+        record = Record(key, "x", own.public, 1, "leased", 60.0, b"v").signed(own)
+        questions: tuple[tuple[Any, ...], ...] = (
+            ("ping", bytes(8)),
+            ("store", [record.packed()]),
+            ("watch", key, bytes(8)),
+            ("alive", 60.0, bytes(8)),
+            ("digests", 3, 1),
+            ("members", b""),
+            ("settled",),
+            ("missing", [bytes(8)]),
+            ("places", 0, []),
+            ("stream.open", "camera"),
+            ("reach.meet", own.public, [["10.0.0.77", 9]], 0),
+            ("reach.introduce", bytes(20), [], 0),
+            ("lease.prepare", f"t{number}", 1, 1, 5.0),
+        )
+        for name, *arguments in questions:
+            asked = crowd.ask(node.entangled.contact, name, *arguments, changes=True)
+            asked.addErrback(lambda failure: None)
+            team.run(0.01)
+        team.run(0.05)
+        crowd.stop()
+
+
+def walk(thing: Any, path: str, sizes: dict[str, int], seen: set[int]) -> None:
+    """Note the size of every table that can be reached from a node."""
+    if id(thing) in seen or isinstance(thing, str | bytes | int | float | random.Random | type):
+        return
+    seen.add(id(thing))
+    if isinstance(thing, dict | list | set | deque | tuple | frozenset):
+        sizes[path] = max(sizes.get(path, 0), len(thing))
+        for each in [*thing.values(), *thing] if isinstance(thing, dict) else list(thing):
+            walk(each, path + "[]", sizes, seen)
+    elif type(thing).__module__.startswith("middleware."):
+        names = [*getattr(thing, "__dict__", ())]
+        names += [name for kind in type(thing).__mro__ for name in getattr(kind, "__slots__", ())]
+        for name in names:
+            if hasattr(thing, name):
+                walk(getattr(thing, name), f"{path}.{name}", sizes, seen)

@@ -1,0 +1,480 @@
+"""Tests of ``middleware.entangled.network.tunnel``, ``link``, ``layer``, ``joint`` and ``pipes``, on a turned clock."""
+
+from __future__ import annotations
+
+import random
+from typing import Any
+
+from twisted.internet.protocol import Protocol
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.entangled.clock import HeapClock
+from middleware.entangled.errors import PortInUse
+from middleware.entangled.network.joint import JointNetwork
+from middleware.entangled.network.layer import Proxied
+from middleware.entangled.network.link import MAX_SENDING, MAX_WAITING
+from middleware.entangled.network.network import Address
+from middleware.entangled.network.pipes import Pipe, Pipes
+from middleware.entangled.network.switchboard import Switchboard
+from middleware.entangled.network.tunnel import (
+    FIRST_HOLD_S,
+    HEAD_S,
+    LAST_HOLD_S,
+    MAX_BEGUN,
+    MAX_LINKS,
+    MAX_OF_HOST,
+    UNANSWERED_S,
+    UNUSED_S,
+    TunnelNetwork,
+)
+from middleware.entangled.network.url import Proxy, Url
+
+HOST = "10.0.0.1"
+URL = Url("wss", HOST, 443)
+PLAIN = Url("ws", HOST, 443)
+Heard = list[tuple[bytes, Address]]
+GREETING = (
+    b"GET /swarm HTTP/1.1\r\nUpgrade: websocket\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n"
+    b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Protocol: swarm-tunnel-1\r\nX-Forwarded-For: 9.9.9.%d\r\n\r\n"
+)
+
+
+class Dribbler(Protocol):
+    """Says what it was told to, and never goes on."""
+
+    def __init__(self, words: bytes = b"") -> None:
+        self.words = words
+        self.heard = b""
+        self.is_lost = False
+
+    def connectionMade(self) -> None:
+        """Say it."""
+        transport: Any = self.transport
+        transport.write(self.words)
+
+    def dataReceived(self, data: bytes) -> None:
+        """Keep it."""
+        self.heard += data
+
+    def connectionLost(self, reason: Any = None) -> None:
+        """Take note."""
+        self.is_lost = True
+
+
+class Relay(Protocol):
+    """An HTTP proxy that takes one CONNECT and hands on what comes after it."""
+
+    def __init__(self, pipes: Pipes, answer: bytes = b"HTTP/1.1 200 Connection established\r\n\r\n") -> None:
+        self.pipes = pipes
+        self.answer = answer
+        self.asked = b""
+        self.far: Protocol | None = None
+
+    def dataReceived(self, data: bytes) -> None:
+        """Take the request, then hand on."""
+        transport: Any = self.transport
+        if self.far is not None:
+            far: Any = self.far.transport
+            far.write(data)
+            return
+        self.asked += data
+        if b"\r\n\r\n" in self.asked:
+            transport.write(self.answer)
+            self.far = Protocol()
+            self.far.dataReceived = transport.write  # type: ignore[method-assign]
+            self.pipes.carrier("10.0.0.250").dial(Address(HOST, 443), self.far, lambda why: None)
+
+
+class TunnelCase(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.clock = HeapClock()
+        self.pipes = Pipes(self.clock)
+        self.ends: list[TunnelNetwork] = []
+        self.addCleanup(self.end)
+
+    def end(self) -> None:
+        """Close all, and leave nothing on the clock."""
+        for end in self.ends:
+            end.close()
+        self.clock.advance(10.0)
+        self.assertEqual(self.clock.getDelayedCalls(), [])
+
+    def made(self, host: str = HOST, *urls: Url, port: int = 443, **options: Any) -> tuple[TunnelNetwork, Heard]:
+        """An end, served where it has no URL, and what it hears."""
+        heard: Heard = []
+        carrier = self.pipes.carrier(host, port)
+        tunnel = TunnelNetwork(carrier, self.clock, random.Random(host), urls, not urls, **options)
+        tunnel.listen(lambda datagram, source: heard.append((datagram, source)))
+        self.ends.append(tunnel)
+        return tunnel, heard
+
+    def pair(self, url: Url = PLAIN) -> tuple[TunnelNetwork, Heard, TunnelNetwork, Heard]:
+        """Two ends with an open tunnel between them."""
+        server, served = self.made(is_plain=not url.is_tls)
+        client, came = self.made("10.0.0.2", url)
+        client.send(b"hello", url.address)
+        self.clock.advance(0.01)
+        self.assertEqual([datagram for datagram, _ in served], [b"hello"])
+        server.send(b"hello", served[0][1])
+        self.clock.advance(0.01)
+        self.assertEqual(came, [(b"hello", url.address)])
+        served.clear()
+        came.clear()
+        return client, came, server, served
+
+    def dribble(self, words: bytes = b"", host: str = "10.6.6.6") -> Dribbler:
+        """Somebody who dials, says that, and waits."""
+        dribbler = Dribbler(words)
+        self.pipes.carrier(host).dial(Address(HOST, 443), dribbler, lambda why: None)
+        self.clock.advance(0.0)
+        self.clock.advance(0.0)
+        return dribbler
+
+
+class TunnelTests(TunnelCase):
+    def test_carry_both_ways(self) -> None:
+        """What is sent to a URL's address arrives, over TLS or plain, and answers find back."""
+        for url in (URL, PLAIN):
+            client, came, server, served = self.pair(url)
+            for size in (1, 200, 1400):
+                client.send(b"q" * size, url.address)
+                self.clock.advance(0.01)
+                datagram, source = served.pop()
+                self.assertEqual(datagram, b"q" * size)
+                self.assertRegex(source.host, "^~wss-[0-9a-f]{12}$")
+                server.send(b"a" * size, source)
+                self.clock.advance(0.01)
+                self.assertEqual(came.pop(), (b"a" * size, url.address))
+            self.assertEqual((client.counters["sent"], client.counters["received"]), (4, 4))
+            client.close()
+            server.close()
+            self.clock.advance(1.0)
+
+    def test_nothing_readable_outside(self) -> None:
+        """Over TLS neither the greeting nor a datagram can be read on the stream."""
+        seen: list[bytes] = []
+        self.made()
+        client, _ = self.made("10.0.0.2", URL)
+        client.send(b"a datagram in clear", URL.address)
+        for _ in range(20):
+            self.clock.advance(0.001)
+            for pipe in self.pipes.streams:
+                write = pipe.write
+                if getattr(write, "__name__", "") != "spied":
+
+                    def spied(data: bytes, write: Any = write) -> None:
+                        seen.append(data)
+                        write(data)
+
+                    pipe.write = spied  # type: ignore[method-assign]
+        client.send(b"a datagram in clear", URL.address)
+        self.clock.advance(0.1)
+        self.assertTrue(seen)
+        self.assertNotIn(b"datagram", b"".join(seen))
+        self.assertNotIn(b"websocket", b"".join(seen).lower())
+
+    def test_dial_on_demand(self) -> None:
+        """Nothing is dialled before something is sent to a URL's address; what was sent first arrives then."""
+        self.pipes.delay_s = 0.1
+        _, served = self.made()
+        client, _ = self.made("10.0.0.2", URL)
+        self.clock.advance(5.0)
+        self.assertEqual(self.pipes.dialled, [])
+        client.send(b"first", URL.address)
+        client.send(b"second", URL.address)
+        self.clock.advance(1.0)
+        self.assertEqual([datagram for datagram, _ in served], [b"first", b"second"])
+        self.assertEqual(len(self.pipes.dialled), 1)
+
+    def test_unknown_addresses(self) -> None:
+        """What is sent to an address for which there is no tunnel is counted and lost."""
+        client, _ = self.made("10.0.0.2", URL)
+        for address in (Address("~wss-000000000000", 1), Address("10.0.0.1", 443), Address("~", 1)):
+            client.send(b"x", address)
+        client.send(bytes(5000), URL.address)
+        client.close()
+        client.send(b"x", URL.address)
+        self.assertEqual(client.counters["unsent"], 5)
+
+    def test_back_off(self) -> None:
+        """A URL at which nobody is is dialled again when something is sent, less and less often."""
+        client, _ = self.made("10.0.0.2", URL)
+        moments = []
+        for _ in range(1200):
+            before = len(self.pipes.dialled)
+            client.send(b"x", URL.address)
+            if len(self.pipes.dialled) > before:
+                moments.append(self.clock.seconds())
+            self.clock.advance(0.05)
+        gaps = [b - a for a, b in zip(moments, moments[1:], strict=False)]
+        self.assertLess(gaps[0], 1.25 * FIRST_HOLD_S + 0.1)
+        self.assertLess(max(gaps), 1.25 * LAST_HOLD_S + 0.1)
+        self.assertGreater(gaps[-1], 0.75 * LAST_HOLD_S - 0.1)
+        self.assertLess(len(moments), 15)
+
+    def test_reconnect(self) -> None:
+        """A tunnel whose server was restarted is dialled again, and carries within a second."""
+        client, _, server, _ = self.pair(URL)
+        self.clock.advance(11.0)
+        server.close()
+        self.clock.advance(0.1)
+        self.assertEqual(client.peers, [])
+        _, served = self.made()
+        for _ in range(20):
+            client.send(b"again", URL.address)
+            self.clock.advance(0.05)
+        self.assertIn(b"again", [datagram for datagram, _ in served])
+
+    def test_let_go_unused(self) -> None:
+        """A tunnel that carried nothing for a minute is closed by who dialled it; one in use stays."""
+        client, _, server, served = self.pair()
+        for _ in range(10):
+            self.clock.advance(20.0)
+            client.send(b"x", PLAIN.address)
+        self.assertEqual(len(client.peers), 1)
+        self.clock.advance(UNUSED_S - 2.0)
+        self.assertEqual((len(client.peers), len(server.peers)), (1, 1))
+        self.clock.advance(4.0)
+        self.assertEqual((client.peers, server.peers), ([], []))
+        self.assertEqual(len(self.pipes.dialled), 1)
+
+    def test_notice_half_open(self) -> None:
+        """An end that is cut off without a word is noticed: soon where something is sent to it, else by pings."""
+        client, _, server, served = self.pair()
+        self.clock.advance(1.0)
+        self.pipes.cut(HOST)
+        for _ in range(24):
+            self.clock.advance(0.5)
+            client.send(b"there?", PLAIN.address)
+        self.assertEqual(client.peers, [])
+        self.assertEqual(len(server.peers), 1)
+        self.clock.advance(20.0)
+        self.assertEqual(server.peers, [])
+
+    def test_port_in_use(self) -> None:
+        """A port at which another listens is refused by name, and a joint network opens neither then."""
+        self.made()
+        carrier = self.pipes.carrier(HOST, 443)
+        other = TunnelNetwork(carrier, self.clock, random.Random(1), is_served=True)
+        self.assertRaises(PortInUse, other.listen, lambda datagram, source: None)
+        udp = Switchboard(self.clock, random.Random(1)).network(HOST, 7000)
+        self.assertRaises(PortInUse, JointNetwork(udp, other).listen, lambda datagram, source: None)
+        self.assertIsNone(udp.receiver)
+
+    def test_through_a_proxy(self) -> None:
+        """Where there is an HTTP proxy the tunnel goes through it by CONNECT, with its login."""
+        _, served = self.made()
+        relay = Relay(self.pipes)
+        self.pipes.carrier("10.0.0.200", 3128).listen(lambda host: relay)
+        client, _ = self.made("10.0.0.2", URL, proxy_for=lambda url: Proxy("10.0.0.200", 3128, "me:secret"))
+        client.send(b"through", URL.address)
+        self.clock.advance(0.1)
+        self.assertEqual([datagram for datagram, _ in served], [b"through"])
+        self.assertTrue(relay.asked.startswith(b"CONNECT 10.0.0.1:443 HTTP/1.1\r\n"))
+        self.assertIn(b"Proxy-Authorization: Basic bWU6c2VjcmV0\r\n", relay.asked)
+
+    def test_proxy_says_no(self) -> None:
+        """A proxy that refuses, or is none, is a tunnel that cannot be, and the reason is kept."""
+        for answer in (b"HTTP/1.1 407 Proxy Authentication Required\r\n\r\n", b"SSH-2.0-box\r\n\r\n", b"x" * 9000):
+            layer = Proxied("a:443")
+            layer.received(answer)
+            self.assertTrue(layer.fault and not layer.is_open)
+        layer = Proxied("a:443")
+        self.assertEqual(layer.received(b"HTTP/1.1 200 OK\r\n\r\nrest"), (b"rest", b""))
+
+
+class BurdenTests(TunnelCase):
+    """What a tunnel bears: slow readers, dribblers, and those that are no members."""
+
+    def far(self) -> Pipe:
+        """The server's end of the only stream."""
+        (pipe,) = self.pipes.streams
+        return pipe.other
+
+    def test_slow_reader(self) -> None:
+        """For who reads nothing at most 64 KiB wait, the newest is dropped, and the tunnel ends after a while."""
+        client, _, server, served = self.pair()
+        (address,) = server.peers
+        self.pipes.streams[0].is_read = False
+        for number in range(500):
+            server.send(number.to_bytes(2, "big") * 700, address)
+        (link,) = server._links
+        self.assertLess(link.waiting + len(self.far().buffer), 64 * 1024)
+        self.assertLessEqual(link.waiting, MAX_WAITING)
+        self.assertGreater(server.counters["dropped"], 450)
+        for _ in range(45):
+            client.send(b"I still talk", PLAIN.address)
+            self.clock.advance(1.0)
+        self.assertNotIn(address, server.peers)
+
+    def test_deaf_talker(self) -> None:
+        """Who reads nothing, but goes on talking, is given up after half a minute."""
+        server, served = self.made(is_plain=True)
+        talker = self.dribble(GREETING % 1, "127.0.0.1")
+        self.clock.advance(0.1)
+        self.pipes.streams[0].is_read = False
+        (address,) = server.peers
+        for second in range(40):
+            for _ in range(1 if second else 20):
+                server.send(bytes(1400), address)
+            transport: Any = talker.transport
+            transport.write(b"\x8a\x80" + bytes(4))
+            self.clock.advance(1.0)
+            if second == 25:
+                self.assertEqual(server.peers, [address])
+        self.assertEqual(server.peers, [])
+
+    def test_oldest_come_first(self) -> None:
+        """When a slow reader reads again, what came first is what it gets, in order, and the newest is missing."""
+        client, came, server, _ = self.pair()
+        (address,) = server.peers
+        reader = self.pipes.streams[0]
+        reader.is_read = False
+        for number in range(100):
+            server.send(number.to_bytes(2, "big") * 700, address)
+        reader.is_read = True
+        self.far().pump()
+        self.clock.advance(1.0)
+        numbers = [int.from_bytes(datagram[:2], "big") for datagram, _ in came]
+        self.assertEqual(numbers, list(range(len(numbers))))
+        self.assertTrue(20 < len(numbers) < 60, len(numbers))
+
+    def test_heartbeats_pass_bulk(self) -> None:
+        """On a link of 50 kB a second that is flooded with long datagrams short ones pass within half a second."""
+        client, came, server, served = self.pair()
+        self.pipes.rate = 50_000.0
+        late: list[float] = []
+
+        def receive(datagram: bytes, source: Address) -> None:
+            if len(datagram) == 100:
+                late.append(self.clock.seconds() - int.from_bytes(datagram[:8], "big") / 1e6)
+
+        server._receiver = receive
+        for _ in range(100):
+            for _ in range(10):
+                client.send(bytes(1400), PLAIN.address)
+            client.send(round(self.clock.seconds() * 1e6).to_bytes(8, "big") + bytes(92), PLAIN.address)
+            self.clock.advance(0.1)
+        self.clock.advance(2.0)
+        self.assertEqual(len(late), 100)
+        self.assertLess(max(late), (MAX_SENDING + 8192) / 50_000.0)
+        self.assertGreater(client.counters["dropped"], 500)
+
+    def test_dribblers_are_let_go(self) -> None:
+        """Who sends no whole greeting is cut off in time, whether it says nothing, half of TLS, or a slow request."""
+        self.made()
+        idle, half = self.dribble(), self.dribble(b"\x16\x03\x01")
+        self.clock.advance(HEAD_S - 1.0)
+        self.assertFalse(idle.is_lost or half.is_lost)
+        self.clock.advance(2.1)
+        self.assertTrue(idle.is_lost and half.is_lost)
+
+    def test_garbage_is_let_go(self) -> None:
+        """Who speaks no TLS, or no WebSocket, is cut off at once; nothing is raised."""
+        server, _ = self.made()
+        self.assertTrue(self.dribble(b"GET / HTTP/1.1\r\n\r\n").is_lost or server.peers == [])
+        self.clock.advance(0.1)
+        self.assertEqual(server.counters["refused"], 1)
+        server.close()
+        self.clock.advance(3.0)
+        server, _ = self.made(is_plain=True)
+        page = self.dribble(b"GET / HTTP/1.1\r\nHost: a\r\n\r\n")
+        self.clock.advance(0.1)
+        self.assertTrue(page.is_lost and page.heard.startswith(b"HTTP/1.1 404"))
+
+    def test_bear_one_address(self) -> None:
+        """Of one address so many connections are borne and no more; others are served all the same."""
+        server, _ = self.made()
+        crowd = [self.dribble() for _ in range(100)]
+        self.clock.advance(0.1)
+        self.assertEqual(sum(not one.is_lost for one in crowd), MAX_OF_HOST)
+        client, _ = self.made("10.0.0.2", URL)
+        client.send(b"x", URL.address)
+        self.clock.advance(0.1)
+        self.assertEqual(len(client.peers), 1)
+
+    def test_bear_many_addresses(self) -> None:
+        """Of five hundred dribblers from as many addresses few are borne at a time; a member gets through meanwhile."""
+        server, served = self.made()
+        crowd = [self.dribble(host=f"10.7.{n // 250}.{n % 250}") for n in range(500)]
+        self.assertEqual(sum(not one.is_lost for one in crowd), MAX_BEGUN)
+        client, _ = self.made("10.0.0.2", URL)
+        client.send(b"x", URL.address)
+        self.clock.advance(0.1)
+        self.assertEqual([datagram for datagram, _ in served], [b"x"])
+        self.clock.advance(HEAD_S + 2.0)
+        self.assertTrue(all(one.is_lost for one in crowd))
+        self.assertEqual(len(server._links), 1)
+
+    def test_behind_a_reverse_proxy(self) -> None:
+        """Served plain, those that a proxy brings are counted by the address that it names."""
+        server, _ = self.made(is_plain=True)
+        one = [self.dribble(GREETING % 1, "127.0.0.1") for _ in range(40)]
+        others = [self.dribble(GREETING % n, "127.0.0.1") for n in range(2, 12)]
+        self.clock.advance(0.5)
+        self.assertEqual(sum(not each.is_lost for each in one), MAX_OF_HOST)
+        self.assertFalse(any(each.is_lost for each in others))
+
+    def test_strangers_are_let_go(self) -> None:
+        """Who opens a tunnel and is never answered by the node, whatever it sends, is let go; an answered one stays."""
+        client, _, server, served = self.pair()
+        stranger, _ = self.made("10.0.0.3", PLAIN)
+        for second in range(int(UNANSWERED_S) + 2):
+            if second < UNANSWERED_S:
+                stranger.send(b"garbage", PLAIN.address)
+            client.send(b"x", PLAIN.address)
+            self.clock.advance(1.0)
+        self.assertEqual(stranger.peers, [])
+        self.assertEqual((len(client.peers), len(server.peers)), (1, 1))
+
+    def test_full_house(self) -> None:
+        """When all places are taken, strangers make room for a newcomer, and members are never put out."""
+        server, served = self.made(is_plain=True)
+        members = []
+        for n in range(MAX_LINKS - 1):
+            member, _ = self.made(f"10.1.{n // 250}.{n % 250}", PLAIN)
+            member.send(b"m", PLAIN.address)
+            self.clock.advance(0.0)
+            self.clock.advance(0.01)
+            server.send(b"hello", served.pop()[1])
+            members.append(member)
+        stranger, _ = self.made("10.0.0.3", PLAIN)
+        stranger.send(b"garbage", PLAIN.address)
+        self.clock.advance(0.01)
+        late, _ = self.made("10.0.0.4", PLAIN)
+        late.send(b"x", PLAIN.address)
+        self.clock.advance(0.01)
+        self.assertEqual((len(stranger.peers), len(late.peers)), (0, 1))
+        server.send(b"hello", served[-1][1])
+        latest, _ = self.made("10.0.0.5", PLAIN)
+        latest.send(b"x", PLAIN.address)
+        self.clock.advance(0.01)
+        self.assertEqual((len(latest.peers), len(late.peers)), (0, 1))
+        self.assertTrue(all(member.peers for member in members))
+
+
+class JointTests(TunnelCase):
+    def test_pick_by_address(self) -> None:
+        """A tunnel's address is served by the tunnel, any other by UDP; both hand to one receiver."""
+        board = Switchboard(self.clock, random.Random(1))
+        server, served = self.made()
+        plain = board.network("10.0.0.9", 7000)
+        by_udp: Heard = []
+        plain.listen(lambda datagram, source: by_udp.append((datagram, source)))
+        tunnel = TunnelNetwork(self.pipes.carrier("10.0.0.2"), self.clock, random.Random(2), [URL])
+        joint = JointNetwork(board.network("10.0.0.2", 7000), tunnel)
+        heard: Heard = []
+        joint.listen(lambda datagram, source: heard.append((datagram, source)))
+        self.addCleanup(joint.close)
+        joint.send(b"udp", plain.address)
+        joint.send(b"tunnel", URL.address)
+        self.clock.advance(0.1)
+        self.assertEqual(by_udp, [(b"udp", joint.address)])
+        server.send(b"back", served[0][1])
+        plain.send(b"back", joint.address)
+        self.clock.advance(0.1)
+        self.assertEqual(sorted(heard), [(b"back", plain.address), (b"back", URL.address)])
+        self.assertEqual(joint.counters["sent"], 1)  # the switchboard counts for all its ports together
+        self.assertEqual(joint.counters["tunnel opened"], 1)
+        joint.close()
+        joint.close()

@@ -1,0 +1,182 @@
+"""Tests of ``middleware.entangled.network.websocket`` and ``url``: datagrams in a WebSocket, and where one begins."""
+
+from __future__ import annotations
+
+import random
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.entangled.network.layer import MAX_HEAD
+from middleware.entangled.network.network import Address
+from middleware.entangled.network.url import Proxy, Url
+from middleware.entangled.network.websocket import BINARY, CLOSE, CONTINUATION, MAX_PAYLOAD, PING, WebSocket
+
+URL = Url.of("wss://node.example:443/swarm")
+
+
+class WebSocketTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        dice = random.Random(1)
+        self.client = WebSocket(dice.randbytes, URL)
+        self.server = WebSocket(dice.randbytes)
+
+    def greet(self) -> None:
+        """Open both ends."""
+        _, answer = self.server.received(self.client.opening())
+        self.client.received(answer)
+        self.assertTrue(self.client.is_open and self.server.is_open, (self.client.fault, self.server.fault))
+
+    def test_carry_datagrams_cut_anyhow(self) -> None:
+        """Datagrams of every length arrive whole and in order, both ways, whether bytes come one by one or together."""
+        sizes = [0, 1, 125, 126, 127, 1399, 1400, 1452, MAX_PAYLOAD]
+        sent = [random.Random(size).randbytes(size) for size in sizes]
+        for is_cut in (True, False):
+            self.setUp()
+            self.greet()
+            for source, sink in ((self.client, self.server), (self.server, self.client)):
+                stream = b"".join(source.framed(datagram) for datagram in sent)
+                pieces = [stream[i : i + 1] for i in range(len(stream))] if is_cut else [stream]
+                came = [datagram for piece in pieces for datagram in sink.received(piece)[0]]
+                self.assertEqual(came, sent)
+                self.assertEqual(sink.fault, "")
+
+    def test_greet_byte_by_byte(self) -> None:
+        """A greeting may come in single bytes, and frames right behind it are heard."""
+        stream = self.client.opening()
+        answer = b"".join(self.server.received(stream[i : i + 1])[1] for i in range(len(stream)))
+        datagrams, _ = self.client.received(answer + self.server.framed(b"at once"))
+        self.assertEqual(datagrams, [b"at once"])
+
+    def test_join_fragments(self) -> None:
+        """A message that a proxy has cut into frames is one datagram again, a ping in between notwithstanding."""
+        self.greet()
+        first = self.client._frame(BINARY, b"one ")
+        stream = bytes([first[0] & 0x7F]) + first[1:] + self.client.ping() + self.client._frame(CONTINUATION, b"two")
+        datagrams, reply = self.server.received(stream)
+        self.assertEqual(datagrams, [b"one two"])
+        self.assertEqual(reply, b"\x8a\x00")
+
+    def test_answer_ping_and_goodbye(self) -> None:
+        """A ping is answered by what it held; after a goodbye nothing is heard."""
+        self.greet()
+        _, reply = self.client.received(self.server._frame(PING, b"there?"))
+        self.assertEqual(self.server.received(reply), ([], b""))
+        self.server.received(self.client.closing() + self.client.framed(b"too late"))
+        self.assertIn("goodbye", self.server.fault)
+
+    def test_refuse_garbage(self) -> None:
+        """What no lawful client sends ends the link, is answered by a goodbye, and raises nothing."""
+        masked = bytes(4)
+        garbage = {
+            "extension": b"\xc2\x80" + masked,
+            "unmasked": b"\x82\x01x",
+            "text": b"\x81\x80" + masked,
+            "long ping": b"\x89\xfe\x00\x80" + masked,
+            "ping in parts": b"\x09\x80" + masked,
+            "64 bits of length": b"\x82\xff" + bytes(8) + masked,
+            "too long": b"\x82\xfe" + (MAX_PAYLOAD + 1).to_bytes(2, "big") + masked,
+            "no beginning": b"\x80\x80" + masked,
+            "no end": b"\x02\x80" + masked + b"\x82\x80" + masked,
+            "too long in parts": (b"\x02\xfe\x04\x01" + masked + bytes(0x401))
+            + (b"\x00\xfe\x04\x01" + masked + bytes(0x401)),
+        }
+        for name, stream in garbage.items():
+            self.setUp()
+            self.greet()
+            datagrams, reply = self.server.received(stream)
+            self.assertTrue(self.server.fault, name)
+            self.assertEqual((datagrams, reply[0] & 0x0F), ([], CLOSE), name)
+            self.assertEqual(self.server.received(self.client.framed(b"x")), ([], b""), name)
+
+    def test_survive_noise(self) -> None:
+        """Bytes of dice raise nothing and grow no buffer, before the greeting and after it, at both ends."""
+        for seed in range(300):
+            dice = random.Random(seed)
+            self.setUp()
+            if seed % 2:
+                self.greet()
+            for end in (self.client, self.server):
+                for _ in range(30):
+                    end.received(dice.randbytes(dice.randrange(1, 600)))
+                self.assertLess(len(end._buffer), MAX_HEAD + 600)
+
+    def test_refuse_other_requests(self) -> None:
+        """Another page, a plain request and another kind of WebSocket are answered in HTTP and end the link."""
+        lawful = self.client.opening()
+        for stream, status in (
+            (lawful.replace(b"/swarm", b"/admin"), b"404"),
+            (lawful.replace(b"GET", b"POST"), b"404"),
+            (lawful.replace(b"Upgrade: websocket", b"Accept: text/html"), b"400"),
+            (lawful.replace(b": 13", b": 8"), b"426"),
+            (lawful.replace(b"swarm-tunnel-1", b"chat"), b"426"),
+            (b"\r\n\r\n", b"404"),
+        ):
+            server = WebSocket(random.Random(1).randbytes)
+            _, reply = server.received(stream)
+            self.assertTrue(server.fault and not server.is_open, stream)
+            self.assertEqual(reply.split(b" ")[1], status)
+        server.fault = ""
+        server.received(b"x" * MAX_HEAD)
+        self.assertIn("no end", server.fault)
+
+    def test_refuse_other_answers(self) -> None:
+        """A client knows a page, an answer out of a cache and another WebSocket from a tunnel."""
+        _, lawful = self.server.received(self.client.opening())
+        for answer, why in (
+            (b"HTTP/1.1 200 OK\r\n\r\n", "no tunnel"),
+            (b"HTTP/1.1 403 Forbidden\r\nServer: box\r\n\r\n", "403"),
+            (lawful.replace(b"swarm-tunnel-1", b"chat"), "but no"),
+            (lawful.replace(b"Accept: ", b"Accept: x"), "not to this request"),
+        ):
+            client = WebSocket(random.Random(1).randbytes, URL)
+            client.received(answer)
+            self.assertIn(why, client.fault)
+            self.assertFalse(client.is_open)
+
+    def test_hear_for_whom_a_proxy_speaks(self) -> None:
+        """Of the addresses that a request names the last one is taken: it is the proxy's own word."""
+        head = self.client.opening().replace(b"Upgrade: w", b"X-Forwarded-For: 6.6.6.6, 10.0.0.9\r\nUpgrade: w")
+        self.server.received(head)
+        self.assertEqual(self.server.forwarded, "10.0.0.9")
+
+
+class UrlTests(SynchronousTestCase):
+    def test_read(self) -> None:
+        """Host, port and path are found, the usual ones where they are left out; the text comes back."""
+        for text, parts, again in (
+            ("wss://a.example", ("wss", "a.example", 443, "/swarm"), "wss://a.example/swarm"),
+            ("ws://127.0.0.1:8000/x", ("ws", "127.0.0.1", 8000, "/x"), "ws://127.0.0.1:8000/x"),
+            ("wss://[fe80::1]:8443/swarm", ("wss", "fe80::1", 8443, "/swarm"), "wss://[fe80::1]:8443/swarm"),
+        ):
+            self.assertEqual((tuple(Url.of(text)), str(Url.of(text))), (parts, again))
+        for text in (
+            "",
+            "https://a",
+            "wss://",
+            "wss://a:0",
+            "wss://a:65536",
+            "wss://a b",
+            "wss://a/\r\nx",
+            "wss://a:x",
+        ):
+            self.assertRaises(ValueError, Url.of, text)
+
+    def test_address(self) -> None:
+        """Each URL has a virtual address of its own, the same whenever it is read."""
+        addresses = {Url.of(text).address for text in ("wss://a", "wss://a:443/swarm", "wss://b", "wss://a:444")}
+        self.assertEqual(len(addresses), 3)
+        for address in addresses:
+            self.assertRegex(address.host, "^~wss-[0-9a-f]{12}$")
+            self.assertTrue(address.is_virtual and not Address("10.0.0.1", 7000).is_virtual)
+
+    def test_proxy(self) -> None:
+        """What ``https_proxy`` usually says is read, a login included, and no error shows it."""
+        for text, parts in (
+            ("http://10.0.0.1:8080", ("10.0.0.1", 8080, "")),
+            ("proxy:3128/", ("proxy", 3128, "")),
+            ("http://me:p%40ss@proxy:80/", ("proxy", 80, "me:p@ss")),
+            ("http://[fe80::1]:80", ("fe80::1", 80, "")),
+        ):
+            self.assertEqual(tuple(Proxy.of(text)), parts)
+        for text in ("", "socks5://me:secret@a:1", "http://a:99999", "https://a"):
+            self.assertNotIn("secret", str(self.assertRaises(ValueError, Proxy.of, text)))

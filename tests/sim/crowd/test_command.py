@@ -1,0 +1,198 @@
+"""Tests of ``sim.crowd.command``, ``search`` and ``picture``, with a team whose agents are made up."""
+
+from __future__ import annotations
+
+import json
+import math
+import signal
+import xml.etree.ElementTree as ET
+from collections import Counter
+from collections.abc import Callable, Mapping
+from contextlib import redirect_stderr, redirect_stdout
+from io import StringIO
+from pathlib import Path
+from random import Random
+from types import SimpleNamespace
+from typing import Any
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.entangled.clock import HeapClock
+from sim.crowd.command import MakeTeam, main
+from sim.crowd.controller import Controller, stand
+from sim.crowd.crowd import Crowd
+from sim.crowd.ground import Ground, roomy
+from sim.crowd.picture import INK, OTHER, drawn
+from sim.crowd.search import Word, search, table
+from sim.crowd.yard import CrowdYard
+
+
+class PlayedTeam:
+    """Agents that know how far the target is, name the nearest, and let it reach the target, each a second later."""
+
+    is_far_chosen = False
+
+    def __init__(
+        self,
+        seed: int,
+        agents: int,
+        ground: Ground,
+        controller: Controller = stand,
+        stopwatch: Callable[[], float] = lambda: 0.0,
+    ) -> None:
+        self.clock = HeapClock()
+        self.board: Any = SimpleNamespace(counters=Counter(sent=0), digest=lambda: "0" * 64)
+        self.yard = CrowdYard(self.clock, Random(seed), ground, agents, controller, stopwatch)
+        self.yard.start()
+        self.is_stopped = False
+
+    def assign(self) -> None:
+        """Begin."""
+        self.board.counters["sent"] += 10
+
+    def words(self) -> Mapping[str, Word]:
+        """Nobody knows anything until the target is there; then all do."""
+        crowd, target = self.yard.crowd, self.yard.crowd.target
+        if target is None:
+            return {name: Word(None, "") for name in self.yard.names}
+        costs = {
+            name: math.hypot(crowd.x[body] - target.x, crowd.y[body] - target.y)
+            for body, name in enumerate(self.yard.names)
+        }
+        choose = max if self.is_far_chosen else min
+        chosen = choose(costs, key=lambda name: costs[name]) if self.clock.seconds() > 6.0 else ""
+        return {name: Word(cost, chosen) for name, cost in costs.items()}
+
+    def done_by(self) -> str | None:
+        """Who stands there."""
+        return next(iter(self.words().values())).assigned if self.clock.seconds() > 7.0 else None
+
+    def stop(self) -> None:
+        """End."""
+        self.is_stopped = True
+
+
+class FarTeam(PlayedTeam):
+    """The same, and the farthest is chosen."""
+
+    is_far_chosen = True
+
+
+class ImpatientTeam(PlayedTeam):
+    """The same, and somebody presses Ctrl-C at the first look."""
+
+    is_pressed = False
+
+    def words(self) -> Mapping[str, Word]:
+        """What they say."""
+        if not self.is_pressed:
+            self.is_pressed = True
+            signal.raise_signal(signal.SIGINT)
+        return super().words()
+
+
+class SearchTests(SynchronousTestCase):
+    def test_moments_are_noted(self) -> None:
+        """Engaged at once, found when the target is there, agreed and reached when the team says so, by the nearest."""
+        team = PlayedTeam(1, 4, roomy(9))
+        outcome = search(team, 1, 60.0, lambda: 0.0)
+        self.assertEqual((outcome.engaged, outcome.first, outcome.found), (0.5, 5.0, 4))
+        self.assertEqual((outcome.agree, outcome.reach, outcome.right), (6.5, 7.5, True))
+        self.assertEqual((outcome.datagrams, len(outcome.trail)), (10, 3))
+        self.assertIn(f"7.5 s by {outcome.by}", table(outcome))
+
+    def test_a_wrong_choice_is_seen(self) -> None:
+        """Where the farthest is chosen the report says that it was not the nearest."""
+        outcome = search(FarTeam(1, 4, roomy(9)), 1, 60.0, lambda: 0.0)
+        self.assertIs(outcome.right, False)
+        self.assertIn("NO", table(outcome))
+
+    def test_limit_and_end_leave_a_report(self) -> None:
+        """A run that is over before anything was found, or that is ended, says what it knows."""
+        team = PlayedTeam(1, 4, roomy(9))
+        short = search(team, 1, 2.0, lambda: 0.0)
+        ended = search(team, 1, 60.0, lambda: 0.0, is_over=lambda: team.clock.seconds() > 3.22)
+        for outcome, seconds in ((short, 2.0), (ended, 1.25)):
+            self.assertEqual((outcome.seconds, outcome.reach, outcome.right), (seconds, None, None))
+            self.assertIn("- by nobody", table(outcome))
+
+
+class CommandTests(SynchronousTestCase):
+    def run_with(self, *words: str, team: MakeTeam | None = None) -> tuple[int, str]:
+        """The exit code and what was printed."""
+        told = StringIO()
+        with redirect_stdout(told), redirect_stderr(told):
+            try:
+                code = main(words, team)
+            except SystemExit as error:
+                code = int(str(error.code))
+        return code, told.getvalue()
+
+    def test_crowd_alone(self) -> None:
+        """A crowd without agents prints its figures, writes both files, and gives the same hash twice."""
+        folder = Path(self.mktemp())
+        folder.mkdir()
+        picture, figures = folder / "a.svg", folder / "a.json"
+        words = ("--bodies", "40", "--seconds", "6", "--controller", "disperse", "--seed", "5")
+        code, told = self.run_with(*words, "--picture", str(picture), "--json", str(figures))
+        self.assertEqual(code, 0, told)
+        rows = json.loads(figures.read_text(encoding="utf-8"))
+        self.assertEqual((rows["robots"], rows["controller"]), (40, "disperse"))
+        self.assertIn("real time factor", told)
+        self.assertIn(rows["digest"], self.run_with(*words)[1])
+        self.assertNotIn(rows["digest"], self.run_with(*words[:-1], "6")[1])
+        self.assertTrue(ET.fromstring(picture.read_text(encoding="utf-8")).tag.endswith("svg"))
+
+    def test_search_with_agents(self) -> None:
+        """With agents the table of the search is printed, and 0 comes back where the target was reached, else 1."""
+        code, told = self.run_with("--bodies", "9", "--agents", "4", team=PlayedTeam)
+        self.assertEqual(code, 0, told)
+        self.assertIn("4 agents joined", told)
+        self.assertIn("it was the nearest of those           yes", told)
+        code, told = self.run_with("--bodies", "9", "--agents", "4", "--seconds", "2", team=PlayedTeam)
+        self.assertEqual(code, 1, told)
+
+    def test_interrupt_leaves_the_table(self) -> None:
+        """Ctrl-C ends a search with its table and its file, and is afterwards what it was before."""
+        folder, usual = Path(self.mktemp()), signal.getsignal(signal.SIGINT)
+        folder.mkdir()
+        words = ("--bodies", "9", "--agents", "4", "--json", str(folder / "a.json"))
+        code, told = self.run_with(*words, team=ImpatientTeam)
+        self.assertEqual((code, "- by nobody" in told), (1, True), told)
+        self.assertEqual(json.loads((folder / "a.json").read_text(encoding="utf-8"))["seconds"], 0.5)
+        self.assertEqual(signal.getsignal(signal.SIGINT), usual)
+
+    def test_wrong_words_are_refused(self) -> None:
+        """What cannot be run is said in one line with the remedy, before anything is run."""
+        for words, problem in (
+            (("--bodies", "0"), "bodies must be"),
+            (("--room", "0.01"), "room must be"),
+            (("--seconds", "0"), "--seconds must be"),
+            (("--seconds", "nan"), "--seconds must be"),
+            (("--seed", "-1"), "--seed must be"),
+            (("--controller", "dance"), "invalid choice"),
+            (("--agents", "3"), "say swarm crowd instead"),
+            (("--picture", "/nowhere/at/all.svg"), "there is no folder"),
+            (("--bodies", "121", "--room", "0.0677", "--seconds", "1"), "no place is free"),
+        ):
+            code, told = self.run_with(*words)
+            self.assertEqual(code, 2, told)
+            self.assertIn(problem, told)
+        for agents in ("10", "-1"):
+            code, told = self.run_with("--bodies", "9", "--agents", agents, team=PlayedTeam)
+            self.assertEqual(code, 2, told)
+            self.assertIn("--agents must be from 0 to 9", told)
+
+
+class PictureTests(SynchronousTestCase):
+    def test_draws_everybody(self) -> None:
+        """Each robot is drawn once, in the colour of what it is, with target, caption and a legend of what is there."""
+        crowd = Crowd(1, roomy(30))
+        crowd.place_target_at_random()
+        going = "the one that goes"
+        svg = drawn(crowd, "a < b", {3: going}, [(1.0, 1.0), (2.0, 2.0)])
+        ET.fromstring(svg)
+        self.assertEqual(svg.count("h0"), 30)
+        for words in ("a &lt; b", INK[going], INK[OTHER], going, OTHER):
+            self.assertIn(words, svg)
+        self.assertNotIn("agents that search", svg)

@@ -1,0 +1,104 @@
+"""Tests of ``sim.crowd.ray``: all rays at once say what the yard's own say one by one."""
+
+from __future__ import annotations
+
+import math
+from random import Random
+
+import numpy as np
+from twisted.trial.unittest import SynchronousTestCase
+
+from sim.crowd.crowd import RAYS, REACH, Crowd
+from sim.crowd.ground import Ground
+from sim.crowd.ray import Rays
+from sim.scene import FOOTPRINT, Kennel, Scene
+from sim.world import World
+
+
+def twin(crowd: Crowd) -> World:
+    """The same robots in the same places as dogs of the yard, and the same target."""
+    ground = crowd.ground
+    kennels = tuple(
+        Kennel(f"dog{n}", float(crowd.x[n]), float(crowd.y[n]), float(crowd.heading[n]), 1) for n in range(len(crowd.x))
+    )
+    scene = Scene("twin", ground.width, ground.height, 0.4, ground.target_radius, ground.target_height, kennels)
+    world = World(Random(1), scene)
+    if crowd.target is not None:
+        world.place_target(crowd.target.x, crowd.target.y)
+    return world
+
+
+def one_by_one(world: World, crowd: Crowd, body: int) -> list[float]:
+    """What ``segment_query_first`` says along each ray of ``body``, which is turned round for it."""
+    x, y, heading = (float(row[body]) for row in (crowd.x, crowd.y, crowd.heading))
+    dog, found = world.dogs[f"dog{body}"], []
+    for ray in range(RAYS):
+        dog.put(x, y, heading + ray * math.tau / RAYS)
+        hit = world.distance_ahead(dog, 0.0, REACH)
+        found.append(REACH if hit is None else hit)
+    return found
+
+
+class TwinTests(SynchronousTestCase):
+    def check(self, crowd: Crowd) -> int:
+        """Compare every ray; returns how many of them met something."""
+        world = twin(crowd)
+        rows = np.array([one_by_one(world, crowd, body) for body in range(len(crowd.x))])
+        self.assertLess(float(np.abs(rows - crowd.ranges).max()), 0.001)
+        return int((rows < REACH).sum())
+
+    def test_random_scenes(self) -> None:
+        """In thin and dense yards, with the target in some, every ray is that of the yard to a millimetre."""
+        met = 0
+        for seed, (bodies, side) in enumerate([(12, 3.0), (40, 4.0), (80, 4.0), (60, 9.0), (30, 12.0)] * 4):
+            crowd = Crowd(seed, Ground(bodies, side, side + 0.7))
+            if seed % 2 and bodies < 80:
+                crowd.place_target_at_random()
+            met += self.check(crowd)
+        self.assertGreater(met, 2000)
+
+    def test_still_holds_after_they_have_moved(self) -> None:
+        """Neighbours that are remembered from earlier steps hide nobody who has come near since."""
+        crowd = Crowd(3, Ground(40, 5.0, 5.0))
+        for turn in range(120):
+            crowd.wish[:] = (0.16, 0.0, 0.4 * math.sin(turn / 20))
+            crowd.step()
+            if turn % 40 == 39:
+                self.check(crowd)
+
+
+class RaysTests(SynchronousTestCase):
+    """Single rays in an empty yard of 6 x 4 m."""
+
+    def cast(self, x: list[float], y: list[float], heading: list[float], count: int = 8) -> list[list[float]]:
+        """The rays of robots at these places, in millimetres."""
+        rays = Rays(6.0, 4.0, count, REACH)
+        rows: list[list[float]] = (1000 * rays.cast(np.array(x), np.array(y), np.array(heading))).round(6).tolist()
+        return rows
+
+    def test_walls(self) -> None:
+        """A wall is met at its inner face, head-on, aslant and by the ray that runs along it."""
+        (row,) = self.cast([0.12], [1.0], [math.pi])
+        self.assertEqual([row[0], row[1], row[2], row[4]], [120.0, 169.705627, 1000.0, 1700.0])
+        (corner,) = self.cast([5.88], [3.88], [0.0])
+        self.assertEqual(corner[:3], [120.0, 169.705627, 120.0])
+
+    def test_grazing_rays(self) -> None:
+        """A ray that passes a disc by a tenth of a millimetre misses it; one as far within meets it."""
+        for side, is_met in ((FOOTPRINT + 1e-4, False), (FOOTPRINT - 1e-4, True)):
+            row = self.cast([2.0, 3.0], [2.0, 2.0 + side], [0.0, 0.0])[0]
+            self.assertEqual(row[0] < 1700.0, is_met)
+            if is_met:
+                self.assertAlmostEqual(row[0], 1000.0 - 1e3 * math.sqrt(FOOTPRINT**2 - side**2), 3)
+
+    def test_who_touches_is_met_by_more_than_one_ray(self) -> None:
+        """A robot that touches covers a sixth of the round: two of eight rays, and eleven of sixty-four."""
+        at = [2.0, 2.0 + 2 * FOOTPRINT], [2.0, 2.0], [-math.pi / 8, 0.0]
+        self.assertEqual([n for n, r in enumerate(self.cast(*at)[0]) if r < 1700.0], [0, 1])
+        self.assertEqual(sum(r < 1000.0 for r in self.cast(*at, 64)[0]), 11)
+
+    def test_the_nearest_hides_what_is_behind(self) -> None:
+        """Of three in a row the first is met, whatever their order."""
+        for order in ((2.5, 3.0, 3.5), (3.5, 3.0, 2.5), (3.0, 3.5, 2.5)):
+            row = self.cast([2.0, *order], [2.0] * 4, [0.0] * 4)[0]
+            self.assertAlmostEqual(row[0], 500.0 - 120.0, 6)

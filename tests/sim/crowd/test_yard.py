@@ -1,0 +1,246 @@
+"""Tests of ``sim.crowd.yard``, ``feeling``, ``eye`` and ``body``: to a driver a robot of a crowd is as a dog."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from random import Random
+from typing import Any
+
+import numpy as np
+from twisted.internet.task import Clock
+from twisted.trial.unittest import SynchronousTestCase
+
+from agents.vision import Size, find_target
+from drivers.driver import Permit
+from drivers.errors import DriverError, UsageError
+from drivers.reading import Observation
+from drivers.sim.driver import SimDriver
+from middleware.entangled.clock import HeapClock
+from sim.crowd.body import CrowdBody
+from sim.crowd.controller import stand
+from sim.crowd.crowd import TICK
+from sim.crowd.ground import Ground
+from sim.crowd.yard import SPARE, CrowdYard
+from sim.scene import FOOTPRINT, SceneError, loaded
+from sim.sensor import NOSE
+from sim.yard import Yard
+
+
+class DrivenTests(SynchronousTestCase):
+    """Five robots on 6 x 4 m, two of them to be driven."""
+
+    def setUp(self) -> None:
+        """The first stands at the left and looks to the right, the others behind it."""
+        self.clock = HeapClock()
+        self.yard = CrowdYard(self.clock, Random(1), Ground(5, 6.0, 4.0), 2, stand)
+        self.crowd = self.yard.crowd
+        for body, (x, y) in enumerate(((1.0, 2.0), (0.3, 0.3), (0.3, 3.7), (0.3, 3.0), (0.3, 1.0))):
+            self.crowd.move(body, x, y, 0.0)
+        self.yard.start()
+
+    def driver(self, name: str = "robot1", fps: float = 0.0) -> SimDriver:
+        """A driver of that robot, connected and with its motors on as soon as can be."""
+        driver = SimDriver({"robot": name, "camera_fps": fps}, self.yard.connector(), self.clock)
+        driver.connect().addCallback(lambda _: driver.enable()).addErrback(lambda why: why.trap(DriverError))
+        self.clock.advance(0.5)
+        return driver
+
+    def newest(self, driver: SimDriver) -> Observation:
+        """What the driver has heard last."""
+        seen = driver.observe()
+        assert seen is not None
+        return seen
+
+    def act(self, driver: SimDriver, seconds: float, ttl: float = 0.3, **motion: float) -> None:
+        """Drive for so long, an order each tenth of a second."""
+        for _ in range(round(seconds / 0.1)):
+            permit = Permit(1, self.clock.seconds() + ttl)
+            driver.act({f"base.{key}": value for key, value in motion.items()}, permit)
+            self.clock.advance(0.1)
+
+    def test_tells_what_a_dog_tells(self) -> None:
+        """Keys, kinds of values and names of samples are those of a dog of the yard, and frames come each 32 ms."""
+        dogs = Yard(self.clock, Random(1), loaded("three-dogs"))
+        dogs.start()
+        dog = SimDriver({"robot": "dog1"}, dogs.connector(), self.clock)
+        dog.connect()
+        driver = self.driver()
+        here, there = self.newest(driver), self.newest(dog)
+        self.assertEqual(sorted(here.values), sorted(there.values))
+        self.assertEqual(
+            {key: type(value) for key, value in here.values.items()},
+            {key: type(value) for key, value in there.values.items()},
+        )
+        self.assertEqual(sorted(here.samples), sorted(there.samples))
+        before = driver.diagnostics()["frames"]
+        self.clock.advance(100 * TICK)
+        self.assertEqual(driver.diagnostics()["frames"] - before, 100)
+        for yard in (dogs, self.yard):
+            yard.stop()
+
+    def test_obeys_its_driver(self) -> None:
+        """It walks as it is told, its odometry with it; it stands when the time to live is over, and others stay."""
+        driver = self.driver()
+        others = self.crowd.x[1:].tolist()
+        self.act(driver, 2.0, vx=0.5)
+        went = float(self.crowd.x[0]) - 1.0
+        self.assertAlmostEqual(went, 0.16 * 2.0, 1)
+        values = self.newest(driver).values
+        self.assertLess(abs(float(values["odom.x"]) - went), 0.05)
+        self.assertIs(values["base.moving"], True)
+        self.clock.advance(0.6)
+        self.assertEqual(float(self.crowd.vx[0]), 0.0)
+        self.assertEqual(self.crowd.x[1:].tolist(), others)
+
+    def test_stands_when_its_driver_is_gone(self) -> None:
+        """Whoever hangs up lets the robot stand, and another may have it."""
+        first = self.driver()
+        self.act(first, 0.5, ttl=5.0, vx=0.16)
+        first.disconnect()
+        self.clock.advance(0.3)
+        self.assertEqual((self.yard.holders, float(self.crowd.vx[0])), ([], 0.0))
+        second = self.driver()
+        self.assertEqual((second.state, self.yard.holders), ("ready", ["robot1"]))
+
+    def test_stands_when_nothing_is_heard(self) -> None:
+        """A link that is silent, though nobody closed it, lets the robot stand at the end of the time to live."""
+        connector = self.yard.connector()
+        driver = SimDriver({"robot": "robot1", "camera_fps": 0.0}, connector, self.clock)
+        driver.connect().addCallback(lambda _: driver.enable())
+        self.clock.advance(0.5)
+        self.act(driver, 0.5, ttl=0.4, vx=0.16)
+        connector.silence()
+        self.clock.advance(0.25)
+        self.assertGreater(float(self.crowd.vx[0]), 0.15)
+        self.clock.advance(0.5)
+        self.assertEqual(float(self.crowd.vx[0]), 0.0)
+        self.clock.advance(4.0)
+        self.assertEqual(self.yard.holders, [])
+
+    def test_robots_of_others_are_refused(self) -> None:
+        """A robot is for one driver; those of the controller, and those that are not there, are for none."""
+        self.driver()
+        self.assertGreater(self.driver().diagnostics()["refused"], 0)
+        self.assertEqual(self.driver("robot3").state, "closed")
+        self.assertEqual(self.driver("robot2").state, "ready")
+
+    def test_ranges(self) -> None:
+        """Near and far measure from the nose to what is ahead, and say NaN beyond their reach, as a dog's do."""
+        driver = self.driver()
+        for gap, near in ((0.3, True), (1.0, False)):
+            self.crowd.place_target(1.0 + NOSE + gap + 0.08, 2.0)
+            rows: list[Observation] = []
+            end = driver.subscribe(rows.append)
+            self.clock.advance(1.0)
+            end()
+            far = statistics.fmean(float(seen.values["range.far"]) for seen in rows)
+            self.assertLess(abs(far - gap), 0.005)
+            self.assertEqual(math.isnan(float(rows[-1].values["range.near"])), not near)
+            self.assertLess(abs(float(rows[-1].values["range.chest"]) - 0.204), 0.02)
+
+    def test_feels_how_it_moves(self) -> None:
+        """Accelerometer, compass and battery: a start is felt ahead, a turn is seen, and power is used up."""
+        driver = self.driver()
+        felt: list[float] = []
+        end = driver.subscribe(lambda seen: felt.append(float(seen.values["imu.ax"])))
+        self.act(driver, 0.2, vx=0.16)
+        self.assertGreater(max(felt), 0.5)
+        end()
+        self.act(driver, 1.0, wz=1.0)
+        values = self.newest(driver).values
+        self.assertLess(
+            abs(math.remainder(float(values["compass.heading"]) - float(self.crowd.heading[0]), math.tau)), 0.2
+        )
+        self.assertLess(abs(float(values["odom.yaw"]) - float(self.crowd.heading[0])), 0.1)
+        self.assertTrue(0.999 < float(values["power.level"]) < 1.0)
+
+    def test_pictures_show_the_target(self) -> None:
+        """The agents' own eyes find the target in its pictures, where it is, unless somebody stands before it."""
+        driver = self.driver(fps=10.0)
+        self.crowd.place_target(3.0, 2.3)
+        self.clock.advance(0.5)
+        frame = self.newest(driver).frame
+        assert frame is not None
+        self.assertGreaterEqual(driver.diagnostics()["pictures"], 9)
+        seen = find_target(frame.data, Size(0.08, 0.22))
+        assert seen is not None
+        self.assertLess(abs(seen.bearing - math.atan2(0.3, 2.0 - NOSE)), 0.02)
+        self.assertLess(abs(seen.distance - math.hypot(0.3, 2.0 - NOSE)), 0.1)
+        for body, (x, y) in enumerate(((1.5, 2.08), (1.75, 2.11)), 3):
+            self.crowd.move(body, x, y, 0.0)
+        self.clock.advance(0.5)
+        hidden = self.newest(driver).frame
+        assert hidden is not None
+        rest = find_target(hidden.data, Size(0.08, 0.22))
+        self.assertTrue(rest is None or not rest.is_whole)
+
+    def test_pictures_without_a_target_have_no_red(self) -> None:
+        """Walls, floor and the others look like no target to anybody."""
+        yard = CrowdYard(self.clock, Random(2), Ground(60, 5.0, 5.0), 60, stand)
+        for name in yard.names:
+            picture = yard.lend(name).picture()
+            assert picture is not None
+            self.assertIsNone(find_target(picture, Size(0.08, 0.22)))
+
+    def test_body_for_an_emulator(self) -> None:
+        """A robot that is lent moves, halts and senses by its body, feels bumps, and no driver may have it."""
+        body = self.yard.lend("robot2")
+        body.drive(0.16, 0.0, 0.0)
+        self.clock.advance(1.0)
+        self.assertGreater(float(self.crowd.x[1]), 0.4)
+        body.drive(math.nan, 0.0, 0.0)
+        self.clock.advance(0.5)
+        self.assertEqual(float(self.crowd.vx[1]), 0.0)
+        self.assertEqual(self.bumps(body), (False, False))
+        self.crowd.move(2, float(self.crowd.x[1]) + 2 * FOOTPRINT, 0.3, 0.0)
+        self.assertEqual(self.bumps(body), (True, True))
+        self.crowd.move(1, 3.0, FOOTPRINT, math.radians(-60.0))
+        self.assertEqual(self.bumps(body), (False, True))
+        self.crowd.move(1, 3.0, 2.0, 0.0)
+        self.crowd.place_target(3.0 + FOOTPRINT + 0.08, 2.0)
+        self.assertEqual(self.bumps(body), (True, True))
+        self.assertIn("odom.x", body.sense())
+        body.halt()
+        self.assertEqual(self.driver("robot2").state, "closed")
+        self.assertRaises(UsageError, self.yard.lend, "robot3")
+
+    def bumps(self, body: CrowdBody) -> tuple[Any, Any]:
+        """Whether its left and its right are touched."""
+        values = body.sense()
+        return values["bump.left"], values["bump.right"]
+
+    def test_wrong_numbers_are_refused(self) -> None:
+        """More drivers than robots, or what is no number of them, is refused; so is one connection too many."""
+        for driven in (-1, 6, 1.5, True):
+            self.assertRaises(SceneError, CrowdYard, self.clock, Random(1), Ground(5, 6.0, 4.0), driven)
+        connector = self.yard.connector()
+        callers = [SimDriver({"robot": "robot1"}, connector, self.clock) for _ in range(2 + SPARE + 1)]
+        for caller in callers:
+            caller.connect().addErrback(lambda why: None)
+        self.clock.advance(0.05)
+        self.assertEqual(callers[-1].diagnostics()["refused"], 1)
+
+    def test_costs_are_counted_apart(self) -> None:
+        """The stopwatch's time goes to moving or to telling, each step to both."""
+        moments = iter(np.arange(0.0, 1000.0, 1.0).tolist())
+        yard = CrowdYard(self.clock, Random(1), Ground(5, 6.0, 4.0), 1, stand, lambda: next(moments))
+        yard.start()
+        self.clock.advance(TICK * 10.5)
+        self.assertEqual((yard.moving, yard.telling), (10.0, 10.0))
+
+    def test_time_lost_is_not_made_up_for(self) -> None:
+        """After a machine stood still the crowd goes on from there, and obeys nothing ordered before."""
+        clock = Clock()
+        yard = CrowdYard(clock, Random(1), Ground(5, 6.0, 4.0), 1, stand)
+        yard.start()
+        yard.drive("robot1", 0.16, 0.0, 0.0)
+        clock.advance(TICK)
+        self.assertGreater(float(yard.crowd.wish[0, 0]), 0.0)
+        clock.advance(5.0)
+        self.assertEqual((yard.crowd.ticks, float(yard.crowd.wish[0, 0])), (2, 0.0))
+        clock.advance(TICK)
+        self.assertEqual(yard.crowd.ticks, 3)
+        yard.stop()
+        clock.advance(1.0)
+        self.assertEqual(yard.crowd.ticks, 3)

@@ -1,0 +1,52 @@
+"""The logbook of long runs: what it keeps, and what is left to be run."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.errors import BadSetting
+from sim.team.logbook import Entry, append, entries, missing, stretches
+
+ENTRY = Entry("2026-11-22T10:00:00Z", "abc", "", 1, 3, (2,), 1.5)
+
+
+class LogbookTests(SynchronousTestCase):
+    def book(self) -> Path:
+        """Where a logbook may stand."""
+        return Path(self.mktemp())
+
+    def test_what_is_added_is_read(self) -> None:
+        """Entries are read as they were added, in their order."""
+        book, second = self.book(), replace(ENTRY, first=4, failures=())
+        for entry in (ENTRY, second):
+            append(str(book), entry)
+        self.assertEqual(entries(book.read_text(), "book"), [ENTRY, second])
+
+    def test_half_a_line(self) -> None:
+        """Half a line at the end is left out when the book is read, and gone when it is added to."""
+        book = self.book()
+        append(str(book), ENTRY)
+        with book.open("a") as torn:
+            torn.write(ENTRY.line()[:20])
+        self.assertEqual(entries(book.read_text(), "book"), [ENTRY])
+        append(str(book), ENTRY)
+        self.assertEqual(entries(book.read_text(), "book"), [ENTRY, ENTRY])
+
+    def test_no_logbook(self) -> None:
+        """A whole line that is no entry is refused with its number."""
+        told = ENTRY.line() + "\nhello\n" + ENTRY.line() + "\n"
+        error = self.assertRaises(BadSetting, entries, told, "book")
+        self.assertIn("line 2", str(error))
+
+    def test_missing(self) -> None:
+        """What a book has of the same workloads is not run again; what it has of others is."""
+        logged = [ENTRY, replace(ENTRY, first=6), replace(ENTRY, first=4, what="wire")]
+        self.assertEqual(missing(range(1, 11), logged, ""), [4, 5, 9, 10])
+
+    def test_stretches(self) -> None:
+        """Seeds are told of in stretches without gaps, none longer than is allowed."""
+        self.assertEqual(stretches([1, 2, 3, 7, 8, 10], 2), [[1, 2], [3], [7, 8], [10]])
+        self.assertEqual(stretches([], 2), [])

@@ -1,0 +1,108 @@
+"""Tests of a place's computer."""
+
+from __future__ import annotations
+
+import random
+
+from twisted.internet.error import AlreadyCalled, AlreadyCancelled
+from twisted.internet.interfaces import IReactorTime
+from twisted.trial.unittest import SynchronousTestCase
+from zope.interface.verify import verifyObject
+
+from middleware.entangled.clock import HeapClock
+from middleware.entangled.network.switchboard import Switchboard
+from sim.team.machine import MOST_WAITING, Machine, MachineNetwork
+
+
+class MachineTests(SynchronousTestCase):
+    """Behaviour of ``Machine`` and its network."""
+
+    def setUp(self) -> None:
+        """Have a world, and a place to write down what happens."""
+        self.world = HeapClock()
+        self.seen: list[object] = []
+
+    def test_clock_runs_at_its_own_rate(self) -> None:
+        """A fast clock shows more, its timers are due sooner, and a new rate moves no moment that has passed."""
+        machine = Machine(self.world, 2.0, 100.0)
+        verifyObject(IReactorTime, machine)
+        machine.callLater(4.0, lambda: self.seen.append(self.world.seconds()))
+        self.world.advance(3.0)
+        self.assertEqual((self.seen, machine.seconds()), ([2.0], 106.0))
+        machine.set_rate(0.5)
+        self.world.advance(2.0)
+        self.assertEqual(machine.seconds(), 107.0)
+
+    def test_waiting_for_what_is_left_ends(self) -> None:
+        """Who sets a timer for the rest of a wait again and again gets there, however the clocks round."""
+        dice = random.Random(1)
+        for _ in range(300):
+            self.world = HeapClock(1e6 + dice.random())  # its digits are coarser than those of a clock that begins now
+            rate = dice.uniform(0.99, 1.01)
+            machine = Machine(self.world, rate, -rate * self.world.seconds())
+            turns: list[int] = []
+            deadline = machine.seconds() + 0.3 * dice.random()
+
+            def again(machine: Machine = machine, deadline: float = deadline, turns: list[int] = turns) -> None:
+                turns.append(1)
+                if machine.seconds() < deadline and len(turns) < 50:
+                    machine.callLater(deadline - machine.seconds(), again)
+
+            again()
+            self.world.advance(1.0)
+            self.assertLess(len(turns), 5, f"rate {rate}")
+
+    def test_what_was_due_waits_for_the_thaw(self) -> None:
+        """Nothing of a still machine runs; then come the timers in their order, and after them what came in."""
+        board = Switchboard(self.world, random.Random(1))
+        machine = Machine(self.world)
+        network = MachineNetwork(machine, board.network("10.0.0.1", 7000))
+        network.listen(lambda datagram, source: self.seen.append(datagram))
+        other = board.network("10.0.0.2", 7000)
+        other.listen(lambda datagram, source: None)
+        machine.freeze()
+        machine.callLater(2.0, self.seen.append, "second")
+        machine.callLater(1.0, self.seen.append, "first")
+        machine.callLater(1.5, self.seen.append, "never").cancel()
+        other.send(b"hello", network.address)
+        self.world.advance(3.0)
+        self.assertEqual((self.seen, machine.seconds()), ([], 3.0))
+        machine.thaw()
+        self.assertEqual(self.seen, ["first", "second", b"hello"])
+
+    def test_buffer_holds_so_many_datagrams(self) -> None:
+        """A machine that stands still for long keeps the first datagrams and drops the rest."""
+        machine = Machine(self.world)
+        machine.freeze()
+        for number in range(MOST_WAITING + 50):
+            machine.take(lambda datagram, source: self.seen.append(datagram), b"%d" % number, None)  # type: ignore[arg-type]
+        machine.thaw()
+        self.assertEqual((len(self.seen), self.seen[0]), (MOST_WAITING, b"0"))
+
+    def test_dead_machine_does_nothing(self) -> None:
+        """Timers of a dead machine are never made, be it still or not."""
+        machine = Machine(self.world)
+        machine.callLater(1.0, self.seen.append, "late")
+        machine.freeze()
+        self.world.advance(2.0)
+        machine.callLater(1.0, self.seen.append, "later")
+        machine.die()
+        machine.thaw()
+        self.world.advance(2.0)
+        self.assertEqual(self.seen, [])
+
+    def test_calls_can_be_moved_and_taken_back_once(self) -> None:
+        """A call is moved in the machine's own seconds; what was called or cancelled cannot be moved."""
+        machine = Machine(self.world, 2.0)
+        call = machine.callLater(2.0, self.seen.append, "moved")
+        call.reset(6.0)
+        call.delay(2.0)
+        self.assertEqual((call.getTime(), call.active()), (8.0, True))
+        self.world.advance(3.9)
+        self.assertEqual(self.seen, [])
+        self.world.advance(0.2)
+        self.assertEqual(self.seen, ["moved"])
+        self.assertRaises(AlreadyCalled, call.cancel)
+        other = machine.callLater(1.0, self.seen.append, "x")
+        other.cancel()
+        self.assertRaises(AlreadyCancelled, other.reset, 1.0)

@@ -1,0 +1,62 @@
+"""Tests of what a team needs and what there is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.errors import BadSetting
+from sim.team.fault import Fault
+from sim.team.memory import BASE, KIB, NO_LIMIT, check, foreseen, free, resident
+from sim.team.scenario import Scenario
+
+MEMINFO = "MemTotal: 8000000 kB\nMemAvailable:    4000000 kB\n"
+
+
+def _machine(files: dict[str, str]) -> Callable[[str], str]:
+    def read(path: str) -> str:
+        if path not in files:
+            raise FileNotFoundError(path)
+        return files[path]
+
+    return read
+
+
+class MemoryTests(SynchronousTestCase):
+    """What is foreseen before a run begins."""
+
+    def test_machine_and_groups_set_the_limit(self) -> None:
+        """The least of what the machine has and what each group leaves counts, of either sort; "max" is none."""
+        files = {"/proc/meminfo": MEMINFO}
+        self.assertEqual(free(_machine(files)), 4_000_000 * 1024)
+        files |= {
+            "/proc/self/cgroup": "0::/team/run\n",
+            "/sys/fs/cgroup/team/run/memory.max": "max",
+            "/sys/fs/cgroup/team/run/memory.current": "5",
+            "/sys/fs/cgroup/team/memory.max": "1000",
+            "/sys/fs/cgroup/team/memory.current": "300",
+        }
+        self.assertEqual(free(_machine(files)), 700)
+        files["/proc/self/cgroup"] = "3:cpu,cpuacct:/\n5:memory:/box\n"
+        files["/sys/fs/cgroup/memory/box/memory.limit_in_bytes"] = "500"
+        files["/sys/fs/cgroup/memory/box/memory.usage_in_bytes"] = "600"
+        self.assertEqual(free(_machine(files)), 0)
+        self.assertEqual(free(_machine({})), NO_LIMIT)
+
+    def test_team_that_does_not_fit_is_refused(self) -> None:
+        """The refusal has what is needed, what there is, and how many nodes would fit; newcomers count, too."""
+        files = {"/proc/meminfo": MEMINFO}
+        check(Scenario(nodes=10_000), _machine(files))
+        error = self.assertRaises(BadSetting, check, Scenario(nodes=20_000), _machine(files))
+        self.assertEqual(error.key, "--nodes")
+        fit = int(error.remedy.split()[3].rstrip(",").replace(",", ""))
+        check(Scenario(nodes=fit), _machine(files))
+        self.assertRaises(BadSetting, check, Scenario(nodes=fit + 50), _machine(files))
+        crowd = Scenario(nodes=10, faults=(Fault("crowd", 1.0, count=90),))
+        self.assertEqual(foreseen(crowd), BASE + 100 * KIB["entangled"] * 1024)
+
+    def test_own_size_is_read(self) -> None:
+        """What the process has is told in bytes, or as 0 where the system does not tell."""
+        self.assertEqual(resident(_machine({"/proc/self/status": "Name: x\nVmRSS:\t  100 kB\n"})), 102_400)
+        self.assertEqual(resident(_machine({})), 0)

@@ -1,0 +1,238 @@
+"""Tests of runs: faults, sessions, and what comes of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from twisted.logger import Logger
+from twisted.python.failure import Failure
+from twisted.trial.unittest import SynchronousTestCase
+
+from sim.team.disk import Disk
+from sim.team.fault import Fault
+from sim.team.figure import Bound, Figure
+from sim.team.link import LinkSettings
+from sim.team.run import DONE, JOINING, RUNNING, Run
+from sim.team.scenario import Clocks, Join, Scenario, Sessions
+from sim.team.team import Team
+from sim.team.workload import Kind
+
+
+@dataclass(frozen=True)
+class _Nothing:
+    pass
+
+
+class _Steps:
+    """A workload that counts what is asked of it, and finds what it is told to find."""
+
+    found: tuple[str, ...] = ()
+
+    def __init__(self, team: Team, settings: object) -> None:
+        self.team = team
+        self.steps: list[float] = []
+        self.settled_at = 0.0
+
+    def step(self) -> None:
+        self.steps.append(self.team.clock.seconds())
+
+    def settled(self) -> None:
+        self.settled_at = self.team.clock.seconds()
+
+    def verdict(self) -> list[str]:
+        return list(self.found)
+
+    def figures(self) -> list[Figure]:
+        return [Figure("steps", len(self.steps))]
+
+
+class _Finds(_Steps):
+    found = ("E1: something is wrong",)
+
+
+KINDS = {"steps": Kind(_Nothing, _Steps), "finds": Kind(_Nothing, _Finds)}
+JOIN = Join(pause=0.2, settle=1.0)
+BASE = Scenario(nodes=6, seconds=10.0, join=JOIN, loads=(("steps", _Nothing()),))
+
+
+class RunTests(SynchronousTestCase):
+    """Behaviour of ``Run``, its faults and its sessions."""
+
+    def told(self, scenario: Scenario, seed: int = 1) -> tuple[Run, list[tuple[float, str, int]]]:
+        """A run that was played to its end, and what was told from the moment when the team stood."""
+        run = Run(scenario, seed, KINDS)
+        told: list[tuple[float, str, int]] = []
+        run.team.told.append(lambda now, event, place, more: told.append((now, event, place)))
+        run.go()
+        began = run.began_at or 0.0
+        return run, [(round(now - began, 6), event, place) for now, event, place in told if now >= began]
+
+    def test_workloads_act_while_it_lasts(self) -> None:
+        """They step at the scenario's pace, are told when the repair is over, and their figures meet the targets."""
+        run = Run(replace(BASE, repair=5.0, targets=(("steps", Bound(19)),)), 1, KINDS)
+        outcome = run.go()
+        workload = run.workloads[0][1]
+        assert isinstance(workload, _Steps) and run.began_at is not None
+        self.assertEqual([round(at - run.began_at, 3) for at in workload.steps], [n / 2 for n in range(20)])
+        self.assertAlmostEqual(workload.settled_at, run.began_at + 15.0)
+        self.assertEqual([(f.name, f.value, f.holds) for f in outcome.missed], [("steps", 20, False)])
+        self.assertEqual((outcome.phase, outcome.is_partial, outcome.violations), (DONE, False, []))
+        self.assertAlmostEqual(outcome.seconds, run.expected_end)
+
+    def test_workloads_wait_for_their_lead(self) -> None:
+        """With a lead the workloads begin to act only then."""
+        run = Run(replace(BASE, lead=7.5), 1, KINDS)
+        run.go()
+        workload = run.workloads[0][1]
+        assert isinstance(workload, _Steps) and run.began_at is not None
+        self.assertEqual(round(workload.steps[0] - run.began_at, 3), 7.5)
+        self.assertEqual(len(workload.steps), 5)
+
+    def test_violations_and_unknown_targets_are_told(self) -> None:
+        """What a workload finds is in the outcome, and a target for which nothing was measured is a violation."""
+        scenario = replace(BASE, loads=(("finds", _Nothing()),), targets=(("stops", Bound(1)),))
+        found = Run(scenario, 1, KINDS).go().violations
+        self.assertEqual(found, ["targets: nothing measured 'stops'; there are steps", "E1: something is wrong"])
+
+    def test_it_can_be_ended_at_any_moment(self) -> None:
+        """Ended while the team comes, or while it lasts, there is an outcome that says so."""
+        for end, phase in ((0.5, JOINING), (6.0, RUNNING)):
+            run = Run(BASE, 1, KINDS, lambda run, end=end: run.team.clock.seconds() >= end)  # type: ignore[misc]
+            outcome = run.go()
+            self.assertEqual((outcome.phase, outcome.is_partial), (phase, True))
+            self.assertLess(outcome.seconds, end + 0.5)
+            self.assertEqual(len(outcome.digest), 32)
+
+    def test_slow_machine_is_watched_as_often(self) -> None:
+        """Where the machine is slow the grains get finer, so that a person is heard; what happens is the same."""
+        watched: dict[bool, list[float]] = {False: [], True: []}
+        digests = []
+        for is_slow, seen in watched.items():
+            real = [0.0]
+
+            def look(run: Run, seen: list[float] = seen) -> bool:
+                seen.append(run.team.clock.seconds())
+                return False
+
+            def seconds(real: list[float] = real, is_slow: bool = is_slow) -> float:
+                real[0] += 0.6 if is_slow and real[0] < 6.0 else 0.0
+                return real[0]
+
+            digests.append(Run(replace(BASE, seconds=1.0), 1, KINDS, watched=look, seconds=seconds).go().digest)
+        self.assertEqual(digests[0], digests[1])
+        gaps = [min(b - a for a, b in zip(seen, seen[1:], strict=False) if b > a) for seen in watched.values()]
+        self.assertEqual(gaps[1] < 0.01 < gaps[0], True, gaps)
+        end = Run(BASE, 1, KINDS, watched=lambda run: run.team.clock.seconds() > 0.1, seconds=lambda: 0.0).go()
+        self.assertTrue(end.is_partial)
+
+    def test_who_is_not_in_is_a_violation(self) -> None:
+        """A node that does not get in within the time for it is said to be outside."""
+        link = LinkSettings("none", loss=0.9)
+        scenario = replace(BASE, link=link, join=replace(JOIN, within=1.0), seconds=0.0)
+        self.assertIn("nodes are not in", Run(scenario, 1, KINDS).go().violations[0])
+
+    def test_exception_is_a_violation(self) -> None:
+        """A call that raises, or a failure that a node only logs, ends nothing; the verdict has it."""
+        run = Run(BASE, 1, KINDS)
+        run.team.at(3.0, lambda: 1 // 0)
+        run.team.at(4.0, lambda: Logger().failure("a node's own", Failure(KeyError("x"))))
+        outcome = run.go()
+        self.assertFalse(outcome.is_partial)
+        self.assertEqual(
+            [line.rpartition(":")[0] for line in outcome.violations],
+            ["exception: ZeroDivisionError at 3.000 s", "exception: KeyError at 4.000 s"],
+        )
+        self.assertEqual(len(self.flushLoggedErrors(ZeroDivisionError, KeyError)), 2)
+
+    def test_power_fails_and_comes_back(self) -> None:
+        """Half of them die at their time, one after the other, and start again as long after."""
+        crash = Fault("crash", 2.0, lasts=3.0, share=0.5, over=1.5)
+        _, told = self.told(replace(BASE, faults=(crash,)))
+        killed = [(at, place) for at, event, place in told if event == "killed"]
+        born = [(at, place) for at, event, place in told if event == "born"]
+        self.assertEqual([at for at, _ in killed], [2.0, 2.5, 3.0])
+        self.assertEqual(born, [(at + 3.0, place) for at, place in killed])
+
+    def test_healing_brings_all_back(self) -> None:
+        """With time for repair every fault is taken back at the end: nobody is cut, still, full or away."""
+        faults = tuple(
+            Fault(kind, 1.0, lasts=99.0, count=2, amount=1.1 if kind == "rate" else 0.0)
+            for kind in ("crash", "leave", "freeze", "cut", "deaf", "mute", "clog", "rate", "full")
+        )
+        faults += Fault("pairs", 1.0, lasts=99.0, share=0.2), Fault("weather", 1.0, lasts=99.0, amount=0.2)
+        faults += Fault("step", 1.0, lasts=99.0, count=3, amount=-3600.0), Fault("crowd", 1.0, count=2)
+        run, told = self.told(replace(BASE, nodes=8, faults=faults, repair=60.0))
+        team = run.team
+        self.assertEqual(len([1 for _, event, _ in told if event == "fault"]), len(faults))
+        self.assertEqual((team.alive(), sorted(team.inside())), (list(range(10)), list(range(10))))
+        self.assertEqual(team.board.barriers, [])
+        self.assertAlmostEqual(team.link.worse, 0.0)
+        for place in team.places:
+            here = team.place(place)
+            assert here.machine is not None
+            self.assertFalse(here.machine.is_still)
+            self.assertAlmostEqual(here.rate, 1.0)
+            self.assertAlmostEqual(here.step, 0.0)
+            self.assertEqual(here.store.trouble, "")
+        known = [len(team.entangled(place).overlay.contacts()) for place in team.alive()]
+        self.assertEqual(known, [9] * 10)
+
+    def test_what_lasts_ends_at_its_time(self) -> None:
+        """A cut, bad weather, a fast clock, a full disk and a frozen node are there for their time, and no longer."""
+        faults = tuple(
+            Fault(kind, 2.0, lasts=3.0, places=(1,), amount=1.5 if kind == "rate" else -60.0 if kind == "step" else 0.0)
+            for kind in ("cut", "freeze", "rate", "full", "step")
+        ) + (Fault("weather", 2.0, lasts=3.0, amount=0.25),)
+        seen: dict[float, tuple[object, ...]] = {}
+
+        def looked(run: Run) -> bool:
+            here, at = run.team.place(1), run.team.clock.seconds() - (run.began_at or 99.0)
+            if here.machine is not None and isinstance(here.store, Disk):
+                still, full = here.machine.is_still, here.store.is_full
+                seen[at] = len(run.team.board.barriers), run.team.link.worse, still, here.rate, full, here.step
+            return False
+
+        Run(replace(BASE, faults=faults), 1, KINDS, looked).go()
+        calm, bad = (0, 0.0, False, 1.0, False, 0.0), (1, 0.25, True, 1.5, True, -60.0)
+        self.assertEqual({seen[at] for at in seen if 0 <= at < 1.9 or at > 5.1}, {calm})
+        self.assertEqual({seen[at] for at in seen if 2.1 < at < 4.9}, {bad})
+
+    def test_crowd_comes_and_goes(self) -> None:
+        """Newcomers come over the time that the fault says, at places of their own, and leave after theirs."""
+        run, told = self.told(replace(BASE, faults=(Fault("crowd", 1.0, lasts=4.0, count=4, over=2.0),)))
+        self.assertEqual([(at, p) for at, event, p in told if event == "born"], [(1 + n / 2, 6 + n) for n in range(4)])
+        self.assertEqual([(at, p) for at, event, p in told if event == "left"], [(5 + n / 2, 6 + n) for n in range(4)])
+        self.assertEqual(run.team.alive(), list(range(6)))
+
+    def test_sessions_end_and_others_begin(self) -> None:
+        """Nodes leave at the rate that follows from the mean, and come back after their breaks; some stay always."""
+        sessions = Sessions("exponential", 10.0, 2.0)
+        run, told = self.told(replace(BASE, nodes=12, seconds=60.0, sessions=sessions))
+        ended = [event for _, event, _ in told if event == "killed"]
+        stays = sessions.stays
+        assert stays is not None
+        expected = 12 * 60.0 / (stays.mean + sessions.breaks.mean)
+        self.assertApproximates(len(ended) / expected, 1.0, 0.35)
+        self.assertGreaterEqual(len(run.team.nodes), 2)
+        self.assertGreater(len([1 for _, event, _ in told if event == "born"]), 0.7 * len(ended))
+
+    def test_sessions_may_bring_others(self) -> None:
+        """With ``same`` false a newcomer takes the place; some of those who go say goodbye."""
+        run = Run(replace(BASE, seconds=40.0, sessions=Sessions("fixed", 15.0, 2.0, 0.5, same=False)), 1, KINDS)
+        before = [run.team.identity(place) for place in range(6)]
+        run.go()
+        self.assertTrue(all(run.team.identity(place) != before[place] for place in range(6)))
+
+    def test_same_seed_gives_the_same_hash(self) -> None:
+        """Two runs of one seed with faults and sessions are the same to the last datagram; another seed is not."""
+        scenario = replace(
+            BASE,
+            link=LinkSettings("wifi", loss=0.05, burst=0.05, duplicate=0.05, reorder=0.05),
+            clocks=Clocks(0.01, 60.0),
+            sessions=Sessions("weibull", 20.0, 3.0, 0.3),
+            faults=(Fault("freeze", 1.0, lasts=3.0, count=2), Fault("cut", 5.0, lasts=3.0, share=0.4)),
+            repair=5.0,
+        )
+        hashes = [Run(scenario, seed, KINDS).go().digest for seed in (5, 5, 6)]
+        self.assertEqual(hashes[0], hashes[1])
+        self.assertNotEqual(hashes[0], hashes[2])

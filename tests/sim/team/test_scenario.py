@@ -1,0 +1,178 @@
+"""Tests of scenario files."""
+
+from __future__ import annotations
+
+import random
+import re
+from dataclasses import dataclass, field
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware import setting
+from middleware.errors import BadSetting
+from sim.team.command import KINDS
+from sim.team.scenario import FOLDER, Scenario, loaded, names, scenario_of
+
+
+@dataclass(frozen=True)
+class _Load:
+    rate: float = field(default=1.0, metadata=setting.number(0.0, 100.0))
+
+
+SETTINGS = {"lookups": _Load}
+
+WHOLE = """
+about = "a bad day"
+nodes = 50
+kind = "swarm"
+seconds = 60.0
+
+[join]
+how = "batches"
+size = 10
+
+[link]
+kind = "wifi"
+loss = 0.05
+
+[[fault]]  # the first
+kind = "crash"
+at = 10.0
+share = 0.5
+
+[[fault]]
+kind = "cut"
+at = 20
+places = [0, 3]
+lasts = 5.0
+
+[load.lookups]
+rate = 2.0
+
+[targets]
+"hops" = "<= 5"
+"""
+
+WRONG = {
+    "nodes = 0": ("1", "nodes"),
+    "about = 'x'\nnods = 3": ("2", "nods"),
+    "nodes = true": ("1", "nodes"),
+    "seconds = -1.0": ("1", "seconds"),
+    "[join]\nhow = 'slowly'": ("2", "[join] how"),
+    "nodes = 5\n[join]\nhow = 'batches'\nsize = 6": ("4", "[join] size"),
+    "seconds = 5.0\nlead = 5.0": ("2", "lead"),
+    "about = 'x'\njoin = { how = 'slowly' }": ("2", "[join] how"),
+    "about = 'x'\njoin.how = 'slowly'": ("2", "[join] how"),
+    "join = 3": ("1", "join"),
+    "[link]\nburst = 0.1": ("2", "[link] burst"),
+    "[link]\nloss = 0.1\nburst = 0.1\nasymmetry = 0.5": ("4", "[link] asymmetry"),
+    "[link]\nasymmetry = 0.5": ("2", "[link] asymmetry"),
+    "nodes = 2\n[nat]\nshare = 0.5": ("3", "[nat] share"),
+    "nodes = 2\n[sessions]\nmedian = 60.0": ("3", "[sessions] median"),
+    "[[fault]]\nkind = 'crash'\ncount = 1": ("1", "[[fault]] 1 at"),
+    "[[fault]]\nkind = 'crush'\nat = 1.0": ("2", "[[fault]] 1 kind"),
+    "[[fault]]\nkind = 'crash'\nat = 1.0\ncount = 1\n[[fault]]\nkind = 'cut'\nat = 1.0\ncount = 1": (
+        "5",
+        "[[fault]] 2 lasts",
+    ),
+    "[[fault]]\nkind = 'crash'\nat = 99.0\ncount = 1": ("3", "[[fault]] 1 at"),
+    "[[fault]]\nkind = 'crash'\nat = 1.0\ncount = 1\nshare = 0.5": ("2", "[[fault]] 1 kind"),
+    "[[fault]]\nkind = 'crash'\nat = 1.0\nplaces = [10]": ("4", "[[fault]] 1 places"),
+    "[[fault]]\nkind = 'crash'\nat = 1.0\nplaces = [-1]": ("4", "[[fault]] 1 places"),
+    "[[fault]]\nkind = 'crash'\nat = 1.0\ncount = 11": ("4", "[[fault]] 1 count"),
+    "[[fault]]\nkind = 'crash'\nat = 1.0\nshare = 1.0": ("4", "[[fault]] 1 share"),
+    "[[fault]]\nkind = 'pairs'\nat = 1.0\nlasts = 1.0": ("1", "[[fault]] 1 share"),
+    "[[fault]]\nkind = 'crowd'\nat = 1.0": ("1", "[[fault]] 1 count"),
+    "[[fault]]\nkind = 'rate'\nat = 1.0\nlasts = 1.0\ncount = 1\namount = 3.0": ("6", "[[fault]] 1 amount"),
+    "[[fault]]\nkind = 'step'\nat = 1.0\ncount = 1": ("1", "[[fault]] 1 amount"),
+    "[[fault]]\nkind = 'weather'\nat = 1.0\nlasts = 1.0": ("1", "[[fault]] 1 amount"),
+    "[[fault]]\nkind = 'rebind'\nat = 1.0\ncount = 1": ("2", "[[fault]] 1 kind"),
+    "[[fault]]\nkind = 'crash'\nat = 1.0\ncount = 1\namount = 2.0": ("5", "[[fault]] 1 amount"),
+    "[[fault]]\nkind = 'rebind'\nat = 1.0\ncount = 1\nlasts = 2.0": ("5", "[[fault]] 1 lasts"),
+    "[[fault]]\nkind = 'weather'\nat = 1.0\nlasts = 1.0\nshare = 0.5": ("5", "[[fault]] 1 share"),
+    "fault = 3": ("1", "fault"),
+    "[load.lookups]\nrate = 1.0\nspeed = 3": ("3", "[load.lookups] speed"),
+    "[load.nothing]": ("1", "[load.nothing]"),
+    "load = 3": ("1", "load"),
+    "[targets]\nhops = 5": ("2", "[targets] hops"),
+    '[targets]\n"p50, s" = "about 5"': ("2", "[targets] p50, s"),
+    "targets = 1": ("1", "targets"),
+}
+
+
+def _read(text: str, **changes: object) -> Scenario:
+    return scenario_of(text, "bad.toml", "bad", SETTINGS, changes)
+
+
+class ScenarioTests(SynchronousTestCase):
+    """What is in a file is what is played, and whatever is wrong is said before the first step."""
+
+    def test_file_means_what_it_says(self) -> None:
+        """Tables, faults in their order, workloads and targets are all there; what is left out has its default."""
+        scenario = _read(WHOLE)
+        self.assertEqual((scenario.nodes, scenario.kind, scenario.join.size), (50, "swarm", 10))
+        self.assertEqual([fault.kind for fault in scenario.faults], ["crash", "cut"])
+        self.assertEqual(scenario.faults[1].places, (0, 3))
+        self.assertEqual(scenario.loads, (("lookups", _Load(2.0)),))
+        self.assertEqual([(name, str(bound)) for name, bound in scenario.targets], [("hops", "<= 5")])
+        self.assertEqual(scenario.sessions.stays, None)
+
+    def test_wrong_values_are_named_with_their_line(self) -> None:
+        """Each wrong or impossible value is refused with file, line, key and a remedy."""
+        for text, (line, key) in WRONG.items():
+            error = self.assertRaises(BadSetting, _read, text)
+            self.assertEqual((error.file, error.key), (f"bad.toml:{line}", key), text)
+            self.assertTrue(error.problem and error.remedy, text)
+
+    def test_any_file_is_a_scenario_or_is_refused(self) -> None:
+        """However a file is damaged, it is refused with a remedy or means something; nothing else is raised."""
+        dice, refused = random.Random(1), 0
+        values = ("-1", "nan", "inf", "true", "'x'", "[]", "{}", "[1, 'a']", "9" * 30, "[[1]]", "1979-05-27")
+        for _ in range(600):
+            lines = WHOLE.splitlines()
+            for _ in range(dice.randint(1, 3)):
+                at = dice.randrange(len(lines))
+                if dice.random() < 0.6 and "=" in lines[at]:
+                    lines[at] = f"{lines[at].partition('=')[0]}= {dice.choice(values)}"
+                elif dice.random() < 0.5:
+                    lines.insert(
+                        at, dice.choice([*lines, "[[join]]", "[fault]", "load = 3", "[load.lookups.x]", "x.y=1"])
+                    )
+                else:
+                    lines[at] = lines[at][: len(lines[at]) // 2] + dice.choice('[]="{}\x00')
+            try:
+                _read("\n".join(lines))
+            except BadSetting as error:
+                refused += 1
+                self.assertTrue(error.remedy)
+        self.assertGreater(refused, 300)
+
+    def test_what_is_no_toml_says_where(self) -> None:
+        """A file that cannot be parsed is refused with the line that the parser names."""
+        error = self.assertRaises(BadSetting, _read, "nodes = 5\nseconds = = 3")
+        self.assertIn("line 2", str(error))
+
+    def test_command_line_comes_before_the_file(self) -> None:
+        """``--nodes`` takes the place of what the file says, and is checked as that is."""
+        self.assertEqual(_read(WHOLE, nodes=70).nodes, 70)
+        error = self.assertRaises(BadSetting, _read, WHOLE, nodes=0)
+        self.assertEqual((error.file, error.key), ("command line", "--nodes"))
+
+    def test_scenarios_that_ship_are_lawful(self) -> None:
+        """Each scenario of the folder can be played, and says what it is about."""
+        self.assertIn("steady", names())
+        for name in names():
+            self.assertTrue(loaded(name, {name: kind.settings for name, kind in KINDS.items()}).about, name)
+
+    def test_example_of_the_document_is_lawful(self) -> None:
+        """The scenario that docs/sim.md shows can be played."""
+        document = (FOLDER.parent.parent / "docs" / "sim.md").read_text(encoding="utf-8")
+        found = re.findall(r"```toml\n(.*?)```", document, re.DOTALL)
+        self.assertEqual(len(found), 1)
+        sorts = {name: kind.settings for name, kind in KINDS.items()}
+        self.assertEqual(len(scenario_of(found[0], "docs/sim.md", "example", sorts).faults), 1)
+
+    def test_unknown_names_are_refused_with_the_nearest(self) -> None:
+        """A scenario that is not there is refused, and so is a file that cannot be read."""
+        self.assertIn("steady", self.assertRaises(BadSetting, loaded, "stedy", {}).remedy)
+        self.assertIn("cannot be read", self.assertRaises(BadSetting, loaded, "/nowhere/x.toml", {}).problem)

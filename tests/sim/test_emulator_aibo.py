@@ -1,0 +1,225 @@
+"""Tests of ``sim.emulator.aibo``: the dog's side of the wire, as a client that knows bytes alone sees it."""
+
+from __future__ import annotations
+
+import math
+import random
+import struct
+
+from twisted.internet.task import Clock
+from twisted.trial.unittest import SynchronousTestCase
+
+from drivers.aibo.codec import T2, GainReader, command
+from drivers.link import Link
+from sim.emulator.aibo import AiboEmulator
+from sim.emulator.body import MemoryBody
+
+MAIN, STATE, WALK, HEAD, ESTOP, CAMERA, GAINS = 10020, 10031, 10050, 10052, 10053, 10011, 10032
+
+
+class Client:
+    """Who calls one port and keeps what it hears."""
+
+    def __init__(self) -> None:
+        self.heard = b""
+        self.link: Link | None = None
+
+    def link_up(self, link: Link) -> None:
+        """Take the link."""
+        self.link = link
+
+    def link_down(self) -> None:
+        """Lose it."""
+        self.link = None
+
+    def received(self, data: bytes) -> None:
+        """Keep bytes."""
+        self.heard += data
+
+
+class AiboEmulatorTests(SynchronousTestCase):
+    """What is known of a dog, one by one."""
+
+    def setUp(self) -> None:
+        """A dog that was just switched on."""
+        self.clock = Clock()
+        self.body = MemoryBody()
+        self.dog = self.made()
+
+    def made(self, dialect: str = "T4", is_raw: bool = False) -> AiboEmulator:
+        """A dog of one's own."""
+        dog = AiboEmulator(self.clock, self.body, random.Random(1), dialect, is_raw=is_raw)
+        dog.start()
+        self.addCleanup(dog.stop)
+        self.connector = dog.connector()
+        return dog
+
+    def called(self, port: int) -> Client:
+        """A client of that port, which may not have answered."""
+        client = Client()
+        line = self.connector.call("dog", port, client)
+        self.addCleanup(line.hang_up)
+        self.pass_time(0.01)
+        return client
+
+    def pass_time(self, seconds: float) -> None:
+        """Turn the clock."""
+        self.clock.pump([0.002] * round(seconds / 0.002))
+
+    def say(self, client: Client, data: bytes) -> bytes:
+        """What the dog says upon these bytes within 10 ms."""
+        assert client.link is not None
+        client.heard = b""
+        client.link.send(data)
+        self.pass_time(0.01)
+        return client.heard
+
+    def released(self) -> tuple[Client, Client]:
+        """Main control and the walk server of a dog whose motors are on."""
+        main, estop = self.called(MAIN), self.called(ESTOP)
+        self.say(main, b'!select "Walk Remote Control"\n')
+        self.say(estop, b"start\n")
+        return main, self.called(WALK)
+
+    def test_listens_where_a_dog_does(self) -> None:
+        """Main control and the e-stop listen from the start, the others once they are selected, each for one client."""
+        self.assertIsNone(self.called(WALK).link)
+        main = self.called(MAIN)
+        self.assertIsNotNone(self.called(ESTOP).link)
+        self.assertIsNone(self.called(MAIN).link)
+        heard = self.say(main, b'!select "Walk Remote Control"\n')
+        self.assertTrue(heard.startswith(b"push\nload\norg.tekkotsu.mon.WalkGUI\nWalkGUI\n10050\n\npop\nrefresh\n"))
+        walk = self.called(WALK)
+        self.assertIsNotNone(walk.link)
+        self.assertIsNone(self.called(WALK).link)
+        assert walk.link is not None
+        walk.link.close()
+        self.pass_time(0.01)
+        self.assertTrue(self.dog.listens(WALK))
+
+    def test_shows_in_the_menu_what_runs(self) -> None:
+        """A running server is called #name: selecting its name again does nothing, and #name stops it."""
+        main = self.called(MAIN)
+        self.say(main, b'!select "Walk Remote Control"\n')
+        again = self.say(main, b'!select "Walk Remote Control"\n')
+        self.assertTrue(again.startswith(b"refresh\n"))
+        self.assertIn(b"\n#Walk Remote Control\n", again)
+        self.assertTrue(self.say(main, b'!select "#Walk Remote Control"\n').startswith(b"close\nWalkGUI\nrefresh\n"))
+        self.assertFalse(self.dog.listens(WALK))
+
+    def test_answers_every_line(self) -> None:
+        """Greetings are answered with a count, and lines that are none with a status; nothing breaks."""
+        main = self.called(MAIN)
+        self.assertEqual(self.say(main, b"!hello\r\n"), b"hello\n1\n")
+        self.assertEqual(self.say(main, b"!dump_stack\n"), b"stack_dump\n1\nRoot Control\n")
+        self.assertTrue(self.say(main, b'!select "never closed\n').startswith(b"status\n0\n"))
+        self.assertTrue(self.say(main, b"warp\n").startswith(b"status\n1\n"))
+        self.assertIn(b"\n----------\n0\n\n2\n1\nMode Switch\n2\n", self.say(main, b"!refresh\n"))
+
+    def test_starts_stopped_and_tells_changes_alone(self) -> None:
+        """The e-stop is on at first, says nothing on connect, and tells changes, refreshes and presses."""
+        estop = self.called(ESTOP)
+        self.assertEqual(estop.heard, b"")
+        for said, answer in ((b"refresh\n", b"on\n"), (b"stop\n", b""), (b"start\n", b"off\n"), (b"warp\n", b"")):
+            self.assertEqual(self.say(estop, said), answer)
+        self.dog.press()
+        self.pass_time(0.01)
+        self.assertEqual(estop.heard, b"on\n")
+
+    def test_walks_while_its_motors_are_on(self) -> None:
+        """Each of the three parts holds until it is changed; a stopped dog ignores them, and starts at rest."""
+        _, walk = self.released()
+        self.say(walk, command("f", 0.5) + command("r", -0.25))
+        self.assertEqual(self.body.motion, (0.08, 0.0, -0.5075))
+        self.say(walk, command("f", -1.0) + command("s", 1.0))
+        self.assertEqual(self.body.motion, (-0.156, 0.103, -0.5075))
+        self.dog.press()
+        self.assertEqual(self.body.motion, (0.0, 0.0, 0.0))
+        self.say(walk, command("f", 0.5))
+        self.dog.press()
+        self.assertEqual(self.body.motion, (0.0, 0.0, 0.0))
+
+    def test_walks_no_nan(self) -> None:
+        """A command that is no number stands for zero; the others count."""
+        _, walk = self.released()
+        for value in (math.nan, math.inf, -math.inf):
+            self.say(walk, command("f", 0.5) + command("r", value))
+            self.assertEqual(self.body.motion, (0.08, 0.0, 0.0))
+
+    def test_stops_three_seconds_after_the_last_command(self) -> None:
+        """The dead man's time is 3 s from the last command, which may be the one that means nothing."""
+        _, walk = self.released()
+        self.say(walk, command("f", 0.5))
+        self.pass_time(2.5)
+        self.say(walk, command("0", 0.0))
+        self.pass_time(2.5)
+        self.assertGreater(self.body.motion[0], 0.0)
+        self.pass_time(0.6)
+        self.assertEqual(self.body.motion, (0.0, 0.0, 0.0))
+
+    def test_stops_when_its_walk_server_stops(self) -> None:
+        """Stopping the walk server stops the walk and its client."""
+        main, walk = self.released()
+        self.say(walk, command("f", 0.5))
+        self.say(main, b'!select "#Walk Remote Control"\n')
+        self.assertEqual((self.body.motion, walk.link), ((0.0, 0.0, 0.0), None))
+
+    def test_tells_its_world_every_32_ms(self) -> None:
+        """World states of 374 bytes come every 32 ms, 244 from an old dog, and gains beside them."""
+        for dialect, size in (("T4", 374), (T2, 244)):
+            self.dog = self.made(dialect)
+            main = self.called(MAIN)
+            self.say(main, b'!select "World State Serializer"\n')
+            state, gains = self.called(STATE), self.called(GAINS)
+            state.heard = gains.heard = b""
+            self.pass_time(3.2)
+            self.assertEqual(len(state.heard) % size, 0)
+            self.assertAlmostEqual(len(state.heard) / size, 100, delta=1.5, places=None)
+            self.assertEqual(len(list(GainReader().read(gains.heard))), len(state.heard) // size)
+
+    def test_holds_its_head(self) -> None:
+        """Head commands move the neck to their share of its range, and are clipped."""
+        main = self.called(MAIN)
+        self.say(main, b'!select "Head Remote Control"\n!select "World State Serializer"\n')
+        head, state = self.called(HEAD), self.called(STATE)
+        self.say(head, command("p", 0.5) + command("t", -9.0) + command("x", 1.0))
+        state.heard = b""
+        self.pass_time(0.032)
+        tilt, pan = struct.unpack_from("<2f", state.heard, 18 + 12 * 4)
+        self.assertAlmostEqual(tilt, -1.309, places=5)
+        self.assertAlmostEqual(pan, 0.768, places=5)
+
+    def test_sends_pictures_only_where_they_are_asked_for(self) -> None:
+        """By TCP once the transport is set so; by UDP after the request; and says so when it closes."""
+        main = self.called(MAIN)
+        heard = self.say(main, b'!select "Raw Cam Server"\n')
+        self.assertIn(b'10011\n"raw" "10011" "udp"\n', heard)
+        self.assertFalse(self.dog.listens(CAMERA))
+        packets: list[bytes] = []
+        self.dog.datagram(b"hello", packets.append)
+        self.pass_time(0.1)
+        self.assertEqual(packets, [])
+        self.dog.datagram(b"connection request", packets.append)
+        self.pass_time(1.0)
+        self.assertIn(len(packets), (29, 30, 31))
+        self.say(main, b'!select "#Raw Cam Server"\n')
+        self.assertEqual(packets[-1], b"\x0f\0\0\0CloseConnection\0")
+        self.say(main, b'!set vision.rawcam.transport=TCP\n!select "Raw Cam Server"\n')
+        camera = self.called(CAMERA)
+        self.pass_time(0.1)
+        self.assertTrue(camera.heard.startswith(b"\x0d\0\0\0TekkotsuImage\0"))
+        self.say(main, b'!select "#Raw Cam Server"\n')
+        self.assertTrue(camera.heard.endswith(b"\x0f\0\0\0CloseConnection\0"))
+        self.assertIsNone(camera.link)
+
+    def test_begins_anew_after_a_reboot(self) -> None:
+        """A reboot breaks every link, stops servers and motors, and begins the time at zero."""
+        main, walk = self.released()
+        self.say(walk, command("f", 0.5))
+        self.dog.reboot()
+        self.assertTrue(self.dog.is_engaged)
+        self.assertEqual(self.body.motion, (0.0, 0.0, 0.0))
+        self.assertFalse(self.dog.listens(WALK))
+        self.pass_time(0.2)
+        self.assertIsNotNone(main.link)
+        self.assertIsNone(walk.link)

@@ -1,0 +1,98 @@
+"""Tests of ``sim.emulator.mjpeg``: what a client of any kind finds there."""
+
+from __future__ import annotations
+
+from twisted.internet.task import Clock
+from twisted.trial.unittest import SynchronousTestCase
+
+from drivers.camera.codec import StreamReader, request
+from sim.emulator.body import MemoryBody
+from sim.emulator.mjpeg import MjpegCamera
+
+
+class Wire:
+    """A link that keeps what is sent."""
+
+    def __init__(self) -> None:
+        self.said = b""
+        self.is_busy = False
+        self.is_open = True
+
+    def send(self, data: bytes) -> None:
+        """Keep it."""
+        self.said += data
+
+    def close(self) -> None:
+        """Note it."""
+        self.is_open = False
+
+
+class MjpegCameraTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        """A camera of 8 pictures a second that is on."""
+        self.clock = Clock()
+        self.body = MemoryBody(jpeg=b"\xff\xd8a\xff\xd9")
+        self.camera = MjpegCamera(self.clock, self.body, 8.0)
+        self.camera.start()
+        self.camera.start()
+
+    def tearDown(self) -> None:
+        """Nothing is left on the clock once it is off."""
+        self.camera.stop()
+        self.camera.stop()
+        self.assertEqual(self.clock.getDelayedCalls(), [])
+
+    def pictures(self, wire: Wire) -> list[bytes]:
+        """What the client sees."""
+        return StreamReader().read(wire.said)
+
+    def test_serves_several_clients(self) -> None:
+        """Each client gets every picture from its request on, whatever path it asks for; a late one loses none."""
+        first, second = Wire(), Wire()
+        asks = self.camera.accept(first)
+        for byte in request("cam", "/stream"):
+            asks.received(bytes([byte]))
+        self.clock.pump([0.0625] * 16)
+        self.camera.accept(second).received(request("cam", "/any?thing=1"))
+        asks.received(b"what comes later is not heard")
+        self.clock.pump([0.0625] * 16)
+        self.assertEqual((len(self.pictures(first)), len(self.pictures(second))), (16, 8))
+        asks.link_down()
+        asks.link_down()
+        self.clock.pump([0.0625] * 16)
+        self.assertEqual((len(self.pictures(first)), len(self.pictures(second))), (16, 16))
+
+    def test_drops_for_a_busy_client(self) -> None:
+        """A client that does not take its pictures loses them whole, and the others lose none."""
+        slow, quick = Wire(), Wire()
+        for wire in (slow, quick):
+            self.camera.accept(wire).received(request("cam", "/"))
+        slow.is_busy = True
+        self.clock.pump([0.0625] * 16)
+        slow.is_busy = False
+        self.clock.pump([0.0625] * 16)
+        self.assertEqual((len(self.pictures(slow)), len(self.pictures(quick)), self.camera.dropped), (8, 16, 8))
+
+    def test_turns_away(self) -> None:
+        """Another method, an endless request, and who comes while it is out of order get no pictures."""
+        posts, endless, late = Wire(), Wire(), Wire()
+        self.camera.accept(posts).received(b"POST / HTTP/1.1\r\n\r\n")
+        self.camera.accept(endless).received(bytes(10_000))
+        self.camera.status = "503 Busy"
+        self.camera.accept(late).received(request("cam", "/"))
+        self.clock.pump([0.0625] * 16)
+        self.assertTrue(posts.said.startswith(b"HTTP/1.1 405 ") and late.said.startswith(b"HTTP/1.1 503 "))
+        self.assertEqual((endless.said, endless.is_open), (b"", False))
+        self.camera.stop()
+        self.assertFalse(posts.is_open or late.is_open)
+
+    def test_leaves_out_what_a_body_does_not_see(self) -> None:
+        """A body without a picture sends none, and the stream goes on when it has one again."""
+        wire = Wire()
+        self.camera.accept(wire).received(request("cam", "/"))
+        self.body.jpeg = None
+        self.clock.pump([0.0625] * 16)
+        self.assertEqual(self.pictures(wire), [])
+        self.body.jpeg = b"\xff\xd8b\xff\xd9"
+        self.clock.pump([0.0625] * 16)
+        self.assertEqual(self.pictures(wire), [b"\xff\xd8b\xff\xd9"] * 8)

@@ -1,0 +1,191 @@
+"""Tests of ``sim.robots`` and ``sim.emulator.dog``: dogs of the yard that are reached as other robots are."""
+
+from __future__ import annotations
+
+import math
+import os
+from pathlib import Path
+from random import Random
+from typing import Any
+
+from twisted.internet.task import Clock
+from twisted.trial.unittest import SynchronousTestCase
+
+from drivers.aibo.driver import AiboDriver
+from drivers.driver import Permit
+from drivers.errors import UsageError
+from drivers.jpeg import size_of
+from drivers.registry import describe
+from sim.dog import LIMITS
+from sim.emulator.aibo import AiboEmulator
+from sim.emulator.bittle import Bittle
+from sim.emulator.body import MemoryBody
+from sim.emulator.dog import DogBody
+from sim.emulator.pty import PtyPort
+from sim.robots import Robots
+from sim.scene import loaded
+from sim.yard import TICK_S, Yard
+
+
+class FakeReactor(Clock):
+    """A clock on which ports can be read and written, though nobody does."""
+
+    def _ignore(self, port: object) -> None:
+        pass
+
+    addReader = removeReader = addWriter = removeWriter = _ignore  # noqa: N815 (Twisted's)
+
+
+class YardCase(SynchronousTestCase):
+    """A running yard on a turned clock."""
+
+    def setUp(self) -> None:
+        self.clock = Clock()
+        self.yard = Yard(self.clock, Random(1), loaded("three-dogs"))
+        self.yard.start()
+
+    def pass_time(self, seconds: float) -> None:
+        """Turn the clock, a tick of the yard at a time."""
+        for _ in range(round(seconds / TICK_S)):
+            self.clock.advance(TICK_S)
+
+
+class DogBodyTests(YardCase):
+    """A lent dog is moved and felt through its body."""
+
+    def lent(self, limits: Any = LIMITS) -> DogBody:
+        """The body of dog1, which heads for the middle of the yard."""
+        return self.yard.lend("dog1", limits)
+
+    def test_moves_as_fast_as_its_kind(self) -> None:
+        """The body obeys the limits that it is lent with, and stands still when it is halted."""
+        body = self.lent({"base.vx": (-0.5, 0.5), "base.wz": (-4.25, 4.25)})
+        body.drive(0.9, 0.2, 0.0)
+        self.pass_time(1.0)
+        sensed = body.sense()
+        self.assertAlmostEqual(float(sensed["base.vx"]), 0.5, places=2)
+        self.assertAlmostEqual(float(sensed["base.vy"]), 0.0, places=2)
+        body.halt()
+        self.pass_time(1.0)
+        self.assertFalse(body.sense()["base.moving"])
+
+    def test_stands_where_it_is_told_no_number(self) -> None:
+        """A velocity that is NaN or infinite halts the dog, and its place stays a number."""
+        body = self.lent()
+        for motion in ((math.nan, 0.0, 0.0), (0.0, -math.inf, 0.0), (0.0, 0.0, math.nan)):
+            body.drive(0.1, 0.0, 0.0)
+            self.pass_time(0.5)
+            body.drive(*motion)
+            self.pass_time(1.0)
+            self.assertFalse(body.sense()["base.moving"])
+            self.assertTrue(math.isfinite(self.yard.world.dogs["dog1"].x))
+
+    def test_feels_between_the_ticks(self) -> None:
+        """What is always felt is a number at any moment, also after the yard has told its samples."""
+        body = self.lent()
+        self.pass_time(0.5)
+        sensed = body.sense()
+        for key in ("imu.ax", "imu.az", "odom.x", "power.level"):
+            self.assertTrue(math.isfinite(float(sensed[key])), key)
+
+    def test_feels_what_it_bumps_into(self) -> None:
+        """A wall ahead presses both halves of the bumper, one beside it one of them, nothing none."""
+        body = self.lent()
+        self.pass_time(0.1)
+        self.assertEqual((body.sense()["bump.left"], body.sense()["bump.right"]), (False, False))
+        for heading, wanted in ((180.0, (True, True)), (135.0, (True, False)), (-135.0, (False, True))):
+            self.yard.world.move_dog("dog1", 0.2, 1.2, math.radians(heading))
+            body.drive(0.16, 0.0, 0.0)
+            self.pass_time(1.5)
+            sensed = body.sense()
+            self.assertEqual((sensed["bump.left"], sensed["bump.right"]), wanted, str(heading))
+
+    def test_sees(self) -> None:
+        """Its eye gives a picture of the camera's own size, or of half of it."""
+        body = self.lent()
+        self.assertEqual(size_of(body.picture() or b""), (208, 160))
+        self.assertEqual(size_of(body.picture(True) or b""), (104, 80))
+
+
+class RobotsTests(YardCase):
+    """The table of robots is checked, and each dog is reached in one way only."""
+
+    def test_driver_of_its_kind_moves_it(self) -> None:
+        """The driver of an AIBO walks a dog of the yard through Tekkotsu's ports."""
+        emulator = AiboEmulator(self.clock, self.yard.lend("dog1", LIMITS), Random(2))
+        emulator.start()
+        driver = AiboDriver({"host": "dog1"}, "dog1", emulator.connector(), self.clock)
+        driver.connect()
+        self.pass_time(3.0)
+        driver.enable()
+        self.pass_time(0.2)
+        before = self.yard.world.dogs["dog1"].x
+        driver.act({"base.vx": 0.16}, Permit(1, self.clock.seconds() + 1.0))
+        self.pass_time(2.0)
+        self.assertGreater(self.yard.world.dogs["dog1"].x - before, 0.08)
+        self.assertFalse(self.yard.world.dogs["dog1"].is_moving)
+        self.assertEqual(driver.diagnostics()["bad_frames"], 0)
+        driver.disconnect()
+        emulator.stop()
+
+    def test_lent_dog_has_no_other_driver(self) -> None:
+        """A driver of simulated dogs is told that this one is none of them any more."""
+        from drivers.sim.driver import SimDriver
+
+        self.yard.lend("dog1", describe("create2", {"port": "x"}).limits)
+        driver = SimDriver({"robot": "dog1"}, self.yard.connector(), self.clock)
+        failed = driver.connect()
+        self.pass_time(0.5)
+        self.assertIn("reached as a robot of another kind", self.failureResultOf(failed).getErrorMessage())
+
+    def test_refuses_what_it_cannot_play(self) -> None:
+        """A dog that is not there, a kind without an emulator, and an unknown dialect are named."""
+        aibo = {"kind": "aibo", "options": {"host": "127.0.0.1"}}
+        cases: list[tuple[dict[str, Any], str]] = [
+            ({"dog9": aibo}, "no robot is named 'dog9'.*it has dog1, dog2, dog3"),
+            ({"dog1": {"kind": "phone"}}, "no robot of kind 'phone'.*it has aibo"),
+            ({"dog1": {**aibo, "dialect": "T9"}}, "dialect is 'T9', but must be one of T4, T2"),
+            ({"dog1": {"kind": "aibo", "options": {"port": 1}}}, "unknown option 'port'"),
+            ({"dog1": {"kind": "aibo", "options": 7}}, r"\[dog1\] options must be a table"),
+            ({"dog1": {**aibo, "parts": 7}}, r"\[dog1\] parts must be tables"),
+            ({"dog1": {**aibo, "parts": [{"options": {}}]}}, r"\[dog1\] parts must be tables"),
+            ({"dog1": {**aibo, "parts": [{"kind": "camera"}]}}, r"\[dog1\] a camera of the yard needs the option url"),
+            ({"dog1": {**aibo, "parts": [{"kind": "compass"}]}}, r"\[dog1\] part 1: .* option host .* or device"),
+            ({"dog1": {**aibo, "dialct": "T2"}}, r"\[dog1\] has an unknown key 'dialct'; known are kind, options"),
+            ({"dog1": 7}, r"\[dog1\] must name a kind"),
+        ]
+        for table, problem in cases:
+            with self.assertRaisesRegex(UsageError, problem):
+                Robots(self.clock, Random(1), self.yard, table)
+
+    def test_replaces_no_file(self) -> None:
+        """What lies where a robot's cable shall begin stays as it is, and is named; only a link left behind goes."""
+        folder = Path(self.mktemp())
+        folder.mkdir()
+        path = folder / "ttyUSB0"
+        table = {"dog1": {"kind": "create2", "options": {"port": str(path)}}}
+        path.write_text("a device, or somebody's notes")
+        robots = Robots(FakeReactor(), Random(1), self.yard, table)
+        with self.assertRaisesRegex(UsageError, r"\[dog1\] .*ttyUSB0 is there already"):
+            robots.start()
+        robots.stop()
+        self.assertEqual(path.read_text(), "a device, or somebody's notes")
+        path.unlink()
+        path.symlink_to("/dev/pts/99999")
+        port = PtyPort(FakeReactor(), Bittle(MemoryBody(), self.clock, Random(1)).accept, str(path))
+        self.assertNotEqual(str(path.readlink()), "/dev/pts/99999")
+        # Another one that took the path over keeps it.
+        path.unlink()
+        path.symlink_to("elsewhere")
+        port.close()
+        self.assertEqual(str(path.readlink()), "elsewhere")
+
+    def test_names_whose_address_cannot_be_had(self) -> None:
+        """A robot that cannot be served is named with what is wrong, and nothing of it stays open."""
+        before = len(os.listdir("/dev/fd"))
+        table = {"dog2": {"kind": "create2", "options": {"port": "/nowhere/at/all"}}}
+        robots = Robots(FakeReactor(), Random(1), self.yard, table)
+        with self.assertRaisesRegex(UsageError, r"\[dog2\] it cannot be served: .*/nowhere/at/all"):
+            robots.start()
+        robots.stop()
+        self.assertEqual(len(os.listdir("/dev/fd")), before)

@@ -1,0 +1,146 @@
+"""The curves of ``sim scale``: what they are made of, resumed and drawn."""
+
+from __future__ import annotations
+
+import io
+import itertools
+import json
+import math
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.errors import BadSetting
+from sim.team.command import World
+from sim.team.figure import Figure
+from sim.team.scale import theory
+from sim.team.scale.command import scale
+from sim.team.scale.curve import CURVES
+from sim.team.scale.drawing import drawn
+from sim.team.scale.page import led, page
+from sim.team.scale.record import Record
+from sim.team.scale.survey import Ended, Sized, SurveySettings, Watcher, surveyed
+
+
+def world() -> World:
+    """A machine with room for everything."""
+    ticks = itertools.count()
+    return World(
+        io.StringIO(), io.StringIO(), lambda: next(ticks), lambda: 0.0, read=lambda path: "MemAvailable: 99999999 kB"
+    )
+
+
+def sized(nodes: int) -> Sized:
+    """A made-up size: everything is 1, and hops are as many as there are nodes."""
+    figures = [Figure(curve.figure, 1.0, curve.unit) for curve in CURVES if curve.figure != "lookups.hops.mean"]
+    return Sized(nodes, [*figures, Figure("lookups.hops.mean", float(nodes), "hops").against(None)], [], "h", 1.0)
+
+
+class TheoryTests(SynchronousTestCase):
+    def test_curves(self) -> None:
+        """What is expected by arithmetic: half the bits in hops, full buckets and the near ones, a tree's messages."""
+        self.assertEqual((theory.hops(3), theory.hops(1024)), (2.0, 5.0))
+        self.assertEqual(theory.contacts(4), 3.0)
+        self.assertTrue(60 < theory.contacts(1024) < 80)
+        self.assertEqual(theory.tree(2), 2.0)
+        self.assertAlmostEqual(theory.agreement(10_000), 0.975)
+        self.assertTrue(theory.agreement(100) < theory.agreement(200) < theory.agreement(300))
+
+
+class RecordTests(SynchronousTestCase):
+    def test_resumed(self) -> None:
+        """A size that is in the file is not measured again, and one of other settings is."""
+        out = self.mktemp()
+        asked: list[int] = []
+
+        def measured(nodes: int, settings: SurveySettings, watcher: Watcher) -> Sized:
+            asked.append(nodes)
+            return sized(nodes)
+
+        scale(["--nodes", "3,10", "--out", out], world(), measured)
+        scale(["--nodes", "3,10,30", "--out", out], world(), measured)
+        self.assertEqual(asked, [3, 10, 30])
+        scale(["--nodes", "3", "--out", out, "--seed", "2"], world(), measured)
+        self.assertEqual(asked, [3, 10, 30, 3])
+        self.assertEqual(list(json.loads(Path(out, "scale.json").read_text())["sizes"]), ["3"])
+
+    def test_ended_run_keeps_what_it_has(self) -> None:
+        """Each size is written as soon as it is measured; one in whose midst a person wants an end is let go of."""
+        out, here, wishes = self.mktemp(), world(), list[int]()
+        here.is_stopped = lambda: bool(wishes)
+
+        def measured(nodes: int, settings: SurveySettings, watcher: Watcher) -> Sized:
+            if nodes == 3:
+                return sized(nodes)
+            wishes.append(nodes)
+            return surveyed(nodes, settings, watcher)
+
+        self.assertEqual(scale(["--nodes", "3,10", "--out", out], here, measured), 130)
+        self.assertEqual(list(json.loads(Path(out, "scale.json").read_text())["sizes"]), ["3"])
+
+    def test_bad_input(self) -> None:
+        """Sizes that are none, and a file that is not ours, are refused by name."""
+        for text in ("", "many", "2", "3,1000000"):
+            with self.assertRaisesRegex(BadSetting, "--nodes"):
+                scale(["--nodes", text, "--out", self.mktemp()], world())
+        torn = json.dumps({"digest": SurveySettings().digest(), "sizes": {"x": 1}})
+        for text in ("{", "[]", torn):
+            path = Path(self.mktemp())
+            path.write_text(text)
+            with self.assertRaisesRegex(BadSetting, "cannot be taken up"):
+                Record(path, SurveySettings()).read()
+
+    def test_missed_targets_show(self) -> None:
+        """A figure beyond its target makes the command say so, and end with 1."""
+        here = world()
+        code = scale(["--nodes", "1000", "--out", self.mktemp()], here, lambda nodes, settings, watcher: sized(nodes))
+        self.assertEqual(code, 1)
+        assert isinstance(here.out, io.StringIO)
+        self.assertRegex(here.out.getvalue(), r"traffic.cpu +1 ms a second +<= 0.5 +NO")
+        self.assertRegex(here.out.getvalue(), r"auctions.messages +1 datagrams +<= 6 +yes")
+
+
+class DrawingTests(SynchronousTestCase):
+    def test_svg(self) -> None:
+        """Every curve with points is drawn in a field of its own, and the whole is XML, whatever its values are."""
+        for values in ([1.0, 1.0], [0.0, 0.0], [0.001, 5e6], [3.0, 4.0]):
+            points = {curve.figure: [(3, values[0]), (1000, values[1])] for curve in CURVES[:5]}
+            root = ElementTree.fromstring(drawn(CURVES, points, "a & b"))
+            titles = [text.text for text in root.iter("{http://www.w3.org/2000/svg}text")]
+            for curve in CURVES:
+                self.assertEqual(curve.title in titles, curve in CURVES[:5], curve.title)
+
+
+class PageTests(SynchronousTestCase):
+    def test_table(self) -> None:
+        """A value beyond its target is bold, and the last column goes on straight over the logarithm of the size."""
+        hops = [(n, 1.0 + 0.3 * math.log2(n)) for n in (3, 100, 300, 1000)]
+        shown = page(CURVES, {"lookups.hops.mean": hops, "traffic.cpu": [(100, 1.0), (1000, 1.0)]})
+        self.assertRegex(shown, r"Hops of a lookup \| hops \|.*\| 6.979 \|")
+        self.assertRegex(shown, r"Processor of a node.* \| - \| 1 \| - \| \*\*1\*\* \| <= 0.5 \|  \|")
+        self.assertIsNone(led(hops[:3]))
+
+
+class SurveyTests(SynchronousTestCase):
+    def test_ends_soon(self) -> None:
+        """A survey ends within a quarter of a second of the team's time after a person wants it to."""
+        looks: list[int] = []
+
+        def is_stopped() -> bool:
+            looks.append(1)
+            return len(looks) == 5
+
+        with self.assertRaises(Ended):
+            surveyed(3, SurveySettings(), Watcher(is_stopped=is_stopped))
+        self.assertEqual(len(looks), 5)
+
+    def test_small_team(self) -> None:
+        """A team of five is measured in everything, twice the same, and nothing is violated."""
+        settings = SurveySettings(settle=5.0, quiet=5.0, lookups=2.0, exact=5, auctions=1, takeovers=1, swarm_most=5)
+        one, same = surveyed(5, settings), surveyed(5, settings)
+        self.assertEqual(one.violations, [])
+        self.assertEqual(one.hash, same.hash)
+        figures = {figure.name: figure.value for figure in one.figures}
+        self.assertEqual([curve.figure for curve in CURVES if figures.get(curve.figure) is None], [])
+        self.assertEqual((figures["lookups.success"], figures["auctions.right"]), (1.0, 1.0))

@@ -1,0 +1,123 @@
+"""Tests of ``swarm doctor``: what it asks, prints and returns."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import os
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.entangled.control.place import ENDING, FOLDER
+from middleware.settings import Settings
+from swarmnode.doctor.command import main
+from swarmnode.doctor.facts import Facts, Health
+from tests.swarmnode.doctor.test_diagnosis import WELL
+
+HEALTH = {
+    "id": "ab" * 20,
+    "address": "192.168.1.7:8484",
+    "contacts": 1,
+    "rows": 1,
+    "max_rows": 100,
+    "bytes": 1,
+    "max_bytes": 100,
+    "trouble": "",
+    "refusals": [],
+}
+LINKS = [
+    {"id": "cd" * 20, "address": "192.168.1.9:8484", "relayed": False, "times": [0.002] * 10},
+    {"id": "ef" * 20, "address": "~ef:1", "relayed": True, "times": [None] * 10},
+]
+
+
+class CommandTests(SynchronousTestCase):
+    """Behaviour of the command."""
+
+    def setUp(self) -> None:
+        self.folder = Path(self.mktemp()).absolute()
+        (self.folder / FOLDER).mkdir(parents=True)
+        self.patch(os, "environ", {**os.environ, "XDG_RUNTIME_DIR": str(self.folder)})
+        self.settings = self.folder / "dog1.toml"
+        self.settings.write_text('[node]\nname = "dog1"\nteam_key = "k"\n', encoding="utf-8")
+        self.health: dict[str, Any] = HEALTH
+        self.facts = WELL
+        self.measured: list[tuple[str, bool, Health | None]] = []
+
+    def runs(self, name: str) -> None:
+        """Have a node of that name run here."""
+        (self.folder / FOLDER / f"{name}{ENDING}").touch()
+
+    def ask(self, path: Path, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
+        """What the node answers."""
+        yield {"answer": self.health if request["verb"] == "health" else LINKS}
+
+    def measure(self, settings: Settings, is_running: bool, health: Health | None) -> Facts:
+        """The facts."""
+        self.measured.append((settings.node.name, is_running, health))
+        return replace(self.facts, health=health, is_running=is_running)
+
+    def run_it(self, *words: str) -> tuple[int, str, str]:
+        """The exit code, what was printed, and the complaint."""
+        out, errors = io.StringIO(), io.StringIO()
+        with contextlib.redirect_stderr(errors):
+            code = main(words, out, self.ask, self.measure)
+        return code, out.getvalue(), errors.getvalue()
+
+    def test_well(self) -> None:
+        """Where nothing is wrong it says so, with code 0."""
+        code, printed, _ = self.run_it(str(self.settings))
+        self.assertEqual((code, printed), (0, "nothing is wrong that can be seen while the node is off\n"))
+        self.assertEqual(self.measured, [("dog1", False, None)])
+
+    def test_ill(self) -> None:
+        """A finding is printed with its reason and remedy, with code 1."""
+        self.facts = replace(WELL, open_files=(("dog1.toml", 0o644),))
+        code, printed, _ = self.run_it(str(self.settings))
+        self.assertEqual(code, 1)
+        for part in ("ERROR  key-readable: ", "    why: Its mode is 0644.", "    do:  chmod 600 dog1.toml"):
+            self.assertIn(part, printed)
+
+    def test_running_node_is_asked(self) -> None:
+        """The node of the settings is asked where it runs, and each of its links is scored."""
+        self.runs("dog1")
+        code, printed, _ = self.run_it(str(self.settings))
+        self.assertEqual((code, self.measured[0][1]), (0, True))
+        self.assertIn("cdcdcdcdcd  192.168.1.9:8484  100/100  2.0 ms, jitter 0.0 ms, 0 % lost\n", printed)
+        self.assertIn("~ef:1    0/100  does not answer\n", printed)
+
+    def test_running_node_without_settings(self) -> None:
+        """Without settings the only running node is asked; what it met is named."""
+        self.runs("dog1")
+        self.health = {**HEALTH, "address": "127.0.0.1:8484", "refusals": [["revoked", "192.168.1.9:8484"]]}
+        code, printed, _ = self.run_it()
+        self.assertEqual((code, self.measured), (1, []))
+        self.assertIn("certificate-revoked", printed)
+
+    def test_json(self) -> None:
+        """With --json it is one line that a program reads, findings and links alike."""
+        self.runs("dog1")
+        self.facts = replace(WELL, open_files=(("dog1.toml", 0o644),))
+        code, printed, _ = self.run_it("--json", str(self.settings))
+        read = json.loads(printed)
+        self.assertEqual((code, printed.count("\n")), (1, 1))
+        self.assertEqual((read["findings"][0]["cause"], read["findings"][0]["weight"]), ("key-readable", "error"))
+        self.assertEqual([each["score"] for each in read["links"]], [100, 0])
+
+    def test_nobody_to_ask(self) -> None:
+        """Without settings and without a running node it says what to give, with code 2."""
+        code, _, complaint = self.run_it()
+        self.assertEqual(code, 2)
+        self.assertIn("swarm doctor SETTINGS", complaint)
+
+    def test_bad_settings(self) -> None:
+        """Settings that a node would refuse are refused in one line, with code 2."""
+        self.settings.write_text("[node]\nport = 1\n", encoding="utf-8")
+        code, _, complaint = self.run_it(str(self.settings))
+        self.assertEqual((code, complaint.count("\n")), (2, 1))
+        self.assertIn("[node] name: is missing", complaint)

@@ -1,0 +1,171 @@
+"""Tests of what ``swarm driver`` is told and finds: options, candidates, units, the catalogue, problems of links."""
+
+from __future__ import annotations
+
+import math
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+from twisted.internet import error
+from twisted.internet.task import Clock
+from twisted.logger import Logger
+from twisted.python.failure import Failure
+from twisted.trial.unittest import SynchronousTestCase
+
+from drivers.errors import UsageError
+from drivers.link import TcpConnector
+from swarmnode.driver.candidate import Candidate, candidates
+from swarmnode.driver.candidate import lines as candidate_lines
+from swarmnode.driver.catalogue import Entry, catalogue
+from swarmnode.driver.catalogue import lines as catalogue_lines
+from swarmnode.driver.choice import options_of
+from swarmnode.driver.unit import shown
+from swarmnode.driver.witness import Ear, WitnessedConnector
+
+
+class OptionTests(SynchronousTestCase):
+    def test_words_become_options(self) -> None:
+        """A value is TOML where it can be read so, else the text as it stands; dots make tables."""
+        words = ["host=192.168.0.51", "port=7400", "camera=false", "speed=[0.1, 0.2]", "ports.walk=1", "ports.head=2"]
+        self.assertEqual(
+            options_of([*words, "name=a=b", "when=2020-01-01", "empty="]),
+            {
+                **{"host": "192.168.0.51", "port": 7400, "camera": False, "speed": [0.1, 0.2]},
+                **{"ports": {"walk": 1, "head": 2}, "name": "a=b", "when": "2020-01-01", "empty": ""},
+            },
+        )
+
+    def test_other_words_are_refused(self) -> None:
+        """What is no KEY=VALUE, and a key that is both a value and a table, is named."""
+        for words in (["host"], ["=1"], ["a..b=1"], ["ports=1", "ports.walk=2"]):
+            self.assertIn("--option", str(self.assertRaises(UsageError, options_of, words)))
+
+
+class CandidateTests(SynchronousTestCase):
+    def test_serial_devices_are_shown(self) -> None:
+        """Each device comes with what its plug says, the next command, and the remedy where it is not allowed."""
+        found = candidates(lambda: [("/dev/ttyUSB1", "FTDI"), ("/dev/ttyUSB0", "")], lambda device: "1" in device)
+        self.assertEqual(found, [Candidate("/dev/ttyUSB0", "", False), Candidate("/dev/ttyUSB1", "FTDI", True)])
+        told = "\n".join(candidate_lines(found))
+        self.assertIn("/dev/ttyUSB1  FTDI\n  swarm driver probe --kind create2 --option port=/dev/ttyUSB1", told)
+        self.assertEqual(told.count("no permission"), 1)
+
+    def test_nothing_is_said_as_well(self) -> None:
+        """Where there is no device the network is not searched, and how to name a robot in it is said."""
+        self.assertIn("is asked only where it is named", "\n".join(candidate_lines([])))
+
+
+class UnitTests(SynchronousTestCase):
+    def test_readings_have_their_units(self) -> None:
+        """SI units by the key; angles in degrees as well; nothing in range is said in words."""
+        for key, value, told in (
+            ("base.vx", 0.1, "0.100 m/s"),
+            ("base.wz", -0.5, "-0.500 rad/s"),
+            ("odom.yaw", math.pi, "3.142 rad  (180 degrees)"),
+            ("joint.NECK:pan.pos", 0.0, "0.000 rad  (0 degrees)"),
+            ("joint.NECK:pan.effort", 0.5, "0.500"),
+            ("range.far", math.nan, "nothing in range"),
+            ("compass.heading", math.nan, "unknown"),
+            ("power.level", 0.5, "50 %"),
+            ("power.volts", 7.4, "7.400 V"),
+            ("imu.az", 9.8, "9.800 m/s2"),
+            ("bump.left", True, "yes"),
+            ("mode", "safe", "safe"),
+            ("safety.event", "", "-"),
+        ):
+            self.assertEqual(shown(key, value), told)
+
+
+class CatalogueTests(SynchronousTestCase):
+    def test_says_what_is_missing(self) -> None:
+        """A kind whose library is not there tells what installs it; the others tell nothing of the kind."""
+        bare = {entry.kind: entry for entry in catalogue(lambda library: False)}
+        self.assertIn("pip install 'swarm-node[serial]'", bare["create2"].needs)
+        self.assertEqual((bare["create2"].is_ready, bare["aibo"].is_ready), (False, True))
+        self.assertTrue(all(entry.is_ready for entry in catalogue(lambda library: True)))
+
+    def test_names_the_broken_kinds_of_others(self) -> None:
+        """A driver of another distribution is listed by its docstring; one that cannot be imported as broken."""
+        folder = Path(self.mktemp()).resolve()
+        (folder / "odd-1.dist-info").mkdir(parents=True)
+        (folder / "odd-1.dist-info" / "METADATA").write_text("Name: odd\nVersion: 1\n")
+        entries = "[swarm_node.drivers]\nodd = odd_of_tests:Odd\ntorn = no_such_module_of_tests:Torn\n"
+        (folder / "odd-1.dist-info" / "entry_points.txt").write_text(entries)
+        (folder / "odd_of_tests.py").write_text('class Odd:\n    """An odd robot.\n\n    And more.\n    """\n')
+        self.patch(sys, "path", [str(folder), *sys.path])
+        self.addCleanup(sys.modules.pop, "odd_of_tests", None)
+        found = {entry.kind: entry for entry in catalogue()}
+        self.assertEqual(found["odd"], Entry("odd", "An odd robot (odd_of_tests:Odd)"))
+        self.assertIn("no_such_module_of_tests", found["torn"].problem)
+        told = catalogue_lines([found["odd"], found["torn"]])
+        self.assertEqual(told[0], "odd   An odd robot (odd_of_tests:Odd)")
+        self.assertTrue(told[1].startswith("torn  broken: driver 'torn' cannot be loaded"))
+
+
+class WitnessTests(SynchronousTestCase):
+    def test_remembers_what_is_wrong_with_each_line(self) -> None:
+        """Serial devices and addresses go to their connectors; a line's problem is told while it lasts."""
+        line = SimpleNamespace(problem="it is off")
+        tcp = SimpleNamespace(call=lambda host, port, caller: line)
+        cable = SimpleNamespace()
+        serial = SimpleNamespace(call=lambda host, port, caller: cable)
+        connector = WitnessedConnector(tcp, serial)
+        self.assertIs(connector.call("dog1", 10020, None), line)
+        self.assertIs(connector.call("/dev/ttyUSB0", 115200, None), cable)
+        self.assertEqual(connector.problems(), ["dog1:10020: it is off"])
+        line.problem = ""
+        self.assertEqual(connector.problems(), [])
+
+    def test_knows_a_serial_device_by_its_name(self) -> None:
+        """Any path is a serial device, as the yard's or a link of one's own, and a host that begins like one is not."""
+        tcp = SimpleNamespace(call=lambda host, port, caller: "tcp")
+        serial = SimpleNamespace(call=lambda host, port, caller: "serial")
+        connector = WitnessedConnector(tcp, serial)
+        for name in ("/dev/ttyUSB0", "/tmp/create2", "./create2", "COM3", r"\\.\COM12"):
+            self.assertEqual(connector.call(name, 115200, None), "serial", name)
+        for name in ("dog1", "192.168.0.51", "fe80::1", "COMpass.lan", "COM-board"):
+            self.assertEqual(connector.call(name, 10020, None), "tcp", name)
+
+    def test_keeps_one_line_to_each_place(self) -> None:
+        """A robot that is asked by a connection for each request does not fill the memory with them."""
+        tcp = SimpleNamespace(call=lambda host, port, caller: SimpleNamespace(problem=caller))
+        connector = WitnessedConnector(tcp, None)
+        for number in range(1000):
+            connector.call("dog1", 80, f"problem {number}")
+        self.assertEqual(len(vars(connector)["_lines"]), 1)
+        self.assertEqual(connector.problems(), ["dog1:80: problem 999"])
+
+    def test_hears_the_warnings_of_drivers(self) -> None:
+        """What drivers warn of is heard once; what others say, and what is no warning, is not."""
+        ear = Ear()
+        for namespace in ("drivers.aibo.driver", "drivers.aibo.driver", "middleware.node"):
+            Logger(namespace).warn("{robot}: it\nis off", robot=namespace[:7])
+        Logger("drivers.link").info("nothing")
+        ear.close()
+        Logger("drivers.link").warn("too late")
+        self.assertEqual(ear.heard, ["drivers: it is off"])
+
+    def test_tcp_line_says_why_there_is_no_link(self) -> None:
+        """A refused call, a time-out and the like are told with their remedy, until there is a link."""
+        connected: list[object] = []
+
+        class Reactor(Clock):
+            def connectTCP(self, *arguments: object, **_: object) -> object:  # noqa: N802 (Twisted's)
+                connected.append(arguments)
+                return SimpleNamespace(state="disconnected", connect=lambda: None)
+
+        line = TcpConnector(Reactor()).call("dog1", 1, SimpleNamespace())
+        told = vars(line)
+        for problem, remedy in (
+            (error.ConnectionRefusedError(), "nothing listens at this port"),
+            (error.TCPTimedOutError(), "is it switched on"),
+            (error.TimeoutError(), "is it switched on"),
+            (error.NoRouteError(), "is this machine in its network"),
+            (error.DNSLookupError("dog1"), "write the address in figures"),
+            (OSError("out of\nsorts"), "out of sorts"),
+        ):
+            line.clientConnectionFailed(told["connector"], Failure(problem))  # type: ignore[attr-defined]
+            self.assertIn(remedy, told["problem"])
+        line.buildProtocol(None)  # type: ignore[attr-defined]
+        self.assertEqual(told["problem"], "")

@@ -1,0 +1,227 @@
+"""Tests of ``swarm driver`` on an emulated AIBO in memory: list, info, probe, drive, monitor."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import random
+import sys
+from pathlib import Path
+
+from twisted.internet.task import Clock
+from twisted.trial.unittest import SynchronousTestCase
+
+from drivers.driver import Permit
+from drivers.registry import driver_for, kinds
+from sim.emulator.aibo import AiboEmulator
+from sim.emulator.body import MemoryBody
+from swarmnode.driver.command import main
+from swarmnode.driver.pilot import Pilot
+from tests.swarmnode.driver.ground import MemoryGround
+
+JPEG = b"\xff\xd8dog\xff\xd9"
+ROBOT = "--kind aibo --option host=dog1"
+BLIND = f"{ROBOT} --option camera=false"
+
+
+class DriverCommandTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        """A dog on a clock that is turned by hand."""
+        self.clock = Clock()
+        self.body = MemoryBody(jpeg=JPEG, values={"power.level": 0.8, "range.near": 0.25})
+        self.dog = AiboEmulator(self.clock, self.body, random.Random(1))
+        self.dog.start()
+        self.connector = self.dog.connector()
+        self.speeds: list[tuple[float, float, float]] = []
+        self.ground = MemoryGround(self.clock, self.connector, self.pass_time)
+
+    def tearDown(self) -> None:
+        """Whatever the command did, the robot stands, has its motors off, and nothing is left on the clock."""
+        for _ in range(100):
+            self.clock.advance(0.01)
+        self.assertEqual((self.body.motion, self.dog.is_engaged), ((0.0, 0.0, 0.0), True))
+        self.dog.stop()
+        self.clock.advance(0.1)
+        self.assertEqual(self.clock.getDelayedCalls(), [])
+
+    def pass_time(self, seconds: float) -> None:
+        """Move the body, and note how."""
+        self.body.pass_time(seconds)
+        self.speeds.append((round(self.clock.seconds(), 3), *self.body.motion[::2]))
+
+    def moving(self, began: float, ended: float) -> list[float]:
+        """How fast it went forward between two moments."""
+        return [vx for at, vx, _ in self.speeds if began <= at <= ended]
+
+    def test_list_names_every_kind(self) -> None:
+        """Every kind is listed in a line, and in JSON; nothing is imported of what is not there."""
+        code, output, _ = self.ground.swarm_driver("list")
+        self.assertEqual(code, 0)
+        told = {line.split()[0] for line in output.splitlines() if not line.startswith(" ")}
+        self.assertLessEqual(set(kinds()), told)
+        entries = json.loads(self.ground.swarm_driver("list --json")[1])
+        self.assertEqual([entry["kind"] for entry in entries], kinds())
+
+    def test_info_describes_before_connecting(self) -> None:
+        """Limits with their units, skills and rates are told without a robot, by kind or by a node's settings."""
+        code, output, _ = self.ground.swarm_driver("info aibo")
+        self.assertEqual(code, 0)
+        self.assertRegex(output, r"base\.vx +-0\.156 to \+0\.16 m/s")
+        self.assertIn("look play howl", output)
+        told = json.loads(self.ground.swarm_driver("info camera --option source=./pictures --json")[1])
+        self.assertEqual((told["limits"], told["capabilities"]["camera"]["width"]), ({}, 320))
+        file = Path(self.mktemp())
+        file.write_text('[node]\nname = "dog1"\n[driver]\nkind = "aibo"\noptions = {host = "dog1", camera = false}\n')
+        told = json.loads(self.ground.swarm_driver(f"info {file} --json")[1])
+        self.assertNotIn("camera", told["capabilities"])
+        with file.open("a") as more:
+            more.write('[[driver.parts]]\nkind = "compass"\noptions = {host = "compass1"}\n')
+        told = json.loads(self.ground.swarm_driver(f"info {file} --json")[1])
+        self.assertIn("compass", told["capabilities"])
+
+    def test_probe_says_what_came(self) -> None:
+        """After some seconds: when the first observation came, the rate, the dialect, the battery, no bad frames."""
+        code, output, complaint = self.ground.swarm_driver(f"probe {ROBOT}")
+        self.assertEqual((code, complaint), (0, ""))
+        self.assertRegex(output, r"the first observation came after 0\.\d\d s")
+        self.assertRegex(output, r"rate +31\.\d of 31\.25 a second")
+        for told in ("mode          T4", "power.level   80 %", "104 x 80 jpeg", "bad frames    0 of ", "range.near"):
+            self.assertIn(told, output)
+        self.assertNotIn("!", output)
+        self.assertEqual({speed[1:] for speed in self.speeds}, {(0.0, 0.0)})
+        finding = json.loads(self.ground.swarm_driver(f"probe {BLIND} --seconds 1 --json")[1])
+        self.assertEqual((finding["is_there"], finding["readings"]["mode"]), (True, "T4"))
+
+    def test_probe_names_what_is_wrong(self) -> None:
+        """A robot that is off is given up with what its link says, or what its driver does, and exit code 1."""
+        self.connector.is_open = False
+        self.ground.problems = ["dog1:10020: it does not answer; is it switched on?"]
+        code, output, _ = self.ground.swarm_driver(f"probe {BLIND}")
+        self.assertEqual((code, self.clock.seconds() < 4.0), (1, True))
+        self.assertIn("not reached\n  ! dog1:10020: it does not answer; is it switched on?\n", output)
+        self.ground.problems = []
+        code, output, _ = self.ground.swarm_driver(f"probe {BLIND}")
+        self.assertEqual(code, 1)
+        self.assertIn("its main server at dog1:10020 does not answer; is it on, and does no other client", output)
+
+    def test_probe_sees_a_slow_and_spoilt_robot(self) -> None:
+        """Lost world states and a camera without pictures are said."""
+        self.dog.foul.drop = 0.5
+        _, output, _ = self.ground.swarm_driver(f"probe {BLIND}")
+        self.assertIn("! it is slow", output)
+
+    def test_probe_is_interrupted_in_order(self) -> None:
+        """Ctrl-C ends a probe with what came so far."""
+        self.ground.interrupted_at = 1.0
+        code, output, _ = self.ground.swarm_driver(f"probe {BLIND} --seconds 30")
+        self.assertEqual((code, self.clock.seconds() < 1.5), (0, True))
+        self.assertIn("the first observation", output)
+
+    def test_drive_by_keys(self) -> None:
+        """A held key moves the robot at 30 % of its speed; let go, it stands 0.4 s later; x ends with motors off."""
+        held = [(1.0 + 0.1 * n, "w") for n in range(10)]
+        self.ground.keys = [*held, (3.0, "a"), (3.1, "w"), (4.0, "+"), (4.1, "s"), (4.2, " "), (5.0, "x")]
+        code, _, complaint = self.ground.swarm_driver(f"drive {BLIND}")
+        self.assertEqual((code, complaint), (0, ""))
+        self.assertTrue(all(abs(vx - 0.3 * 0.16) < 0.002 for vx in self.moving(1.05, 2.25)))
+        self.assertEqual(set(self.moving(2.36, 3.05)), {0.0})
+        turning = [(vx > 0.0, wz > 0.0) for at, vx, wz in self.speeds if 3.15 <= at <= 3.35]
+        self.assertEqual(set(turning), {(True, True)})
+        last = [(vx > 0.0, wz > 0.0) for at, vx, wz in self.speeds if 3.45 <= at <= 3.48]
+        self.assertEqual(set(last), {(True, False)})
+        self.assertTrue(all(abs(vx + 0.4 * 0.156) < 0.002 for vx in self.moving(4.13, 4.19)))
+        self.assertEqual(set(self.moving(4.25, 5.5)), {0.0})
+        terminal = self.ground.terminals[0]
+        self.assertGreater(terminal.closed, 0)
+        lines = [line for at, line in terminal.lines if 1.2 < at < 1.9]
+        self.assertTrue(all("ready" in line and "vx +0.05" in line and "battery 80 %" in line for line in lines), lines)
+        self.assertTrue(any("near 0.25 m" in line for line in lines))
+
+    def test_drive_ends_at_rest_however_it_ends(self) -> None:
+        """Keys that run out and Ctrl-C end the drive as x does: the robot stands, its motors are off."""
+        for ending in ([(1.2, "")], [(1.2, "\x04")], []):
+            began = self.clock.seconds()
+            self.ground.keys = [(1.0, "w"), *ending]
+            self.ground.interrupted_at = None if ending else began + 1.2
+            self.assertEqual(self.ground.swarm_driver(f"drive {BLIND}")[0], 0)
+            self.assertTrue(any(self.moving(began + 1.05, began + 1.19)))
+            self.assertEqual((self.body.motion, self.dog.is_engaged), ((0.0, 0.0, 0.0), True))
+
+    def test_drive_says_why_it_does_not_move(self) -> None:
+        """Motors that somebody switched off, an axis that is not there, and a lost link are on the line."""
+        self.ground.keys = [(1.5, "w"), (2.0, "m"), (3.0, "w"), (4.0, "x")]
+        self.clock.callLater(1.0, self.dog.press)
+        self.ground.swarm_driver(f"drive {BLIND}")
+        lines = self.ground.terminals[0].lines
+        self.assertTrue(any("motors are off; call enable() first" in line for at, line in lines if 1.5 < at < 1.7))
+        self.assertTrue(any("motors off (m)" in line for at, line in lines if 1.2 < at < 1.5))
+        self.assertTrue(any(self.moving(3.05, 3.3)))
+
+    def test_drive_is_refused_by_name(self) -> None:
+        """No terminal, a robot that does not move, no robot, two robots: each is one line, with exit code 2."""
+        for words, told in (
+            (["drive", *BLIND.split()], "there is no terminal here"),
+            (["drive", "--kind", "camera"], "a camera does not move"),
+            (["drive"], "name the robot by --kind"),
+            (["probe", "--kind", "aibo", "--config", "x.toml"], "not by both"),
+            (["probe", "--kind", "warp"], "known are aibo"),
+            (["probe", "--kind", "aibo"], "option host is None"),
+            (["probe", "--kind", "aibo", "--option", "host"], "KEY=VALUE"),
+            (["probe", "--option", "host=x"], "--option says nothing without --kind"),
+            (["monitor", "--config", "/no/such/file.toml"], "cannot be read"),
+        ):
+            with self.subTest(words=words):
+                self.patch(sys, "stdin", io.StringIO())
+                complaint = self.complaint(words)
+                self.assertIn(told, complaint)
+                self.assertEqual(complaint.count("\n"), 1)
+
+    def complaint(self, words: list[str]) -> str:
+        """What a command that is wrong says."""
+        said = io.StringIO()
+        with contextlib.redirect_stderr(said):
+            self.assertEqual(main(words, io.StringIO()), 2)
+        return said.getvalue()
+
+    def test_monitor_shows_and_saves(self) -> None:
+        """Readings with their units each second; the newest picture is whole in its file."""
+        picture = Path(self.mktemp())
+        code, output, _ = self.ground.swarm_driver(f"monitor {ROBOT} --seconds 2 --picture {picture}")
+        self.assertEqual((code, picture.read_bytes()), (0, JPEG))
+        self.assertEqual(output.count("ready, "), 3)
+        self.assertRegex(output, r"range\.near +0\.250 m\n")
+        self.assertRegex(output, r"range\.far +nothing in range\n")
+        lines = self.ground.swarm_driver(f"monitor {ROBOT} --seconds 2 --json")[1].splitlines()
+        self.assertEqual({json.loads(line)["values"]["range.near"] for line in lines}, {0.25})
+        self.assertIsNone(json.loads(lines[0])["values"]["range.far"])
+
+    def test_monitor_says_what_it_lacks(self) -> None:
+        """No picture, a file that cannot be written, and a robot that is not there are said, with exit code 1."""
+        code, output, _ = self.ground.swarm_driver(f"monitor {BLIND} --seconds 1 --picture {self.mktemp()}")
+        self.assertEqual((code, "! no picture came" in output), (1, True))
+        code, output, _ = self.ground.swarm_driver(f"monitor {ROBOT} --seconds 5 --picture /no/such/folder/x.jpg")
+        self.assertEqual((code, "! /no/such/folder/x.jpg cannot be written" in output), (1, True))
+        self.connector.is_open = False
+        code, output, _ = self.ground.swarm_driver(f"monitor {BLIND}")
+        self.assertEqual((code, "! nothing came within 8 s" in output), (1, True))
+
+    def test_pilot_speaks_with_the_robots_own_token(self) -> None:
+        """A robot that has obeyed token 7 is driven under token 7: no higher one, which would lock a team out."""
+        driver = driver_for("aibo", {"host": "dog1", "camera": False}, "dog1", self.clock, self.connector)
+        driver.connect()
+        self.turn(1.0)
+        driver.enable()
+        self.turn(0.3)
+        driver.act({}, Permit(7, self.clock.seconds() + 0.5))
+        pilot = Pilot(driver)
+        self.assertTrue(pilot.press("w", self.clock.seconds()))
+        self.assertEqual((pilot.said, driver.token, pilot.is_moving), ("", 7, True))
+        self.assertFalse(pilot.press("x", self.clock.seconds()))
+        self.assertEqual(pilot.done["base.vx"], 0.0)
+        driver.disconnect()
+
+    def turn(self, seconds: float) -> None:
+        """Turn the clock."""
+        for _ in range(round(seconds / 0.005)):
+            self.clock.advance(0.005)

@@ -1,0 +1,202 @@
+"""Tests of ``swarm service``: the unit, and what installing writes and tells systemd."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import shutil
+import stat
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+
+from twisted.trial.unittest import SkipTest, SynchronousTestCase
+
+from middleware.settings import Settings
+from swarmnode.systemd.command import main
+from swarmnode.systemd.unit import Unit, unit_for
+
+PROGRAM = "/opt/swarm-node/bin/twistd"
+
+
+def unit(node: dict[str, object] | None = None, **tables: dict[str, object]) -> Unit:
+    """The unit of a node of the system."""
+    mapping = {"node": {"name": "dog1", **(node or {})}, **tables}
+    return unit_for(Settings.from_mapping(mapping, "/etc/team/dog1.toml"), PROGRAM, is_user=False)
+
+
+class UnitTests(SynchronousTestCase):
+    """The text of a unit."""
+
+    def test_a_node_may_little(self) -> None:
+        """A unit of the system has no user, no capability, no device and no file but its own folders."""
+        lines = unit().text.splitlines()
+        for line in (
+            "DynamicUser=yes",
+            "ProtectSystem=strict",
+            "NoNewPrivileges=yes",
+            "CapabilityBoundingSet=",
+            "PrivateDevices=yes",
+            "StateDirectory=swarm-node-dog1",
+            "MemoryMax=256M",
+            "SystemCallFilter=@system-service",
+            "RestartPreventExitStatus=2",
+            f"ExecStart={PROGRAM} --nodaemon --pidfile= swarm-node --config %S/swarm-node-dog1/node.toml",
+        ):
+            self.assertIn(line, lines)
+
+    def test_a_robot_on_a_cable_is_let_through(self) -> None:
+        """The device that the driver's settings name may be used, and no other."""
+        lines = unit(driver={"kind": "create2", "options": {"port": "/dev/ttyUSB0"}}).text.splitlines()
+        self.assertIn("DeviceAllow=/dev/ttyUSB0 rw", lines)
+        self.assertIn("DevicePolicy=closed", lines)
+        self.assertNotIn("PrivateDevices=yes", lines)
+
+    def test_a_low_port_takes_its_one_capability(self) -> None:
+        """A page at port 443 takes the right to listen there, and nothing else."""
+        lines = unit({"roles": ["web"]}, web={"tls": "auto", "tls_port": 443}).text.splitlines()
+        self.assertIn("AmbientCapabilities=CAP_NET_BIND_SERVICE", lines)
+
+    def test_names_cannot_add_lines(self) -> None:
+        """Spaces, quotes and percent signs of a path stay in their place."""
+        made = unit_for(Settings.from_mapping({"node": {"name": "a"}}, '/a b/50%"/a.toml'), PROGRAM, is_user=True)
+        self.assertIn('--config "/a b/50%%\\"/a.toml"\n', made.text)
+
+    def test_systemd_takes_it(self) -> None:
+        """Where systemd is, it finds nothing wrong with the unit and calls its exposure low (below 2 of 10)."""
+        if shutil.which("systemd-analyze") is None:
+            raise SkipTest("there is no systemd-analyze here")
+        folder = Path(self.mktemp())
+        folder.mkdir()
+        file = folder / "swarm-node-dog1.service"
+        made = unit_for(Settings.from_mapping({"node": {"name": "dog1"}}, "/a.toml"), shutil.which("true") or "", False)
+        file.write_text(made.text, encoding="utf-8")
+        verified = subprocess.run(["systemd-analyze", "verify", file], capture_output=True, text=True, check=False)
+        self.assertEqual((verified.returncode, verified.stderr), (0, ""))
+        words = ["systemd-analyze", "security", "--offline=true", "--threshold=20", "--no-pager", str(file)]
+        judged = subprocess.run(words, capture_output=True, text=True, check=False)
+        self.assertEqual(judged.returncode, 0, judged.stdout[-300:])
+
+
+class CommandTests(SynchronousTestCase):
+    """What the verbs do, below a root of the test's own."""
+
+    def setUp(self) -> None:
+        self.root = Path(self.mktemp()).absolute()
+        self.root.mkdir()
+        self.told: list[str] = []
+        self.codes: dict[str, int] = {}
+        self.settings = self.root / "team" / "dog1.toml"
+        self.settings.parent.mkdir()
+        self.settings.write_text('[node]\nname = "dog1"\nstore = "dog1.sqlite"\nteam_key = "k"\n', encoding="utf-8")
+        self.unit = self.root / "etc/systemd/system/swarm-node-dog1.service"
+        self.state = self.root / "var/lib/swarm-node-dog1"
+        (self.root / "twistd").touch()
+        self.program = str(self.root / "python")
+        self.closed = Path("/nowhere")
+
+    def can_enter(self, folder: Path) -> bool:
+        """Whether the service's user could."""
+        return folder != self.closed
+
+    def run_it(self, *words: str, uid: int = 0) -> tuple[int, str, str]:
+        """The exit code, what was printed, and the complaint."""
+
+        def systemctl(words: Sequence[str]) -> int:
+            self.told.append(" ".join(words))
+            return self.codes.get(words[1], 0)
+
+        out, errors = io.StringIO(), io.StringIO()
+        with contextlib.redirect_stderr(errors):
+            code = main(words, out, self.root, uid, systemctl, self.program, self.can_enter)
+        return code, out.getvalue(), errors.getvalue()
+
+    def install(self) -> tuple[int, str, str]:
+        """Install as root."""
+        return self.run_it("install", str(self.settings))
+
+    def test_install(self) -> None:
+        """Installing writes the unit, copies settings and store for the service alone, and has systemd start it."""
+        (self.settings.parent / "dog1.sqlite").write_bytes(b"kept")
+        code, printed, _ = self.install()
+        self.assertEqual((code, printed), (0, f"{self.unit}\n"))
+        self.assertIn("DynamicUser=yes", self.unit.read_text(encoding="utf-8"))
+        copied = self.state / "node.toml"
+        self.assertEqual(copied.read_bytes(), self.settings.read_bytes())
+        self.assertEqual(stat.S_IMODE(copied.stat().st_mode), 0o600)
+        self.assertEqual((self.state / "dog1.sqlite").read_bytes(), b"kept")
+        self.assertEqual(
+            self.told,
+            ["systemctl daemon-reload", "systemctl enable swarm-node-dog1", "systemctl restart swarm-node-dog1"],
+        )
+
+    def test_install_again_keeps_the_store(self) -> None:
+        """New settings take the place of the old; what the service stored since stays."""
+        self.install()
+        (self.state / "dog1.sqlite").write_bytes(b"newer")
+        (self.settings.parent / "dog1.sqlite").write_bytes(b"older")
+        self.settings.write_text('[node]\nname = "dog1"\nstore = "dog1.sqlite"\nkind = "x"\n', encoding="utf-8")
+        self.assertEqual(self.install()[0], 0)
+        self.assertEqual((self.state / "dog1.sqlite").read_bytes(), b"newer")
+        self.assertIn("kind", (self.state / "node.toml").read_text(encoding="utf-8"))
+
+    def test_a_store_elsewhere_is_refused(self) -> None:
+        """A store outside of the settings' folder could not be written by the service, so nothing is installed."""
+        self.settings.write_text('[node]\nname = "dog1"\nstore = "/srv/dog1.sqlite"\n', encoding="utf-8")
+        code, _, complaint = self.install()
+        self.assertEqual(code, 2)
+        self.assertIn("/srv/dog1.sqlite lies outside", complaint)
+        self.assertFalse(self.unit.exists())
+
+    def test_refused_settings_are_said_in_one_line(self) -> None:
+        """Settings that a node would refuse are refused here, with the line to mend."""
+        self.settings.write_text("[node]\n", encoding="utf-8")
+        code, _, complaint = self.run_it("show", str(self.settings))
+        self.assertEqual(code, 2)
+        self.assertIn("[node] name: is missing", complaint)
+
+    def test_a_program_that_the_service_could_not_run_is_refused(self) -> None:
+        """A program in somebody's closed home is refused with the folder and the remedy."""
+        self.closed = self.root
+        code, _, complaint = self.install()
+        self.assertEqual(code, 2)
+        self.assertIn(f"other users cannot enter {self.root}", complaint)
+        self.assertIn("/opt", complaint)
+        self.assertEqual(self.run_it("show", str(self.settings), "--user")[0], 0)
+
+    def test_remove(self) -> None:
+        """Removing stops it, takes the unit away and leaves what was stored."""
+        self.install()
+        self.told.clear()
+        self.assertEqual(self.run_it("remove", "dog1")[0], 0)
+        self.assertEqual(self.told, ["systemctl disable --now swarm-node-dog1", "systemctl daemon-reload"])
+        self.assertFalse(self.unit.exists())
+        self.assertTrue((self.state / "node.toml").exists())
+
+    def test_what_is_not_there_is_neither_restarted_nor_removed(self) -> None:
+        """A name of no service is refused, and systemd is told nothing."""
+        for verb in ("restart", "remove"):
+            code, _, complaint = self.run_it(verb, "cat")
+            self.assertEqual((code, self.told), (2, []))
+            self.assertIn("swarm-node-cat.service is not there", complaint)
+
+    def test_systemd_refuses(self) -> None:
+        """What systemd refuses ends with code 1 and where to read why."""
+        self.codes["restart"] = 1
+        code, _, complaint = self.install()
+        self.assertEqual(code, 1)
+        self.assertIn("journalctl -u swarm-node-dog1", complaint)
+
+    def test_without_root_it_is_the_users_own(self) -> None:
+        """Who is not root gets a unit of the user's manager, with the settings where they are."""
+        self.patch(os, "environ", {**os.environ, "XDG_CONFIG_HOME": "/home/ann/.config"})
+        code, printed, _ = self.run_it("install", str(self.settings), uid=1000)
+        self.assertEqual(code, 0)
+        made = self.root / "home/ann/.config/systemd/user/swarm-node-dog1.service"
+        self.assertIn(str(made), printed)
+        text = made.read_text(encoding="utf-8")
+        self.assertIn(f"--config {self.settings}", text)
+        self.assertNotIn("DynamicUser", text)
+        self.assertEqual(self.told[0], "systemctl --user daemon-reload")
+        self.assertFalse(self.state.exists())

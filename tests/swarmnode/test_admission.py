@@ -1,0 +1,320 @@
+"""Tests of the verbs by which a closed team is made, joined and left: at a shell beside a whole virtual team."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import io
+import json
+import os
+import random
+import shutil
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.admission import operator as operators
+from middleware.admission.code import Code
+from middleware.admission.membership import Membership, MembershipFile, MemoryMembership
+from middleware.admission.newcomer import Newcomer
+from middleware.entangled.control.place import made
+from middleware.entangled.errors import EntangledError, NoAnswer
+from middleware.entangled.network.network import Address
+from middleware.errors import BadSetting
+from middleware.settings import Settings
+from swarmnode.assembly import assembled
+from swarmnode.rehearsal import VirtualTeam
+from swarmnode.team import init, invite, join, members, promote, revoke, rotate
+from swarmnode.team.office import Desk
+from tests.swarmnode.shell import Shell
+from tests.swarmnode.team import KEY, World
+
+Main = Callable[[Sequence[str], Desk], int]
+
+
+class AdmissionTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        # Trial's own folders are deeper than the path of a socket may be.
+        self.folder = Path(tempfile.mkdtemp())
+        self.addCleanup(shutil.rmtree, self.folder)
+        home = {"XDG_RUNTIME_DIR": str(self.folder), "XDG_CONFIG_HOME": str(self.folder / "config")}
+        self.patch(os, "environ", {**os.environ, **home})
+        made("vaio").touch()
+        self.team = VirtualTeam(21, dogs=("dog1",))
+        self.addCleanup(self.team.stop)
+        self.laptop = self.team.services["vaio"].assembly.node
+        self.shell = Shell(self.team, self.laptop)
+        self.key = self.folder / "key"
+        operators.made(self.key, self.team.operator)
+        self.patch(os, "environ", {**os.environ, "SWARM_OPERATOR": str(self.key)})
+        self.dice = random.Random(1)
+        self.said = ""
+        self.newcomers = 0
+
+    def run_verb(self, main: Callable[..., int], *words: str, **more: Any) -> tuple[int, str]:
+        """Exit code and output of a verb; what is complained of is in ``said``."""
+        out, complaint = io.StringIO(), io.StringIO()
+        desk = Desk(out, self.shell.ask, self.team.clock.seconds, self.dice)
+        with contextlib.redirect_stderr(complaint):
+            code = main(list(words), desk, **more)
+        self.said = complaint.getvalue()
+        return code, out.getvalue()
+
+    def done(self, main: Callable[..., int], *words: str, **more: Any) -> Any:
+        """The answer of a verb that succeeds."""
+        code, output = self.run_verb(main, *words, "--json", **more)
+        self.assertEqual(code, 0, self.said)
+        return json.loads(output)
+
+    def knock(self, code: Code, seed: bytes, wish: str, doors: Sequence[Address], timeout: float) -> Membership:
+        """Knock as the verb does, on the team's clock and wire."""
+        self.newcomers += 1
+        network = self.team.board.network("127.0.0.1", 9000 + self.newcomers)
+        work = Newcomer(code, seed, network, self.team.clock, self.dice, wish).join(doors, timeout)
+        outcome: list[Any] = []
+        work.addCallbacks(outcome.append, lambda failure: outcome.append(failure.value))
+        self.team.clock.advance(timeout + 0.1)
+        if isinstance(outcome[0], EntangledError):
+            raise outcome[0]
+        found: Membership = outcome[0]
+        return found
+
+    def joined(self, text: str, folder: str = "new", **more: Any) -> Any:
+        """What ``swarm join`` answers."""
+        return self.done(join.main, text, "--folder", str(self.folder / folder), knocking=self.knock, **more)
+
+    def names(self) -> list[str]:
+        """Whom ``swarm members`` shows."""
+        return [each["name"] for each in self.done(members.main)["members"]]
+
+    def test_init_makes_a_team(self) -> None:
+        """``swarm init`` makes a key, a membership and settings that a node starts from; a second time it refuses."""
+        where = self.folder / "made"
+        words = ("yard", "--operator", str(self.folder / "yard"), "--folder", str(where), "--at", "127.0.0.1:7000")
+        found = self.done(init.main, *words, "--set", "presence_lease=2.5")
+        settings = Settings.load(found["settings"])
+        kept = MembershipFile(Path(settings.node.membership))
+        self.assertEqual(kept.membership.operator, operators.load(Path(found["operator"])).public)
+        self.assertEqual((settings.node.presence_lease, settings.node.port), (2.5, 7000))
+        self.assertEqual(dict(kept.membership.settings), {"presence_lease": 2.5})
+        self.assertEqual(Path(found["operator"]).stat().st_mode & 0o777, 0o600)
+        self.assertEqual(self.run_verb(init.main, *words)[0], 2)
+        self.assertIn("is there already", self.said)
+
+    def test_first_node_without_an_address(self) -> None:
+        """Without ``--at`` the first node listens at every address and the usual port; ``--page`` opens its page."""
+        words = ("yard", "--operator", str(self.folder / "yard"), "--folder", str(self.folder), "--page")
+        settings = Settings.load(self.done(init.main, *words)["settings"])
+        self.assertEqual((settings.node.host, settings.node.port), ("*", 8484))
+        self.assertIn("web", settings.node.roles)
+        self.assertEqual(settings.web.host, "0.0.0.0")
+
+    def test_member_from_the_beginning(self) -> None:
+        """``--member`` makes all that a further node needs, which is then carried to it."""
+        words = ("yard", "--operator", str(self.folder / "yard"), "--folder", str(self.folder))
+        self.done(init.main, *words, "--at", "192.0.2.7:8484", "--member", "mine=operator,gateway")
+        settings = Settings.load(str(self.folder / "mine.toml")).node
+        self.assertEqual((settings.host, settings.known_nodes), ("*", (Address("192.0.2.7", 8484),)))
+        self.assertEqual(MembershipFile(Path(settings.membership)).membership.member.roles, ("operator", "gateway"))
+
+    def test_newcomer_hears_more_than_its_own_machine(self) -> None:
+        """Who joins by a bootstrap node of another machine listens where that one reaches it."""
+        found = self.done(invite.main, "dog9")
+
+        def elsewhere(*knock: Any) -> Membership:
+            return replace(self.knock(*knock), known=(Address("192.0.2.7", 7000),))
+
+        words = (found["text"], "--folder", str(self.folder / "far"))
+        settings = Settings.load(self.done(join.main, *words, knocking=elsewhere)["settings"])
+        self.assertEqual(settings.node.host, "*")
+        near = self.joined(self.done(invite.main, "dog8")["text"], "near")
+        self.assertEqual(Settings.load(near["settings"]).node.host, "127.0.0.1")
+
+    def test_invite_and_join(self) -> None:
+        """A code made at the laptop makes a newcomer a member, with files from which its node starts and is seen."""
+        code, output = self.run_verb(invite.main, "dog9")
+        self.assertEqual(code, 0, self.said)
+        self.assertIn("lets in dog9, once, within 24 h", output)
+        text = output.partition("swarm join ")[2].split()[0]
+        self.assertTrue(text.endswith("@127.0.0.1:7000"))
+        found = self.joined(text)
+        settings = Settings.load(found["settings"])
+        self.assertEqual((found["name"], settings.node.name, found["roles"]), ("dog9", "dog9", ["device"]))
+        self.assertEqual(self.names(), ["dog1", "dog9", "vaio"])
+        world = World()
+        seams = world.seams("dog9", 7099)
+        kept = MembershipFile(Path(settings.node.membership))
+        made_node = assembled(settings, type(seams)(**{**seams.__dict__, "membership": kept})).node
+        self.assertEqual(made_node.entangled.identity, kept.membership.identity)
+
+    def test_killed_while_joining(self) -> None:
+        """Who was let in and killed before it could keep that says the same again, and the code still counts once."""
+        found = self.done(invite.main, "dog9")
+        words = (found["text"], "--folder", str(self.folder / "new"))
+
+        def killed(*knock: Any) -> Membership:
+            self.knock(*knock)
+            raise SystemExit(1)
+
+        with self.assertRaises(SystemExit):
+            self.run_verb(join.main, *words, knocking=killed)
+        self.assertEqual([path.stat().st_mode & 0o777 for path in (self.folder / "new").iterdir()], [0o600])
+        self.assertEqual(self.done(join.main, *words, knocking=self.knock)["name"], "dog9")
+        self.assertEqual(self.names(), ["dog1", "dog9", "vaio"])
+        left = sorted(path.name for path in (self.folder / "new").iterdir())
+        self.assertEqual(left, ["swarm.membership", "swarm.toml"])
+        other = self.done(invite.main, "dog8")["text"]
+        self.assertEqual(self.joined(other, "more")["name"], "dog8")
+
+    def test_place_of_a_member(self) -> None:
+        """Where a member is stands in words that mean something to people."""
+        places = {"10.0.0.7:8484": "10.0.0.7:8484", "": "not in sight", "~wss-1fa56333f510:1": "by a tunnel"}
+        for address, words in {**places, f"~{'ab' * 20}:1": "carried by others"}.items():
+            self.assertEqual(members.place(address), words)
+
+    def test_settings_that_were_there(self) -> None:
+        """Settings that lie there already are left as they are, and that is said; the same again is no news."""
+        where = self.folder / "new"
+        where.mkdir()
+        (where / "swarm.toml").write_text('[node]\nname = "mine"\n')
+        text = self.done(invite.main, "dog9")["text"]
+        _, output = self.run_verb(join.main, text, "--folder", str(where), knocking=self.knock)
+        self.assertIn("was there already", output)
+        self.assertEqual((where / "swarm.toml").read_text(), '[node]\nname = "mine"\n')
+        text = self.done(invite.main, "dog8")["text"]
+        _, output = self.run_verb(join.main, text, "--folder", str(self.folder / "other"), knocking=self.knock)
+        self.assertNotIn("was there already", output)
+
+    def test_key_of_another_code_is_not_used(self) -> None:
+        """A join that was broken off and one by another code are two newcomers."""
+        seeds: list[bytes] = []
+        first, other = (self.done(invite.main, name)["text"] for name in ("dog8", "dog9"))
+
+        def silent(code: Code, seed: bytes, *rest: Any) -> Membership:
+            seeds.append(seed)
+            raise NoAnswer("nobody opens")
+
+        for text in (first, first, other):
+            words = (text, "--folder", str(self.folder / "new"))
+            self.assertEqual(self.run_verb(join.main, *words, knocking=silent)[0], 1)
+        self.assertEqual((seeds[0], len(set(seeds))), (seeds[1], 2))
+
+    def test_code_as_a_picture(self) -> None:
+        """The code is drawn for a phone's camera, with the address behind it."""
+        lines = self.run_verb(invite.main, "dog9")[1].splitlines()
+        self.assertGreater(sum("█" in line or "▀" in line or "▄" in line for line in lines), 10)
+
+    def test_bad_codes_are_named(self) -> None:
+        """A mistyped code is refused before anything is sent; a used one by its bootstrap, each with the remedy."""
+        found = self.done(invite.main, "dog9")
+        wrong = found["code"][:-1] + ("0" if found["code"][-1] != "0" else "1")
+        self.assertEqual(self.run_verb(join.main, wrong, "--at", "127.0.0.1:7000", knocking=self.knock)[0], 2)
+        self.assertIn("mistyped", self.said)
+        self.assertEqual(self.newcomers, 0)
+        self.joined(found["text"])
+        words = (found["text"], "--folder", str(self.folder / "other"))
+        self.assertEqual(self.run_verb(join.main, *words, knocking=self.knock)[0], 1)
+        self.assertIn("was used as often as it may be; ask the operator", self.said)
+        self.assertEqual(self.run_verb(join.main, found["code"], knocking=self.knock, around=lambda: [])[0], 2)
+        self.assertIn("--at HOST:PORT", self.said)
+
+    def test_code_alone(self) -> None:
+        """A code without an address is tried at whoever answers on the LAN."""
+        code = self.done(invite.main, "dog9")["code"]
+        around = [Address("127.0.0.1", 7077), Address("127.0.0.1", 7000)]
+        self.assertEqual(self.joined(code, around=lambda: around)["name"], "dog9")
+
+    def test_membership_is_not_overwritten(self) -> None:
+        """Who is a member already is told so before its new code is spent."""
+        self.joined(self.done(invite.main, "dog8")["text"])
+        text = self.done(invite.main, "dog9")["text"]
+        knocked = self.newcomers
+        code, _ = self.run_verb(join.main, text, "--folder", str(self.folder / "new"), knocking=self.knock)
+        self.assertEqual((code, self.newcomers), (2, knocked))
+        self.assertIn("is a member", self.said)
+
+    def test_name_that_is_taken(self) -> None:
+        """A code for a name that a member has already is not made."""
+        self.assertEqual(self.run_verb(invite.main, "dog1")[0], 1)
+        self.assertIn("a member is called dog1 already", self.said)
+
+    def test_revoke(self) -> None:
+        """A revoked member is one no more, and its code and name can be told from a slip of the pen."""
+        self.joined(self.done(invite.main, "dog9")["text"])
+        self.assertEqual(self.run_verb(revoke.main, "dgo9")[0], 1)
+        self.assertIn("there are dog1, dog9, vaio", self.said)
+        self.assertEqual(self.done(revoke.main, "dog9")["what"], "the member")
+        self.assertEqual(self.names(), ["dog1", "vaio"])
+        self.assertEqual([each["name"] for each in self.done(members.main)["revoked"]], ["dog9"])
+
+    def test_revoke_invitation(self) -> None:
+        """With an invitation go all that came by it, and they are named."""
+        text = self.done(invite.main, "pupil", "--uses", "3")["text"]
+        self.joined(text)
+        found = self.done(revoke.main, "pupil")
+        self.assertEqual((found["what"], found["with"]), ("the invitation", ["pupil-1"]))
+        self.assertEqual(self.names(), ["dog1", "vaio"])
+
+    def test_rotate(self) -> None:
+        """A rotation is for all members, and each has the new secret in its membership afterwards."""
+        self.assertEqual(self.done(rotate.main, "--grace", "1h")["members"], ["dog1", "vaio"])
+        self.team.clock.advance(2.0)
+        numbers = {name: kept.membership.secrets[0][0] for name, kept in self.team._memberships.items()}
+        self.assertEqual(numbers, {"vaio": 2, "dog1": 2})
+
+    def test_promote(self) -> None:
+        """A promoted member has the role at once, and the others know."""
+        self.assertEqual(self.done(promote.main, "dog1")["roles"], ["device", "bootstrap"])
+        self.team.clock.advance(2.0)
+        dog = self.team.services["dog1"].assembly.node.team
+        assert dog is not None
+        self.assertEqual(dog.door.me.roles, ("device", "bootstrap"))
+        self.assertIn("dog1", str(self.done(members.main)))
+
+    def test_keys_of_others(self) -> None:
+        """Another team's key, one that others can read, and none at all are each refused with the remedy."""
+        other = self.folder / "other"
+        operators.made(other, operators.drawn("other", random.Random(2)))
+        self.assertEqual(self.run_verb(invite.main, "dog9", "--operator", str(other))[0], 1)
+        self.assertIn("another operator", self.said)
+        self.key.chmod(0o644)
+        self.assertEqual(self.run_verb(invite.main, "dog9")[0], 2)
+        self.assertIn("chmod 600", self.said)
+        self.patch(os, "environ", {**os.environ, "SWARM_OPERATOR": ""})
+        self.assertEqual(self.run_verb(invite.main, "dog9")[0], 2)
+        self.assertIn("swarm init", self.said)
+
+    def test_node_takes_statements_only(self) -> None:
+        """What the control socket is told counts only when this team's operator signed it."""
+        strange = operators.drawn("other", random.Random(2)).revoke(b"r" * 32, "dog1", self.team.clock.seconds())
+        told = {"statement": {"base64": base64.b64encode(strange).decode()}}
+        [line] = self.shell.ask(self.folder, {"verb": "team tell", "with": told})
+        self.assertIn("sign with the key of the team", line["text"])
+
+
+class TeamSettingsTests(SynchronousTestCase):
+    """Which team a node belongs to."""
+
+    def refusal(self, **node: str) -> str:
+        """Why a node is not made."""
+        settings = Settings.from_mapping({"node": {"name": "a", **node}}, "a.toml")
+        return str(self.assertRaises(BadSetting, assembled, settings, World().seams("a", 7000)))
+
+    def test_neither_and_both(self) -> None:
+        """A node of no team is refused and told of swarm init and swarm join; one of two teams is refused, too."""
+        self.assertIn("swarm join CODE", self.refusal())
+        self.assertIn("closed or open", self.refusal(team_key=KEY, membership="m"))
+
+    def test_membership_opens_the_door(self) -> None:
+        """A membership makes the node's identity and its door; no team key is needed."""
+        dice = random.Random(1)
+        membership = operators.drawn("yard", dice).founded("a", ("device",), 0, dice)
+        seams = World().seams("a", 7000)
+        seams = type(seams)(**{**seams.__dict__, "membership": MemoryMembership(membership)})
+        node = assembled(Settings.from_mapping({"node": {"name": "a"}}, "a.toml"), seams).node
+        self.assertEqual(node.entangled.identity, membership.identity)
+        self.assertEqual(node.entangled.endpoint.door.shown, membership.shown)

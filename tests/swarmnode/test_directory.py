@@ -1,0 +1,72 @@
+"""Tests of what people see of a directory that is split: the page and the shell still have all devices."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from twisted.internet.defer import Deferred
+
+from middleware.entangled.control.place import made
+from middleware.survey import inventory
+from swarmnode.asker import Asker
+from swarmnode.team.verb import TeamVerbs
+from tests.fleet import FleetCase, SwarmFleet
+from webnode.ledger import state_from
+from webnode.state import Departed
+from webnode.team import TeamDesk
+
+COUNT = 9
+
+
+class NoVerbs:
+    """Nothing else is asked."""
+
+    def run(self, name: object, arguments: object, tell: Callable[[Any], None]) -> Deferred[Any]:
+        """Refuse."""
+        raise AssertionError(name)
+
+
+class SplitTests(FleetCase):
+    def apart(self) -> SwarmFleet:
+        """Nodes that stand as those of a large team do."""
+        fleet = self.swarm(COUNT)
+        for node in fleet.nodes:
+            node.directory.depth = 3
+            node.presence.change(depth=3)
+        fleet.run(2.0)
+        return fleet
+
+    def test_page(self) -> None:
+        """The page of a web node shows every device of a directory that is split."""
+        fleet = self.apart()
+        desk = TeamDesk(fleet.nodes[2], {}, "")
+        fleet.run(3.0)
+        state = state_from(desk.read, Departed(), "dog2", 0.0)
+        self.assertEqual([device["name"] for device in state["devices"]], [f"dog{n}" for n in range(COUNT)])
+
+    def test_shell(self) -> None:
+        """What ``swarm links``, ``chaos`` and ``deploy`` ask for is every device, in the order of joining."""
+        fleet = self.apart()
+        folder = Path(tempfile.mkdtemp())
+        self.addCleanup(shutil.rmtree, folder)
+        self.patch(os, "environ", {**os.environ, "XDG_RUNTIME_DIR": str(folder)})
+        made("dog2").touch()
+        verbs = TeamVerbs(NoVerbs(), fleet.nodes[2])
+
+        def ask(path: Path, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
+            asked = verbs.run(request["verb"], request["with"], lambda event: None)
+            yield {"answer": self.done(fleet, asked, 1.0)}
+
+        found = Asker("dog2", ask).devices()
+        self.assertEqual([device.name for device, _ in found], [f"dog{n}" for n in range(COUNT)])
+        self.assertEqual(found[4][1].owner, fleet.nodes[4].entangled.identity.public)
+
+    def test_what_a_node_holds(self) -> None:
+        """The inventory of a node counts the records of a split directory as devices."""
+        fleet = self.apart()
+        self.assertEqual({kind for node in fleet.nodes for kind in inventory(node)["kinds"]}, {"devices"})

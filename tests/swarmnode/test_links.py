@@ -1,0 +1,146 @@
+"""Tests of ``swarm links``: what is printed of the ways to a node's peers."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from twisted.internet.defer import Deferred
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.entangled.control.place import made
+from middleware.entangled.errors import Refused
+from middleware.link import link
+from middleware.survey import ENDING_S, links, team
+from swarmnode.links import main
+from swarmnode.rehearsal import VirtualTeam
+from tests.swarmnode.shell import Shell
+
+FAR = {"id": "cd" * 20, "address": f"~{'cd' * 20}:1", "way": "carried", "by": "ef" * 20, "for": 150.0, "relayed": True}
+NEAR = {"id": "ef" * 20, "address": "192.168.1.9:8484", "way": "lan", "by": "", "for": 7500.0, "relayed": False}
+
+
+class LinksTests(SynchronousTestCase):
+    """Behaviour of the command."""
+
+    def setUp(self) -> None:
+        # Trial's own folders are deeper than the path of a socket may be.
+        folder = Path(tempfile.mkdtemp())
+        self.addCleanup(shutil.rmtree, folder)
+        self.patch(os, "environ", {**os.environ, "XDG_RUNTIME_DIR": str(folder)})
+        made("vaio").touch()
+        self.links: Any = [{**NEAR, "times": [0.002] * 10}, {**FAR, "times": [0.08] * 9 + [None]}]
+
+    def ask(self, path: Path, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
+        """What the node answers; it has no records."""
+        yield {"answer": self.links if request["verb"] == "links" else []}
+
+    def run_it(self, *words: str) -> tuple[int, str]:
+        """The exit code, and what was printed."""
+        out = io.StringIO()
+        return main(words, out, self.ask), out.getvalue()
+
+    def test_worst_first(self) -> None:
+        """Each peer is a line with score, way, figures and since when; the worst is the first."""
+        score = link([0.08] * 9 + [None], True).score
+        self.assertLess(score, 100)
+        code, printed = self.run_it()
+        self.assertEqual(
+            (code, printed.splitlines()),
+            (
+                0,
+                [
+                    f"cdcdcdcdcd  {score:3}/100  carried by efefefefef  80.0 ms, jitter 0.0 ms, 10 % lost, for 2 min",
+                    "efefefefef  100/100  LAN                    2.0 ms, jitter 0.0 ms, 0 % lost, for 2 h",
+                ],
+            ),
+        )
+
+    def test_silent_peer(self) -> None:
+        """A peer that answers nothing has 0 points, and the command ends with 1."""
+        self.links = [{**NEAR, "way": "none", "for": None, "times": [None] * 10}]
+        self.assertEqual(self.run_it(), (1, "efefefefef    0/100  no way yet  does not answer\n"))
+
+    def test_no_peer(self) -> None:
+        """A node alone says so, and what tells why."""
+        self.links = []
+        self.assertEqual(self.run_it(), (0, "this node knows no peer; swarm doctor says why\n"))
+
+    def test_json(self) -> None:
+        """With --json it is one line with the same figures."""
+        code, printed = self.run_it("--json")
+        rows = json.loads(printed)["links"]
+        self.assertEqual((code, [row["way"] for row in rows], rows[1]["score"]), (0, ["carried", "lan"], 100))
+        self.assertEqual((rows[0]["loss"], rows[0]["by"], rows[0]["for"]), (0.1, "ef" * 20, 150.0))
+
+    def test_real_node(self) -> None:
+        """A running node names its peers as the devices are called."""
+        team = VirtualTeam(3)
+        self.addCleanup(team.stop)
+        shell = Shell(team, team.services["vaio"].assembly.node)
+        code, printed = shell.run(main, [])
+        self.assertEqual((code, shell.said), (0, ""))
+        for name in ("dog1", "dog2", "dog3"):
+            self.assertRegex(printed, rf"(?m)^{name}\s+100/100  this machine  \d.* 0 % lost, for \d+ s$")
+
+
+class TeamTests(SynchronousTestCase):
+    """What a node of a closed team says of it, and of whom it met that was not let in."""
+
+    def setUp(self) -> None:
+        self.team = VirtualTeam(5, dogs=("dog1", "dog2"))
+        self.addCleanup(self.team.stop)
+        self.laptop = self.team.services["vaio"].assembly.node
+        self.dog = self.team.services["dog1"].assembly.node
+
+    def tell(self, statement: bytes) -> None:
+        """Let the operator's word spread."""
+        assert self.laptop.team is not None
+        self.laptop.later(0.0, lambda: Deferred.fromCoroutine(self.laptop.team.tell(statement)))  # type: ignore[union-attr]
+        self.team.clock.advance(3.0)
+
+    def test_members(self) -> None:
+        """A closed team has a name, the fingerprint that strangers see, and its members with roles."""
+        told = team(self.laptop)
+        assert self.laptop.team is not None
+        self.assertEqual((told["kind"], told["me"]), ("closed", self.laptop.uuid))
+        self.assertEqual(bytes.fromhex(told["fingerprint"]), self.laptop.entangled.endpoint.door.fingerprint)
+        self.assertEqual([member["name"] for member in told["members"]], ["dog1", "dog2", "vaio"])
+        self.assertEqual(told["members"][0]["uuid"], self.dog.uuid)
+        self.assertFalse(told["is_ending"] or any(member["is_ending"] for member in told["members"]))
+
+    def test_ending_certificate(self) -> None:
+        """Whose certificate ends within two weeks stands first, and is said to be so."""
+        dog = self.team.services["dog2"].assembly.node
+        begin = int(self.team.clock.seconds()) + 1
+        public = dog.entangled.identity.public
+        self.tell(self.team.operator.grant(public, "dog2", ("device",), begin, int(ENDING_S) - 60))
+        told = team(self.laptop)
+        found = [(member["name"], member["is_ending"]) for member in told["members"]]
+        self.assertEqual(found, [("dog2", True), ("dog1", False), ("vaio", False)])
+        self.assertEqual((told["is_ending"], team(dog)["is_ending"]), (False, True))
+
+    def test_refusals(self) -> None:
+        """Who was revoked is named with the remedy by those that put it out, and by itself."""
+        self.tell(self.team.operator.revoke(self.dog.entangled.identity.public, "dog1", self.team.clock.seconds()))
+        self.team.clock.advance(3.0)
+        ours, theirs = links(self.laptop)["refusals"], links(self.dog)["refusals"]
+        self.assertIn(("dog1", "we", "revoked"), [(each["who"], each["side"], each["code"]) for each in ours])
+        self.assertIn(("they", "revoked"), [(each["side"], each["code"]) for each in theirs])
+        self.assertIn("only a new code lets that node in again", ours[0]["reason"])
+        self.assertNotIn("dog1", [member["name"] for member in team(self.laptop)["members"]])
+
+    def test_refused_call(self) -> None:
+        """A member that asks for what its role does not allow is named by whom it asked, as a call."""
+        asked = self.dog.entangled.call(self.laptop.entangled.contact, "device.message", "sit", changes=True)
+        self.team.clock.advance(1.0)
+        self.failureResultOf(asked, Refused)
+        (told,) = links(self.laptop)["refusals"]
+        self.assertEqual((told["who"], told["side"], told["code"], told["count"]), ("dog1", "call", "role", 1))
+        self.assertIn("; ask the operator for another role", told["reason"])

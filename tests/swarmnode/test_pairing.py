@@ -1,0 +1,99 @@
+"""Table 5.1 of the thesis as configuration: each robot has its laptop and its agent, and all are told by name."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import msgpack
+from twisted.logger import ILogObserver, LogEvent, formatEvent, globalLogPublisher
+from twisted.trial.unittest import SynchronousTestCase
+from zope.interface import implementer
+
+from agents.catalogue import DEMO, TASKS
+from drivers.registry import describe
+from middleware.presence import Device
+from middleware.settings import Settings
+from sim.emulator.aibo import AiboEmulator
+from sim.emulator.body import MemoryBody
+from swarmnode.service import NodeService
+from tests.swarmnode.team import World
+from webnode.ledger import state_from
+from webnode.state import Departed, device_view
+from webnode.team import TeamDesk
+
+FOLDER = Path(__file__).resolve().parents[2] / "examples" / "table-5.1"
+ROWS = [(f"dog{n}", f"dog{n}_laptop", f"dog{n}_agent") for n in (1, 2, 3)]
+
+
+class PairingTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        """The four files."""
+        self.settings = {file.stem: Settings.load(str(file)) for file in sorted(FOLDER.glob("*.toml"))}
+
+    def test_files_are_the_table(self) -> None:
+        """A file a row, with device, laptop and agent; each dog has one address and each laptop one dog."""
+        self.assertEqual(list(self.settings), ["dog1", "dog2", "dog3", "vaio"])
+        dogs = [self.settings[name] for name, _, _ in ROWS]
+        self.assertEqual([(each.node.name, each.node.laptop, each.agent.name) for each in dogs], ROWS)
+        for each in dogs:
+            body = describe(each.driver.kind, each.driver.options, each.node.name)
+            self.assertEqual(body.kind, "aibo-ers7")
+        self.assertEqual(len({str(each.driver.options["host"]) for each in dogs}), 3)
+        self.assertEqual(len({each.node.host for each in self.settings.values()}), 4)
+
+    def test_files_are_a_team(self) -> None:
+        """All have the same key, and each dog enters by the small laptop, which is bootstrap and web node."""
+        vaio = self.settings["vaio"]
+        self.assertEqual((set(vaio.node.roles), vaio.driver.kind), ({"bootstrap", "edge", "web"}, ""))
+        for each in self.settings.values():
+            self.assertEqual(each.node.team_secret, vaio.node.team_secret)
+            known = [] if each is vaio else [(vaio.node.host, vaio.node.port)]
+            self.assertEqual([(address.host, address.port) for address in each.node.known_nodes], known)
+
+    def test_team_tells_who_belongs_together(self) -> None:
+        """Nodes made of the files, with emulated dogs: page and log say device, laptop and agent, and all connect."""
+        lines: list[str] = []
+
+        @implementer(ILogObserver)
+        def seen(event: LogEvent) -> None:
+            lines.append(formatEvent(event))
+
+        globalLogPublisher.addObserver(seen)
+        self.addCleanup(globalLogPublisher.removeObserver, seen)
+        world = World()
+        services: dict[str, NodeService] = {}
+        for port, (name, settings) in enumerate(sorted(self.settings.items(), reverse=True), 7000):
+            seams = world.seams(name, port)
+            host = settings.node.host
+            seams = replace(seams, network=partial(world.board.network, host, port))
+            if settings.driver.kind:
+                dog = AiboEmulator(world.clock, MemoryBody(), random.Random(name))
+                dog.start()
+                self.addCleanup(dog.stop)
+                seams = replace(seams, connector=dog.connector())
+            settings = replace(settings, node=replace(settings.node, store=":memory:"))
+            services[name] = NodeService(settings, seams, [])
+            services[name].startService()
+            self.addCleanup(services[name].stopService)
+            world.clock.advance(1.0)
+        world.clock.advance(3.0)
+        desk = TeamDesk(services["vaio"].assembly.node, TASKS, DEMO, None)
+        devices = state_from(desk.read, Departed(), "vaio", world.clock.seconds())["devices"]
+        told = {device["name"]: (device["name"], device["laptop"], device["agent"]) for device in devices}
+        self.assertEqual(told, {"vaio": ("vaio", "vaio", ""), **{row[0]: row for row in ROWS}})
+        self.assertEqual({device["kind"] for device in devices}, {"laptop", "aibo-ers7"})
+        for device, laptop, agent in ROWS:
+            self.assertIn(f"{device} has the agent {agent} on {laptop}", lines)
+            driver = services[device].assembly.driver
+            assert driver is not None
+            self.assertEqual(driver.state, "ready")
+
+    def test_names_cost_nothing_where_there_are_none(self) -> None:
+        """The record of a device without such names is as long as ever; names that are no text are not taken."""
+        bare, named = Device("ab", "dog1"), Device("ab", "dog1", laptop="dog1_laptop", agent="dog1_agent")
+        keys = [set(msgpack.unpackb(device.packed())) for device in (bare, named)]
+        self.assertEqual(keys[0] ^ keys[1], {"laptop", "agent"})
+        self.assertEqual(device_view({"name": "dog1", "laptop": 7})["laptop"], "")

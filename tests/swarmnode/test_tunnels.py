@@ -1,0 +1,88 @@
+"""Tests of ``swarmnode.tunnels``: what settings and environment say, wired."""
+
+from __future__ import annotations
+
+import random
+from typing import Any
+
+from twisted.internet.testing import MemoryReactorClock
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.entangled.clock import HeapClock
+from middleware.entangled.network.foul import FoulNetwork
+from middleware.entangled.network.joint import JointNetwork
+from middleware.entangled.network.network import Network, detours_of
+from middleware.entangled.network.switchboard import Switchboard
+from middleware.entangled.network.url import Proxy, Url
+from middleware.settings import Settings
+from swarmnode.tunnels import proxy_for, with_tunnels
+
+
+class WiringTests(SynchronousTestCase):
+    def wired(self, **node: object) -> tuple[Network, list[Any], MemoryReactorClock]:
+        """The network of a node with these settings, the addresses that it knows, and its reactor."""
+        settings = Settings.from_mapping({"node": {"name": "a", **node}}, "test").node
+        board = Switchboard(HeapClock(), random.Random(1))
+        reactor = MemoryReactorClock()
+        network = with_tunnels(settings, board.network, reactor, random.Random(1), {})()
+        network.listen(lambda datagram, source: None)
+        self.addCleanup(network.close)
+        return network, detours_of(FoulNetwork(network, HeapClock(), random.Random(1))), reactor
+
+    def test_nothing_without_tunnels(self) -> None:
+        """A node with neither tunnels nor a port for them has its plain network, and listens at no TCP port."""
+        for node in ({}, {"known_nodes": ["127.0.0.1:7000"]}, {"known_nodes": ["10.0.0.7:7000"], "tunnels": []}):
+            network, addresses, reactor = self.wired(**node)
+            self.assertNotIsInstance(network, JointNetwork)
+            self.assertEqual((addresses, reactor.tcpServers), ([], []))
+
+    def test_known_nodes_may_be_dialled(self) -> None:
+        """A node with known nodes knows a virtual address for each; nothing is dialled or served for that."""
+        network, addresses, reactor = self.wired(known_nodes=["10.0.0.7:7000"])
+        self.assertIsInstance(network, JointNetwork)
+        self.assertEqual(addresses, [Url.of("wss://10.0.0.7").address])
+        self.assertEqual((reactor.tcpServers, reactor.tcpClients), ([], []))
+
+    def test_port(self) -> None:
+        """A port for tunnels is opened where the node listens; one without TLS to this machine alone."""
+        for tls, host in ((True, "10.0.0.5"), (False, "127.0.0.1")):
+            reactor = MemoryReactorClock()
+            settings = Settings.from_mapping(
+                {"node": {"name": "a", "host": "10.0.0.5", "tunnel_port": 443, "tunnel_tls": tls}}, "test"
+            ).node
+            board = Switchboard(HeapClock(), random.Random(1))
+            opened: list[tuple[int, str]] = []
+
+            def listen_tcp(
+                port: int, factory: Any, backlog: int, interface: str, opened: list[tuple[int, str]] = opened
+            ) -> Any:
+                opened.append((port, interface))
+                return _Port()
+
+            reactor.listenTCP = listen_tcp  # type: ignore[method-assign,assignment]
+            network = with_tunnels(settings, board.network, reactor, random.Random(1), {})()
+            network.listen(lambda datagram, source: None)
+            network.close()
+            self.assertEqual((opened, detours_of(network)), ([(443, host)], []))
+
+    def test_proxy(self) -> None:
+        """A proxy of the environment is used for TLS, but not for those whom ``no_proxy`` names, nor a wrong one."""
+        url, plain = Url.of("wss://node.example"), Url.of("ws://node.example")
+        said = {"https_proxy": "http://10.0.0.1:8080"}
+        self.assertEqual(proxy_for(said, url), Proxy("10.0.0.1", 8080))
+        self.assertEqual(proxy_for({"HTTPS_PROXY": "10.0.0.1:8080"}, url), Proxy("10.0.0.1", 8080))
+        for environment in ({}, {"https_proxy": ""}, {"https_proxy": "socks5://a:1"}):
+            self.assertIsNone(proxy_for(environment, url))
+        self.assertIsNone(proxy_for(said, plain))
+        for spared, is_used in (("example", False), (".example,a", False), ("*", False), ("ample", True), ("", True)):
+            self.assertEqual(proxy_for({**said, "no_proxy": spared}, url) is not None, is_used, spared)
+
+
+class _Port:
+    class socket:  # noqa: N801
+        @staticmethod
+        def setsockopt(*options: int) -> None:
+            """Take any option."""
+
+    def stopListening(self) -> None:
+        """Close."""
