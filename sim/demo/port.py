@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import errno
+import random
 import socket
+from collections.abc import Iterator
 from contextlib import ExitStack
 from typing import Literal
 
 Kind = Literal["tcp", "udp"]
+
+QUIET = range(20_000, 32_000)
+"""Systems hand out none of these by themselves (Linux begins at 32,768, others at 49,152): a port that is free here
+is still free when the process starts that it was looked up for, however many connections others open meanwhile."""
 
 
 class PortBusy(Exception):
@@ -20,16 +27,35 @@ def chosen(kind: Kind, host: str, wanted: int, what: str) -> int:
     return wanted
 
 
-def preferred(kind: Kind, host: str, wanted: int) -> int:
-    """``wanted`` where it is free, else any free port; 0 wants any."""
-    return wanted if wanted and _is_free(kind, host, wanted) else free(kind, host, 1)[0]
+def preferred(kind: Kind, host: str, wanted: int, spare: Iterator[int]) -> int:
+    """``wanted`` where it is free, else the next of the ``spare`` ones; 0 wants any."""
+    return wanted if wanted and _is_free(kind, host, wanted) else next(spare)
 
 
 def free(kind: Kind, host: str, count: int) -> list[int]:
-    """``count`` different free ports, free at this moment; held all at once, so none is given twice."""
+    """``count`` different ``QUIET`` ports, free at this moment; held all at once, so none is given twice.
+
+    Drawn by chance, so that who asks at the same moment is given others.  Raises ``OSError`` where ``host`` is no
+    address of this machine, or too few are free.
+    """
+    check(kind, host)
+    draw = random.SystemRandom()
+    found: list[int] = []
     with ExitStack() as stack:
-        held = [stack.enter_context(_bound(kind, host, 0)) for _ in range(count)]
-        return [int(one.getsockname()[1]) for one in held]
+        for port in draw.sample(QUIET, len(QUIET)):
+            if len(found) == count:
+                return found
+            try:
+                stack.enter_context(_bound(kind, host, port))
+            except OSError:
+                continue
+            found.append(port)
+    raise OSError(errno.EADDRINUSE, f"fewer than {count} ports are free")
+
+
+def check(kind: Kind, host: str) -> None:
+    """Raises ``OSError`` where ``host`` is no address of this machine."""
+    _bound(kind, host, 0).close()
 
 
 def _is_free(kind: Kind, host: str, port: int) -> bool:

@@ -15,6 +15,9 @@ from sim.demo.cast import LOOPBACK, MOST_PORTS, chosen
 from sim.demo.configuration import BOOTSTRAP, DOGS, RESERVE, Plan
 
 WEB_PORT, TLS_PORT, NODE_PORT, YARD_PORT = 8080, 8443, 7000, 7400
+PAGES = 5
+"""Ports of the page, of its reserve, of both over TLS, and of the yard."""
+EVERYWHERE = "0.0.0.0"
 MARK = ".swarm-demo"
 LETTERS = "abcdefghjkmnpqrstuvwxyz"
 """Of these is the code to sign in with: none looks like another, or like a digit."""
@@ -73,25 +76,28 @@ def arranged(
     ``robot``: the cast, of ``sim.demo.cast.CASTS``.
     """
     try:
-        port.free("tcp", web_host, 1)
+        port.check("tcp", web_host)
     except OSError as error:
         remedy = "give --web-host an address of this machine, or 0.0.0.0 for all of them"
         raise Trouble(f"the page cannot be at {web_host} ({error.strerror}); {remedy}") from error
+    # Free at every address: the page may be at another one than the robots.
+    spare = iter(port.free("tcp", EVERYWHERE, PAGES + MOST_PORTS * len(DOGS)))
     if web_port:
         web = port.chosen("tcp", web_host, web_port, "the page")
     else:
-        web = port.preferred("tcp", web_host, WEB_PORT if usual else 0)
-    reserve = port.preferred("tcp", web_host, web + 1 if usual and web < 65535 else 0)
+        web = port.preferred("tcp", web_host, WEB_PORT if usual else 0, spare)
+    reserve = port.preferred("tcp", web_host, web + 1 if usual and web < 65535 else 0, spare)
     tls = (0, 0)
     if with_tls:
         # Nobody holds the ports of the page yet, so that they look free.
         wish = TLS_PORT if usual and not {TLS_PORT, TLS_PORT + 1} & {web, reserve} else 0
-        first = port.preferred("tcp", web_host, wish)
-        tls = (first, port.preferred("tcp", web_host, first + 1 if first == wish else 0))
-    yard = port.preferred("tcp", LOOPBACK, YARD_PORT if usual else 0)
-    node, *others = port.free("udp", LOOPBACK, 2 + len(DOGS))
+        first = port.preferred("tcp", web_host, wish, spare)
+        tls = (first, port.preferred("tcp", web_host, first + 1 if first == wish else 0, spare))
+    yard = port.preferred("tcp", LOOPBACK, YARD_PORT if usual else 0, spare)
+    quiet = iter(port.free("udp", LOOPBACK, 2 + len(DOGS)))
+    node = port.preferred("udp", LOOPBACK, NODE_PORT if usual else 0, quiet)
+    others = [next(quiet) for _ in (RESERVE, *DOGS)]
     if usual:
-        node = port.preferred("udp", LOOPBACK, NODE_PORT)
         wanted = [("the page", web_port or WEB_PORT, web), ("the yard", YARD_PORT, yard), ("vaio", NODE_PORT, node)]
         wanted += [("the page over TLS", TLS_PORT, tls[0])] if with_tls else []
         for what, wish, got in wanted:
@@ -99,6 +105,5 @@ def arranged(
                 say(f"port {wish} is busy; {what} uses {got}")
     nodes = {BOOTSTRAP: node, **dict(zip((RESERVE, *DOGS), others, strict=True))}
     code = "".join(secrets.choice(LETTERS) for _ in range(8))
-    ports = iter(port.free("tcp", LOOPBACK, MOST_PORTS * len(DOGS)))
-    robots = chosen(robot, DOGS, run_dir, ports, yard)
+    robots = chosen(robot, DOGS, run_dir, spare, yard)
     return Plan(run_dir, web_host, web, yard, nodes, f"{code[:4]}-{code[4:]}", reserve, tls, robots)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import random
-import socket
 
 from twisted.internet import reactor
 from twisted.internet.defer import Deferred
@@ -14,6 +13,7 @@ from twisted.trial.unittest import TestCase
 from drivers.aibo.driver import AiboDriver
 from drivers.driver import Permit
 from drivers.registry import driver_for
+from sim.demo.port import free
 from sim.emulator.aibo import EMULATED, AiboEmulator
 from sim.emulator.aibo_server import AiboServer
 from sim.emulator.body import MemoryBody
@@ -21,13 +21,7 @@ from sim.emulator.body import MemoryBody
 
 def free_ports() -> dict[str, int]:
     """Numbers that nobody uses at the moment, one for each of the dog's ports."""
-    sockets = {service: socket.socket() for service in EMULATED}
-    for one in sockets.values():
-        one.bind(("127.0.0.1", 0))
-    numbers = {service: int(one.getsockname()[1]) for service, one in sockets.items()}
-    for one in sockets.values():
-        one.close()
-    return numbers
+    return dict(zip(EMULATED, free("tcp", "127.0.0.1", len(EMULATED)), strict=True))
 
 
 class AiboSocketTests(TestCase):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import socket
 import subprocess
 import sys
 import threading
@@ -11,15 +10,15 @@ from pathlib import Path
 
 from twisted.trial.unittest import TestCase
 
+from sim.demo.port import free
+
 ROOT = Path(__file__).resolve().parent.parent.parent
 PATIENCE = 30.0
 
 
 def free_port() -> int:
     """A UDP port that nobody holds just now."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
-        one.bind(("127.0.0.1", 0))
-        return int(one.getsockname()[1])
+    return free("udp", "127.0.0.1", 1)[0]
 
 
 class ExamplesTests(TestCase):

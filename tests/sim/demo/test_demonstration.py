@@ -305,6 +305,14 @@ class StageTests(SynchronousTestCase):
         ports = [plan.web_port, plan.reserve_port, *plan.tls_ports, plan.yard_port]
         self.assertEqual((plan.web_port, len(set(ports))), (wanted, 5))
 
+    def test_free_ports_stay_free(self) -> None:
+        """No free port is one that systems give to outgoing connections, so none is taken before its process starts."""
+        lowest_given = 32_768
+        for kind in ("tcp", "udp"):
+            ports = port.free(kind, "127.0.0.1", 20)
+            self.assertEqual(len(set(ports)), 20)
+            self.assertLess(max(ports), lowest_given)
+
     def test_foreign_folder_is_refused(self) -> None:
         """A folder with somebody's file in it is refused and left as it is."""
         self.folder.mkdir()
