@@ -32,6 +32,8 @@ TIGHT = 3.0
 """Who turns on a circle only, and has the target aside within so many of its radii, walks back first."""
 MEMORY = 4.0
 """Seconds for which a target out of sight is still believed to be where it was: another dog may only be passing by."""
+HIDDEN = 30.0
+"""The same where something is seen to stand between: a robot that died on its way stays where it is."""
 DISAGREEMENT = 0.25
 SETTLE = 3
 STRIDE, STUCK = 0.02, 1.5
@@ -88,6 +90,8 @@ class SearchAndApproach:
             self._saw(find_target(seen.frame.data, self._size, self._means.lens), now)
         if self._circling.is_walking or self._detour.is_on(now):
             self._looked_at = now  # it looks elsewhere, and the target stays where it is
+        elif self._is_hidden and now - self._seen_at <= HIDDEN - MEMORY:
+            self._looked_at = now
         if now - self._looked_at > MEMORY:
             self._forget()
 
@@ -130,6 +134,13 @@ class SearchAndApproach:
         """Metres from the camera to the target's axis."""
         assert self._target is not None
         return max(0.0, math.dist(self._pose[:2], self._target) - self._means.ahead)
+
+    @property
+    def _is_hidden(self) -> bool:
+        """Whether something stands between here and where the target is believed to be."""
+        if self._target is None or abs(self._bearing) > AT_IT:
+            return False
+        return self._ahead + self._radius < self._distance * (1 - DISAGREEMENT) - 0.05
 
     @property
     def cost(self) -> float | None:
@@ -208,7 +219,7 @@ class SearchAndApproach:
             if math.dist(self._pose[:2], self._target) < TIGHT * means.circle:
                 return means.go(-CREEP)  # nearer than it can turn to
             return means.spin(turn)
-        if self._ahead < IN_THE_WAY and self._ahead + self._radius < self._distance * (1 - DISAGREEMENT) - 0.05:
+        if self._ahead < IN_THE_WAY and self._is_hidden:
             # Something stands between: step aside, keep the eyes on the target; or go round it.
             if means.strafes:
                 return {**STAND, "base.vy": self._side * SIDESTEP, "base.wz": turn}

@@ -10,7 +10,7 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from agents.context import Context
 from agents.means import STOP_AT
-from agents.search import MEMORY, SearchAndApproach
+from agents.search import HIDDEN, MEMORY, SearchAndApproach
 from drivers.reading import Action, Frame, Observation
 from sim.camera import Camera
 from sim.scene import FOOTPRINT, loaded
@@ -210,6 +210,56 @@ class MemoryTests(SynchronousTestCase):
         walk = self.found()
         observation = Observation(0.0, 0.0, walk.senses.values(), frame=Frame(walk.frames, 208, 160, b"", 0.0))
         walk.behaviour.look(observation, walk.now + MEMORY + 0.1)
+        self.assertIsNone(walk.behaviour.cost)
+
+
+class HiddenTests(SynchronousTestCase):
+    """Another robot stands before the target, as a dead one does that was on its way."""
+
+    def hidden(self, at: float = 0.55) -> Walk:
+        """A dog that has found the target, and then another stops that far before it on the straight line."""
+        walk = Walk()
+        walk.world.place_target(1.9, 1.4)
+        self.assertIsNotNone(walk.find())
+        heading = math.atan2(1.4 - walk.dog.y, 1.9 - walk.dog.x)
+        away = NOSE + at
+        walk.world.move_dog("dog2", 0.4 + away * math.cos(heading), 1.2 + away * math.sin(heading), heading)
+        return walk
+
+    def test_report_stays(self) -> None:
+        """Who cannot see past another robot keeps its report, for as long as another may need to act."""
+        walk = self.hidden()
+        began = walk.now
+        while walk.now - began < HIDDEN - 0.5:
+            walk.live(walk.behaviour.hold)
+            self.assertIsNotNone(walk.behaviour.cost)
+
+    def test_way_leads_round_it(self) -> None:
+        """Sent to the target, the dog goes round who hides it, and stands at the target without having touched it."""
+        walk = self.hidden()
+        other = walk.world.dogs["dog2"]
+        place = other.x, other.y
+        while walk.live(walk.execute) is not None:
+            self.assertLess(walk.now, 60.0)
+        self.assertLess(abs(walk.gap() - STOP_AT + 0.02), 0.05)
+        self.assertEqual((other.x, other.y), place)
+
+    def test_belief_ends(self) -> None:
+        """A target that stays hidden is forgotten in the end, and searched anew."""
+        walk = self.hidden()
+        began = walk.now
+        while walk.now - began < HIDDEN + 0.5:
+            walk.live(walk.behaviour.hold)
+        self.assertIsNone(walk.behaviour.cost)
+
+    def test_free_view_tells_that_it_is_gone(self) -> None:
+        """A target that was taken away is forgotten as before where nothing stands between."""
+        walk = self.hidden()
+        walk.world.move_dog("dog2", 2.85, 0.15, 0.0)
+        walk.world.clear_target()
+        began = walk.now
+        while walk.now - began < MEMORY + 0.5:
+            walk.live(walk.behaviour.hold)
         self.assertIsNone(walk.behaviour.cost)
 
 
