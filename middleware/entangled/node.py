@@ -91,7 +91,7 @@ class EntangledNode:
         self.replica = Replica(store, self.endpoint, clock, chores)
         self._owner = Owner(identity, lease, store, self.replica, self.overlay, self.endpoint, clock, chores)
         self._membership = membership = Membership(self.overlay, self.endpoint, clock, rng, chores)
-        membership.needs_use = self.reach.needs_use
+        membership.sounding.needs_use = self.reach.needs_use
         self.endpoint.on_let_go = self.reach.let_go
         self._detour = membership.detour
         self.discovery = (

@@ -10,7 +10,8 @@ from twisted.internet.defer import Deferred
 from middleware.entangled.kademlia import membership, overlay, roster
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.distance import closest
-from middleware.entangled.kademlia.membership import LARGE_FOR, NEAR_SILENCE, SESSION_S
+from middleware.entangled.kademlia.membership import LARGE_FOR
+from middleware.entangled.kademlia.sounding import NEAR_SILENCE, SESSION_S
 from middleware.entangled.kademlia.overlay import MOST_HEDGE, K
 from middleware.entangled.kademlia.pace import FIRST
 from middleware.entangled.network.network import Address
@@ -92,7 +93,7 @@ class LargeTests(FleetCase):
         fleet = self.large()
         node = fleet.nodes[0]
         far = self.far(node)
-        node._membership.needs_use = lambda contact: contact == far
+        node._membership.sounding.needs_use = lambda contact: contact == far
         asked = self.pings(node)
         fleet.run(FIRST)
         self.assertGreater(asked[far.node_id], 1)
@@ -119,7 +120,7 @@ class LargeTests(FleetCase):
         """Who hears nobody at all for a while takes itself for out of touch, and not all others for dead."""
         fleet = self.large()
         before = len(fleet.nodes[5].overlay.contacts())
-        fleet.nodes[5]._membership._pace.wait = 1.0
+        fleet.nodes[5]._membership.sounding.pace.wait = 1.0
         fleet.board.partition([fleet.address(5)])
         fleet.run(6.0)
         self.assertGreater(len(fleet.nodes[5].overlay.contacts()), before - K)
@@ -135,9 +136,9 @@ class LargeTests(FleetCase):
         node = fleet.nodes[0]
         fleet.run(FIRST)
         far = self.far(node)
-        node._membership._pace.wait = 10 * SESSION_S
+        node._membership.sounding.pace.wait = 10 * SESSION_S
         other = next(other for other in fleet.nodes if other.contact == far)
-        other._membership._pace.wait = 10 * SESSION_S
+        other._membership.sounding.pace.wait = 10 * SESSION_S
         fleet.run(SESSION_S + 60.0)
         self.assertFalse(node.endpoint.is_met(far))
         self.assertIn(far, node.overlay.contacts())

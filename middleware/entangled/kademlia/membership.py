@@ -4,14 +4,13 @@ Every ping carries a digest of the live members; where two nodes differ, one ask
 it did not know (nobody enters unproved).  So in a small team everybody knows everybody, and after a partition the two
 sides find each other again through any pair, whether the node that all joined by is still there or not.
 
-A network of more than ``MAX_MEMBERS`` is too large for that.  There a node asks its neighbours often, for they hold
-what it holds, and of the others whoever was silent for longest, at a ``pace`` that follows how many come and go.
+A network of more than ``MAX_MEMBERS`` is too large for that.  There a node sounds out its contacts (``sounding``).
 """
 
 from __future__ import annotations
 
 import random
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from twisted.internet.defer import Deferred, DeferredList
 from twisted.internet.interfaces import IReactorTime
@@ -21,9 +20,9 @@ from middleware.entangled.background import Background
 from middleware.entangled.errors import NoAnswer, NotRunning, Refused
 from middleware.entangled.kademlia.contact import Contact, unpacked
 from middleware.entangled.kademlia.detour import Detour
-from middleware.entangled.kademlia.overlay import K, Overlay, contacts_of
-from middleware.entangled.kademlia.pace import Pace
+from middleware.entangled.kademlia.overlay import Overlay, contacts_of
 from middleware.entangled.kademlia.roster import MAX_MEMBERS
+from middleware.entangled.kademlia.sounding import PROBE, Sounding
 from middleware.entangled.network.network import Address
 from middleware.entangled.wire.endpoint import Endpoint
 
@@ -31,7 +30,6 @@ SILENCE = 3.0
 """Seconds without a word after which a contact is asked whether it is still there, in a team of ``SMALL``."""
 SMALL = 10
 MAX_SILENCE = 9.0
-PROBE = 1.0
 REFRESH = 3600.0
 """Seconds after which a bucket that nobody searched is refreshed (Kademlia, section 2.3)."""
 BACKOFF = (0.2, 5.0)
@@ -44,18 +42,6 @@ AGAIN = 4.0
 LARGE_FOR = 60.0
 """Seconds for which one word that the network is too large to be known whole holds against those who do not see it.
 Who hears no such word for as long again begins to know the members anew."""
-AROUND = (3.0, 60.0)
-"""Seconds until a newcomer of a large network looks up its own id again; twice as many each time, up to these."""
-NEAR_SILENCE = 12.0
-"""Seconds of silence after which a neighbour, or one whose way has to be used, is asked in a large network."""
-PROBES = 2
-"""Far contacts that are asked in one ``PROBE``."""
-UPKEEP = 15.0
-"""Seconds between two looks at what changes slowly in a large network."""
-SESSION_S = 120.0
-"""Seconds of silence after which a session is let go of in a large network: there are too many peers to keep all."""
-IN_TOUCH = 90.0
-"""Seconds of silence up to which the other side surely has its end of a session yet."""
 BREATH = 0.02
 """Seconds that a newcomer lets its first reads, and those of others, have before it meets the next few strangers, and
 as much again at most."""
@@ -68,10 +54,7 @@ PAGE = 20
 
 
 class Membership:
-    """The comings and goings around one node.
-
-    ``needs_use`` says of a contact whether the way to it is open for only so long as it is used.
-    """
+    """The comings and goings around one node."""
 
     _log = Logger()
 
@@ -88,11 +71,7 @@ class Membership:
         self._listed_at: dict[bytes, float] = {}
         self._returning = False
         self._large_until = float("-inf")
-        self._pace = Pace()
-        self._sounding: set[bytes] = set()
-        self._next_sounding = self._next_upkeep = float("-inf")
-        self._fragile: list[Contact] = []
-        self.needs_use: Callable[[Contact], bool] = lambda contact: False
+        self.sounding = Sounding(overlay, endpoint, rng, chores, self._keep_up)
         self._joining = False
         self._is_entered = False
         self.detour = Detour(overlay, endpoint, clock, rng, chores, self._enter)
@@ -157,12 +136,11 @@ class Membership:
             await self._overlay.lookup(self._overlay.own_id)
         self._overlay.is_placed = True
         if self._overlay.is_large:
-            self._chores.fork(self._look_around())
+            self._chores.fork(self.sounding.look_around())
 
     def lost(self, contact: Contact) -> None:
         """Keep in mind where ``contact`` was."""
-        self._pace.lost()
-        self._next_sounding = float("-inf")
+        self.sounding.lost()
         if contact.address.is_virtual:
             return
         self._former.pop(contact.address, None)
@@ -269,7 +247,7 @@ class Membership:
         if not self._overlay.is_large:
             self._overlay.grew()
             if self._overlay.is_placed:
-                self._chores.fork(self._look_around())
+                self._chores.fork(self.sounding.look_around())
 
     async def _count_absent(self) -> None:
         """Count as absent whom others know and this newcomer cannot reach, or it would take its side of a cut for all.
@@ -312,7 +290,7 @@ class Membership:
 
     def _probe(self) -> None:
         overlay, now = self._overlay, self._clock.seconds()
-        if overlay.is_large and self._sound_out(now):
+        if overlay.is_large and self.sounding.step(now):
             return
         overlay.roster.strike(now)
         contacts = overlay.contacts()
@@ -340,107 +318,9 @@ class Membership:
 
     # -- in a large network -----------------------------------------------------------------------------------------
 
-    async def _look_around(self) -> None:
-        """Look up the own id again until that brings no nearer ones: where many come at once nobody knows many yet."""
-        overlay, pause = self._overlay, AROUND[0]
-        while not self._chores.is_stopped and overlay.is_large:
-            before = overlay.neighbours()
-            await self._chores.sleep(pause * (0.75 + self._rng.random() / 2))
-            pause = min(2 * pause, AROUND[1])
-            await overlay.lookup(overlay.own_id)
-            if len(before) == K and overlay.neighbours() == before:
-                return
-
-    def _sound_out(self, now: float) -> bool:
-        """Ask neighbours that were silent for a while, and a few of the others; False where this node is lost."""
-        overlay = self._overlay
-        if not overlay.is_placed:
-            return False
-        near = overlay.neighbours()
-        if not near:
-            return False
-        if now >= self._next_upkeep:
-            self._next_upkeep = now + UPKEEP
-            self._keep_up(now)
-        for contact in near:
-            if overlay.silence(contact) > NEAR_SILENCE:
-                self._sound(contact, True)
-        for contact in self._fragile:
-            if overlay.silence(contact) > NEAR_SILENCE and overlay.is_contact(contact):
-                self._sound(contact, True)
-        if now >= self._next_sounding or overlay.is_anybody_doubted:
-            self._next_sounding = self._sound_far(now)
-        return True
-
     def _keep_up(self, now: float) -> None:
-        """Do what need not be done every second."""
-        overlay = self._overlay
-        overlay.patience = self._pace.wait
-        overlay.tidy()
-        self._endpoint.let_go(SESSION_S)
         self._look_whether_large(now)
         self._refresh(now)
-        self._fragile = [contact for contact in overlay.contacts() if self.needs_use(contact)]
-
-    def _sound_far(self, now: float) -> float:
-        """Ask those of the contacts that were silent for longest; the moment when the next one may be due."""
-        overlay, wait, left = self._overlay, self._pace.wait, PROBES
-        silences = overlay.silences()
-        if not silences or silences[-1][1] > SILENCE:
-            return now + PROBE  # nobody at all is heard: it is this node that is out of touch
-        near = {contact.node_id for contact in overlay.neighbours()}
-        for doubted in overlay.doubted():
-            if doubted.node_id not in near and left > 0:
-                self._sound(doubted, False)
-                left -= 1
-        for node_id, silence in silences:
-            if silence <= wait:
-                return now + min(wait - silence, UPKEEP)
-            contact = overlay.contact(node_id)
-            if contact is None or node_id in self._sounding or node_id in near:
-                continue
-            if left <= 0:
-                return now + PROBE
-            self._sound(contact, False)
-            left -= 1
-        return now + UPKEEP
-
-    def _sound(self, contact: Contact, is_near: bool) -> None:
-        if contact.node_id not in self._sounding:
-            self._sounding.add(contact.node_id)
-            self._chores.fork(self._sounded(contact, is_near))
-
-    async def _sounded(self, contact: Contact, is_near: bool) -> None:
-        """Ask a contact whether it is there, without the cost of a handshake where it is not."""
-        overlay = self._overlay
-        silence = overlay.silence(contact)
-        try:
-            if silence < IN_TOUCH and not overlay.is_doubted(contact) and self._endpoint.is_met(contact):
-                await overlay.ask(contact, "ping", b"", changes=True, is_light=True)
-            else:
-                await self._greet_again(contact, is_near)
-            if not is_near and silence >= self._pace.wait:
-                self._pace.answered()
-        except NoAnswer:
-            if not is_near:
-                overlay.missed(contact, is_over=True)
-            raise
-        finally:
-            self._sounding.discard(contact.node_id)
-
-    async def _greet_again(self, contact: Contact, is_near: bool) -> None:
-        """See whether ``contact`` still listens at its address; a neighbour shows its key as well."""
-        try:
-            found = await self._endpoint.greet(contact.address)
-            if found.public != contact.public:
-                raise NoAnswer(f"another node listens at {contact.address}")
-        except NoAnswer:
-            self._overlay.missed(contact)
-            raise
-        if is_near:
-            await self._overlay.ask(contact, "ping", b"", changes=True)
-        else:
-            self._overlay.heard(contact)
 
     def _look_whether_large(self, now: float) -> None:
         """Be sure from time to time that the network is still large, by what is known here or by others' word."""
