@@ -26,6 +26,8 @@ AT_IT = math.radians(12.0)
 TURN_FIRST = math.radians(25)
 IN_THE_WAY = 0.30
 SIDESTEP, CREEP = 0.10, 0.04
+SHOULDER = 2.0
+"""So many of its own radii a robot goes on aside once its eyes are past what stands between: its body is broader."""
 TOUCHING = 0.30
 """Who faces a target that seems no farther away and bumps into something bumped into the target."""
 TIGHT = 3.0
@@ -63,6 +65,7 @@ class SearchAndApproach:
         self._is_lit = self._is_bumped = self._was_bumped = self._has_arrived = False
         self._moved: tuple[Pose, float] = (0.0, 0.0, 0.0), -math.inf
         self._asked_at = -math.inf
+        self._blocked_at = math.inf, math.inf
         self._way = 0.0
         self._north: float | None = None
 
@@ -221,10 +224,12 @@ class SearchAndApproach:
             return means.spin(turn)
         if self._ahead < IN_THE_WAY and self._is_hidden:
             # Something stands between: step aside, keep the eyes on the target; or go round it.
-            if means.strafes:
-                return {**STAND, "base.vy": self._side * SIDESTEP, "base.wz": turn}
-            self._detour.begin(self._pose, self._side, now, has_touched=False)
-            return self._dodge(now) or STAND
+            if not means.strafes:
+                self._detour.begin(self._pose, self._side, now, has_touched=False)
+                return self._dodge(now) or STAND
+            self._blocked_at = self._pose[:2]
+        if math.dist(self._pose[:2], self._blocked_at) < SHOULDER * means.radius:
+            return {**STAND, "base.vy": self._side * SIDESTEP, "base.wz": turn}
         return means.go(clipped(max(CREEP, gap - means.stop_at), means.walk), turn)
 
     @property
