@@ -235,7 +235,7 @@ class HiddenTests(SynchronousTestCase):
             self.assertIsNotNone(walk.behaviour.cost)
 
     def test_way_leads_round_it(self) -> None:
-        """Sent to the target, the dog goes round who hides it, and stands at the target without having pushed it away."""
+        """Sent to the target, the dog goes round who hides it, does not push it away, and stands at the target."""
         walk = self.hidden()
         other = walk.world.dogs["dog2"]
         place = other.x, other.y

@@ -11,9 +11,9 @@ from middleware.entangled.kademlia import membership, overlay, roster
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.distance import closest
 from middleware.entangled.kademlia.membership import LARGE_FOR
-from middleware.entangled.kademlia.sounding import NEAR_SILENCE, SESSION_S
 from middleware.entangled.kademlia.overlay import MOST_HEDGE, K
 from middleware.entangled.kademlia.pace import FIRST
+from middleware.entangled.kademlia.sounding import NEAR_SILENCE, SESSION_S
 from middleware.entangled.network.network import Address
 from middleware.entangled.network.switchboard import SwitchboardNetwork
 from middleware.entangled.node import EntangledNode
