@@ -13,10 +13,10 @@ import numpy as np
 from twisted.trial.unittest import SynchronousTestCase
 
 from sim.crowd.controller import CONTROLLERS, Senses
-from sim.crowd.crowd import RAYS, TICK, Crowd
+from sim.crowd.crowd import RAYS, Crowd
 from sim.crowd.ground import CELL, MAX_BODIES, Ground, roomy
 from sim.scene import FOOTPRINT, Kennel, Scene, SceneError
-from sim.world import SUBSTEP, NotPossible, World
+from sim.world import SUBSTEP, TICK, NotPossible, World
 
 ROOT = Path(__file__).resolve().parents[3]
 RUN = """
