@@ -17,6 +17,9 @@ from sim.scene import FOOTPRINT, Scene
 
 SUBSTEP = 0.008
 """Seconds of one ``step``; the ERS-7 samples its sensors as often."""
+SUBSTEPS = 4
+TICK = SUBSTEPS * SUBSTEP
+"""Seconds by which a yard goes on at a time: one sensor frame of the ERS-7."""
 WALL_THICKNESS = 0.04
 TRIES = 2000
 LATEST = 3600.0

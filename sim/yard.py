@@ -10,37 +10,32 @@ from typing import Any
 
 from twisted.internet.interfaces import IReactorTime
 
-from drivers.link import Link, MemoryConnector
 from drivers.sim.codec import VERSION, Done, Message, Order, Overlook, Truth
 from sim.camera import Camera
 from sim.emulator.dog import DogBody
-from sim.reception import Reception
+from sim.paced import PacedYard
 from sim.scene import Scene
 from sim.sensor import Sensors as Senses
 from sim.session import Beat, Session
-from sim.world import SUBSTEP, NotPossible, World
+from sim.world import SUBSTEPS, TICK, NotPossible, World
 
-SUBSTEPS = 4
-TICK_S = SUBSTEP * SUBSTEPS
-MAX_LATE_S = 1.0
 MAX_SESSIONS = 64
-MAX_RATE = 1.0 / TICK_S
+MAX_RATE = 1.0 / TICK
 
 
-class Yard:
-    """One yard; ``start`` lets its time run on ``clock``, ``attach`` takes a connection.
+class Yard(PacedYard):
+    """The yard of a ``scene``.
 
     The truth is in ``world``; whoever referees may look there, or ask as an operator over a link.
     """
 
     def __init__(self, clock: IReactorTime, rng: Random, scene: Scene) -> None:
-        self._clock = clock
         self.world = World(Random(rng.getrandbits(64)), scene)
         self._camera = Camera(Random(rng.getrandbits(64)), self.world)
         self._senses = {
             name: Senses(Random(rng.getrandbits(64)), self.world, dog) for name, dog in self.world.dogs.items()
         }
-        self._reception = Reception(self.world.dogs, self.world, self._now, MAX_SESSIONS, self._on_operator)
+        super().__init__(clock, self.world.dogs, self.world, MAX_SESSIONS, self._on_operator)
         self._orders: dict[str, tuple[Callable[..., None], tuple[type, ...]]] = {
             "place_target": (self.world.place_target, (float, float)),
             "place_target_at_random": (self.world.place_target_at_random, ()),
@@ -49,14 +44,6 @@ class Yard:
             "move_dog": (self.world.move_dog, (str, float, float, float)),
             "scatter": (self.world.scatter, (int,)),
         }
-        self._origin = clock.seconds()
-        self._ticks = 0
-        self._pending: Any = None
-
-    @property
-    def holders(self) -> list[str]:
-        """The dogs that a driver holds now."""
-        return [name for name in self.world.dogs if name in self._reception.holders]
 
     def truth(self) -> dict[str, object]:
         """The whole yard as seen from above, and of each dog what its gate has let through and refused."""
@@ -65,22 +52,6 @@ class Yard:
         counts = [{"token": g.token or 0, "accepted": g.accepted, "refused": sum(g.refused.values())} for g in gates]
         dogs: Any = snapshot["dogs"]
         return {**snapshot, "dogs": [{**dog, **count} for dog, count in zip(dogs, counts, strict=True)]}
-
-    def start(self) -> None:
-        """Let time run from now on."""
-        self._origin = self._clock.seconds() - self._ticks * TICK_S
-        self._schedule()
-
-    def stop(self) -> None:
-        """Let time stand still, and close every connection."""
-        if self._pending is not None:
-            self._pending.cancel()
-            self._pending = None
-        self._reception.close()
-
-    def attach(self, link: Link) -> Session:
-        """Take a new connection; what arrives on it goes to the session that is returned."""
-        return self._reception.attach(link)
 
     def lend(self, name: str, limits: Mapping[str, tuple[float, float]]) -> DogBody:
         """Hand a dog over to an emulator, which moves it within ``limits`` from now on; no driver may hold it here.
@@ -96,29 +67,12 @@ class Yard:
         """Have operators order ``verb`` as well, with arguments of ``kinds``."""
         self._orders[verb] = (work, kinds)
 
-    def connector(self, delay: float = 0.0005) -> MemoryConnector:
-        """What drivers in this process connect through: ``SimDriver(options, yard.connector(), clock)``."""
-        return MemoryConnector(self._clock, self.attach, delay)
-
-    def _now(self) -> float:
-        """The yard's time between the ticks too, in seconds since its start."""
-        return self._clock.seconds() - self._origin
-
-    def _schedule(self) -> None:
-        self._pending = self._clock.callLater(max(0.0, (self._ticks + 1) * TICK_S - self._now()), self._turn)
-
-    def _turn(self) -> None:
-        late = self._now() - (self._ticks + 1) * TICK_S
-        if late > MAX_LATE_S:
-            # After a suspended machine nobody wants the lost minutes back at once, nor what was ordered before them.
-            self._origin += late
-            late = 0.0
-            self._reception.halt()
-        due = 1 + max(0, math.floor(late / TICK_S + 1e-6))
+    def _play(self, late: float) -> int:
+        due = 1 + max(0, math.floor(late / TICK + 1e-6))
         for left in range(due - 1, -1, -1):
             # A late yard drops pictures, never physics.
             self._tick(with_pictures=left == 0)
-        self._schedule()
+        return due
 
     def _tick(self, with_pictures: bool) -> None:
         for _ in range(SUBSTEPS):
@@ -126,7 +80,6 @@ class Yard:
             self.world.step()
             for senses in self._senses.values():
                 senses.sample()
-        self._ticks += 1
         self._report(with_pictures)
         self._reception.drop_silent()
 

@@ -54,7 +54,7 @@ EXAMPLES = sorted((ROOT / "examples").glob("*.toml"))
 FIGURES: Sequence[tuple[str, str]] = (
     ("simulator", f"until somebody has gone {50 * ray.SKIN:g} cm"),
     ("simulator", f"overlaps by more than {1000 * crowd.SLOP:g} mm"),
-    ("simulator", f"Steps are of {1000 * crowd.TICK:g} ms"),
+    ("simulator", f"Steps are of {1000 * world.TICK:g} ms"),
     ("agents", f"one turn each {1000 * loop.TICK:g} ms"),
     ("agents", f"its battery is empty (below {body.EMPTY:g} where it tells its level)"),
     ("agents", f"the simulated dog | {means.WALK:g} m/s"),

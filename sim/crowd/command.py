@@ -13,12 +13,12 @@ from dataclasses import asdict
 from pathlib import Path
 
 from sim.crowd.controller import CONTROLLERS, Controller, Senses
-from sim.crowd.crowd import TICK, Crowd
+from sim.crowd.crowd import Crowd
 from sim.crowd.ground import ROOM, Ground, roomy
 from sim.crowd.picture import drawn
 from sim.crowd.search import Outcome, Team, kinds, search, table
 from sim.scene import SceneError
-from sim.world import NotPossible
+from sim.world import TICK, NotPossible
 
 MakeTeam = Callable[[int, int, Ground, Controller, Callable[[], float]], Team]
 """Seed, agents, ground, the controller of the others, a stopwatch."""

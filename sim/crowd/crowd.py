@@ -17,10 +17,8 @@ from sim.crowd.neighbour import Neighbours
 from sim.crowd.ray import Disc, Rays
 from sim.dog import ACCELERATION, ANGULAR_ACCELERATION, BRAKING, LIMITS
 from sim.scene import FOOTPRINT, SceneError
-from sim.world import NotPossible, Target
+from sim.world import TICK, NotPossible, Target
 
-TICK = 0.032
-"""Seconds of one ``step``: one sensor frame of the ERS-7."""
 RAYS = 8
 REACH = 1.7
 """Metres of a ray from the middle of a robot: a little more than its far ranger reaches from the nose."""

@@ -12,10 +12,10 @@ from random import Random
 import numpy as np
 
 from drivers.reading import Value
-from sim.crowd.crowd import REACH, TICK, Crowd
+from sim.crowd.crowd import REACH, Crowd
 from sim.crowd.ground import Floats
 from sim.sensor import BATTERY_S, CHEST, CHEST_PITCH, CHEST_REACH, FAR, FLOOR, GRAVITY, NEAR, NOSE, SAMPLED
-from sim.world import SUBSTEP
+from sim.world import SUBSTEP, TICK
 
 _KEYS = (
     *("base.vx", "base.vy", "base.wz", "odom.x", "odom.y", "odom.yaw", "compass.heading"),

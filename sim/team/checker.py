@@ -1,4 +1,7 @@
-"""Checker: what must hold of a history, whoever made it; every judgement over a run is here, and none elsewhere.
+"""Checker: what must hold of a history, whoever made it.
+
+What stands in no history it cannot judge: workloads that compare what they see with the team as it is, such as lookups,
+values, takeovers and tasks, do so themselves (``verdict``), under the same letters where the invariant is the same.
 
 The invariants have letters and numbers, under which the documents promise them: E of execution, D of durability, T of
 tuples, R of the wire.  Each is a function of the events; what was asked and never answered counts as "maybe".

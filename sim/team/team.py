@@ -44,6 +44,11 @@ Told = Callable[[float, str, int, str], object]
 """Called with the moment, what happened, at which place (-1: at none), and more about it."""
 
 
+def core(node: Node) -> EntangledNode:
+    """The peer of the network that a node is, or has."""
+    return node.entangled if isinstance(node, SwarmNode) else node
+
+
 class Place:
     """What stays at a place from life to life; ``step`` is how wrong its wall clock is."""
 
@@ -119,8 +124,7 @@ class Team:
 
     def entangled(self, place: int) -> EntangledNode:
         """The peer of the network that the node of a place is, or has."""
-        node = self.nodes[place]
-        return node.entangled if isinstance(node, SwarmNode) else node
+        return core(self.nodes[place])
 
     def identity(self, place: int) -> Identity:
         """Who the node of a place is."""

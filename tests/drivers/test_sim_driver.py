@@ -135,6 +135,7 @@ class SimDriverTests(DriverContract, SynchronousTestCase):
     def test_is_stale_when_the_yard_falls_silent(self) -> None:
         """A yard that sends nothing though its link is open makes the driver stale, and act refuses."""
         driver = self.ready()
+        assert self.yard._pending is not None
         self.yard._pending.cancel()
         self.yard._pending = None
         self.pass_time(SimDriver.STALE_S + 0.1)

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from typing import Any
 
-from twisted.internet.defer import Deferred
 from twisted.python.failure import Failure
 
-from middleware.entangled.errors import EntangledError, Unavailable
+from middleware.entangled.errors import EntangledError
 from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.overlay import K
 from middleware.entangled.node import EntangledNode
 from middleware.entangled.record import Record, hashed_key
+from sim.team.clients import REMOVE, Clients
 from sim.team.event import Counted, Met, Stored
 from sim.team.invariant.durability import Slot
 from tests.invariants.schedule import Schedule
@@ -29,7 +28,7 @@ class Records:
         self._schedule = schedule
         self._history = schedule.history
         self._rng = schedule.rng
-        self._written: Counter[Slot] = Counter()
+        self._clients = Clients(schedule.history)
         self._held: dict[tuple[int, int, Slot], tuple[int, bytes]] = {}
         self._met: dict[int, set[Contact]] = {}
         self._old: list[Record] = []
@@ -67,42 +66,25 @@ class Records:
 
     def _put(self, place: int) -> None:
         key, name = self._rng.choice(KEYS), self._rng.choice(NAMES)
-        concern = self._rng.choice(["majority", "majority", "majority", "all"])
-        self._write(place, key, name, concern)
+        concern: Any = self._rng.choice(["majority", "majority", "majority", "all"])
+        self._clients.write(place, self._schedule.node(place), key, name, concern)
 
     def _remove(self, place: int) -> None:
-        mine = [slot for slot in self._written if slot.owner == self._schedule.node(place).identity.public]
+        node = self._schedule.node(place)
+        mine = self._clients.slots(node.identity.public)
         if mine:
             slot = self._rng.choice(mine)
-            self._write(place, slot.key, slot.name, "majority", is_removal=True)
-
-    def _write(self, place: int, key: bytes, name: str, concern: Any, is_removal: bool = False) -> None:
-        node = self._schedule.node(place)
-        slot = Slot(key, node.identity.public, name)
-        self._written[slot] += 1
-        number = self._written[slot]
-        asked = self._history.asked(place, "remove" if is_removal else "write", slot, number)
-        stored = node.remove(key, name, concern) if is_removal else node.put(key, name, b"%d" % number, "team", concern)
-        stored.addCallbacks(lambda _: self._history.answered(asked), self._failed, errbackArgs=(asked,))
+            self._clients.write(place, node, slot.key, slot.name, act=REMOVE)
 
     def _read(self, place: int) -> None:
         self._get(place, self._rng.choice(KEYS), self._rng.choice(["majority", "majority", "fast"]))
 
     def _get(self, place: int, key: bytes, concern: Any) -> None:
-        node = self._schedule.node(place)
-        # Another life of a node is another client: what it has read itself it may have forgotten.
-        asked = self._history.asked((place, self._schedule.life[place]), "read", key, concern)
-        work: Deferred[list[Record]] = node.get(key, concern)
-        work.addCallbacks(self._shown, self._failed, (asked,), {}, (asked,))
+        life = self._schedule.life[place]
+        self._clients.read(place, life, self._schedule.node(place), key, concern).addCallback(self._keep)
 
-    def _shown(self, records: list[Record], asked: int) -> None:
-        shown = {Slot(*record.slot): int(record.value or b"0") for record in records}
-        self._history.answered(asked, shown)
+    def _keep(self, records: list[Record]) -> None:
         self._old += [record for record in records if len(self._old) < 50]
-
-    def _failed(self, failure: Failure, asked: int) -> None:
-        failure.trap(EntangledError)
-        self._history.unanswered(asked, failure.value, failure.check(Unavailable) is not None)
 
     def _find(self, place: int, target: bytes) -> None:
         asked = self._history.asked(place, "look up", target, K)

@@ -213,6 +213,12 @@ class DirectoryTests(FleetCase):
             self.assertEqual(here - set(listed), set(), "somebody is missing")
             self.assertEqual(set(listed) - here - late, set(), "somebody is listed who left")
 
+    def all_stay(self, town: Town, readers: int = 2, times: int = 12, pause: float = 5.0) -> None:
+        """They are all there so many ``times``, ``pause`` seconds apart."""
+        for _ in range(times):
+            town.clock.advance(pause)
+            self.all_there(town, readers)
+
     def test_growth_and_back(self) -> None:
         """From 3 devices to 300 and back, at every moment everybody is listed once, and at the end it is one key."""
         town = Town()
@@ -240,9 +246,7 @@ class DirectoryTests(FleetCase):
         town.come(20, 1.0)
         town.come(200, 0.0)
         self.all_there(town, 5)
-        for _ in range(12):
-            town.clock.advance(5.0)
-            self.all_there(town, 2)
+        self.all_stay(town)
 
     def test_estimates_that_disagree(self) -> None:
         """Where some know few of their neighbours and some many that left, all are listed all the same, by all."""
@@ -250,9 +254,7 @@ class DirectoryTests(FleetCase):
         town.come(250, 0.1)
         for neighbour in town.dice.sample(town.neighbours, 60):
             neighbour.error = town.dice.choice((1.0, 1.5, 2.0))
-        for _ in range(10):
-            town.clock.advance(REVIEW)
-            self.all_there(town, 4)
+        self.all_stay(town, 4, 10, REVIEW)
 
     def test_partition_and_healing(self) -> None:
         """Both sides of a cut list themselves; when it heals, everybody lists all at once, though they stand apart."""
@@ -268,9 +270,7 @@ class DirectoryTests(FleetCase):
         self.assertEqual(len(self.listed(next(n for n in town.neighbours if n not in away))), 220)
         town.heal()
         self.all_there(town, 5)
-        for _ in range(12):
-            town.clock.advance(5.0)
-            self.all_there(town, 2)
+        self.all_stay(town)
 
     def test_half_vanish(self) -> None:
         """When half of all vanish at once, the others are never missing, and within a lease nobody else is listed."""
@@ -281,9 +281,8 @@ class DirectoryTests(FleetCase):
         town.go(gone)
         self.all_there(town, 3, gone)
         town.clock.advance(max(n.directory.lease for n in gone))
-        for _ in range(20):
-            self.all_there(town, 1)
-            town.clock.advance(5.0)
+        self.all_there(town, 1)
+        self.all_stay(town, 1, 19)
 
     def test_liars(self) -> None:
         """Whoever writes where it does not stand is not listed there, hides nobody, and costs few reads."""

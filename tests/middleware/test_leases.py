@@ -14,8 +14,8 @@ class LeaseTests(FleetCase):
         """What one node holds there."""
         return [record.name for record in fleet.nodes[place].store.get(key, tombstones=True)]
 
-    def alive(self, fleet: Fleet, place: int) -> list[float]:
-        """The leases that the node of ``place`` is told from now on, one for each sign of life."""
+    def told(self, fleet: Fleet, place: int, seconds: float) -> list[float]:
+        """The leases that the node of ``place`` is told in the next seconds, one for each sign of life."""
         told: list[float] = []
         replica = fleet.nodes[place].replica
         answer = replica.answer_alive
@@ -25,6 +25,7 @@ class LeaseTests(FleetCase):
             answer(peer, lease, digest)  # type: ignore[arg-type]
 
         fleet.nodes[place].endpoint.expose("alive", heard, changes=True, idempotent=True)
+        fleet.run(seconds)
         return told
 
     def test_each_its_own(self) -> None:
@@ -48,9 +49,7 @@ class LeaseTests(FleetCase):
         fleet = self.fleet(2)
         fleet.nodes[1].put(KEY, "long", b"x", "leased", lease=60.0)
         fleet.run(30.0)
-        told = self.alive(fleet, 0)
-        fleet.run(60.0)
-        self.assertEqual(told, [60.0] * 3)
+        self.assertEqual(self.told(fleet, 0, 60.0), [60.0] * 3)
 
     def test_the_shorter_one_is_told(self) -> None:
         """Who holds a long lease and a short one is told the short one, and after it has ended the long one again."""
@@ -58,14 +57,10 @@ class LeaseTests(FleetCase):
         fleet.nodes[1].put(KEY, "long", b"x", "leased", lease=60.0)
         fleet.nodes[1].put(OTHER, "short", b"x", "leased")
         fleet.run(30.0)
-        told = self.alive(fleet, 0)
-        fleet.run(6.0)
-        self.assertEqual(told, [1.0] * 18)
+        self.assertEqual(self.told(fleet, 0, 6.0), [1.0] * 18)
         fleet.nodes[1].release(OTHER, "short")
         fleet.run(30.0)
-        del told[:]
-        fleet.run(60.0)
-        self.assertEqual(told, [60.0] * 3)
+        self.assertEqual(self.told(fleet, 0, 60.0), [60.0] * 3)
 
     def test_who_has_the_long_one_only(self) -> None:
         """Who holds only the long lease of an owner is told of it as seldom as it is long."""
@@ -80,9 +75,7 @@ class LeaseTests(FleetCase):
         owner.put(KEY, "long", b"x", "leased", lease=60.0)
         owner.put(key, "short", b"x", "leased")
         fleet.run(30.0)
-        told = self.alive(fleet, place)
-        fleet.run(60.0)
-        self.assertEqual(told, [60.0] * 3)
+        self.assertEqual(self.told(fleet, place, 60.0), [60.0] * 3)
 
     def test_a_short_one_comes_later(self) -> None:
         """A short lease that begins between two far signs of a long one is kept alive from its first moment on."""
@@ -130,9 +123,7 @@ class LeaseTests(FleetCase):
         fleet = self.fleet(2)
         fleet.nodes[1].put(KEY, "short", b"x", "leased", lease=0.1)
         fleet.run(5.0)
-        told = self.alive(fleet, 0)
-        fleet.run(3.0)
-        self.assertEqual(told, [1.0] * 9)
+        self.assertEqual(self.told(fleet, 0, 3.0), [1.0] * 9)
 
     def test_the_nodes_lease_changes(self) -> None:
         """A node whose lease becomes longer than a record's own keeps that record for the longer one."""
@@ -141,11 +132,7 @@ class LeaseTests(FleetCase):
         fleet.run(3.0)
         fleet.nodes[1].set_lease(30.0)
         fleet.run(1.0)
-        told = self.alive(fleet, 0)
-        fleet.run(60.0)
-        self.assertEqual(told, [30.0] * 6)
+        self.assertEqual(self.told(fleet, 0, 60.0), [30.0] * 6)
         fleet.nodes[1].set_lease(1.0)
         fleet.run(3.0)
-        del told[:]
-        fleet.run(12.0)
-        self.assertEqual(told, [6.0] * 6)
+        self.assertEqual(self.told(fleet, 0, 12.0), [6.0] * 6)

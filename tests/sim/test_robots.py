@@ -24,7 +24,8 @@ from sim.emulator.dog import DogBody
 from sim.emulator.pty import PtyPort
 from sim.robots import Robots
 from sim.scene import loaded
-from sim.yard import TICK_S, Yard
+from sim.world import TICK
+from sim.yard import Yard
 
 
 class FakeReactor(Clock):
@@ -46,8 +47,8 @@ class YardCase(SynchronousTestCase):
 
     def pass_time(self, seconds: float) -> None:
         """Turn the clock, a tick of the yard at a time."""
-        for _ in range(round(seconds / TICK_S)):
-            self.clock.advance(TICK_S)
+        for _ in range(round(seconds / TICK)):
+            self.clock.advance(TICK)
 
 
 class DogBodyTests(YardCase):

@@ -29,7 +29,8 @@ from drivers.sim.codec import (
 from sim.reception import SILENT_S
 from sim.scene import loaded
 from sim.session import Beat, Session
-from sim.yard import TICK_S, Yard
+from sim.world import TICK
+from sim.yard import Yard
 
 
 class Client:
@@ -78,7 +79,7 @@ class YardTests(SynchronousTestCase):
     def ticks(self, count: int) -> None:
         """Let whole ticks pass."""
         for _ in range(count):
-            self.clock.advance(TICK_S)
+            self.clock.advance(TICK)
 
     def drive(self, token: int = 1, ttl: float = 0.5, sent: float | None = None, vx: float = 0.16) -> None:
         """Send a command as dog1's driver."""
@@ -95,7 +96,7 @@ class YardTests(SynchronousTestCase):
             self.client.say(Alive())
         stamps = [message.t for message in self.client.of(Sensors) if isinstance(message, Sensors)]
         self.assertEqual(len(stamps), 312)
-        self.assertAlmostEqual(stamps[-1], 312 * TICK_S, 9)
+        self.assertAlmostEqual(stamps[-1], 312 * TICK, 9)
 
     def test_catches_up_on_physics_but_not_on_pictures(self) -> None:
         """A yard that was held up for half a second makes up for the sensor frames, and draws once."""
@@ -208,7 +209,7 @@ class YardTests(SynchronousTestCase):
         """A frozen driver is hung up on after some seconds, and so is a stranger who never says hello."""
         stranger = Client(self.yard)
         lively = Client(self.yard)
-        for _ in range(round(SILENT_S / TICK_S) + 3):
+        for _ in range(round(SILENT_S / TICK) + 3):
             lively.say(Alive())
             self.ticks(1)
         self.assertEqual((self.client.is_open, stranger.is_open, lively.is_open), (False, False, True))
@@ -245,7 +246,7 @@ class YardTests(SynchronousTestCase):
         self.ticks(1)
         (newest,) = self.client.of(Sensors)
         assert isinstance(newest, Sensors)
-        self.assertAlmostEqual(newest.t, 11 * TICK_S)
+        self.assertAlmostEqual(newest.t, 11 * TICK)
         self.assertEqual({len(row) for row in newest.samples.values()}, {4})
 
     def test_lives_on_after_rubbish(self) -> None:
@@ -294,7 +295,7 @@ class BeatTests(SynchronousTestCase):
         """Any rate up to the tick rate is kept over ten seconds of ticks."""
         for rate in (1.0, 10.0, 15.0, 29.97, 30.0, 31.25):
             beat = Beat(rate)
-            count = sum(beat.is_due(tick * TICK_S) for tick in range(1, 3126))
+            count = sum(beat.is_due(tick * TICK) for tick in range(1, 3126))
             self.assertLess(abs(count - 100 * rate), 2, rate)
 
     def test_never_beats_at_rate_zero(self) -> None:

@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 from twisted.trial.unittest import SynchronousTestCase
 
 from sim.crowd.ground import Ground
 from sim.crowd.search import search
 from swarmnode.crowd import DESK, CrowdTeam
+from tests.replay import replayed
 
-ROOT = Path(__file__).resolve().parents[2]
 RUN = """
 from sim.crowd.ground import Ground
 from sim.crowd.search import search
@@ -49,14 +44,7 @@ class CrowdTeamTests(SynchronousTestCase):
 
     def test_order_of_sets_does_not_matter(self) -> None:
         """The hash seed of the interpreter changes nothing: two processes with different ones give the same hash."""
-        digests = set()
-        for hash_seed in ("1", "4242"):
-            environment = {**os.environ, "PYTHONHASHSEED": hash_seed}
-            command = [sys.executable, "-c", RUN]
-            child = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=120)
-            self.assertEqual(child.returncode, 0, child.stderr)
-            digests.add(child.stdout.strip())
-        self.assertEqual(len(digests), 1, digests)
+        replayed(self, RUN)
 
     def test_names_and_places(self) -> None:
         """The desk has no body, each agent has one, and each node an address of its own."""

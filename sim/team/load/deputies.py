@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from weakref import WeakKeyDictionary
 
-from middleware.entangled.node import EntangledNode
-from middleware.node import SwarmNode
 from sim.team.load.deputy import Deputy
-from sim.team.team import Team
+from sim.team.team import Node, Team
 
 
 class Deputies:
@@ -32,12 +30,12 @@ class Deputies:
         """Whether its node goes on."""
         return self._present.get(deputy.place) is deputy
 
-    def _born(self, place: int, node: EntangledNode | SwarmNode) -> None:
+    def _born(self, place: int, node: Node) -> None:
         self._lives += 1
         dice = self._rng(f"rooms/{place}/{self._lives}")
         self._present[place] = Deputy(place, node, self._clock, dice)
 
-    def _died(self, place: int, node: EntangledNode | SwarmNode) -> None:
+    def _died(self, place: int, node: Node) -> None:
         deputy = self._present.get(place)
         if deputy is not None and deputy.node is node:
             del self._present[place]

@@ -26,6 +26,7 @@ from middleware.entangled.node import EntangledNode
 from middleware.node import LEASE_VERBS, SwarmNode
 from middleware.tasks import Task
 from sim.team.load.tally import Tally
+from sim.team.team import Node, core
 
 
 class Rooms:
@@ -69,10 +70,10 @@ class Rooms:
 class Deputy:
     """One place's agent, as far as bidding and claiming goes, for one life of its ``node``; ``tally`` counts."""
 
-    def __init__(self, place: int, node: EntangledNode | SwarmNode, clock: IReactorTime, rng: random.Random) -> None:
+    def __init__(self, place: int, node: Node, clock: IReactorTime, rng: random.Random) -> None:
         self.place = place
         self.node = node
-        bare = node.entangled if isinstance(node, SwarmNode) else node
+        bare = core(node)
         self.uuid = bare.identity.node_id.hex()
         self.tally = Tally(bare.endpoint)
         self._rooms: Rooms | SwarmNode = node if isinstance(node, SwarmNode) else Rooms(node, self.tally, clock, rng)

@@ -6,22 +6,18 @@ Nothing is measured here but how much is answered: whether it is right, fresh an
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass, field
 
-from twisted.python.failure import Failure
-
-from middleware.entangled.errors import EntangledError, Unavailable
-from middleware.entangled.record import Record, hashed_key
+from middleware.entangled.record import hashed_key
 from middleware.setting import number, whole
+from sim.team.clients import READ, REMOVE, WRITE, Clients
 from sim.team.figure import Figure, share
-from sim.team.invariant.durability import MAJORITY, Slot
 from sim.team.load.pace import Pace
 from sim.team.load.residents import Residents
 from sim.team.team import Team
 
-WRITE, REMOVE, READ = "write", "remove", "read"
-"""As the checker knows what is asked."""
+NAME = "r"
+"""Of the one slot that each node has under a key."""
 ACTS = (WRITE, WRITE, REMOVE, READ, READ, READ)
 MOST_READERS = 32
 """Nodes that read everything at the end: in a network of thousands not all of them."""
@@ -43,14 +39,11 @@ class Records:
 
     def __init__(self, team: Team, settings: RecordSettings) -> None:
         self._team = team
-        self._history = team.history
         self._rng = team.rng("records")
         self._residents = Residents(team)
         self._pace = Pace(team.clock, settings.rate)
         self._keys = [hashed_key(f"records {number}") for number in range(settings.keys)]
-        self._written: Counter[Slot] = Counter()
-        self.asked: Counter[str] = Counter()
-        self.answered: Counter[str] = Counter()
+        self._clients = Clients(team.history)
 
     def step(self) -> None:
         """What is due, each at a random node."""
@@ -60,7 +53,7 @@ class Records:
                 if act == READ:
                     self._read(place, key)
                 else:
-                    self._write(place, key, act)
+                    self._clients.write(place, self._residents.node(place), key, NAME, act=act)
 
     def settled(self) -> None:
         """Many read everything."""
@@ -74,38 +67,13 @@ class Records:
 
     def figures(self) -> list[Figure]:
         """How much was answered; what was not may have been done."""
-        writes = self.asked[WRITE] + self.asked[REMOVE]
+        asked, answered = self._clients.asked, self._clients.answered
         return [
-            share("records.acknowledged", self.answered[WRITE] + self.answered[REMOVE], writes),
-            share("records.read", self.answered[READ], self.asked[READ]),
+            share("records.acknowledged", answered[WRITE] + answered[REMOVE], asked[WRITE] + asked[REMOVE]),
+            share("records.read", answered[READ], asked[READ]),
         ]
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
-    def _write(self, place: int, key: bytes, act: str) -> None:
-        node = self._residents.node(place)
-        slot = Slot(key, node.identity.public, "r")
-        self._written[slot] += 1
-        count = self._written[slot]
-        number = self._history.asked(place, act, slot, count)
-        self.asked[act] += 1
-        done = node.put(key, slot.name, b"%d" % count) if act == WRITE else node.remove(key, slot.name)
-        done.addCallbacks(lambda _: self._told(number, act), self._failed, errbackArgs=(number,))
-
     def _read(self, place: int, key: bytes) -> None:
-        # Another life of a node is another client: what it has read itself it may have forgotten.
-        client = place, self._team.place(place).lives
-        number = self._history.asked(client, READ, key, MAJORITY)
-        self.asked[READ] += 1
-        self._residents.node(place).get(key).addCallbacks(self._shown, self._failed, (number,), {}, (number,))
-
-    def _shown(self, records: list[Record], number: int) -> None:
-        self._told(number, READ, {Slot(*record.slot): int(record.value or b"0") for record in records})
-
-    def _told(self, number: int, act: str, result: object = None) -> None:
-        self.answered[act] += 1
-        self._history.answered(number, result)
-
-    def _failed(self, failure: Failure, number: int) -> None:
-        failure.trap(EntangledError)
-        self._history.unanswered(number, failure.value, failure.check(Unavailable) is not None)
+        self._clients.read(place, self._team.place(place).lives, self._residents.node(place), key)

@@ -5,14 +5,8 @@ from __future__ import annotations
 import random
 
 from middleware.entangled.node import EntangledNode
-from middleware.node import SwarmNode
 from sim.team.load.census import Census
-from sim.team.team import Team
-
-
-def core(node: EntangledNode | SwarmNode) -> EntangledNode:
-    """The node of the library in a node of either kind."""
-    return node.entangled if isinstance(node, SwarmNode) else node
+from sim.team.team import Node, Team, core
 
 
 class Residents:
@@ -45,7 +39,7 @@ class Residents:
         """All of them."""
         return sorted(self._order)
 
-    def _born(self, place: int, node: EntangledNode | SwarmNode) -> None:
+    def _born(self, place: int, node: Node) -> None:
         life = core(node)
 
         def entered(is_in: bool) -> None:
@@ -57,7 +51,7 @@ class Residents:
 
         self._team.entered(place).addCallback(entered)
 
-    def _died(self, place: int, node: EntangledNode | SwarmNode) -> None:
+    def _died(self, place: int, node: Node) -> None:
         if not self.lives(place, core(node)):
             return
         del self._lives[place]

@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 
 from middleware.setting import whole
 from sim.team.figure import Figure, mean, percentile
-from sim.team.load.residents import core
 from sim.team.team import Team
 
 PAGE = resource.getpagesize()
@@ -77,7 +76,7 @@ class Traffic:
         for place in self._team.places:
             (datagrams, size), (past, past_size) = self._sent(place), self._before.get(place, (0, 0))
             sent, volume, busiest = sent + datagrams - past, volume + size - past_size, max(busiest, size - past_size)
-        known = [float(len(core(self._team.nodes[place]).overlay.contacts())) for place in self._sampled()]
+        known = [float(len(self._team.entangled(place).overlay.contacts())) for place in self._sampled()]
         n = len(self._team.nodes)
         memory = (resident_bytes() - self._bare_bytes) / 1024 / max(1, n)
         return [

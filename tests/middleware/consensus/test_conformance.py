@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import math
-import os
 import runpy
-import subprocess
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -26,6 +23,7 @@ from middleware.consensus.rendezvous import Centre, Median, Rendezvous
 from middleware.consensus.sequential import Sequential
 from middleware.consensus.strategy import BUILT_IN, Consensus, Report, digest_of, strategy_for
 from middleware.consensus.weighted_vote import WeightedVote
+from tests.replay import replayed
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -247,17 +245,9 @@ class ConformanceTests(SynchronousTestCase):
 
     def test_same_in_every_process(self) -> None:
         """Every strategy finds the same, digest included, however the process hashes its strings."""
-        program = (
+        replayed(
+            self,
             "import random; from middleware.consensus.conformance import team\n"
             "from middleware.consensus.strategy import BUILT_IN, strategy_for\n"
-            "for n in sorted(BUILT_IN): print(strategy_for(n).find(team(random.Random(3), 90)))\n"
+            "for n in sorted(BUILT_IN): print(strategy_for(n).find(team(random.Random(3), 90)))\n",
         )
-        told = set()
-        for seed in ("1", "2"):
-            child = subprocess.run(
-                [sys.executable, "-c", program],
-                cwd=ROOT, env={**os.environ, "PYTHONHASHSEED": seed}, capture_output=True, text=True, timeout=60,
-            )  # fmt: skip
-            self.assertEqual((child.returncode, child.stderr), (0, ""))
-            told.add(child.stdout)
-        self.assertEqual(len(told), 1)

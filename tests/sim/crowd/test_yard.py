@@ -19,11 +19,11 @@ from drivers.sim.driver import SimDriver
 from middleware.entangled.clock import HeapClock
 from sim.crowd.body import CrowdBody
 from sim.crowd.controller import stand
-from sim.crowd.crowd import TICK
 from sim.crowd.ground import Ground
 from sim.crowd.yard import SPARE, CrowdYard
 from sim.scene import FOOTPRINT, SceneError, loaded
 from sim.sensor import NOSE
+from sim.world import TICK
 from sim.yard import Yard
 
 

@@ -1,0 +1,73 @@
+"""Clients: those who write, remove and read slots at the nodes of a team, and write down what they were told.
+
+Who runs them judges nothing: the checker does, by what stands in the history (``sim.team.invariant.durability``).
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Hashable
+
+from twisted.internet.defer import Deferred
+from twisted.python.failure import Failure
+
+from middleware.entangled.errors import EntangledError, Unavailable
+from middleware.entangled.node import EntangledNode
+from middleware.entangled.record import Record
+from middleware.entangled.replication.owner import Concern
+from middleware.entangled.replication.reader import ReadConcern
+from sim.team.history import History
+from sim.team.invariant.durability import Slot
+
+WRITE, REMOVE, READ = "write", "remove", "read"
+"""As the checker knows what is asked."""
+
+
+class Clients:
+    """Those of one run; ``asked`` and ``answered`` count how often they did what."""
+
+    def __init__(self, history: History) -> None:
+        self.asked: Counter[str] = Counter()
+        self.answered: Counter[str] = Counter()
+        self._history = history
+        self._written: Counter[Slot] = Counter()
+
+    def slots(self, owner: bytes) -> list[Slot]:
+        """Those that the node with this public key has written or removed, the first one first."""
+        return [slot for slot in self._written if slot.owner == owner]
+
+    def write(
+        self, place: int, node: EntangledNode, key: bytes, name: str, concern: Concern = "majority", act: str = WRITE
+    ) -> None:
+        """Write the next number in a slot of the ``node`` at ``place``, or by ``REMOVE`` nothing."""
+        slot = Slot(key, node.identity.public, name)
+        self._written[slot] += 1
+        count = self._written[slot]
+        number = self._asked(place, act, slot, count)
+        done = node.put(key, name, b"%d" % count, "team", concern) if act == WRITE else node.remove(key, name, concern)
+        done.addCallbacks(lambda _: self._answered(number, act), self._failed, errbackArgs=(number,))
+
+    def read(
+        self, place: int, life: int, node: EntangledNode, key: bytes, concern: ReadConcern = "majority"
+    ) -> Deferred[list[Record]]:
+        """Read at the ``node`` at ``place`` in its ``life``; fires with what was found: nothing, where that fails."""
+        # Another life of a node is another client: what it has read itself it may have forgotten.
+        number = self._asked((place, life), READ, key, concern)
+        return node.get(key, concern).addCallbacks(self._shown, self._failed, (number,), {}, (number,))
+
+    def _asked(self, client: Hashable, act: str, subject: Hashable, argument: object) -> int:
+        self.asked[act] += 1
+        return self._history.asked(client, act, subject, argument)
+
+    def _answered(self, number: int, act: str, result: object = None) -> None:
+        self.answered[act] += 1
+        self._history.answered(number, result)
+
+    def _shown(self, records: list[Record], number: int) -> list[Record]:
+        self._answered(number, READ, {Slot(*record.slot): int(record.value or b"0") for record in records})
+        return records
+
+    def _failed(self, failure: Failure, number: int) -> list[Record]:
+        failure.trap(EntangledError)
+        self._history.unanswered(number, failure.value, failure.check(Unavailable) is not None)
+        return []

@@ -1,0 +1,83 @@
+"""Tests of what clients write down."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+from twisted.internet.defer import Deferred, fail, succeed
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.entangled.errors import NotAcknowledged, Unavailable
+from middleware.entangled.identity import Identity
+from middleware.entangled.node import EntangledNode
+from middleware.entangled.record import Record
+from sim.team.clients import READ, REMOVE, WRITE, Clients
+from sim.team.event import Answered, Asked, Unanswered
+from sim.team.history import History
+from sim.team.invariant.durability import Slot
+
+KEY = b"k" * 32
+
+
+class Peer:
+    """A node that answers at once with what it is given: success, or an error."""
+
+    def __init__(self) -> None:
+        self.identity = Identity(b"i" * 32)
+        self.puts: list[bytes] = []
+        self.answer: Exception | list[Record] = []
+
+    def put(self, key: bytes, name: str, value: bytes, lifetime: str, concern: str) -> Deferred[Any]:
+        """A write."""
+        self.puts.append(value)
+        return self.remove(key, name, concern)
+
+    def remove(self, key: bytes, name: str, concern: str) -> Deferred[Any]:
+        """A removal."""
+        return fail(self.answer) if isinstance(self.answer, Exception) else succeed(None)
+
+    def get(self, key: bytes, concern: str) -> Deferred[Any]:
+        """A read."""
+        return fail(self.answer) if isinstance(self.answer, Exception) else succeed(self.answer)
+
+
+class ClientTests(SynchronousTestCase):
+    """Behaviour of ``Clients``."""
+
+    def setUp(self) -> None:
+        """Clients of one node."""
+        self.peer = Peer()
+        self.node = cast(EntangledNode, self.peer)
+        self.slot = Slot(KEY, self.peer.identity.public, "a")
+        self.history = History(lambda: 1.0)
+        self.clients = Clients(self.history)
+
+    def test_changes_of_a_slot_are_numbered(self) -> None:
+        """Writes and removals of one slot count on, those of another from 1, and the history has what came of each."""
+        for name, act in (("a", WRITE), ("a", REMOVE), ("b", WRITE), ("a", WRITE)):
+            self.clients.write(2, self.node, KEY, name, act=act)
+        self.assertEqual(self.peer.puts, [b"1", b"1", b"3"])
+        self.assertEqual(self.history.events[2:4], [Asked(1.0, 2, 2, REMOVE, self.slot, 2), Answered(1.0, 2)])
+        self.assertEqual([slot.name for slot in self.clients.slots(self.slot.owner)], ["a", "b"])
+        self.assertEqual(self.clients.slots(b"somebody else"), [])
+
+    def test_reads(self) -> None:
+        """A read fires with what was found, and the history has the number in each slot, 0 where it is empty."""
+        owner = self.peer.identity.public
+        self.peer.answer = [
+            Record(KEY, name, owner, 1, "team", 60.0, value, b"") for name, value in (("a", b"3"), ("b", None))
+        ]
+        found = self.successResultOf(self.clients.read(2, 4, self.node, KEY))
+        self.assertEqual(found, self.peer.answer)
+        shown = {self.slot: 3, Slot(KEY, owner, "b"): 0}
+        self.assertEqual(self.history.events, [Asked(1.0, 1, (2, 4), READ, KEY, "majority"), Answered(1.0, 1, shown)])
+
+    def test_what_fails_may_have_been_done(self) -> None:
+        """What fails is noted as open, a read of too few as unavailable, and is not counted as answered."""
+        self.peer.answer = NotAcknowledged(1, 3)
+        self.clients.write(2, self.node, KEY, "a")
+        self.peer.answer = Unavailable(1, 3)
+        self.assertEqual(self.successResultOf(self.clients.read(2, 1, self.node, KEY)), [])
+        gaps = [event.is_unavailable for event in self.history if isinstance(event, Unanswered)]
+        self.assertEqual(gaps, [False, True])
+        self.assertEqual((self.clients.asked, dict(self.clients.answered)), ({WRITE: 1, READ: 1}, {}))
