@@ -32,12 +32,13 @@ from middleware.entangled.reach.candidate import (
     packed,
     unpacked,
 )
+from middleware.entangled.reach.known import Known, keep
 from middleware.entangled.reach.mirror import IMAGE, MIRROR, Mirror
 from middleware.entangled.reach.passage import Kind, Passage, kind_of
 from middleware.entangled.reach.path import PathNetwork
 from middleware.entangled.reach.relay import CARRIED, CARRY, HEAD, Bucket, Relay
 from middleware.entangled.wire.endpoint import Endpoint
-from middleware.entangled.wire.peer import MAX_PEERS, Opening, Peer
+from middleware.entangled.wire.peer import Opening, Peer
 from middleware.entangled.wire.session import Session
 
 HELPERS = 3
@@ -65,8 +66,6 @@ UPGRADES = (1.0, 2.0, 5.0, 15.0, 60.0)
 UPGRADING_S = 1.2
 TURN = 0.5
 """Seconds by which one of the two is behind the other, so that only one of them tries."""
-MAX_KNOWN = 1024
-"""Peers of which is kept who named them, and who carries to them."""
 MAX_NAMERS = 3
 MAX_FURTHER = 16
 """Fresh local ports at the same time."""
@@ -138,7 +137,7 @@ class Reach:
         self._acquaintances = acquaintances
         self._clock = clock
         self._chores = chores
-        self._ids: dict[bytes, bytes] = {}
+        self._known = Known(endpoint.peers)
         self._namers: dict[bytes, dict[bytes, None]] = {}
         self._carriers: dict[bytes, dict[bytes, float]] = {}
         self._upgrades: dict[bytes, _Upgrade] = {}
@@ -155,7 +154,7 @@ class Reach:
         self._is_ticking = False
         self._opened_at = float("-inf")
         self._shown_until = float("-inf")
-        self.relay = Relay(self._session_by_id, endpoint.send_inside, clock, endpoint.counters)
+        self.relay = Relay(self._known.direct_session, endpoint.send_inside, clock, endpoint.counters)
         self.mirror = Mirror(endpoint.send_inside, paths, clock, lambda: self._rng, chores)
         endpoint.route_inside(CARRY, self.relay.on_carry)
         endpoint.route_inside(CARRIED, self._on_carried)
@@ -182,8 +181,8 @@ class Reach:
         if not self._is_far(contact.address):
             return
         namers = self._namers.pop(contact.node_id, None) or {}
-        _keep(namers, by.public, None, MAX_NAMERS)
-        _keep(self._namers, contact.node_id, namers, MAX_KNOWN)
+        keep(namers, by.public, None, MAX_NAMERS)
+        keep(self._namers, contact.node_id, namers)
 
     def seen_as(self, peer: Contact) -> Address | None:
         """The address of this node as ``peer`` last told it."""
@@ -192,14 +191,14 @@ class Reach:
 
     def way(self, contact: Contact) -> Way:
         """How a peer is reached now: directly, by those who carry, or not at all so far."""
-        session = self._session(contact.public)
+        session = self._peers.session(contact.public)
         if session is None:
             return "none"
         return "carried" if is_relayed(session.contact.address) else "direct"
 
     def passage(self, contact: Contact) -> Passage:
         """How a peer is reached now, by whom, and since when."""
-        session = self._session(contact.public)
+        session = self._peers.session(contact.public)
         if session is None:
             return Passage("none")
         kind = self._kind(session)
@@ -214,7 +213,7 @@ class Reach:
 
     def let_go(self, public: bytes) -> None:
         """Forget a peer that was silent for long, and with which there is no session."""
-        self._ids.pop(node_id(public), None)
+        self._known.forget(public)
         for table in (self._passages, self._seen, self._told_at, self._punched, self._introduced_at):
             table.pop(public, None)
 
@@ -285,7 +284,7 @@ class Reach:
         if opening is None or not self._is_pending(opening) or not attempt.helpful:
             return
         helper = attempt.helpful[0]
-        session = self._direct_session(helper.public)
+        session = self._peers.direct_session(helper.public)
         port = self._open_further() if session is not None else 0
         if session is None or not port:
             return
@@ -303,7 +302,7 @@ class Reach:
 
     def _knock_further(self, attempt: _Attempt, found: list[Address]) -> None:
         if found and attempt.opening is not None:
-            _keep(self._introduced_at, attempt.peer.public, self._clock.seconds(), MAX_KNOWN)
+            keep(self._introduced_at, attempt.peer.public, self._clock.seconds())
             self._peers.knock_at(attempt.opening, found)
 
     async def _introduced(self, attempt: _Attempt, helper: Contact, own: list[Address], order: int) -> list[Address]:
@@ -341,7 +340,7 @@ class Reach:
             self._lead(peer, candidates, port)
         if peer.opening is None and not self._peers.open(peer, candidates[0], is_wanted=False):
             return False
-        _keep(self._introduced_at, public, self._clock.seconds(), MAX_KNOWN)
+        keep(self._introduced_at, public, self._clock.seconds())
         opening = peer.opening
         if opening is not None:
             self._peers.hold(opening, max(opening.held_until, self._clock.seconds() + seconds))
@@ -361,13 +360,13 @@ class Reach:
         now = self._clock.seconds()
         first = [*attempt.hinted]
         for public in [*self._namers.get(attempt.node_id, ()), *self._carriers.get(attempt.node_id, ())]:
-            first += [session.contact] if (session := self._session(public)) is not None else []
+            first += [session.contact] if (session := self._peers.session(public)) is not None else []
         known = list(self._acquaintances())
         self._rng.shuffle(known)
         known.sort(key=lambda contact: (is_relayed(contact.address), contact.address not in self.bootstraps))
         found: dict[bytes, Contact] = {}
         for contact in [*first, *known]:
-            session = self._session(contact.public)
+            session = self._peers.session(contact.public)
             if contact.public in attempt.asked or contact.public == attempt.peer.public:
                 continue
             if contact.node_id == self._own_id:
@@ -388,7 +387,7 @@ class Reach:
         """REACH.INTRODUCE: tell the node of that id where ``peer`` is, and ``peer`` where it is; nil: not known."""
         if len(wanted) != ID_BYTES or not self._may("introduce", peer, INTRODUCTIONS):
             raise Refused("no introduction: that is no id, or too many are wanted")
-        session = self._session(self._ids.get(wanted, b""))
+        session = self._known.session(wanted)
         if session is None or self._clock.seconds() - session.heard_at > LIVELY_S:
             return None
         theirs = [*self._as_seen(peer, order != USUAL), *unpacked(candidates)]
@@ -412,15 +411,15 @@ class Reach:
         stranger = node_id(public)
         if stranger == self._own_id:
             raise Refused("that is this node itself")
-        self._ids_keep(public)
-        _keep(self._introducers, public, peer.public, MAX_KNOWN)
+        self._known.note(public)
+        keep(self._introducers, public, peer.public)
         if not is_relayed(peer.address):
             self._carries(stranger, peer.public)
         upgrade = self._upgrades.get(public)
         if upgrade is not None:
             upgrade.due = max(upgrade.due, self._clock.seconds() + _pause(upgrade.step) + TURN)  # the other is at it
         port, own = 0, self._own(peer)
-        session = self._direct_session(peer.public)
+        session = self._peers.direct_session(peer.public)
         if order != USUAL and session is not None and (further := self._open_further()):
             seen = await self.mirror.look(session, further)
             if seen is not None:
@@ -446,7 +445,7 @@ class Reach:
         if self._seen_last == address:
             address = self._seen_last  # one object for all who see it there
         self._seen_last = address
-        _keep(self._seen, peer.public, (address, now), MAX_KNOWN)
+        keep(self._seen, peer.public, (address, now))
         self._is_translated = self._is_translated or address.host not in self._paths.hosts()
         # By another port of this node itself it is seen elsewhere anyway.
         is_usual = self._paths.local(peer.address).port == self._paths.address.port
@@ -460,7 +459,7 @@ class Reach:
             return
         self._opened_at = now
         for public in list(reversed(self._punched))[:OPENED]:
-            session = self._session(public)
+            session = self._peers.session(public)
             peer = self._peers.known(public)
             if session is None or peer is None:
                 del self._punched[public]
@@ -494,13 +493,13 @@ class Reach:
         carriers[carrier] = self._clock.seconds()
         if len(carriers) > MAX_NAMERS:
             del carriers[min(carriers, key=lambda public: carriers[public])]
-        _keep(self._carriers, to, carriers, MAX_KNOWN)
+        keep(self._carriers, to, carriers)
 
     def _carrier(self, to: bytes) -> Session | None:
         """The direct session with who was last known to carry to the node of that id."""
         carriers = self._carriers.get(to, {})
         for public in sorted(carriers, key=lambda public: -carriers[public]):
-            session = self._direct_session(public)
+            session = self._peers.direct_session(public)
             if session is not None:
                 return session
         return None
@@ -509,21 +508,21 @@ class Reach:
 
     def _established(self, session: Session) -> None:
         public, now = session.contact.public, self._clock.seconds()
-        self._ids_keep(public)
+        self._known.note(public)
         self._note_passage(session, now)
         bucket = self._buckets.get(("meet", self._introducers.pop(public, b"")))
         if bucket is not None:
             bucket.give(1.0)
         if is_relayed(session.contact.address):
-            newest = self._session(public)
+            newest = self._peers.session(public)
             if public not in self._upgrades and newest is session:
                 behind = TURN if self._own_id > session.contact.node_id else 0.0
-                _keep(self._upgrades, public, _Upgrade(now + UPGRADES[0] + behind), MAX_KNOWN)
+                keep(self._upgrades, public, _Upgrade(now + UPGRADES[0] + behind))
                 self._wake()
         else:
             self._upgrades.pop(public, None)
             if self._is_far(session.contact.address):
-                _keep(self._punched, public, None, MAX_KNOWN)
+                keep(self._punched, public, None)
                 self._wake()
 
     def _note_passage(self, session: Session, now: float) -> None:
@@ -538,7 +537,7 @@ class Reach:
             noted = (self._kind(former), former.opened_at)
         if noted is not None or kind == "punched":  # else the session itself says it
             since = noted[1] if noted is not None and noted[0] == kind else now
-            _keep(self._passages, public, (kind, since), MAX_KNOWN)
+            keep(self._passages, public, (kind, since))
 
     def _kind(self, session: Session) -> Kind:
         contact = session.contact
@@ -555,11 +554,11 @@ class Reach:
             return
         if now - self._told_at.get(contact.public, -SEEN_GAP) < SEEN_GAP:
             return
-        _keep(self._told_at, contact.public, now, MAX_KNOWN)
+        keep(self._told_at, contact.public, now)
         self._chores.later(SEEN_AFTER, self._tell_seen, contact)
 
     def _tell_seen(self, contact: Contact) -> None:
-        session = self._session(contact.public)
+        session = self._peers.session(contact.public)
         if self._endpoint.is_running and session is not None and session.contact == contact:
             self._endpoint.tell(contact, "reach.seen", contact.address.host, contact.address.port)
 
@@ -591,7 +590,7 @@ class Reach:
         """Where nobody was heard lately who could introduce us, show one that we are here, and so from where."""
         if now <= self._shown_until:
             return
-        sessions = [s for c in self._acquaintances() if (s := self._direct_session(c.public)) is not None]
+        sessions = [s for c in self._acquaintances() if (s := self._peers.direct_session(c.public)) is not None]
         sessions.sort(key=lambda session: -session.heard_at)
         latest = next((session for session in sessions if self._is_far(session.contact.address)), None)
         if latest is not None:
@@ -613,24 +612,8 @@ class Reach:
     def _is_pending(self, opening: Opening) -> bool:
         return opening.peer.opening is opening
 
-    def _ids_keep(self, public: bytes) -> None:
-        _keep(self._ids, node_id(public), public, MAX_PEERS)
-
-    def _session(self, public: bytes) -> Session | None:
-        peer = self._peers.known(public)
-        return peer.session if peer is not None else None
-
-    def _direct_session(self, public: bytes) -> Session | None:
-        """The newest session with a peer that no other node carries for."""
-        peer = self._peers.known(public)
-        sessions = peer.sessions if peer is not None else []
-        return next((session for session in reversed(sessions) if not is_relayed(session.contact.address)), None)
-
-    def _session_by_id(self, wanted: bytes) -> Session | None:
-        return self._direct_session(self._ids.get(wanted, b""))
-
     def _contacts_of(self, publics: Iterable[bytes]) -> list[Contact]:
-        sessions = [self._direct_session(public) for public in publics]
+        sessions = [self._peers.direct_session(public) for public in publics]
         return [session.contact for session in sessions if session is not None][:MAX_NAMERS]
 
     def _own(self, helper: Contact) -> list[Address]:
@@ -646,7 +629,7 @@ class Reach:
     def _may(self, what: str, peer: Contact, rate: float, at_once: float = 0.0) -> bool:
         key = (what, peer.public)
         bucket = self._buckets.pop(key, None) or Bucket(rate, at_once or 2 * rate)
-        _keep(self._buckets, key, bucket, MAX_KNOWN)
+        keep(self._buckets, key, bucket)
         return bucket.take(1.0, self._clock.seconds())
 
     def _open_further(self) -> int:
@@ -669,7 +652,7 @@ class Reach:
     def _is_used(self, port: int) -> bool:
         """Whether a session goes by this port."""
         for public in self._punched:
-            session = self._direct_session(public)
+            session = self._peers.direct_session(public)
             if session is not None and self._paths.local(session.contact.address).port == port:
                 return True
         return False
@@ -677,14 +660,6 @@ class Reach:
 
 def _pause(step: int) -> float:
     return UPGRADES[min(step, len(UPGRADES) - 1)]
-
-
-def _keep(table: dict, key: object, value: object, most: int) -> None:  # type: ignore[type-arg]
-    """Put something at the end of a table, and drop what was put there first where that are too many."""
-    table.pop(key, None)
-    table[key] = value
-    if len(table) > most:
-        del table[next(iter(table))]
 
 
 def _id_in(address: Address) -> bytes:

@@ -10,7 +10,8 @@ from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact, unpacked
 from middleware.entangled.network.network import Address, relayed
 from middleware.entangled.network.switchboard import Weather
-from middleware.entangled.reach.reach import MAX_KNOWN, MEETS, MEETS_AT_ONCE
+from middleware.entangled.reach.known import MAX_KNOWN
+from middleware.entangled.reach.reach import MEETS, MEETS_AT_ONCE
 from middleware.entangled.wire.peer import KNOCKS, MAX_DOORS
 from tests.middleware.reach.ground import GroundCase
 
@@ -94,7 +95,7 @@ class HostileTests(GroundCase):
             self.g.run(0.005)
         self.g.run(30.0)
         reach = self.b.reach
-        for table in (reach._ids, reach._namers, reach._carriers, reach._upgrades, reach._buckets, reach._seen):
+        for table in (reach._known, reach._namers, reach._carriers, reach._upgrades, reach._buckets, reach._seen):
             self.assertLessEqual(len(table), MAX_KNOWN)
         knocks = self.g.board.counters["unheard"] - sent
         self.assertLess(knocks, (MEETS_AT_ONCE + 30 * MEETS) * MAX_DOORS * 2 * KNOCKS)
