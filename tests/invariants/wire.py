@@ -260,10 +260,12 @@ def _buckets(node: EntangledNode) -> list[Any]:
 
 def _ways(node: EntangledNode) -> list[tuple[str, int, int]]:
     reach: Any = node.reach
-    tables = ("_namers", "_carriers", "_upgrades", "_punched", "_seen", "_told_at", "_buckets")
+    tables = ("_namers", "_carriers", "_upgrades", "_punched", "_buckets")
     return [
         ("peers by their ids", len(reach._known), MAX_PEERS),
         ("pairs that are carried for", len(reach.relay), MAX_PAIRS),
         ("fresh ports", len(reach._further), MAX_FURTHER),
         *((f"ways ({name})", len(getattr(reach, name)), MAX_KNOWN) for name in tables),
+        ("where it is seen", len(reach.outside._seen), MAX_KNOWN),
+        ("who was told where it is seen", len(reach.outside._told_at), MAX_KNOWN),
     ]

@@ -27,16 +27,17 @@ from middleware.entangled.network.network import Address, is_relayed, relayed
 from middleware.entangled.reach.candidate import (
     MAX_CANDIDATES,
     is_loopback,
-    is_near,
     is_possible,
     packed,
     unpacked,
 )
+from middleware.entangled.reach.carrier import MAX_CARRIERS, Carriers
 from middleware.entangled.reach.known import Known, keep
 from middleware.entangled.reach.mirror import IMAGE, MIRROR, Mirror
+from middleware.entangled.reach.outside import Outside
 from middleware.entangled.reach.passage import Kind, Passage, kind_of
 from middleware.entangled.reach.path import PathNetwork
-from middleware.entangled.reach.relay import CARRIED, CARRY, HEAD, Bucket, Relay
+from middleware.entangled.reach.relay import CARRIED, CARRY, Bucket, Relay
 from middleware.entangled.wire.endpoint import Endpoint
 from middleware.entangled.wire.peer import Opening, Peer
 from middleware.entangled.wire.session import Session
@@ -67,27 +68,20 @@ UPGRADING_S = 1.2
 TURN = 0.5
 """Seconds by which one of the two is behind the other, so that only one of them tries."""
 MAX_NAMERS = 3
+"""Peers of which is kept that they named the same node."""
 MAX_FURTHER = 16
 """Fresh local ports at the same time."""
 FURTHER_S = 60.0
 """Seconds after which a fresh port is closed where no session goes by it, and a silent carried peer is given up."""
 TICK = 1.0
-ANCHOR_S = 2.5
-"""Seconds without a word from anybody who introduces after which such a one is shown that this node is here: by the
-datagram that shows it, it learns where to."""
 INTRODUCTIONS = 20.0
 """Times in a second, and at once twice as often, that one peer may have this node introduce it."""
 MEETS, MEETS_AT_ONCE = 1.0, 60.0
 """Times in a second, and at once, that one peer may make this node knock where nobody answers.  Who is met does not
 count; so a member that names addresses of strangers gets 0.2 MB/s sent there by this node, and a team that starts
 behind routers none the less meets in a moment."""
-SEEN_S = 600.0
-"""Seconds for which others' word on where this node is holds beside a newer one."""
 OPENED, OPENED_GAP = 64, 2.0
 """Sessions that are opened anew when this node's address changed, and seconds at least between two times."""
-SEEN_AFTER, SEEN_GAP = 0.1, 1.0
-"""Seconds after which a peer is told that it moved, if it still seems so (who replays what it caught moves nobody for
-long), and at least between two times."""
 
 Way = Literal["none", "direct", "carried"]
 
@@ -139,37 +133,34 @@ class Reach:
         self._chores = chores
         self._known = Known(endpoint.peers)
         self._namers: dict[bytes, dict[bytes, None]] = {}
-        self._carriers: dict[bytes, dict[bytes, float]] = {}
         self._upgrades: dict[bytes, _Upgrade] = {}
         self._punched: dict[bytes, None] = {}
         self._introduced_at: dict[bytes, float] = {}
         self._passages: dict[bytes, tuple[Kind, float]] = {}
-        self._seen: dict[bytes, tuple[Address, float]] = {}
-        self._seen_last: Address | None = None
-        self._told_at: dict[bytes, float] = {}
         self._buckets: dict[tuple[str, bytes], Bucket] = {}
         self._introducers: dict[bytes, bytes] = {}
         self._further: dict[int, float] = {}
-        self._is_translated = False
         self._is_ticking = False
         self._opened_at = float("-inf")
-        self._shown_until = float("-inf")
+        self.outside = Outside(endpoint, paths, acquaintances, clock, chores)
+        self._carriers = Carriers(own_id, endpoint, paths, clock)
         self.relay = Relay(self._known.direct_session, endpoint.send_inside, clock, endpoint.counters)
         self.mirror = Mirror(endpoint.send_inside, paths, clock, lambda: self._rng, chores)
         endpoint.route_inside(CARRY, self.relay.on_carry)
-        endpoint.route_inside(CARRIED, self._on_carried)
+        endpoint.route_inside(CARRIED, self._carriers.on_carried)
         endpoint.route_inside(MIRROR, self.mirror.on_mirror)
         endpoint.route_inside(IMAGE, self.mirror.on_image)
         # Run once for each question, however often it is repeated: each run would open another port.
         endpoint.expose("reach.introduce", self._answer_introduce, changes=True)
         endpoint.expose("reach.meet", self._answer_meet, changes=True)
-        endpoint.expose("reach.seen", self._answer_seen, changes=True)
-        self._peers.is_far = self._is_far
+        endpoint.expose("reach.seen", self.outside.answer_seen, changes=True)
+        self._peers.is_far = self.outside.is_far
         self._peers.on_silence = lambda opening: chores.fork(self._find(opening))
         self._peers.on_established = self._established
-        self._peers.on_moved = self._moved
-        endpoint.on_seen = self._saw
-        paths.carry = self._carry
+        self._peers.on_moved = self.outside.tell
+        endpoint.on_seen = self.outside.saw
+        self.outside.on_change = self._open_again
+        paths.carry = self._carriers.carry
 
     @cached_property
     def _rng(self) -> random.Random:
@@ -178,16 +169,11 @@ class Reach:
 
     def named(self, contact: Contact, by: Contact) -> None:
         """Keep in mind that the peer ``by`` named ``contact``: it may know how to reach it."""
-        if not self._is_far(contact.address):
+        if not self.outside.is_far(contact.address):
             return
         namers = self._namers.pop(contact.node_id, None) or {}
         keep(namers, by.public, None, MAX_NAMERS)
         keep(self._namers, contact.node_id, namers)
-
-    def seen_as(self, peer: Contact) -> Address | None:
-        """The address of this node as ``peer`` last told it."""
-        seen = self._seen.get(peer.public)
-        return seen[0] if seen is not None else None
 
     def way(self, contact: Contact) -> Way:
         """How a peer is reached now: directly, by those who carry, or not at all so far."""
@@ -203,7 +189,7 @@ class Reach:
             return Passage("none")
         kind = self._kind(session)
         noted, since = self._passages.get(contact.public, (kind, session.opened_at))
-        carrier = self._carrier(contact.node_id) if kind == "carried" else None
+        carrier = self._carriers.session(contact.node_id) if kind == "carried" else None
         by = b"" if carrier is None else carrier.contact.node_id
         return Passage(kind, session.contact.address, by, since if noted == kind else session.opened_at)
 
@@ -214,19 +200,14 @@ class Reach:
     def let_go(self, public: bytes) -> None:
         """Forget a peer that was silent for long, and with which there is no session."""
         self._known.forget(public)
-        for table in (self._passages, self._seen, self._told_at, self._punched, self._introduced_at):
+        self.outside.forget(public)
+        for table in (self._passages, self._punched, self._introduced_at):
             table.pop(public, None)
 
     def needs_use(self, contact: Contact) -> bool:
         """Whether the way to a peer is open for only so long as it is used: routers forget whom they let in."""
         kind, _ = self._passages.get(contact.public, ("none", 0.0))
-        return self._is_translated or contact.address.is_virtual or kind == "punched"
-
-    @property
-    def outside(self) -> list[Address]:
-        """Where others see this node, the word of the most recent first; two ports of one host: a symmetric router."""
-        recent = sorted(self._seen.values(), key=lambda seen: -seen[1])
-        return list(dict.fromkeys(address for address, at in recent if recent[0][1] - at < SEEN_S))
+        return self.outside.is_translated or contact.address.is_virtual or kind == "punched"
 
     # -- finding a way ----------------------------------------------------------------------------------------------
 
@@ -317,8 +298,8 @@ class Reach:
         attempt.helpful.append(helper)
         attempt.candidates.update(dict.fromkeys(found))
         if may_carry is True and not is_relayed(helper.address):
-            self._carries(attempt.node_id, helper.public)
-        for each in carriers[:MAX_NAMERS] if isinstance(carriers, list) else ():
+            self._carriers.note(attempt.node_id, helper.public)
+        for each in carriers[:MAX_CARRIERS] if isinstance(carriers, list) else ():
             contact = contact_in(each)
             if contact is not None:
                 attempt.hinted.append(contact)
@@ -327,7 +308,7 @@ class Reach:
     def _have_carried(self, opening: Opening) -> None:
         """Let those who carry to the peer carry a handshake, too."""
         peer_id = node_id(opening.peer.public)
-        if self._is_pending(opening) and self._carrier(peer_id) is not None:
+        if self._is_pending(opening) and self._carriers.session(peer_id) is not None:
             self._peers.knock_at(opening, [relayed(peer_id)])
 
     def _knock(self, public: bytes, candidates: list[Address], port: int, seconds: float) -> bool:
@@ -359,7 +340,7 @@ class Reach:
         """Whom to ask about a peer: who named it or carries to it, bootstraps, then anybody; nobody twice."""
         now = self._clock.seconds()
         first = [*attempt.hinted]
-        for public in [*self._namers.get(attempt.node_id, ()), *self._carriers.get(attempt.node_id, ())]:
+        for public in [*self._namers.get(attempt.node_id, ()), *self._carriers.of(attempt.node_id)]:
             first += [session.contact] if (session := self._peers.session(public)) is not None else []
         known = list(self._acquaintances())
         self._rng.shuffle(known)
@@ -400,7 +381,7 @@ class Reach:
         fields, was_fresh = answer if isinstance(answer, list) and len(answer) == 2 else ([], False)
         found = [*self._as_seen(session.contact, was_fresh is True), *unpacked(fields)]
         is_direct = not (is_relayed(session.contact.address) or is_relayed(peer.address))
-        carriers = self._contacts_of(self._carriers.get(wanted, ())) if is_relayed(session.contact.address) else []
+        carriers = self._carriers.contacts(wanted) if is_relayed(session.contact.address) else []
         return [packed(found), [contact.packed() for contact in carriers], is_direct and self.relay.has_room]
 
     async def _answer_meet(self, peer: Contact, public: bytes, candidates: list[object], order: int) -> list[object]:
@@ -414,7 +395,7 @@ class Reach:
         self._known.note(public)
         keep(self._introducers, public, peer.public)
         if not is_relayed(peer.address):
-            self._carries(stranger, peer.public)
+            self._carriers.note(stranger, peer.public)
         upgrade = self._upgrades.get(public)
         if upgrade is not None:
             upgrade.due = max(upgrade.due, self._clock.seconds() + _pause(upgrade.step) + TURN)  # the other is at it
@@ -431,27 +412,6 @@ class Reach:
             self._chores.later(wait, self._knock, public, found, port, HELD_S)
         return [packed(own), bool(port)]
 
-    def _answer_seen(self, peer: Contact, host: str, port: int) -> None:
-        """REACH.SEEN (told): this node writes from another address than before; ways through its router are lost."""
-        if is_possible(Address(host, port)):
-            self._saw(peer, Address(host, port), is_told=True)
-
-    def _saw(self, peer: Contact, address: Address, is_told: bool = False) -> None:
-        """Take note of the address at which a peer sees this node."""
-        before, at = self._seen.get(peer.public, (None, -SEEN_GAP))
-        now = self._clock.seconds()
-        if now - at < SEEN_GAP or is_relayed(peer.address):
-            return
-        if self._seen_last == address:
-            address = self._seen_last  # one object for all who see it there
-        self._seen_last = address
-        keep(self._seen, peer.public, (address, now))
-        self._is_translated = self._is_translated or address.host not in self._paths.hosts()
-        # By another port of this node itself it is seen elsewhere anyway.
-        is_usual = self._paths.local(peer.address).port == self._paths.address.port
-        if is_usual and address != before and (is_told or before is not None):
-            self._open_again(peer)
-
     def _open_again(self, teller: Contact) -> None:
         """Open the sessions anew that went through a hole in the own router, the newest ones of them at least."""
         now = self._clock.seconds()
@@ -467,42 +427,6 @@ class Reach:
                 self._peers.open(peer, session.contact.address)
         for upgrade in self._upgrades.values():
             upgrade.due, upgrade.step = now, 0
-
-    # -- carrying ---------------------------------------------------------------------------------------------------
-
-    def _carry(self, datagram: bytes, to: Address) -> None:
-        """Have a datagram carried to the node for which that address stands; it is lost where nobody does."""
-        target = _id_in(to)
-        carrier = self._carrier(target) if target else None
-        if carrier is None:
-            self._endpoint.counters["uncarried"] += 1
-        else:
-            self._endpoint.send_inside(carrier, bytes([CARRY]) + target + datagram)
-
-    def _on_carried(self, session: Session, plain: bytes, source: Address) -> None:
-        inner, sender = plain[HEAD:], plain[1:HEAD]
-        if not inner or is_relayed(session.contact.address) or sender == self._own_id:
-            self._endpoint.counters["malformed"] += 1
-            return
-        self._carries(sender, session.contact.public)
-        self._paths.carried(inner, relayed(sender))
-
-    def _carries(self, to: bytes, carrier: bytes) -> None:
-        """Take note that somebody carries to the node of that id."""
-        carriers = self._carriers.pop(to, None) or {}
-        carriers[carrier] = self._clock.seconds()
-        if len(carriers) > MAX_NAMERS:
-            del carriers[min(carriers, key=lambda public: carriers[public])]
-        keep(self._carriers, to, carriers)
-
-    def _carrier(self, to: bytes) -> Session | None:
-        """The direct session with who was last known to carry to the node of that id."""
-        carriers = self._carriers.get(to, {})
-        for public in sorted(carriers, key=lambda public: -carriers[public]):
-            session = self._peers.direct_session(public)
-            if session is not None:
-                return session
-        return None
 
     # -- upkeep -----------------------------------------------------------------------------------------------------
 
@@ -521,7 +445,7 @@ class Reach:
                 self._wake()
         else:
             self._upgrades.pop(public, None)
-            if self._is_far(session.contact.address):
+            if self.outside.is_far(session.contact.address):
                 keep(self._punched, public, None)
                 self._wake()
 
@@ -545,22 +469,7 @@ class Reach:
         before, _ = self._passages.get(contact.public, ("none", 0.0))
         introduced_at = self._introduced_at.get(contact.public, float("-inf"))
         was_introduced = before == "punched" or abs(session.opened_at - introduced_at) < HELD_S
-        return kind_of(contact.address, own, self._is_translated, was_introduced)
-
-    def _moved(self, session: Session) -> None:
-        """Tell a peer that its address is another one than before: it cannot see that itself."""
-        contact, now = session.contact, self._clock.seconds()
-        if not self._is_far(contact.address) or is_relayed(contact.address):
-            return
-        if now - self._told_at.get(contact.public, -SEEN_GAP) < SEEN_GAP:
-            return
-        keep(self._told_at, contact.public, now)
-        self._chores.later(SEEN_AFTER, self._tell_seen, contact)
-
-    def _tell_seen(self, contact: Contact) -> None:
-        session = self._peers.session(contact.public)
-        if self._endpoint.is_running and session is not None and session.contact == contact:
-            self._endpoint.tell(contact, "reach.seen", contact.address.host, contact.address.port)
+        return kind_of(contact.address, own, self.outside.is_translated, was_introduced)
 
     def _wake(self) -> None:
         if not self._is_ticking:
@@ -581,40 +490,18 @@ class Reach:
                 self._chores.fork(self._upgrade(peer, upgrade.step))
                 upgrade.step += 1
                 upgrade.due = now + _pause(upgrade.step)
-        self._show_oneself(now)
+        self.outside.show(now)
         self._is_ticking = bool(self._upgrades or self._punched or self._further)
         if self._is_ticking:
             self._chores.later(TICK, self._tick)
 
-    def _show_oneself(self, now: float) -> None:
-        """Where nobody was heard lately who could introduce us, show one that we are here, and so from where."""
-        if now <= self._shown_until:
-            return
-        sessions = [s for c in self._acquaintances() if (s := self._peers.direct_session(c.public)) is not None]
-        sessions.sort(key=lambda session: -session.heard_at)
-        latest = next((session for session in sessions if self._is_far(session.contact.address)), None)
-        if latest is not None:
-            self._shown_until = latest.heard_at + ANCHOR_S
-            if now > self._shown_until:
-                self._endpoint.send_inside(latest, b"")
-
     # -- small things -----------------------------------------------------------------------------------------------
-
-    def _is_far(self, address: Address) -> bool:
-        """Whether others may know more of an address than that it does not answer."""
-        if address.host[:1] == "~":
-            return is_relayed(address)
-        return not is_near(address.host, self._paths.local(address).host, self._is_translated)
 
     def _is_worth(self, address: Address) -> bool:
         return is_possible(address) and (not is_loopback(address.host) or is_loopback(self._paths.local(address).host))
 
     def _is_pending(self, opening: Opening) -> bool:
         return opening.peer.opening is opening
-
-    def _contacts_of(self, publics: Iterable[bytes]) -> list[Contact]:
-        sessions = [self._peers.direct_session(public) for public in publics]
-        return [session.contact for session in sessions if session is not None][:MAX_NAMERS]
 
     def _own(self, helper: Contact) -> list[Address]:
         """The own addresses, as this machine knows them; first the one from which it writes to ``helper``."""
@@ -660,11 +547,3 @@ class Reach:
 
 def _pause(step: int) -> float:
     return UPGRADES[min(step, len(UPGRADES) - 1)]
-
-
-def _id_in(address: Address) -> bytes:
-    try:
-        found = bytes.fromhex(address.host[1:])
-    except ValueError:
-        return b""
-    return found if len(found) == ID_BYTES else b""

@@ -95,7 +95,14 @@ class HostileTests(GroundCase):
             self.g.run(0.005)
         self.g.run(30.0)
         reach = self.b.reach
-        for table in (reach._known, reach._namers, reach._carriers, reach._upgrades, reach._buckets, reach._seen):
+        for table in (
+            reach._known,
+            reach._namers,
+            reach._carriers,
+            reach._upgrades,
+            reach._buckets,
+            reach.outside._seen,
+        ):
             self.assertLessEqual(len(table), MAX_KNOWN)
         knocks = self.g.board.counters["unheard"] - sent
         self.assertLess(knocks, (MEETS_AT_ONCE + 30 * MEETS) * MAX_DOORS * 2 * KNOCKS)
@@ -136,8 +143,8 @@ class HostileTests(GroundCase):
         """A node learns from a peer how it looks from outside."""
         c = self.g.at("c", "full")
         self.g.run(1.0)
-        self.assertEqual(c.reach.seen_as(self.g.nodes["pub"].contact), Address(self.g.routers["c"].host, 7000))
-        self.assertEqual(self.a.reach.outside, [self.a.contact.address])
+        self.assertEqual(c.reach.outside.seen_as(self.g.nodes["pub"].contact), Address(self.g.routers["c"].host, 7000))
+        self.assertEqual(self.a.reach.outside.addresses, [self.a.contact.address])
 
     def test_noise_inside_sessions(self) -> None:
         """Whatever a member puts behind the first bytes of carrying and mirrors, nothing is raised."""
@@ -157,5 +164,5 @@ class HostileTests(GroundCase):
         for site, kind, ports in (("c", "port", 1), ("d", "sym", 2)):
             c = self.g.at(site, kind)
             self.g.run(2.0)
-            self.assertGreaterEqual(len({address.port for address in c.reach.outside}), ports)
-            self.assertEqual({address.host for address in c.reach.outside}, {self.g.routers[site].host})
+            self.assertGreaterEqual(len({address.port for address in c.reach.outside.addresses}), ports)
+            self.assertEqual({address.host for address in c.reach.outside.addresses}, {self.g.routers[site].host})

@@ -182,7 +182,7 @@ class WeatherTests(GroundCase):
         at_b = peer.session.contact.address
         port = ground.networks["a2"].local(at_b).port
         self.assertIn(port, a.reach._further)
-        a.reach._saw(peer.session.contact, Address(ground.routers["a"].host, 3), is_told=True)
+        a.reach.outside.saw(peer.session.contact, Address(ground.routers["a"].host, 3), is_told=True)
         self.assertEqual(len(a.endpoint.peers._openings), 0)
         a.reach._lead(peer, [at_b], 0)
         self.assertEqual(ground.networks["a2"].local(at_b).port, port)
