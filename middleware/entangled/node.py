@@ -91,7 +91,7 @@ class EntangledNode:
         self.replica = Replica(store, self.endpoint, clock, chores)
         self._owner = Owner(identity, lease, store, self.replica, self.overlay, self.endpoint, clock, chores)
         self._membership = membership = Membership(self.overlay, self.endpoint, clock, rng, chores)
-        membership.sounding.needs_use = self.reach.needs_use
+        membership.sounding.needs_use = self.reach.ways.needs_use
         self.endpoint.on_let_go = self.reach.let_go
         self._detour = membership.detour
         self.discovery = (
@@ -365,7 +365,7 @@ class EntangledNode:
         self._subscriber.forget(contact.node_id)
         self._handover.lost(contact)
         self._membership.lost(contact)
-        self.reach.lost(contact)
+        self.reach.ways.lost(contact)
 
     def _refused(self, contact: Contact, code: str) -> None:
         """A member does not let this node in: it cannot be reached, and counts as one that is absent."""

@@ -14,7 +14,6 @@ import random
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Literal
 
 from twisted.internet.interfaces import IReactorTime
 
@@ -32,12 +31,13 @@ from middleware.entangled.reach.candidate import (
     unpacked,
 )
 from middleware.entangled.reach.carrier import MAX_CARRIERS, Carriers
+from middleware.entangled.reach.freshport import FreshPorts
 from middleware.entangled.reach.known import Known, keep
 from middleware.entangled.reach.mirror import IMAGE, MIRROR, Mirror
 from middleware.entangled.reach.outside import Outside
-from middleware.entangled.reach.passage import Kind, Passage, kind_of
 from middleware.entangled.reach.path import PathNetwork
 from middleware.entangled.reach.relay import CARRIED, CARRY, Bucket, Relay
+from middleware.entangled.reach.way import HELD_S, Ways
 from middleware.entangled.wire.endpoint import Endpoint
 from middleware.entangled.wire.peer import Opening, Peer
 from middleware.entangled.wire.session import Session
@@ -49,8 +49,6 @@ FRESH_AT = 0.5
 CARRIED_AT = 0.9
 """Seconds after its beginning from which a handshake goes by those who carry, too: most direct ways are found by then,
 and what is asked with the usual patience of 1.5 s is answered yet."""
-HELD_S = 5.0
-"""Seconds for which a handshake goes on that others help with."""
 ASKED_S = 1.0
 WELL_S = 3.0
 """Seconds since a peer was heard for which its way is left alone."""
@@ -65,14 +63,12 @@ other.  A knock that comes too early spoils some routers' ports, and does no har
 UPGRADES = (1.0, 2.0, 5.0, 15.0, 60.0)
 """Seconds after which a carried pair tries the direct way again; the last one is repeated."""
 UPGRADING_S = 1.2
+GIVEN_UP_S = 60.0
+"""Seconds after which a silent carried peer is given up."""
 TURN = 0.5
 """Seconds by which one of the two is behind the other, so that only one of them tries."""
 MAX_NAMERS = 3
 """Peers of which is kept that they named the same node."""
-MAX_FURTHER = 16
-"""Fresh local ports at the same time."""
-FURTHER_S = 60.0
-"""Seconds after which a fresh port is closed where no session goes by it, and a silent carried peer is given up."""
 TICK = 1.0
 INTRODUCTIONS = 20.0
 """Times in a second, and at once twice as often, that one peer may have this node introduce it."""
@@ -80,10 +76,8 @@ MEETS, MEETS_AT_ONCE = 1.0, 60.0
 """Times in a second, and at once, that one peer may make this node knock where nobody answers.  Who is met does not
 count; so a member that names addresses of strangers gets 0.2 MB/s sent there by this node, and a team that starts
 behind routers none the less meets in a moment."""
-OPENED, OPENED_GAP = 64, 2.0
-"""Sessions that are opened anew when this node's address changed, and seconds at least between two times."""
-
-Way = Literal["none", "direct", "carried"]
+OPENED_GAP = 2.0
+"""Seconds at least between two times at which sessions are opened anew since this node's address changed."""
 
 
 @dataclass(slots=True)
@@ -134,16 +128,14 @@ class Reach:
         self._known = Known(endpoint.peers)
         self._namers: dict[bytes, dict[bytes, None]] = {}
         self._upgrades: dict[bytes, _Upgrade] = {}
-        self._punched: dict[bytes, None] = {}
-        self._introduced_at: dict[bytes, float] = {}
-        self._passages: dict[bytes, tuple[Kind, float]] = {}
         self._buckets: dict[tuple[str, bytes], Bucket] = {}
         self._introducers: dict[bytes, bytes] = {}
-        self._further: dict[int, float] = {}
         self._is_ticking = False
         self._opened_at = float("-inf")
         self.outside = Outside(endpoint, paths, acquaintances, clock, chores)
         self._carriers = Carriers(own_id, endpoint, paths, clock)
+        self.ways = Ways(endpoint.peers, paths, self.outside, self._carriers, clock)
+        self._ports = FreshPorts(paths, self.ways, clock)
         self.relay = Relay(self._known.direct_session, endpoint.send_inside, clock, endpoint.counters)
         self.mirror = Mirror(endpoint.send_inside, paths, clock, lambda: self._rng, chores)
         endpoint.route_inside(CARRY, self.relay.on_carry)
@@ -175,39 +167,11 @@ class Reach:
         keep(namers, by.public, None, MAX_NAMERS)
         keep(self._namers, contact.node_id, namers)
 
-    def way(self, contact: Contact) -> Way:
-        """How a peer is reached now: directly, by those who carry, or not at all so far."""
-        session = self._peers.session(contact.public)
-        if session is None:
-            return "none"
-        return "carried" if is_relayed(session.contact.address) else "direct"
-
-    def passage(self, contact: Contact) -> Passage:
-        """How a peer is reached now, by whom, and since when."""
-        session = self._peers.session(contact.public)
-        if session is None:
-            return Passage("none")
-        kind = self._kind(session)
-        noted, since = self._passages.get(contact.public, (kind, session.opened_at))
-        carrier = self._carriers.session(contact.node_id) if kind == "carried" else None
-        by = b"" if carrier is None else carrier.contact.node_id
-        return Passage(kind, session.contact.address, by, since if noted == kind else session.opened_at)
-
-    def lost(self, contact: Contact) -> None:
-        """Forget since when a peer was reached: it is no more."""
-        self._passages.pop(contact.public, None)
-
     def let_go(self, public: bytes) -> None:
         """Forget a peer that was silent for long, and with which there is no session."""
         self._known.forget(public)
         self.outside.forget(public)
-        for table in (self._passages, self._punched, self._introduced_at):
-            table.pop(public, None)
-
-    def needs_use(self, contact: Contact) -> bool:
-        """Whether the way to a peer is open for only so long as it is used: routers forget whom they let in."""
-        kind, _ = self._passages.get(contact.public, ("none", 0.0))
-        return self.outside.is_translated or contact.address.is_virtual or kind == "punched"
+        self.ways.forget(public)
 
     # -- finding a way ----------------------------------------------------------------------------------------------
 
@@ -266,7 +230,7 @@ class Reach:
             return
         helper = attempt.helpful[0]
         session = self._peers.direct_session(helper.public)
-        port = self._open_further() if session is not None else 0
+        port = self._open_port() if session is not None else 0
         if session is None or not port:
             return
         wait = WE_WAIT.get(order, 0.0)
@@ -283,7 +247,7 @@ class Reach:
 
     def _knock_further(self, attempt: _Attempt, found: list[Address]) -> None:
         if found and attempt.opening is not None:
-            keep(self._introduced_at, attempt.peer.public, self._clock.seconds())
+            self.ways.introduced(attempt.peer.public)
             self._peers.knock_at(attempt.opening, found)
 
     async def _introduced(self, attempt: _Attempt, helper: Contact, own: list[Address], order: int) -> list[Address]:
@@ -321,7 +285,7 @@ class Reach:
             self._lead(peer, candidates, port)
         if peer.opening is None and not self._peers.open(peer, candidates[0], is_wanted=False):
             return False
-        keep(self._introduced_at, public, self._clock.seconds())
+        self.ways.introduced(public)
         opening = peer.opening
         if opening is not None:
             self._peers.hold(opening, max(opening.held_until, self._clock.seconds() + seconds))
@@ -401,7 +365,7 @@ class Reach:
             upgrade.due = max(upgrade.due, self._clock.seconds() + _pause(upgrade.step) + TURN)  # the other is at it
         port, own = 0, self._own(peer)
         session = self._peers.direct_session(peer.public)
-        if order != USUAL and session is not None and (further := self._open_further()):
+        if order != USUAL and session is not None and (further := self._open_port()):
             seen = await self.mirror.look(session, further)
             if seen is not None:
                 port, own = further, [seen, self._paths.local(peer.address, further)]
@@ -413,18 +377,12 @@ class Reach:
         return [packed(own), bool(port)]
 
     def _open_again(self, teller: Contact) -> None:
-        """Open the sessions anew that went through a hole in the own router, the newest ones of them at least."""
+        """Open the ways through the own router anew, and try soon to do without those who carry."""
         now = self._clock.seconds()
         if now - self._opened_at < OPENED_GAP:
             return
         self._opened_at = now
-        for public in list(reversed(self._punched))[:OPENED]:
-            session = self._peers.session(public)
-            peer = self._peers.known(public)
-            if session is None or peer is None:
-                del self._punched[public]
-            elif public != teller.public:
-                self._peers.open(peer, session.contact.address)
+        self.ways.open_again(teller.public)
         for upgrade in self._upgrades.values():
             upgrade.due, upgrade.step = now, 0
 
@@ -433,7 +391,7 @@ class Reach:
     def _established(self, session: Session) -> None:
         public, now = session.contact.public, self._clock.seconds()
         self._known.note(public)
-        self._note_passage(session, now)
+        self.ways.established(session)
         bucket = self._buckets.get(("meet", self._introducers.pop(public, b"")))
         if bucket is not None:
             bucket.give(1.0)
@@ -442,58 +400,30 @@ class Reach:
             if public not in self._upgrades and newest is session:
                 behind = TURN if self._own_id > session.contact.node_id else 0.0
                 keep(self._upgrades, public, _Upgrade(now + UPGRADES[0] + behind))
-                self._wake()
         else:
             self._upgrades.pop(public, None)
-            if self.outside.is_far(session.contact.address):
-                keep(self._punched, public, None)
-                self._wake()
-
-    def _note_passage(self, session: Session, now: float) -> None:
-        """Take note since when a peer is reached as it is now; a successor of a session changes nothing of that."""
-        public = session.contact.public
-        peer = self._peers.known(public)
-        if peer is None or peer.session is not session:
-            return  # the one that was there is used on
-        kind, noted = self._kind(session), self._passages.get(public)
-        if noted is None and len(peer.sessions) > 1:
-            former = peer.sessions[-2]
-            noted = (self._kind(former), former.opened_at)
-        if noted is not None or kind == "punched":  # else the session itself says it
-            since = noted[1] if noted is not None and noted[0] == kind else now
-            keep(self._passages, public, (kind, since))
-
-    def _kind(self, session: Session) -> Kind:
-        contact = session.contact
-        own = contact.address if contact.address.is_virtual else self._paths.local(contact.address)
-        before, _ = self._passages.get(contact.public, ("none", 0.0))
-        introduced_at = self._introduced_at.get(contact.public, float("-inf"))
-        was_introduced = before == "punched" or abs(session.opened_at - introduced_at) < HELD_S
-        return kind_of(contact.address, own, self.outside.is_translated, was_introduced)
+        self._wake()
 
     def _wake(self) -> None:
-        if not self._is_ticking:
+        """Go on with the upkeep as long as there is something to keep up."""
+        if not self._is_ticking and (self._upgrades or self.ways.has_holes or self._ports):
             self._is_ticking = True
             self._chores.later(TICK, self._tick)
 
     def _tick(self) -> None:
         now = self._clock.seconds()
-        for port, opened_at in list(self._further.items()):
-            if now - opened_at > FURTHER_S and not self._is_used(port):
-                del self._further[port]
-                self._paths.shut_port(port)
+        self._ports.shut_unused(now)
         for public, upgrade in list(self._upgrades.items()):
             peer = self._peers.known(public)
-            if peer is None or peer.session is None or now - peer.session.heard_at > FURTHER_S:
+            if peer is None or peer.session is None or now - peer.session.heard_at > GIVEN_UP_S:
                 del self._upgrades[public]
             elif now >= upgrade.due:
                 self._chores.fork(self._upgrade(peer, upgrade.step))
                 upgrade.step += 1
                 upgrade.due = now + _pause(upgrade.step)
         self.outside.show(now)
-        self._is_ticking = bool(self._upgrades or self._punched or self._further)
-        if self._is_ticking:
-            self._chores.later(TICK, self._tick)
+        self._is_ticking = False
+        self._wake()
 
     # -- small things -----------------------------------------------------------------------------------------------
 
@@ -519,30 +449,11 @@ class Reach:
         keep(self._buckets, key, bucket)
         return bucket.take(1.0, self._clock.seconds())
 
-    def _open_further(self) -> int:
+    def _open_port(self) -> int:
         """A fresh local port; 0 where there are too many."""
-        if len(self._further) >= MAX_FURTHER:
-            before = self._clock.seconds() - HELD_S
-            unused = [
-                port for port, opened_at in self._further.items() if opened_at < before and not self._is_used(port)
-            ]
-            if not unused:
-                return 0
-            del self._further[unused[0]]
-            self._paths.shut_port(unused[0])
-        port = self._paths.open_port()
-        if port:
-            self._further[port] = self._clock.seconds()
-            self._wake()
+        port = self._ports.open()
+        self._wake()
         return port
-
-    def _is_used(self, port: int) -> bool:
-        """Whether a session goes by this port."""
-        for public in self._punched:
-            session = self._peers.direct_session(public)
-            if session is not None and self._paths.local(session.contact.address).port == port:
-                return True
-        return False
 
 
 def _pause(step: int) -> float:

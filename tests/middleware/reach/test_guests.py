@@ -37,7 +37,7 @@ class QuietTests(GroundCase):
         ground.run(30.0)
         self.assertEqual(asked, [])
         for node in nodes[:3]:
-            self.assertFalse(node.reach._upgrades or node.reach._further or node.reach._is_ticking)
+            self.assertFalse(node.reach._upgrades or node.reach._ports or node.reach._is_ticking)
             self.assertEqual(len(node.reach.relay), 0)
 
     def test_answered_at_once(self) -> None:

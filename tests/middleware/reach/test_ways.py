@@ -181,7 +181,7 @@ class WeatherTests(GroundCase):
         assert peer is not None and peer.session is not None
         at_b = peer.session.contact.address
         port = ground.networks["a2"].local(at_b).port
-        self.assertIn(port, a.reach._further)
+        self.assertIn(port, a.reach._ports)
         a.reach.outside.saw(peer.session.contact, Address(ground.routers["a"].host, 3), is_told=True)
         self.assertEqual(len(a.endpoint.peers._openings), 0)
         a.reach._lead(peer, [at_b], 0)
