@@ -18,11 +18,12 @@ from functools import cached_property
 from twisted.internet.interfaces import IReactorTime
 
 from middleware.entangled.background import Background, until
-from middleware.entangled.errors import EntangledError, Refused
-from middleware.entangled.identity import ID_BYTES, node_id
+from middleware.entangled.errors import Refused
+from middleware.entangled.identity import node_id
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.contact import unpacked as contact_in
 from middleware.entangled.network.network import Address, is_relayed, relayed
+from middleware.entangled.reach.allowance import Allowance
 from middleware.entangled.reach.candidate import (
     MAX_CANDIDATES,
     is_loopback,
@@ -32,11 +33,13 @@ from middleware.entangled.reach.candidate import (
 )
 from middleware.entangled.reach.carrier import MAX_CARRIERS, Carriers
 from middleware.entangled.reach.freshport import FreshPorts
+from middleware.entangled.reach.introducer import ASKED_S, LIVELY_S, USUAL, Introducer
 from middleware.entangled.reach.known import Known, keep
 from middleware.entangled.reach.mirror import IMAGE, MIRROR, Mirror
 from middleware.entangled.reach.outside import Outside
 from middleware.entangled.reach.path import PathNetwork
-from middleware.entangled.reach.relay import CARRIED, CARRY, Bucket, Relay
+from middleware.entangled.reach.relay import CARRIED, CARRY, Relay
+from middleware.entangled.reach.upgrade import Upgrades
 from middleware.entangled.reach.way import HELD_S, Ways
 from middleware.entangled.wire.endpoint import Endpoint
 from middleware.entangled.wire.peer import Opening, Peer
@@ -49,43 +52,20 @@ FRESH_AT = 0.5
 CARRIED_AT = 0.9
 """Seconds after its beginning from which a handshake goes by those who carry, too: most direct ways are found by then,
 and what is asked with the usual patience of 1.5 s is answered yet."""
-ASKED_S = 1.0
 WELL_S = 3.0
 """Seconds since a peer was heard for which its way is left alone."""
-LIVELY_S = 20.0
-"""Seconds since a helper was heard for which it is worth asking."""
-USUAL, AT_ONCE = 0, 1
+AT_ONCE = 1
 WE_WAIT = {3: 0.15, 5: 0.7}
 THEY_WAIT = {2: 0.15, 4: 0.7}
 ORDERS = (2, 3, 4, 5, AT_ONCE)
 """In which order two knock: at their usual ports; or at fresh ones, at the same time or one some seconds after the
 other.  A knock that comes too early spoils some routers' ports, and does no harm to others; nobody knows which."""
-UPGRADES = (1.0, 2.0, 5.0, 15.0, 60.0)
-"""Seconds after which a carried pair tries the direct way again; the last one is repeated."""
 UPGRADING_S = 1.2
-GIVEN_UP_S = 60.0
-"""Seconds after which a silent carried peer is given up."""
-TURN = 0.5
-"""Seconds by which one of the two is behind the other, so that only one of them tries."""
 MAX_NAMERS = 3
 """Peers of which is kept that they named the same node."""
 TICK = 1.0
-INTRODUCTIONS = 20.0
-"""Times in a second, and at once twice as often, that one peer may have this node introduce it."""
-MEETS, MEETS_AT_ONCE = 1.0, 60.0
-"""Times in a second, and at once, that one peer may make this node knock where nobody answers.  Who is met does not
-count; so a member that names addresses of strangers gets 0.2 MB/s sent there by this node, and a team that starts
-behind routers none the less meets in a moment."""
 OPENED_GAP = 2.0
 """Seconds at least between two times at which sessions are opened anew since this node's address changed."""
-
-
-@dataclass(slots=True)
-class _Upgrade:
-    """A carried peer, and when the direct way is tried next."""
-
-    due: float
-    step: int = 0
 
 
 @dataclass(slots=True)
@@ -127,9 +107,6 @@ class Reach:
         self._chores = chores
         self._known = Known(endpoint.peers)
         self._namers: dict[bytes, dict[bytes, None]] = {}
-        self._upgrades: dict[bytes, _Upgrade] = {}
-        self._buckets: dict[tuple[str, bytes], Bucket] = {}
-        self._introducers: dict[bytes, bytes] = {}
         self._is_ticking = False
         self._opened_at = float("-inf")
         self.outside = Outside(endpoint, paths, acquaintances, clock, chores)
@@ -137,13 +114,16 @@ class Reach:
         self.ways = Ways(endpoint.peers, paths, self.outside, self._carriers, clock)
         self._ports = FreshPorts(paths, self.ways, clock)
         self.relay = Relay(self._known.direct_session, endpoint.send_inside, clock, endpoint.counters)
+        self._allowance = Allowance(clock)
+        self.introducer = Introducer(endpoint, self._known, self._carriers, self.relay, self._allowance, clock)
+        self._upgrades = Upgrades(endpoint.peers)
         self.mirror = Mirror(endpoint.send_inside, paths, clock, lambda: self._rng, chores)
         endpoint.route_inside(CARRY, self.relay.on_carry)
         endpoint.route_inside(CARRIED, self._carriers.on_carried)
         endpoint.route_inside(MIRROR, self.mirror.on_mirror)
         endpoint.route_inside(IMAGE, self.mirror.on_image)
         # Run once for each question, however often it is repeated: each run would open another port.
-        endpoint.expose("reach.introduce", self._answer_introduce, changes=True)
+        endpoint.expose("reach.introduce", self.introducer.answer_introduce, changes=True)
         endpoint.expose("reach.meet", self._answer_meet, changes=True)
         endpoint.expose("reach.seen", self.outside.answer_seen, changes=True)
         self._peers.is_far = self.outside.is_far
@@ -326,43 +306,19 @@ class Reach:
 
     # -- what others ask --------------------------------------------------------------------------------------------
 
-    async def _answer_introduce(
-        self, peer: Contact, wanted: bytes, candidates: list[object], order: int
-    ) -> list[object] | None:
-        """REACH.INTRODUCE: tell the node of that id where ``peer`` is, and ``peer`` where it is; nil: not known."""
-        if len(wanted) != ID_BYTES or not self._may("introduce", peer, INTRODUCTIONS):
-            raise Refused("no introduction: that is no id, or too many are wanted")
-        session = self._known.session(wanted)
-        if session is None or self._clock.seconds() - session.heard_at > LIVELY_S:
-            return None
-        theirs = [*self._as_seen(peer, order != USUAL), *unpacked(candidates)]
-        try:
-            answer = await self._endpoint.ask(
-                session.contact, "reach.meet", peer.public, packed(theirs), order, timeout=ASKED_S, changes=True
-            )
-        except EntangledError:
-            return None
-        fields, was_fresh = answer if isinstance(answer, list) and len(answer) == 2 else ([], False)
-        found = [*self._as_seen(session.contact, was_fresh is True), *unpacked(fields)]
-        is_direct = not (is_relayed(session.contact.address) or is_relayed(peer.address))
-        carriers = self._carriers.contacts(wanted) if is_relayed(session.contact.address) else []
-        return [packed(found), [contact.packed() for contact in carriers], is_direct and self.relay.has_room]
-
     async def _answer_meet(self, peer: Contact, public: bytes, candidates: list[object], order: int) -> list[object]:
         """REACH.MEET: knock at the candidates of ``public``, whom ``peer`` introduces; gives the own ones."""
-        if not self._may("meet", peer, MEETS, MEETS_AT_ONCE):
+        if not self._allowance.may_meet(peer.public):
             raise Refused("too many introductions to who does not answer")
         found = [address for address in unpacked(candidates) if self._is_worth(address)]
         stranger = node_id(public)
         if stranger == self._own_id:
             raise Refused("that is this node itself")
         self._known.note(public)
-        keep(self._introducers, public, peer.public)
+        self._allowance.introduced(public, peer.public)
         if not is_relayed(peer.address):
             self._carriers.note(stranger, peer.public)
-        upgrade = self._upgrades.get(public)
-        if upgrade is not None:
-            upgrade.due = max(upgrade.due, self._clock.seconds() + _pause(upgrade.step) + TURN)  # the other is at it
+        self._upgrades.put_off(public, self._clock.seconds())
         port, own = 0, self._own(peer)
         session = self._peers.direct_session(peer.public)
         if order != USUAL and session is not None and (further := self._open_port()):
@@ -383,8 +339,7 @@ class Reach:
             return
         self._opened_at = now
         self.ways.open_again(teller.public)
-        for upgrade in self._upgrades.values():
-            upgrade.due, upgrade.step = now, 0
+        self._upgrades.hurry(now)
 
     # -- upkeep -----------------------------------------------------------------------------------------------------
 
@@ -392,16 +347,12 @@ class Reach:
         public, now = session.contact.public, self._clock.seconds()
         self._known.note(public)
         self.ways.established(session)
-        bucket = self._buckets.get(("meet", self._introducers.pop(public, b"")))
-        if bucket is not None:
-            bucket.give(1.0)
+        self._allowance.met(public)
         if is_relayed(session.contact.address):
-            newest = self._peers.session(public)
-            if public not in self._upgrades and newest is session:
-                behind = TURN if self._own_id > session.contact.node_id else 0.0
-                keep(self._upgrades, public, _Upgrade(now + UPGRADES[0] + behind))
+            if self._peers.session(public) is session:
+                self._upgrades.add(public, self._own_id > session.contact.node_id, now)
         else:
-            self._upgrades.pop(public, None)
+            self._upgrades.drop(public)
         self._wake()
 
     def _wake(self) -> None:
@@ -413,14 +364,8 @@ class Reach:
     def _tick(self) -> None:
         now = self._clock.seconds()
         self._ports.shut_unused(now)
-        for public, upgrade in list(self._upgrades.items()):
-            peer = self._peers.known(public)
-            if peer is None or peer.session is None or now - peer.session.heard_at > GIVEN_UP_S:
-                del self._upgrades[public]
-            elif now >= upgrade.due:
-                self._chores.fork(self._upgrade(peer, upgrade.step))
-                upgrade.step += 1
-                upgrade.due = now + _pause(upgrade.step)
+        for peer, step in self._upgrades.due(now):
+            self._chores.fork(self._upgrade(peer, step))
         self.outside.show(now)
         self._is_ticking = False
         self._wake()
@@ -439,22 +384,8 @@ class Reach:
         others = [Address(host, self._paths.address.port) for host in self._paths.hosts()]
         return list(dict.fromkeys([first, *others]))[: MAX_CANDIDATES - 1]
 
-    def _as_seen(self, contact: Contact, is_fresh: bool) -> list[Address]:
-        """Where this node sees a peer, which is no help where the peer uses a fresh port."""
-        return [contact.address] if not is_fresh and is_possible(contact.address) else []
-
-    def _may(self, what: str, peer: Contact, rate: float, at_once: float = 0.0) -> bool:
-        key = (what, peer.public)
-        bucket = self._buckets.pop(key, None) or Bucket(rate, at_once or 2 * rate)
-        keep(self._buckets, key, bucket)
-        return bucket.take(1.0, self._clock.seconds())
-
     def _open_port(self) -> int:
         """A fresh local port; 0 where there are too many."""
         port = self._ports.open()
         self._wake()
         return port
-
-
-def _pause(step: int) -> float:
-    return UPGRADES[min(step, len(UPGRADES) - 1)]

@@ -10,8 +10,8 @@ from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact, unpacked
 from middleware.entangled.network.network import Address, relayed
 from middleware.entangled.network.switchboard import Weather
+from middleware.entangled.reach.allowance import MEETS, MEETS_AT_ONCE
 from middleware.entangled.reach.known import MAX_KNOWN
-from middleware.entangled.reach.reach import MEETS, MEETS_AT_ONCE
 from middleware.entangled.wire.peer import KNOCKS, MAX_DOORS
 from tests.middleware.reach.ground import GroundCase
 
@@ -100,7 +100,7 @@ class HostileTests(GroundCase):
             reach._namers,
             reach._carriers,
             reach._upgrades,
-            reach._buckets,
+            reach._allowance,
             reach.outside._seen,
         ):
             self.assertLessEqual(len(table), MAX_KNOWN)

@@ -307,7 +307,7 @@ def _peer(of: EntangledNode, other: EntangledNode) -> Peer | None:
 
 def _listening(node: EntangledNode, asked: list[bytes]) -> Any:
     """The node's method, which notes that it was asked."""
-    answer = node.reach._answer_introduce
+    answer = node.reach.introducer.answer_introduce
 
     def introduce(peer: Contact, wanted: bytes, candidates: list[object], order: int) -> Any:
         asked.append(node.identity.node_id)
