@@ -87,7 +87,7 @@ class EntangledNode:
         self.endpoint = Endpoint(identity, team_key, paths, clock, rng, door)
         self.overlay = Overlay(lambda: self.contact, self.endpoint, clock, chores)
         self.reach = Reach(identity.node_id, self.endpoint, paths, self.overlay.contacts, clock, chores)
-        self.overlay.on_named = self.reach.named
+        self.overlay.on_named = self.reach.acquaintances.named
         self.replica = Replica(store, self.endpoint, clock, chores)
         self._owner = Owner(identity, lease, store, self.replica, self.overlay, self.endpoint, clock, chores)
         self._membership = membership = Membership(self.overlay, self.endpoint, clock, rng, chores)
@@ -160,7 +160,7 @@ class EntangledNode:
         with a ``lan``, as soon as one of the team answers there or nobody did for a moment.  The node then looks up
         its own id, meets the others, and takes over what it is to hold.
         """
-        self.reach.bootstraps |= {*known, *detours_of(self._network)}
+        self.reach.acquaintances.bootstraps |= {*known, *detours_of(self._network)}
         return _run(self._join(known))
 
     def stop(self) -> None:

@@ -260,7 +260,7 @@ def _buckets(node: EntangledNode) -> list[Any]:
 
 def _ways(node: EntangledNode) -> list[tuple[str, int, int]]:
     reach: Any = node.reach
-    tables = ("_namers", "_carriers", "_upgrades", "_allowance")
+    tables = ("acquaintances", "_carriers", "_upgrades", "_allowance")
     return [
         ("peers by their ids", len(reach._known), MAX_PEERS),
         ("pairs that are carried for", len(reach.relay), MAX_PAIRS),

@@ -1,4 +1,4 @@
-"""Introducer: the third, who tells two peers where it sees the other, so that they knock at the same time."""
+"""Introducer: the third, who tells each of two peers where it sees the other, so that they knock at the same time."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from middleware.entangled.network.network import Address, is_relayed
 from middleware.entangled.reach.allowance import Allowance
 from middleware.entangled.reach.candidate import is_possible, packed, unpacked
 from middleware.entangled.reach.carrier import Carriers
-from middleware.entangled.reach.known import Known
+from middleware.entangled.reach.known import LIVELY_S, Known
 from middleware.entangled.reach.relay import Relay
 from middleware.entangled.wire.endpoint import Endpoint
 
@@ -19,8 +19,6 @@ USUAL = 0
 """The order in which two knock at their usual ports; in all others they do so at fresh ones."""
 ASKED_S = 1.0
 """Seconds for which an answer is waited for."""
-LIVELY_S = 20.0
-"""Seconds since a peer was heard for which it is worth asking."""
 
 
 class Introducer:

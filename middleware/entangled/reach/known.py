@@ -9,6 +9,8 @@ from middleware.entangled.identity import node_id
 from middleware.entangled.wire.peer import MAX_PEERS, Peers
 from middleware.entangled.wire.session import Session
 
+LIVELY_S = 20.0
+"""Seconds since a peer was heard for which it is worth asking."""
 MAX_KNOWN = 1024
 """Peers of which is kept who named them, who carries to them, and the like."""
 

@@ -31,7 +31,7 @@ datagram that shows it, it learns where to."""
 class Outside:
     """The addresses at which peers see this node.
 
-    ``acquaintances`` gives the peers that are known.  ``on_change`` is called with the peer that told it when this
+    ``contacts`` gives the peers that are known.  ``on_change`` is called with the peer that told it when this
     node is seen elsewhere than before.  A node ``is_translated`` as soon as one peer saw it at an address that it has
     not.
     """
@@ -40,7 +40,7 @@ class Outside:
         self,
         endpoint: Endpoint,
         paths: PathNetwork,
-        acquaintances: Callable[[], Iterable[Contact]],
+        contacts: Callable[[], Iterable[Contact]],
         clock: IReactorTime,
         chores: Background,
     ) -> None:
@@ -49,7 +49,7 @@ class Outside:
         self._endpoint = endpoint
         self._peers = endpoint.peers
         self._paths = paths
-        self._acquaintances = acquaintances
+        self._contacts = contacts
         self._clock = clock
         self._chores = chores
         self._seen: dict[bytes, tuple[Address, float]] = {}
@@ -123,7 +123,7 @@ class Outside:
         """Where nobody was heard lately who could introduce us, show one that we are here, and so from where."""
         if now <= self._shown_until:
             return
-        sessions = [s for c in self._acquaintances() if (s := self._peers.direct_session(c.public)) is not None]
+        sessions = [s for c in self._contacts() if (s := self._peers.direct_session(c.public)) is not None]
         sessions.sort(key=lambda session: -session.heard_at)
         latest = next((session for session in sessions if self.is_far(session.contact.address)), None)
         if latest is not None:

@@ -23,18 +23,13 @@ from middleware.entangled.identity import node_id
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.contact import unpacked as contact_in
 from middleware.entangled.network.network import Address, is_relayed, relayed
+from middleware.entangled.reach.acquaintance import Acquaintances
 from middleware.entangled.reach.allowance import Allowance
-from middleware.entangled.reach.candidate import (
-    MAX_CANDIDATES,
-    is_loopback,
-    is_possible,
-    packed,
-    unpacked,
-)
+from middleware.entangled.reach.candidate import MAX_CANDIDATES, is_loopback, is_possible, packed, unpacked
 from middleware.entangled.reach.carrier import MAX_CARRIERS, Carriers
 from middleware.entangled.reach.freshport import FreshPorts
-from middleware.entangled.reach.introducer import ASKED_S, LIVELY_S, USUAL, Introducer
-from middleware.entangled.reach.known import Known, keep
+from middleware.entangled.reach.introducer import ASKED_S, USUAL, Introducer
+from middleware.entangled.reach.known import Known
 from middleware.entangled.reach.mirror import IMAGE, MIRROR, Mirror
 from middleware.entangled.reach.outside import Outside
 from middleware.entangled.reach.path import PathNetwork
@@ -45,8 +40,6 @@ from middleware.entangled.wire.endpoint import Endpoint
 from middleware.entangled.wire.peer import Opening, Peer
 from middleware.entangled.wire.session import Session
 
-HELPERS = 3
-"""Peers that are asked at the same time how another one is reached."""
 FRESH_AT = 0.5
 """Seconds after its beginning from which a handshake is tried from a fresh local port, too."""
 CARRIED_AT = 0.9
@@ -61,8 +54,6 @@ ORDERS = (2, 3, 4, 5, AT_ONCE)
 """In which order two knock: at their usual ports; or at fresh ones, at the same time or one some seconds after the
 other.  A knock that comes too early spoils some routers' ports, and does no harm to others; nobody knows which."""
 UPGRADING_S = 1.2
-MAX_NAMERS = 3
-"""Peers of which is kept that they named the same node."""
 TICK = 1.0
 OPENED_GAP = 2.0
 """Seconds at least between two times at which sessions are opened anew since this node's address changed."""
@@ -82,10 +73,9 @@ class _Attempt:
 
 
 class Reach:
-    """Introductions, carrying and their upkeep for one node.
+    """Finds ways to peers, by introductions and by those who carry, and keeps them up, for one node.
 
-    ``acquaintances`` gives the peers that are known; ``bootstraps`` are addresses of nodes that are asked rather than
-    others.
+    ``contacts`` gives the peers that are known.
     """
 
     def __init__(
@@ -93,24 +83,24 @@ class Reach:
         own_id: bytes,
         endpoint: Endpoint,
         paths: PathNetwork,
-        acquaintances: Callable[[], Iterable[Contact]],
+        contacts: Callable[[], Iterable[Contact]],
         clock: IReactorTime,
         chores: Background,
     ) -> None:
-        self.bootstraps: set[Address] = set()
         self._own_id = own_id
         self._endpoint = endpoint
         self._peers = endpoint.peers
         self._paths = paths
-        self._acquaintances = acquaintances
         self._clock = clock
         self._chores = chores
         self._known = Known(endpoint.peers)
-        self._namers: dict[bytes, dict[bytes, None]] = {}
         self._is_ticking = False
         self._opened_at = float("-inf")
-        self.outside = Outside(endpoint, paths, acquaintances, clock, chores)
+        self.outside = Outside(endpoint, paths, contacts, clock, chores)
         self._carriers = Carriers(own_id, endpoint, paths, clock)
+        self.acquaintances = Acquaintances(
+            own_id, endpoint.peers, contacts, self.outside, self._carriers, clock, lambda: self._rng
+        )
         self.ways = Ways(endpoint.peers, paths, self.outside, self._carriers, clock)
         self._ports = FreshPorts(paths, self.ways, clock)
         self.relay = Relay(self._known.direct_session, endpoint.send_inside, clock, endpoint.counters)
@@ -138,14 +128,6 @@ class Reach:
     def _rng(self) -> random.Random:
         # Dice of its own: they only spread the load, and the endpoint's shall fall as they would without it.
         return random.Random(int.from_bytes(self._own_id))
-
-    def named(self, contact: Contact, by: Contact) -> None:
-        """Keep in mind that the peer ``by`` named ``contact``: it may know how to reach it."""
-        if not self.outside.is_far(contact.address):
-            return
-        namers = self._namers.pop(contact.node_id, None) or {}
-        keep(namers, by.public, None, MAX_NAMERS)
-        keep(self._namers, contact.node_id, namers)
 
     def let_go(self, public: bytes) -> None:
         """Forget a peer that was silent for long, and with which there is no session."""
@@ -202,6 +184,9 @@ class Reach:
             return bool(attempt.helpful)
 
         await until(lambda results: any(results), [ask(helper) for helper in helpers])
+
+    def _helpers(self, attempt: _Attempt) -> list[Contact]:
+        return self.acquaintances.helpers(attempt.node_id, attempt.hinted, attempt.asked)
 
     async def _knock_afresh(self, attempt: _Attempt, order: int) -> None:
         """Try again from a fresh local port: early knocks of the other side may have spoilt the first one."""
@@ -280,30 +265,6 @@ class Reach:
             if address != used:
                 self._paths.lead(address, port)
 
-    def _helpers(self, attempt: _Attempt) -> list[Contact]:
-        """Whom to ask about a peer: who named it or carries to it, bootstraps, then anybody; nobody twice."""
-        now = self._clock.seconds()
-        first = [*attempt.hinted]
-        for public in [*self._namers.get(attempt.node_id, ()), *self._carriers.of(attempt.node_id)]:
-            first += [session.contact] if (session := self._peers.session(public)) is not None else []
-        known = list(self._acquaintances())
-        self._rng.shuffle(known)
-        known.sort(key=lambda contact: (is_relayed(contact.address), contact.address not in self.bootstraps))
-        found: dict[bytes, Contact] = {}
-        for contact in [*first, *known]:
-            session = self._peers.session(contact.public)
-            if contact.public in attempt.asked or contact.public == attempt.peer.public:
-                continue
-            if contact.node_id == self._own_id:
-                continue
-            if session is not None and now - session.heard_at < LIVELY_S:
-                found.setdefault(contact.public, session.contact)
-            elif contact in attempt.hinted:
-                found.setdefault(contact.public, contact)
-            if len(found) == HELPERS:
-                break
-        return list(found.values())
-
     # -- what others ask --------------------------------------------------------------------------------------------
 
     async def _answer_meet(self, peer: Contact, public: bytes, candidates: list[object], order: int) -> list[object]:
@@ -332,6 +293,8 @@ class Reach:
             self._chores.later(wait, self._knock, public, found, port, HELD_S)
         return [packed(own), bool(port)]
 
+    # -- upkeep -----------------------------------------------------------------------------------------------------
+
     def _open_again(self, teller: Contact) -> None:
         """Open the ways through the own router anew, and try soon to do without those who carry."""
         now = self._clock.seconds()
@@ -340,8 +303,6 @@ class Reach:
         self._opened_at = now
         self.ways.open_again(teller.public)
         self._upgrades.hurry(now)
-
-    # -- upkeep -----------------------------------------------------------------------------------------------------
 
     def _established(self, session: Session) -> None:
         public, now = session.contact.public, self._clock.seconds()

@@ -97,7 +97,7 @@ class HostileTests(GroundCase):
         reach = self.b.reach
         for table in (
             reach._known,
-            reach._namers,
+            reach.acquaintances,
             reach._carriers,
             reach._upgrades,
             reach._allowance,

@@ -293,7 +293,7 @@ class CarriedTests(GroundCase):
         known = peers.known(b.identity.public)
         assert known is not None
         peers.evict(known)
-        c.reach.named(Contact(b.identity.public, relayed(b.identity.node_id)), others[3].contact)
+        c.reach.acquaintances.named(Contact(b.identity.public, relayed(b.identity.node_id)), others[3].contact)
         asked.clear()
         answer, _ = ground.call(c, Contact(b.identity.public, relayed(b.identity.node_id)))
         self.assertEqual(answer, 7)
