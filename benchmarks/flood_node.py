@@ -185,7 +185,7 @@ class Node(Protocol):
                 "peers": len(endpoint._peers._peers),
                 "assemblies": len(endpoint._courier._assemblies),
                 "led": len(self.network._led),
-                "seen": len(reach._seen),
+                "seen": len(reach.outside._seen),
             },
         }
         self._clear()

@@ -87,11 +87,11 @@ class EntangledNode:
         self.endpoint = Endpoint(identity, team_key, paths, clock, rng, door)
         self.overlay = Overlay(lambda: self.contact, self.endpoint, clock, chores)
         self.reach = Reach(identity.node_id, self.endpoint, paths, self.overlay.contacts, clock, chores)
-        self.overlay.on_named = self.reach.named
+        self.overlay.on_named = self.reach.acquaintances.named
         self.replica = Replica(store, self.endpoint, clock, chores)
         self._owner = Owner(identity, lease, store, self.replica, self.overlay, self.endpoint, clock, chores)
         self._membership = membership = Membership(self.overlay, self.endpoint, clock, rng, chores)
-        membership.sounding.needs_use = self.reach.needs_use
+        membership.sounding.needs_use = self.reach.ways.needs_use
         self.endpoint.on_let_go = self.reach.let_go
         self._detour = membership.detour
         self.discovery = (
@@ -160,7 +160,7 @@ class EntangledNode:
         with a ``lan``, as soon as one of the team answers there or nobody did for a moment.  The node then looks up
         its own id, meets the others, and takes over what it is to hold.
         """
-        self.reach.bootstraps |= {*known, *detours_of(self._network)}
+        self.reach.acquaintances.bootstraps |= {*known, *detours_of(self._network)}
         return _run(self._join(known))
 
     def stop(self) -> None:
@@ -365,7 +365,7 @@ class EntangledNode:
         self._subscriber.forget(contact.node_id)
         self._handover.lost(contact)
         self._membership.lost(contact)
-        self.reach.lost(contact)
+        self.reach.ways.lost(contact)
 
     def _refused(self, contact: Contact, code: str) -> None:
         """A member does not let this node in: it cannot be reached, and counts as one that is absent."""

@@ -19,7 +19,8 @@ from middleware.entangled.identity import Identity, exchange_key
 from middleware.entangled.kademlia.overlay import MAX_FOUND, K
 from middleware.entangled.network.network import Address
 from middleware.entangled.node import EntangledNode
-from middleware.entangled.reach.reach import MAX_FURTHER, MAX_KNOWN
+from middleware.entangled.reach.freshport import MAX_FRESH
+from middleware.entangled.reach.known import MAX_KNOWN
 from middleware.entangled.reach.relay import MAX_PAIRS
 from middleware.entangled.wire.answerer import MAX_CANCELLED
 from middleware.entangled.wire.greeting import TOKEN_BYTES, who
@@ -259,10 +260,13 @@ def _buckets(node: EntangledNode) -> list[Any]:
 
 def _ways(node: EntangledNode) -> list[tuple[str, int, int]]:
     reach: Any = node.reach
-    tables = ("_namers", "_carriers", "_upgrades", "_punched", "_seen", "_told_at", "_buckets")
+    tables = ("acquaintances", "_carriers", "_upgrades", "_allowance")
     return [
-        ("peers by their ids", len(reach._ids), MAX_PEERS),
+        ("peers by their ids", len(reach._known), MAX_PEERS),
         ("pairs that are carried for", len(reach.relay), MAX_PAIRS),
-        ("fresh ports", len(reach._further), MAX_FURTHER),
+        ("fresh ports", len(reach._ports), MAX_FRESH),
         *((f"ways ({name})", len(getattr(reach, name)), MAX_KNOWN) for name in tables),
+        ("holes in its router", len(reach.ways._holes), MAX_KNOWN),
+        ("where it is seen", len(reach.outside._seen), MAX_KNOWN),
+        ("who was told where it is seen", len(reach.outside._told_at), MAX_KNOWN),
     ]

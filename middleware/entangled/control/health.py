@@ -55,7 +55,7 @@ async def links(node: EntangledNode, clock: IReactorTime) -> list[Mapping[str, A
 
 def way(node: EntangledNode, clock: IReactorTime, contact: Contact) -> dict[str, Any]:
     """How a peer is reached: ``way`` is a ``passage.Kind``, ``by`` the id of who carries, or empty."""
-    passage = node.reach.passage(contact)
+    passage = node.reach.ways.passage(contact)
     return {
         "id": contact.node_id.hex(),
         "address": str(passage.address or contact.address),

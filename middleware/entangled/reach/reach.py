@@ -14,91 +14,49 @@ import random
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Literal
 
 from twisted.internet.interfaces import IReactorTime
 
 from middleware.entangled.background import Background, until
-from middleware.entangled.errors import EntangledError, Refused
-from middleware.entangled.identity import ID_BYTES, node_id
+from middleware.entangled.errors import Refused
+from middleware.entangled.identity import node_id
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.contact import unpacked as contact_in
 from middleware.entangled.network.network import Address, is_relayed, relayed
-from middleware.entangled.reach.candidate import (
-    MAX_CANDIDATES,
-    is_loopback,
-    is_near,
-    is_possible,
-    packed,
-    unpacked,
-)
+from middleware.entangled.reach.acquaintance import Acquaintances
+from middleware.entangled.reach.allowance import Allowance
+from middleware.entangled.reach.candidate import MAX_CANDIDATES, is_loopback, is_possible, packed, unpacked
+from middleware.entangled.reach.carrier import MAX_CARRIERS, Carriers
+from middleware.entangled.reach.freshport import FreshPorts
+from middleware.entangled.reach.introducer import ASKED_S, USUAL, Introducer
+from middleware.entangled.reach.known import Known
 from middleware.entangled.reach.mirror import IMAGE, MIRROR, Mirror
-from middleware.entangled.reach.passage import Kind, Passage, kind_of
+from middleware.entangled.reach.outside import Outside
 from middleware.entangled.reach.path import PathNetwork
-from middleware.entangled.reach.relay import CARRIED, CARRY, HEAD, Bucket, Relay
+from middleware.entangled.reach.relay import CARRIED, CARRY, Relay
+from middleware.entangled.reach.upgrade import Upgrades
+from middleware.entangled.reach.way import HELD_S, Ways
 from middleware.entangled.wire.endpoint import Endpoint
-from middleware.entangled.wire.peer import MAX_PEERS, Opening, Peer
+from middleware.entangled.wire.peer import Opening, Peer
 from middleware.entangled.wire.session import Session
 
-HELPERS = 3
-"""Peers that are asked at the same time how another one is reached."""
 FRESH_AT = 0.5
 """Seconds after its beginning from which a handshake is tried from a fresh local port, too."""
 CARRIED_AT = 0.9
 """Seconds after its beginning from which a handshake goes by those who carry, too: most direct ways are found by then,
 and what is asked with the usual patience of 1.5 s is answered yet."""
-HELD_S = 5.0
-"""Seconds for which a handshake goes on that others help with."""
-ASKED_S = 1.0
 WELL_S = 3.0
 """Seconds since a peer was heard for which its way is left alone."""
-LIVELY_S = 20.0
-"""Seconds since a helper was heard for which it is worth asking."""
-USUAL, AT_ONCE = 0, 1
+AT_ONCE = 1
 WE_WAIT = {3: 0.15, 5: 0.7}
 THEY_WAIT = {2: 0.15, 4: 0.7}
 ORDERS = (2, 3, 4, 5, AT_ONCE)
 """In which order two knock: at their usual ports; or at fresh ones, at the same time or one some seconds after the
 other.  A knock that comes too early spoils some routers' ports, and does no harm to others; nobody knows which."""
-UPGRADES = (1.0, 2.0, 5.0, 15.0, 60.0)
-"""Seconds after which a carried pair tries the direct way again; the last one is repeated."""
 UPGRADING_S = 1.2
-TURN = 0.5
-"""Seconds by which one of the two is behind the other, so that only one of them tries."""
-MAX_KNOWN = 1024
-"""Peers of which is kept who named them, and who carries to them."""
-MAX_NAMERS = 3
-MAX_FURTHER = 16
-"""Fresh local ports at the same time."""
-FURTHER_S = 60.0
-"""Seconds after which a fresh port is closed where no session goes by it, and a silent carried peer is given up."""
 TICK = 1.0
-ANCHOR_S = 2.5
-"""Seconds without a word from anybody who introduces after which such a one is shown that this node is here: by the
-datagram that shows it, it learns where to."""
-INTRODUCTIONS = 20.0
-"""Times in a second, and at once twice as often, that one peer may have this node introduce it."""
-MEETS, MEETS_AT_ONCE = 1.0, 60.0
-"""Times in a second, and at once, that one peer may make this node knock where nobody answers.  Who is met does not
-count; so a member that names addresses of strangers gets 0.2 MB/s sent there by this node, and a team that starts
-behind routers none the less meets in a moment."""
-SEEN_S = 600.0
-"""Seconds for which others' word on where this node is holds beside a newer one."""
-OPENED, OPENED_GAP = 64, 2.0
-"""Sessions that are opened anew when this node's address changed, and seconds at least between two times."""
-SEEN_AFTER, SEEN_GAP = 0.1, 1.0
-"""Seconds after which a peer is told that it moved, if it still seems so (who replays what it caught moves nobody for
-long), and at least between two times."""
-
-Way = Literal["none", "direct", "carried"]
-
-
-@dataclass(slots=True)
-class _Upgrade:
-    """A carried peer, and when the direct way is tried next."""
-
-    due: float
-    step: int = 0
+OPENED_GAP = 2.0
+"""Seconds at least between two times at which sessions are opened anew since this node's address changed."""
 
 
 @dataclass(slots=True)
@@ -115,10 +73,9 @@ class _Attempt:
 
 
 class Reach:
-    """Introductions, carrying and their upkeep for one node.
+    """Finds ways to peers, by introductions and by those who carry, and keeps them up, for one node.
 
-    ``acquaintances`` gives the peers that are known; ``bootstraps`` are addresses of nodes that are asked rather than
-    others.
+    ``contacts`` gives the peers that are known.
     """
 
     def __init__(
@@ -126,108 +83,57 @@ class Reach:
         own_id: bytes,
         endpoint: Endpoint,
         paths: PathNetwork,
-        acquaintances: Callable[[], Iterable[Contact]],
+        contacts: Callable[[], Iterable[Contact]],
         clock: IReactorTime,
         chores: Background,
     ) -> None:
-        self.bootstraps: set[Address] = set()
         self._own_id = own_id
         self._endpoint = endpoint
         self._peers = endpoint.peers
         self._paths = paths
-        self._acquaintances = acquaintances
         self._clock = clock
         self._chores = chores
-        self._ids: dict[bytes, bytes] = {}
-        self._namers: dict[bytes, dict[bytes, None]] = {}
-        self._carriers: dict[bytes, dict[bytes, float]] = {}
-        self._upgrades: dict[bytes, _Upgrade] = {}
-        self._punched: dict[bytes, None] = {}
-        self._introduced_at: dict[bytes, float] = {}
-        self._passages: dict[bytes, tuple[Kind, float]] = {}
-        self._seen: dict[bytes, tuple[Address, float]] = {}
-        self._seen_last: Address | None = None
-        self._told_at: dict[bytes, float] = {}
-        self._buckets: dict[tuple[str, bytes], Bucket] = {}
-        self._introducers: dict[bytes, bytes] = {}
-        self._further: dict[int, float] = {}
-        self._is_translated = False
+        self._known = Known(endpoint.peers)
         self._is_ticking = False
         self._opened_at = float("-inf")
-        self._shown_until = float("-inf")
-        self.relay = Relay(self._session_by_id, endpoint.send_inside, clock, endpoint.counters)
+        self.outside = Outside(endpoint, paths, contacts, clock, chores)
+        self._carriers = Carriers(own_id, endpoint, paths, clock)
+        self.acquaintances = Acquaintances(
+            own_id, endpoint.peers, contacts, self.outside, self._carriers, clock, lambda: self._rng
+        )
+        self.ways = Ways(endpoint.peers, paths, self.outside, self._carriers, clock)
+        self._ports = FreshPorts(paths, self.ways, clock)
+        self.relay = Relay(self._known.direct_session, endpoint.send_inside, clock, endpoint.counters)
+        self._allowance = Allowance(clock)
+        self.introducer = Introducer(endpoint, self._known, self._carriers, self.relay, self._allowance, clock)
+        self._upgrades = Upgrades(endpoint.peers)
         self.mirror = Mirror(endpoint.send_inside, paths, clock, lambda: self._rng, chores)
         endpoint.route_inside(CARRY, self.relay.on_carry)
-        endpoint.route_inside(CARRIED, self._on_carried)
+        endpoint.route_inside(CARRIED, self._carriers.on_carried)
         endpoint.route_inside(MIRROR, self.mirror.on_mirror)
         endpoint.route_inside(IMAGE, self.mirror.on_image)
         # Run once for each question, however often it is repeated: each run would open another port.
-        endpoint.expose("reach.introduce", self._answer_introduce, changes=True)
+        endpoint.expose("reach.introduce", self.introducer.answer_introduce, changes=True)
         endpoint.expose("reach.meet", self._answer_meet, changes=True)
-        endpoint.expose("reach.seen", self._answer_seen, changes=True)
-        self._peers.is_far = self._is_far
+        endpoint.expose("reach.seen", self.outside.answer_seen, changes=True)
+        self._peers.is_far = self.outside.is_far
         self._peers.on_silence = lambda opening: chores.fork(self._find(opening))
         self._peers.on_established = self._established
-        self._peers.on_moved = self._moved
-        endpoint.on_seen = self._saw
-        paths.carry = self._carry
+        self._peers.on_moved = self.outside.tell
+        endpoint.on_seen = self.outside.saw
+        self.outside.on_change = self._open_again
+        paths.carry = self._carriers.carry
 
     @cached_property
     def _rng(self) -> random.Random:
         # Dice of its own: they only spread the load, and the endpoint's shall fall as they would without it.
         return random.Random(int.from_bytes(self._own_id))
 
-    def named(self, contact: Contact, by: Contact) -> None:
-        """Keep in mind that the peer ``by`` named ``contact``: it may know how to reach it."""
-        if not self._is_far(contact.address):
-            return
-        namers = self._namers.pop(contact.node_id, None) or {}
-        _keep(namers, by.public, None, MAX_NAMERS)
-        _keep(self._namers, contact.node_id, namers, MAX_KNOWN)
-
-    def seen_as(self, peer: Contact) -> Address | None:
-        """The address of this node as ``peer`` last told it."""
-        seen = self._seen.get(peer.public)
-        return seen[0] if seen is not None else None
-
-    def way(self, contact: Contact) -> Way:
-        """How a peer is reached now: directly, by those who carry, or not at all so far."""
-        session = self._session(contact.public)
-        if session is None:
-            return "none"
-        return "carried" if is_relayed(session.contact.address) else "direct"
-
-    def passage(self, contact: Contact) -> Passage:
-        """How a peer is reached now, by whom, and since when."""
-        session = self._session(contact.public)
-        if session is None:
-            return Passage("none")
-        kind = self._kind(session)
-        noted, since = self._passages.get(contact.public, (kind, session.opened_at))
-        carrier = self._carrier(contact.node_id) if kind == "carried" else None
-        by = b"" if carrier is None else carrier.contact.node_id
-        return Passage(kind, session.contact.address, by, since if noted == kind else session.opened_at)
-
-    def lost(self, contact: Contact) -> None:
-        """Forget since when a peer was reached: it is no more."""
-        self._passages.pop(contact.public, None)
-
     def let_go(self, public: bytes) -> None:
         """Forget a peer that was silent for long, and with which there is no session."""
-        self._ids.pop(node_id(public), None)
-        for table in (self._passages, self._seen, self._told_at, self._punched, self._introduced_at):
-            table.pop(public, None)
-
-    def needs_use(self, contact: Contact) -> bool:
-        """Whether the way to a peer is open for only so long as it is used: routers forget whom they let in."""
-        kind, _ = self._passages.get(contact.public, ("none", 0.0))
-        return self._is_translated or contact.address.is_virtual or kind == "punched"
-
-    @property
-    def outside(self) -> list[Address]:
-        """Where others see this node, the word of the most recent first; two ports of one host: a symmetric router."""
-        recent = sorted(self._seen.values(), key=lambda seen: -seen[1])
-        return list(dict.fromkeys(address for address, at in recent if recent[0][1] - at < SEEN_S))
+        self._known.forget(public)
+        self.outside.forget(public)
+        self.ways.forget(public)
 
     # -- finding a way ----------------------------------------------------------------------------------------------
 
@@ -279,14 +185,17 @@ class Reach:
 
         await until(lambda results: any(results), [ask(helper) for helper in helpers])
 
+    def _helpers(self, attempt: _Attempt) -> list[Contact]:
+        return self.acquaintances.helpers(attempt.node_id, attempt.hinted, attempt.asked)
+
     async def _knock_afresh(self, attempt: _Attempt, order: int) -> None:
         """Try again from a fresh local port: early knocks of the other side may have spoilt the first one."""
         opening = attempt.opening
         if opening is None or not self._is_pending(opening) or not attempt.helpful:
             return
         helper = attempt.helpful[0]
-        session = self._direct_session(helper.public)
-        port = self._open_further() if session is not None else 0
+        session = self._peers.direct_session(helper.public)
+        port = self._open_port() if session is not None else 0
         if session is None or not port:
             return
         wait = WE_WAIT.get(order, 0.0)
@@ -303,7 +212,7 @@ class Reach:
 
     def _knock_further(self, attempt: _Attempt, found: list[Address]) -> None:
         if found and attempt.opening is not None:
-            _keep(self._introduced_at, attempt.peer.public, self._clock.seconds(), MAX_KNOWN)
+            self.ways.introduced(attempt.peer.public)
             self._peers.knock_at(attempt.opening, found)
 
     async def _introduced(self, attempt: _Attempt, helper: Contact, own: list[Address], order: int) -> list[Address]:
@@ -318,8 +227,8 @@ class Reach:
         attempt.helpful.append(helper)
         attempt.candidates.update(dict.fromkeys(found))
         if may_carry is True and not is_relayed(helper.address):
-            self._carries(attempt.node_id, helper.public)
-        for each in carriers[:MAX_NAMERS] if isinstance(carriers, list) else ():
+            self._carriers.note(attempt.node_id, helper.public)
+        for each in carriers[:MAX_CARRIERS] if isinstance(carriers, list) else ():
             contact = contact_in(each)
             if contact is not None:
                 attempt.hinted.append(contact)
@@ -328,7 +237,7 @@ class Reach:
     def _have_carried(self, opening: Opening) -> None:
         """Let those who carry to the peer carry a handshake, too."""
         peer_id = node_id(opening.peer.public)
-        if self._is_pending(opening) and self._carrier(peer_id) is not None:
+        if self._is_pending(opening) and self._carriers.session(peer_id) is not None:
             self._peers.knock_at(opening, [relayed(peer_id)])
 
     def _knock(self, public: bytes, candidates: list[Address], port: int, seconds: float) -> bool:
@@ -341,7 +250,7 @@ class Reach:
             self._lead(peer, candidates, port)
         if peer.opening is None and not self._peers.open(peer, candidates[0], is_wanted=False):
             return False
-        _keep(self._introduced_at, public, self._clock.seconds(), MAX_KNOWN)
+        self.ways.introduced(public)
         opening = peer.opening
         if opening is not None:
             self._peers.hold(opening, max(opening.held_until, self._clock.seconds() + seconds))
@@ -356,72 +265,24 @@ class Reach:
             if address != used:
                 self._paths.lead(address, port)
 
-    def _helpers(self, attempt: _Attempt) -> list[Contact]:
-        """Whom to ask about a peer: who named it or carries to it, bootstraps, then anybody; nobody twice."""
-        now = self._clock.seconds()
-        first = [*attempt.hinted]
-        for public in [*self._namers.get(attempt.node_id, ()), *self._carriers.get(attempt.node_id, ())]:
-            first += [session.contact] if (session := self._session(public)) is not None else []
-        known = list(self._acquaintances())
-        self._rng.shuffle(known)
-        known.sort(key=lambda contact: (is_relayed(contact.address), contact.address not in self.bootstraps))
-        found: dict[bytes, Contact] = {}
-        for contact in [*first, *known]:
-            session = self._session(contact.public)
-            if contact.public in attempt.asked or contact.public == attempt.peer.public:
-                continue
-            if contact.node_id == self._own_id:
-                continue
-            if session is not None and now - session.heard_at < LIVELY_S:
-                found.setdefault(contact.public, session.contact)
-            elif contact in attempt.hinted:
-                found.setdefault(contact.public, contact)
-            if len(found) == HELPERS:
-                break
-        return list(found.values())
-
     # -- what others ask --------------------------------------------------------------------------------------------
-
-    async def _answer_introduce(
-        self, peer: Contact, wanted: bytes, candidates: list[object], order: int
-    ) -> list[object] | None:
-        """REACH.INTRODUCE: tell the node of that id where ``peer`` is, and ``peer`` where it is; nil: not known."""
-        if len(wanted) != ID_BYTES or not self._may("introduce", peer, INTRODUCTIONS):
-            raise Refused("no introduction: that is no id, or too many are wanted")
-        session = self._session(self._ids.get(wanted, b""))
-        if session is None or self._clock.seconds() - session.heard_at > LIVELY_S:
-            return None
-        theirs = [*self._as_seen(peer, order != USUAL), *unpacked(candidates)]
-        try:
-            answer = await self._endpoint.ask(
-                session.contact, "reach.meet", peer.public, packed(theirs), order, timeout=ASKED_S, changes=True
-            )
-        except EntangledError:
-            return None
-        fields, was_fresh = answer if isinstance(answer, list) and len(answer) == 2 else ([], False)
-        found = [*self._as_seen(session.contact, was_fresh is True), *unpacked(fields)]
-        is_direct = not (is_relayed(session.contact.address) or is_relayed(peer.address))
-        carriers = self._contacts_of(self._carriers.get(wanted, ())) if is_relayed(session.contact.address) else []
-        return [packed(found), [contact.packed() for contact in carriers], is_direct and self.relay.has_room]
 
     async def _answer_meet(self, peer: Contact, public: bytes, candidates: list[object], order: int) -> list[object]:
         """REACH.MEET: knock at the candidates of ``public``, whom ``peer`` introduces; gives the own ones."""
-        if not self._may("meet", peer, MEETS, MEETS_AT_ONCE):
+        if not self._allowance.may_meet(peer.public):
             raise Refused("too many introductions to who does not answer")
         found = [address for address in unpacked(candidates) if self._is_worth(address)]
         stranger = node_id(public)
         if stranger == self._own_id:
             raise Refused("that is this node itself")
-        self._ids_keep(public)
-        _keep(self._introducers, public, peer.public, MAX_KNOWN)
+        self._known.note(public)
+        self._allowance.introduced(public, peer.public)
         if not is_relayed(peer.address):
-            self._carries(stranger, peer.public)
-        upgrade = self._upgrades.get(public)
-        if upgrade is not None:
-            upgrade.due = max(upgrade.due, self._clock.seconds() + _pause(upgrade.step) + TURN)  # the other is at it
+            self._carriers.note(stranger, peer.public)
+        self._upgrades.put_off(public, self._clock.seconds())
         port, own = 0, self._own(peer)
-        session = self._direct_session(peer.public)
-        if order != USUAL and session is not None and (further := self._open_further()):
+        session = self._peers.direct_session(peer.public)
+        if order != USUAL and session is not None and (further := self._open_port()):
             seen = await self.mirror.look(session, further)
             if seen is not None:
                 port, own = further, [seen, self._paths.local(peer.address, further)]
@@ -432,180 +293,45 @@ class Reach:
             self._chores.later(wait, self._knock, public, found, port, HELD_S)
         return [packed(own), bool(port)]
 
-    def _answer_seen(self, peer: Contact, host: str, port: int) -> None:
-        """REACH.SEEN (told): this node writes from another address than before; ways through its router are lost."""
-        if is_possible(Address(host, port)):
-            self._saw(peer, Address(host, port), is_told=True)
-
-    def _saw(self, peer: Contact, address: Address, is_told: bool = False) -> None:
-        """Take note of the address at which a peer sees this node."""
-        before, at = self._seen.get(peer.public, (None, -SEEN_GAP))
-        now = self._clock.seconds()
-        if now - at < SEEN_GAP or is_relayed(peer.address):
-            return
-        if self._seen_last == address:
-            address = self._seen_last  # one object for all who see it there
-        self._seen_last = address
-        _keep(self._seen, peer.public, (address, now), MAX_KNOWN)
-        self._is_translated = self._is_translated or address.host not in self._paths.hosts()
-        # By another port of this node itself it is seen elsewhere anyway.
-        is_usual = self._paths.local(peer.address).port == self._paths.address.port
-        if is_usual and address != before and (is_told or before is not None):
-            self._open_again(peer)
+    # -- upkeep -----------------------------------------------------------------------------------------------------
 
     def _open_again(self, teller: Contact) -> None:
-        """Open the sessions anew that went through a hole in the own router, the newest ones of them at least."""
+        """Open the ways through the own router anew, and try soon to do without those who carry."""
         now = self._clock.seconds()
         if now - self._opened_at < OPENED_GAP:
             return
         self._opened_at = now
-        for public in list(reversed(self._punched))[:OPENED]:
-            session = self._session(public)
-            peer = self._peers.known(public)
-            if session is None or peer is None:
-                del self._punched[public]
-            elif public != teller.public:
-                self._peers.open(peer, session.contact.address)
-        for upgrade in self._upgrades.values():
-            upgrade.due, upgrade.step = now, 0
-
-    # -- carrying ---------------------------------------------------------------------------------------------------
-
-    def _carry(self, datagram: bytes, to: Address) -> None:
-        """Have a datagram carried to the node for which that address stands; it is lost where nobody does."""
-        target = _id_in(to)
-        carrier = self._carrier(target) if target else None
-        if carrier is None:
-            self._endpoint.counters["uncarried"] += 1
-        else:
-            self._endpoint.send_inside(carrier, bytes([CARRY]) + target + datagram)
-
-    def _on_carried(self, session: Session, plain: bytes, source: Address) -> None:
-        inner, sender = plain[HEAD:], plain[1:HEAD]
-        if not inner or is_relayed(session.contact.address) or sender == self._own_id:
-            self._endpoint.counters["malformed"] += 1
-            return
-        self._carries(sender, session.contact.public)
-        self._paths.carried(inner, relayed(sender))
-
-    def _carries(self, to: bytes, carrier: bytes) -> None:
-        """Take note that somebody carries to the node of that id."""
-        carriers = self._carriers.pop(to, None) or {}
-        carriers[carrier] = self._clock.seconds()
-        if len(carriers) > MAX_NAMERS:
-            del carriers[min(carriers, key=lambda public: carriers[public])]
-        _keep(self._carriers, to, carriers, MAX_KNOWN)
-
-    def _carrier(self, to: bytes) -> Session | None:
-        """The direct session with who was last known to carry to the node of that id."""
-        carriers = self._carriers.get(to, {})
-        for public in sorted(carriers, key=lambda public: -carriers[public]):
-            session = self._direct_session(public)
-            if session is not None:
-                return session
-        return None
-
-    # -- upkeep -----------------------------------------------------------------------------------------------------
+        self.ways.open_again(teller.public)
+        self._upgrades.hurry(now)
 
     def _established(self, session: Session) -> None:
         public, now = session.contact.public, self._clock.seconds()
-        self._ids_keep(public)
-        self._note_passage(session, now)
-        bucket = self._buckets.get(("meet", self._introducers.pop(public, b"")))
-        if bucket is not None:
-            bucket.give(1.0)
+        self._known.note(public)
+        self.ways.established(session)
+        self._allowance.met(public)
         if is_relayed(session.contact.address):
-            newest = self._session(public)
-            if public not in self._upgrades and newest is session:
-                behind = TURN if self._own_id > session.contact.node_id else 0.0
-                _keep(self._upgrades, public, _Upgrade(now + UPGRADES[0] + behind), MAX_KNOWN)
-                self._wake()
+            if self._peers.session(public) is session:
+                self._upgrades.add(public, self._own_id > session.contact.node_id, now)
         else:
-            self._upgrades.pop(public, None)
-            if self._is_far(session.contact.address):
-                _keep(self._punched, public, None, MAX_KNOWN)
-                self._wake()
-
-    def _note_passage(self, session: Session, now: float) -> None:
-        """Take note since when a peer is reached as it is now; a successor of a session changes nothing of that."""
-        public = session.contact.public
-        peer = self._peers.known(public)
-        if peer is None or peer.session is not session:
-            return  # the one that was there is used on
-        kind, noted = self._kind(session), self._passages.get(public)
-        if noted is None and len(peer.sessions) > 1:
-            former = peer.sessions[-2]
-            noted = (self._kind(former), former.opened_at)
-        if noted is not None or kind == "punched":  # else the session itself says it
-            since = noted[1] if noted is not None and noted[0] == kind else now
-            _keep(self._passages, public, (kind, since), MAX_KNOWN)
-
-    def _kind(self, session: Session) -> Kind:
-        contact = session.contact
-        own = contact.address if contact.address.is_virtual else self._paths.local(contact.address)
-        before, _ = self._passages.get(contact.public, ("none", 0.0))
-        introduced_at = self._introduced_at.get(contact.public, float("-inf"))
-        was_introduced = before == "punched" or abs(session.opened_at - introduced_at) < HELD_S
-        return kind_of(contact.address, own, self._is_translated, was_introduced)
-
-    def _moved(self, session: Session) -> None:
-        """Tell a peer that its address is another one than before: it cannot see that itself."""
-        contact, now = session.contact, self._clock.seconds()
-        if not self._is_far(contact.address) or is_relayed(contact.address):
-            return
-        if now - self._told_at.get(contact.public, -SEEN_GAP) < SEEN_GAP:
-            return
-        _keep(self._told_at, contact.public, now, MAX_KNOWN)
-        self._chores.later(SEEN_AFTER, self._tell_seen, contact)
-
-    def _tell_seen(self, contact: Contact) -> None:
-        session = self._session(contact.public)
-        if self._endpoint.is_running and session is not None and session.contact == contact:
-            self._endpoint.tell(contact, "reach.seen", contact.address.host, contact.address.port)
+            self._upgrades.drop(public)
+        self._wake()
 
     def _wake(self) -> None:
-        if not self._is_ticking:
+        """Go on with the upkeep as long as there is something to keep up."""
+        if not self._is_ticking and (self._upgrades or self.ways.has_holes or self._ports):
             self._is_ticking = True
             self._chores.later(TICK, self._tick)
 
     def _tick(self) -> None:
         now = self._clock.seconds()
-        for port, opened_at in list(self._further.items()):
-            if now - opened_at > FURTHER_S and not self._is_used(port):
-                del self._further[port]
-                self._paths.shut_port(port)
-        for public, upgrade in list(self._upgrades.items()):
-            peer = self._peers.known(public)
-            if peer is None or peer.session is None or now - peer.session.heard_at > FURTHER_S:
-                del self._upgrades[public]
-            elif now >= upgrade.due:
-                self._chores.fork(self._upgrade(peer, upgrade.step))
-                upgrade.step += 1
-                upgrade.due = now + _pause(upgrade.step)
-        self._show_oneself(now)
-        self._is_ticking = bool(self._upgrades or self._punched or self._further)
-        if self._is_ticking:
-            self._chores.later(TICK, self._tick)
-
-    def _show_oneself(self, now: float) -> None:
-        """Where nobody was heard lately who could introduce us, show one that we are here, and so from where."""
-        if now <= self._shown_until:
-            return
-        sessions = [s for c in self._acquaintances() if (s := self._direct_session(c.public)) is not None]
-        sessions.sort(key=lambda session: -session.heard_at)
-        latest = next((session for session in sessions if self._is_far(session.contact.address)), None)
-        if latest is not None:
-            self._shown_until = latest.heard_at + ANCHOR_S
-            if now > self._shown_until:
-                self._endpoint.send_inside(latest, b"")
+        self._ports.shut_unused(now)
+        for peer, step in self._upgrades.due(now):
+            self._chores.fork(self._upgrade(peer, step))
+        self.outside.show(now)
+        self._is_ticking = False
+        self._wake()
 
     # -- small things -----------------------------------------------------------------------------------------------
-
-    def _is_far(self, address: Address) -> bool:
-        """Whether others may know more of an address than that it does not answer."""
-        if address.host[:1] == "~":
-            return is_relayed(address)
-        return not is_near(address.host, self._paths.local(address).host, self._is_translated)
 
     def _is_worth(self, address: Address) -> bool:
         return is_possible(address) and (not is_loopback(address.host) or is_loopback(self._paths.local(address).host))
@@ -613,83 +339,14 @@ class Reach:
     def _is_pending(self, opening: Opening) -> bool:
         return opening.peer.opening is opening
 
-    def _ids_keep(self, public: bytes) -> None:
-        _keep(self._ids, node_id(public), public, MAX_PEERS)
-
-    def _session(self, public: bytes) -> Session | None:
-        peer = self._peers.known(public)
-        return peer.session if peer is not None else None
-
-    def _direct_session(self, public: bytes) -> Session | None:
-        """The newest session with a peer that no other node carries for."""
-        peer = self._peers.known(public)
-        sessions = peer.sessions if peer is not None else []
-        return next((session for session in reversed(sessions) if not is_relayed(session.contact.address)), None)
-
-    def _session_by_id(self, wanted: bytes) -> Session | None:
-        return self._direct_session(self._ids.get(wanted, b""))
-
-    def _contacts_of(self, publics: Iterable[bytes]) -> list[Contact]:
-        sessions = [self._direct_session(public) for public in publics]
-        return [session.contact for session in sessions if session is not None][:MAX_NAMERS]
-
     def _own(self, helper: Contact) -> list[Address]:
         """The own addresses, as this machine knows them; first the one from which it writes to ``helper``."""
         first = self._paths.local(helper.address)
         others = [Address(host, self._paths.address.port) for host in self._paths.hosts()]
         return list(dict.fromkeys([first, *others]))[: MAX_CANDIDATES - 1]
 
-    def _as_seen(self, contact: Contact, is_fresh: bool) -> list[Address]:
-        """Where this node sees a peer, which is no help where the peer uses a fresh port."""
-        return [contact.address] if not is_fresh and is_possible(contact.address) else []
-
-    def _may(self, what: str, peer: Contact, rate: float, at_once: float = 0.0) -> bool:
-        key = (what, peer.public)
-        bucket = self._buckets.pop(key, None) or Bucket(rate, at_once or 2 * rate)
-        _keep(self._buckets, key, bucket, MAX_KNOWN)
-        return bucket.take(1.0, self._clock.seconds())
-
-    def _open_further(self) -> int:
+    def _open_port(self) -> int:
         """A fresh local port; 0 where there are too many."""
-        if len(self._further) >= MAX_FURTHER:
-            before = self._clock.seconds() - HELD_S
-            unused = [
-                port for port, opened_at in self._further.items() if opened_at < before and not self._is_used(port)
-            ]
-            if not unused:
-                return 0
-            del self._further[unused[0]]
-            self._paths.shut_port(unused[0])
-        port = self._paths.open_port()
-        if port:
-            self._further[port] = self._clock.seconds()
-            self._wake()
+        port = self._ports.open()
+        self._wake()
         return port
-
-    def _is_used(self, port: int) -> bool:
-        """Whether a session goes by this port."""
-        for public in self._punched:
-            session = self._direct_session(public)
-            if session is not None and self._paths.local(session.contact.address).port == port:
-                return True
-        return False
-
-
-def _pause(step: int) -> float:
-    return UPGRADES[min(step, len(UPGRADES) - 1)]
-
-
-def _keep(table: dict, key: object, value: object, most: int) -> None:  # type: ignore[type-arg]
-    """Put something at the end of a table, and drop what was put there first where that are too many."""
-    table.pop(key, None)
-    table[key] = value
-    if len(table) > most:
-        del table[next(iter(table))]
-
-
-def _id_in(address: Address) -> bytes:
-    try:
-        found = bytes.fromhex(address.host[1:])
-    except ValueError:
-        return b""
-    return found if len(found) == ID_BYTES else b""

@@ -104,6 +104,11 @@ class Peer:
         """The session that is used for sending: the newest one."""
         return self.sessions[-1] if self.sessions else None
 
+    @property
+    def direct_session(self) -> Session | None:
+        """The newest session that no other node carries."""
+        return next((session for session in reversed(self.sessions) if not is_relayed(session.contact.address)), None)
+
     def oldest(self, number: int) -> int:
         """The oldest question that is asked of it; ``number`` where there is none."""
         return next(iter(self.inquiries), number)
@@ -173,6 +178,16 @@ class Peers:
     def known(self, public: bytes) -> Peer | None:
         """The peer of that key, if anything is remembered of it."""
         return self._peers.get(public)
+
+    def session(self, public: bytes) -> Session | None:
+        """The newest session with the peer of that key."""
+        peer = self._peers.get(public)
+        return peer.session if peer is not None else None
+
+    def direct_session(self, public: bytes) -> Session | None:
+        """The newest session with the peer of that key that no other node carries."""
+        peer = self._peers.get(public)
+        return peer.direct_session if peer is not None else None
 
     def peer(self, contact: Contact) -> Peer:
         """The peer of that key, remembered from now on; raises ``ValueError`` where the key is none."""

@@ -83,7 +83,7 @@ class Ground:
 
     def way(self, a: EntangledNode, b: EntangledNode) -> str:
         """How ``a`` reaches ``b`` now."""
-        return a.reach.way(b.contact)
+        return a.reach.ways.way(b.contact)
 
     def call(self, a: EntangledNode, contact: Contact, timeout: float | None = None) -> tuple[Any, float]:
         """What ``a`` is answered, and after how many seconds."""

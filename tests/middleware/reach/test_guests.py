@@ -10,7 +10,8 @@ from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact, unpacked
 from middleware.entangled.network.network import Address, relayed
 from middleware.entangled.network.switchboard import Weather
-from middleware.entangled.reach.reach import MAX_KNOWN, MEETS, MEETS_AT_ONCE
+from middleware.entangled.reach.allowance import MEETS, MEETS_AT_ONCE
+from middleware.entangled.reach.known import MAX_KNOWN
 from middleware.entangled.wire.peer import KNOCKS, MAX_DOORS
 from tests.middleware.reach.ground import GroundCase
 
@@ -36,7 +37,7 @@ class QuietTests(GroundCase):
         ground.run(30.0)
         self.assertEqual(asked, [])
         for node in nodes[:3]:
-            self.assertFalse(node.reach._upgrades or node.reach._further or node.reach._is_ticking)
+            self.assertFalse(node.reach._upgrades or node.reach._ports or node.reach._is_ticking)
             self.assertEqual(len(node.reach.relay), 0)
 
     def test_answered_at_once(self) -> None:
@@ -94,7 +95,14 @@ class HostileTests(GroundCase):
             self.g.run(0.005)
         self.g.run(30.0)
         reach = self.b.reach
-        for table in (reach._ids, reach._namers, reach._carriers, reach._upgrades, reach._buckets, reach._seen):
+        for table in (
+            reach._known,
+            reach.acquaintances,
+            reach._carriers,
+            reach._upgrades,
+            reach._allowance,
+            reach.outside._seen,
+        ):
             self.assertLessEqual(len(table), MAX_KNOWN)
         knocks = self.g.board.counters["unheard"] - sent
         self.assertLess(knocks, (MEETS_AT_ONCE + 30 * MEETS) * MAX_DOORS * 2 * KNOCKS)
@@ -135,8 +143,8 @@ class HostileTests(GroundCase):
         """A node learns from a peer how it looks from outside."""
         c = self.g.at("c", "full")
         self.g.run(1.0)
-        self.assertEqual(c.reach.seen_as(self.g.nodes["pub"].contact), Address(self.g.routers["c"].host, 7000))
-        self.assertEqual(self.a.reach.outside, [self.a.contact.address])
+        self.assertEqual(c.reach.outside.seen_as(self.g.nodes["pub"].contact), Address(self.g.routers["c"].host, 7000))
+        self.assertEqual(self.a.reach.outside.addresses, [self.a.contact.address])
 
     def test_noise_inside_sessions(self) -> None:
         """Whatever a member puts behind the first bytes of carrying and mirrors, nothing is raised."""
@@ -156,5 +164,5 @@ class HostileTests(GroundCase):
         for site, kind, ports in (("c", "port", 1), ("d", "sym", 2)):
             c = self.g.at(site, kind)
             self.g.run(2.0)
-            self.assertGreaterEqual(len({address.port for address in c.reach.outside}), ports)
-            self.assertEqual({address.host for address in c.reach.outside}, {self.g.routers[site].host})
+            self.assertGreaterEqual(len({address.port for address in c.reach.outside.addresses}), ports)
+            self.assertEqual({address.host for address in c.reach.outside.addresses}, {self.g.routers[site].host})

@@ -34,11 +34,11 @@ class KindTests(SynchronousTestCase):
 
 
 class PassageTests(GroundCase):
-    """Behaviour of ``Reach.passage``, over routers in memory."""
+    """Behaviour of ``Ways.passage``, over routers in memory."""
 
     def passage(self, a: EntangledNode, b: EntangledNode) -> Passage:
         """How one reaches the other."""
-        return a.reach.passage(b.contact)
+        return a.reach.ways.passage(b.contact)
 
     def pair(self, ground: Ground, one: str, other: str) -> tuple[EntangledNode, EntangledNode]:
         """Two nodes behind routers, when they have met."""
@@ -87,7 +87,7 @@ class PassageTests(GroundCase):
         self.assertEqual(self.passage(a, pub).since, since)
         pub.vanish()
         ground.run(60.0)
-        self.assertNotIn(pub.identity.public, a.reach._passages)
+        self.assertNotIn(pub.identity.public, a.reach.ways._passages)
 
     def test_no_way(self) -> None:
         """Who was never met is reached by no way."""

@@ -181,8 +181,8 @@ class WeatherTests(GroundCase):
         assert peer is not None and peer.session is not None
         at_b = peer.session.contact.address
         port = ground.networks["a2"].local(at_b).port
-        self.assertIn(port, a.reach._further)
-        a.reach._saw(peer.session.contact, Address(ground.routers["a"].host, 3), is_told=True)
+        self.assertIn(port, a.reach._ports)
+        a.reach.outside.saw(peer.session.contact, Address(ground.routers["a"].host, 3), is_told=True)
         self.assertEqual(len(a.endpoint.peers._openings), 0)
         a.reach._lead(peer, [at_b], 0)
         self.assertEqual(ground.networks["a2"].local(at_b).port, port)
@@ -293,7 +293,7 @@ class CarriedTests(GroundCase):
         known = peers.known(b.identity.public)
         assert known is not None
         peers.evict(known)
-        c.reach.named(Contact(b.identity.public, relayed(b.identity.node_id)), others[3].contact)
+        c.reach.acquaintances.named(Contact(b.identity.public, relayed(b.identity.node_id)), others[3].contact)
         asked.clear()
         answer, _ = ground.call(c, Contact(b.identity.public, relayed(b.identity.node_id)))
         self.assertEqual(answer, 7)
@@ -307,7 +307,7 @@ def _peer(of: EntangledNode, other: EntangledNode) -> Peer | None:
 
 def _listening(node: EntangledNode, asked: list[bytes]) -> Any:
     """The node's method, which notes that it was asked."""
-    answer = node.reach._answer_introduce
+    answer = node.reach.introducer.answer_introduce
 
     def introduce(peer: Contact, wanted: bytes, candidates: list[object], order: int) -> Any:
         asked.append(node.identity.node_id)

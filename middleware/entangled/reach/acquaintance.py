@@ -1,0 +1,84 @@
+"""Acquaintance: a peer that may know how another one is reached, and is asked for an introduction."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable, Collection, Iterable
+
+from twisted.internet.interfaces import IReactorTime
+
+from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.network.network import Address, is_relayed
+from middleware.entangled.reach.carrier import Carriers
+from middleware.entangled.reach.known import LIVELY_S, keep
+from middleware.entangled.reach.outside import Outside
+from middleware.entangled.wire.peer import Peers
+
+HELPERS = 3
+"""Peers that are asked at the same time how another one is reached."""
+MAX_NAMERS = 3
+"""Peers of which is kept that they named the same node."""
+
+
+class Acquaintances:
+    """Whom a node asks about others, and who named whom.
+
+    ``contacts`` gives the peers that are known; ``bootstraps`` are addresses of nodes that are asked rather than
+    others.  ``rng`` gives dice when they are needed.
+    """
+
+    def __init__(
+        self,
+        own_id: bytes,
+        peers: Peers,
+        contacts: Callable[[], Iterable[Contact]],
+        outside: Outside,
+        carriers: Carriers,
+        clock: IReactorTime,
+        rng: Callable[[], random.Random],
+    ) -> None:
+        self.bootstraps: set[Address] = set()
+        self._own_id = own_id
+        self._peers = peers
+        self._contacts = contacts
+        self._outside = outside
+        self._carriers = carriers
+        self._clock = clock
+        self._rng = rng
+        self._namers: dict[bytes, dict[bytes, None]] = {}
+
+    def __len__(self) -> int:
+        return len(self._namers)
+
+    def named(self, contact: Contact, by: Contact) -> None:
+        """Keep in mind that the peer ``by`` named ``contact``: it may know how to reach it."""
+        if not self._outside.is_far(contact.address):
+            return
+        namers = self._namers.pop(contact.node_id, None) or {}
+        keep(namers, by.public, None, MAX_NAMERS)
+        keep(self._namers, contact.node_id, namers)
+
+    def helpers(self, wanted: bytes, hinted: Collection[Contact], asked: Collection[bytes]) -> list[Contact]:
+        """Whom to ask about the node of that id, but for those that were ``asked``.
+
+        They are those that others ``hinted`` at, who named it or carries to it, bootstraps, then anybody.
+        """
+        now = self._clock.seconds()
+        first = [*hinted]
+        for public in [*self._namers.get(wanted, ()), *self._carriers.of(wanted)]:
+            first += [session.contact] if (session := self._peers.session(public)) is not None else []
+        known = list(self._contacts())
+        self._rng().shuffle(known)
+        known.sort(key=lambda contact: (is_relayed(contact.address), contact.address not in self.bootstraps))
+        found: dict[bytes, Contact] = {}
+        for contact in [*first, *known]:
+            if contact.public in asked or contact.node_id in (wanted, self._own_id):
+                continue
+            session = self._peers.session(contact.public)
+            if session is not None and now - session.heard_at < LIVELY_S:
+                found.setdefault(contact.public, session.contact)
+            elif contact in hinted:
+                found.setdefault(contact.public, contact)
+            if len(found) == HELPERS:
+                break
+        return list(found.values())
