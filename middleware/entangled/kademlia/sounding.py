@@ -28,9 +28,9 @@ PROBES = 2
 """Far contacts that are asked in one ``PROBE``."""
 UPKEEP = 15.0
 """Seconds between two looks at what changes slowly in a large network."""
-SESSION_S = 120.0
+SESSION_S = 60.0
 """Seconds of silence after which a session is let go of in a large network: there are too many peers to keep all."""
-IN_TOUCH = 90.0
+IN_TOUCH = 45.0
 """Seconds of silence up to which the other side surely has its end of a session yet."""
 
 
