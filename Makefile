@@ -63,7 +63,7 @@ help:
 	@echo 'make bench-consensus [QUICK=1]        every strategy over the same missions: cost, messages, time to agree'
 	@echo 'make bench-flood                      20,000 forged datagrams a second at a node, while two call each other'
 	@echo 'make bench-robots                     three AIBOs driven at once: frames, pictures, command to wheel, memory'
-	@echo 'make bench-crowd [QUICK=1]            a yard for many: 3 to 10,000 robots, and a hundred agents attached; QUICK: no agents'
+	@echo 'make bench-crowd [QUICK=1]            a yard for many: 3 to 10,000 robots, a hundred agents attached, a task; QUICK: no agents'
 	@echo 'make bench-scale [NODES=3,10,30]      teams of 3 to 10,000 nodes, simulated: hops, bytes, memory, seconds; resumable'
 	@echo 'make api                              the reference of every class, from the docstrings, in build/api'
 	@echo 'make dist                             sdist and wheel, installed into a fresh environment and asked for help'
@@ -145,7 +145,7 @@ bench-robots: $(RUNTIME)
 
 bench-crowd: $(RUNTIME)
 	@mkdir -p build
-	$(PY) -m benchmarks.crowd $(if $(filter-out 0,$(QUICK)),--agents 0) --out build/bench-crowd.json
+	$(PY) -m benchmarks.crowd $(if $(filter-out 0,$(QUICK)),--agents 0 --tasks 0) --out build/bench-crowd.json
 
 # Sizes that stand in docs/scale/scale.json already are not measured again.
 bench-scale: $(RUNTIME)

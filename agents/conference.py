@@ -10,16 +10,21 @@ from agents.decision import Decision, decide
 from agents.division import Division
 from agents.epoch import Epoch
 from middleware.consensus.strategy import ConsensusAlgorithm
+from middleware.panel import Panel
 from middleware.presence import EXECUTING
 from middleware.tasks import Member, Task
 
 
 class Conference:
-    """One agent's view of it; ``uuid`` is the agent's own, ``division`` that of the task's group, where it has one."""
+    """One agent's view of it; ``uuid`` is the agent's own, ``division`` that of the task's group, where it has one.
+
+    ``panel`` says whose records stand for all: an agent that is not of it decides as these do, without itself.
+    """
 
     def __init__(self, uuid: str, strategy: ConsensusAlgorithm) -> None:
         self.strategy = strategy
         self.division: Division | None = None
+        self.panel = Panel(uuid)
         self._uuid = uuid
         self._circle = Circle(uuid)
         self._epoch = Epoch()
@@ -38,6 +43,10 @@ class Conference:
     def others(self, now: float) -> list[Member]:
         """The others with what counts now."""
         return self._circle.members(now)
+
+    def counts(self, now: float) -> bool:
+        """Whether the others know of this agent."""
+        return self.panel.counts(now)
 
     def hear(self, members: Sequence[Member], me: Member, now: float) -> Member:
         """Take in who is present and what they report; the own report ``me``, counted on from where it is known."""
@@ -66,7 +75,9 @@ class Conference:
             self._first_report_at = now
         since = None if self._first_report_at is None else now - self._first_report_at
         strategy = self.strategy if self.division is None else self.division.share(task, now, since)
-        decision = decide(members, strategy, task.hysteresis, task.waiting_period, since)
+        known = members if self.counts(now) else others
+        has_word = self.panel.has_word if self.panel.is_partial(now) else None
+        decision = decide(known, strategy, task.hysteresis, task.waiting_period, since, has_word)
         basis = (*decision.basis, task.generation, task.configuration)
         self._epoch.decide(basis, decision.assigned or "", decision.digest, others)
         return decision
@@ -74,4 +85,8 @@ class Conference:
     def is_first(self, now: float) -> bool:
         """Whether it falls to this agent to say what all know: nobody acts, and no uuid here is lower."""
         others = self.others(now)
-        return not any(m.status == EXECUTING for m in others) and all(self._uuid < m.uuid for m in others)
+        return (
+            self.counts(now)
+            and not any(m.status == EXECUTING for m in others)
+            and all(self._uuid < m.uuid for m in others)
+        )

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 from middleware.consensus.strategy import Consensus, ConsensusAlgorithm, Report, agreement
 from middleware.consensus.view import view_of
+from middleware.panel import PATIENCE
 from middleware.presence import EXECUTING
 from middleware.tasks import Member
 
@@ -42,6 +43,7 @@ def decide(
     hysteresis: float,
     waiting_period: float,
     since_first: float | None,
+    has_word: bool | None = None,
 ) -> Decision:
     """The consensus point of ``members``, as ``strategy`` finds it (a foreign one from behind its guard).
 
@@ -50,6 +52,9 @@ def decide(
     ``since_first`` is the seconds since the first report was seen, None when there is none.  Within the waiting period
     nobody is assigned, unless everybody has reported (or has no body free to do so), or somebody acts already; whoever
     acts keeps the task until another is better by the ``hysteresis``.
+
+    Where the members are only a panel of all, ``has_word`` says whether the council has announced who is the best of
+    all: until then nobody is assigned, for a while longer.
     """
     present = {m.uuid: m for m in members}
     view = view_of(strategy)
@@ -64,7 +69,10 @@ def decide(
     if not reports or since_first is None:
         return Decision(None, "", "nobody has reported yet", basis=basis)
     missing = sorted(m.name for m in present.values() if m.uuid not in reports and m.available)
-    if missing and since_first < waiting_period and not acting:
+    if has_word is not None:
+        if not (has_word or acting) and since_first < waiting_period + PATIENCE:
+            return Decision(None, "", "waiting for the council", basis=basis)
+    elif missing and since_first < waiting_period and not acting:
         return Decision(None, "", f"waiting for {', '.join(missing)}", basis=basis)
     holder = reports[acting[0].uuid] if acting else None
     consensus, best = _chosen(list(reports.values()), holder, strategy, hysteresis)

@@ -31,6 +31,7 @@ from middleware.consensus.strategy import ConsensusAlgorithm, reads_of
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.kademlia.contact import Contact
 from middleware.order import PAUSE, Order
+from middleware.panel import Panel
 from middleware.presence import EXECUTING
 from middleware.tasks import COMPLETED, FAILED, Member, Result, Task
 from middleware.verdict import Verdict
@@ -128,6 +129,10 @@ class Engagement:
         self._conference.division = division
         division.join(self.task, self._members, self._clock.seconds())
 
+    def seat(self, panel: Panel) -> None:
+        """Have ``panel`` say whose records stand for the group."""
+        self._conference.panel = panel
+
     def _members(self, now: float) -> list[Member]:
         return [self.me, *self._conference.others(now)]
 
@@ -162,7 +167,8 @@ class Engagement:
         assigned = self.me.assigned
         if self.lessee is not None and assigned not in ("", self.me.uuid, *(member.uuid for member in members)):
             self.lessee.suspect()
-        if self._formation.hear(self._conference.others(now)) and not self.is_over:
+        left = self._formation.hear(self._conference.others(now))
+        if left and self._conference.counts(now) and not self.is_over:
             self._say(f"one left, {len(self._conference) + 1} here: spreads out")
 
     def ordered(self, order: Order | None) -> None:
@@ -323,7 +329,9 @@ class Engagement:
             self._publish(again=True)
 
     def _stand_by(self, decision: Decision, now: float) -> Deed:
-        post = self._formation.close_up(self.me, self._conference.others(now), decision.assigned)
+        post = None
+        if self._conference.counts(now):  # of a large team those close up who know of each other
+            post = self._formation.close_up(self.me, self._conference.others(now), decision.assigned)
         self._publish_decision(decision, 0, post=post)
         searching = self.me.cost is None
         action = self._behaviour.search(now) if searching else self._behaviour.hold(now)

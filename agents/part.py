@@ -16,8 +16,10 @@ from middleware.entangled.errors import EntangledError
 from middleware.entangled.record import Record
 from middleware.node import SwarmNode
 from middleware.order import order_of
+from middleware.panel import Panel, place_of
 from middleware.presence import IDLE
-from middleware.tasks import Member, Result, Task
+from middleware.tasks import Member, Result, Task, group_key
+from middleware.verdict import Verdict
 
 AGAIN = 0.5
 """Seconds until an outcome that no majority could be told is told again."""
@@ -46,10 +48,12 @@ class Part:
         self.engagement = Engagement(
             task, me, behaviour, strategy, clock, token, self._tell, self._conclude, self._say, halt, age
         )
-        self.engagement.justify = node.justify
+        self._panel = Panel(node.uuid, place_of(node.uuid, group_key(task.task_id)))
+        self.engagement.seat(self._panel)
+        self.engagement.justify = self._justify
         self.engagement.reached = node.reached
         self.caretaker = Caretaker(self.engagement, node, clock)
-        self._group = node.group(task, self.engagement.heard, self._ordered)
+        self._group = node.group(task, self.engagement.heard, self._ordered, self._panel)
 
     def report(self) -> None:
         """Tell the others how things stand."""
@@ -73,6 +77,10 @@ class Part:
     def _tell(self, member: Member) -> None:
         self._group.report(member)
         self._told(self, member)
+
+    def _justify(self, verdict: Verdict) -> None:
+        if self._panel.counts(self._clock.seconds()):
+            self._node.justify(verdict)
 
     def _conclude(self, result: Result) -> None:
         if not self.is_left:

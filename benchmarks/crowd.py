@@ -1,4 +1,4 @@
-"""What a yard for many costs: rays, moves and controllers of 3 to 10,000 robots, and a hundred agents attached.
+"""What a yard for many costs: rays, moves and controllers of 3 to 10,000 robots, a hundred agents attached, and a task.
 
 ``make bench-crowd``.  Milliseconds are of processor, so that other work on the machine matters little; each size is a
 process of its own, so that its memory is its own.
@@ -21,6 +21,8 @@ TICK_MS = 32.0
 LOOK_S = 2.0
 """Virtual seconds for which attached agents are measured, once they have settled."""
 SETTLING_S = 4.0
+TASK_S = 3.0
+"""Virtual seconds from the assignment of a task for which its datagrams are counted."""
 ARGOS = "ARGoS is quoted with 10,000 e-pucks at 1.7 x real time, by many threads on a machine of 2012"
 
 
@@ -31,6 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--agents", type=int, default=100, help="attached to 1,000 robots; 0: none (default %(default)s)"
     )
+    parser.add_argument("--tasks", default="10,20,40", help="agents that share a task (default %(default)s; 0: none)")
     parser.add_argument("--controller", default="search", help="of all robots (default %(default)s)")
     parser.add_argument("--seconds", type=float, default=3.0, help="of processor for each size (default %(default)s)")
     parser.add_argument("--out", type=Path, help="write the figures to this file, as JSON")
@@ -39,6 +42,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     sizes = given.bodies.split(",")
     if not all(size.isdecimal() and 1 <= int(size) <= 100_000 for size in sizes):
         parser.error(f"--bodies must be numbers from 1 to 100000 with commas between, not {given.bodies!r}")
+    shared = given.tasks.split(",")
+    if not all(size.isdecimal() and int(size) <= 1000 for size in shared):
+        parser.error(f"--tasks must be numbers from 0 to 1000 with commas between, not {given.tasks!r}")
     if not 0.1 <= given.seconds <= 600 or not 0 <= given.agents <= 1000:
         parser.error("--seconds must be 0.1 to 600, and --agents 0 to 1000")
     if given.one is not None:
@@ -62,6 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     figures: dict[str, Any] = {"alone": rows}
     if given.agents:
         figures["attached"] = _attached(given.agents)
+    figures["tasks"] = _tasked([int(size) for size in shared if int(size)])
     if given.out is not None:
         given.out.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
     return 0 if all(row["factor"] >= 1.0 for row in rows) else 1
@@ -131,6 +138,31 @@ def _attached(agents: int) -> dict[str, float]:
         figures |= {f"{part}, yard": yard, f"{part}, all": whole, f"{part}, datagrams": rate}
     team.stop()
     return figures
+
+
+def _tasked(sizes: Sequence[int]) -> list[dict[str, float]]:
+    """What so many agents send from the assignment of one task on, beside what they send without."""
+    from sim.crowd.ground import roomy
+    from swarmnode.crowd import CrowdTeam
+
+    rows = []
+    if sizes:
+        _say(f"\n{'agents':>8}{'at the task':>13}{'datagrams':>11}{'without':>9}   in the first {TASK_S:g} s of a task")
+    for agents in sizes:
+        team = CrowdTeam(1, agents, roomy(max(100, agents)))
+        team.clock.advance(TASK_S)
+        sent = []
+        for begin in (lambda: None, team.assign):
+            before = team.board.counters["sent"]
+            begin()
+            team.clock.advance(TASK_S)
+            sent.append(float(team.board.counters["sent"] - before))
+        rows.append(
+            {"agents": float(agents), "taking part": float(len(team.words())), "idle": sent[0], "task": sent[1]}
+        )
+        _say(f"{agents:>8}{len(team.words()):>13}{sent[1]:>11,.0f}{sent[0]:>9,.0f}")
+        team.stop()
+    return rows
 
 
 def _peak() -> float:

@@ -5,6 +5,7 @@ Thesis, section 4.2.5: agents assigned to the same task write to one part of the
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
@@ -15,6 +16,8 @@ from middleware.consensus.view import View
 from middleware.entangled.node import EntangledNode
 from middleware.entangled.record import Record
 from middleware.entangled.replication.owner import Stored
+from middleware.panel import BELIEVED, Panel
+from middleware.presence import WAITING
 from middleware.tasks import MEMBER, RESULT, Member, Result, group_key, member_of, outcome_of
 
 if TYPE_CHECKING:
@@ -26,6 +29,9 @@ Heard = Callable[[list[Member], Result | None], None]
 Enter = Callable[[Callable[[tuple[Report, ...]], None]], "Bidding"]
 """Begins to bid, given what is to be told of the bids that the council announces."""
 
+Later = Callable[[float, Callable[[], None]], Callable[[], None]]
+"""Calls after so many seconds; calling what it returns prevents that."""
+
 
 class Group:
     """One participant's place in the group of ``task_id``.
@@ -33,6 +39,8 @@ class Group:
     ``quietly`` takes what may fail without anybody waiting, ``ordered`` all records there are, for an operator's orders
     among them.  With ``enter`` bids go to the task's council as well (``dissemination``), which announces those that
     decide; the records stay as what people see, and as who is present.  ``view`` is what the task's strategy goes by.
+
+    Of a team of many ``devices`` only the ``panel`` writes records.
     """
 
     def __init__(
@@ -41,9 +49,13 @@ class Group:
         entangled: EntangledNode,
         heard: Heard,
         quietly: Callable[[Deferred[Stored]], None],
-        ordered: Callable[[list[Record]], None] = lambda records: None,
-        enter: Enter | None = None,
-        view: View | None = None,
+        ordered: Callable[[list[Record]], None],
+        enter: Enter | None,
+        view: View | None,
+        panel: Panel,
+        devices: Callable[[], int],
+        seconds: Callable[[], float],
+        later: Later,
     ) -> None:
         self._key = group_key(task_id)
         self._entangled = entangled
@@ -56,14 +68,24 @@ class Group:
         self._view = view or View()
         self._roll = Roll(self._view)
         self._outcome: Result | None = None
+        self._panel = panel
+        self._devices = devices
+        self._seconds = seconds
+        self._later = later
+        self._me: Member | None = None
+        self._cancel: Callable[[], None] = lambda: None
+        self._is_left = False
+        panel.heard((), devices(), seconds())
         self._bidding = enter(self._announced) if enter is not None else None
         self._watch = entangled.watch(self._key, self._changed)
 
     def report(self, member: Member) -> None:
         """Tell the other participants; gone with this node, should it go."""
-        self._quietly(self._entangled.put(self._key, MEMBER, member.packed(), "leased"))
+        self._me = member
+        self._write()
         if self._bidding is None:
             return
+        self._bidding.expect(self._expected())
         report = self._view.report(member)
         if report is not None:
             self._bidding.report(report)
@@ -72,7 +94,10 @@ class Group:
 
     def withdraw(self) -> None:
         """Take this node's report back."""
-        self._quietly(self._entangled.remove(self._key, MEMBER))
+        self._me = None
+        if self._panel.is_written:
+            self._quietly(self._entangled.remove(self._key, MEMBER))
+            self._panel.wrote(None, self._seconds())
         if self._bidding is not None:
             self._bidding.withdraw()
 
@@ -82,6 +107,8 @@ class Group:
 
     def leave(self) -> None:
         """Hear no more of it."""
+        self._is_left = True
+        self._cancel()
         self._watch.stop()
         if self._bidding is not None:
             self._bidding.leave()
@@ -89,11 +116,50 @@ class Group:
     def _changed(self, records: list[Record]) -> None:
         self._roll.present(m for record in records if (m := member_of(record)) is not None)
         self._outcome = outcome_of(records)
+        present = {member.uuid for member in self._roll.members()}
+        self._panel.heard(present, self._devices(), self._seconds())
         if self._bidding is not None:
-            self._bidding.expect(len(self._roll))
-        self._heard(self._roll.members(), self._outcome)
+            self._bidding.expect(self._expected())
+        self._tell()
         self._ordered(records)
+        self._write()
 
     def _announced(self, reports: tuple[Report, ...]) -> None:
         self._roll.announced(reports)
-        self._heard(self._roll.members(), self._outcome)
+        self._panel.announced([report.agent for report in reports], self._seconds())
+        self._tell()
+        self._write()
+        if self._awaited():
+            self._later(BELIEVED, self._tell)
+
+    def _tell(self) -> None:
+        if not self._is_left:
+            self._heard([*self._roll.members(), *self._awaited()], self._outcome)
+
+    def _awaited(self) -> list[Member]:
+        """Who was announced and is believed to be here: its record is on its way."""
+        now = self._seconds()
+        if not self._panel.is_partial(now):
+            return []
+        return [
+            self._view.told(Member(report.agent, report.agent[:8], WAITING), report)
+            for report in self._roll.awaited()
+            if self._panel.believes(report.agent, now)
+        ]
+
+    def _expected(self) -> float:
+        """How many are to bid until the council need not wait any longer."""
+        return math.inf if self._panel.is_partial(self._seconds()) else len(self._roll)
+
+    def _write(self) -> None:
+        """Write the record, where the panel has use for it, or look again when it may."""
+        self._cancel()
+        if self._me is None:
+            return
+        now = self._seconds()
+        due = self._panel.due(self._me, now)
+        if due <= now:
+            self._panel.wrote(self._me, now)
+            self._quietly(self._entangled.put(self._key, MEMBER, self._me.packed(), "leased"))
+        elif due != math.inf:
+            self._cancel = self._later(due - now, self._write)

@@ -55,6 +55,7 @@ if TYPE_CHECKING:
     from middleware.dissemination.dissemination import Dissemination
     from middleware.dissemination.party import OnSummary
     from middleware.gauge import Gauge
+    from middleware.panel import Panel
     from middleware.verdict import Verdict
 
 CAMERA = "camera"
@@ -242,6 +243,12 @@ class SwarmNode(Service):
         said = unpacked([record.owner, host, int(port)]) if port.isascii() and port.isdigit() else None
         return said and (self.entangled.overlay.known(said.node_id) or said)
 
+    def team_size(self) -> int:
+        """About how many nodes the team has, this one included."""
+        from middleware.dissemination.scale import team_size
+
+        return team_size(self.entangled.identity.node_id, self.entangled.overlay.contacts())
+
     def reached(self, uuids: Sequence[str]) -> list[Contact]:
         """How to reach those of the devices that this node has met."""
         return [contact for contact in self.entangled.overlay.contacts() if contact.node_id.hex() in uuids]
@@ -275,12 +282,21 @@ class SwarmNode(Service):
         """Follow the reports and the outcome of one task; ``keep`` leaves them in the store as well."""
         return self.entangled.watch(group_key(task_id), changed, keep)
 
-    def group(self, task: Task, heard: Heard, ordered: Changed = lambda records: None) -> Group:
-        """Take part in a task: a place among its participants.  Where it has a council, bids go there, too."""
-        if not task.council:
-            return Group(task.task_id, self.entangled, heard, self._quietly, ordered)
-        enter = partial(self.bidding, task, task.generation)
-        return Group(task.task_id, self.entangled, heard, self._quietly, ordered, enter, self._view(task.strategy))
+    def group(
+        self, task: Task, heard: Heard, ordered: Changed = lambda records: None, panel: Panel | None = None
+    ) -> Group:
+        """Take part in a task: a place among its participants.  Where it has a council, bids go there, too.
+
+        Then, in a large team, a ``panel`` writes records for all; tasks that are divided together need all of them.
+        """
+        from middleware.panel import Panel, place_of
+
+        panel = panel or Panel(self.uuid, place_of(self.uuid, group_key(task.task_id)))
+        enter = partial(self.bidding, task, task.generation) if task.council else None
+        view = self._view(task.strategy) if task.council else None
+        devices = self.team_size if task.council and not task.group else lambda: 1
+        told = (heard, self._quietly, ordered, enter, view)
+        return Group(task.task_id, self.entangled, *told, panel, devices, self.clock.seconds, self.later)
 
     def bidding(self, task: Task, epoch: int, on_summary: OnSummary) -> Bidding:
         """Bid for ``task`` in ``epoch``: ``on_summary`` is told which bids the task's council announces."""
@@ -374,17 +390,15 @@ class SwarmNode(Service):
         """How the bids for tasks travel through this node."""
         # Imported by the first bid: a node that never carries one is spared the memory.
         from middleware.dissemination.dissemination import Dissemination, Surroundings
-        from middleware.dissemination.scale import team_size
 
         entangled = self.entangled
-
-        def size() -> int:
-            return team_size(entangled.identity.node_id, entangled.overlay.contacts())
 
         def may_bid(key: bytes, public: bytes) -> bool:
             return entangled.replica.may_store(Slot(key, public, MEMBER))
 
-        around = Surroundings(lambda: entangled.contact, entangled.overlay.contacts, size, self.strategy, may_bid)
+        around = Surroundings(
+            lambda: entangled.contact, entangled.overlay.contacts, self.team_size, self.strategy, may_bid
+        )
         return Dissemination(entangled.identity, entangled.endpoint, around, self.clock, self.rng)
 
     # -- what peers ask ---------------------------------------------------------------------------------------------

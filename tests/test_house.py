@@ -131,6 +131,7 @@ PURE = (
     "middleware.link",
     "middleware.listing",
     "middleware.order",
+    "middleware.panel",
     "middleware.explanation",
     "middleware.presence",
     "middleware.prefix",

@@ -19,7 +19,7 @@ class Bidding:
         auction: Auction,
         on_summary: OnSummary,
         publish: Publish,
-        expect: Callable[[Auction, int], None],
+        expect: Callable[[Auction, float], None],
         leave: Callable[[Bidding], None],
     ) -> None:
         self.auction = auction
@@ -45,8 +45,11 @@ class Bidding:
         if not self._has_bid or self._last is not None:
             self._next(None)
 
-    def expect(self, bidders: int) -> None:
-        """Where this node is of the council: close the bidding as soon as that many have bid or abstained."""
+    def expect(self, bidders: float) -> None:
+        """Where this node is of the council: close the bidding as soon as that many have bid or abstained.
+
+        Infinity: when the waiting period is over.
+        """
         self._expect(self.auction, bidders)
 
     def leave(self) -> None:

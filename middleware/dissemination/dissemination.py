@@ -205,7 +205,7 @@ class Dissemination:
         bid = Bid(self._identity.public, report, party.next_revision).signed(self._identity, party.auction)
         party.bid(bid, self._scale.counted(self._around.team_size()), self._clock.seconds())
 
-    def _expect(self, auction: Auction, bidders: int) -> None:
+    def _expect(self, auction: Auction, bidders: float) -> None:
         party = self._party(auction, OWN)
         party.expect(bidders)
         self._pump(party)

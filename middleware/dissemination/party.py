@@ -92,7 +92,7 @@ class Party:
         """Whether a bid of this agent's former life is announced in place of the own one, which has to be made anew."""
         return self.own is not None and self.own.revision < self.next_revision - 1
 
-    def expect(self, bidders: int) -> None:
+    def expect(self, bidders: float) -> None:
         """Close the bidding as soon as that many agents have bid or abstained."""
         if self._teller is not None:
             self._teller.expected = bidders

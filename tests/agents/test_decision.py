@@ -13,6 +13,7 @@ from agents.decision import Decision, decide
 from middleware.consensus.guard import Guard
 from middleware.consensus.nearest import Nearest
 from middleware.consensus.strategy import strategy_for
+from middleware.panel import PATIENCE
 from middleware.presence import EXECUTING, SEARCHING, WAITING
 from middleware.tasks import Member
 
@@ -156,3 +157,24 @@ class DecisionTests(SynchronousTestCase):
         assert decision.assigned is not None
         chosen = costs[decision.assigned]
         self.assertTrue(chosen == min(costs.values()) or min(costs.values()) >= chosen * 0.9)
+
+
+class PanelTests(SynchronousTestCase):
+    """Decisions where the members are only a panel of all."""
+
+    def panelled(self, since: float, has_word: bool, *members: Member) -> str | None:
+        """Who is assigned."""
+        return decide(members, Nearest(), 0.1, 8.0, since, has_word).assigned
+
+    def test_council_is_waited_for(self) -> None:
+        """That all of the panel have reported decides nothing until the council has spoken, or for too long has not."""
+        panel = member("a", 2.0), member("b", 1.0)
+        self.assertIsNone(self.panelled(0.0, False, *panel))
+        self.assertIsNone(self.panelled(8.0 + PATIENCE - 0.1, False, *panel))
+        self.assertEqual(self.panelled(8.0 + PATIENCE, False, *panel), "b")
+
+    def test_word_of_the_council_decides(self) -> None:
+        """When it has spoken, or somebody acts, nobody who is silent is waited for."""
+        panel = member("a", 2.0), member("b", 1.0), member("c", None)
+        self.assertEqual(self.panelled(0.0, True, *panel), "b")
+        self.assertEqual(self.panelled(0.0, False, member("a", 1.0, EXECUTING), *panel[1:]), "a")

@@ -329,8 +329,8 @@ class Node:
         self.on_tasks = changed
         self.ether.listed(self.place)
 
-    def group(self, task: Task, heard: Any, ordered: Any) -> Any:
-        """A place among those at a task."""
+    def group(self, task: Task, heard: Any, ordered: Any, panel: Any = None) -> Any:
+        """A place among those at a task; all of them write."""
         task_id = task.task_id
         followers = self.groups.setdefault(task_id, [])
         followers.append((heard, ordered))

@@ -237,9 +237,10 @@ class Tasks:
             hysteresis: float,
             period: float,
             since: float | None,
+            has_word: bool | None,
         ) -> Decision:
             listed = list(members)
-            decision: Decision = genuine(listed, strategy, hysteresis, period, since)
+            decision: Decision = genuine(listed, strategy, hysteresis, period, since, has_word)
             self.decided(listed, decision, hysteresis)
             return decision
 

@@ -57,6 +57,27 @@ class RollTests(SynchronousTestCase):
         self.roll.present([member("a", 3.0)])
         self.roll.present([member("a", 3.0), member("b", None)])
         self.assertEqual(costs(self.roll.members()), {"a": 3.0, "b": None})
+        self.roll.present([member("a", 3.0)])
+        self.roll.announced([Report("b", 1.0)])
+        self.assertEqual(self.roll.awaited(), [])
+
+    def test_announced_before_the_record(self) -> None:
+        """What was announced of somebody whose record is on its way counts when that comes, until it says otherwise."""
+        self.roll.announced([Report("c", 0.5)])
+        self.assertEqual(self.roll.awaited(), [Report("c", 0.5)])
+        here = [member("a", 3.0), member("b", None)]
+        self.roll.present([*here, member("c", None)])
+        self.assertEqual((costs(self.roll.members())["c"], self.roll.awaited()), (0.5, []))
+        self.roll.present([*here, member("c", 0.7)])
+        self.assertEqual(costs(self.roll.members())["c"], 0.7)
+
+    def test_newest_announcement_alone_awaits(self) -> None:
+        """Who is not announced any more is not awaited, and its record, which came later, holds."""
+        self.roll.announced([Report("c", 0.5), Report("d", 0.6)])
+        self.roll.present([member("a", 3.0), member("d", None)])
+        self.roll.announced([Report("a", 2.0)])
+        self.assertEqual(self.roll.awaited(), [])
+        self.assertEqual(costs(self.roll.members()), {"a": 2.0, "d": None})
 
 
 class GroupTests(FleetCase):

@@ -1,0 +1,108 @@
+"""Tests of a task for many: real nodes and agents, of whom only a panel writes records."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Mapping
+from typing import Any
+
+from twisted.internet.defer import Deferred
+from twisted.trial.unittest import SynchronousTestCase
+
+from agents.behaviour import KINDS, STAND
+from agents.context import Context
+from agents.engagement import Engagement
+from agents.state import State
+from drivers.reading import Action, Observation
+from middleware.entangled.record import Record
+from middleware.panel import SEATS
+from middleware.tasks import Task, member_of
+from sim.crowd.ground import Ground
+from swarmnode.crowd import DESK, CrowdTeam
+
+AGENTS = 24
+ANNOUNCED = 4
+STEP = 0.05
+
+
+class Stand:
+    """A task that nobody gets done, at a cost that dice say."""
+
+    def __init__(self, parameters: Mapping[str, float | str], rng: random.Random) -> None:
+        self.cost = round(1.0 + rng.random(), 3)
+
+    def look(self, seen: Observation, now: float) -> None:
+        """Nothing that it senses matters."""
+
+    def search(self, now: float) -> Action:
+        """Stand."""
+        return STAND
+
+    def hold(self, now: float) -> Action:
+        """Stand."""
+        return STAND
+
+    def execute(self, context: Context) -> Action:
+        """Stand, and go on doing so."""
+        return STAND
+
+
+class ManyTests(SynchronousTestCase):
+    """Two dozen agents and one task for one of them."""
+
+    def setUp(self) -> None:
+        KINDS["stand"] = f"{__name__}:Stand"
+        self.addCleanup(KINDS.pop, "stand")
+        self.team = CrowdTeam(7, AGENTS, Ground(30, 5.0, 5.0), camera_fps=0.0)
+        self.addCleanup(self.team.stop)
+        self.records: list[Record] = []
+        node = self.team.services[DESK].assembly.node
+        node.watch_group("job", self.heard)
+        task = Task("job", "stand", "Stand", {"base2d": {}}, waiting_period=0.5)
+        self.sent = self.team.board.counters["sent"]
+        Deferred.fromCoroutine(node.submit(task))
+
+    def heard(self, records: list[Record]) -> None:
+        """Take down what stands under the task's key."""
+        self.records = records
+
+    def engagements(self) -> dict[str, Engagement]:
+        """What each agent that lives is at."""
+        named = {name: self.team.services[name] for name in self.team.yard.names}
+        agents: dict[str, Any] = {name: one.assembly.agent for name, one in named.items() if one.running}
+        return {name: agent.engagement for name, agent in agents.items() if agent.engagement is not None}
+
+    def acting(self) -> list[str]:
+        """Who executes, by name."""
+        return [name for name, one in self.engagements().items() if one.course.state is State.EXECUTING]
+
+    def run_until_one_acts(self, limit: float) -> tuple[str, float]:
+        """Who does, and after how many seconds; there are never two."""
+        began = self.team.clock.seconds()
+        while not (acting := self.acting()):
+            self.team.clock.advance(STEP)
+            self.assertLess(self.team.clock.seconds() - began, limit)
+        self.assertEqual(len(acting), 1)
+        return acting[0], self.team.clock.seconds() - began
+
+    def ranked(self) -> list[str]:
+        """Those that live, the best first."""
+        every = self.engagements()
+        return sorted(every, key=lambda name: (every[name].me.cost or 0.0, every[name].me.uuid))
+
+    def test_best_acts_and_the_next_takes_over(self) -> None:
+        """The best of all acts, few write, all name it, each sends some datagrams; the next best takes over in 3 s."""
+        name, _ = self.run_until_one_acts(5.0)
+        self.assertEqual(name, self.ranked()[0])
+        self.team.clock.advance(2.0)
+        self.assertEqual((self.acting(), len(self.engagements())), ([name], AGENTS))
+        sent = self.team.board.counters["sent"] - self.sent
+        self.assertLess(sent / AGENTS, 1000)
+        members = {member.uuid for record in self.records if (member := member_of(record)) is not None}
+        self.assertLessEqual(len(members), SEATS + 2 * ANNOUNCED)  # some write before they hear of the last
+        uuid = self.engagements()[name].me.uuid
+        self.assertEqual({one.me.assigned for one in self.engagements().values()}, {uuid})
+        self.team.services[name].vanish()
+        heir, seconds = self.run_until_one_acts(3.0)
+        self.assertEqual(heir, self.ranked()[0])
+        self.assertLess(seconds, 3.0)
