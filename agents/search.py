@@ -93,7 +93,7 @@ class SearchAndApproach:
             self._saw(find_target(seen.frame.data, self._size, self._means.lens), now)
         if self._circling.is_walking or self._detour.is_on(now):
             self._looked_at = now  # it looks elsewhere, and the target stays where it is
-        elif self._is_hidden and now - self._seen_at <= HIDDEN - MEMORY:
+        elif self.cost is not None and self._is_hidden and now - self._seen_at <= HIDDEN - MEMORY:
             self._looked_at = now
         if now - self._looked_at > MEMORY:
             self._forget()

@@ -252,6 +252,15 @@ class HiddenTests(SynchronousTestCase):
             walk.live(walk.behaviour.hold)
         self.assertIsNone(walk.behaviour.cost)
 
+    def test_glimpse_is_no_belief(self) -> None:
+        """What was seen once in passing, and never measured, is forgotten as before though something stands there."""
+        walk = self.hidden()
+        walk.behaviour._distances = []
+        began = walk.now
+        while walk.now - began < MEMORY + 0.5:
+            walk.live(walk.behaviour.hold)
+        self.assertIsNone(walk.behaviour._target)
+
     def test_free_view_tells_that_it_is_gone(self) -> None:
         """A target that was taken away is forgotten as before where nothing stands between."""
         walk = self.hidden()
