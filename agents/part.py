@@ -16,7 +16,7 @@ from middleware.entangled.errors import EntangledError
 from middleware.entangled.record import Record
 from middleware.node import SwarmNode
 from middleware.order import order_of
-from middleware.panel import Panel, place_of
+from middleware.panel import panel_of
 from middleware.presence import IDLE
 from middleware.tasks import Member, Result, Task, group_key
 from middleware.verdict import Verdict
@@ -48,7 +48,7 @@ class Part:
         self.engagement = Engagement(
             task, me, behaviour, strategy, clock, token, self._tell, self._conclude, self._say, halt, age
         )
-        self._panel = Panel(node.uuid, place_of(node.uuid, group_key(task.task_id)))
+        self._panel = panel_of(node.uuid, group_key(task.task_id))
         self.engagement.seat(self._panel)
         self.engagement.justify = self._justify
         self.engagement.reached = node.reached

@@ -116,8 +116,7 @@ class Group:
     def _changed(self, records: list[Record]) -> None:
         self._roll.present(m for record in records if (m := member_of(record)) is not None)
         self._outcome = outcome_of(records)
-        present = {member.uuid for member in self._roll.members()}
-        self._panel.heard(present, self._devices(), self._seconds())
+        self._panel.heard(self._roll.uuids(), self._devices(), self._seconds())
         if self._bidding is not None:
             self._bidding.expect(self._expected())
         self._tell()

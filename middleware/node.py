@@ -289,9 +289,9 @@ class SwarmNode(Service):
 
         Then, in a large team, a ``panel`` writes records for all; tasks that are divided together need all of them.
         """
-        from middleware.panel import Panel, place_of
+        from middleware.panel import panel_of
 
-        panel = panel or Panel(self.uuid, place_of(self.uuid, group_key(task.task_id)))
+        panel = panel or panel_of(self.uuid, group_key(task.task_id))
         enter = partial(self.bidding, task, task.generation) if task.council else None
         view = self._view(task.strategy) if task.council else None
         devices = self.team_size if task.council and not task.group else lambda: 1

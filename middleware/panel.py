@@ -107,6 +107,11 @@ class Panel:
         self._told, self._told_at = me, now
 
 
+def panel_of(uuid: str, key: bytes) -> Panel:
+    """The panel of the task with the group's ``key``, as ``uuid`` sees it."""
+    return Panel(uuid, place_of(uuid, key))
+
+
 def place_of(uuid: str, key: bytes) -> float:
     """The place of a participant's turn, 0 to 1, at the task with the group's ``key``.
 

@@ -7,7 +7,7 @@ not come yet is kept in mind until it does; who went is gone.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Set
 
 from middleware.consensus.strategy import Report
 from middleware.consensus.view import View
@@ -52,6 +52,10 @@ class Roll:
     def awaited(self) -> list[Report]:
         """What was announced of those who have not come yet."""
         return [report for uuid, report in self._announced.items() if uuid not in self._present]
+
+    def uuids(self) -> Set[str]:
+        """Who is present."""
+        return self._present.keys()
 
     def members(self) -> list[Member]:
         """Everybody that is present, with the bid that counts."""

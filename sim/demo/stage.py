@@ -80,8 +80,9 @@ def arranged(
     except OSError as error:
         remedy = "give --web-host an address of this machine, or 0.0.0.0 for all of them"
         raise Trouble(f"the page cannot be at {web_host} ({error.strerror}); {remedy}") from error
-    # Free at every address: the page may be at another one than the robots.
-    spare = iter(port.free("tcp", EVERYWHERE, PAGES + MOST_PORTS * len(DOGS)))
+    # Free at every address: the page may be at another one than the robots.  What was asked for is nobody else's.
+    found = port.free("tcp", EVERYWHERE, 1 + PAGES + MOST_PORTS * len(DOGS))
+    spare = iter([one for one in found if one != web_port])
     if web_port:
         web = port.chosen("tcp", web_host, web_port, "the page")
     else:
