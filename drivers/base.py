@@ -19,6 +19,7 @@ from drivers.driver import Permit
 from drivers.errors import LinkLost, NoReply, NotEnabled, Unsupported, UsageError
 from drivers.gate import Gate
 from drivers.reading import Action, Description, Frame, Observation, Value
+from drivers.subscribers import Subscribers
 
 ENGAGED = "estop.engaged"
 """Whether the robot's own switch keeps its motors off; a robot without one leaves the key out."""
@@ -62,7 +63,7 @@ class BaseDriver:
         self._motion = dict.fromkeys(description.limits, 0.0)
         self._end: Any = None
         self._newest: Observation | None = None
-        self._seen: list[Callable[[Observation], None]] = []
+        self._seen = Subscribers[Observation](name, self.log)
         self._counts = dict.fromkeys(("frames", "bad_frames", "pictures", "bytes", "links", "refused"), 0)
 
     # -- the contract -----------------------------------------------------------------------------------------------
@@ -163,13 +164,7 @@ class BaseDriver:
 
     def subscribe(self, seen: Callable[[Observation], None]) -> Callable[[], None]:
         """Call ``seen`` at each observation; call what is returned to end that."""
-        self._seen.append(seen)
-
-        def end() -> None:
-            if seen in self._seen:
-                self._seen.remove(seen)
-
-        return end
+        return self._seen.add(seen)
 
     def invoke(self, name: str, **arguments: float | str) -> Deferred[Mapping[str, Value]]:
         """Have the robot do one of ``description.skills``, or tell something that is not observed all the time."""
@@ -246,11 +241,7 @@ class BaseDriver:
         connecting, self._connecting = self._connecting, None
         if connecting is not None:
             connecting.callback(self._description)
-        for seen in list(self._seen):
-            try:
-                seen(observation)
-            except Exception:
-                self.log.failure("a subscriber of {robot} failed", robot=self._name)
+        self._seen.tell(observation)
 
     def _refused(self, error: Exception) -> None:
         """There is no such robot, for good."""

@@ -16,6 +16,7 @@ from twisted.python.failure import Failure
 from drivers.driver import Driver, Filming, Permit
 from drivers.errors import Unsupported, UsageError
 from drivers.reading import Action, Description, Frame, Observation, Value
+from drivers.subscribers import Subscribers
 
 CAMERA = "camera"
 
@@ -67,7 +68,7 @@ class Joined:
         self._told: set[str] = set()
         self._source: Observation | None = None
         self._newest: Observation | None = None
-        self._seen: list[Callable[[Observation], None]] = []
+        self._seen = Subscribers[Observation](name, self.log)
         main.subscribe(self._on_main)
 
     # -- the contract -----------------------------------------------------------------------------------------------
@@ -134,13 +135,7 @@ class Joined:
 
     def subscribe(self, seen: Callable[[Observation], None]) -> Callable[[], None]:
         """Call ``seen`` at each observation of the robot; call what is returned to end that."""
-        self._seen.append(seen)
-
-        def end() -> None:
-            if seen in self._seen:
-                self._seen.remove(seen)
-
-        return end
+        return self._seen.add(seen)
 
     def invoke(self, name: str, **arguments: float | str) -> Deferred[Mapping[str, Value]]:
         """Have whoever knows the skill do it, the robot first."""
@@ -166,11 +161,7 @@ class Joined:
         observation = self.observe()
         if observation is None:
             return
-        for seen in list(self._seen):
-            try:
-                seen(observation)
-            except Exception:
-                self.log.failure("a subscriber of {robot} failed", robot=self._name)
+        self._seen.tell(observation)
 
     def _joined(self, source: Observation) -> Observation:
         self._told.update(source.values)

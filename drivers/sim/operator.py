@@ -14,6 +14,7 @@ from drivers.link import Connector, Line, Link
 from drivers.reading import Value
 from drivers.sim.codec import VERSION, Alive, Done, FrameReader, Order, Overlook, Truth, encoded
 from drivers.sim.option import DEFAULT_PORT
+from drivers.subscribers import Subscribers
 
 REPLY_S = 2.0
 ALIVE_S = 0.5
@@ -51,7 +52,7 @@ class YardOperator:
         self._snapshot: Snapshot | None = None
         self._connecting: Deferred[Snapshot] | None = None
         self._alive: Any = None
-        self._seen: list[Callable[[Snapshot], None]] = []
+        self._seen = Subscribers[Snapshot]("the yard", self.log)
         self._orders: dict[int, tuple[Deferred[bool], Any]] = {}
         self._number = 0
 
@@ -79,13 +80,7 @@ class YardOperator:
 
     def subscribe(self, seen: Callable[[Snapshot], None]) -> Callable[[], None]:
         """Call ``seen`` at each snapshot; call what is returned to end that."""
-        self._seen.append(seen)
-
-        def end() -> None:
-            if seen in self._seen:
-                self._seen.remove(seen)
-
-        return end
+        return self._seen.add(seen)
 
     def place_target(self, x: float, y: float) -> Deferred[bool]:
         """Put the red target at this place, in metres from the lower left corner."""
@@ -149,11 +144,7 @@ class YardOperator:
         connecting, self._connecting = self._connecting, None
         if connecting is not None:
             connecting.callback(snapshot)
-        for seen in list(self._seen):
-            try:
-                seen(snapshot)
-            except Exception:
-                self.log.failure("a subscriber of the yard failed")
+        self._seen.tell(snapshot)
 
     def _keep_alive(self) -> None:
         if self._link is not None:

@@ -17,6 +17,7 @@ from drivers.conformance import CHECKS, Faulty, MemoryBench, broken
 from drivers.driver import Driver, Permit
 from drivers.errors import LinkLost, NotEnabled
 from drivers.reading import Action, Description, Observation, Value
+from drivers.subscribers import Subscribers
 
 FOLDER = Path(__file__).resolve().parents[2] / "examples" / "driver"
 EXAMPLE: Any = runpy.run_path(str(FOLDER / "robot.py"))
@@ -252,18 +253,23 @@ class Clinging(Rover):
         return lambda: None
 
 
-class Fragile(Rover):
+class Frail(Subscribers[Observation]):
     """Tells nobody any more once one subscriber has raised."""
 
-    def _observed(self, values: Mapping[str, Value], t_robot: float, *rest: Any) -> None:
-        seen, self._seen = self._seen, []
-        super()._observed(values, t_robot, *rest)
-        self._seen = seen
+    def tell(self, newest: Observation) -> None:
         try:
-            for each in seen:
-                each(self._newest)
+            for each in self._all:
+                each(newest)
         except Faulty:
-            self._seen = []
+            self._all = []
+
+
+class Fragile(Rover):
+    """Has such subscribers."""
+
+    def __init__(self, *given: Any, **more: Any) -> None:
+        super().__init__(*given, **more)
+        self._seen = Frail(self._name, self.log)
 
 
 class Silent(Rover):
