@@ -39,7 +39,7 @@ FIRST_HEDGE, MOST_HEDGE = 0.01, 0.15
 """Seconds after which others are asked beside one that does not answer: while nobody was measured yet, and at most;
 else those within which nearly every answer comes."""
 LEAST_PATIENCE, TRIES = 0.4, 2.6
-"""Seconds, and usual waits, that a question of a lookup may take in a large network: two tries."""
+"""Seconds, and usual waits, that a question of a lookup may take in a large network: two tries where little is lost."""
 MAX_FOUND = 512
 MAX_HEARD = 4096
 """Contacts of which is kept when they were heard, or missed; who was heard longest ago is forgotten first."""
@@ -289,7 +289,10 @@ class Overlay:
 
         In a large network there are always others, and some of those that are named are dead.
         """
-        return min(PATIENCE, max(LEAST_PATIENCE, TRIES * self._endpoint.peers.guess)) if self.is_large else None
+        if not self.is_large:
+            return None
+        peers = self._endpoint.peers
+        return min(PATIENCE, max(LEAST_PATIENCE, max(TRIES, peers.loss.tries) * peers.guess))
 
     def slow(self, contact: Contact) -> None:
         """``contact`` took longer than it should; until it is heard, others are asked first."""

@@ -17,7 +17,7 @@ from twisted.internet.interfaces import IDelayedCall, IReactorTime
 from middleware.entangled.errors import Crowded, NoAnswer, TooLarge
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address
-from middleware.entangled.wire.congestion import BACK_OFF, LONGEST
+from middleware.entangled.wire.congestion import LONGEST
 from middleware.entangled.wire.courier import Courier
 from middleware.entangled.wire.message import (
     MAX_MESSAGE,
@@ -31,7 +31,7 @@ from middleware.entangled.wire.message import (
     encoded,
 )
 from middleware.entangled.wire.method import ErrorCodes
-from middleware.entangled.wire.peer import MAX_TRIES, Opening, Peer, Peers, cancel
+from middleware.entangled.wire.peer import MAX_TRIES, OPENING_S, Opening, Peer, Peers, cancel
 from middleware.entangled.wire.session import MAX_PLAIN, Session
 
 PATIENCE = 1.5
@@ -265,7 +265,8 @@ class Asker:
             self._courier.post(inquiry.peer.public, Key(False, inquiry.number), message)
         else:
             self._send(session, message)
-        wait = inquiry.peer.round_trip.wait * BACK_OFF ** min(inquiry.tries - 1, MAX_TRIES)
+        within = inquiry.deadline - inquiry.asked_at
+        wait = self._peers.spacing(inquiry.peer.round_trip, min(inquiry.tries, MAX_TRIES + 1), within)
         if inquiry.is_patient and inquiry.tries > 1:
             # A method that takes its time: the later tries are there for an answer that got lost.
             wait = max(wait, (inquiry.deadline - now) / max(1, MAX_TRIES + 1 - inquiry.tries))
@@ -299,7 +300,7 @@ class Asker:
             if is_silent or now - session.heard_at > LONGEST:
                 self._open(inquiry)
             self._set_timer(inquiry, LONGEST)
-        elif inquiry.tries >= MAX_TRIES:
+        elif inquiry.tries >= self._peers.tries:
             if inquiry.is_patient or not is_silent or peer.opening is not None or not peer.round_trip.is_measured:
                 self._set_timer(inquiry, left)
             else:
@@ -331,8 +332,9 @@ class Asker:
 
     def _open(self, inquiry: Inquiry) -> bool:
         """Open a session for a question, which rides in the INIT where it may; False where there are too many."""
-        rider = b"" if inquiry.changes else aged(inquiry.message, inquiry.deadline - self._clock.seconds())
-        return self._peers.open(inquiry.peer, inquiry.address, rider)
+        left = inquiry.deadline - self._clock.seconds()
+        rider = b"" if inquiry.changes else aged(inquiry.message, left)
+        return self._peers.open(inquiry.peer, inquiry.address, rider, within=min(left, OPENING_S))
 
     def _unheard(self, opening: Opening) -> None:
         """Give up what waited for a handshake that nobody answered."""
@@ -341,7 +343,7 @@ class Asker:
         peer.tells = ()
         if peer.sessions:
             for inquiry in self._of(peer):
-                if inquiry.tries >= MAX_TRIES:  # it waited for this handshake only
+                if inquiry.tries >= self._peers.tries:  # it waited for this handshake only
                     self._due(inquiry)
             return  # the others have their own timers
         for inquiry in self._of(peer):

@@ -375,10 +375,11 @@ class Endpoint:
             self.counters["replayed"] += 1
             return
         try:
-            data, is_newest = session.open(datagram)
+            data, ahead = session.open(datagram)
         except Forged:
             self.counters["forged"] += 1
             return
+        self._peers.loss.arrived(ahead)
         session.heard_at = self._clock.seconds()
         if data[:1] == _REFUSAL:
             self._turned_away(session, data[1:])
@@ -387,7 +388,7 @@ class Endpoint:
             self._refuse(session, SUPERSEDED)
             return
         inside = self._inside.get(data[0]) if data else None
-        if is_newest and source != session.contact.address and inside is None:
+        if ahead > 0 and source != session.contact.address and inside is None:
             session.contact = Contact(session.contact.public, source)
             self._peers.moved(session)
         if not session.is_confirmed:

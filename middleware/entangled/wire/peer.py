@@ -19,6 +19,7 @@ from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address, Network, is_relayed
 from middleware.entangled.wire.congestion import BACK_OFF, FIRST_GUESS, LONGEST, RoundTrip
 from middleware.entangled.wire.door import OPEN, Door
+from middleware.entangled.wire.loss import Loss
 from middleware.entangled.wire.session import INDEX_BYTES, Credentials, Hello, Invitation, Session
 
 STRANGER_WAIT = 0.3
@@ -64,8 +65,9 @@ class Opening:
     """A handshake of ours that waits for its RESP.
 
     ``address`` is where it was begun, ``doors`` has every address at which it knocks with the cookie that was asked for
-    there.  Up to ``held_until`` others help, and it goes on whatever the number of its tries.  With ``is_wanted``
-    somebody here waits for it; else it was begun to let the peer in, or to find a better way.
+    there, ``within`` in how many seconds it should succeed.  Up to ``held_until`` others help, and it goes on whatever
+    the number of its tries.  With ``is_wanted`` somebody here waits for it; else it was begun to let the peer in, or to
+    find a better way.
     """
 
     invitation: Invitation
@@ -73,6 +75,7 @@ class Opening:
     address: Address
     started_at: float
     doors: dict[Address, bytes]
+    within: float
     tries: int = 0
     knocks: int = 0
     held_until: float = 0.0
@@ -145,7 +148,7 @@ class Peers:
     elsewhere.
 
     ``usual`` is how long anybody takes.  In a network that ``is_wide`` strangers are thought to take as long: there
-    are so many that what is asked twice for nothing counts.
+    are so many that what is asked twice for nothing counts.  ``loss`` is what gets lost of what anybody sends us.
     """
 
     def __init__(
@@ -170,6 +173,7 @@ class Peers:
         self._network = network
         self._counters = counters
         self.usual = RoundTrip()
+        self.loss = Loss()
         self.is_wide = False
         self._peers: dict[bytes, Peer] = {}
         self._openings: dict[int, Opening] = {}
@@ -214,6 +218,21 @@ class Peers:
         """How long to wait for a sign of a peer before trying again, in seconds."""
         peer = self._peers.get(public)
         return peer.round_trip.wait if peer is not None and peer.round_trip.is_measured else STRANGER_WAIT
+
+    @property
+    def tries(self) -> int:
+        """How often anything is tried before it is given up, the usual number at least."""
+        return max(MAX_TRIES, self.loss.tries)
+
+    def spacing(self, round_trip: RoundTrip, tries: int, within: float) -> float:
+        """Seconds between a try, the ``tries``-th, and the next one of what should succeed ``within`` some seconds.
+
+        Each waits longer than the one before.  Where much gets lost, they are as close to each other as they must be to
+        have as many as it takes; but none comes before an answer usually would.
+        """
+        wait = round_trip.wait * BACK_OFF ** (tries - 1)
+        mean = round_trip.mean if round_trip.is_measured else self.usual.mean
+        return wait if mean is None else min(wait, max(mean, within / self.loss.tries))
 
     def usable(self, peer: Peer) -> Session | None:
         """The session to send on; an old or worn one calls for its successor, a very old one is dropped."""
@@ -317,10 +336,13 @@ class Peers:
 
     # -- handshakes of ours -----------------------------------------------------------------------------------------
 
-    def open(self, peer: Peer, address: Address, rider: bytes = b"", is_wanted: bool = True) -> bool:
+    def open(
+        self, peer: Peer, address: Address, rider: bytes = b"", is_wanted: bool = True, within: float = OPENING_S
+    ) -> bool:
         """Open a session, unless that is under way; False where there are too many handshakes.
 
-        ``rider`` is a message for its INIT; one that does not fit stays behind.
+        ``rider`` is a message for its INIT; one that does not fit stays behind.  ``within`` is in how many seconds
+        whoever wants it needs it.
         """
         if peer.opening is not None:
             if is_wanted and not peer.opening.is_wanted:
@@ -334,7 +356,7 @@ class Peers:
         own, hello = peer.own or self.ring[0], self.hello
         rider = rider if len(rider) <= hello.rider_room else b""
         invitation = Invitation(own, peer.static, self._rng.randbytes(32), self.new_index(), rider, hello)
-        opening = Opening(invitation, peer, address, self._clock.seconds(), {address: b""})
+        opening = Opening(invitation, peer, address, self._clock.seconds(), {address: b""}, within)
         self._openings[invitation.local_index] = self._by_mac[invitation.mac] = peer.opening = opening
         opening.is_wanted = is_wanted
         if is_wanted:
@@ -384,7 +406,7 @@ class Peers:
 
     def _knock(self, opening: Opening) -> None:
         """Send an INIT, again if need be, until the tries are used up."""
-        if opening.tries >= MAX_TRIES and self._clock.seconds() >= opening.held_until:
+        if opening.tries >= self.tries and self._clock.seconds() >= opening.held_until:
             self.close(opening)
             if len(self.ring) > 1:  # it may not have heard of the newest secret, or of nothing older any more
                 ring = list(self.ring)
@@ -404,8 +426,8 @@ class Peers:
 
     def _wait(self, opening: Opening) -> float:
         round_trip = opening.peer.round_trip
-        wait = round_trip.wait * BACK_OFF ** (min(opening.tries, MAX_TRIES) - 1)
-        if opening.tries == MAX_TRIES and not round_trip.is_measured:
+        wait = self.spacing(round_trip, min(opening.tries, MAX_TRIES), opening.within)
+        if opening.tries == self.tries and not round_trip.is_measured:
             # Nothing is known of this peer: it may be far away rather than gone.
             wait = max(wait, opening.started_at + OPENING_S - self._clock.seconds())
         return wait

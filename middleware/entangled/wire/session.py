@@ -330,8 +330,8 @@ class Session:
         behind = self._highest - int.from_bytes(datagram[5:_HEADER], "little")
         return behind >= 0 and (behind >= WINDOW or bool(self._seen >> behind & 1))
 
-    def open(self, datagram: bytes) -> tuple[bytes, bool]:
-        """The message inside a DATA datagram, and whether it is the newest so far.
+    def open(self, datagram: bytes) -> tuple[bytes, int]:
+        """The message inside a DATA datagram, and how far its counter is ahead of the newest one before it.
 
         Raises ``Forged`` where the datagram does not open or was here before; the session is then as it was.
         """
@@ -347,7 +347,7 @@ class Session:
             self._highest = counter
         else:
             self._seen |= 1 << -ahead
-        return message, ahead > 0
+        return message, ahead
 
 
 def index_of(datagram: bytes) -> int:
