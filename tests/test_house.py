@@ -120,6 +120,7 @@ PURE = (
     "middleware.entangled.space.decree",
     "middleware.entangled.space.posting",
     "middleware.entangled.space.template",
+    "middleware.entangled.token_bucket",
     "middleware.entangled.wire.congestion",
     "middleware.entangled.wire.door",
     "middleware.entangled.wire.message",
