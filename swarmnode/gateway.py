@@ -23,6 +23,7 @@ from drivers.phone.option import FPS, MOST_SIDE
 from middleware.admission.certificate import GATEWAY
 from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.identity import Identity
+from middleware.entangled.token_bucket import TokenBucket
 from middleware.node import SwarmNode
 from middleware.presence import DEVICES, DONE, EXECUTING, IDLE, Device, devices_of
 from middleware.settings import (
@@ -35,7 +36,6 @@ from middleware.settings import (
     WebSettings,
 )
 from swarmnode.assembly import FAULTS, assembled
-from swarmnode.bucket import Bucket
 from swarmnode.seams import Seams
 from webnode.board import Phones, Wanted
 from webnode.errors import Refusal
@@ -94,7 +94,7 @@ class Gateway:
         self._phones: dict[str, _Phone] = {}
         self._ending: dict[str, Deferred[Any]] = {}
         self._away: dict[str, float] = {}
-        self._joins = Bucket(JOINS, JOINS_S)
+        self._joins = TokenBucket(JOINS_S, JOINS)
 
     def join(self, secret: bytes, name: str, can: Mapping[str, Any]) -> Deferred[str]:
         """Let a phone take part; fires with its uuid, fails with ``Refusal`` 409, 429 or 503."""
@@ -198,7 +198,7 @@ class _Phone:
 
     def __init__(self, node: SwarmNode, agent: Service, driver: PhoneDriver, silent: Callable[[], None]) -> None:
         self.name = node.presence.device.name
-        self.bucket = Bucket(LOOKS, LOOKS_S)
+        self.bucket = TokenBucket(LOOKS_S, LOOKS)
         self._node = node
         self._agent = agent
         self._driver = driver

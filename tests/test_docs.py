@@ -28,7 +28,7 @@ from middleware.deployment import manifest, module
 from middleware.dissemination import check, party, scale, teller, tree
 from middleware.entangled.control import port
 from middleware.entangled.kademlia import detour, membership, roster
-from middleware.entangled.network import bundle, layer, link, tcp, tunnel, websocket
+from middleware.entangled.network import bundle, link, tcp, tunnel, websocket
 from middleware.entangled.replication import handover, pusher, replica, subscriber
 from middleware.entangled.space import shelf, template
 from middleware.entangled.wire import rebuff
@@ -40,6 +40,7 @@ from sim.demo.configuration import DOGS
 from sim.emulator import aibo, rosbridge
 from sim.robots import Robots
 from sim.yard import Yard
+from standards.head import MAX_HEAD
 from swarmnode import gateway
 from swarmnode.driver import pilot
 from webnode import channel, limits, live, team
@@ -143,7 +144,7 @@ FIGURES: Sequence[tuple[str, str]] = (
     ("tunnel", f"after {link.IDLE_S:g} s without a sign of the other end, or {link.QUIET_S:g} s when"),
     ("tunnel", f"does not answer within {link.PONG_S:g} s"),
     ("tunnel", f"takes nothing for {link.STALL_S:g} s"),
-    ("tunnel", f"| {tunnel.HEAD_S:g} s from the connection on, and {layer.MAX_HEAD // 1024} KiB of head"),
+    ("tunnel", f"| {tunnel.HEAD_S:g} s from the connection on, and {MAX_HEAD // 1024} KiB of head"),
     ("tunnel", f"got nothing through for {bundle.STILL_S:g} s"),
     ("tunnel", f"until {bundle.ROUGH_S:g} s after that"),
     ("tunnel", f"stands still for {bundle.DEAD_S:g} s while another moves"),

@@ -14,15 +14,16 @@ from pathlib import Path
 from twisted.trial.unittest import SynchronousTestCase
 
 ROOT = Path(__file__).resolve().parent.parent
-BELOW = ("agents", "drivers", "middleware", "sim", "webnode")
+BELOW = ("agents", "drivers", "middleware", "sim", "standards", "webnode")
 ROOMS = (*BELOW, "swarmnode")
 
 # From the most special name to the room: what a module may import of the house.  The longest name that fits holds.
 MAY_IMPORT: dict[str, tuple[str, ...]] = {
+    "standards": ("standards",),
     "middleware": ("middleware",),
-    "middleware.entangled": ("middleware.entangled",),
+    "middleware.entangled": ("middleware.entangled", "standards"),
     "middleware.admission": ("middleware.admission", "middleware.entangled"),
-    "drivers": ("drivers",),
+    "drivers": ("drivers", "standards"),
     "sim": ("sim", "drivers"),
     "sim.team": ("sim.team", "middleware"),
     "webnode": ("webnode", "middleware"),
@@ -120,6 +121,7 @@ PURE = (
     "middleware.entangled.space.decree",
     "middleware.entangled.space.posting",
     "middleware.entangled.space.template",
+    "middleware.entangled.token_bucket",
     "middleware.entangled.wire.congestion",
     "middleware.entangled.wire.door",
     "middleware.entangled.wire.message",
@@ -168,6 +170,7 @@ PURE = (
     "sim.team.scale.theory",
     "sim.team.scenario",
     "sim.team.session",
+    "standards",
     "swarmnode.doctor.diagnosis",
     "swarmnode.doctor.facts",
     "swarmnode.doctor.finding",
@@ -202,7 +205,7 @@ EDGES = (
     "middleware.entangled.data.writer",
 )
 WORLD = ("time", "socket", "threading", "asyncio", "selectors", "subprocess", "secrets", "twisted.internet.reactor")
-GUARDED = ("middleware", "agents", "drivers")
+GUARDED = ("standards", "middleware", "agents", "drivers")
 
 ON_DEMAND = (
     *("middleware.deployment", "middleware.explanation", "middleware.verdict"),
@@ -260,6 +263,7 @@ def _allowed(module: str) -> tuple[str, ...]:
         kinds = sorted({name.split(".")[1] for name in FILES if re.fullmatch(r"drivers\.\w+\.maker", name)})
         own = parts[1] if len(parts) > 2 or module in (f"drivers.{kind}" for kind in kinds) else ""
         contract = tuple(name for name in FILES if name.startswith("drivers.") and name.split(".")[1] not in kinds)
+        contract += ("standards",)
         allowed = (*contract, f"drivers.{own}") if own else contract
     return allowed
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-import socket
 import sys
 from pathlib import Path
 from typing import Any
 
 from benchmarks.dht.contestant import HOST, Entry
 from benchmarks.remote import Remote
+from sim.demo.port import BOTH, free
 
 ROOT = Path(__file__).resolve().parents[2]
 SPAWNED_AT_ONCE = 4
@@ -46,7 +46,7 @@ class Team:
 
     async def __aenter__(self) -> Team:
         try:
-            ports = free_ports(self._size)
+            ports = free(BOTH, HOST, self._size)  # of those compared some use UDP, some TCP as well
             for first in range(0, self._size, SPAWNED_AT_ONCE):
                 spawned = [await self._spawn(port) for port in ports[first : first + SPAWNED_AT_ONCE]]
                 for node in spawned:
@@ -73,22 +73,3 @@ class Team:
 
     async def _end(self) -> None:
         await asyncio.gather(*(node.ended() for node in self.nodes))
-
-
-def free_ports(count: int) -> list[int]:
-    """Ports that nobody uses now, for UDP and TCP alike."""
-    held: list[socket.socket] = []
-    ports: list[int] = []
-    while len(ports) < count:
-        udp = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        tcp = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-        held += [udp, tcp]
-        udp.bind((HOST, 0))
-        try:
-            tcp.bind((HOST, udp.getsockname()[1]))
-        except OSError:
-            continue
-        ports.append(udp.getsockname()[1])
-    for one in held:
-        one.close()
-    return ports

@@ -22,7 +22,7 @@ from drivers.rosbridge import codec
 from drivers.rosbridge.codec import Answered, Published, Status, decoded, encoded
 from drivers.rosbridge.link import Bridge
 from drivers.rosbridge.option import RATES, TYPES, Options, checked, described, sectors
-from drivers.rosbridge.websocket import Nonce
+from standards.websocket import Nonce
 
 REPEAT_S = 0.1
 """A velocity is said so often while it is in force: most bases stop by themselves when they hear none."""

@@ -10,7 +10,8 @@ from twisted.logger import Logger
 
 from drivers.base import heard_at
 from drivers.link import Connector, Line, Link
-from drivers.rosbridge.websocket import Nonce, WebSocket
+from drivers.rosbridge.websocket import WebSocket
+from standards.websocket import Nonce
 
 PING_S = 1.0
 SILENCE_S = 3.0

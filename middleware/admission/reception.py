@@ -25,6 +25,7 @@ from middleware.admission.statement import Invite
 from middleware.entangled.errors import EntangledError, RemoteError
 from middleware.entangled.identity import Identity
 from middleware.entangled.network.network import Address
+from middleware.entangled.token_bucket import TokenBucket
 from middleware.entangled.wire.door import Noted
 
 RATE = 50.0
@@ -70,8 +71,8 @@ class Reception:
         self.on_refused: Callable[[bytes, Address, str], None] = lambda who, source, code: None
         """Called when a newcomer is not let in, with its key (empty: nobody knows its code) and the code of ``WHY``."""
         self._said = Noted()
-        self._opening = _Rate(RATE)
-        self._hinting = _Rate(HINTS)
+        self._opening = TokenBucket(RATE)
+        self._hinting = TokenBucket(HINTS)
 
     def on_knock(self, datagram: bytes, source: Address) -> None:
         """Answer a KNOCK; nothing that it holds raises."""
@@ -84,14 +85,14 @@ class Reception:
             name = knock.id_of(datagram)
             known = self._roll.invited(name)
             if known is None:
-                if self._hinting.is_within(self._now()):
+                if self._hinting.take(self._now()):
                     self._say(name, "unknown", source)
                     self._send(knock.unknown(name), source)
                 return
             invite, packed = known
             heard = knock.opened_knock(datagram, invite.public)
             # After that, or whoever has seen the id on its way could use up what is meant for those with the code.
-            if not self._opening.is_within(self._now()):
+            if not self._opening.take(self._now()):
                 return
             if not is_proof(invite.public, heard.public, heard.wish, heard.proof):
                 return
@@ -180,19 +181,3 @@ class Reception:
         self._log.warn(
             "not let in{whose}, from {source}: {code}: {why}", whose=whose, source=source, code=code, why=WHY[code]
         )
-
-
-class _Rate:
-    """At most so many a second, and as many at once."""
-
-    def __init__(self, rate: float) -> None:
-        self._rate = self._left = rate
-        self._at = 0.0
-
-    def is_within(self, now: float) -> bool:
-        self._left = min(self._rate, self._left + (now - self._at) * self._rate)
-        self._at = now
-        if self._left < 1.0:
-            return False
-        self._left -= 1.0
-        return True

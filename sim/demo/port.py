@@ -10,6 +10,7 @@ from contextlib import ExitStack
 from typing import Literal
 
 Kind = Literal["tcp", "udp"]
+BOTH: tuple[Kind, ...] = ("tcp", "udp")
 
 QUIET = range(20_000, 32_000)
 """Systems hand out none of these by themselves (Linux begins at 32,768, others at 49,152): a port that is free here
@@ -32,25 +33,29 @@ def preferred(kind: Kind, host: str, wanted: int, spare: Iterator[int]) -> int:
     return wanted if wanted and _is_free(kind, host, wanted) else next(spare)
 
 
-def free(kind: Kind, host: str, count: int) -> list[int]:
+def free(kind: Kind | tuple[Kind, ...], host: str, count: int) -> list[int]:
     """``count`` different ``QUIET`` ports, free at this moment; held all at once, so none is given twice.
 
-    Drawn by chance, so that who asks at the same moment is given others.  Raises ``OSError`` where ``host`` is no
-    address of this machine, or too few are free.
+    Each is free for every ``kind``.  Drawn by chance, so that who asks at the same moment is given others.  Raises
+    ``OSError`` where ``host`` is no address of this machine, or too few are free.
     """
-    check(kind, host)
+    kinds = (kind,) if isinstance(kind, str) else kind
+    check(kinds[0], host)
     draw = random.SystemRandom()
     found: list[int] = []
     with ExitStack() as stack:
         for port in draw.sample(QUIET, len(QUIET)):
             if len(found) == count:
-                return found
+                break
             try:
-                stack.enter_context(_bound(kind, host, port))
+                for each in kinds:
+                    stack.enter_context(_bound(each, host, port))
             except OSError:
                 continue
             found.append(port)
-    raise OSError(errno.EADDRINUSE, f"fewer than {count} ports are free")
+    if len(found) < count:
+        raise OSError(errno.EADDRINUSE, f"fewer than {count} ports are free")
+    return found
 
 
 def check(kind: Kind, host: str) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from tests.live.page import CHROMIUM, DESK, FLAGS, MISSING, PHONE, TABLET, Team
+from tests.live.page import CHROMIUM, DESK, FLAGS, MISSING, PATIENCE_MS, PHONE, TABLET, Team
 
 ABSENT = [*MISSING, *([] if find_spec("segno") else ["the Python package segno"])]
 PHONES = """async () => {
@@ -36,7 +36,7 @@ class InviteTests(SynchronousTestCase):
         context = self.browser.new_context(**screen, color_scheme=scheme, reduced_motion="reduce")
         self.addCleanup(context.close)
         page = context.new_page()
-        page.set_default_timeout(8000)
+        page.set_default_timeout(PATIENCE_MS)
         self.faults: list[str] = []
         page.on("pageerror", lambda error: self.faults.append(str(error)))
         page.on("console", lambda words: self.faults.append(words.text) if words.type == "error" else None)

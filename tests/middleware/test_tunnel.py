@@ -275,7 +275,12 @@ class TunnelTests(TunnelCase):
 
     def test_proxy_says_no(self) -> None:
         """A proxy that refuses, or is none, is a tunnel that cannot be, and the reason is kept."""
-        for answer in (b"HTTP/1.1 407 Proxy Authentication Required\r\n\r\n", b"SSH-2.0-box\r\n\r\n", b"x" * 9000):
+        for answer in (
+            b"HTTP/1.1 407 Proxy Authentication Required\r\n\r\n",
+            b"SSH-2.0-box\r\n\r\n",
+            b"\r\n\r\n",
+            b"x" * 9000,
+        ):
             layer = Proxied("a:443")
             layer.received(answer)
             self.assertTrue(layer.fault and not layer.is_open)

@@ -6,10 +6,11 @@ import random
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.entangled.network.layer import MAX_HEAD
 from middleware.entangled.network.network import Address
 from middleware.entangled.network.url import Proxy, Url
-from middleware.entangled.network.websocket import BINARY, CLOSE, CONTINUATION, MAX_PAYLOAD, PING, WebSocket
+from middleware.entangled.network.websocket import MAX_PAYLOAD, WebSocket
+from standards.head import MAX_HEAD
+from standards.websocket import BINARY, CLOSE, CONTINUATION, PING, framed
 
 URL = Url.of("wss://node.example:443/swarm")
 
@@ -50,8 +51,8 @@ class WebSocketTests(SynchronousTestCase):
     def test_join_fragments(self) -> None:
         """A message that a proxy has cut into frames is one datagram again, a ping in between notwithstanding."""
         self.greet()
-        first = self.client._frame(BINARY, b"one ")
-        stream = bytes([first[0] & 0x7F]) + first[1:] + self.client.ping() + self.client._frame(CONTINUATION, b"two")
+        first = framed(BINARY, b"one ", b"mask")
+        stream = bytes([first[0] & 0x7F]) + first[1:] + self.client.ping() + framed(CONTINUATION, b"two", b"mask")
         datagrams, reply = self.server.received(stream)
         self.assertEqual(datagrams, [b"one two"])
         self.assertEqual(reply, b"\x8a\x00")
@@ -59,7 +60,7 @@ class WebSocketTests(SynchronousTestCase):
     def test_answer_ping_and_goodbye(self) -> None:
         """A ping is answered by what it held; after a goodbye nothing is heard."""
         self.greet()
-        _, reply = self.client.received(self.server._frame(PING, b"there?"))
+        _, reply = self.client.received(framed(PING, b"there?", None))
         self.assertEqual(self.server.received(reply), ([], b""))
         self.server.received(self.client.closing() + self.client.framed(b"too late"))
         self.assertIn("goodbye", self.server.fault)

@@ -10,7 +10,6 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.data.memory import MemoryStore
 from middleware.presence import DEVICES, devices_of
-from swarmnode.bucket import Bucket
 from swarmnode.gateway import FIRST_S, LOOKS, MOST, SILENCE_S, Gateway, seed_of, sides
 from swarmnode.rehearsal import VirtualTeam
 from swarmnode.seams import Seams
@@ -288,11 +287,3 @@ class GatewayTests(SynchronousTestCase):
 
     def dogs(self) -> list[str]:
         return [each["status"] for each in self.team.state()["devices"] if each["name"].startswith("dog")]
-
-
-class BucketTests(SynchronousTestCase):
-    def test_so_many_at_once_and_so_many_a_second(self) -> None:
-        """A burst goes through, then what time has brought; a clock that was set back brings nothing."""
-        bucket = Bucket(3.0, 2.0)
-        self.assertEqual([bucket.take(10.0) for _ in range(4)], [True, True, True, False])
-        self.assertEqual([bucket.take(10.5), bucket.take(10.5), bucket.take(5.0)], [True, False, False])

@@ -7,8 +7,8 @@ import ssl
 from tempfile import NamedTemporaryFile
 from typing import Protocol
 
-MAX_HEAD = 8192
-"""Bytes of an HTTP head."""
+from standards.head import MAX_HEAD, head, taken
+
 _PIECE = 16384
 
 
@@ -88,30 +88,30 @@ class Proxied:
         self.fault = ""
         self._target = target
         self._login = login
-        self._head = b""
+        self._buffer = bytearray()
 
     def opening(self) -> bytes:
         """What to send first."""
-        lines = [f"CONNECT {self._target} HTTP/1.1", f"Host: {self._target}"]
-        if self._login:
-            lines.append(f"Proxy-Authorization: Basic {base64.b64encode(self._login.encode()).decode()}")
-        return ("\r\n".join(lines) + "\r\n\r\n").encode()
+        login = base64.b64encode(self._login.encode()).decode()
+        more = [f"Proxy-Authorization: Basic {login}"] if login else []
+        return head(f"CONNECT {self._target} HTTP/1.1", f"Host: {self._target}", *more)
 
     def received(self, data: bytes) -> tuple[bytes, bytes]:
         """Take bytes as they come; those after the proxy's answer are the stream's."""
         if self.is_open:
             return data, b""
-        self._head += data
-        head, end, rest = self._head.partition(b"\r\n\r\n")
-        if not end:
-            if len(self._head) > MAX_HEAD:
+        self._buffer += data
+        answer = taken(self._buffer)
+        if answer is None:
+            if len(self._buffer) >= MAX_HEAD:
                 self.fault = "no proxy answers there"
             return b"", b""
-        status = head.split(b"\r\n")[0].split(b" ", 2)
-        if len(status) < 2 or not status[0].startswith(b"HTTP/1.") or not status[1].startswith(b"2"):
-            self.fault = f"the proxy refuses: {head[:60].decode('ascii', 'replace').splitlines()[0]!r}"
+        version, status = [*answer.first.split(b" "), b""][:2]
+        if not version.startswith(b"HTTP/1.") or not status.startswith(b"2"):
+            self.fault = f"the proxy refuses: {answer.said!r}"
             return b"", b""
-        self.is_open, self._head = True, b""
+        self.is_open = True
+        rest, self._buffer = bytes(self._buffer), bytearray()
         return rest, b""
 
     def wrapped(self, data: bytes) -> bytes:

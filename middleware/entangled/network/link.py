@@ -17,7 +17,8 @@ from zope.interface import implementer
 
 from middleware.entangled.network.layer import Layer
 from middleware.entangled.network.network import Address
-from middleware.entangled.network.websocket import NORMAL, WebSocket
+from middleware.entangled.network.websocket import WebSocket
+from standards.websocket import NORMAL
 
 SHORT = 300
 """Heartbeats, receipts, greetings and most questions have fewer bytes; parts of parcels have 1400."""

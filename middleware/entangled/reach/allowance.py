@@ -5,7 +5,7 @@ from __future__ import annotations
 from twisted.internet.interfaces import IReactorTime
 
 from middleware.entangled.reach.known import keep
-from middleware.entangled.reach.relay import Bucket
+from middleware.entangled.token_bucket import TokenBucket
 
 INTRODUCTIONS = 20.0
 """Times in a second, and at once twice as often, that one peer may have this node introduce it."""
@@ -20,7 +20,7 @@ class Allowance:
 
     def __init__(self, clock: IReactorTime) -> None:
         self._clock = clock
-        self._buckets: dict[tuple[str, bytes], Bucket] = {}
+        self._buckets: dict[tuple[str, bytes], TokenBucket] = {}
         self._introducers: dict[bytes, bytes] = {}
 
     def __len__(self) -> int:
@@ -42,10 +42,10 @@ class Allowance:
         """Give back to who introduced a peer what this cost: it has answered."""
         bucket = self._buckets.get(("meet", self._introducers.pop(public, b"")))
         if bucket is not None:
-            bucket.give(1.0)
+            bucket.give()
 
     def _may(self, what: str, public: bytes, rate: float, at_once: float) -> bool:
         key = (what, public)
-        bucket = self._buckets.pop(key, None) or Bucket(rate, at_once)
+        bucket = self._buckets.pop(key, None) or TokenBucket(rate, at_once)
         keep(self._buckets, key, bucket)
-        return bucket.take(1.0, self._clock.seconds())
+        return bucket.take(self._clock.seconds())

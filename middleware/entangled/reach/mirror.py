@@ -15,7 +15,7 @@ from twisted.internet.interfaces import IReactorTime
 from middleware.entangled.background import Background
 from middleware.entangled.network.address import ADDRESS, address_of, packed_address
 from middleware.entangled.network.network import Address, Ports
-from middleware.entangled.reach.relay import Bucket
+from middleware.entangled.token_bucket import TokenBucket
 from middleware.entangled.wire.session import Session
 
 MIRROR = 0x06
@@ -46,7 +46,7 @@ class Mirror:
         self._clock = clock
         self._rng = rng
         self._chores = chores
-        self._bucket = Bucket(RATE, BURST)
+        self._bucket = TokenBucket(RATE, BURST)
         self._pending: dict[bytes, Callable[[Address | None], None]] = {}
 
     def look(self, session: Session, port: int = 0) -> Deferred[Address | None]:
@@ -80,7 +80,7 @@ class Mirror:
 
     def on_mirror(self, session: Session, plain: bytes, source: Address) -> None:
         """Tell a peer the address that it wrote from."""
-        if len(plain) != _LENGTH or not self._bucket.take(1.0, self._clock.seconds()):
+        if len(plain) != _LENGTH or not self._bucket.take(self._clock.seconds()):
             return
         self._send(session, bytes([IMAGE]) + plain[1 : 1 + _TOKEN] + packed_address(source), source)
 

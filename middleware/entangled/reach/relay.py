@@ -15,6 +15,7 @@ from twisted.internet.interfaces import IReactorTime
 
 from middleware.entangled.identity import ID_BYTES
 from middleware.entangled.network.network import MAX_DATAGRAM, Address, is_relayed
+from middleware.entangled.token_bucket import TokenBucket
 from middleware.entangled.wire.session import Session
 
 CARRY = 0x03
@@ -28,36 +29,12 @@ ONE_SIDED_S = 120.0
 """Seconds for which one of two may send to the other without a word from it."""
 
 
-class Bucket:
-    """A token bucket: ``rate`` tokens come in a second, up to ``size``."""
-
-    __slots__ = ("_rate", "_size", "_tokens", "_filled_at")
-
-    def __init__(self, rate: float, size: float) -> None:
-        self._rate = rate
-        self._size = self._tokens = size
-        self._filled_at = float("-inf")
-
-    def take(self, amount: float, now: float) -> bool:
-        """Whether there is so much; then it is gone."""
-        self._tokens = min(self._size, self._tokens + (now - self._filled_at) * self._rate)
-        self._filled_at = now
-        if self._tokens < amount:
-            return False
-        self._tokens -= amount
-        return True
-
-    def give(self, amount: float) -> None:
-        """Put back what was taken for nothing."""
-        self._tokens = min(self._size, self._tokens + amount)
-
-
 @dataclass(slots=True)
 class _Pair:
     """Two peers; ``heard`` has when each last sent, by its id."""
 
     begun_at: float
-    bucket: Bucket = field(default_factory=lambda: Bucket(PAIR_RATE, PAIR_BURST))
+    bucket: TokenBucket = field(default_factory=lambda: TokenBucket(PAIR_RATE, PAIR_BURST))
     heard: dict[bytes, float] = field(default_factory=dict)
 
 
@@ -80,7 +57,7 @@ class Relay:
         self._clock = clock
         self._counters = counters
         self._pairs: OrderedDict[tuple[bytes, bytes], _Pair] = OrderedDict()
-        self._all = Bucket(ALL_RATE, ALL_BURST)
+        self._all = TokenBucket(ALL_RATE, ALL_BURST)
 
     def __len__(self) -> int:
         return len(self._pairs)
@@ -117,7 +94,7 @@ class Relay:
         pair.heard[sender] = now
         if now - pair.heard.get(to, pair.begun_at) > ONE_SIDED_S:
             return False
-        return pair.bucket.take(size, now) and self._all.take(size, now)
+        return pair.bucket.take(now, size) and self._all.take(now, size)
 
     def _forget_idle(self) -> None:
         before = self._clock.seconds() - ONE_SIDED_S

@@ -16,6 +16,7 @@ from twisted.logger import Logger
 from twisted.python.failure import Failure as Trouble
 
 from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.token_bucket import TokenBucket
 from middleware.entangled.wire.courier import Courier
 from middleware.entangled.wire.door import ROLE, meaning
 from middleware.entangled.wire.message import (
@@ -73,7 +74,7 @@ class Answerer:
         self._counters = counters
         self._ledger = Ledger()
         self._cancelled: dict[tuple[bytes, int], None] = {}
-        self._asking: dict[bytes, Allowance] = {}
+        self._asking: dict[bytes, TokenBucket] = {}
 
     def clear(self) -> None:
         """Forget what was asked; answers that are still being made go nowhere."""
@@ -87,9 +88,8 @@ class Answerer:
             work.cancel()
 
     def tidy(self, now: float) -> None:
-        """Forget how much those asked who asked nothing for so long that they may ask as much as anybody again."""
-        before = now - QUESTIONS_AT_ONCE / QUESTIONS
-        for public in [public for public, allowance in self._asking.items() if allowance.at <= before]:
+        """Forget how much those asked who ask so little that they may ask as much as anybody again."""
+        for public in [public for public, bucket in self._asking.items() if bucket.is_full(now)]:
             del self._asking[public]
 
     def answer(self, question: Question, session: Session, is_bulky: bool = False) -> None:
@@ -253,13 +253,13 @@ class Answerer:
     def _is_within(self, public: bytes) -> bool:
         """Whether a peer may ask one thing more now."""
         asking = self._asking
-        allowance = asking.pop(public, None)
-        if allowance is None:
-            allowance = Allowance(QUESTIONS_AT_ONCE, self._clock.seconds())
+        bucket = asking.pop(public, None)
+        if bucket is None:
+            bucket = TokenBucket(QUESTIONS, QUESTIONS_AT_ONCE)
             if len(asking) >= MAX_ASKING:
                 del asking[next(iter(asking))]
-        asking[public] = allowance
-        return allowance.take(self._clock.seconds())
+        asking[public] = bucket
+        return bucket.take(self._clock.seconds())
 
     def _called(self, method: Method, peer: Contact, arguments: tuple[object, ...], deadline: float) -> object:
         """What the method returned, a Deferred for a coroutine, or the trouble it raised."""
@@ -292,25 +292,6 @@ class Answerer:
             self._counters["refused"] += 1
         else:
             self._log.failure("{method} failed for a peer", failure=trouble, method=method.name)
-
-
-class Allowance:
-    """What one peer may still ask."""
-
-    __slots__ = ("_left", "at")
-
-    def __init__(self, left: float, now: float) -> None:
-        self._left = left
-        self.at = now
-
-    def take(self, now: float) -> bool:
-        """Whether there is one left; it is gone then."""
-        self._left = min(QUESTIONS_AT_ONCE, self._left + (now - self.at) * QUESTIONS)
-        self.at = now
-        if self._left < 1.0:
-            return False
-        self._left -= 1.0
-        return True
 
 
 def _kept(number: int, answer: bytes) -> bytes:

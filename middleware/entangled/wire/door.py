@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
 from middleware.entangled.record import Slot
+from middleware.entangled.token_bucket import TokenBucket
 
 NONCE = 8
 MAX_ROOM = 640
@@ -172,19 +173,15 @@ class Noted:
 
     def __init__(self) -> None:
         self._said: dict[tuple[object, ...], None] = {}
-        self._lines = LINES
-        self._filled_at = 0.0
+        self._lines = TokenBucket(1.0, LINES)
 
     def is_new(self, now: float, *what: object) -> bool:
         """Whether to log ``what``; noted it is then."""
         if what in self._said:
             self._said[what] = self._said.pop(what)
             return False
-        self._lines = min(LINES, self._lines + now - self._filled_at)
-        self._filled_at = now
-        if self._lines < 1.0:
+        if not self._lines.take(now):
             return False
-        self._lines -= 1.0
         self._said[what] = None
         if len(self._said) > MAX_NOTED:
             del self._said[next(iter(self._said))]

@@ -23,6 +23,7 @@ from twisted.internet.interfaces import IDelayedCall, IReactorTime
 from middleware.entangled.errors import Forged, NoAnswer
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address, Network
+from middleware.entangled.token_bucket import TokenBucket
 from middleware.entangled.wire.congestion import BACK_OFF, FIRST_GUESS, LONGEST
 from middleware.entangled.wire.peer import Peers
 from middleware.entangled.wire.session import MAC, Credentials, has_cookie, mac_of
@@ -92,8 +93,8 @@ class Cookies:
         self._key = key
         self._rng = rng
         self._secret = rng.randbytes(32)
-        self._quiet = Bucket(QUIET_RATE)
-        self._most = Bucket(MOST_RATE)
+        self._quiet = TokenBucket(QUIET_RATE)
+        self._most = TokenBucket(MOST_RATE)
 
     def is_lawful(self, init: bytes, source: Address, now: float) -> bool:
         """Whether the last field of an INIT is what it must be: zero, or made with a cookie of ours."""
@@ -122,23 +123,6 @@ class Cookies:
         return hashlib.blake2s(
             f"{step} {source.port} {source.host}".encode(), key=self._secret, digest_size=16
         ).digest()
-
-
-class Bucket:
-    """A token bucket that holds what one second brings."""
-
-    def __init__(self, rate: float) -> None:
-        self._rate = self._tokens = rate
-        self._filled_at = 0.0
-
-    def take(self, now: float) -> bool:
-        """Whether there was a token left; it is gone then."""
-        self._tokens = min(self._rate, self._tokens + (now - self._filled_at) * self._rate)
-        self._filled_at = now
-        if self._tokens < 1.0:
-            return False
-        self._tokens -= 1.0
-        return True
 
 
 class Greeter:

@@ -17,8 +17,8 @@ from twisted.internet.interfaces import IDelayedCall, IReactorTime
 from middleware.entangled.errors import Malformed, NoAnswer
 from middleware.entangled.network.address import ADDRESS, address_of, packed_address
 from middleware.entangled.network.network import Address
+from middleware.entangled.token_bucket import TokenBucket
 from middleware.entangled.wire.congestion import BACK_OFF, FIRST_GUESS, LONGEST
-from middleware.entangled.wire.greeting import Bucket
 from middleware.entangled.wire.peer import cancel
 
 HAIL, ECHO = 0x19, 0x1A
@@ -78,7 +78,7 @@ class Echoer:
         self._send = send
         self._clock = clock
         self._fingerprint = fingerprint
-        self._bucket = Bucket(RATE)
+        self._bucket = TokenBucket(RATE)
 
     def on_hail(self, datagram: bytes, source: Address) -> str:
         """Answer one; why it was not, in one word."""

@@ -18,7 +18,6 @@ from middleware.entangled.reach.relay import (
     ONE_SIDED_S,
     PAIR_BURST,
     PAIR_RATE,
-    Bucket,
     Relay,
 )
 from middleware.entangled.wire.noise import TransportKeys
@@ -102,13 +101,6 @@ class RelayTests(SynchronousTestCase):
         self.clock.advance(ONE_SIDED_S + 1.0)
         self.assertTrue(self.relay.has_room)
         self.assertEqual((self.carry(self.a, many[-1].contact.node_id), len(self.relay)), (1, 1))
-
-    def test_bucket(self) -> None:
-        """A bucket gives what came into it, and never more than it holds."""
-        bucket = Bucket(2.0, 4.0)
-        self.assertEqual([bucket.take(1.0, 0.0) for _ in range(5)], [True] * 4 + [False])
-        self.assertTrue(bucket.take(2.0, 1.0))
-        self.assertFalse(bucket.take(5.0, 100.0))
 
     def test_noise_raises_nothing(self) -> None:
         """Whatever a peer sends, nothing is raised."""

@@ -308,10 +308,22 @@ class StageTests(SynchronousTestCase):
     def test_free_ports_stay_free(self) -> None:
         """No free port is one that systems give to outgoing connections, so none is taken before its process starts."""
         lowest_given = 32_768
-        for kind in ("tcp", "udp"):
+        for kind in ("tcp", "udp", port.BOTH):
             ports = port.free(kind, "127.0.0.1", 20)
             self.assertEqual(len(set(ports)), 20)
             self.assertLess(max(ports), lowest_given)
+
+    def test_ports_are_free_for_both_kinds(self) -> None:
+        """Where a port shall do for both kinds, one that is held for one of them alone is not given."""
+        first, last = port.free(port.BOTH, "127.0.0.1", 2)
+        self.patch(port, "QUIET", [first, last])
+        for kind in (socket.SOCK_STREAM, socket.SOCK_DGRAM):
+            with socket.socket(socket.AF_INET, kind) as held:
+                held.bind(("127.0.0.1", first))
+                if kind == socket.SOCK_STREAM:
+                    held.listen(1)
+                self.assertEqual(port.free(port.BOTH, "127.0.0.1", 1), [last])
+                self.assertRaises(OSError, port.free, port.BOTH, "127.0.0.1", 2)
 
     def test_foreign_folder_is_refused(self) -> None:
         """A folder with somebody's file in it is refused and left as it is."""

@@ -1,0 +1,49 @@
+"""Tests of ``middleware.entangled.token_bucket``."""
+
+from __future__ import annotations
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.entangled.token_bucket import TokenBucket
+
+
+class TokenBucketTests(SynchronousTestCase):
+    def test_so_many_at_once_and_so_many_a_second(self) -> None:
+        """A burst goes through, then what time has brought, and never more than it holds."""
+        bucket = TokenBucket(2.0, 3.0)
+        self.assertEqual([bucket.take(10.0) for _ in range(4)], [True, True, True, False])
+        self.assertEqual([bucket.take(10.5), bucket.take(10.5)], [True, False])
+        self.assertEqual([bucket.take(100.0) for _ in range(4)], [True, True, True, False])
+
+    def test_holds_what_a_second_brings(self) -> None:
+        """Where no size is named as many go through at once as in a second."""
+        bucket = TokenBucket(2.0)
+        self.assertEqual([bucket.take(0.0) for _ in range(3)], [True, True, False])
+
+    def test_take_much(self) -> None:
+        """What asks for more than there is takes nothing; less than that is still there."""
+        bucket = TokenBucket(2.0, 4.0)
+        self.assertEqual([bucket.take(0.0, 5.0), bucket.take(0.0, 3.0), bucket.take(0.0, 2.0)], [False, True, False])
+        self.assertEqual([bucket.take(0.5, 2.0), bucket.take(0.5, 0.5)], [True, False])
+
+    def test_clock_set_back(self) -> None:
+        """A clock that was set back brings nothing and takes nothing; from there on time counts."""
+        bucket = TokenBucket(2.0, 3.0)
+        self.assertTrue(bucket.take(10.0, 2.0))
+        self.assertEqual([bucket.take(5.0), bucket.take(5.0), bucket.take(5.5)], [True, False, True])
+
+    def test_give(self) -> None:
+        """What is given back may be taken again, but never more than it holds."""
+        bucket = TokenBucket(1.0, 2.0)
+        self.assertTrue(bucket.take(0.0, 2.0))
+        bucket.give()
+        self.assertEqual([bucket.take(0.0), bucket.take(0.0)], [True, False])
+        bucket.give(9.0)
+        self.assertEqual([bucket.take(0.0, 2.0), bucket.take(0.0)], [True, False])
+
+    def test_full(self) -> None:
+        """It is full at first, and again when as much came as was taken."""
+        bucket = TokenBucket(2.0, 4.0)
+        self.assertTrue(bucket.is_full(0.0))
+        bucket.take(7.0, 3.0)
+        self.assertEqual([bucket.is_full(moment) for moment in (7.0, 8.0, 8.5)], [False, False, True])
