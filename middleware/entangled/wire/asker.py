@@ -222,14 +222,9 @@ class Asker:
         if inquiry is None or inquiry.peer.public != public:
             self._counters["unasked"] += 1
             return
-        if inquiry.progress_at < 0 and not inquiry.is_bulky:  # else it is the time of the transfer
-            if inquiry.tries == 1:
-                took = self._clock.seconds() - inquiry.sent_at
-                inquiry.peer.round_trip.measured(took)
-                self._peers.usual.measured(took)
-            elif inquiry.tries > 1:
-                inquiry.peer.round_trip.ambiguous()
-                self._peers.usual.ambiguous()
+        is_timed = inquiry.tries > 0 and inquiry.progress_at < 0 and not inquiry.is_bulky
+        if is_timed:  # else it is the time of the handshake, or of the transfer
+            self._peers.answered(inquiry.peer, inquiry.tries, self._clock.seconds() - inquiry.sent_at)
         self._forget(inquiry)
         if isinstance(message, Answer):
             inquiry.deferred.callback(message.value)
@@ -306,7 +301,7 @@ class Asker:
             else:
                 self._fail(inquiry, f"no answer to {inquiry.tries} tries")
         else:
-            if is_silent and not inquiry.is_light:
+            if is_silent and not inquiry.is_light and inquiry.tries >= self._peers.doubtful(peer):
                 self._open(inquiry)  # perhaps it restarted and knows no session
             self._try(inquiry)
 

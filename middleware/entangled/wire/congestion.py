@@ -57,9 +57,13 @@ class RoundTrip:
             return self.wait
         return max(self._smoothed * 9 / 8, self._smoothed + max(LATE, 4 * self._deviation))
 
-    def ambiguous(self) -> None:
-        """Learn from an answer to one of several tries: the wait was perhaps too short."""
-        self.wait = min(LONGEST, self.wait * BACK_OFF)
+    def ambiguous(self, seconds: float) -> None:
+        """Learn from an answer to one of several tries, so long after the first: the wait was perhaps too short.
+
+        Where nothing is known, the way may be as long as that.
+        """
+        longer = self.wait * BACK_OFF
+        self.wait = min(LONGEST, longer if self.is_measured else max(longer, seconds))
 
 
 class Window:

@@ -398,6 +398,7 @@ class Endpoint:
                 return
             self._half_open.confirm(session)
             self._established(session, is_owed=False)
+            self._peers.confirmed(session)
             self.on_contact(session.contact)
         if not data or not self.is_running:
             return
@@ -491,7 +492,7 @@ class Endpoint:
 
     def _admitted(self, acceptance: Acceptance, source: Address, now: float) -> bytes:
         """The RESP for who proved its key by an INIT; nothing where what rides in the INIT is malformed."""
-        contact, hello = Contact(acceptance.public, source), self._peers.hello
+        contact, hello = self._peers.contact(acceptance.public, source), self._peers.hello
         code = self._judged(contact.public, acceptance.shown, acceptance.life)
         if code:  # that is all that comes of it: it may be a recording, with a pass that was succeeded since
             self.counters["refused"] += 1
@@ -532,7 +533,7 @@ class Endpoint:
         except Forged:
             self.counters["forged"] += 1
             return
-        contact = Contact(opening.peer.public, source)
+        contact = self._peers.contact(opening.peer.public, source)
         index = opening.invitation.local_index
         self._peers.accepted(opening)
         if reply.refusal:

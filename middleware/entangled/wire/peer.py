@@ -86,13 +86,12 @@ class Opening:
 
 @dataclass(slots=True, eq=False)
 class Peer:
-    """One peer, known by its public key; ``static`` is the X25519 key that follows from it.
+    """One peer, known by its public key; ``contact`` says where it was asked last.
 
     ``own`` is under which of the team's secrets it is to be met, where that is not the newest one.
     """
 
-    public: bytes
-    static: bytes
+    contact: Contact
     sessions: list[Session] = field(default_factory=list)
     opening: Opening | None = None
     round_trip: RoundTrip = field(default_factory=RoundTrip)
@@ -101,6 +100,11 @@ class Peer:
     queue: Mapping[int, None] = field(default_factory=lambda: NONE)  # those of them that have not been sent yet
     in_flight: int = 0
     own: Credentials | None = None
+
+    @property
+    def public(self) -> bytes:
+        """The key by which it is known."""
+        return self.contact.public
 
     @property
     def session(self) -> Session | None:
@@ -183,6 +187,13 @@ class Peers:
         """The peer of that key, if anything is remembered of it."""
         return self._peers.get(public)
 
+    def contact(self, public: bytes, address: Address) -> Contact:
+        """The contact of that key at that address; where it is known already no second one is made of it."""
+        peer = self._peers.get(public)
+        if peer is not None and peer.contact.address == address:
+            return peer.contact
+        return Contact(public, address)
+
     def session(self, public: bytes) -> Session | None:
         """The newest session with the peer of that key."""
         peer = self._peers.get(public)
@@ -194,12 +205,14 @@ class Peers:
         return peer.direct_session if peer is not None else None
 
     def peer(self, contact: Contact) -> Peer:
-        """The peer of that key, remembered from now on; raises ``ValueError`` where the key is none."""
+        """The peer of that contact, remembered from now on; raises ``ValueError`` where its key is none."""
         peer = self._peers.get(contact.public)
         if peer is not None:
             self._peers[contact.public] = self._peers.pop(contact.public)  # whoever is wanted least stands first
+            peer.contact = contact
             return peer
-        peer = self._peers[contact.public] = Peer(contact.public, exchange_key(contact.public))
+        exchange_key(contact.public)  # or it is none
+        peer = self._peers[contact.public] = Peer(contact)
         if self.is_wide:
             peer.round_trip = RoundTrip(self.guess)
         if len(self._peers) > MAX_PEERS:
@@ -263,6 +276,30 @@ class Peers:
             self.close(peer.opening)  # the peer, which was told to knock too, came first
         self.on_established(session)
         return peer
+
+    def confirmed(self, session: Session) -> None:
+        """Learn how far away a peer is that opened a session, and has just confirmed it: one round trip after our RESP.
+
+        Without that, who was asked first would ask back too soon, and take a long way for a peer that restarted.
+        """
+        peer = self.peer(session.contact)
+        if not peer.round_trip.is_measured:
+            self.answered(peer, 1, self._clock.seconds() - session.opened_at)
+
+    def answered(self, peer: Peer, tries: int, seconds: float) -> None:
+        """Learn from an answer to the last of so many tries, so many seconds after the first."""
+        for round_trip in (peer.round_trip, self.usual):
+            if tries == 1:
+                round_trip.measured(seconds)
+            else:
+                round_trip.ambiguous(seconds)
+
+    def doubtful(self, peer: Peer) -> int:
+        """After how many tries that got no answer a peer may have forgotten our session.
+
+        Where it is not known how far away it is, or much gets lost, one says nothing.
+        """
+        return 1 if peer.round_trip.is_measured and self.loss.tries == 1 else 2
 
     def moved(self, session: Session) -> None:
         """Take note that a peer's newest datagram came from another address."""
@@ -355,7 +392,7 @@ class Peers:
             return False
         own, hello = peer.own or self.ring[0], self.hello
         rider = rider if len(rider) <= hello.rider_room else b""
-        invitation = Invitation(own, peer.static, self._rng.randbytes(32), self.new_index(), rider, hello)
+        invitation = Invitation(own, exchange_key(peer.public), self._rng.randbytes(32), self.new_index(), rider, hello)
         opening = Opening(invitation, peer, address, self._clock.seconds(), {address: b""}, within)
         self._openings[invitation.local_index] = self._by_mac[invitation.mac] = peer.opening = opening
         opening.is_wanted = is_wanted
@@ -397,12 +434,9 @@ class Peers:
     def accepted(self, opening: Opening) -> None:
         """Take note that a handshake of ours got its RESP."""
         self.close(opening)
-        if opening.tries == 1 and not any(opening.doors.values()):
-            took = self._clock.seconds() - opening.started_at
-            opening.peer.round_trip.measured(took)
-            self.usual.measured(took)
-        else:
-            self.usual.ambiguous()
+        if not opening.knocks:  # else the way had to be opened first, which says nothing of its length
+            tries = opening.tries + any(opening.doors.values())  # who asked for a cookie was asked twice
+            self.answered(opening.peer, tries, self._clock.seconds() - opening.started_at)
 
     def _knock(self, opening: Opening) -> None:
         """Send an INIT, again if need be, until the tries are used up."""

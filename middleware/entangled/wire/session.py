@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import hashlib
 import hmac
+import struct
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -63,6 +64,8 @@ MAX_RESPONSES = 512
 RESPONSES_S = 30.0
 _NO_LIFE = bytes(_LIFE)
 _WINDOW_MASK = (1 << WINDOW) - 1
+_pack = struct.Struct("<BIQ").pack
+"""The header of a DATA datagram: its kind, the receiver's index, the counter."""
 
 
 def derived_key(team_key: bytes, purpose: bytes) -> bytes:
@@ -285,7 +288,6 @@ class Session:
         "_sent",
         "_highest",
         "_seen",
-        "_header",
     )
 
     def __init__(
@@ -311,13 +313,12 @@ class Session:
         self._sent = 0
         self._highest = -1
         self._seen = 0  # bit n: the counter n below the highest has been here
-        self._header = bytes([DATA]) + remote_index.to_bytes(INDEX_BYTES, "little")
 
     def seal(self, message: bytes) -> bytes:
         """The next DATA datagram, with ``message`` of at most ``MAX_PLAIN`` bytes inside."""
         counter = self._sent
         self._sent = counter + 1
-        header = self._header + counter.to_bytes(8, "little")
+        header = _pack(DATA, self.remote_index, counter)
         return header + sealed(self._sending, counter, message, header)
 
     @property
