@@ -18,6 +18,7 @@ from middleware.entangled.network.switchboard import Switchboard, SwitchboardNet
 from middleware.entangled.wire import method, peer
 from middleware.entangled.wire.endpoint import Endpoint
 from middleware.entangled.wire.message import MAX_MESSAGE
+from middleware.entangled.wire.peer import IN_TOUCH
 from middleware.entangled.wire.session import DATA, INIT, INIT_LEAST, MAX_PLAIN, RESP, Invitation
 
 TEAM = b"k" * 32
@@ -382,6 +383,27 @@ class WeatherTests(EndpointCase):
             before = len(self.kept(self.to_b, INIT))
             self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 2)), 2)
             self.assertEqual(len(self.kept(self.to_b, INIT)), before + 1)
+
+    def test_nobody_is_asked_on_a_session_that_may_be_gone(self) -> None:
+        """In a wide network a question after a long silence takes one round trip, though the other side let go."""
+        self.a.peers.is_wide = self.b.peers.is_wide = True
+        self.got(self.a.ask(self.to_b, "echo", 1))
+        self.clock.advance(IN_TOUCH - 3.5)
+        self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 2), 2 * DELAY), 2)
+        self.assertEqual(len(self.kept(self.to_b, INIT)), 1)
+        self.clock.advance(IN_TOUCH + 1)
+        self.b.let_go(IN_TOUCH)
+        self.assertFalse(self.a.is_met(self.to_b))
+        self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 3), 2 * DELAY), 3)
+        self.assertTrue(self.a.is_met(self.to_b))
+
+    def test_a_small_network_keeps_its_sessions(self) -> None:
+        """Where nobody lets go of sessions, a question after a long silence needs no handshake."""
+        self.got(self.a.ask(self.to_b, "echo", 1))
+        self.clock.advance(10 * IN_TOUCH)
+        self.assertTrue(self.a.is_met(self.to_b))
+        self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 2), 2 * DELAY), 2)
+        self.assertEqual(len(self.kept(self.to_b, INIT)), 1)
 
     def test_worn_session_is_renewed(self) -> None:
         """After its number of datagrams a session gets a successor, and after twice as many nothing is sent on it."""

@@ -15,9 +15,11 @@ from middleware.entangled.kademlia.overlay import MOST_HEDGE, K
 from middleware.entangled.kademlia.pace import FIRST
 from middleware.entangled.kademlia.sounding import NEAR_SILENCE, SESSION_S
 from middleware.entangled.network.network import Address
-from middleware.entangled.network.switchboard import SwitchboardNetwork
+from middleware.entangled.network.switchboard import CALM, SwitchboardNetwork, Weather
 from middleware.entangled.node import EntangledNode
+from middleware.entangled.wire.asker import SILENCE_S
 from middleware.entangled.wire.congestion import FIRST_GUESS
+from middleware.entangled.wire.peer import IN_TOUCH, OPENING_S
 from middleware.entangled.wire.session import INIT
 from tests.fleet import Fleet, FleetCase
 
@@ -30,9 +32,9 @@ class LargeTests(FleetCase):
         for module in (membership, overlay, roster):
             self.patch(module, "MAX_MEMBERS", MANY)
 
-    def large(self, n: int = 24) -> Fleet:
+    def large(self, n: int = 24, weather: Weather = CALM) -> Fleet:
         """A network that has found itself."""
-        fleet = self.fleet(n, seed=3)
+        fleet = self.fleet(n, seed=3, weather=weather)
         fleet.run(20.0)
         self.assertTrue(all(node.overlay.is_large for node in fleet.nodes))
         return fleet
@@ -70,6 +72,18 @@ class LargeTests(FleetCase):
             target = fleet.nodes[7].identity.node_id
             others = [other.contact for other in fleet.nodes if other is not node]
             self.assertEqual(self.found(fleet, node, target), closest(others, target, K))
+
+    def test_a_lookup_finds_who_let_go_of_the_session(self) -> None:
+        """Lookups are exact over long ways, too, while some let go of sessions that the others have yet."""
+        fleet = self.large(weather=Weather(0.08))
+        node, target = fleet.nodes[0], self.far(fleet.nodes[0]).node_id
+        others = [other.contact for other in fleet.nodes[1:]]
+        self.assertEqual(self.found(fleet, node, target), closest(others, target, K))
+        self.patch(node.endpoint, "let_go", lambda seconds: None)  # its own turn to look comes a little later
+        fleet.run(SESSION_S)
+        for other in fleet.nodes[1:]:
+            other.endpoint.let_go(SESSION_S)
+        self.assertEqual(self.found(fleet, node, target), closest(others, target, K))
 
     def test_neighbours_are_asked_often_and_others_rarely(self) -> None:
         """No neighbour is silent for much longer than twelve seconds; of the others one is asked when its time came."""
@@ -145,6 +159,10 @@ class LargeTests(FleetCase):
         self.assertTrue(node.endpoint.is_met(node.overlay.neighbours()[0]))
         self.done(fleet, node.call(far, "ping", b"", changes=True), 1.0)
         self.assertTrue(node.endpoint.is_met(far))
+
+    def test_sessions_are_kept_for_longer_than_they_are_used(self) -> None:
+        """What one side heard last may lie as far before what the other one did as a tell goes without an answer."""
+        self.assertLess(IN_TOUCH + SILENCE_S + OPENING_S, SESSION_S)
 
     def test_a_stranger_without_a_place_is_let_be(self) -> None:
         """Who asks, and would find no place among the contacts, is not asked in turn."""

@@ -30,8 +30,6 @@ UPKEEP = 15.0
 """Seconds between two looks at what changes slowly in a large network."""
 SESSION_S = 60.0
 """Seconds of silence after which a session is let go of in a large network: there are too many peers to keep all."""
-IN_TOUCH = 45.0
-"""Seconds of silence up to which the other side surely has its end of a session yet."""
 
 
 class Sounding:
@@ -141,7 +139,7 @@ class Sounding:
         overlay = self._overlay
         silence = overlay.silence(contact)
         try:
-            if silence < IN_TOUCH and not overlay.is_doubted(contact) and self._endpoint.is_met(contact):
+            if self._endpoint.is_met(contact) and not overlay.is_doubted(contact):
                 await overlay.ask(contact, "ping", b"", changes=True, is_light=True)
             else:
                 await self._greet_again(contact, is_near)

@@ -152,9 +152,9 @@ class Asker:
             grace=PATIENCE if timeout is None else 0.0,
             deferred=deferred,
         )
+        is_open = self._peers.usable(peer) is not None  # before the question itself makes the session a wanted one
         self._inquiries[number] = inquiry
         peer.began(number)
-        is_open = self._peers.usable(peer) is not None
         if is_open and (peer.in_flight < MAX_IN_FLIGHT or not inquiry.is_counted):
             self._try(inquiry)
             return deferred

@@ -294,7 +294,7 @@ class Endpoint:
     def is_met(self, contact: Contact) -> bool:
         """Whether there is a session with ``contact``, so that a question needs one round trip and no handshake."""
         peer = self._peers.known(contact.public)
-        return peer is not None and peer.session is not None
+        return peer is not None and self._peers.is_in_touch(peer)
 
     def round_trip(self, contact: Contact) -> float | None:
         """How long an answer of ``contact`` takes, in seconds, or None where nobody was timed yet."""

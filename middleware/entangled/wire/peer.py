@@ -37,6 +37,9 @@ HELP_S = 0.2
 KNOCK_S, KNOCKS = 0.1, 16
 """Seconds between knocks where others help, and for how many of them; then they become rarer."""
 LIVELY_S = 3.0
+IN_TOUCH = 50.0
+"""Seconds of silence up to which the other side of a session surely has its end yet, in a wide network: less than those
+after which it lets go of it, by more than can lie between what either of us heard last."""
 SESSION_LIFE_S = 3600.0
 SESSION_END_S = SESSION_LIFE_S + 600.0
 # Far below what ChaCha20-Poly1305 allows under one key (2**62 datagrams of this size).
@@ -248,18 +251,31 @@ class Peers:
         return wait if mean is None else min(wait, max(mean, within / self.loss.tries))
 
     def usable(self, peer: Peer) -> Session | None:
-        """The session to send on; an old or worn one calls for its successor, a very old one is dropped."""
+        """The session to send on; an old or worn one calls for its successor.
+
+        A very old one is dropped, and one that the other side may have let go of, unless something waits for it.
+        """
         session = peer.session
         if session is None:
             return None
         age = self._clock.seconds() - session.opened_at
-        if age > SESSION_END_S or session.sent > 2 * SESSION_DATAGRAMS:
+        is_lost = peer.is_idle and not self.is_in_touch(peer)
+        if is_lost or age > SESSION_END_S or session.sent > 2 * SESSION_DATAGRAMS:
             self._end(peer.sessions)
             peer.sessions = []
             return None
         if age > SESSION_LIFE_S or session.sent > SESSION_DATAGRAMS:
             self.open(peer, session.contact.address)
         return session
+
+    def is_in_touch(self, peer: Peer) -> bool:
+        """Whether there is a session of which the other side, if it lives, surely has its end yet.
+
+        In a wide network each lets go of the sessions with a peer that is silent for long, at a moment of its own and
+        without a word; what the other one sends on them from then on is lost.
+        """
+        since = self._clock.seconds() - IN_TOUCH if self.is_wide else float("-inf")
+        return any(session.heard_at >= since for session in peer.sessions)
 
     def established(self, session: Session) -> Peer:
         """Use a session for sending from now on; gives its peer."""
