@@ -28,7 +28,7 @@ PROBES = 2
 """Far contacts that are asked in one ``PROBE``."""
 UPKEEP = 15.0
 """Seconds between two looks at what changes slowly in a large network."""
-SESSION_S = 60.0
+SESSION_S = 120.0
 """Seconds of silence after which a session is let go of in a large network: there are too many peers to keep all."""
 
 

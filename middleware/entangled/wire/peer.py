@@ -37,7 +37,7 @@ HELP_S = 0.2
 KNOCK_S, KNOCKS = 0.1, 16
 """Seconds between knocks where others help, and for how many of them; then they become rarer."""
 LIVELY_S = 3.0
-IN_TOUCH = 50.0
+IN_TOUCH = 105.0
 """Seconds of silence up to which the other side of a session surely has its end yet, in a wide network: less than those
 after which it lets go of it, by more than can lie between what either of us heard last."""
 SESSION_LIFE_S = 3600.0
