@@ -247,7 +247,8 @@ class SwarmNode(Service):
         """About how many nodes the team has, this one included."""
         from middleware.dissemination.scale import team_size
 
-        return team_size(self.entangled.identity.node_id, self.entangled.overlay.contacts())
+        overlay = self.entangled.overlay
+        return team_size(overlay.own_id, overlay.contacts(), overlay.is_large)
 
     def reached(self, uuids: Sequence[str]) -> list[Contact]:
         """How to reach those of the devices that this node has met."""

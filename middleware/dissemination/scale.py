@@ -31,17 +31,19 @@ class Scale:
 
 
 WHOLE = 50
-"""Up to that many contacts are taken for everybody: a roster holds 64."""
+"""Up to that many contacts are taken for everybody, in a network that is not large: a roster holds 64."""
 NEAR = 8
 """Contacts by whose distance a large team is measured: a node knows its k nearest for certain."""
 
 
-def team_size(own_id: bytes, contacts: Iterable[Contact]) -> int:
+def team_size(own_id: bytes, contacts: Iterable[Contact], is_large: bool) -> int:
     """About how many nodes there are, this one included: as many as are known, or more where those known lie dense.
 
-    Ids are spread evenly, so of N nodes the n-th nearest is about n / N of the whole range away.
+    Ids are spread evenly, so of N nodes the n-th nearest is about n / N of the whole range away.  In a network that
+    ``is_large`` hardly anybody knows all, and a newcomer knows few.
     """
     apart = sorted(distance(own_id, contact.node_id) for contact in contacts)
-    if len(apart) <= WHOLE:
-        return len(apart) + 1
-    return max(len(apart) + 1, NEAR * (1 << (8 * ID_BYTES)) // max(1, apart[NEAR - 1]))
+    known = len(apart) + 1
+    if len(apart) < NEAR or (len(apart) <= WHOLE and not is_large):
+        return known
+    return max(known, NEAR * (1 << (8 * ID_BYTES)) // max(1, apart[NEAR - 1]))

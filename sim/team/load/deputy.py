@@ -53,7 +53,7 @@ class Rooms:
         node = self._node
 
         def size() -> int:
-            return team_size(node.identity.node_id, node.overlay.contacts())
+            return team_size(node.identity.node_id, node.overlay.contacts(), node.overlay.is_large)
 
         around = Surroundings(lambda: node.contact, node.overlay.contacts, size, strategy_for)
         return Dissemination(node.identity, self._tally, around, self._clock, self._rng)

@@ -14,7 +14,7 @@ from middleware.dissemination.errand import MAX_BIDS, Cry, Errand, Notice, Offer
 from middleware.dissemination.parties import LIFE_S, MAX_PARTIES, OWN, Parties
 from middleware.dissemination.party import Party
 from middleware.dissemination.route import hops, shared_bits
-from middleware.dissemination.scale import DIRECT, LEAST_TREE, MOST_DIRECT, TREE, Scale, team_size
+from middleware.dissemination.scale import DIRECT, LEAST_TREE, MOST_DIRECT, NEAR, TREE, Scale, team_size
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.distance import distance
 from middleware.entangled.network.network import Address
@@ -82,13 +82,16 @@ class ScaleTests(SynchronousTestCase):
     def test_team_size(self) -> None:
         """A small team is counted, a large one estimated by how dense the nearest nodes lie."""
         own = CONTACTS[0].node_id
-        self.assertEqual(team_size(own, []), 1)
-        self.assertEqual(team_size(own, CONTACTS[1:]), len(CONTACTS))
+        self.assertEqual(team_size(own, [], False), 1)
+        self.assertEqual(team_size(own, CONTACTS[1:], False), len(CONTACTS))
         rng = random.Random(1)
         many = [Contact(rng.randbytes(32), Address("10.0.0.1", 1)) for _ in range(4_000)]
         near = sorted(many, key=lambda c: distance(c.node_id, own))
         known = near[:40] + rng.sample(near[40:], 40)
-        self.assertTrue(1_500 < team_size(own, known) < 12_000)
+        self.assertTrue(1_500 < team_size(own, known, False) < 12_000)
+        newcomer = near[:NEAR] + rng.sample(near[NEAR:], NEAR)  # knows few yet, but that there are many
+        self.assertTrue(1_500 < team_size(own, newcomer, True) < 12_000)
+        self.assertEqual(team_size(own, newcomer[: NEAR - 1], True), NEAR)
 
 
 class AudienceTests(SynchronousTestCase):
