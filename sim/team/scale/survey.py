@@ -45,7 +45,7 @@ class SurveySettings:
     """Seconds of lookups."""
     rate: float = 30.0
     """Lookups a second."""
-    exact: int = 50
+    exact: int = 1000
     """Keys whose lookup has to be exact."""
     auctions: int = 3
     """Auctions in which everybody bids."""
