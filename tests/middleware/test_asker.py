@@ -8,8 +8,11 @@ from twisted.internet.defer import CancelledError, Deferred
 
 from middleware.entangled.errors import Crowded, NoAnswer
 from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.network.switchboard import Weather
 from middleware.entangled.wire import asker
 from middleware.entangled.wire.asker import MAX_IN_FLIGHT
+from middleware.entangled.wire.congestion import FIRST_GUESS
+from middleware.entangled.wire.session import INIT
 from tests.middleware.test_endpoint import DELAY, EndpointCase
 
 SLOW_S = 0.2
@@ -131,3 +134,40 @@ class TurnTests(EndpointCase):
         at = self.a._peers.known(self.to_b.public)
         assert at is not None
         return at.in_flight, len(at.queue), self.a._asker._queued
+
+
+class GivenUpTests(EndpointCase):
+    """What becomes of a handshake whose questions are over before it is."""
+
+    def inits(self) -> int:
+        """Handshakes that arrived at the other one, repeated ones as well."""
+        return sum(datagram[0] == INIT for datagram, _ in self.taps[self.to_b.address].kept)
+
+    def give_up(self, timeout: float) -> None:
+        """Ask, and wait in vain."""
+        self.failed(self.a.ask(self.to_b, "echo", 1, timeout=timeout), NoAnswer, timeout)
+
+    def test_nothing_more_is_sent_for_nobody(self) -> None:
+        """When nobody waits for the answer any more, the handshake is not tried again, and soon forgotten."""
+        self.board.kill(self.to_b.address)
+        sent = self.board.counters["sent"]
+        self.give_up(FIRST_GUESS / 2)
+        self.clock.advance(5.0)
+        self.assertEqual(self.board.counters["sent"] - sent, 1)
+        self.assertEqual(self.a.peers.peer(self.to_b).opening, None)
+
+    def test_a_late_answer_opens_the_session(self) -> None:
+        """Over a way that is too long for the question the session stands all the same, for the next one."""
+        self.board.weather = Weather(0.3)
+        self.give_up(0.2)
+        self.clock.advance(1.0)
+        self.assertTrue(self.a.is_met(self.to_b))
+
+    def test_who_asks_meanwhile_need_not_wait(self) -> None:
+        """A question that comes while the handshake rests sends it again at once."""
+        self.board.weather = Weather(DELAY, loss=1.0)
+        self.give_up(FIRST_GUESS / 2)
+        self.clock.advance(FIRST_GUESS)
+        self.board.weather = Weather(DELAY)
+        self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 2), 5 * DELAY), 2)
+        self.assertEqual(self.inits(), 1)

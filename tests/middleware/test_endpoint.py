@@ -423,7 +423,7 @@ class WeatherTests(EndpointCase):
         self.board.cut(self.to_a.address, self.to_b.address)
         for _ in range(30):
             self.a.tell(self.to_b, "echo", 1)
-        self.assertEqual(self.a._peers.known(self.to_b.public).sessions, [])  # type: ignore[union-attr]
+        self.assertEqual(self.a._peers.known(self.to_b.public).sessions, ())  # type: ignore[union-attr]
 
 
 class AttackTests(EndpointCase):

@@ -55,7 +55,7 @@ class LossTests(SynchronousTestCase):
         for _ in range(100):
             loss.arrived(2)
             loss.arrived(-1)
-        self.assertLess(loss.share, 0.02)
+        self.assertLess(loss.share, 0.06)
 
     def test_a_leap_counts_once(self) -> None:
         """A session that was cut off for long tells no more of the weather than a few datagrams do."""
@@ -63,7 +63,7 @@ class LossTests(SynchronousTestCase):
         one.arrived(2**40)
         other.arrived(MOST_AT_ONCE + 1)
         self.assertEqual(one.share, other.share)
-        self.assertLess(one.share, 0.15)
+        self.assertLess(one.share, 0.25)
 
 
 class RoughWeatherTests(EndpointCase):

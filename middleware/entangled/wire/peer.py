@@ -70,7 +70,7 @@ class Opening:
     ``address`` is where it was begun, ``doors`` has every address at which it knocks with the cookie that was asked for
     there, ``within`` in how many seconds it should succeed.  Up to ``held_until`` others help, and it goes on whatever
     the number of its tries.  With ``is_wanted`` somebody here waits for it; else it was begun to let the peer in, or to
-    find a better way.
+    find a better way.  While it ``is_resting`` it only waits for a late RESP, since whoever wanted it has given up.
     """
 
     invitation: Invitation
@@ -83,6 +83,7 @@ class Opening:
     knocks: int = 0
     held_until: float = 0.0
     is_wanted: bool = True
+    is_resting: bool = False
     timer: IDelayedCall | None = None
     helper: IDelayedCall | None = None
 
@@ -95,7 +96,7 @@ class Peer:
     """
 
     contact: Contact
-    sessions: list[Session] = field(default_factory=list)
+    sessions: tuple[Session, ...] = ()
     opening: Opening | None = None
     round_trip: RoundTrip = field(default_factory=RoundTrip)
     tells: tuple[bytes, ...] = ()
@@ -262,7 +263,7 @@ class Peers:
         is_lost = peer.is_idle and not self.is_in_touch(peer)
         if is_lost or age > SESSION_END_S or session.sent > 2 * SESSION_DATAGRAMS:
             self._end(peer.sessions)
-            peer.sessions = []
+            peer.sessions = ()
             return None
         if age > SESSION_LIFE_S or session.sent > SESSION_DATAGRAMS:
             self.open(peer, session.contact.address)
@@ -283,11 +284,12 @@ class Peers:
         is_carried = is_relayed(session.contact.address)
         newest = peer.session
         if is_carried and newest is not None and self._is_lively_and_direct(newest):
-            peer.sessions.insert(-1, session)  # one that others carry gives way to one that is as good and needs nobody
+            peer.sessions = (*peer.sessions[:-1], session, newest)  # one that others carry gives way to one as good
         else:
-            peer.sessions.append(session)
+            peer.sessions = (*peer.sessions, session)
         if len(peer.sessions) > MAX_SESSIONS:
-            self._end([peer.sessions.pop(0)])
+            self._end(peer.sessions[:1])
+            peer.sessions = peer.sessions[1:]
         if peer.opening is not None and peer.opening.knocks and not is_carried:
             self.close(peer.opening)  # the peer, which was told to knock too, came first
         self.on_established(session)
@@ -342,7 +344,7 @@ class Peers:
         if peer.opening is not None:
             self.close(peer.opening)
         self._end(peer.sessions)
-        peer.sessions = []
+        peer.sessions = ()
         peer.tells = ()
 
     def let_go(self, before: float) -> list[bytes]:
@@ -361,8 +363,8 @@ class Peers:
         """Forget one session."""
         self._end([session])
         peer = self._peers.get(session.contact.public)
-        if peer is not None and session in peer.sessions:
-            peer.sessions.remove(session)
+        if peer is not None:
+            peer.sessions = tuple(other for other in peer.sessions if other is not session)
 
     @property
     def hello(self) -> Hello:
@@ -402,6 +404,9 @@ class Peers:
                 peer.opening.is_wanted = True
                 peer.opening.doors.setdefault(address, b"")
                 self._prepare_help(peer.opening, address)
+            if peer.opening.is_resting:
+                cancel(peer.opening.timer)
+                self._knock(peer.opening, is_asked=True)
             return True
         if len(self._openings) >= MAX_OPENINGS:
             self._counters["crowded"] += 1
@@ -454,15 +459,24 @@ class Peers:
             tries = opening.tries + any(opening.doors.values())  # who asked for a cookie was asked twice
             self.answered(opening.peer, tries, self._clock.seconds() - opening.started_at)
 
-    def _knock(self, opening: Opening) -> None:
-        """Send an INIT, again if need be, until the tries are used up."""
-        if opening.tries >= self.tries and self._clock.seconds() >= opening.held_until:
+    def _knock(self, opening: Opening, is_asked: bool = False) -> None:
+        """Send an INIT, again if need be, until the tries are used up, or as long as somebody waits.
+
+        ``is_asked``: somebody does, from now on.
+        """
+        left = opening.started_at + OPENING_S - self._clock.seconds()
+        opening.is_resting = not is_asked and opening.tries > 0 and self._is_given_up(opening)
+        is_over = left <= 0 if opening.is_resting else opening.tries >= self.tries
+        if is_over and self._clock.seconds() >= opening.held_until:
             self.close(opening)
             if len(self.ring) > 1:  # it may not have heard of the newest secret, or of nothing older any more
                 ring = list(self.ring)
                 tried = ring.index(opening.invitation.own) if opening.invitation.own in ring else -1
                 opening.peer.own = ring[(tried + 1) % len(ring)]
             self.on_unheard(opening)
+            return
+        if opening.is_resting:
+            opening.timer = self._clock.callLater(left, self._knock, opening)
             return
         opening.tries += 1
         for address, cookie in opening.doors.items():
@@ -473,6 +487,12 @@ class Peers:
         else:
             wait = self._wait(opening)
         opening.timer = self._clock.callLater(wait, self._knock, opening)
+
+    def _is_given_up(self, opening: Opening) -> bool:
+        """Whether it was begun for questions alone, and nobody waits for their answers any more."""
+        peer = opening.peer
+        is_for_others = not opening.is_wanted or opening.knocks or opening.held_until or peer.sessions
+        return not (is_for_others or peer.inquiries or peer.tells)
 
     def _wait(self, opening: Opening) -> float:
         round_trip = opening.peer.round_trip
@@ -502,7 +522,7 @@ class Peers:
         self._by_mac.pop(opening.invitation.mac, None)
         opening.peer.opening = None
 
-    def _end(self, sessions: list[Session]) -> None:
+    def _end(self, sessions: Iterable[Session]) -> None:
         for session in sessions:
             self.sessions.pop(session.local_index, None)
 
