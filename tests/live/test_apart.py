@@ -3,10 +3,22 @@
 from __future__ import annotations
 
 import os
+import signal
+from select import select
+from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
 from sim.team.scale.apart import apart
+
+
+class Ended(Exception):
+    """A signal has come."""
+
+
+def ended(*signal: Any) -> None:
+    """Handle a signal."""
+    raise Ended
 
 
 class ApartTests(SynchronousTestCase):
@@ -27,3 +39,17 @@ class ApartTests(SynchronousTestCase):
         """A process that ends before it has answered is told of, with its exit code."""
         with self.assertRaisesRegex(RuntimeError, "ended with 7"):
             apart(lambda: os._exit(7))
+
+    def test_ended_with_who_waits_for_it(self) -> None:
+        """Who is ended while it waits ends the call as well, which can say so before it goes."""
+        ready, told = os.pipe()
+        self.addCleanup(os.close, ready)
+        self.addCleanup(os.close, told)
+
+        def call() -> None:
+            signal.signal(signal.SIGTERM, ended)
+            os.write(told, b".")
+            signal.pause()
+
+        with self.assertRaises(Ended):
+            apart(call, Ended, is_stopped=lambda: bool(select([ready], [], [], 0.0)[0]))

@@ -9,17 +9,24 @@ from typing import TypeVar
 
 T = TypeVar("T")
 
+LOOK_S = 0.5
+"""Seconds between two looks whether it is to end."""
 
-def apart(call: Callable[[], T], *quiet: type[Exception]) -> T:
+
+def apart(call: Callable[[], T], *quiet: type[Exception], is_stopped: Callable[[], bool] = lambda: False) -> T:
     """What ``call`` returns, or raises of ``quiet``; it sees this process as it is now, and changes nothing in it.
 
-    Raises ``RuntimeError`` where the process ends without a word; what went wrong stands on its standard error.
+    When this process ``is_stopped``, the other one is told by SIGTERM, and does what this one would do then.  Raises
+    ``RuntimeError`` where the process ends without a word; what went wrong stands on its standard error.
     """
     context = multiprocessing.get_context("fork")
     here, there = context.Pipe(duplex=False)
     process = context.Process(target=_answer, args=(there, call, quiet))
     process.start()
     there.close()
+    while not here.poll(LOOK_S):
+        if is_stopped():
+            process.terminate()
     try:
         is_well, result = here.recv()
     except EOFError:

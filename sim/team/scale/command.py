@@ -32,7 +32,7 @@ def surveyed_apart(nodes: int, settings: SurveySettings, watcher: Watcher) -> Si
 
     What one team leaves behind would be free memory for the next one, which then seemed to need less.
     """
-    return apart(partial(surveyed, nodes, settings, watcher), Ended)
+    return apart(partial(surveyed, nodes, settings, watcher), Ended, is_stopped=watcher.is_stopped)
 
 
 def scale(arguments: Sequence[str], world: World, measure: Measure = surveyed_apart) -> int:
