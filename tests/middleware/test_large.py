@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import random
 from collections import Counter
 from typing import Any
 
 from twisted.internet.defer import Deferred
 
+from middleware.entangled.identity import ID_BYTES
 from middleware.entangled.kademlia import membership, overlay, roster
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.distance import closest
@@ -84,6 +86,21 @@ class LargeTests(FleetCase):
         for other in fleet.nodes[1:]:
             other.endpoint.let_go(SESSION_S)
         self.assertEqual(self.found(fleet, node, target), closest(others, target, K))
+
+    def test_many_lookups_that_meet_the_same_strangers(self) -> None:
+        """Where one handshake has to do for many questions at the same moment, all lookups are exact all the same."""
+        fleet = self.large()
+        node, dice = fleet.nodes[0], random.Random(4)
+        others = [other.contact for other in fleet.nodes[1:]]
+        for other in others[::3]:  # within the time of a question for one round trip, and not for two
+            fleet.board.set_weather(node.contact.address, other.address, Weather(0.13))
+        for each in fleet.nodes:
+            each.endpoint.let_go(0.0)
+        targets = [dice.randbytes(ID_BYTES) for _ in range(12)]
+        looked = [Deferred.fromCoroutine(node.overlay.lookup(target)) for target in targets]
+        fleet.run(5.0)
+        for target, one in zip(targets, looked, strict=True):
+            self.assertEqual(self.successResultOf(one), closest(others, target, K))
 
     def test_neighbours_are_asked_often_and_others_rarely(self) -> None:
         """No neighbour is silent for much longer than twelve seconds; of the others one is asked when its time came."""

@@ -202,8 +202,7 @@ class Overlay:
 
         async def visit(contact: Contact) -> None:
             asked.append(hops.setdefault(contact.node_id, 1))
-            answer = await self.ask(contact, "find_node", target, timeout=self.patience_of_lookups)
-            named = contacts_of(answer)
+            named = contacts_of(await self._asked_for(contact, target))
             for other in named:
                 self.on_named(other, contact)
                 hops.setdefault(other.node_id, hops[contact.node_id] + 1)
@@ -271,6 +270,20 @@ class Overlay:
         if is_met:  # else it was a handshake, too
             self._round_trip.measured(self._clock.seconds() - began)
         return answer
+
+    async def _asked_for(self, contact: Contact, target: bytes) -> Any:
+        """Whom ``contact`` knows near ``target``.
+
+        One that was heard while its answer was waited for is asked once more: where several lookups meet a stranger at
+        the same moment, only one question rides in the handshake, and the time of the others may be over after it.
+        """
+        began = self._clock.seconds()
+        try:
+            return await self.ask(contact, "find_node", target, timeout=self.patience_of_lookups)
+        except NoAnswer:
+            if self.silence(contact) >= self._clock.seconds() - began:
+                raise
+            return await self.ask(contact, "find_node", target, timeout=self.patience_of_lookups)
 
     def hedge(self) -> float:
         """Seconds after which others are asked beside one that does not answer: hardly any of this team takes longer.
