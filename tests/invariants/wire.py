@@ -165,7 +165,9 @@ class Wire:
         known = self._heard.get(place)
         if not known:
             return None
-        at, sender, datagram = rng.choice(known[rng.choice(sorted(known))])
+        recorded = known[rng.choice(sorted(known))]
+        _, sender, datagram = rng.choice(recorded)
+        at = min(when for when, _, other in recorded if other == datagram)  # it may have been tried again since
         if kind == "replayed" and datagram[0] == INIT and at < max(now - RESPONSES_S, self._born_at[own]):
             # It opens a session that nobody can use, for whoever plays the recording knows no key of it.
             return None
