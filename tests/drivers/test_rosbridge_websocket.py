@@ -7,17 +7,7 @@ from twisted.trial.unittest import SynchronousTestCase
 from drivers.rosbridge.websocket import MAX_MESSAGE, WebSocket
 from standards.head import MAX_HEAD
 from standards.websocket import BINARY, CLOSE, PING, TEXT, framed
-
-MASK = bytes.fromhex("37fa213d")
-ANSWER = (
-    b"HTTP/1.1 101 Switching Protocols\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
-    b"Sec-WebSocket-Accept: s3pPLMBiTxaQ9kYGzzhZRbK+xOo=\r\n\r\n"
-)
-
-
-def nonce(size: int) -> bytes:
-    """The nonces of the RFC's examples."""
-    return b"the sample nonce" if size == 16 else MASK
+from tests.standards.rfc6455 import ANSWER, MASK, nonce
 
 
 def client() -> WebSocket:

@@ -28,21 +28,12 @@ from standards.websocket import (
     masked,
     switch,
 )
+from tests.standards.rfc6455 import ANSWER, MASK, nonce
 
 settings.register_profile("websocket", derandomize=True, database=None, deadline=None, max_examples=80)
 settings.load_profile("websocket")
 
 LONGEST = 1 << 17
-MASK = bytes.fromhex("37fa213d")
-ANSWER = (
-    b"HTTP/1.1 101 Switching Protocols\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
-    b"Sec-WebSocket-Accept: s3pPLMBiTxaQ9kYGzzhZRbK+xOo=\r\n\r\n"
-)
-
-
-def nonce(size: int) -> bytes:
-    """The nonces of the RFC's examples."""
-    return b"the sample nonce" if size == 16 else MASK
 
 
 class Plain(End):

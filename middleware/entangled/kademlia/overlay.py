@@ -41,9 +41,9 @@ else those within which nearly every answer comes."""
 LEAST_PATIENCE, TRIES = 0.4, 2.6
 """Seconds, and usual waits, that a question of a lookup may take in a large network: two tries where little is lost."""
 MAX_FOUND = 512
+"""Keys whose closest nodes, as the last lookup found them, are remembered."""
 MAX_HEARD = 4096
 """Contacts of which is kept when they were heard, or missed; who was heard longest ago is forgotten first."""
-"""Keys whose closest nodes, as the last lookup found them, are remembered."""
 
 PLACING, PLACING_STEP = 15, 0.1
 MEETING, MEETING_STEP = 75, 0.02
