@@ -41,6 +41,10 @@ class Audience:
     def __len__(self) -> int:
         return len(self._listeners)
 
+    def has(self, contact: Contact) -> bool:
+        """Whether ``contact`` is one of them."""
+        return contact.node_id in self._listeners
+
     @property
     def is_shared(self) -> bool:
         """Whether most listeners are shared, as where every bidder tells the whole council."""

@@ -107,7 +107,7 @@ class Dissemination:
     def answer_offer(
         self, peer: Contact, auction: list[object], bids: list[object], age_ms: int, is_shared: bool
     ) -> list[object] | None:
-        """Take a peer's bids; the announcement, where there is one."""
+        """Take a peer's bids; the announcement, where there is one.  Raises ``Refused`` where they cannot come here."""
         about = _auction(auction)
         if not 0 <= age_ms <= 1000 * MAX_WAITING:
             raise Refused("an offer is at most ten minutes old, in milliseconds")
@@ -115,6 +115,8 @@ class Dissemination:
         # Who says that it tells the whole council itself can say so of its own bid only.
         is_own = all(bid.public == peer.public for bid in given)
         party = self._party(about, peer.node_id)
+        if not party.has_room(peer):
+            raise Refused("as many as may send their bids here do so; any other contact nearer to the key will do")
         now = self._clock.seconds()
         announcement = party.offered(given, peer, age_ms / 1000, is_shared and is_own, now)
         self._pump(party)

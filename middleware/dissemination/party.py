@@ -22,7 +22,7 @@ from middleware.dissemination.rule import Rule
 from middleware.dissemination.scale import DIRECT
 from middleware.dissemination.summary import Summary
 from middleware.dissemination.teller import Teller
-from middleware.dissemination.tree import Branch
+from middleware.dissemination.tree import MAX_CHILDREN, Branch
 from middleware.entangled.kademlia.contact import Contact
 
 RELAY_SILENCE = 0.4
@@ -111,6 +111,10 @@ class Party:
         self._check.bid(bid, self.announcement, is_direct, now)
         if self._flooded_at != math.inf or self._flood.summary.standing:
             self._cry(now)
+
+    def has_room(self, sender: Contact) -> bool:
+        """Whether the bids of ``sender`` may come this way: the council hears everybody, others so many."""
+        return self._teller is not None or len(self.audience) < MAX_CHILDREN or self.audience.has(sender)
 
     def offered(
         self, bids: Iterable[Bid], sender: Contact, age: float, is_shared: bool, now: float

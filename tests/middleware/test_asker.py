@@ -12,6 +12,7 @@ from middleware.entangled.network.switchboard import Weather
 from middleware.entangled.wire import asker
 from middleware.entangled.wire.asker import MAX_IN_FLIGHT
 from middleware.entangled.wire.congestion import FIRST_GUESS
+from middleware.entangled.wire.peer import DOUBTS
 from middleware.entangled.wire.session import INIT
 from tests.middleware.test_endpoint import DELAY, EndpointCase
 
@@ -171,3 +172,16 @@ class GivenUpTests(EndpointCase):
         self.board.weather = Weather(DELAY)
         self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 2), 5 * DELAY), 2)
         self.assertEqual(self.inits(), 1)
+
+    def test_two_handshakes_in_doubt(self) -> None:
+        """Beside a session that stands, a silent peer gets two INITs, however many questions find it silent."""
+        self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 1), 5 * DELAY), 1)
+        self.board.weather = Weather(DELAY, loss=1.0)
+        sent: list[int] = []
+        self.patch(self.a._network, "send", lambda datagram, to: sent.append(datagram[0]))
+        asked = [self.a.ask(self.to_b, "echo", number) for number in range(3)]
+        for _ in range(30):
+            self.clock.advance(0.1)
+        self.assertEqual(sent.count(INIT), DOUBTS)
+        for one in asked:
+            self.failureResultOf(one, NoAnswer)

@@ -220,7 +220,7 @@ class Membership:
         """Ping everybody whom ``contact`` knows and this node does not."""
         after, strangers = b"", []
         for _ in range(1 + MAX_MEMBERS // PAGE):
-            answer = await self._overlay.ask(contact, "members", after)
+            answer = await self._overlay.ask(contact, "members", after, is_light=self._overlay.is_large)
             if answer is None or (type(answer) is int and answer > 0):
                 return self._heard_large(LARGE_FOR if answer is None else min(float(answer), LARGE_FOR))
             if self._overlay.is_large or type(answer) is int:

@@ -385,8 +385,8 @@ class Overlay:
         return list({c.node_id: c for c in [*self.table.contacts(), *self.roster.live()]}.values())
 
     async def check(self, contact: Contact) -> None:
-        """Ask ``contact`` whether it is there."""
-        await self.ask(contact, "ping", self.roster.digest(), changes=True)
+        """Ask ``contact`` whether it is there; in a large network none of them is worth a handshake."""
+        await self.ask(contact, "ping", self.roster.digest(), changes=True, is_light=self.is_large)
 
     def silences(self) -> list[tuple[bytes, float]]:
         """The ids of contacts and perhaps of others, and for how many seconds each was silent, the longest first."""

@@ -62,11 +62,11 @@ class Sounding:
         """Look up the own id again until that brings no nearer ones: where many come at once nobody knows many yet."""
         overlay, pause = self._overlay, AROUND[0]
         while not self._chores.is_stopped and overlay.is_large:
-            before = overlay.neighbours()
             await self._chores.sleep(pause * (0.75 + self._rng.random() / 2))
             pause = min(2 * pause, AROUND[1])
+            before = set(overlay.neighbours())
             await overlay.lookup(overlay.own_id)
-            if len(before) == K and overlay.neighbours() == before:
+            if len(before) == K and before.issuperset(overlay.neighbours()):
                 return
 
     def step(self, now: float) -> bool:

@@ -154,7 +154,9 @@ class Handover:
         try:
             began = self._clock.seconds()
             bit = self._rng.randrange(BITS)
-            answer = await self._overlay.ask(contact, "digests", bit, self._standing_now())
+            answer = await self._overlay.ask(
+                contact, "digests", bit, self._standing_now(), is_light=self._overlay.is_large
+            )
             digests, extra, lives, standing = (
                 answer if isinstance(answer, list) and len(answer) == 4 else ([], 0, [], 0)
             )

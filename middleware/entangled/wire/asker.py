@@ -261,7 +261,7 @@ class Asker:
         else:
             self._send(session, message)
         within = inquiry.deadline - inquiry.asked_at
-        wait = self._peers.spacing(inquiry.peer.round_trip, min(inquiry.tries, MAX_TRIES + 1), within)
+        wait = self._peers.spacing(inquiry.peer.round_trip, inquiry.tries, within)
         if inquiry.is_patient and inquiry.tries > 1:
             # A method that takes its time: the later tries are there for an answer that got lost.
             wait = max(wait, (inquiry.deadline - now) / max(1, MAX_TRIES + 1 - inquiry.tries))

@@ -24,6 +24,8 @@ from middleware.entangled.wire.session import INDEX_BYTES, Credentials, Hello, I
 
 STRANGER_WAIT = 0.3
 MAX_TRIES = 4
+DOUBTS = 2
+"""How often, at least, an INIT goes to a peer that may have forgotten our session."""
 MAX_PEERS = 4096
 MAX_OPENINGS = 1024
 MAX_SESSIONS = 3
@@ -70,7 +72,7 @@ class Opening:
     ``address`` is where it was begun, ``doors`` has every address at which it knocks with the cookie that was asked for
     there, ``within`` in how many seconds it should succeed.  Up to ``held_until`` others help, and it goes on whatever
     the number of its tries.  With ``is_wanted`` somebody here waits for it; else it was begun to let the peer in, or to
-    find a better way.  While it ``is_resting`` it only waits for a late RESP, since whoever wanted it has given up.
+    find a better way.  While it ``is_resting`` it only waits for a late RESP.
     """
 
     invitation: Invitation
@@ -244,10 +246,10 @@ class Peers:
     def spacing(self, round_trip: RoundTrip, tries: int, within: float) -> float:
         """Seconds between a try, the ``tries``-th, and the next one of what should succeed ``within`` some seconds.
 
-        Each waits longer than the one before.  Where much gets lost, they are as close to each other as they must be to
-        have as many as it takes; but none comes before an answer usually would.
+        Each waits longer than the one before, up to the usual number.  Where much gets lost, they are as close to each
+        other as they must be to have as many as it takes; but none comes before an answer usually would.
         """
-        wait = round_trip.wait * BACK_OFF ** (tries - 1)
+        wait = round_trip.wait * BACK_OFF ** (min(tries, MAX_TRIES) - 1)
         mean = round_trip.mean if round_trip.is_measured else self.usual.mean
         return wait if mean is None else min(wait, max(mean, within / self.loss.tries))
 
@@ -404,7 +406,7 @@ class Peers:
                 peer.opening.is_wanted = True
                 peer.opening.doors.setdefault(address, b"")
                 self._prepare_help(peer.opening, address)
-            if peer.opening.is_resting:
+            if peer.opening.is_resting and not peer.sessions:
                 cancel(peer.opening.timer)
                 self._knock(peer.opening, is_asked=True)
             return True
@@ -465,7 +467,7 @@ class Peers:
         ``is_asked``: somebody does, from now on.
         """
         left = opening.started_at + OPENING_S - self._clock.seconds()
-        opening.is_resting = not is_asked and opening.tries > 0 and self._is_given_up(opening)
+        opening.is_resting = not is_asked and opening.tries > 0 and self._is_enough(opening)
         is_over = left <= 0 if opening.is_resting else opening.tries >= self.tries
         if is_over and self._clock.seconds() >= opening.held_until:
             self.close(opening)
@@ -488,15 +490,23 @@ class Peers:
             wait = self._wait(opening)
         opening.timer = self._clock.callLater(wait, self._knock, opening)
 
-    def _is_given_up(self, opening: Opening) -> bool:
-        """Whether it was begun for questions alone, and nobody waits for their answers any more."""
+    def _is_enough(self, opening: Opening) -> bool:
+        """Whether its INIT, the dearest of all datagrams, was sent as often as is worth while.
+
+        If it was begun for questions, until nobody waits for their answers any more.  Beside a session that stands it
+        only asks whether the peer forgot that one, or succeeds it: what is asked goes out on the session as well, and
+        the next question would ask anew.
+        """
         peer = opening.peer
-        is_for_others = not opening.is_wanted or opening.knocks or opening.held_until or peer.sessions
-        return not (is_for_others or peer.inquiries or peer.tells)
+        if not opening.is_wanted or opening.knocks or opening.held_until:
+            return False
+        if peer.sessions:
+            return opening.tries >= max(DOUBTS, self.loss.tries)
+        return not (peer.inquiries or peer.tells)
 
     def _wait(self, opening: Opening) -> float:
         round_trip = opening.peer.round_trip
-        wait = self.spacing(round_trip, min(opening.tries, MAX_TRIES), opening.within)
+        wait = self.spacing(round_trip, opening.tries, opening.within)
         if opening.tries == self.tries and not round_trip.is_measured:
             # Nothing is known of this peer: it may be far away rather than gone.
             wait = max(wait, opening.started_at + OPENING_S - self._clock.seconds())

@@ -9,7 +9,9 @@ from collections.abc import Callable
 from typing import Any
 
 from twisted.internet.defer import Deferred
+from twisted.python.failure import Failure
 
+from middleware.entangled.errors import Refused
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.wire.endpoint import Endpoint
 
@@ -37,7 +39,7 @@ class Tally:
     ) -> Deferred[Any]:
         """Ask a peer; its answer is one more datagram."""
         asked = self._endpoint.ask(contact, method, *arguments, timeout=timeout, changes=changes)
-        return asked.addCallback(self._answered)
+        return asked.addCallbacks(self._answered, self._refused)
 
     def tell(self, contact: Contact, method: str, *arguments: object) -> None:
         """Tell a peer."""
@@ -51,6 +53,10 @@ class Tally:
     def _answered(self, answer: Any) -> Any:
         self.received += 1
         return answer
+
+    def _refused(self, failure: Failure) -> Failure:
+        self.received += failure.check(Refused) is not None
+        return failure
 
     def _counted(self, send: Callable[..., None]) -> Callable[..., None]:
         def counted(session: Any, message: bytes) -> None:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 from middleware.consensus.strategy import Report
+from middleware.dissemination import party
 from middleware.dissemination.announcement import Announcement, Entry
 from middleware.dissemination.auction import Auction
 from middleware.dissemination.bid import Bid
@@ -17,6 +19,8 @@ from middleware.entangled.errors import Refused
 from middleware.entangled.kademlia.distance import closest
 from middleware.entangled.network.switchboard import Weather
 from middleware.entangled.wire.door import ROLE
+from middleware.entangled.wire.message import Failure
+from middleware.entangled.wire.method import ErrorCodes
 from middleware.node import SwarmNode
 from middleware.tasks import MEMBER, Task, group_key
 from tests.fleet import FleetCase, SwarmFleet
@@ -84,16 +88,45 @@ class DisseminationTests(AuctionCase):
         winners = {self.views[place][-1][0].agent for place in range(5)}
         self.assertEqual(winners, {fleet.nodes[1].uuid})
 
-    def test_tree_of_real_nodes(self) -> None:
-        """Bids that go along the tree come to the same end."""
+    def tree(self) -> SwarmFleet:
+        """A fleet of twelve whose bids go along the tree."""
         fleet = self.prepared(12)
         for node in fleet.nodes:
             node.dissemination._scale.way = TREE
             node.dissemination._scale.counted = lambda bidders: TREE  # type: ignore[method-assign]
+        return fleet
+
+    def assert_agreed(self, fleet: SwarmFleet) -> None:
+        """Let all twelve bid; they agree on the last one, which is the nearest."""
         self.enter(fleet, *(float(12 - place) for place in range(12)))
         fleet.run(3.0)
         winners = {self.views[place][-1][0].agent for place in range(12)}
         self.assertEqual(winners, {fleet.nodes[11].uuid})
+
+    def test_tree_of_real_nodes(self) -> None:
+        """Bids that go along the tree come to the same end."""
+        self.assert_agreed(self.tree())
+
+    def test_more_than_one_carries(self) -> None:
+        """Of many that know one contact only, those for whom it has no room go on to the council, and all agree."""
+        fleet = self.tree()
+        council = {member.node_id for member in self.task.council}
+        outside = [node for node in fleet.nodes if node.entangled.identity.node_id not in council]
+        [known] = closest([node.entangled.contact for node in outside], group_key("job"), 1)
+        refused: list[str] = []
+        answered = ErrorCodes.error
+
+        def noted(codes: ErrorCodes, failure: Failure) -> Exception:
+            refused.append(failure.text)
+            return answered(codes, failure)
+
+        self.patch(party, "MAX_CHILDREN", 2)
+        self.patch(ErrorCodes, "error", noted)
+        for node in outside:
+            around = replace(node.dissemination._around, contacts=lambda: [known])
+            node.dissemination._around = around
+        self.assert_agreed(fleet)
+        self.assertEqual(sum("send their bids here" in text for text in refused), len(outside) - 1 - 2)
 
     def test_closes_early(self) -> None:
         """Where the council knows how many bid, nobody waits longer than it takes."""

@@ -15,6 +15,7 @@ from middleware.dissemination.parties import LIFE_S, MAX_PARTIES, OWN, Parties
 from middleware.dissemination.party import Party
 from middleware.dissemination.route import hops, shared_bits
 from middleware.dissemination.scale import DIRECT, LEAST_TREE, MOST_DIRECT, NEAR, TREE, Scale, team_size
+from middleware.dissemination.tree import MAX_CHILDREN
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.distance import distance
 from middleware.entangled.network.network import Address
@@ -287,6 +288,22 @@ class BranchTests(SynchronousTestCase):
                 straight += offer.is_straight
                 self.party.answered(offer, step * 0.1)
         self.assertEqual(straight, MAX_RELAYED)
+
+    def test_so_many_children(self) -> None:
+        """A branch that carries the bids of as many as it may has no room for another one, but for those it has."""
+        children = [Contact(number.to_bytes(32), Address("10.0.0.1", 1)) for number in range(MAX_CHILDREN)]
+        for child in children:
+            self.assertTrue(self.party.has_room(child))
+            self.party.offered([], child, 0.0, False, 0.0)
+        self.assertFalse(self.party.has_room(CONTACTS[6]))
+        self.assertTrue(self.party.has_room(children[0]))
+
+    def test_the_council_hears_everybody(self) -> None:
+        """A member of the council has room for whoever comes: there is nobody else to go to."""
+        member = party(0)
+        for number in range(MAX_CHILDREN + 1):
+            member.offered([], Contact(number.to_bytes(32), Address("10.0.0.1", 1)), 0.0, False, 0.0)
+        self.assertTrue(member.has_room(CONTACTS[6]))
 
 
 class TellerTests(SynchronousTestCase):
