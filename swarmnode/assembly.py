@@ -75,53 +75,80 @@ def assembled(settings: Settings, seams: Seams) -> Assembly:
 
     Raises ``SwarmError`` or ``DriverError`` where they cannot be met.
     """
-    node_settings, driver = settings.node, None
     if seams.membership is None:
         checked_team(settings)
-    if settings.agent.module and not settings.driver.kind:
-        problem = f"is {settings.agent.module!r}, which has no robot to act with"
-        raise BadSetting(settings.origin, "[agent] module", problem, "name its [driver] kind, or leave the agent out")
-    if settings.driver.parts and not settings.driver.kind:
-        raise BadSetting(settings.origin, "[driver] parts", "have no robot to ride on", "name its [driver] kind")
+    _checked_body(settings)
     frailty = None
     if settings.faults.allow:
         from swarmnode.frailty import Frailty  # any other node is spared the memory
 
         frailty = Frailty(seams)
         seams = frailty.seams
-    capabilities = dict(node_settings.capabilities)
-    kind = node_settings.kind
-    if settings.driver.kind:
-        wanted = settings.driver
-        body = describe(wanted.kind, wanted.options, node_settings.name, wanted.parts)
+    device, driver = _device(settings), _driver(settings, seams)
+    if driver is not None and frailty is not None:
+        driver = frailty.drained(driver)
+    node = _node(device, settings, seams)
+    _answer(node, settings, driver)
+    if frailty is not None:
+        frailty.answer(node)
+    if settings.deployment.allow:
+        _deployable(node, settings, seams)
+    return Assembly(node, _agent(node, settings, driver, seams), driver)
+
+
+def _checked_body(settings: Settings) -> None:
+    """Raise ``BadSetting`` where an agent or a part has no robot."""
+    if settings.agent.module and not settings.driver.kind:
+        problem = f"is {settings.agent.module!r}, which has no robot to act with"
+        raise BadSetting(settings.origin, "[agent] module", problem, "name its [driver] kind, or leave the agent out")
+    if settings.driver.parts and not settings.driver.kind:
+        raise BadSetting(settings.origin, "[driver] parts", "have no robot to ride on", "name its [driver] kind")
+
+
+def _device(settings: Settings) -> Device:
+    """What the device says of itself: its robot's kind and capabilities as well, where its owner says no other."""
+    node, wanted = settings.node, settings.driver
+    kind, capabilities = node.kind, dict(node.capabilities)
+    if wanted.kind:
+        body = describe(wanted.kind, wanted.options, node.name, wanted.parts)
         capabilities = {**body.capabilities, **capabilities}
         kind = kind if kind != "generic" else body.kind
-        driver = driver_for(wanted.kind, wanted.options, node_settings.name, seams.clock, seams.connector, wanted.parts)
-        driver = driver if frailty is None else frailty.drained(driver)
-    device = Device(
+    return Device(
         uuid="",
-        name=node_settings.name,
+        name=node.name,
         kind=kind,
-        description=node_settings.description,
+        description=node.description,
         capabilities=capabilities,
-        roles=tuple(node_settings.roles),
-        position=node_settings.position,
-        laptop=node_settings.laptop,
+        roles=tuple(node.roles),
+        position=node.position,
+        laptop=node.laptop,
         agent=settings.agent.name,
     )
+
+
+def _driver(settings: Settings, seams: Seams) -> Driver | None:
+    """The driver of its robot, not yet connected; None for a device that has none."""
+    wanted = settings.driver
+    if not wanted.kind:
+        return None
+    return driver_for(wanted.kind, wanted.options, settings.node.name, seams.clock, seams.connector, wanted.parts)
+
+
+def _node(device: Device, settings: Settings, seams: Seams) -> SwarmNode:
+    """The node of ``device``, a member of its team."""
     team = _closed_team(seams)
-    known = [] if team is None else [address for address in team.membership.known]
+    known = [] if team is None else team.membership.known
     node = SwarmNode(
         device,
         identity_in(seams.store, seams.rng) if team is None else team.identity,
-        node_settings.team_secret if team is None else team.secret,
-        list(dict.fromkeys([*node_settings.known_nodes, *known])),
+        settings.node.team_secret if team is None else team.secret,
+        list(dict.fromkeys([*settings.node.known_nodes, *known])),
         seams.network(),
         seams.store,
         seams.clock,
         seams.rng,
         seams.wall,
-        node_settings.presence_lease,
+        settings.node.presence_lease,
         lan=None if seams.lan is None else seams.lan(),
         door=OPEN if team is None else team.door,
     )
@@ -130,25 +157,30 @@ def assembled(settings: Settings, seams: Seams) -> Assembly:
     else:
         team.attach(node.entangled, seams.clock)
         node.team = team
+    return node
+
+
+def _answer(node: SwarmNode, settings: Settings, driver: Driver | None) -> None:
+    """Let the others survey, tune and halt the node."""
     answer_survey(node)
     tuning = answer_tuning(node, settings, {} if driver is None else driver.description.capabilities)
     filming: object = driver
-    if isinstance(filming, Filming) and "camera" in capabilities:
+    if isinstance(filming, Filming) and "camera" in node.presence.device.capabilities:
         tuning.add(_camera_knob(filming))
     node.halt = answer_halt(node.entangled)
-    if frailty is not None:
-        frailty.answer(node)
-    if settings.deployment.allow:
-        _deployable(node, settings, seams)
-    agent = None
-    if settings.agent.module and driver is not None:
-        agent = agent_named(settings.agent.module)(node, driver, seams.clock, seams.rng)
-        if settings.agent.name:
-            place = f" on {node_settings.laptop}" if node_settings.laptop else ""
-            _log.info(
-                "{device} has the agent {agent}{place}", device=device.name, agent=settings.agent.name, place=place
-            )
-    return Assembly(node, agent, driver)
+
+
+def _agent(node: SwarmNode, settings: Settings, driver: Driver | None, seams: Seams) -> Service | None:
+    """The agent that acts for the device; None where the settings name none."""
+    if not settings.agent.module or driver is None:
+        return None
+    agent = agent_named(settings.agent.module)(node, driver, seams.clock, seams.rng)
+    if settings.agent.name:
+        place = f" on {settings.node.laptop}" if settings.node.laptop else ""
+        _log.info(
+            "{device} has the agent {agent}{place}", device=settings.node.name, agent=settings.agent.name, place=place
+        )
+    return agent
 
 
 def _closed_team(seams: Seams) -> Team | None:
