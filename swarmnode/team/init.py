@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import tomllib
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from middleware.admission import membership as memberships
 from middleware.admission import operator as operators
-from middleware.admission.operator import FIRST
+from middleware.admission.membership import Membership
+from middleware.admission.operator import FIRST, Operator
 from middleware.admission.statement import ROLES
 from middleware.entangled.network.interface import is_loopback
 from middleware.entangled.network.network import EVERYWHERE
@@ -22,6 +25,23 @@ from swarmnode.team.office import ENDING, Desk, Wrong, key_folder, options, run
 MEMBERSHIP, SETTINGS = ".membership", ".toml"
 ANYWHERE = f"{EVERYWHERE}:{NODE_PORT}"
 """Every address of the machine: what a laptop has today it may not have tomorrow."""
+
+
+@dataclass(frozen=True)
+class _Member:
+    """Who is a member from the team's beginning, and so needs no code; its two files are made in ``folder``."""
+
+    name: str
+    roles: Sequence[str]
+    folder: Path
+
+    @property
+    def membership(self) -> Path:
+        return self.folder / f"{self.name}{MEMBERSHIP}"
+
+    @property
+    def settings(self) -> Path:
+        return self.folder / f"{self.name}{SETTINGS}"
 
 
 def main(words: Sequence[str] | None = None, desk: Desk | None = None) -> int:
@@ -48,63 +68,83 @@ def main(words: Sequence[str] | None = None, desk: Desk | None = None) -> int:
         help="files for one more node at once, to be carried to it by hand; may be said again (device)",
     )
     wishes = init.parse_args(words)
-
-    def work() -> tuple[Any, list[str]]:
-        operator = operators.drawn(wishes.team, desk.rng)
-        key = wishes.operator or key_folder() / f"{wishes.team}{ENDING}"
-        first, settings = wishes.folder / f"{wishes.first}{MEMBERSHIP}", wishes.folder / f"{wishes.first}{SETTINGS}"
-        team = team_settings(wishes.set)
-        does = ["bootstrap", "edge", *(["web"] if wishes.page else [])]
-        text = settings_text(wishes.first, first.name, does, wishes.at or ANYWHERE, (), team)
-        others = {wishes.folder / f"{name}{MEMBERSHIP}": (name, roles) for name, roles in map(_member, wishes.member)}
-        known = [wishes.at] if wishes.at else []
-        host = {} if known and is_loopback(wishes.at.rpartition(":")[0]) else {"host": EVERYWHERE}
-        texts = {
-            path.with_suffix(SETTINGS): settings_text(name, path.name, ["edge"], None, known, {**host, **team})
-            for path, (name, _) in others.items()
-        }
-        for path in (key, first, settings, *others, *texts):
-            if path.exists():
-                raise Wrong(f"{path} is there already; name another team, or --folder DIR")
-        try:
-            founded = operator.founded(wishes.first, FIRST, desk.wall(), desk.rng)
-            secret, rest = founded.secrets[0][1], {}
-            for path, (name, roles) in others.items():
-                rest[path] = operator.founded(name, roles, desk.wall(), desk.rng, secret)
-        except ValueError as error:
-            raise Wrong(f"a member's name or role: {error}") from error
-        try:
-            key.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-            wishes.folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise Wrong(f"{error.filename} cannot be made: {error.strerror}") from error
-        operators.made(key, operator)
-        for path, membership in {first: founded, **rest}.items():
-            memberships.made(path, memberships.with_settings(membership, team))
-        for path, words in {settings: text, **texts}.items():
-            written(path, words)
-        return {"team": wishes.team, "operator": str(key), "membership": str(first), "settings": str(settings)}, [
-            f"The team {wishes.team} is made.",
-            f"  {key}  the operator's key: it lets in and puts out; no node needs it. Keep a copy in a safe place.",
-            f"  {first}  the first node's membership: a secret of that node",
-            f"  {settings}  its settings; start it by: twistd -n --pidfile= swarm-node --config {settings}",
-            *(
-                f"  {path}  for {name} ({', '.join(roles)}): carry it and {name}{SETTINGS} there, and keep no copy"
-                for path, (name, roles) in others.items()
-            ),
-            "Then let others in: swarm invite NAME",
-        ]
-
-    return run("init", work, wishes.json, desk.out)
+    return run("init", lambda: _made(wishes, desk), wishes.json, desk.out)
 
 
-def _member(text: str) -> tuple[str, list[str]]:
+def _made(wishes: argparse.Namespace, desk: Desk) -> tuple[Any, list[str]]:
+    operator = operators.drawn(wishes.team, desk.rng)
+    key = wishes.operator or key_folder() / f"{wishes.team}{ENDING}"
+    team = team_settings(wishes.set)
+    first = _Member(wishes.first, FIRST, wishes.folder)
+    others = list({each.name: each for each in (_member(text, wishes.folder) for text in wishes.member)}.values())
+    texts = _texts(first, others, wishes.at, wishes.page, team)
+    for path in (key, first.membership, first.settings, *(each.membership for each in others), *texts):
+        if path.exists():
+            raise Wrong(f"{path} is there already; name another team, or --folder DIR")
+    founded = _founded(operator, [first, *others], desk)
+    _make_folders(key.parent, wishes.folder)
+    operators.made(key, operator)
+    for path, membership in founded.items():
+        memberships.made(path, memberships.with_settings(membership, team))
+    for path, text in texts.items():
+        written(path, text)
+    answer = {"team": wishes.team, "operator": str(key)}
+    return {**answer, "membership": str(first.membership), "settings": str(first.settings)}, [
+        f"The team {wishes.team} is made.",
+        f"  {key}  the operator's key: it lets in and puts out; no node needs it. Keep a copy in a safe place.",
+        f"  {first.membership}  the first node's membership: a secret of that node",
+        f"  {first.settings}  its settings; start it by: twistd -n --pidfile= swarm-node --config {first.settings}",
+        *(
+            f"  {each.membership}  for {each.name} ({', '.join(each.roles)}): "
+            f"carry it and {each.settings.name} there, and keep no copy"
+            for each in others
+        ),
+        "Then let others in: swarm invite NAME",
+    ]
+
+
+def _member(text: str, folder: Path) -> _Member:
     name, _, roles = text.partition("=")
     found = roles.split(",") if roles else ["device"]
     unknown = [role for role in found if role not in ROLES]
     if unknown:
         raise Wrong(f"--member {text}: no role {unknown[0]!r}; there are {', '.join(ROLES)}")
-    return name, found
+    return _Member(name, found, folder)
+
+
+def _texts(
+    first: _Member, others: Sequence[_Member], at: str | None, has_page: bool, team: dict[str, Any]
+) -> dict[Path, str]:
+    """The settings file of each: the first node listens where it is told, the others know it from there."""
+    does = ["bootstrap", "edge", *(["web"] if has_page else [])]
+    texts = {first.settings: settings_text(first.name, first.membership.name, does, at or ANYWHERE, (), team)}
+    known = [at] if at else []
+    host = {} if at and is_loopback(at.rpartition(":")[0]) else {"host": EVERYWHERE}
+    for each in others:
+        texts[each.settings] = settings_text(each.name, each.membership.name, ["edge"], None, known, {**host, **team})
+    return texts
+
+
+def _founded(operator: Operator, members: Sequence[_Member], desk: Desk) -> dict[Path, Membership]:
+    """The membership of each, all with the secret of the first; raises ``Wrong``."""
+    found: dict[Path, Membership] = {}
+    secret = None
+    for each in members:
+        try:
+            membership = operator.founded(each.name, each.roles, desk.wall(), desk.rng, secret)
+        except ValueError as error:
+            raise Wrong(f"a member's name or role: {error}") from error
+        found[each.membership] = membership
+        secret = membership.secrets[0][1]
+    return found
+
+
+def _make_folders(keys: Path, members: Path) -> None:
+    try:
+        keys.mkdir(mode=0o700, parents=True, exist_ok=True)
+        members.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise Wrong(f"{error.filename} cannot be made: {error.strerror}") from error
 
 
 def team_settings(given: Sequence[str]) -> dict[str, Any]:
