@@ -75,7 +75,8 @@ def main(
     try:
         if wishes.verb in ("restart", "remove"):
             return _Place(wishes.name, is_user, root, run, out).do(wishes.verb)
-        unit = unit_for(_settings(wishes.settings), twistd(executable, is_user, can_enter), is_user, wishes.memory)
+        program, interpreter = twistd(executable, is_user, can_enter), str(_interpreter(executable))
+        unit = unit_for(_settings(wishes.settings), program, is_user, wishes.memory, interpreter)
         if wishes.verb == "show":
             out.write(unit.text)
             return DONE
@@ -90,13 +91,17 @@ def twistd(executable: str, is_user: bool, can_enter: Callable[[Path], bool]) ->
     path = Path(executable).with_name("twistd")
     if not path.exists():
         raise CannotInstall(f"{path} is not there; install swarm-node into the environment that runs this")
-    # The interpreter of an environment is often a link to another one.
-    folders = [] if is_user else [*path.parents, *Path(executable).resolve().parents]
+    folders = [] if is_user else [*path.parents, *_interpreter(executable).parents]
     for folder in folders:
         if not can_enter(folder):
             remedy = "make an environment below /opt with the system's Python, or say --user"
             raise CannotInstall(f"other users cannot enter {folder}, which this program needs; {remedy}")
     return str(path)
+
+
+def _interpreter(executable: str) -> Path:
+    """The Python that runs: the interpreter of an environment is often a link to another one."""
+    return Path(executable).resolve()
 
 
 def _settings(path: str) -> Settings:

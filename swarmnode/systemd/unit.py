@@ -17,11 +17,16 @@ MEMORY = "256M"
 """What one node may have; without page and camera it needs 40 MiB."""
 LOWEST_FREE_PORT = 1024
 SETTINGS = "node.toml"
+HOMES = ("/home/", "/root/", "/run/user/")
+"""What ``ProtectHome=`` hides, on any machine (systemd.exec(5))."""
 
 
 @dataclass(frozen=True)
 class Unit:
-    """What a unit is made of: ``twistd`` and ``settings`` are paths, ``name`` is the node's."""
+    """What a unit is made of: ``twistd`` and ``settings`` are paths, ``name`` is the node's.
+
+    ``interpreter`` is the Python that runs ``twistd``, wherever the links of its environment lead.
+    """
 
     name: str
     twistd: str
@@ -31,6 +36,7 @@ class Unit:
     devices: tuple[str, ...] = ()
     is_low: bool = False
     """Whether it listens at a port below 1024, which only root may otherwise."""
+    interpreter: str = ""
 
     @property
     def label(self) -> str:
@@ -67,7 +73,8 @@ class Unit:
         yield f"Environment=XDG_RUNTIME_DIR=%t/{self.label}"
         low = "CAP_NET_BIND_SERVICE" if self.is_low else ""
         yield from (f"CapabilityBoundingSet={low}", f"AmbientCapabilities={low}")
-        yield f"ProtectHome={'read-only' if _is_at_home(self.twistd) else 'yes'}"
+        is_at_home = any(path.startswith(HOMES) for path in (self.twistd, self.interpreter))
+        yield f"ProtectHome={'read-only' if is_at_home else 'yes'}"
         yield from _MOUNTED
         if self.devices:
             yield from ("DevicePolicy=closed", *(f"DeviceAllow={device} rw" for device in self.devices))
@@ -111,7 +118,7 @@ _MOUNTED = (
 )
 
 
-def unit_for(settings: Settings, twistd: str, is_user: bool, memory: str = MEMORY) -> Unit:
+def unit_for(settings: Settings, twistd: str, is_user: bool, memory: str = MEMORY, interpreter: str = "") -> Unit:
     """The unit of the node with these settings, which are in the file ``settings.origin``."""
     node, web = settings.node, settings.web
     ports = [node.port, getattr(node, "tunnel_port", 0) or 0]
@@ -120,17 +127,13 @@ def unit_for(settings: Settings, twistd: str, is_user: bool, memory: str = MEMOR
     options = [settings.driver.options, *(options for _, options in settings.driver.parts)]
     devices = tuple(dict.fromkeys(device for each in options for device in _devices(each)))
     is_low = any(0 < port < LOWEST_FREE_PORT for port in ports)
-    return Unit(node.name, twistd, settings.origin, is_user, memory, devices, is_low)
+    return Unit(node.name, twistd, settings.origin, is_user, memory, devices, is_low, interpreter)
 
 
 def _devices(options: Mapping[str, object]) -> Iterator[str]:
     for value in options.values():
         if isinstance(value, str) and value.startswith("/dev/"):
             yield value
-
-
-def _is_at_home(path: str) -> bool:
-    return path.startswith(("/home/", "/root/"))
 
 
 def _quoted(path: str) -> str:

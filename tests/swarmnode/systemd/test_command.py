@@ -58,6 +58,18 @@ class UnitTests(SynchronousTestCase):
         lines = unit({"roles": ["web"]}, web={"tls": "auto", "tls_port": 443}).text.splitlines()
         self.assertIn("AmbientCapabilities=CAP_NET_BIND_SERVICE", lines)
 
+    def test_a_python_in_a_home_can_be_read(self) -> None:
+        """Homes are hidden, but where the program or the Python behind its environment lies in one."""
+        self.assertIn("ProtectHome=yes", unit().text.splitlines())
+        settings = Settings.from_mapping({"node": {"name": "dog1"}}, "/a.toml")
+        for twistd, python in (
+            ("/home/ann/env/bin/twistd", "/usr/bin/python3"),
+            (PROGRAM, "/home/ann/.pyenv/bin/python3"),
+            (PROGRAM, "/root/.local/share/uv/python3"),
+        ):
+            lines = unit_for(settings, twistd, is_user=False, interpreter=python).text.splitlines()
+            self.assertIn("ProtectHome=read-only", lines)
+
     def test_names_cannot_add_lines(self) -> None:
         """Spaces, quotes and percent signs of a path stay in their place."""
         made = unit_for(Settings.from_mapping({"node": {"name": "a"}}, '/a b/50%"/a.toml'), PROGRAM, is_user=True)
@@ -164,6 +176,13 @@ class CommandTests(SynchronousTestCase):
         self.assertIn(f"other users cannot enter {self.root}", complaint)
         self.assertIn("/opt", complaint)
         self.assertEqual(self.run_it("show", str(self.settings), "--user")[0], 0)
+
+    def test_the_python_behind_the_environment_counts(self) -> None:
+        """An environment outside of all homes whose Python is a link into one is let read it."""
+        Path(self.program).symlink_to("/home/ann/.pyenv/bin/python3")
+        code, printed, _ = self.run_it("show", str(self.settings))
+        self.assertEqual(code, 0)
+        self.assertIn("ProtectHome=read-only\n", printed)
 
     def test_remove(self) -> None:
         """Removing stops it, takes the unit away and leaves what was stored."""
