@@ -76,12 +76,17 @@ def _made(wishes: argparse.Namespace, desk: Desk) -> tuple[Any, list[str]]:
     key = wishes.operator or key_folder() / f"{wishes.team}{ENDING}"
     team = team_settings(wishes.set)
     first = _Member(wishes.first, FIRST, wishes.folder)
-    others = list({each.name: each for each in (_member(text, wishes.folder) for text in wishes.member)}.values())
-    texts = _texts(first, others, wishes.at, wishes.page, team)
-    for path in (key, first.membership, first.settings, *(each.membership for each in others), *texts):
+    members = [first]
+    for text in wishes.member:
+        member = _member(text, wishes.folder)
+        if member.name in {each.name for each in members}:
+            raise Wrong(f"--member {text}: another member is called so; give each a name of its own")
+        members.append(member)
+    texts = _texts(members, wishes.at, wishes.page, team)
+    for path in (key, *(each.membership for each in members), *texts):
         if path.exists():
             raise Wrong(f"{path} is there already; name another team, or --folder DIR")
-    founded = _founded(operator, [first, *others], desk)
+    founded = _founded(operator, members, desk)
     _make_folders(key.parent, wishes.folder)
     operators.made(key, operator)
     for path, membership in founded.items():
@@ -97,7 +102,7 @@ def _made(wishes: argparse.Namespace, desk: Desk) -> tuple[Any, list[str]]:
         *(
             f"  {each.membership}  for {each.name} ({', '.join(each.roles)}): "
             f"carry it and {each.settings.name} there, and keep no copy"
-            for each in others
+            for each in members[1:]
         ),
         "Then let others in: swarm invite NAME",
     ]
@@ -112,10 +117,9 @@ def _member(text: str, folder: Path) -> _Member:
     return _Member(name, found, folder)
 
 
-def _texts(
-    first: _Member, others: Sequence[_Member], at: str | None, has_page: bool, team: dict[str, Any]
-) -> dict[Path, str]:
+def _texts(members: Sequence[_Member], at: str | None, has_page: bool, team: dict[str, Any]) -> dict[Path, str]:
     """The settings file of each: the first node listens where it is told, the others know it from there."""
+    first, *others = members
     does = ["bootstrap", "edge", *(["web"] if has_page else [])]
     texts = {first.settings: settings_text(first.name, first.membership.name, does, at or ANYWHERE, (), team)}
     known = [at] if at else []

@@ -121,6 +121,13 @@ class AdmissionTests(SynchronousTestCase):
         self.assertEqual((settings.host, settings.known_nodes), ("*", (Address("192.0.2.7", 8484),)))
         self.assertEqual(MembershipFile(Path(settings.membership)).membership.member.roles, ("operator", "gateway"))
 
+    def test_members_of_one_name(self) -> None:
+        """Two members of one name would have one pair of files: that is refused, the first node's name as well."""
+        words = ("yard", "--operator", str(self.folder / "yard"), "--folder", str(self.folder), "--first", "vaio")
+        for twice in (("--member", "vaio"), ("--member", "dog1", "--member", "dog1=gateway")):
+            self.assertEqual(self.run_verb(init.main, *words, *twice)[0], 2)
+            self.assertIn(f"--member {twice[-1]}: another member is called so", self.said)
+
     def test_newcomer_hears_more_than_its_own_machine(self) -> None:
         """Who joins by a bootstrap node of another machine listens where that one reaches it."""
         found = self.done(invite.main, "dog9")
