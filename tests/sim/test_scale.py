@@ -84,12 +84,24 @@ class RecordTests(SynchronousTestCase):
         for text in ("", "many", "2", "3,1000000"):
             with self.assertRaisesRegex(BadSetting, "--nodes"):
                 scale(["--nodes", text, "--out", self.mktemp()], world())
+        for key, text in (("--takeovers", "-1"), ("--swarm-most", "-1")):
+            with self.assertRaisesRegex(BadSetting, key):
+                scale(["--nodes", "3", key, text, "--out", self.mktemp()], world())
         torn = json.dumps({"digest": SurveySettings().digest(), "sizes": {"x": 1}})
         for text in ("{", "[]", torn):
             path = Path(self.mktemp())
             path.write_text(text)
             with self.assertRaisesRegex(BadSetting, "cannot be taken up"):
                 Record(path, SurveySettings()).read()
+
+    def test_a_folder_that_cannot_be_written(self) -> None:
+        """A folder that cannot be made, or where nothing can be written, is refused before anything is measured."""
+        file, full = Path(self.mktemp()), Path(self.mktemp())
+        file.touch()
+        (full / "scale.new").mkdir(parents=True)
+        for out in (file, file / "below", full):
+            with self.assertRaisesRegex(BadSetting, "--out: .* cannot be written"):
+                scale(["--nodes", "3", "--out", str(out)], world(), lambda nodes, settings, watcher: self.fail("late"))
 
     def test_missed_targets_show(self) -> None:
         """A figure beyond its target makes the command say so, and end with 1."""

@@ -43,9 +43,12 @@ def scale(arguments: Sequence[str], world: World, measure: Measure = surveyed_ap
     wanted = _parsed(arguments)
     sizes = _sizes(wanted.nodes)
     out = Path(wanted.out)
+    for key, value in (("--takeovers", wanted.takeovers), ("--swarm-most", wanted.swarm_most)):
+        if value < 0:
+            raise BadSetting("command line", key, f"must be from 0 on, is {value}", f"write {key} 100")
     settings = SurveySettings(seed=wanted.seed, takeovers=wanted.takeovers, swarm_most=wanted.swarm_most)
-    out.mkdir(parents=True, exist_ok=True)
     record = Record(out / "scale.json", settings)
+    record.prepare()
     record.read()
     watcher = Watcher(lambda line: _say(world, line), world.is_stopped)
     for nodes in sizes:

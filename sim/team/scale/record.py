@@ -18,8 +18,19 @@ class Record:
 
     def __init__(self, path: Path, settings: SurveySettings) -> None:
         self._path = path
+        self._new = path.with_suffix(".new")
         self._settings = settings
         self.sizes: dict[int, Sized] = {}
+
+    def prepare(self) -> None:
+        """Make the folder, and see that a file can be written there; raises ``BadSetting``."""
+        try:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            self._new.touch()
+            self._new.unlink()
+        except OSError as error:
+            problem = f"{error.filename} cannot be written: {error.strerror}"
+            raise BadSetting("command line", "--out", problem, "name a folder in which you may write") from error
 
     def read(self) -> None:
         """Take up what is there; raises ``BadSetting`` for a file that is none of ours."""
@@ -46,9 +57,8 @@ class Record:
             "settings": asdict(self._settings),
             "sizes": {str(nodes): _packed(self.sizes[nodes]) for nodes in sorted(self.sizes)},
         }
-        new = self._path.with_suffix(".new")
-        new.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-        os.replace(new, self._path)
+        self._new.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+        os.replace(self._new, self._path)
 
     def _wrong(self, problem: str) -> BadSetting:
         return BadSetting(str(self._path), "", f"cannot be taken up: {problem}", "move it away, or name another --out")
