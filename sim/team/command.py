@@ -49,7 +49,7 @@ def run(arguments: Sequence[str], world: World, kinds: Kinds = KINDS) -> int:
     wanted = _parsed(arguments)
     changes = {} if wanted.nodes is None else {"nodes": wanted.nodes}
     scenario = loaded(wanted.scenario, {name: kind.settings for name, kind in kinds.items()}, changes)
-    check_targets(scenario, kinds)
+    check_targets(scenario, kinds, wanted.scenario)
     check(scenario, world.read)
     line = again(wanted.scenario, wanted.seed, wanted.nodes)
     with ExitStack() as files:
@@ -92,7 +92,7 @@ def run(arguments: Sequence[str], world: World, kinds: Kinds = KINDS) -> int:
     return MISSED if outcome.missed or outcome.violations else 0
 
 
-def check_targets(scenario: Scenario, kinds: Kinds) -> None:
+def check_targets(scenario: Scenario, kinds: Kinds, origin: str) -> None:
     """Raise ``BadSetting`` for a target that no figure of the scenario's workloads can be held to."""
     sorts = [kinds[name] for name, _ in scenario.loads]
     known = [figure for sort in sorts for figure in sort.figures]
@@ -100,7 +100,7 @@ def check_targets(scenario: Scenario, kinds: Kinds) -> None:
         for name, _ in scenario.targets:
             if name not in known:
                 remedy = f"there are {', '.join(known)}" if known else "write a [load.NAME] that measures it"
-                raise BadSetting(scenario.name, f"[targets] {name}", "is no figure of these workloads", remedy)
+                raise BadSetting(origin, f"[targets] {name}", "is no figure of these workloads", remedy)
 
 
 def _parsed(arguments: Sequence[str]) -> argparse.Namespace:

@@ -182,8 +182,8 @@ def loaded(name: str, settings: Settings, changes: Mapping[str, object] = {}) ->
     """
     path = Path(name) if name.endswith(".toml") else FOLDER / f"{name}.toml"
     if not name.endswith(".toml") and not path.exists():
-        near = get_close_matches(name, names(), n=1, cutoff=0.0)
-        remedy = f"there are {', '.join(names())}; the nearest is {near[0] if near else 'none'}"
+        near = get_close_matches(name, names(), n=1)
+        remedy = f"there are {', '.join(names())}{f'; the nearest is {near[0]}' if near else ''}"
         raise BadSetting("command line", "--scenario", f"there is no {name!r}", remedy)
     try:
         text = path.read_text(encoding="utf-8")
@@ -234,7 +234,7 @@ class _Reader:
             parts[key] = self._table(sort, content.get(key, {}), key)
         faults = content.get("fault", [])
         if not isinstance(faults, list) or len(faults) > MOST_FAULTS:
-            raise self.bad("", "fault", f"must be at most {MOST_FAULTS} tables", "write [[fault]] for each")
+            raise self.bad("", "fault", f"must be tables, {MOST_FAULTS} at most", "write [[fault]] for each")
         parts["faults"] = tuple(self._table(Fault, fault, f"fault {n}") for n, fault in enumerate(faults, 1))
         parts["loads"] = tuple(self._loads(content.get("load", {}), settings))
         parts["targets"] = tuple(self._targets(content.get("targets", {})))
@@ -266,8 +266,11 @@ class _Reader:
 
     def bad(self, where: str, key: str, problem: str, remedy: str, shown: str = "") -> BadSetting:
         """The error, with the line."""
-        lines = self._lines  # an inline table stands in the line of its key
-        line = lines.get((where, key)) or lines.get((where, "")) or lines.get(("", where.partition(".")[0]))
+        whole = f"{where}.{key}".strip(".")
+        above, _, last = whole.rpartition(".")
+        # A table is a header, or a key of the table above it; an inline one stands in the line of its key.
+        places = (where, key), (whole, ""), (above, last), (where, ""), ("", where.partition(".")[0])
+        line = next((self._lines[place] for place in places if place in self._lines), 0)
         table = f"[[fault]] {where.split()[1]} " if where.startswith("fault ") else f"[{where}] " if where else ""
         if shown:
             return BadSetting("command line", shown, problem, remedy)
@@ -325,7 +328,7 @@ def _places(text: str) -> Iterator[tuple[tuple[str, str], int]]:
     for number, line in enumerate(text.splitlines(), 1):
         if header := re.match(r"\s*\[\[?\s*([\w.\" -]+?)\s*\]\]?\s*(#.*)?$", line):
             where = header[1].replace('"', "")
-            if line.lstrip().startswith("[["):
+            if where == "fault" and line.lstrip().startswith("[["):
                 faults += 1
                 where = f"{where} {faults}"
             yield (where, ""), number

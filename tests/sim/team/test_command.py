@@ -90,6 +90,7 @@ class CommandTests(SynchronousTestCase):
         """A target that no workload of the scenario measures is refused before the first step."""
         error = self.assertRaises(BadSetting, self.run_it, text=SCENARIO + '[targets]\n"hops" = "<= 5"\n')
         self.assertIn("nodes inside", error.remedy)
+        self.assertEqual(error.file, str(self.path))
 
     def test_ending_leaves_a_valid_partial_report(self) -> None:
         """Who ends a run gets a report, as text, JSON, trace and picture, that says that it is partial."""
