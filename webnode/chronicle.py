@@ -60,8 +60,11 @@ class TeamChronicle:
         self._devices(_by(before, "devices", "uuid"), _rows(state, "devices"), now)
         titles = {task["id"]: task["title"] for task in _rows(state, "tasks")}
         self._tasks(_by(before, "tasks", "id"), _rows(state, "tasks"), now)
-        self._groups(_by(before, "groups", "task"), _rows(state, "groups"), now)
-        self._takeovers(state, titles, now)
+        ended = {task["id"] for task in _rows(state, "tasks") if task["status"] in DECIDED}
+        # The reports on a task that has ended go one by one, and those left agree on nothing.
+        confer = [group for group in _rows(state, "groups") if group["task"] not in ended]
+        self._groups(_by(before, "groups", "task"), confer, now)
+        self._takeovers(state, titles, ended, now)
         if bool(state.get("halted")) != bool(before.get("halted")):
             self._add(now, "halt", text="the team is halted" if state.get("halted") else "the team goes on")
 
@@ -133,7 +136,7 @@ class TeamChronicle:
                 )
                 self._add(now, "agreed", group["assigned_uuid"], group["task"], told)
 
-    def _takeovers(self, state: State, titles: Mapping[str, str], now: float) -> None:
+    def _takeovers(self, state: State, titles: Mapping[str, str], ended: set[str], now: float) -> None:
         names = {device["uuid"]: device["name"] for device in _rows(state, "devices")}
         acting: dict[str, set[str]] = {}
         for device in _rows(state, "devices"):
@@ -147,7 +150,6 @@ class TeamChronicle:
                     self._lost[task] = _Loss(device["uuid"], device["name"], at, True)
         for task, uuids in acting.items():
             self._followed(task, titles.get(task, task), uuids, names, now)
-        ended = {task["id"] for task in _rows(state, "tasks") if task["status"] in DECIDED}
         for task in [*self._lost]:
             if task in ended or (not self._lost[task].is_gone and now - self._lost[task].at > DOUBTED_S):
                 del self._lost[task]

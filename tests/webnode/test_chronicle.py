@@ -82,6 +82,15 @@ class ChronicleTests(SynchronousTestCase):
         self.assertEqual(self.saw(3.0, groups=agreed), ["2 of 2 agree on dog2 (dog1 1.04 m, dog2 0.62 m)"])
         self.assertEqual(self.saw(4.0, groups=agreed), [])
 
+    def test_tell_of_no_consensus_on_what_is_over(self) -> None:
+        """Once a task has ended its reports go one by one; that those left agree is no news."""
+        bids = [{**dog(n), "cost": float(n), "assigned": uuid(1)} for n in (1, 2)]
+        self.saw(1.0, tasks=[job("EXECUTING")])
+        self.assertEqual(len(self.saw(2.0, tasks=[job("EXECUTING")], groups={"t1": bids})), 1)
+        for status in ("COMPLETED", "FAILED", "CANCELLED"):
+            told = self.saw(3.0, tasks=[job(status)], groups={"t1": bids[1:]})
+            self.assertEqual([line for line in told if "agree" in line], [], status)
+
     def test_tell_of_halting(self) -> None:
         """That the whole team is halted, and goes on, is told."""
         self.saw(1.0)
