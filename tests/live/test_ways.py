@@ -70,6 +70,17 @@ class WaysTests(PageCase):
         self.assertIn("not here", third)
         self.assertNotIn("!", second + third)
 
+    def test_keep_a_name_whole(self) -> None:
+        """However much a member may do, its name stands in one line."""
+        page = self.looked(DESK)
+        lines = """item => {
+          item.querySelector(".roles").textContent = "device, operator, gateway, bootstrap";
+          const name = document.createRange();
+          name.selectNodeContents(item.querySelector("b"));
+          return name.getClientRects().length;
+        }"""
+        self.assertEqual(page.locator("#members li").first.evaluate(lines), 1)
+
     def test_show_commands_to_operators_alone(self) -> None:
         """An operator reads by which command a member is put out; a viewer sees the members without, and no button."""
         page = self.looked(DESK)
