@@ -167,6 +167,7 @@ class Team:
                 "uuid": each["uuid"],
                 "name": each["name"],
                 "status": each["status"],
+                "state": f"WAITING({each['joined']})" if each["status"] == "WAITING" else each["status"],
                 "cost": costs.get(each["name"], 1.0),
                 "assigned": "02" * 16,
                 "token": 1,

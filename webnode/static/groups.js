@@ -27,7 +27,9 @@ function update(article, group) {
     words(name, member.name);
     bar.firstChild.style.width = `${100 * (member.share ?? 0)}%`;
     words(cost, member.cost === null ? (member.available ? "no bid" : "not free") : `${member.cost.toFixed(2)} m`);
-    const detail = [member.state.toLowerCase(), member.post === null ? "" : `goes to ${member.post}°`,
+    // Those that stand by have their place in its name: WAITING(2).
+    const state = member.state.toLowerCase().replace(/\((\d+)\)$/, " as number $1");
+    const detail = [state, member.post === null ? "" : `goes to ${member.post}°`,
       member.progress === null ? "" : `${Math.round(100 * member.progress)} % done`].filter(Boolean).join(", ");
     words(choice, `${member.choice ? `names ${member.choice}` : "undecided"}${member.token ? `, token ${member.token}` : ""}${member.why ? ` – ${member.why}` : ""}${detail ? ` (${detail})` : ""}`);
   });
