@@ -244,6 +244,19 @@ class PageTests(PageCase):
         self.assertFalse([words for words in page.locator("#d-events").all_inner_texts() if "dog3" in words])
         self.assertEqual(self.faults, [])
 
+    def test_read_what_happened_on_a_phone(self) -> None:
+        """On a phone, where the events have the screen to themselves, the page is scrolled and not a list within it."""
+        page = self.opened(PHONE)
+        self.view(page, "events")
+        page.locator("#events li", has_text="begins to look").wait_for()
+        inside = """events => {
+          for (let n = 0; n < 100; n += 1) events.append(events.firstElementChild.cloneNode(true));
+          return events.scrollHeight - events.clientHeight;
+        }"""
+        self.assertEqual(page.locator("#events").evaluate(inside), 0)
+        page.evaluate("scrollTo(0, document.body.scrollHeight)")
+        self.assertLessEqual(page.locator("#events").bounding_box()["y"], 0)
+
     def test_speak_to_a_device(self) -> None:
         """From the dialog a message is sent and a device told to leave; the answer stands there in words."""
         page = self.opened(DESK)
