@@ -13,7 +13,7 @@ from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorTime
 
 from middleware.entangled.background import Background, first
-from middleware.entangled.errors import EntangledError, NoAnswer
+from middleware.entangled.errors import EntangledError, NoAnswer, Refused
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.distance import closest
 from middleware.entangled.node import EntangledNode
@@ -29,6 +29,8 @@ MARGIN = 0.02
 """Share by which two clocks of correct nodes may drift apart (1 % each)."""
 ENROLLED = 5.0
 """Seconds for which the council of a key is not asked again whether it is there."""
+ENROLMENTS = 3
+"""Times that the nodes closest to a key are looked up and asked until a council is whole."""
 REPAIR = 2.0
 LEASED_RETRY = 0.5
 CONTEST_RETRY = (0.02, 0.08)
@@ -78,22 +80,35 @@ class Taker:
     # -- councils ---------------------------------------------------------------------------------------------------
 
     async def enrolled(self, key: bytes) -> list[Member]:
-        """The council for a tuple that is put now: the live nodes closest to ``key``, this one among them."""
+        """The council for a tuple that is put now: the live nodes closest to ``key``, this one among them.
+
+        It is smaller than it should be only where the network is; fails with ``NoAnswer`` where nodes that are there
+        keep silent, for a council of two or one would not survive the loss of anybody.
+        """
         until, members = self._members.get(key, (0.0, []))
         if until > self._clock.seconds():
             return members
-        near = closest([*await self._node.find_node(key), self._node.contact], key, 2 * self._size)
-        left, members = near, []
-        while left and len(members) < self._size:
-            asked, left = left[: self._size - len(members)], left[self._size - len(members) :]
-            members += [m for m in await first(len(asked), [self._enrol(c) for c in asked]) if m is not None]
-        if not members:
-            raise NoAnswer("no node agrees to be in the council of a tuple")
-        self._members[key] = (self._clock.seconds() + ENROLLED, members)
-        return members
+        members = []
+        for _ in range(ENROLMENTS):
+            near = closest([*await self._node.find_node(key), self._node.contact], key, 2 * self._size)
+            agreed = {member.contact.node_id for member in members}
+            left, silent = [contact for contact in near if contact.node_id not in agreed], 0
+            while left and len(members) < self._size:
+                asked, left = left[: self._size - len(members)], left[self._size - len(members) :]
+                answers = await first(len(asked), [self._enrol(contact) for contact in asked])
+                members += [member for member in answers if member is not None]
+                silent += len(asked) - len(answers)
+            if members and (len(members) == self._size or not silent):
+                self._members[key] = (self._clock.seconds() + ENROLLED, members)
+                return members
+        raise NoAnswer(f"{len(members)} of {self._size} nodes agree to be in the council of a tuple, others are silent")
 
     async def _enrol(self, contact: Contact) -> Member | None:
-        incarnation = await self._ask(contact, "decree.enrol", ())
+        """The node as a member, or None where it refuses."""
+        try:
+            incarnation = await self._ask(contact, "decree.enrol", ())
+        except Refused:
+            return None
         lawful = isinstance(incarnation, bytes) and len(incarnation) == INCARNATION_BYTES
         return Member(contact, incarnation) if lawful else None
 

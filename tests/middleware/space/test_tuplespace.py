@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from twisted.internet.defer import CancelledError, Deferred
 
-from middleware.entangled.errors import NoAnswer, NotRunning, TooLarge
+from middleware.entangled.errors import NoAnswer, NotRunning, Refused, TooLarge
 from middleware.entangled.network.switchboard import Weather
+from middleware.entangled.node import EntangledNode
 from middleware.entangled.space.claim import Claim, ClaimLost
 from middleware.entangled.space.posting import Posted, posting
 from middleware.entangled.space.template import ANY, BadTuple, where
@@ -42,6 +44,11 @@ class SpaceCase(FleetCase):
         """Every tuple that some node keeps, each once."""
         said = [posting(record) for node in fleet.nodes for record in node.store.records()]
         return list({one.place: one for one in said if isinstance(one, Posted)}.values())
+
+    def called_up(self, node: EntangledNode, answer: Callable[..., object]) -> None:
+        """Let ``node`` give this answer when it is called to a council."""
+        node.seat.sit()  # a seat that is taken up later would answer for itself
+        node.endpoint.expose("decree.enrol", answer)
 
     def moment(self, fleet: Fleet, work: Deferred[Any]) -> list[float]:
         """Where the moment at which ``work`` fires will stand."""
@@ -155,6 +162,41 @@ class TupleSpaceTests(SpaceCase):
         fleet.board.heal()
         fleet.run(1.0)
         self.assertEqual(len(waiting), 1)
+
+    def test_a_council_is_whole(self) -> None:
+        """A put waits for members that are silent, for a tuple with a smaller council would not survive any of them."""
+        fleet, (a, *_) = self.spaces(4)
+        for node in fleet.nodes[1:]:
+            self.called_up(node, lambda peer: Deferred())
+        put = a.put(("job",))
+        fleet.run(4.0)
+        self.assertNoResult(put)
+        self.assertEqual(self.posted(fleet), [])
+        for node in fleet.nodes[1:]:
+            self.called_up(node, node.seat.answer_enrol)
+        self.done(fleet, put)
+        self.assertEqual([len(one.council) for one in self.posted(fleet)], [3])
+
+    def test_no_council(self) -> None:
+        """Where others live and none says whether it will be a member, the put fails by name and nothing is put."""
+        fleet, (a, *_) = self.spaces(3)
+        for node in fleet.nodes[1:]:
+            self.called_up(node, lambda peer: Deferred())
+        put = a.put(("job",))
+        fleet.run(10.0)
+        self.failureResultOf(put, NoAnswer)
+        self.assertEqual(self.posted(fleet), [])
+
+    def test_a_council_without_those_who_refuse(self) -> None:
+        """Nobody waits for nodes that say that they will not be members: the council is as large as can be."""
+        fleet, (a, *_) = self.spaces(3)
+
+        def refuse(peer: object) -> bytes:
+            raise Refused("not here")
+
+        self.called_up(fleet.nodes[1], refuse)
+        self.done(fleet, a.put(("job",)), 1.0)
+        self.assertEqual([len(one.council) for one in self.posted(fleet)], [2])
 
     def test_timeout(self) -> None:
         """A blocking call ends by name after its time-out, and leaves nothing behind."""
