@@ -133,6 +133,11 @@ class PageTests(SynchronousTestCase):
         self.assertRegex(shown, r"Processor of a node.* \| - \| 1 \| - \| \*\*1\*\* \| <= 0.5 \|  \|")
         self.assertIsNone(led(hops[:3]))
 
+    def test_targets_of_some_sizes(self) -> None:
+        """Where smaller teams are held to something else, the table says to what."""
+        shown = page(CURVES, {"auctions.agree.p95": [(n, 0.7) for n in (3, 100, 1000, 10_000)]})
+        self.assertIn("| 0.7 | **0.7** | 0.7 | 0.7 | <= 1; <= 0.6 at 100, <= 0.8 at 1,000 |", shown)
+
 
 class SurveyTests(SynchronousTestCase):
     def test_ends_soon(self) -> None:

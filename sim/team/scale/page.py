@@ -47,6 +47,8 @@ def page(curves: Sequence[Curve], points: Mapping[str, Points]) -> str:
             cells.append(f"**{text}**" if value is not None and bound is not None and not bound.holds(value) else text)
         target, far = curve.target(sizes[-1]), led(points[curve.figure])
         goes_on = "" if far is None or curve.unit == "share" else shown(far)
-        row = [curve.title.replace("|", "/"), curve.unit, *cells, str(target or ""), goes_on]
+        own = [f"{bound} at {n:,}" for n, bound in curve.at if n in sizes and bound != target]
+        wanted = "; ".join(filter(None, [str(target or ""), ", ".join(own)]))
+        row = [curve.title.replace("|", "/"), curve.unit, *cells, wanted, goes_on]
         lines.append("| " + " | ".join(row) + " |")
     return "\n".join(lines) + "\n"
