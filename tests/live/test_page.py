@@ -7,6 +7,18 @@ from typing import Any
 
 from tests.live.page import DESK, PHONE, PageCase, Team
 
+TWINS = """async () => {
+  const { keyed } = await import("/static/element.js");
+  const list = document.createElement("ul");
+  const seen = ["abab", "aba", "baa"].map((items) => {
+    const before = new Set(list.children);
+    const update = (child, item) => { child.textContent = item; };
+    keyed(list, [...items], (item) => item, () => document.createElement("li"), update);
+    return [list.textContent, [...list.children].filter((child) => !before.has(child)).length];
+  });
+  return seen;
+}"""
+"""A list that is kept in step with items two of which are alike: what it shows, and how many rows were made anew."""
 PANELS = """async () => {
   const { panel } = await import("/static/panel.js");
   const { model } = await import("/static/model.js");
@@ -65,6 +77,11 @@ class PageTests(PageCase):
         page.locator("dialog[open]").wait_for(state="hidden")
         self.assertEqual(page.evaluate(shown), ["place-cameras"])
         self.assertEqual(self.faults, [])
+
+    def test_keep_twins_apart(self) -> None:
+        """Two rows that are alike, as two equal messages of one moment, stay two, and go when they are no more."""
+        page = self.opened(PHONE)
+        self.assertEqual(page.evaluate(TWINS), [["abab", 4], ["aba", 0], ["baa", 0]])
 
     def test_choose_colours(self) -> None:
         """Light and dark can be chosen against the system's, and stay chosen."""

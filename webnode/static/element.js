@@ -26,21 +26,21 @@ export function attribute(node, name, value) {
   if (node.getAttribute(name) !== String(value)) node.setAttribute(name, value);
 }
 
-// One child for each item, in order; `make` once for a new key, `update` each time.
+// One child for each item, in order; `make` once for a new key, `update` each time.  Items of one key have one child each.
 export function keyed(parent, items, key, make, update) {
-  const old = new Map([...parent.children].map((child) => [child.dataset.key, child]));
+  const old = new Map();
+  for (const child of parent.children) old.set(child.dataset.key, [...(old.get(child.dataset.key) ?? []), child]);
   items.forEach((item, place) => {
     const name = String(key(item));
-    let child = old.get(name);
+    let child = old.get(name)?.shift();
     if (!child) {
       child = make(item);
       child.dataset.key = name;
     }
-    old.delete(name);
     if (parent.children[place] !== child) parent.insertBefore(child, parent.children[place] ?? null);
     update(child, item);
   });
-  for (const child of old.values()) child.remove();
+  for (const child of [...old.values()].flat()) child.remove();
 }
 
 // A shape for each state, so that no state is told by colour alone.
