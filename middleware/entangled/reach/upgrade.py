@@ -8,8 +8,11 @@ from dataclasses import dataclass
 from middleware.entangled.reach.known import keep
 from middleware.entangled.wire.peer import Peer, Peers
 
-PAUSES = (1.0, 2.0, 5.0, 15.0, 60.0)
-"""Seconds after which a carried pair tries the direct way again; the last one is repeated."""
+PAUSES = (1.0, 2.0, 5.0, 5.0, 15.0, 60.0)
+"""Seconds after which a carried pair tries the direct way again; the last one is repeated.
+
+As many are short as there are orders in which two knock at fresh ports: but one of them may do.
+"""
 TURN = 0.5
 """Seconds by which one of the two is behind the other, so that only one of them tries."""
 GIVEN_UP_S = 60.0

@@ -107,7 +107,7 @@ class WeatherTests(GroundCase):
                     ground.board.set_weather(ground.public, Address(host, port), Weather(delay_s=0.5), one_way=True)
                 ways_seen = set()
                 ways(ground, one, other)
-                ground.run(30.0)
+                ground.run(20.0)
                 for _ in range(20):
                     ground.run(1.0)
                     ways_seen.add(ground.way(ground.nodes["a2"], ground.nodes["b2"]))
