@@ -50,7 +50,7 @@ class TheoryTests(SynchronousTestCase):
 
 class RecordTests(SynchronousTestCase):
     def test_resumed(self) -> None:
-        """A size that is in the file is not measured again, and one of other settings is."""
+        """A size that is in the file is not measured again; what has other settings is not put over it."""
         out = self.mktemp()
         asked: list[int] = []
 
@@ -61,9 +61,11 @@ class RecordTests(SynchronousTestCase):
         scale(["--nodes", "3,10", "--out", out], world(), measured)
         scale(["--nodes", "3,10,30", "--out", out], world(), measured)
         self.assertEqual(asked, [3, 10, 30])
-        scale(["--nodes", "3", "--out", out, "--seed", "2"], world(), measured)
-        self.assertEqual(asked, [3, 10, 30, 3])
-        self.assertEqual(list(json.loads(Path(out, "scale.json").read_text())["sizes"]), ["3"])
+        before = Path(out, "scale.json").read_text()
+        with self.assertRaisesRegex(BadSetting, "other settings.*'seed': 1"):
+            scale(["--nodes", "3", "--out", out, "--seed", "2"], world(), measured)
+        self.assertEqual(asked, [3, 10, 30])
+        self.assertEqual(Path(out, "scale.json").read_text(), before)
 
     def test_ended_run_keeps_what_it_has(self) -> None:
         """Each size is written as soon as it is measured; one in whose midst a person wants an end is let go of."""

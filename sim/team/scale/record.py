@@ -14,7 +14,7 @@ from sim.team.scale.survey import Sized, SurveySettings
 
 
 class Record:
-    """The sizes that were measured with ``settings``, in the file ``path``; those of other settings are let go of."""
+    """The sizes that were measured with ``settings``, in the file ``path``."""
 
     def __init__(self, path: Path, settings: SurveySettings) -> None:
         self._path = path
@@ -33,7 +33,7 @@ class Record:
             raise BadSetting("command line", "--out", problem, "name a folder in which you may write") from error
 
     def read(self) -> None:
-        """Take up what is there; raises ``BadSetting`` for a file that is none of ours."""
+        """Take up what is there; raises ``BadSetting`` for a file that is none of ours, or of other settings."""
         try:
             content = json.loads(self._path.read_text(encoding="utf-8"))
         except FileNotFoundError:
@@ -43,7 +43,7 @@ class Record:
         if not isinstance(content, dict) or not isinstance(content.get("sizes"), dict):
             raise self._wrong("it has no sizes")
         if content.get("digest") != self._settings.digest():
-            return
+            raise self._wrong(f"it was measured with other settings: {content.get('settings')}")
         try:
             self.sizes = {int(nodes): _sized(int(nodes), size) for nodes, size in content["sizes"].items()}
         except (TypeError, ValueError, KeyError) as error:
