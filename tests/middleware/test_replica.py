@@ -166,6 +166,15 @@ class ReplicaTests(SynchronousTestCase):
         self.clock.advance(0.1)
         self.assertEqual(self.heard, [("missing", [digest_of([held])])])
 
+    def test_missing_is_told_at_once_where_all_ran_out(self) -> None:
+        """An owner whose signs of life were lost until its lease ended hears so with the first that arrives."""
+        self.stored(record(lifetime="leased"))
+        self.clock.advance(60.0)
+        self.assertEqual(self.store.get(KEY), [])
+        self.replica.answer_alive(self.dog, 1.0, b"other")
+        self.clock.advance(0.1)
+        self.assertEqual(self.heard, [("missing", [])])
+
     def test_let_go(self) -> None:
         """The owner can take a lease away from here, nobody else can, and never a team record."""
         held, team = record(lifetime="leased"), record("t")

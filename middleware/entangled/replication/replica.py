@@ -188,13 +188,16 @@ class Replica:
         return [number, None if digest == digest_of(self.held(key)) else self.first_page(key)]
 
     def answer_alive(self, peer: Contact, lease: float, digest: bytes) -> None:
-        """ALIVE: extend the leases of ``peer``; where what is held differs from what it says twice, tell it."""
+        """ALIVE: extend the leases of ``peer``; where what is held differs from what it says twice, tell it.
+
+        Where nothing is held, they have run out here though the peer lives: it is told at once.
+        """
         self.on_peer(peer)
         held = self._leased(peer.public)
         self._store.extend(peer.public, self._clock.seconds() + min(float(lease), MAX_LEASE))
         if digest == digest_of(held):
             self._doubtful.discard(peer.node_id)
-        elif peer.node_id in self._doubtful:
+        elif peer.node_id in self._doubtful or not held:
             self._doubtful.discard(peer.node_id)
             self._endpoint.tell(peer, "missing", [digest_of([r]) for r in held[:MARKS]])
         else:
