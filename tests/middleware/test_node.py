@@ -308,7 +308,11 @@ class WatchTests(NodeCase):
         self.assertEqual(told, [])
 
     def test_rough_weather(self) -> None:
-        """With three of ten datagrams lost, each value arrives everywhere and the living stay in sight."""
+        """With three of ten datagrams lost, each value arrives everywhere and the living stay in sight.
+
+        Their leases are of 1 s and told three times in that, which one of them in some hundred does not outlive: it is
+        seen again within 2 s.
+        """
         for seed in range(3):
             fleet = self.fleet(4, seed, ROUGH)
             fleet.run(8.0)
@@ -322,7 +326,14 @@ class WatchTests(NodeCase):
                 self.assertEqual(sorted(told[-1], key=repr), sorted(everybody, key=repr), seed)
             fleet.nodes[1].vanish()
             fleet.run(8.0)
-            self.assertEqual({len(told[-1]) for place, told in enumerate(tellings) if place != 1}, {3}, seed)
+            others = [told for place, told in enumerate(tellings) if place != 1]
+            for told in others:
+                self.assertNotIn(fleet.nodes[1].identity.node_id[:2], told[-1], seed)
+            for _ in range(20):
+                if all(len(told[-1]) == 3 for told in others):
+                    break
+                fleet.run(0.1)
+            self.assertEqual({len(told[-1]) for told in others}, {3}, seed)
 
 
 class RpcTests(NodeCase):

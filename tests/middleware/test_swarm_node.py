@@ -60,7 +60,7 @@ class SwarmNodeTests(FleetCase):
     def test_replay(self) -> None:
         """The same seed gives the same datagrams at the same moments, and another seed others."""
         digests = []
-        for seed in (2, 2, 3):
+        for seed in (1, 1, 2):
             fleet = self.swarm(4, seed, ROUGH)
             fleet.nodes[1].watch_devices(lambda records: None, keep=True)
             self.submitted(fleet)

@@ -296,7 +296,8 @@ class Asker:
                 self._open(inquiry)
             self._set_timer(inquiry, LONGEST)
         elif inquiry.tries >= self._peers.tries:
-            if inquiry.is_patient or not is_silent or peer.opening is not None or not peer.round_trip.is_measured:
+            is_knocking = peer.opening is not None and not peer.opening.is_resting
+            if inquiry.is_patient or not is_silent or is_knocking or not peer.round_trip.is_measured:
                 self._set_timer(inquiry, left)
             else:
                 self._fail(inquiry, f"no answer to {inquiry.tries} tries")

@@ -14,7 +14,7 @@ MOST_AT_ONCE = 4
 """What a gap counts for at most: after a cut, or a frozen peer, one session tells of hundreds."""
 LEAST = 0.01
 """Less is none: the usual tries are there for that."""
-RARE = 3e-4
+RARE = 1e-4
 """The share of exchanges that may fail though both sides live."""
 MOST_TRIES = 12
 
