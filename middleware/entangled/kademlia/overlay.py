@@ -23,7 +23,6 @@ from middleware.entangled.kademlia.distance import closest
 from middleware.entangled.kademlia.lookup import Lookup
 from middleware.entangled.kademlia.roster import MAX_MEMBERS, Roster
 from middleware.entangled.kademlia.routing import STALE_AFTER, RoutingTable
-from middleware.entangled.wire.asker import PATIENCE
 from middleware.entangled.wire.congestion import RoundTrip
 from middleware.entangled.wire.endpoint import Endpoint
 
@@ -38,8 +37,9 @@ FRESH = 0.1
 FIRST_HEDGE, MOST_HEDGE = 0.01, 0.15
 """Seconds after which others are asked beside one that does not answer: while nobody was measured yet, and at most;
 else those within which nearly every answer comes."""
-LEAST_PATIENCE, TRIES = 0.4, 2.6
-"""Seconds, and usual waits, that a question of a lookup may take in a large network: two tries where little is lost."""
+LEAST_PATIENCE, MOST_PATIENCE, TRIES = 0.4, 2.5, 2.6
+"""Seconds, at least and at most, and usual waits that a question of a lookup may take in a large network: two tries
+where little is lost, as many as it takes where much is."""
 MAX_FOUND = 512
 """Keys whose closest nodes, as the last lookup found them, are remembered."""
 MAX_HEARD = 4096
@@ -305,7 +305,7 @@ class Overlay:
         if not self.is_large:
             return None
         peers = self._endpoint.peers
-        return min(PATIENCE, max(LEAST_PATIENCE, max(TRIES, peers.loss.tries) * peers.guess))
+        return min(MOST_PATIENCE, max(LEAST_PATIENCE, max(TRIES, peers.loss.tries) * peers.guess))
 
     def slow(self, contact: Contact) -> None:
         """``contact`` took longer than it should; until it is heard, others are asked first."""

@@ -31,7 +31,7 @@ from middleware.entangled.wire.message import (
     encoded,
 )
 from middleware.entangled.wire.method import ErrorCodes
-from middleware.entangled.wire.peer import MAX_TRIES, OPENING_S, Opening, Peer, Peers, cancel
+from middleware.entangled.wire.peer import OPENING_S, Opening, Peer, Peers, cancel
 from middleware.entangled.wire.session import MAX_PLAIN, Session
 
 PATIENCE = 1.5
@@ -264,7 +264,7 @@ class Asker:
         wait = self._peers.spacing(inquiry.peer.round_trip, inquiry.tries, within)
         if inquiry.is_patient and inquiry.tries > 1:
             # A method that takes its time: the later tries are there for an answer that got lost.
-            wait = max(wait, (inquiry.deadline - now) / max(1, MAX_TRIES + 1 - inquiry.tries))
+            wait = max(wait, (inquiry.deadline - now) / max(1, self._peers.tries + 1 - inquiry.tries))
         self._set_timer(inquiry, wait)
 
     def _due(self, inquiry: Inquiry) -> None:
