@@ -46,10 +46,10 @@ class TeamStage:
                 refusals.append(f"{device.name}: {error}")
         raise Refusal("nobody publishes the task: " + ("; ".join(refusals) or "no device is there"))
 
-    def cause(self, device: Device, fault: Fault) -> None:
+    def cause(self, device: Device, fault: Fault) -> float:
         """Ask the device."""
         try:
-            self._asker.call(device.address, CAUSE, fault.kind, fault.seconds, fault.amount or None)
+            return float(self._asker.call(device.address, CAUSE, fault.kind, fault.seconds, fault.amount or None))
         except Refusal as error:
             raise Refusal(f"{device.name}: {_plain(error)}") from error
 

@@ -26,8 +26,9 @@ from swarmnode.seams import Seams
 
 ASSIGN = "device.assign"
 """Method of a node that allows faults: publish a predefined task, so that a scenario can begin by itself."""
-AFTER_THE_ANSWER = 0.05
-"""Seconds from the answer to the fault: who is cut off, or dead, could not say that it took the order."""
+AFTER_THE_ANSWER, AFTER_ANSWERS = 0.05, 0.5
+"""Seconds from the answer to the fault: who is cut off, or dead, could not say that it took the order.  Who suffers
+from losses may have to say it several times."""
 
 
 class SkewedWall:
@@ -70,8 +71,9 @@ class Frailty:
                 raise Refused(str(error)) from error
             if fault.kind not in self.kinds():
                 raise Refused(f"kind: this device cannot suffer {fault.kind}; choose one of {', '.join(self.kinds())}")
-            node.later(AFTER_THE_ANSWER, self._suffer, node, fault)
-            return fault.seconds
+            wait = AFTER_ANSWERS if "loss" in self._active else AFTER_THE_ANSWER
+            node.later(wait, self._suffer, node, fault)
+            return wait
 
         def asked(peer: Contact) -> dict[str, Any]:
             now = self._raw.clock.seconds()

@@ -42,8 +42,8 @@ class Stage(Protocol):
     def assign(self, task: str) -> str:
         """Publish a task of the catalogue; returns its id."""
 
-    def cause(self, device: Device, fault: Fault) -> None:
-        """Let the device suffer the fault; returns when it has taken it."""
+    def cause(self, device: Device, fault: Fault) -> float:
+        """Let the device suffer the fault, and return when it has agreed: the seconds until it begins."""
 
     def is_over(self, task_id: str) -> bool:
         """Whether the task has ended."""
@@ -96,8 +96,7 @@ def play(scenario: Scenario, seed: int, stage: Stage, say: Callable[[str], None]
             _look(stage, losses, say)
         device = _device(stage, step.device, dice, losses, say)
         task = acting(stage.devices()).get(device.uuid, "")
-        stage.cause(device, step.fault)
-        now = stage.seconds()
+        now = stage.cause(device, step.fault) + stage.seconds()
         lasts = "" if step.fault.kind == "kill" else f" for {step.fault.seconds:g} s"
         say(f"{device.name}: {step.fault.kind}{lasts}")
         losses.append(Loss(device.name, step.fault, Takeover(device.uuid, task, now, now + step.fault.seconds)))

@@ -42,9 +42,9 @@ class RehearsedStage:
         """Let the laptop publish it."""
         return str(self._called(self._node.presence.device, ASSIGN, task))
 
-    def cause(self, device: Device, fault: Fault) -> None:
+    def cause(self, device: Device, fault: Fault) -> float:
         """Let the laptop ask for it."""
-        self._called(device, CAUSE, fault.kind, fault.seconds, fault.amount or None)
+        return float(self._called(device, CAUSE, fault.kind, fault.seconds, fault.amount or None))
 
     def is_over(self, task_id: str) -> bool:
         """Whether its outcome is recorded."""

@@ -32,7 +32,7 @@ BITING = {
 """A seed that shows each bug, and an invariant that it breaks."""
 
 BITING_ELSEWHERE = {
-    "one promise is a majority": (1, "T1"),
+    "one promise is a majority": (34, "T1"),
     "a take is not noted": (1, "T3"),
     "who waits is not woken": (1, "T6"),
     "questions are not remembered": (2, "R2"),
