@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import gc
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from twisted.internet.defer import CancelledError, Deferred
@@ -97,6 +98,26 @@ class TupleSpaceTests(SpaceCase):
         for space in (a, a, b):
             self.done(fleet, space.put(("same",)), 1.0)
         self.assertEqual(self.done(fleet, b.get_many(("same",), 5)), [("same",)] * 3)
+
+    def test_stopped_while_several_are_confirmed(self) -> None:
+        """A space that is stopped before the council has said who has them fails the call, and nothing goes unsaid."""
+        fleet, (a, b, _) = self.spaces(3)
+        for _ in range(3):
+            self.done(fleet, a.put(("same",)), 1.0)
+        decide = b._taker.decide
+
+        async def cut_off(claims: Sequence[Claim]) -> list[bool]:
+            fleet.board.weather = Weather(loss=1.0)
+            return await decide(claims)
+
+        self.patch(b._taker, "decide", cut_off)
+        taking = b.get_many(("same",), 3)
+        fleet.run(0.2)  # the question whether they are confirmed is on its way
+        b.stop()
+        fleet.run(30.0)
+        self.failureResultOf(taking, NotRunning)
+        gc.collect()
+        self.assertEqual(self.flushLoggedErrors(), [])
 
     def test_back_to_back(self) -> None:
         """Thirty tuples put at once by random nodes are all found at once."""
