@@ -9,7 +9,7 @@ from contextlib import suppress
 from typing import Any, Protocol
 
 from twisted.internet import defer
-from twisted.internet.defer import Deferred, DeferredList
+from twisted.internet.defer import Deferred, FirstError, gatherResults
 from twisted.internet.interfaces import IReactorTime
 
 from middleware.entangled.background import Background, first
@@ -184,11 +184,10 @@ class Taker:
         outcomes = await self._council.confirm([claim.posted for claim in claims], ballot, ballot.taker)
         pairs = zip(claims, outcomes, strict=True)
         works = [Deferred.fromCoroutine(self._settled(claim, outcome, wait)) for claim, outcome in pairs]
-        settled = await DeferredList(works, consumeErrors=True)
-        for is_settled, failure in settled:
-            if not is_settled:  # the node stops
-                failure.raiseException()
-        return [is_ours for _, is_ours in settled]
+        try:
+            return await gatherResults(works, consumeErrors=True)
+        except FirstError as error:  # the node stops
+            error.subFailure.raiseException()
 
     async def _settled(self, claim: Claim, outcome: Outcome, wait: Waits | None) -> bool:
         taker, place = claim.ballot.taker, claim.posted.place
