@@ -104,6 +104,7 @@ class EntangledNode:
         )
         self.replica.is_sure = self._handover.is_sure
         self.replica.nearest = self.overlay.nearest
+        self.replica.belongs = lambda key: self.overlay.belongs(key, self.overlay.me())
         self._made_of = (clock, rng)
         self.endpoint.expose("decree.enrol", self._answer_enrol)
         self.overlay.on_newcomer = self._welcome

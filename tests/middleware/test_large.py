@@ -19,6 +19,7 @@ from middleware.entangled.kademlia.sounding import NEAR_SILENCE, SESSION_S
 from middleware.entangled.network.network import Address
 from middleware.entangled.network.switchboard import CALM, SwitchboardNetwork, Weather
 from middleware.entangled.node import EntangledNode
+from middleware.entangled.record import Record, hashed_key
 from middleware.entangled.wire.asker import SILENCE_S
 from middleware.entangled.wire.congestion import FIRST_GUESS
 from middleware.entangled.wire.peer import IN_TOUCH, OPENING_S
@@ -86,6 +87,36 @@ class LargeTests(FleetCase):
         for other in fleet.nodes[1:]:
             other.endpoint.let_go(SESSION_S)
         self.assertEqual(self.found(fleet, node, target), closest(others, target, K))
+
+    def far_from(self, fleet: Fleet, key: bytes) -> tuple[EntangledNode, EntangledNode]:
+        """Who is the farthest from a key, of whose holders it knows none, and whom it asks first."""
+        order = closest([node.contact for node in fleet.nodes], key, len(fleet.nodes))
+        reader, first = (fleet.nodes[contact.address.port - 7000] for contact in (order[-1], order[K]))
+        for contact in order[:K]:
+            reader.overlay.table.remove(contact)
+            reader.overlay.roster.left(contact.node_id)
+        self.assertEqual(reader.overlay.nearest(key)[0], first.contact)
+        return reader, first
+
+    def test_a_fast_read_goes_past_who_wrote(self) -> None:
+        """What all have written under one key is read whole, though who is asked first still has its own record."""
+        fleet = self.large()
+        key = hashed_key("all write here")
+        for node in fleet.nodes:
+            self.done(fleet, node.put(key, "x", b"here", "leased", lease=30.0))
+        reader, first = self.far_from(fleet, key)
+        own = Record(key, "x", first.identity.public, 1, "leased", 30.0, b"here").signed(first.identity)
+        first.replica.keep(own)  # from when it was one of the closest
+        self.assertEqual(len(self.done(fleet, reader.get(key, "fast"))), len(fleet.nodes))
+
+    def test_a_fast_read_takes_what_is_left(self) -> None:
+        """What only a node has that is not among the closest any more is read all the same: nobody knows better."""
+        fleet = self.large()
+        key = hashed_key("left behind")
+        reader, first = self.far_from(fleet, key)
+        record = Record(key, "x", first.identity.public, 1, "team", 60.0, b"old").signed(first.identity)
+        first.replica.keep(record)
+        self.assertEqual(self.done(fleet, reader.get(key, "fast")), [record])
 
     def test_many_lookups_that_meet_the_same_strangers(self) -> None:
         """Where one handshake has to do for many questions at the same moment, all lookups are exact all the same."""

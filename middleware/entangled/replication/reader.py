@@ -230,7 +230,9 @@ class Reader:
     async def _walk(self, key: bytes) -> list[Record]:
         """FIND_VALUE in a large network: ask nearer and nearer nodes until one has it (Kademlia, section 2.3).
 
-        The nearest node that did not have it gets a copy, which lives the shorter the more nodes are nearer.
+        One that is not among the closest, or has yet to catch up, may have only some: its word counts where no better
+        one is found.  The nearest node that did not have it gets a copy, which lives the shorter the more nodes are
+        nearer.
         """
         lookup = Lookup(key, K, ALPHA, self._overlay.nearest(key), exclude=self._overlay.own_id)
         found: list[Record] = []
@@ -238,7 +240,7 @@ class Reader:
 
         async def visit(contact: Contact) -> None:
             answer = await self.pages(contact, key, wants_sure=False)
-            if _is_something(answer.records):
+            if _is_something(answer.records) and answer.worth in (SURE, CACHED):
                 found[:] = found or answer.records
             else:
                 answers[contact.node_id] = answer
@@ -249,7 +251,8 @@ class Reader:
         if not found:
             voters = frozenset(contact.node_id for contact in nearest)
             self._overlay.note_found(key, nearest)
-            return self._nothing(answers, voters)
+            some = list(newest_of(answer.records for answer in answers.values()).values())
+            return some if _is_something(some) else self._nothing(answers, voters)
         without = [contact for contact in nearest if contact.node_id in answers]
         if without and all(record.lifetime == "team" for record in found):
             between = nearest.index(without[0])

@@ -49,7 +49,8 @@ class Replica:
     """The records of others, held for them; ``keepsakes`` are the node's own copies, which nobody else gets to see.
 
     ``may_store`` says whether the owner of a slot may write there, by its role, ``is_sure`` whether this node has
-    caught up with the others, ``nearest`` whom it knows close to a key.
+    caught up with the others, ``nearest`` whom it knows close to a key, ``belongs`` whether it is one of the closest
+    itself.
 
     ``on_record`` is told of every record that was accepted, ``on_gone`` of every one that is let go of, ``on_silent``
     of every owner (its public key) whose lease ran out or that said goodbye, ``on_peer`` of every peer that stores,
@@ -67,6 +68,7 @@ class Replica:
         self.may_store: Callable[[Slot], bool] = lambda slot: True
         self.is_sure: Callable[[], bool] = lambda: True
         self.nearest: Callable[[bytes], list[Contact]] = lambda key: []
+        self.belongs: Callable[[bytes], bool] = lambda key: True
         self._doubtful: set[bytes] = set()
         self._swept_at = self._sweep_at = -1.0
         self._no_sweep: Callable[[], None] = lambda: None
@@ -157,18 +159,22 @@ class Replica:
         """FIND_VALUE: a page of the records under ``key``, where the next page begins (None: that was all), its worth.
 
         Where nothing is held, the contacts that are closest to the key follow, and a copy from the path may be given
-        unless ``wants_sure``.  Where ``digest`` is that of all that is held, None stands for the records.
+        unless ``wants_sure``.  Whose way leads past a node that is not one of the closest gets these contacts too: what
+        is held there, such as the node's own record, may be all that was not let go of.  Where ``digest`` is that of
+        all that is held, None stands for the records.
         """
         if digest and digest == digest_of(self.held(_checked_key(key))):
             return [None, None, self._worth()]
         page, following = self._page(_checked_key(key), after)
-        if not page and after is None:
-            cached = None if wants_sure else self.cache.get(key, self._clock.seconds())
-            if cached:
-                return [[record.packed() for record in cached], None, CACHED]
-            near = [contact.packed() for contact in self.nearest(key) if contact.node_id != peer.node_id]
-            return [[], None, self._worth(), near]
-        return [page, following, self._worth()]
+        is_nothing = not page and after is None
+        cached = self.cache.get(key, self._clock.seconds()) if is_nothing and not wants_sure else None
+        if cached:
+            return [[record.packed() for record in cached], None, CACHED]
+        is_aside = not is_nothing and not wants_sure and not self.belongs(key)
+        if not (is_nothing or is_aside):
+            return [page, following, self._worth()]
+        near = [contact.packed() for contact in self.nearest(key) if contact.node_id != peer.node_id]
+        return [page, following, UNSURE if is_aside else self._worth(), near]
 
     def answer_cache(self, peer: Contact, key: bytes, packed: list[object], ttl: float) -> None:
         """CACHE: keep a copy of what a lookup found, for those whose way leads past here (Kademlia, section 2.3)."""
