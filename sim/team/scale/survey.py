@@ -1,7 +1,8 @@
-"""Survey: everything that is measured of a team of one size, one thing after the other, in one team.
+"""Survey: everything that is measured of a team of one size, one thing after the other.
 
-To let a large team come together costs more than to measure it, so lookups, auctions and takeovers share one of bare
-nodes.  The directory has a second one of whole nodes, for bare ones have no devices.
+Nodes wait for an answer as long as answers took before, so a team stays on the links on which it came together: one of
+bare nodes has an internet, for its cost and its lookups, and one the quick links that auctions and takeovers are held
+to.  The directory has a third one of whole nodes, for bare ones have no devices.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from dataclasses import dataclass, field, replace
 from sim.team.figure import Figure
 from sim.team.link import LinkSettings
 from sim.team.load.auctions import Auctions, AuctionSettings
+from sim.team.load.deputies import deputies_of
 from sim.team.load.directory import Directory, DirectorySettings
 from sim.team.load.lookups import Lookups, LookupSettings
 from sim.team.load.takeovers import Takeovers, TakeoverSettings
@@ -28,7 +30,7 @@ SLICE = 0.25
 """Seconds of the team's time between two looks at whether a person wants an end."""
 AWAY = 5.0
 """Seconds for which those that die while they act are gone."""
-VERSION = 1
+VERSION = 2
 """Another one when what is measured means something else."""
 
 
@@ -103,7 +105,7 @@ class Survey:
     def run(self) -> Sized:
         """Measure everything; raises ``Ended``."""
         began, sized = time.process_time(), self._sized
-        hashes = [self._bare()]
+        hashes = [self._far(), self._near()]
         if self._nodes <= self._settings.swarm_most:
             hashes.append(self._whole())
         sized.hash = hashlib.blake2s("".join(hashes).encode(), digest_size=16).hexdigest()
@@ -112,33 +114,40 @@ class Survey:
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
-    def _bare(self) -> str:
-        """Cost, lookups, auctions and takeovers, by nodes of the library with the rooms for bids beside them."""
+    def _far(self) -> str:
+        """Cost and lookups, by nodes of the library on an internet."""
+        team = Team(self._scenario, self._settings.seed)
+        cost = Traffic(team, TrafficSettings())
+        deputies_of(team)  # the rooms for bids cost memory too
+        asking = Lookups(team, LookupSettings(rate=self._settings.rate, exact=self._settings.exact))
+        self._say("nodes come together")
+        self._stand(team)
+        self._say("nodes in quiet")
+        self._play(team, cost, self._settings.quiet)
+        self._sized.figures += cost.figures()
+        self._say("nodes look for each other")
+        self._play(team, asking, self._settings.lookups)
+        self._finish(team, asking)
+        return team.digest()  # and no goodbyes, which would take longer than all the lookups
+
+    def _near(self) -> str:
+        """Auctions and takeovers, by nodes of the library with the rooms for bids beside them."""
         nodes, settings = self._nodes, self._settings
         team = Team(self._scenario, settings.seed)
-        cost = Traffic(team, TrafficSettings())
-        asking = Lookups(team, LookupSettings(rate=settings.rate, exact=settings.exact))
+        team.board.link = Floor(settings.loss)
         bidding = Auctions(team, AuctionSettings(count=settings.auctions, every=4.0))
         # No more are away at once than a small team can do without.
         rate = min(5.0, max(0.12, nodes / 200))
         dying = Takeovers(team, TakeoverSettings(count=settings.takeovers, rate=rate, away=AWAY))
-        self._say("nodes come together")
+        self._say("nodes come together for a task")
         self._stand(team)
-        self._say("nodes in quiet")
-        self._play(team, cost, settings.quiet)
-        self._sized.figures += cost.figures()
-        self._say("nodes look for each other")
-        self._play(team, asking, settings.lookups)
-        self._finish(team, asking)
         self._say("nodes bid")
-        team.board.link = Floor(settings.loss)
-        self._pass(team, 10.0)  # they measure each other's round trips anew
         self._play(team, bidding, 4.0 * settings.auctions + STEP)
         self._finish(team, bidding)
         self._say(f"nodes, and {settings.takeovers} of them die while they act")
         self._play(team, dying, settings.takeovers / rate + 15.0)
         self._finish(team, dying)
-        return team.digest()  # and no goodbyes, which would take longer than all the lookups
+        return team.digest()
 
     def _whole(self) -> str:
         """The directory, by the nodes of devices."""
