@@ -7,6 +7,7 @@ import random
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.network.switchboard import Weather
+from middleware.entangled.wire.congestion import RoundTrip
 from middleware.entangled.wire.loss import MOST_AT_ONCE, MOST_TRIES, RARE, Loss
 from middleware.entangled.wire.peer import MAX_TRIES
 from tests.middleware.test_endpoint import DELAY, EndpointCase
@@ -106,3 +107,14 @@ class RoughWeatherTests(EndpointCase):
         self.a.peers.loss.share = 0.5
         peer = self.a.peers.peer(self.to_b)
         self.assertGreaterEqual(self.a.peers.spacing(peer.round_trip, 1, 1.0), 0.39)
+
+    def test_few_tries_are_in_vain(self) -> None:
+        """Where round trips differ, no more than one answer in eight is overtaken by the next try."""
+        dice, path = random.Random(1), RoundTrip()
+        took = [0.04 + dice.expovariate(100.0) + dice.expovariate(100.0) for _ in range(400)]
+        self.a.peers.loss.share = 0.5
+        late = 0
+        for seconds in took:
+            late += path.is_measured and seconds > self.a.peers.spacing(path, 1, 0.4)
+            path.measured(seconds)
+        self.assertTrue(0 < late < 50, late)

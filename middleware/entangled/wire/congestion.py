@@ -51,6 +51,11 @@ class RoundTrip:
         return self._smoothed if self.is_measured else None
 
     @property
+    def likely(self) -> float | None:
+        """Within how many seconds most answers come, or None where nothing was measured yet."""
+        return self._smoothed + max(LATE, 2 * self._deviation) if self.is_measured else None
+
+    @property
     def usual(self) -> float:
         """Within how many seconds nearly every answer comes; the first wait where nothing was measured yet."""
         if not self.is_measured:

@@ -247,11 +247,11 @@ class Peers:
         """Seconds between a try, the ``tries``-th, and the next one of what should succeed ``within`` some seconds.
 
         Each waits longer than the one before, up to the usual number.  Where much gets lost, they are as close to each
-        other as they must be to have as many as it takes; but none comes before an answer usually would.
+        other as they must be to have as many as it takes; but none comes before most answers would.
         """
         wait = round_trip.wait * BACK_OFF ** (min(tries, MAX_TRIES) - 1)
-        mean = round_trip.mean if round_trip.is_measured else self.usual.mean
-        return wait if mean is None else min(wait, max(mean, within / self.loss.tries))
+        likely = round_trip.likely if round_trip.is_measured else self.usual.likely
+        return wait if likely is None else min(wait, max(likely, within / self.loss.tries))
 
     def usable(self, peer: Peer) -> Session | None:
         """The session to send on; an old or worn one calls for its successor.
