@@ -11,6 +11,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import FrameType
 
+from twisted.logger import globalLogBeginner
+
 from middleware.errors import SwarmError
 from sim.team.command import World, run
 from sim.team.scale.command import scale
@@ -61,6 +63,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         is_stopped=lambda: ending.is_wished,
         grown=_spare_the_collector,
     )
+    # Until somebody listens Twisted keeps what is logged, and so each life of each node that logged it.
+    globalLogBeginner.beginLoggingTo([], discardBuffer=True, redirectStandardIO=False)
     _spare_the_collector()
     try:
         return VERBS[verb][0](words[1:], world)
