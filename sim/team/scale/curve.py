@@ -43,7 +43,7 @@ CURVES = (
     Curve("lookups.hops.mean", "Hops of a lookup", "hops", theory.hops, "log2(n) / 2, the most that is wanted", True),
     Curve(
         "lookups.reached.p50",
-        "Until the node that is looked for answers, half of them, 156 ms there and back",
+        "Until who is looked for answers, half of them; 156 ms there and back",
         "s",
         bound=Bound(0.45),
         published=(
@@ -98,7 +98,7 @@ CURVES = (
     ),
     Curve(
         "takeovers.seconds.p50",
-        "Takeover after the death of who acts, half of them, lease of 1.5 s, 10 % loss",
+        "Takeover after who acts died, half of them; lease 1.5 s, 10 % loss",
         "s",
         theory.takeover,
         "the lease alone, simulated",

@@ -15,6 +15,8 @@ WIDE, HIGH = 380, 250
 LEFT, TOP, RIGHT, BOTTOM = 52, 44, 16, 46
 COLUMNS = 3
 OURS, THEORY, OTHERS, BOUND = "#2563a8", "#6b7280", "#c2410c", "#15803d"
+EDGE = 12
+"""What the last number of the rightmost fields needs beyond them."""
 SMALLEST, LARGEST = 3, 10_000
 WIDEST_LINEAR = 8.0
 """Where the largest value is no more times the least one, the upward axis counts and does not multiply."""
@@ -42,7 +44,7 @@ def drawn(curves: Sequence[Curve], points: Mapping[str, Points], note: str) -> s
     parts.append(f'<text x="8" y="{high - 8}" fill="#444">{escape(note)}</text>')
     body = "\n".join(parts)
     return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" width="{WIDE * COLUMNS}" height="{high}"'
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{WIDE * COLUMNS + EDGE}" height="{high}"'
         f' font-family="sans-serif" font-size="11">\n<rect width="100%" height="100%" fill="white"/>\n{body}\n</svg>\n'
     )
 
