@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from difflib import get_close_matches
 from pathlib import Path
 from typing import TextIO
 
@@ -17,7 +18,7 @@ from sim.team.progress import Progress
 from sim.team.report import Cost, again, packed, text
 from sim.team.run import Run
 from sim.team.samples import Samples
-from sim.team.scenario import Scenario, loaded, names
+from sim.team.scenario import Scenario, loaded, names, place_of
 from sim.team.standing import STANDING
 from sim.team.trace import Trace
 from sim.team.workload import Kinds
@@ -49,28 +50,28 @@ def run(arguments: Sequence[str], world: World, kinds: Kinds = KINDS) -> int:
     wanted = _parsed(arguments)
     changes = {} if wanted.nodes is None else {"nodes": wanted.nodes}
     scenario = loaded(wanted.scenario, {name: kind.settings for name, kind in kinds.items()}, changes)
-    check_targets(scenario, kinds, wanted.scenario)
     check(scenario, world.read)
     line = again(wanted.scenario, wanted.seed, wanted.nodes)
+    began, cpu = world.wall(), world.cpu()
+    memory = lambda: resident(world.read)  # noqa: E731
+    progress, samples = Progress(world.err, world.columns, world.wall, memory), Samples()
+
+    def looked(run: Run) -> bool:
+        samples.looked(run)
+        return False
+
+    def watched(run: Run) -> bool:
+        progress.looked(run)
+        return world.is_stopped()
+
+    going = Run(scenario, wanted.seed, kinds, looked, world.grown, watched, world.wall)
+    check_targets(scenario, [figure.name for figure in going.figures()], wanted.scenario)
+    faults: list[tuple[float, str]] = []
     with ExitStack() as files:
         # Opened first: who waited for an hour wants no word about a folder that is not there.
         json_out = _opened(wanted.json, "--json", files)
         trace_out = _opened(wanted.trace, "--trace", files)
         picture_out = _opened(wanted.picture, "--picture", files)
-        began, cpu = world.wall(), world.cpu()
-        memory = lambda: resident(world.read)  # noqa: E731
-        progress, samples = Progress(world.err, world.columns, world.wall, memory), Samples()
-
-        def looked(run: Run) -> bool:
-            samples.looked(run)
-            return False
-
-        def watched(run: Run) -> bool:
-            progress.looked(run)
-            return world.is_stopped()
-
-        going = Run(scenario, wanted.seed, kinds, looked, world.grown, watched, world.wall)
-        faults: list[tuple[float, str]] = []
         going.team.told.append(lambda now, what, _, more: faults.append((now, more)) if what == "fault" else None)
         trace = None if trace_out is None else Trace(trace_out)
         if trace is not None:
@@ -92,15 +93,13 @@ def run(arguments: Sequence[str], world: World, kinds: Kinds = KINDS) -> int:
     return MISSED if outcome.missed or outcome.violations else 0
 
 
-def check_targets(scenario: Scenario, kinds: Kinds, origin: str) -> None:
-    """Raise ``BadSetting`` for a target that no figure of the scenario's workloads can be held to."""
-    sorts = [kinds[name] for name, _ in scenario.loads]
-    known = [figure for sort in sorts for figure in sort.figures]
-    if all(sort.figures for sort in sorts):
-        for name, _ in scenario.targets:
-            if name not in known:
-                remedy = f"there are {', '.join(known)}" if known else "write a [load.NAME] that measures it"
-                raise BadSetting(origin, f"[targets] {name}", "is no figure of these workloads", remedy)
+def check_targets(scenario: Scenario, known: Sequence[str], origin: str) -> None:
+    """Raise ``BadSetting`` for a target that is none of the ``known`` figures."""
+    for name, _ in scenario.targets:
+        if name not in known:
+            near = get_close_matches(name, known, n=1)
+            remedy = f"the nearest is {near[0]}" if near else f"there are {', '.join(known)}"
+            raise BadSetting(place_of(origin, "targets", name), f"[targets] {name}", "is no figure", remedy)
 
 
 def _parsed(arguments: Sequence[str]) -> argparse.Namespace:

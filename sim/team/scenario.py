@@ -180,7 +180,7 @@ def loaded(name: str, settings: Settings, changes: Mapping[str, object] = {}) ->
 
     ``settings`` has the sorts of workloads.  Raises ``BadSetting``.
     """
-    path = Path(name) if name.endswith(".toml") else FOLDER / f"{name}.toml"
+    path = _path(name)
     if not name.endswith(".toml") and not path.exists():
         near = get_close_matches(name, names(), n=1)
         remedy = f"there are {', '.join(names())}{f'; the nearest is {near[0]}' if near else ''}"
@@ -193,6 +193,13 @@ def loaded(name: str, settings: Settings, changes: Mapping[str, object] = {}) ->
     except UnicodeDecodeError as error:
         raise BadSetting(str(path), "", "is no text in UTF-8", "write it anew") from error
     return scenario_of(text, str(path), path.stem, settings, changes)
+
+
+def place_of(name: str, where: str, key: str) -> str:
+    """The file and line of a key of the table ``where`` in a scenario that was ``loaded`` by that name."""
+    path = _path(name)
+    line = dict(_places(path.read_text(encoding="utf-8"))).get((where, key))
+    return f"{path}:{line}" if line else str(path)
 
 
 def scenario_of(
@@ -211,6 +218,10 @@ def scenario_of(
     scenario = reader.scenario(content, name, settings, changes)
     reader.check(scenario)
     return scenario
+
+
+def _path(name: str) -> Path:
+    return Path(name) if name.endswith(".toml") else FOLDER / f"{name}.toml"
 
 
 class _Reader:

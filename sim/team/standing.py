@@ -44,4 +44,4 @@ class Standing:
         ]
 
 
-STANDING = Kind(StandingSettings, Standing, ("nodes", "nodes inside", "sent per node"))
+STANDING = Kind(StandingSettings, Standing)

@@ -23,19 +23,22 @@ class Workload(Protocol):
         """Every violation so far, a line each."""
 
     def figures(self) -> list[Figure]:
-        """What was measured so far; asked now and then while it runs, and at the end."""
+        """What was measured so far; asked now and then while it runs, and at the end.
+
+        The names are there from the beginning, so that targets can be checked, with None as long as nothing was
+        measured.
+        """
 
 
 @dataclass(frozen=True)
 class Kind:
     """A sort of workload: ``settings`` is a frozen dataclass whose fields have rules (``middleware.setting``).
 
-    ``make(team, settings)`` makes one.  ``figures`` names those that it gives, for targets.
+    ``make(team, settings)`` makes one.
     """
 
     settings: type[Any]
     make: Callable[[Team, Any], Workload]
-    figures: tuple[str, ...] = ()
 
 
 Kinds = Mapping[str, Kind]

@@ -247,10 +247,11 @@ class Peers:
         """Seconds between a try, the ``tries``-th, and the next one of what should succeed ``within`` some seconds.
 
         Each waits longer than the one before, up to the usual number.  Where much gets lost, they are as close to each
-        other as they must be to have as many as it takes; but none comes before most answers would.
+        other as they must be to have as many as it takes; but none comes before most answers would.  Of strangers, who
+        may be near or far, nothing is known but how long anybody takes.
         """
         wait = round_trip.wait * BACK_OFF ** (min(tries, MAX_TRIES) - 1)
-        likely = round_trip.likely if round_trip.is_measured else self.usual.likely
+        likely = round_trip.likely if round_trip.is_measured else self.usual.mean
         return wait if likely is None else min(wait, max(likely, within / self.loss.tries))
 
     def usable(self, peer: Peer) -> Session | None:

@@ -118,8 +118,9 @@ class Lookups:
             *spread("lookups.seconds", self.seconds, "s", (0.5, 0.95, 0.99)),
             *spread("lookups.reached", self.reached, "s", (0.5, 0.95)),
         ]
-        compared = self.exact + self.inexact
-        return [*figures, share("lookups.exact", self.exact, compared)] if compared else figures
+        if self._settings.exact:
+            figures.append(share("lookups.exact", self.exact, self.exact + self.inexact))
+        return figures
 
     # -- inside -----------------------------------------------------------------------------------------------------
 

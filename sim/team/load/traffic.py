@@ -16,6 +16,17 @@ from sim.team.figure import Figure, mean, percentile
 from sim.team.team import Team
 
 PAGE = resource.getpagesize()
+UNITS = {
+    "traffic.datagrams": "a node and s",
+    "traffic.bytes": "B a node and s",
+    "traffic.busiest": "B/s",
+    "traffic.contacts": "contacts",
+    "traffic.contacts.max": "contacts",
+    "traffic.cpu": "ms a node and s",
+    "traffic.real_time": "x",
+    "traffic.memory": "KiB a node",
+}
+"""The figures."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +80,7 @@ class Traffic:
     def figures(self) -> list[Figure]:
         """Of a node and a second of its life; its contacts; and what it costs here."""
         if self._began is None or not self._node_seconds:
-            return []
+            return [Figure(name, None, unit) for name, unit in UNITS.items()]
         spent = time.process_time() - self._cpu
         elapsed = self._last_at - self._began
         sent, volume, busiest = 0, 0, 0
@@ -79,15 +90,18 @@ class Traffic:
         known = [float(len(self._team.entangled(place).overlay.contacts())) for place in self._sampled()]
         n = len(self._team.nodes)
         memory = (resident_bytes() - self._bare_bytes) / 1024 / max(1, n)
+        values = [
+            (sent / self._node_seconds, n),
+            (volume / self._node_seconds, n),
+            (busiest / elapsed, n),
+            (mean(known), len(known)),
+            (percentile(known, 1.0), len(known)),
+        ]
+        of_machine = [(1000 * spent / self._node_seconds, n), (elapsed / spent if spent else None, n), (memory, n)]
+        rows = zip(UNITS.items(), values + of_machine, strict=True)
         return [
-            Figure("traffic.datagrams", sent / self._node_seconds, "a node and s", n=n),
-            Figure("traffic.bytes", volume / self._node_seconds, "B a node and s", n=n),
-            Figure("traffic.busiest", busiest / elapsed, "B/s", n=n),
-            Figure("traffic.contacts", mean(known), "contacts", n=len(known)),
-            Figure("traffic.contacts.max", percentile(known, 1.0), "contacts", n=len(known)),
-            Figure("traffic.cpu", 1000 * spent / self._node_seconds, "ms a node and s", n=n, is_exact=False),
-            Figure("traffic.real_time", elapsed / spent if spent else None, "x", n=n, is_exact=False),
-            Figure("traffic.memory", memory, "KiB a node", n=n, is_exact=False),
+            Figure(name, value, unit, n=trials, is_exact=number < len(values))
+            for number, ((name, unit), (value, trials)) in enumerate(rows)
         ]
 
     # -- inside -----------------------------------------------------------------------------------------------------

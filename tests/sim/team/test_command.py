@@ -87,10 +87,15 @@ class CommandTests(SynchronousTestCase):
         self.assertIn("MISSED    nodes: >= 5", self.out.getvalue())
 
     def test_target_without_figure_is_refused(self) -> None:
-        """A target that no workload of the scenario measures is refused before the first step."""
-        error = self.assertRaises(BadSetting, self.run_it, text=SCENARIO + '[targets]\n"hops" = "<= 5"\n')
-        self.assertIn("nodes inside", error.remedy)
-        self.assertEqual(error.file, str(self.path))
+        """A target that no workload of the scenario measures is refused by its line, before the first step."""
+        text = SCENARIO + "[load.lookups]\n[load.traffic]\n[targets]\n"
+        kept = self.folder / "kept.json"
+        kept.write_text("{}")
+        for target, remedy in (("hops", "there are .*nodes inside"), ("lookups.sucess", "the nearest is lookups.succ")):
+            error = self.assertRaises(BadSetting, self.run_it, "--json", str(kept), text=f'{text}"{target}" = "<= 5"\n')
+            self.assertRegex(error.remedy, remedy)
+            self.assertEqual(error.file, f"{self.path}:{len(text.splitlines()) + 1}")
+        self.assertEqual(kept.read_text(), "{}")
 
     def test_ending_leaves_a_valid_partial_report(self) -> None:
         """Who ends a run gets a report, as text, JSON, trace and picture, that says that it is partial."""
