@@ -6,7 +6,6 @@ import argparse
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from difflib import get_close_matches
 from pathlib import Path
 from typing import TextIO
 
@@ -18,7 +17,7 @@ from sim.team.progress import Progress
 from sim.team.report import Cost, again, packed, text
 from sim.team.run import Run
 from sim.team.samples import Samples
-from sim.team.scenario import Scenario, loaded, names, place_of
+from sim.team.scenario import Scenario, loaded, names, place_of, remedy_of
 from sim.team.standing import STANDING
 from sim.team.trace import Trace
 from sim.team.workload import Kinds
@@ -97,9 +96,8 @@ def check_targets(scenario: Scenario, known: Sequence[str], origin: str) -> None
     """Raise ``BadSetting`` for a target that is none of the ``known`` figures."""
     for name, _ in scenario.targets:
         if name not in known:
-            near = get_close_matches(name, known, n=1)
-            remedy = f"the nearest is {near[0]}" if near else f"there are {', '.join(known)}"
-            raise BadSetting(place_of(origin, "targets", name), f"[targets] {name}", "is no figure", remedy)
+            place = place_of(origin, "targets", name)
+            raise BadSetting(place, f"[targets] {name}", "is no figure", remedy_of(name, known))
 
 
 def _parsed(arguments: Sequence[str]) -> argparse.Namespace:

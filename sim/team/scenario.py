@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from difflib import get_close_matches
 from pathlib import Path
@@ -202,6 +202,12 @@ def place_of(name: str, where: str, key: str) -> str:
     return f"{path}:{line}" if line else str(path)
 
 
+def remedy_of(word: str, known: Sequence[str]) -> str:
+    """What to write instead of a word that is none of those that are ``known``."""
+    near = get_close_matches(word, known, n=1)
+    return f"the nearest is {near[0]}" if near else f"there are {', '.join(known)}"
+
+
 def scenario_of(
     text: str,
     origin: str,
@@ -309,9 +315,7 @@ class _Reader:
     def _known(self, content: Mapping[str, object], where: str, known: list[str]) -> None:
         for key in content:
             if key not in known:
-                near = get_close_matches(key, known, n=1)
-                remedy = f"the nearest is {near[0]}" if near else f"there are {', '.join(known)}"
-                raise self.bad(where, key, "is no such key", remedy)
+                raise self.bad(where, key, "is no such key", remedy_of(key, known))
 
     def _loads(self, content: object, settings: Settings) -> Iterator[tuple[str, Any]]:
         if not isinstance(content, dict):

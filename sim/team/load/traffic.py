@@ -16,17 +16,6 @@ from sim.team.figure import Figure, mean, percentile
 from sim.team.team import Team
 
 PAGE = resource.getpagesize()
-UNITS = {
-    "traffic.datagrams": "a node and s",
-    "traffic.bytes": "B a node and s",
-    "traffic.busiest": "B/s",
-    "traffic.contacts": "contacts",
-    "traffic.contacts.max": "contacts",
-    "traffic.cpu": "ms a node and s",
-    "traffic.real_time": "x",
-    "traffic.memory": "KiB a node",
-}
-"""The figures."""
 
 
 @dataclass(frozen=True)
@@ -79,29 +68,27 @@ class Traffic:
 
     def figures(self) -> list[Figure]:
         """Of a node and a second of its life; its contacts; and what it costs here."""
-        if self._began is None or not self._node_seconds:
-            return [Figure(name, None, unit) for name, unit in UNITS.items()]
-        spent = time.process_time() - self._cpu
-        elapsed = self._last_at - self._began
+        spent, elapsed, lived = 0.0, 0.0, self._node_seconds
         sent, volume, busiest = 0, 0, 0
-        for place in self._team.places:
-            (datagrams, size), (past, past_size) = self._sent(place), self._before.get(place, (0, 0))
-            sent, volume, busiest = sent + datagrams - past, volume + size - past_size, max(busiest, size - past_size)
-        known = [float(len(self._team.entangled(place).overlay.contacts())) for place in self._sampled()]
+        known: list[float] = []
+        if lived and self._began is not None:
+            spent, elapsed = time.process_time() - self._cpu, self._last_at - self._began
+            known = [float(len(self._team.entangled(place).overlay.contacts())) for place in self._sampled()]
+            for place in self._team.places:
+                (datagrams, size), (past, past_size) = self._sent(place), self._before.get(place, (0, 0))
+                sent, volume = sent + datagrams - past, volume + size - past_size
+                busiest = max(busiest, size - past_size)
         n = len(self._team.nodes)
-        memory = (resident_bytes() - self._bare_bytes) / 1024 / max(1, n)
-        values = [
-            (sent / self._node_seconds, n),
-            (volume / self._node_seconds, n),
-            (busiest / elapsed, n),
-            (mean(known), len(known)),
-            (percentile(known, 1.0), len(known)),
-        ]
-        of_machine = [(1000 * spent / self._node_seconds, n), (elapsed / spent if spent else None, n), (memory, n)]
-        rows = zip(UNITS.items(), values + of_machine, strict=True)
+        memory = (resident_bytes() - self._bare_bytes) / 1024 / max(1, n) if lived else None
         return [
-            Figure(name, value, unit, n=trials, is_exact=number < len(values))
-            for number, ((name, unit), (value, trials)) in enumerate(rows)
+            Figure("traffic.datagrams", _per(sent, lived), "a node and s", n=n),
+            Figure("traffic.bytes", _per(volume, lived), "B a node and s", n=n),
+            Figure("traffic.busiest", _per(busiest, elapsed), "B/s", n=n),
+            Figure("traffic.contacts", mean(known), "contacts", n=len(known)),
+            Figure("traffic.contacts.max", percentile(known, 1.0), "contacts", n=len(known)),
+            Figure("traffic.cpu", _per(1000 * spent, lived), "ms a node and s", n=n, is_exact=False),
+            Figure("traffic.real_time", _per(elapsed, spent), "x", n=n, is_exact=False),
+            Figure("traffic.memory", memory, "KiB a node", n=n, is_exact=False),
         ]
 
     # -- inside -----------------------------------------------------------------------------------------------------
@@ -114,3 +101,7 @@ class Traffic:
         places = self._team.alive()
         every = max(1, len(places) // self._settings.sample)
         return places[::every]
+
+
+def _per(total: float, whole: float) -> float | None:
+    return total / whole if whole else None
