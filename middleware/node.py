@@ -186,15 +186,20 @@ class SwarmNode(Service):
         self.presence.change(network={"contacts": contacts, "records": records, "dropped": dropped})
 
     async def _step_behind(self) -> None:
-        """Two that join at the same moment take the same place: the one with the higher uuid steps behind."""
+        """Those that join at the same moment take the same place: each steps behind all those whose uuid is lower.
+
+        All at once, so that a crowd is in order as soon as it has seen itself, and not after as many looks as it has
+        heads, with a record of each for each of them.
+        """
         for _ in range(LOOKS):
             await self._chores.sleep(LOOK_AGAIN)
             others = await self._others()
             mine = self.presence.device.joined
-            ahead = [d for d in others if d.joined == mine and d.uuid < self.uuid]
+            same = [d for d in others if d.joined == mine and d.uuid != self.uuid]
+            ahead = sum(d.uuid < self.uuid for d in same)
             if ahead:
-                self.presence.change(joined=_next_place(others))
-            elif not any(d.joined == mine and d.uuid != self.uuid for d in others):
+                self.presence.change(joined=_next_place(others) + ahead - 1)
+            elif not same:
                 return
 
     async def _others(self) -> list[Device]:

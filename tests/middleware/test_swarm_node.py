@@ -50,6 +50,13 @@ class SwarmNodeTests(FleetCase):
             places = [node.presence.device.joined for node in fleet.nodes]
             self.assertEqual(len(set(places)), 5, places)
 
+    def test_a_crowd_at_the_same_moment(self) -> None:
+        """Twenty that come at one moment are in order after a second: each steps behind all that stay ahead at once."""
+        fleet = self.swarm(21, weather=Weather(0.005), pause=0.0)
+        fleet.run(1.0)
+        places = [node.presence.device.joined for node in fleet.nodes]
+        self.assertEqual(len(set(places)), 21, places)
+
     def test_joins_in_rough_weather(self) -> None:
         """A device appears although its first questions were lost."""
         for seed in range(4):
