@@ -133,7 +133,7 @@ class Lessee:
         self.council.token = max(self.council.token, token)
         if self._is_wanted and self.lease is None:
             is_news = not self._is_freed
-            self._free_at = self._clock.seconds() + rest
+            self._free_at = self._ends_at = self._clock.seconds() + rest
             if is_news:
                 self.council.leap()
                 if self._is_looking:
@@ -283,8 +283,11 @@ class Lessee:
         if is_outbid and free_in == math.inf:
             free_in = 0.0  # the others were not heard; with a higher ballot they are
         self._ends_at, self._is_outbid = self._clock.seconds() + free_in, is_outbid
+        self._line_up(self._rng.uniform(*(BACK_OFF if is_outbid else JITTER)))
+
+    def _line_up(self, pause: float) -> None:
+        """Claim ``pause`` seconds after its turn has come, or look whether it has where that is long, or not known."""
         wait = self._turn() if self._is_freed else self._claims_in()
-        pause = self._rng.uniform(*(BACK_OFF if is_outbid else JITTER))
         # A healthy holder renews well before: what runs out that soon is claimed in time, without a look before.
         self._only_looks = wait > SOON * self._poll_period()
         self._again((self._poll_period() if self._only_looks else wait) + pause)
@@ -293,13 +296,16 @@ class Lessee:
         """Ask whether the lease is free, and be promised nothing."""
         self._cancel()
         self._round = asked = self.council.round("lease.prepare", 0, self.council.ttl, short=0.0)
-        asked.outcome.addCallback(self._looked)
+        asked.outcome.addCallback(self._looked, self.council.configuration)
 
-    def _looked(self, asked: Round) -> None:
+    def _looked(self, asked: Round, configuration: int) -> None:
         self.council.hear(asked)
         if self._round is not asked or self._has_ended(asked):
             return
         asked.close()
+        if self.council.configuration != configuration:
+            # Only the members of now know who stands by, and tell it of a release.
+            return self._look()
         if asked.is_won and not self._stagger():
             self._claim()
         else:
@@ -313,7 +319,7 @@ class Lessee:
         before, self._rank = self._stagger(), rank
         waits = self._is_wanted and self.lease is None and not (self._only_looks or self._is_asking or self._is_freed)
         if waits and self._stagger() != before:
-            self._again(self._claims_in() + self._rng.uniform(*JITTER))
+            self._line_up(self._rng.uniform(*JITTER))
 
     def _claims_in(self) -> float:
         """Seconds until it claims what runs out: the first in line is promised it before, and so has time for it."""

@@ -85,6 +85,30 @@ class LesseeTests(RoomCase):
             self.run_for(0.45 * TTL + 0.1)
             self.assertEqual(self.holders()[-1:], [2], seed)
 
+    def test_place_in_the_line_that_changes_after_a_release(self) -> None:
+        """Who did not learn from a majority how long the lease lasts claims what is released, wherever it is moved."""
+        self.cut(1, 4, 5)
+        self.lessee(1).stand_by(3)
+        self.run_for(1.5 * TTL)
+        self.lessee(1).freed(0)
+        self.run_for(0.35)
+        self.lessee(1).stand_by(2)
+        self.room.radio.cut.clear()
+        self.run_for(0.2)
+        self.assertEqual(self.holders(), [1])
+
+    def test_council_that_moved(self) -> None:
+        """Who looks and hears that the council is another one by now asks that at once, and so is told of a release."""
+        self.wanting(0)
+        self.lessee(1).stand_by(1)
+        moved = self.lessee(0).move([self.room.contacts[place] for place in (3, 4, 6)])
+        self.outcome(moved, 0.1)
+        self.lessee(1).suspect()
+        self.run_for(0.1)
+        self.lessee(0).release()
+        self.run_for(0.1)
+        self.assertEqual(self.holders(), [1])
+
     def test_second_in_line_lets_the_first_try(self) -> None:
         """Of two that find at one moment that nobody holds the lease, the first in line has it."""
         for seed in range(5):
