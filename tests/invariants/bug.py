@@ -203,7 +203,7 @@ async def _decided_by_the_new(self: Council, ballot: Any, packed: Any, keep: boo
 
 BUGS: dict[str, list[tuple[Any, str, Any]]] = {
     "tombstone dropped too early": [(owner, "TOMBSTONE_TTL", 3.0)],
-    "acknowledged by a minority": [(Overlay, "voters", lambda self, key, targets: [targets[0].node_id])],
+    "acknowledged by a minority": [(Overlay, "voters", lambda self, key, targets: [c.node_id for c in targets[:1]])],
     "lower sequence accepted": [(Record, "beats", lambda self, other: True)],
     "contact entered unchecked": [(Overlay, "lookup", _lookup_that_believes)],
     "no hand-over": [

@@ -123,6 +123,9 @@ class Leases(Team):
 
     def _verify_health(self, task_id: str) -> None:
         """E3, the graceful leave and E5, when everything is well and one after the other goes."""
+        if not self.has_stores:
+            # A lease that no member remembers any more has to end first: the next one may have its token again.
+            self.clock.advance(self.ttl)
         for rank, place in enumerate(self._dice.sample(self.agents, len(self.agents))):
             lessee = self.bidders[place].lessee(task_id)
             if rank:
@@ -157,6 +160,7 @@ class Leases(Team):
         how = dice.choice(["kill", "freeze", "suspend", "cut"])
         self._begin(Trouble(0, 0, how, (holder, *also)))
         others = [place for place in self.agents if place != holder]
+        within = self.ttl / (1.0 - self.drift) + SLACK + STAGGER * (len(self.agents) - 1)
         if len(others) > 1 and dice.random() < 0.75:
             # Selection names one agent when the lease ends, and thinks better of it.
             fickle = dice.choice(others)
@@ -168,7 +172,7 @@ class Leases(Team):
                 if dice.random() < 0.2:
                     break
             self.bidders[fickle].leave(task_id)
-        within = self.ttl / (1.0 - self.drift) + SLACK + STAGGER * (len(self.agents) - 1)
+            within += self.stop_time
         why = f"{holder} of {task_id} is gone ({how})"
         self._wait_for_command(task_id, why, token, gone_at, within, 3 * self.ttl + SLACK)
         self._heal()
@@ -228,6 +232,8 @@ class Leases(Team):
                         self.bidders[place].machine.freeze(trouble.kind == "suspend")
             case "change":
                 self._change(trouble.places[0])
+            case "torn change":
+                self._change(trouble.places[0], is_torn=True)
             case "leave":
                 for task_id in self.councils:
                     if self.is_up(trouble.places[0]):
@@ -238,7 +244,7 @@ class Leases(Team):
 
     def _end(self, trouble: Trouble) -> None:
         match trouble.kind:
-            case "cut" | "one way" | "swizzle":
+            case "cut" | "one way" | "swizzle" | "torn change":
                 self.radio.cut.clear()
             case "kill" | "wipe":
                 for place in trouble.places:
@@ -258,8 +264,11 @@ class Leases(Team):
         self.radio.cut |= {pair for b in range(self.n) if b != place for pair in ((place, b), (b, place))}
         self.referee.look_at_cuts()
 
-    def _change(self, place: int) -> None:
-        """Somebody has another council chosen, at a moment when the task may be free, or its own."""
+    def _change(self, place: int, is_torn: bool = False) -> None:
+        """Somebody has another council chosen, at a moment when the task may be free, or its own.
+
+        ``is_torn``: of members as new as can be, and none but them and whoever chooses them hear of it.
+        """
         if not self.is_up(place) or not self.has_stores:
             return
         for task_id in self.councils:
@@ -267,8 +276,19 @@ class Leases(Team):
                 for agent in self.agents:
                     if self.is_up(agent) and self._dice.random() < 0.9:
                         self.bidders[agent].leave(task_id)
-            members = [self.contacts[n] for n in sorted(self._dice.sample(range(self.n), 3))]
+            chosen = sorted(self._dice.sample(range(self.n), 3))
+            if is_torn:
+                sitting = [self.place_of(member) for member in self.councils[task_id][0]]
+                chosen = sorted(range(self.n), key=lambda n: n in sitting)[:3]
+                self.clock.callLater(0.4 + self.stop_time, self._part, {place, *chosen})
+            members = [self.contacts[n] for n in chosen]
             self.clock.callLater(0.5 + self.stop_time, self._change_now, place, task_id, members)
+
+    def _part(self, places: set[int]) -> None:
+        if not self._is_well:
+            rest = set(range(self.n)) - places
+            self.radio.cut |= {pair for a in places for b in rest for pair in ((a, b), (b, a))}
+            self.referee.look_at_cuts()
 
     def _change_now(self, place: int, task_id: str, members: Sequence[Contact]) -> None:
         if self.is_up(place):

@@ -182,7 +182,9 @@ class Tasks:
             self.ether.order(name, Order(RESUME, "operator", self.clock.seconds()))
 
     def is_settled(self) -> bool:
-        """Whether every agent knows the end of every task."""
+        """Whether every agent knows the end of every task, and the operator does."""
+        if any(self.ether.outcome(OPERATOR, name) is None for name in self.tasks):
+            return False
         dockets = [agent._docket for agent in self.agents.values()]
         return not any(docket.open or any(map(docket.is_new, self.tasks)) for docket in dockets)
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 KINDS = (
     "cut", "cut", "one way", "swizzle", "kill", "kill", "wipe", "freeze", "freeze", "suspend", "change", "change",
-    "change", "leave", "air", "step", "blackout",
+    "torn change", "leave", "air", "step", "blackout",
 )  # fmt: skip
 
 

@@ -10,7 +10,9 @@ from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.errors import NotAcknowledged, Unavailable
 from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.roster import COUNTED_S, STRUCK_S
+from middleware.entangled.network.switchboard import Weather
 from middleware.entangled.record import Record, hashed_key
+from middleware.entangled.replication.owner import Stored
 from middleware.entangled.replication.replica import HELD
 from tests.fleet import Fleet, FleetCase
 
@@ -118,6 +120,34 @@ class CutTests(MajorityCase):
         refused = self.outcome(fleet, fleet.nodes[0].put(KEY, "b", b"z"))
         self.assertIsInstance(refused, NotAcknowledged)
         self.assertEqual((refused.acknowledged, refused.needed), (1, 2))
+
+    def test_a_later_record_at_the_unsure(self) -> None:
+        """A write is not acknowledged because a replica without a vote has the one after it."""
+        fleet = self.fleet(2)
+        fleet.nodes[1].replica.is_sure = lambda: False
+        first = fleet.nodes[0].put(KEY, "a", b"x")
+        fleet.run(0.1)
+        second = fleet.nodes[0].put(KEY, "a", b"y")
+        self.assertIsInstance(self.outcome(fleet, first), NotAcknowledged)
+        self.assertIsInstance(self.outcome(fleet, second), NotAcknowledged)
+
+    def test_a_later_record_at_the_sure(self) -> None:
+        """A write is acknowledged where a majority has the one after it."""
+        fleet = self.fleet(3)
+        fleet.board.weather = Weather(delay_s=0.02, jitter_s=0.02, reorder=0.5)
+        for _ in range(10):
+            puts = [fleet.nodes[0].put(KEY, "a", b"%d" % number) for number in range(3)]
+            self.assertEqual([type(self.outcome(fleet, put, 0.5)) for put in puts], [Stored] * 3)
+
+    def test_who_comes_back_behind_a_cut(self) -> None:
+        """A node that has yet to meet its team does not take the few that it meets for all, and deny what is there."""
+        fleet = self.fleet(3)
+        self.cut(fleet, 2)
+        self.assertEqual(self.outcome(fleet, fleet.nodes[0].put(KEY, "a", b"x")), 2)
+        fleet.nodes[1].vanish()
+        self.cut(fleet, 1, 2)
+        fleet.restart(1, [2])
+        self.assertIs(type(self.outcome(fleet, fleet.nodes[1].get(KEY, "fast"))), Unavailable)
 
 
 class StartTests(MajorityCase):

@@ -206,7 +206,7 @@ class Owner:
             if contact.node_id in spare:
                 await released
             try:
-                verdict = await self.store_at(contact, record, left)
+                verdict = await self._verdict(contact, record, left)
             except EntangledError as error:
                 release()
                 if isinstance(error, Refused) and error.code == ROLE:
@@ -217,10 +217,8 @@ class Owner:
                     break
                 release()
                 await self._chores.sleep(pause)
-                verdict = await self.store_at(contact, record, left)
-            # A later record of this very life stands there: this one is not lost, it is history.
-            is_history = self._first <= verdict <= self._last
-            verdicts[contact.node_id] = 0 if is_history and record.owner == self._identity.public else verdict
+                verdict = await self._verdict(contact, record, left)
+            verdicts[contact.node_id] = verdict
             votes = sum(1 for node_id, verdict in verdicts.items() if verdict == 0 and node_id in voters)
             if len(verdicts) == len(targets) and votes > len(voters) // 2:
                 self._settled(record)
@@ -278,6 +276,20 @@ class Owner:
         return True
 
     # -- inside -----------------------------------------------------------------------------------------------------
+
+    async def _verdict(self, contact: Contact, record: Record, left: float | None) -> int:
+        """As ``store_at``.  Where a later record of this very life stands, ``record`` is not lost, it is history.
+
+        What that replica says of the later one holds for it, too: it may be one whose word does not count.
+        """
+        verdict = await self.store_at(contact, record, left)
+        if record.owner != self._identity.public or not self._first <= verdict <= self._last:
+            return verdict
+        later = self._own.get(record.slot)
+        if later is None:
+            return 0  # it was a tombstone, and everybody has it
+        verdict = await self.store_at(contact, later)
+        return HELD if verdict > 0 else verdict
 
     def _spare(self, record: Record, targets: list[Contact], counted: list[Contact], needed: int) -> frozenset[bytes]:
         """Of a long record, those that get it only when enough others have it: all at once would share the way."""

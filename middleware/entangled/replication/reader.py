@@ -249,7 +249,7 @@ class Reader:
         await self._overlay.walk(lookup, visit, lambda: bool(found))
         nearest = lookup.closest()
         if not found:
-            voters = frozenset(contact.node_id for contact in nearest)
+            voters = frozenset(self._overlay.voters(key, nearest))
             self._overlay.note_found(key, nearest)
             some = list(newest_of(answer.records for answer in answers.values()).values())
             return some if _is_something(some) else self._nothing(answers, voters)
