@@ -26,9 +26,9 @@ from swarmnode.seams import Seams
 
 ASSIGN = "device.assign"
 """Method of a node that allows faults: publish a predefined task, so that a scenario can begin by itself."""
-AFTER_THE_ANSWER, AFTER_ANSWERS = 0.05, 0.5
-"""Seconds from the answer to the fault: who is cut off, or dead, could not say that it took the order.  Who suffers
-from losses may have to say it several times."""
+AFTER_ANSWERS = 0.5
+"""Seconds from the answer to the fault: who is cut off, or dead, could not say that it took the order.  Where datagrams
+get lost, here or at the other end, it may have to say so several times."""
 
 
 class SkewedWall:
@@ -71,9 +71,8 @@ class Frailty:
                 raise Refused(str(error)) from error
             if fault.kind not in self.kinds():
                 raise Refused(f"kind: this device cannot suffer {fault.kind}; choose one of {', '.join(self.kinds())}")
-            wait = AFTER_ANSWERS if "loss" in self._active else AFTER_THE_ANSWER
-            node.later(wait, self._suffer, node, fault)
-            return wait
+            node.later(AFTER_ANSWERS, self._suffer, node, fault)
+            return AFTER_ANSWERS
 
         def asked(peer: Contact) -> dict[str, Any]:
             now = self._raw.clock.seconds()

@@ -58,7 +58,7 @@ class Mischief:
         return self._kinds.get(uuid, ())
 
     def cause(self, uuid: str, kind: str, seconds: float, amount: float | None) -> Deferred[None]:
-        """Ask the device; the clock runs from its answer."""
+        """Ask the device; the clock runs from when it said in its answer that it would begin."""
         try:
             fault = fault_of(kind, seconds, amount)
         except BadFault as error:
@@ -74,8 +74,8 @@ class Mischief:
             return fail(Refusal("kind" if can else "device", f"{name} does not allow {kind}", remedy, 409))
         task = acting(device for device, _ in devices_of(self._watch.records)).get(uuid, "")
 
-        def taken(_: object) -> None:
-            now = self._clock()
+        def taken(wait: object) -> None:
+            now = self._clock() + (wait if type(wait) is float and 0.0 < wait < PATIENCE_S else 0.0)
             self._count += 1
             self._caused.insert(0, _Caused(self._count, fault, name, Takeover(uuid, task, now, now + fault.seconds)))
             del self._caused[KEPT:]
@@ -108,8 +108,8 @@ class Mischief:
             "name": caused.name,
             "kind": fault.kind,
             "amount": fault.amount if KINDS[fault.kind].unit else None,
-            "left_s": round(max(0.0, clock.until - now), 1),
-            "since_s": round(now - clock.began, 1),
+            "left_s": round(min(fault.seconds, max(0.0, clock.until - now)), 1),
+            "since_s": round(max(0.0, now - clock.began), 1),
             "task": clock.task,
             "takeover_s": None if clock.seconds is None else round(clock.seconds, 2),
             "to": self._names.get(clock.to, clock.to[:8]),

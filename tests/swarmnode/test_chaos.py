@@ -101,6 +101,11 @@ class ChaosTests(SynchronousTestCase):
         lines = self.rehearsed("bad-day.toml")
         self.assertEqual(sum("took over" in line for line in lines), 2)
 
+    def test_answers_that_are_lost(self) -> None:
+        """Whoever is to fall silent has time to say so again to one that hears only four words of five."""
+        for seed in ("12", "24"):  # where the first answer does not arrive
+            self.rehearsed("bad-day.toml", "--seed", seed)
+
 
 class ScenarioTests(SynchronousTestCase):
     def test_examples(self) -> None:

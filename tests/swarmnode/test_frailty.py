@@ -94,7 +94,7 @@ class FrailtyTests(SynchronousTestCase):
         """Drained dogs do not go, though nobody else is there; one goes when they are charged."""
         for name in ("dog1", "dog2", "dog3"):
             self.stage.cause(self.named(name), Fault("battery", 4.0, 0.02))
-        self.stage.wait(0.1)
+        self.stage.wait(0.6)
         self.stage.assign("turn-around")
         for _ in range(30):
             self.stage.wait(0.1)
