@@ -261,10 +261,16 @@ class Settings:
 
         ``origin`` names the file they come from: errors name it, and a relative store lies in its folder.
         """
-        for name in mapping:
-            if name not in TABLES:
+        for name, given in mapping.items():
+            if name in TABLES:
+                continue
+            if isinstance(given, Mapping):
                 remedy = f"the nearest table is [{_nearest(name, TABLES)}]"
                 raise BadSetting(origin, f"[{name}]", "is not a table that a node has", remedy)
+            key = _nearest(name, [key for _, key in _keys()])
+            tables = " or ".join(f"[{table}]" for table, known in _keys() if known == key)
+            remedy = f"write it below {tables}" if key == name else f"the nearest setting is {key}, below {tables}"
+            raise BadSetting(origin, name, "stands outside of any table", remedy)
         made: dict[str, Any] = {}
         for name, kind in TABLES.items():
             table = mapping.get(name, {})
@@ -277,8 +283,8 @@ class Settings:
         if node.membership:
             node = replace(node, membership=os.path.join(folder, node.membership))
         made["node"] = node
-        given = frozenset((name, key) for name, table in mapping.items() if isinstance(table, Mapping) for key in table)
-        return cls(**made, origin=origin, given=given)
+        said = frozenset((name, key) for name, table in mapping.items() if isinstance(table, Mapping) for key in table)
+        return cls(**made, origin=origin, given=said)
 
     def with_flags(self, **flags: object) -> Settings:
         """These settings with some of them replaced from the command line.

@@ -226,6 +226,8 @@ class SettingsTest(SynchronousTestCase):
         """A misspelt table or key is refused, and the error names the one that was meant."""
         for mapping, meant in (
             ({"nod": {}}, "nearest table is [node]"),
+            ({"store": "x"}, "store: stands outside of any table; write it below [node]"),
+            ({"prot": 7000}, "prot: stands outside of any table; the nearest setting is port, below [node] or [web]"),
             ({"node": {"name": "a", "known_node": []}}, "nearest is known_nodes"),
             ({"node": {"name": "a"}, "web": {"prot": 1}}, "nearest is port"),
         ):
