@@ -14,6 +14,8 @@ from middleware.value import is_number
 CAUSE, ASKED = "device.fault", "device.faults"
 """Methods of a node that allows faults: cause one, and say what can be caused and what goes on."""
 MIN_S, MAX_S, USUAL_S = 0.1, 600.0, 15.0
+MOST_AHEAD_S = 2.0
+"""What a device says at most of how long it has until it suffers."""
 
 
 @dataclass(frozen=True)
@@ -66,6 +68,11 @@ def fault_of(kind: object, seconds: object = None, amount: object = None) -> Fau
         return Fault(kind, lasts)
     much = _number("amount", rule.amount if amount is None else amount, rule.least, rule.most, rule.unit)
     return Fault(kind, lasts, much)
+
+
+def begins_in(answer: object) -> float:
+    """Seconds until a fault begins, as the device answers that is asked for it; 0 where it says nothing lawful."""
+    return float(answer) if is_number(answer) and 0.0 < answer <= MOST_AHEAD_S else 0.0  # type: ignore[operator,arg-type]
 
 
 def _number(field: str, value: object, least: float, most: float, unit: str) -> float:

@@ -13,7 +13,7 @@ from middleware.entangled.control.command import FAILED, WRONG, Ask, asked
 from middleware.entangled.control.place import NoControl
 from middleware.entangled.control.word import printable
 from middleware.errors import BadFault, BadSetting
-from middleware.fault import ASKED, CAUSE, KINDS, MAX_S, MIN_S, USUAL_S, Fault, fault_of
+from middleware.fault import ASKED, CAUSE, KINDS, MAX_S, MIN_S, USUAL_S, Fault, begins_in, fault_of
 from middleware.presence import Device
 from middleware.tasks import outcome_of
 from swarmnode.asker import Asker, Refusal
@@ -49,7 +49,7 @@ class TeamStage:
     def cause(self, device: Device, fault: Fault) -> float:
         """Ask the device."""
         try:
-            return float(self._asker.call(device.address, CAUSE, fault.kind, fault.seconds, fault.amount or None))
+            return begins_in(self._asker.call(device.address, CAUSE, fault.kind, fault.seconds, fault.amount or None))
         except Refusal as error:
             raise Refusal(f"{device.name}: {_plain(error)}") from error
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from twisted.internet.defer import Deferred
 
-from middleware.fault import CAUSE, Fault
+from middleware.fault import CAUSE, Fault, begins_in
 from middleware.presence import Device, devices_of
 from middleware.tasks import group_key, outcome_of
 from swarmnode.asker import Refusal
@@ -44,7 +44,7 @@ class RehearsedStage:
 
     def cause(self, device: Device, fault: Fault) -> float:
         """Let the laptop ask for it."""
-        return float(self._called(device, CAUSE, fault.kind, fault.seconds, fault.amount or None))
+        return begins_in(self._called(device, CAUSE, fault.kind, fault.seconds, fault.amount or None))
 
     def is_over(self, task_id: str) -> bool:
         """Whether its outcome is recorded."""

@@ -12,7 +12,7 @@ from twisted.logger import Logger
 from middleware.entangled.errors import EntangledError, NoAnswer
 from middleware.entangled.record import Record
 from middleware.errors import BadFault
-from middleware.fault import ASKED, CAUSE, KINDS, Fault, fault_of
+from middleware.fault import ASKED, CAUSE, KINDS, Fault, begins_in, fault_of
 from middleware.node import SwarmNode
 from middleware.presence import devices_of
 from middleware.takeover import Takeover, acting
@@ -74,8 +74,8 @@ class Mischief:
             return fail(Refusal("kind" if can else "device", f"{name} does not allow {kind}", remedy, 409))
         task = acting(device for device, _ in devices_of(self._watch.records)).get(uuid, "")
 
-        def taken(wait: object) -> None:
-            now = self._clock() + (wait if type(wait) is float and 0.0 < wait < PATIENCE_S else 0.0)
+        def taken(answer: object) -> None:
+            now = self._clock() + begins_in(answer)
             self._count += 1
             self._caused.insert(0, _Caused(self._count, fault, name, Takeover(uuid, task, now, now + fault.seconds)))
             del self._caused[KEPT:]

@@ -8,7 +8,7 @@ from typing import Any
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.errors import BadFault
-from middleware.fault import KINDS, Fault, fault_of
+from middleware.fault import KINDS, Fault, begins_in, fault_of
 from middleware.presence import EXECUTING, SEARCHING, Device
 from middleware.takeover import WATCHED_S, Takeover, acting
 
@@ -20,6 +20,12 @@ class FaultTests(SynchronousTestCase):
             self.assertEqual(fault_of(kind), Fault(kind, 15.0, rule.amount))
         self.assertEqual(fault_of("loss", 3, 0.5), Fault("loss", 3.0, 0.5))
         self.assertEqual(fault_of("kill", None, 0), Fault("kill"))
+
+    def test_begins(self) -> None:
+        """A device says when its fault begins; an answer that no node gives counts for at once."""
+        self.assertEqual(begins_in(0.5), 0.5)
+        for answer in (None, "soon", True, -1.0, 3600.0, math.nan, math.inf, [0.5]):
+            self.assertEqual(begins_in(answer), 0.0)
 
     def test_unlawful(self) -> None:
         """What is no fault is refused by the name of the field, whatever comes over the wire."""
