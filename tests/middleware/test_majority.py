@@ -101,6 +101,33 @@ class CutTests(MajorityCase):
         fleet.run(10.0)
         self.assertEqual([self.values(fleet, place) for place in range(3)], [[b"x"]] * 3)
 
+    def test_a_newcomer_and_a_lost_memory(self) -> None:
+        """Whoever enters by a node that lost its records hears from it who else there was, and is not sure without."""
+        fleet = self.fleet(3)
+        self.cut(fleet, 2, 3)
+        fleet.nodes[2].vanish()
+        former = fleet.stores[2]
+        assert isinstance(former, MemoryStore)
+        fleet.stores[2] = Replaced(former)
+        fleet.restart(2, [0])
+        self.joined(fleet, 1, 2)
+        fleet.run(5.0)
+        self.assertEqual([node.replica.is_sure() for node in fleet.nodes], [True, True, False, False])
+
+    def test_a_door_that_shuts(self) -> None:
+        """A newcomer that did not hear who is known from the only one it met waits for that one, and for its word."""
+        fleet = self.fleet(3)
+        self.cut(fleet, 2, 3)
+        self.joined(fleet, 1, 2)
+        fleet.nodes[2].vanish()
+        fleet.run(8.0)
+        fleet.restart(2, [0])
+        fleet.run(8.0)
+        self.assertEqual([node.replica.is_sure() for node in fleet.nodes], [True, True, False, False])
+        fleet.board.heal()
+        fleet.run(10.0)
+        self.assertEqual([node.replica.is_sure() for node in fleet.nodes], [True] * 4)
+
     def test_the_unsure_hold_without_a_vote(self) -> None:
         """A replica that is not sure keeps what is stored at it, and the writer waits for its vote a little."""
         fleet = self.fleet(2)

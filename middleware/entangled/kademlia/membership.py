@@ -252,11 +252,21 @@ class Membership:
     async def _count_absent(self) -> None:
         """Count as absent whom others know and this newcomer cannot reach, or it would take its side of a cut for all.
 
-        Nobody is counted whom no more than half of those asked name: one that lies makes no members up.
+        Nobody is counted whom no more than half of those asked name: one that lies makes no members up.  What other
+        newcomers know counts where nobody else is there.  Raises ``NoAnswer`` where nobody answers any more.
         """
-        asked = [self._overlay.ask(contact, "known") for contact in self._overlay.roster.live()[:AT_ONCE]]
-        answers = await DeferredList([Deferred.fromCoroutine(each) for each in asked], consumeErrors=True)
-        opinions = [_known_of(answer) for ok, answer in answers if ok and isinstance(answer, list)]
+        there = self._overlay.roster.live()[:AT_ONCE]
+        asked = [Deferred.fromCoroutine(self._overlay.ask(contact, "known")) for contact in there]
+        answers = await DeferredList(asked, consumeErrors=True)
+        told: list[dict[Contact, int]] = []
+        settled: list[dict[Contact, int]] = []
+        for contact, (ok, answer) in zip(there, answers, strict=True):
+            if ok or not answer.check(NoAnswer):  # who refuses has said that it says nothing
+                told.append(_known_of(answer))
+                settled += [told[-1]] if any(named.node_id == contact.node_id for named in told[-1]) else []
+        if there and not told:
+            raise NoAnswer("nobody says who is known")
+        opinions = settled or told
         for contact in dict.fromkeys(contact for opinion in opinions for contact in opinion):
             named = [opinion[contact] for opinion in opinions if contact in opinion]
             if 2 * len(named) > len(opinions) and contact.node_id != self._overlay.own_id:
@@ -337,12 +347,11 @@ class Membership:
         self._compare(peer, digest)
         return b"" if self._overlay.is_large else self._overlay.roster.digest()
 
-    def _answer_known(self, peer: Contact) -> list[object] | None:
-        """KNOWN: the settled members, and for how long each has been absent; a newcomer has nothing to say."""
-        if not self._overlay.roster.is_settled:
-            return None
-        known = [(self._overlay.me(), 0.0), *self._overlay.roster.known(self._clock.seconds())]
-        return [[contact.packed(), int(away)] for contact, away in known]
+    def _answer_known(self, peer: Contact) -> list[object]:
+        """KNOWN: the settled members, and for how long each has been absent; a newcomer is not one of them itself."""
+        roster = self._overlay.roster
+        known = [(self._overlay.me(), 0.0)] if roster.is_settled else []
+        return [[contact.packed(), int(away)] for contact, away in known + roster.known(self._clock.seconds())]
 
     def _answer_members(self, peer: Contact, after: bytes) -> list[object] | int | None:
         """MEMBERS: the next page of them; None where there are too many, seconds where others said so."""
@@ -357,10 +366,10 @@ class Membership:
         return [c.packed() for c in later[:PAGE]]
 
 
-def _known_of(answer: list[object]) -> dict[Contact, int]:
+def _known_of(answer: object) -> dict[Contact, int]:
     """The members in an answer to KNOWN, and the seconds of their absence; what is none is left out."""
     found: dict[Contact, int] = {}
-    for fields in answer[:MAX_MEMBERS]:
+    for fields in answer[:MAX_MEMBERS] if isinstance(answer, list) else ():
         named, away = fields if isinstance(fields, list) and len(fields) == 2 else (None, None)
         contact = unpacked(named)
         if contact is not None and type(away) is int and away >= 0:
