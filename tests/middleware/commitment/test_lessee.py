@@ -225,6 +225,21 @@ class LesseeTests(RoomCase):
         self.wanting(0, 5.0)
         self.assertEqual(self.holders(), [])
 
+    def test_claim_that_is_dropped_shortens_no_rest(self) -> None:
+        """Who gave a lease back and drops another claim tells, by a fast clock, no less of how long its robot moves."""
+        self.room = self.made(stop_time=0.3, rates=(1.01, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0))
+        self.wanting(0, 1.0)
+        self.lessee(0).release()
+        stopped = self.room.clock.seconds()
+        self.run_for(0.27)
+        self.wanting(0, 0.01)
+        self.lessee(0).release()
+        self.run_for(0.1)
+        for place in (3, 4, 5):
+            bidder = self.room.bidders[place]
+            until = bidder.machine.at(bidder.acceptor._ledger.get(T).until)  # type: ignore[union-attr]
+            self.assertGreaterEqual(until, stopped + 0.3)
+
     def test_rough_weather(self) -> None:
         """At half of everything lost, doubled and late there is still never more than one holder, and often one."""
         self.room.radio.air = Air(0.02, 0.05, 0.5, 0.3, 5.0)
