@@ -261,10 +261,10 @@ class Settings:
 
         ``origin`` names the file they come from: errors name it, and a relative store lies in its folder.
         """
-        for name, given in mapping.items():
+        for name, value in mapping.items():
             if name in TABLES:
                 continue
-            if isinstance(given, Mapping):
+            if isinstance(value, Mapping):
                 remedy = f"the nearest table is [{_nearest(name, TABLES)}]"
                 raise BadSetting(origin, f"[{name}]", "is not a table that a node has", remedy)
             key = _nearest(name, [key for _, key in _keys()])
@@ -283,8 +283,8 @@ class Settings:
         if node.membership:
             node = replace(node, membership=os.path.join(folder, node.membership))
         made["node"] = node
-        said = frozenset((name, key) for name, table in mapping.items() if isinstance(table, Mapping) for key in table)
-        return cls(**made, origin=origin, given=said)
+        given = frozenset((name, key) for name, table in mapping.items() if isinstance(table, Mapping) for key in table)
+        return cls(**made, origin=origin, given=given)
 
     def with_flags(self, **flags: object) -> Settings:
         """These settings with some of them replaced from the command line.

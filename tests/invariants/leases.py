@@ -171,8 +171,9 @@ class Leases(Team):
                 self.clock.advance(dice.choice([0.004, 0.011, 0.017]))
                 if dice.random() < 0.2:
                     break
+            # A robot that it has moved has to come to rest first.
+            within += self.stop_time if self.bidders[fickle].holds(task_id) else 0.0
             self.bidders[fickle].leave(task_id)
-            within += self.stop_time
         why = f"{holder} of {task_id} is gone ({how})"
         self._wait_for_command(task_id, why, token, gone_at, within, 3 * self.ttl + SLACK)
         self._heal()
@@ -213,12 +214,13 @@ class Leases(Team):
     # -- troubles ---------------------------------------------------------------------------------------------------
 
     def _begin(self, trouble: Trouble) -> None:
-        rest = [place for place in range(self.n) if place not in trouble.places]
         match trouble.kind:
             case "cut":
-                self.radio.cut |= {pair for a in trouble.places for b in rest for pair in ((a, b), (b, a))}
+                self._part(trouble.places)
             case "one way":
-                self.radio.cut |= {(a, b) for a in trouble.places for b in rest}
+                self.radio.cut |= {
+                    (a, b) for a in trouble.places for b in set(range(self.n)).difference(trouble.places)
+                }
             case "swizzle":
                 order = self._dice.sample(range(self.n), self.n // 2)
                 for number, place in enumerate(order):
@@ -258,11 +260,15 @@ class Leases(Team):
                 self.radio.air = self.air
         self.referee.look_at_cuts()
 
-    def _clog(self, place: int) -> None:
-        if self._is_well:
-            return
-        self.radio.cut |= {pair for b in range(self.n) if b != place for pair in ((place, b), (b, place))}
-        self.referee.look_at_cuts()
+    def _clog(self, *places: int) -> None:
+        """Cut them off, unless all is well by now."""
+        if not self._is_well:
+            self._part(places)
+            self.referee.look_at_cuts()
+
+    def _part(self, places: Sequence[int]) -> None:
+        rest = [place for place in range(self.n) if place not in places]
+        self.radio.cut |= {pair for a in places for b in rest for pair in ((a, b), (b, a))}
 
     def _change(self, place: int, is_torn: bool = False) -> None:
         """Somebody has another council chosen, at a moment when the task may be free, or its own.
@@ -280,15 +286,9 @@ class Leases(Team):
             if is_torn:
                 sitting = [self.place_of(member) for member in self.councils[task_id][0]]
                 chosen = sorted(range(self.n), key=lambda n: n in sitting)[:3]
-                self.clock.callLater(0.4 + self.stop_time, self._part, {place, *chosen})
+                self.clock.callLater(0.4 + self.stop_time, self._clog, place, *chosen)
             members = [self.contacts[n] for n in chosen]
             self.clock.callLater(0.5 + self.stop_time, self._change_now, place, task_id, members)
-
-    def _part(self, places: set[int]) -> None:
-        if not self._is_well:
-            rest = set(range(self.n)) - places
-            self.radio.cut |= {pair for a in places for b in rest for pair in ((a, b), (b, a))}
-            self.referee.look_at_cuts()
 
     def _change_now(self, place: int, task_id: str, members: Sequence[Contact]) -> None:
         if self.is_up(place):

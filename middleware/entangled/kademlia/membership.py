@@ -258,15 +258,14 @@ class Membership:
         there = self._overlay.roster.live()[:AT_ONCE]
         asked = [Deferred.fromCoroutine(self._overlay.ask(contact, "known")) for contact in there]
         answers = await DeferredList(asked, consumeErrors=True)
-        told: list[dict[Contact, int]] = []
-        settled: list[dict[Contact, int]] = []
+        told: dict[bytes, dict[Contact, int]] = {}
         for contact, (ok, answer) in zip(there, answers, strict=True):
             if ok or not answer.check(NoAnswer):  # who refuses has said that it says nothing
-                told.append(_known_of(answer))
-                settled += [told[-1]] if any(named.node_id == contact.node_id for named in told[-1]) else []
+                told[contact.node_id] = _known_of(answer)
         if there and not told:
             raise NoAnswer("nobody says who is known")
-        opinions = settled or told
+        settled = [opinion for own, opinion in told.items() if any(named.node_id == own for named in opinion)]
+        opinions = settled or list(told.values())
         for contact in dict.fromkeys(contact for opinion in opinions for contact in opinion):
             named = [opinion[contact] for opinion in opinions if contact in opinion]
             if 2 * len(named) > len(opinions) and contact.node_id != self._overlay.own_id:
