@@ -93,8 +93,9 @@ class DemonstrationPageTests(DemonstrationPageCase):
         box = floor.bounding_box()
         # A place where a dog stands is refused; three dogs cannot stand in four corners.
         for right, down in ((0.15, 0.15), (0.85, 0.15), (0.15, 0.85), (0.85, 0.85)):
-            page.touchscreen.tap(box["x"] + right * box["width"], box["y"] + down * box["height"])
-            page.wait_for_timeout(600)
+            with page.expect_response("**/api/v1/target"):
+                page.touchscreen.tap(box["x"] + right * box["width"], box["y"] + down * box["height"])
+            page.wait_for_function("() => !document.querySelector('#line').textContent.includes('Moving the target')")
             if "Target moved" in page.locator("#line").inner_text():
                 break
         else:

@@ -14,6 +14,12 @@ from tests.live.page import DESK, BrowserCase, Team
 NAMES = ("vaio", "pi")
 CRASH_S, FREEZE_S = 2.0, 3.0
 CAMERAS = "figure[data-camera=live]"
+KEPT = """async () => {
+  await navigator.serviceWorker.ready;
+  const shell = await caches.open("swarm.shell");
+  while (!await shell.match("/")) await new Promise((done) => setTimeout(done, 50));
+}"""
+"""The browser has kept the page, with all its files."""
 
 
 class FallbackTests(BrowserCase):
@@ -92,6 +98,7 @@ class FallbackTests(BrowserCase):
                 keys.append(request.headers["idempotency-key"])
 
         self.page.on("request", note)
+        self.page.locator("#task option").first.wait_for(state="attached")
         os.kill(self.pid(0), signal.SIGSTOP)
         with self.page.expect_response(f"{self.webs[1].url}api/v1/tasks") as answered:
             self.page.locator("#assign button").click()
@@ -99,12 +106,24 @@ class FallbackTests(BrowserCase):
         self.served("pi")
         self.assertEqual((len(keys), len(set(keys))), (2, 1))
 
+    def test_keep_all_or_nothing(self) -> None:
+        """A file that comes alone is not kept, or half a page would open once its node is gone; all of them are."""
+        self.opened()
+        self.page.evaluate(KEPT)
+        held = "async () => (await (await caches.open('swarm.shell')).keys()).length"
+        files = self.page.evaluate("fetch('/static/files.json').then((told) => told.json())")
+        self.assertGreaterEqual(self.page.evaluate(held), len(files) + 1)
+        self.page.evaluate("caches.delete('swarm.shell')")
+        for path in ("/", files[0]):
+            self.page.evaluate("path => fetch(path).then((told) => told.text())", path)
+        self.page.wait_for_timeout(300)
+        self.assertEqual(self.page.evaluate(held), 0)
+
     def test_open_while_the_node_is_gone(self) -> None:
         """Where the browser keeps the page, it opens at the address of a node that is gone, and finds the other."""
         self.opened()
         # The page itself is kept with all its files or not at all.
-        self.page.wait_for_function("async () => (await caches.open('swarm.shell')).match('/')")
-        self.page.evaluate("navigator.serviceWorker.ready.then(() => true)")
+        self.page.evaluate(KEPT)
         os.kill(self.pid(0), signal.SIGKILL)
         self.page.reload()
         self.served("pi")

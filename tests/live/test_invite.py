@@ -133,7 +133,9 @@ class InviteTests(SynchronousTestCase):
         phone = context.new_page()
         phone.goto(f"{self.team.url}#{link.partition('#')[2]}")
         # The address is mended at once, the session is there only when the node has answered.
-        phone.wait_for_function("location.hash === '#phone' && JSON.parse(localStorage['swarm-session'] ?? '{}').token")
+        phone.wait_for_function(
+            "() => location.hash === '#phone' && JSON.parse(localStorage['swarm-session'] ?? '{}').token"
+        )
         self.assertNotIn("code", phone.url)
         role = phone.evaluate(
             "fetch('/api/v1/session', {headers: {Authorization: 'Bearer ' + "

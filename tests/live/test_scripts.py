@@ -114,4 +114,4 @@ class ScriptTests(PageCase):
         self.page.goto(f"{self.team.url}#code={self.team.code}")
         self.page.locator(".device").first.wait_for()
         self.page.evaluate("document.body.insertAdjacentHTML('beforeend', '<img src=x onerror=ran()>')")
-        self.page.wait_for_function("violations.length > 0")
+        self.page.wait_for_function("() => violations.length > 0")

@@ -13,15 +13,16 @@ addEventListener("fetch", (event) => {
   event.respondWith(answer(event.request, url));
 });
 
-// The node's file where it comes in time, so that an update shows at once; else the one that is kept.
+// The node's file where it comes in time, so that an update shows at once; else the one that is kept.  What is not
+// kept yet is not kept here: the page keeps its files all at once, and half of them would open as half a page.
 async function answer(request, url) {
   const shell = await caches.open(SHELL);
+  const kept = await shell.match(url.pathname);
+  if (!kept) return fetch(request);
   const fresh = fetch(request).then((told) => {
     if (told.ok) shell.put(url.pathname, told.clone());
     return told;
   });
-  const kept = await shell.match(url.pathname);
-  if (!kept) return fresh;
   const late = new Promise((done) => setTimeout(done, PATIENCE, kept));
   return Promise.race([fresh.catch(() => kept), late]);
 }
