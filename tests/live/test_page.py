@@ -22,6 +22,8 @@ TWINS = """async () => {
 PANELS = """async () => {
   const { panel } = await import("/static/panel.js");
   const { model } = await import("/static/model.js");
+  // What the node has comes when it was asked, and takes the place of what was there.
+  while (!model.has.includes("invites")) await new Promise((done) => setTimeout(done, 20));
   globalThis.seen = { model };
   const needs = { role: "operator", has: "wings" };
   const noted = (root) => {
