@@ -381,10 +381,11 @@ class Engagement:
             self.justify(verdict)
 
     def _publish(self, again: bool = False, **changes: object) -> None:
-        status, state = self.course.state.status, str(self.course)
-        told = replace(self.me, status=status, state=state, epoch=self._conference.epoch, **changes)  # type: ignore[arg-type]
-        if again or told != replace(self.me, epoch=told.epoch):  # a round alone is told with the next report
-            self.me = replace(told, load=self.load, serial=self.me.serial + 1 if told.epoch == self.me.epoch else 0)
+        changes |= {"status": self.course.state.status, "state": str(self.course)}
+        if again or any(getattr(self.me, name) != value for name, value in changes.items()):
+            epoch = self._conference.epoch  # a round alone is told with the next report
+            serial = self.me.serial + 1 if epoch == self.me.epoch else 0
+            self.me = replace(self.me, **changes, epoch=epoch, load=self.load, serial=serial)  # type: ignore[arg-type]
             self._tell(self.me)
 
     def _yield(self) -> None:
