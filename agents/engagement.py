@@ -385,7 +385,8 @@ class Engagement:
         if again or any(getattr(self.me, name) != value for name, value in changes.items()):
             epoch = self._conference.epoch  # a round alone is told with the next report
             serial = self.me.serial + 1 if epoch == self.me.epoch else 0
-            self.me = replace(self.me, **changes, epoch=epoch, load=self.load, serial=serial)  # type: ignore[arg-type]
+            changes |= {"epoch": epoch, "serial": serial, "load": self.load}
+            self.me = replace(self.me, **changes)  # type: ignore[arg-type]
             self._tell(self.me)
 
     def _yield(self) -> None:

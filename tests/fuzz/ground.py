@@ -31,7 +31,9 @@ from middleware.entangled.wire.endpoint import Endpoint
 TEAM = b"k" * 32
 STRANGER = Address("10.0.0.9", 999)
 LEFT_OUT = ("door", "counters", "_counters", "_rng", "_network", "_clock", "_log", "_quiet", "_most", "_bucket")
-PLAIN = (bytes, str, int, float, type(None))
+PLAIN = frozenset((bytes, str, int, float, bool, type(None)))
+APART = (FunctionType, MethodType, type, random.Random, HeapClock, Switchboard)
+"""What is not a part of what a node remembers."""
 
 
 class Violation(AssertionError):
@@ -141,39 +143,38 @@ class Ground:
 
 def state_of(thing: object, without: object = None) -> str:
     """The hash of everything that can be reached from ``thing``, but not through ``without``."""
-    digest = hashlib.blake2b(digest_size=16)
-    seen = {id(without): -1}
-    _walk(thing, digest.update, seen)
-    return digest.hexdigest()
+    said: list[str] = []
+    _walk(thing, said.append, {id(without): -1})
+    return hashlib.blake2b(";".join(said).encode(), digest_size=16).hexdigest()
 
 
-def _walk(thing: object, add: Callable[[bytes], None], seen: dict[int, int]) -> None:
+def _walk(thing: object, say: Callable[[str], None], seen: dict[int, int]) -> None:
     kind = type(thing)
-    if kind in PLAIN or isinstance(thing, bool):
-        add(f"{kind.__name__} {thing!r};".encode())
+    if kind in PLAIN:
+        say(f"{kind.__name__} {thing!r}")
         return
     if id(thing) in seen:
-        add(f"again {seen[id(thing)]};".encode())
+        say(f"again {seen[id(thing)]}")
         return
-    if isinstance(thing, FunctionType | MethodType | type | random.Random | HeapClock | Switchboard):
+    if isinstance(thing, APART):
         return
     seen[id(thing)] = len(seen)
     if isinstance(thing, dict):
-        add(f"dict {len(thing)};".encode())
+        say(f"dict {len(thing)}")
         for key, value in thing.items():
-            _walk(key, add, seen)
-            _walk(value, add, seen)
-    elif isinstance(thing, list | tuple | deque):
-        add(f"{kind.__name__} {len(thing)};".encode())
+            _walk(key, say, seen)
+            _walk(value, say, seen)
+    elif isinstance(thing, (list, tuple, deque)):
+        say(f"{kind.__name__} {len(thing)}")
         for item in thing:
-            _walk(item, add, seen)
-    elif isinstance(thing, set | frozenset):
-        add(f"set {sorted(map(repr, thing))};".encode())
-    elif kind.__module__.startswith("middleware.") or kind.__module__.startswith("tests."):
-        add(kind.__name__.encode())
-        names = list(getattr(thing, "__dict__", ()))
-        names += [name for one in kind.__mro__ for name in getattr(one, "__slots__", ())]
-        for name in names:
-            if name not in LEFT_OUT and hasattr(thing, name):
-                add(name.encode())
-                _walk(getattr(thing, name), add, seen)
+            _walk(item, say, seen)
+    elif isinstance(thing, (set, frozenset)):
+        say(f"set {sorted(map(repr, thing))}")
+    elif kind.__module__.startswith(("middleware.", "tests.")):
+        say(kind.__name__)
+        slots = (name for one in kind.__mro__ for name in getattr(one, "__slots__", ()))
+        for name in (*getattr(thing, "__dict__", ()), *slots):
+            value = getattr(thing, name, LEFT_OUT)
+            if name not in LEFT_OUT and value is not LEFT_OUT:
+                say(name)
+                _walk(value, say, seen)
