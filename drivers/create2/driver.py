@@ -203,11 +203,13 @@ class Create2Driver(BaseDriver):
         self._counts["bad_frames"] += self._reader.bad_frames - bad
 
     def _on_frame(self, frame: Mapping[str, int]) -> None:
+        mode, before = mode_of(frame), self._mode
+        if mode in ARMED and not self._is_up:
+            return  # it was said before the robot heard the start, which takes it into passive mode
         now = self._clock.seconds()
         self._heard_at = now
         self._silence_s = SILENCE_S
         self._problem = ""
-        mode, before = mode_of(frame), self._mode
         self._mode = mode
         if not self._is_up:
             self._up()

@@ -232,6 +232,14 @@ class Create2DriverTests(BodyContract, SynchronousTestCase):
         self.assertTrue(math.isclose(float(self.value(driver, "odom.x")), x, abs_tol=0.05))
         driver.act({"base.vx": 0.1}, self.permit())
 
+    def test_takes_nothing_from_before_its_start(self) -> None:
+        """What the robot said before it heard the driver again is no safety event: the motors come back on."""
+        self.connector = MemoryConnector(self.clock, self.robot.accept, delay=0.02)
+        driver = self.ready()
+        self.cut_link()
+        self.pass_time(2.0)
+        self.assertEqual((driver.state, self.robot.mode, driver.diagnostics()["safety_events"]), ("ready", 2, 0))
+
     def test_stops_a_robot_that_it_no_longer_hears(self) -> None:
         """Where the robot hears and says nothing, it is stopped within a second, and the silence has a name."""
         driver = self.ready()
