@@ -382,8 +382,9 @@ class Engagement:
 
     def _publish(self, again: bool = False, **changes: object) -> None:
         changes |= {"status": self.course.state.status, "state": str(self.course)}
+        # A round alone is told with the next report.
         if again or any(getattr(self.me, name) != value for name, value in changes.items()):
-            epoch = self._conference.epoch  # a round alone is told with the next report
+            epoch = self._conference.epoch
             serial = self.me.serial + 1 if epoch == self.me.epoch else 0
             changes |= {"epoch": epoch, "serial": serial, "load": self.load}
             self.me = replace(self.me, **changes)  # type: ignore[arg-type]

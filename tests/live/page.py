@@ -25,6 +25,10 @@ DESK = {"viewport": {"width": 1280, "height": 800}}
 VIEWS = ("tasks", "cameras", "map", "groups", "network", "events", "more", "devices")
 PATIENCE_MS = 45_000
 """How long a page is waited for on a machine that has more to do; where it is in time nothing waits for that."""
+INFORMED = """async () => {
+  const { model } = await import("/static/model.js");
+  while (!model.has.includes("invites")) await new Promise((done) => setTimeout(done, 20));
+}"""
 MISSING = [
     *(() if CHROMIUM else ("the program chromium (apt-get install chromium)",)),
     *(
@@ -112,6 +116,11 @@ class BrowserCase(SynchronousTestCase):
         """The page, when it shows so many devices of the team."""
         page.locator("#link[data-link=live]").wait_for()
         page.locator(".device").nth(devices - 1).wait_for(state="attached")
+        return page
+
+    def informed(self, page: Any) -> Any:
+        """The page, when it knows what its node has; that takes the place of what was there before."""
+        page.evaluate(INFORMED)
         return page
 
     def view(self, page: Any, name: str) -> None:

@@ -5,48 +5,23 @@ from __future__ import annotations
 from importlib.util import find_spec
 from typing import Any
 
-from twisted.trial.unittest import SynchronousTestCase
-
-from tests.live.page import CHROMIUM, DESK, FLAGS, MISSING, PATIENCE_MS, PHONE, TABLET, Team
+from tests.live.page import DESK, MISSING, PHONE, TABLET, PageCase
 
 ABSENT = [*MISSING, *([] if find_spec("segno") else ["the Python package segno"])]
 PHONES = """async () => {
   const { model } = await import("/static/model.js");
-  while (!model.has.includes("invites")) await new Promise((done) => setTimeout(done, 20));
   model.has = [...model.has, "phones"];
 }"""
 """The page's node takes phones."""
 
 
-class InviteTests(SynchronousTestCase):
+class InviteTests(PageCase):
     if ABSENT:
         skip = f"INVITING IS NOT TESTED IN A BROWSER: missing {'; '.join(ABSENT)}"
 
-    def setUp(self) -> None:
-        from playwright.sync_api import sync_playwright
-
-        self.team = Team()
-        self.addCleanup(lambda: self.team.stop())
-        play: Any = sync_playwright().start()
-        self.addCleanup(play.stop)
-        self.browser = play.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        self.addCleanup(self.browser.close)
-
-    def opened(self, screen: dict[str, Any], scheme: Any = "light", fragment: str = "") -> Any:
-        context = self.browser.new_context(**screen, color_scheme=scheme, reduced_motion="reduce")
-        self.addCleanup(context.close)
-        page = context.new_page()
-        page.set_default_timeout(PATIENCE_MS)
-        self.faults: list[str] = []
-        page.on("pageerror", lambda error: self.faults.append(str(error)))
-        page.on("console", lambda words: self.faults.append(words.text) if words.type == "error" else None)
-        page.goto(f"{self.team.url}{fragment or f'#code={self.team.code}'}")
-        page.locator("#link[data-link=live]").wait_for()
-        return page
-
     def invite(self, page: Any) -> None:
         """Open the dialog by keyboard alone."""
-        page.locator(".device").nth(2).wait_for(state="attached")
+        self.informed(page)
         page.evaluate(PHONES)
         page.evaluate("location.hash = 'more'")
         page.get_by_role("button", name="Invite").focus()
@@ -128,9 +103,7 @@ class InviteTests(SynchronousTestCase):
         page.locator("#invite").wait_for(state="detached")
         self.assertTrue(page.get_by_role("button", name="Stop").is_visible())
         page.goto("about:blank")
-        context = self.browser.new_context(**PHONE)
-        self.addCleanup(context.close)
-        phone = context.new_page()
+        phone = self.tab(PHONE)
         phone.goto(f"{self.team.url}#{link.partition('#')[2]}")
         # The address is mended at once, the session is there only when the node has answered.
         phone.wait_for_function(

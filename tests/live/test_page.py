@@ -22,8 +22,6 @@ TWINS = """async () => {
 PANELS = """async () => {
   const { panel } = await import("/static/panel.js");
   const { model } = await import("/static/model.js");
-  // What the node has comes when it was asked, and takes the place of what was there.
-  while (!model.has.includes("invites")) await new Promise((done) => setTimeout(done, 20));
   globalThis.seen = { model };
   const needs = { role: "operator", has: "wings" };
   const noted = (root) => {
@@ -226,7 +224,7 @@ class PageTests(PageCase):
 
     def test_give_panels_their_place(self) -> None:
         """A panel stands where it belongs, in order, for whom and where it is meant, is told what comes, and ends."""
-        page = self.opened(DESK)
+        page = self.informed(self.opened(DESK))
         page.evaluate(PANELS)
         self.assertEqual(page.locator("#place-groups > [data-order]").all_inner_texts(), [])
         page.evaluate("seen.model.has = [...seen.model.has, 'wings']")
