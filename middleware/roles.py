@@ -32,6 +32,7 @@ METHODS: Mapping[str, frozenset[str]] = {
     "settled": ALL,
     "store": ALL,  # each record is judged by its kind
     "find_value": ALL,
+    "certificates": ALL,
     "cache": ALL,
     "watch": ALL,
     "push": ALL,

@@ -79,7 +79,7 @@ class Doorkeeper:
         self._rules = rules
         self._me = membership().member
         self._passes: OrderedDict[bytes, Member] = OrderedDict()
-        self._met: OrderedDict[bytes, Member] = OrderedDict()
+        self._met: OrderedDict[bytes, tuple[Member, bytes]] = OrderedDict()
 
     @property
     def me(self) -> Member:
@@ -102,7 +102,7 @@ class Doorkeeper:
             return FOREIGN
         refusal = self._roll.refusal(member, self._wall())
         if not refusal:
-            self._met[public] = member
+            self._met[public] = member, shown
             self._met.move_to_end(public)
             if len(self._met) > MAX_MET:
                 self._met.popitem(last=False)
@@ -110,13 +110,35 @@ class Doorkeeper:
 
     def may(self, public: bytes, method: str) -> bool:
         """Whether a node that was let in may call ``method``."""
-        member = self.member(public)
-        return member is not None and self._rules.may_call(member.roles, method)
+        roles = self.roles_of(public)
+        return bool(roles) and self._rules.may_call(roles, method)
 
     def may_store(self, slot: Slot) -> bool:
-        """Whether the owner of ``slot`` may write there; of an owner whom nobody here knows it says yes."""
-        member = self.member(slot.owner)
-        return member is None or self._rules.may_store(member.roles, slot)
+        """Whether the present certificate of the owner of ``slot`` allows it to write there."""
+        roles = self.roles_of(slot.owner)
+        return bool(roles) and self._rules.may_store(roles, slot)
+
+    def is_known(self, public: bytes) -> bool:
+        """Whether a certificate of that key is known, be it one that holds no more."""
+        return self.member(public) is not None
+
+    def roles_of(self, public: bytes) -> frozenset[str]:
+        """Return the roles that the holder of that key has now, none for a stranger or a revoked or expired member."""
+        member = self.member(public)
+        if member is None or self._roll.refusal(member, self._wall()):
+            return frozenset()
+        return frozenset(member.roles)
+
+    def certificate(self, public: bytes) -> bytes:
+        """Return the newest certificate of that key which this node knows; empty where it knows none."""
+        if public == self._me.public:
+            return self.shown
+        grant, admission, met = self._roll.granted(public), self._roll.admitted(public), self._met.get(public)
+        if grant is not None and (met is None or grant[0].not_before >= met[0].not_before):
+            return pass_of(grant[1])
+        if met is not None:
+            return met[1]
+        return b"" if admission is None else admission.shown
 
     def member(self, public: bytes) -> Member | None:
         """What is known of the holder of ``public``, met or only heard of."""
@@ -124,7 +146,7 @@ class Doorkeeper:
             return self.me
         met = self._met.get(public)
         if met is not None:
-            return self._roll.known_as(met)
+            return self._roll.known_as(met[0])
         admission = self._roll.admitted(public)
         if admission is not None:
             return self._roll.known_as(admission.member)
@@ -139,7 +161,7 @@ class Doorkeeper:
         now = self._wall()
         gone = [
             (public, refusal)
-            for public, member in self._met.items()
+            for public, (member, _) in self._met.items()
             if (refusal := self._roll.refusal(self._roll.known_as(member), now))
         ]
         for public, _ in gone:

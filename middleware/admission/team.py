@@ -22,7 +22,7 @@ from middleware.admission.reception import Reception
 from middleware.admission.roll import MAX_ENTRIES, Admission, Entry, Roll, invitation_id, packed_admission
 from middleware.admission.statement import Grant, Invite, Revoke, Secret
 from middleware.entangled.background import Background
-from middleware.entangled.data.store import Store
+from middleware.entangled.data.store import OWNER_SHARE, Store
 from middleware.entangled.errors import Full, Refused, RemoteError
 from middleware.entangled.identity import Identity, node_id
 from middleware.entangled.kademlia.contact import Contact
@@ -56,6 +56,7 @@ class Team:
         self._node: EntangledNode | None = None
         self._uses: Uses | None = None
         self._accepted = [secret for _, secret, _ in self.membership.accepted(wall())]
+        store.limit_owners(OWNER_SHARE)
 
     @property
     def membership(self) -> Membership:
@@ -181,10 +182,13 @@ class Team:
             self._log.info("revoked: {name}", name=entry.name)
             self._sweep()
             self._part_with(entry.public)
+            self._review_records()
         elif isinstance(entry, Secret):
             self._heard_of(entry)
-        elif isinstance(entry, Grant) and entry.public == self.identity.public:
-            self._keep(replace(self.membership, shown=self.door.shown))
+        elif isinstance(entry, Grant):
+            if entry.public == self.identity.public:
+                self._keep(replace(self.membership, shown=self.door.shown))
+            self._review_records()  # a member may have lost a role
         elif isinstance(entry, Admission):
             self._log.info("{name} is a member now", name=entry.member.name)
 
@@ -199,6 +203,10 @@ class Team:
         if self._node is not None:
             for public, refusal in self.door.swept():
                 self._node.evict(public, refusal)
+
+    def _review_records(self) -> None:
+        if self._node is not None:
+            self._node.review_records()
 
     def _part_with(self, public: bytes) -> None:
         """Also of who is absent nothing is expected any more."""

@@ -114,7 +114,6 @@ class EntangledNode:
         self.replica.on_silent = self._subscriber.silent
         self.replica.on_peer = self.overlay.heard
         self.replica.on_goodbye = self.overlay.left
-        self.replica.may_store = door.may_store
         if wall is not None:
             self.endpoint.echoer.wall = wall
         self.endpoint.on_refused = self._refused
@@ -194,6 +193,11 @@ class EntangledNode:
         """
         self.endpoint.evict(public, code)
         self._parted(public)
+
+    def review_records(self) -> None:
+        """Let go of the records that the present certificates of their owners do not allow."""
+        self.replica.drop_forbidden()
+        self._subscriber.review()
 
     # -- verbs ------------------------------------------------------------------------------------------------------
 

@@ -13,7 +13,7 @@ from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address
 from middleware.entangled.network.switchboard import SwitchboardNetwork
-from middleware.entangled.wire.door import Life
+from middleware.entangled.wire.door import Life, OpenDoor
 from middleware.entangled.wire.endpoint import Endpoint
 from tests.middleware.admission.village import House, Village, VillageCase
 
@@ -42,7 +42,7 @@ class ClosedTeam(Village):
         return self.signer.founded(name, which or ("device",), self.wall(), self.dice, secret)
 
 
-class PaperDoor:
+class PaperDoor(OpenDoor):
     """The door of an attacker: shows whatever it likes, and lets in everybody."""
 
     def __init__(self, shown: bytes, room: int = 640, life: int = 1) -> None:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from middleware.entangled.record import Slot
-from middleware.entangled.wire.door import FOREIGN, NONCE, Life
+from middleware.entangled.wire.door import FOREIGN, NONCE, Life, OpenDoor
 
 ROOM = 640
 
 
-class Gate:
+class Gate(OpenDoor):
     """Lets in who shows a pass that begins with ``pass``, unless its key is among ``refused``.
 
     ``forbidden`` are pairs of a public key and a method, ``unwritable`` pairs of a public key and a slot's name.

@@ -11,7 +11,7 @@ from middleware import halt, presence, roles, tasks, verdict
 from middleware.deployment.manifest import manifests_key
 from middleware.entangled.identity import Identity
 from middleware.entangled.record import Slot, hashed_key
-from middleware.entangled.wire.door import Life
+from middleware.entangled.wire.door import Life, OpenDoor
 from middleware.node import SwarmNode
 from middleware.prefix import places_of
 from middleware.roles import (
@@ -39,7 +39,7 @@ ABSENT = ("roll.", "reach.")
 """What the methods begin with that not every node has."""
 
 
-class RoleDoor:
+class RoleDoor(OpenDoor):
     """Lets everybody in; ``roles`` by public key say what each may, and ``refusals`` has what was not allowed."""
 
     room = 0

@@ -38,12 +38,14 @@ class MemoryStore:
         self.epoch = epoch
         self._max_rows = max_rows
         self._max_bytes = max_bytes
+        self._owner_share = 1
         self._hold = hold
         self._now = float("-inf")
         self._bytes = 0
         self._slots: dict[Slot, _Held] = {}
         self._by_key: dict[bytes, dict[Slot, _Held]] = {}
         self._by_owner: dict[bytes, dict[Slot, _Held]] = {}
+        self._owner_bytes: dict[bytes, int] = {}
         # In the order in which they may be let go of.
         self._tombstones: dict[Slot, _Held] = {}
         self._made_room: list[Record] = []
@@ -54,6 +56,10 @@ class MemoryStore:
     def __len__(self) -> int:
         """How many slots are held, the empty ones included."""
         return len(self._slots)
+
+    def limit_owners(self, share: int) -> None:
+        """Let each owner use one part in ``share`` of the rows and of the bytes; see ``Store.limit_owners``."""
+        self._owner_share = share
 
     @property
     def trouble(self) -> str:
@@ -177,13 +183,30 @@ class MemoryStore:
         return len(self._slots) + rows <= self._max_rows and self._bytes + size <= self._max_bytes
 
     def _make_room(self, record: Record, held: _Held | None) -> None:
-        """Let go of what may go until ``record`` fits in the place of ``held``; raises ``Full``."""
+        """Let go of what may go until ``record`` fits in the place of ``held``; raises ``Full``.
+
+        Where its owner is above its share, only that owner's own tombstones go.
+        """
         rows = 1 if held is None else 0
         size = weight(record) - (0 if held is None else weight(held.record))
         if not rows and size <= 0:
             return
         leaving: list[Slot] = []
-        candidates = self._dispensable(record.slot)
+        own = (slot for slot in self._dispensable(record.slot) if slot.owner == record.owner)
+        own_rows = rows + len(self._by_owner.get(record.owner, ()))
+        own_bytes = size + self._owner_bytes.get(record.owner, 0)
+        while not self._fits_share(record, own_rows, own_bytes):
+            slot = next(own, None)
+            if slot is None:
+                raise Full(
+                    f"store full for this owner: it may use one part in {self._owner_share} of {self._max_rows} rows"
+                    f" and {self._max_bytes} bytes; remove some of its records, or allow the store more"
+                )
+            leaving.append(slot)
+            own_rows, own_bytes = own_rows - 1, own_bytes - weight(self._slots[slot].record)
+        rows -= len(leaving)
+        size -= sum(weight(self._slots[slot].record) for slot in leaving)
+        candidates = (slot for slot in self._dispensable(record.slot) if slot not in leaving)
         while not self._fits(record, rows, size):
             slot = next(candidates, None)
             if slot is None:
@@ -191,6 +214,15 @@ class MemoryStore:
             leaving.append(slot)
             rows, size = rows - 1, size - weight(self._slots[slot].record)
         self._made_room += [self._remove(slot) for slot in leaving]
+
+    def _fits_share(self, record: Record, rows: int, size: int) -> bool:
+        """Whether the owner of ``record`` may have so many rows and bytes; with one share it may have all."""
+        if self._owner_share == 1:
+            return True
+        most_rows, most_bytes = self._max_rows // self._owner_share, self._max_bytes // self._owner_share
+        if record.is_tombstone:
+            return rows <= 2 * most_rows
+        return rows <= most_rows and size <= most_bytes
 
     def _dispensable(self, spared: Slot) -> Iterator[Slot]:
         """What may be let go of, in that order, but for ``spared``."""
@@ -212,12 +244,20 @@ class MemoryStore:
         self._by_key.setdefault(slot.key, {})[slot] = held
         self._by_owner.setdefault(slot.owner, {})[slot] = held
         self._sorted.pop(slot.key, None)
-        self._bytes += weight(record)
+        self._count_bytes(slot.owner, weight(record))
         self._sort_in(slot, held)
         self._queue(held)
 
+    def _count_bytes(self, owner: bytes, change: int) -> None:
+        self._bytes += change
+        used = self._owner_bytes.get(owner, 0) + change
+        if used:
+            self._owner_bytes[owner] = used
+        else:
+            del self._owner_bytes[owner]
+
     def _replace(self, held: _Held, record: Record, expires_at: float) -> None:
-        self._bytes += weight(record) - weight(held.record)
+        self._count_bytes(record.owner, weight(record) - weight(held.record))
         held.record, held.expires_at = record, expires_at
         self._sort_in(record.slot, held)
         if expires_at < held.queued_at:
@@ -260,7 +300,7 @@ class MemoryStore:
             if not index[name]:
                 del index[name]
         self._sorted.pop(slot.key, None)
-        self._bytes -= weight(held.record)
+        self._count_bytes(slot.owner, -weight(held.record))
         self._tombstones.pop(slot, None)
         self._changed(slot, None)
         return held.record

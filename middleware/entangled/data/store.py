@@ -10,6 +10,9 @@ Where there is no room for a record, room is made in this order, and no further 
 
 Nothing else is ever let go of for the sake of something: if that is not enough, the writer is told ``Full``, with
 figures, and nothing has changed but 1.
+
+Where owners are limited (``limit_owners``), a record of an owner above its share makes room only by tombstones of that
+owner, else its writer is told ``Full``; the records of others stay, and they go on writing.
 """
 
 from __future__ import annotations
@@ -25,6 +28,9 @@ MAX_ROWS = 12_000
 counts.  Full with ``MAX_BYTES`` a store adds some 22 MiB to a node of 40, which a device of 64 MB just bears."""
 MAX_BYTES = 8 * 2**20
 """Bytes that a node holds, as ``weight`` counts them.  More holds more large values; less spares memory and card."""
+OWNER_SHARE = 4
+"""A member of a closed team may use one part in so many of the rows and of the bytes of a store.  In an open team a
+share would protect nothing, as anybody can make one more identity."""
 HOLD = 86_400.0
 """Seconds for which a tombstone stays even where room is short: the longest absence after which a deleted record does
 not come back with whoever was away.  More is safer; less gives room back earlier."""
@@ -71,6 +77,9 @@ class Store(Protocol):
     @property
     def trouble(self) -> str:
         """Why nothing can be written at present; empty if it can."""
+
+    def limit_owners(self, share: int) -> None:
+        """Let each owner use one part in ``share`` of the rows and of the bytes from now on; 1: all of them."""
 
     def put(self, record: Record, expires_at: float, now: float | None = None) -> bool:
         """Hold ``record`` if it beats what its slot holds, and say whether it did.

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections.abc import Callable, Iterator
-from functools import wraps
 
 from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorTime
@@ -18,8 +17,9 @@ from middleware.entangled.background import Background
 from middleware.entangled.data.store import Store
 from middleware.entangled.errors import Refused
 from middleware.entangled.kademlia.contact import Contact
-from middleware.entangled.record import KEY_BYTES, Record, Signed, Slot, unpacked
+from middleware.entangled.record import KEY_BYTES, Record, Signed, unpacked
 from middleware.entangled.replication.cache import PathCache
+from middleware.entangled.replication.certificates import Certificates
 from middleware.entangled.replication.keepsake import Keepsakes
 from middleware.entangled.replication.pusher import WATCH_TTL, Pusher
 from middleware.entangled.replication.watch import digest_of
@@ -48,9 +48,8 @@ OnRecord = Callable[[Record], None]
 class Replica:
     """The records of others, held for them; ``keepsakes`` are the node's own copies, which nobody else gets to see.
 
-    ``may_store`` says whether the owner of a slot may write there, by its role, ``is_sure`` whether this node has
-    caught up with the others, ``nearest`` whom it knows close to a key, ``belongs`` whether it is one of the closest
-    itself.
+    The endpoint's door says whether the owner of a slot may write there.  ``is_sure`` says whether this node has caught
+    up with the others, ``nearest`` whom it knows close to a key, ``belongs`` whether it is one of the closest itself.
 
     ``on_record`` is told of every record that was accepted, ``on_gone`` of every one that is let go of, ``on_silent``
     of every owner (its public key) whose lease ran out or that said goodbye, ``on_peer`` of every peer that stores,
@@ -65,7 +64,8 @@ class Replica:
         self.pusher = Pusher(endpoint, clock, chores)
         self.cache = PathCache()
         self._signed = Signed()
-        self.may_store: Callable[[Slot], bool] = lambda slot: True
+        self.may_store = endpoint.door.may_store
+        self.certificates = Certificates(endpoint)
         self.is_sure: Callable[[], bool] = lambda: True
         self.nearest: Callable[[bytes], list[Contact]] = lambda key: []
         self.belongs: Callable[[bytes], bool] = lambda key: True
@@ -78,7 +78,7 @@ class Replica:
         self.on_peer: Callable[[Contact], None] = lambda contact: None
         self.on_goodbye: Callable[[Contact], None] = lambda contact: None
         self._chores = chores
-        endpoint.expose("store", self._once_written(self.answer_store), changes=True, idempotent=True)
+        endpoint.expose("store", self._answer_store, changes=True, idempotent=True)
         endpoint.expose("find_value", self.answer_find_value)
         endpoint.expose("cache", self.answer_cache, changes=True, idempotent=True)
         endpoint.expose("watch", self.answer_watch, changes=True, idempotent=True)
@@ -125,6 +125,15 @@ class Replica:
         verdict = self.keep(record, left)
         return HELD if not verdict and not self.is_sure() else verdict
 
+    def drop_forbidden(self) -> None:
+        """Let go of the records whose owners' present certificates do not allow them, and tell the watchers.
+
+        Those of owners of which no certificate is known stay: who reads them asks for one.
+        """
+        known = self._endpoint.door.is_known
+        forbidden = [r for r in self._store.records() if not self.may_store(r.slot) and known(r.owner)]
+        self._gone([r for r in forbidden if r.slot in self.keepsakes or self._store.discard(r.slot)])
+
     def left(self, record: Record) -> float:
         """Seconds for which ``record`` is still held here; its ttl where it is not."""
         expiry = self._store.expiry(record.slot)
@@ -139,13 +148,9 @@ class Replica:
         kept, where it does not come from its owner.
         """
         self.on_peer(peer)
-        records = [record for record in map(unpacked, packed) if record is not None]
-        lives = [None] * len(packed) if left is None else [_checked_life(life) for life in left]
-        if len(records) < len(packed) or len(lives) != len(packed):
-            raise Refused("not a record")
         return [
             self.store(record, life) if not (refusal := self._refusal(record, peer)) else refusal
-            for record, life in zip(records, lives, strict=True)
+            for record, life in _checked_batch(packed, left)
         ]
 
     def answer_find_value(
@@ -245,15 +250,22 @@ class Replica:
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
-    def _once_written(self, answer: Callable[..., list[int]]) -> Callable[..., Deferred[list[int]]]:
-        """``answer``, given only when what it took would survive the end of this process."""
+    def _answer_store(
+        self, peer: Contact, packed: list[object], left: list[object] | None = None
+    ) -> Deferred[list[int]]:
+        """STORE, answered when the records that were taken would survive the end of this process.
 
-        @wraps(answer)
-        def acknowledged(*arguments: object) -> Deferred[list[int]]:
-            answers = answer(*arguments)
-            return self._store.written().addCallback(lambda _: answers)
+        The certificates of unknown owners are asked of ``peer`` before the records are judged.
+        """
+        unknown = self.certificates.list_unknown((record for record, _ in _checked_batch(packed, left)), peer)
+        if unknown:
+            learnt = Deferred.fromCoroutine(self.certificates.learn(unknown, peer))
+            return learnt.addCallback(lambda _: self._store_durably(peer, packed, left))
+        return self._store_durably(peer, packed, left)
 
-        return acknowledged
+    def _store_durably(self, peer: Contact, packed: list[object], left: list[object] | None) -> Deferred[list[int]]:
+        answers = self.answer_store(peer, packed, left)
+        return self._store.written().addCallback(lambda _: answers)
 
     def _leased(self, owner: bytes) -> list[Record]:
         """What is held of ``owner`` on lease."""
@@ -335,6 +347,15 @@ def _checked_cursor(after: list[object] | None) -> tuple[bytes, str] | None:
     if len(after) != 2 or not isinstance(after[0], bytes) or not isinstance(after[1], str):
         raise Refused("a page begins after an owner and a name")
     return after[0], after[1]
+
+
+def _checked_batch(packed: list[object], left: list[object] | None) -> list[tuple[Record, float | None]]:
+    """The records of a STORE and the seconds for which each is kept; raises ``Refused``."""
+    records = [record for record in map(unpacked, packed) if record is not None]
+    lives = [None] * len(packed) if left is None else [_checked_life(life) for life in left]
+    if len(records) < len(packed) or len(lives) != len(packed):
+        raise Refused("not a record")
+    return list(zip(records, lives, strict=True))
 
 
 def _checked_life(life: object) -> float:

@@ -100,6 +100,12 @@ class Subscriber:
             watch.forget(replica)
             self._settle(watch)
 
+    def review(self) -> None:
+        """Forget what the present certificates of the owners do not allow."""
+        for watch in list(self._watches):
+            watch.view.keep_only(self._replica.may_store)
+            self._settle(watch)
+
     def silent(self, owner: bytes) -> None:
         """Whoever let its lease run out no longer speaks for others either."""
         if node_id(owner) != self._own_id:
@@ -185,7 +191,23 @@ class Subscriber:
 
     def _answer_push(self, peer: Contact, key: bytes, number: int, packed: list[object], gone: list[object]) -> None:
         self._overlay.heard(peer)
-        records = [r for r in map(unpacked, packed) if r is not None and self._reader.is_credible(r, key, peer)]
+        found = [record for record in map(unpacked, packed) if record is not None]
+        if not any(watch.key == key and peer.node_id in watch.asked for watch in self._watches):
+            return
+        unknown = self._replica.certificates.list_unknown(found, peer)
+        if unknown:
+            self._chores.fork(self._learn_and_take(peer, unknown, key, number, found, gone))
+        else:
+            self._take_push(peer, key, number, found, gone)
+
+    async def _learn_and_take(
+        self, peer: Contact, unknown: list[bytes], key: bytes, number: int, found: list[Record], gone: list[object]
+    ) -> None:
+        await self._replica.certificates.learn(unknown, peer)
+        self._take_push(peer, key, number, found, gone)
+
+    def _take_push(self, peer: Contact, key: bytes, number: int, found: list[Record], gone: list[object]) -> None:
+        records = [record for record in found if self._reader.is_credible(record, key, peer)]
         slots = [slot for place in gone if (slot := _slot_of(key, place)) is not None]
         for watch in [w for w in self._watches if w.key == key and peer.node_id in w.asked]:
             last = watch.pushed.get(peer.node_id, 0)

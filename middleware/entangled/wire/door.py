@@ -84,7 +84,19 @@ class Door(Protocol):
         """Whether a node that was let in may call ``method``."""
 
     def may_store(self, slot: Slot) -> bool:
-        """Whether the owner of ``slot`` may write there; of an owner that this node never met it says yes."""
+        """Whether the present certificate of the owner of ``slot`` allows it to write there."""
+
+    def is_known(self, public: bytes) -> bool:
+        """Whether a certificate of that key is known, so that ``may_store`` can tell."""
+
+    def certificate(self, public: bytes) -> bytes:
+        """Return the newest certificate of that key which this node knows; empty where it knows none."""
+
+    def roles_of(self, public: bytes) -> frozenset[str] | None:
+        """Return the roles that the holder of that key has now, none for a stranger or a revoked or expired member.
+
+        None means that the team is open and restricts nobody.
+        """
 
 
 class OpenDoor:
@@ -106,6 +118,18 @@ class OpenDoor:
     def may_store(self, slot: Slot) -> bool:
         """Everybody may."""
         return True
+
+    def is_known(self, public: bytes) -> bool:
+        """No certificate is needed."""
+        return True
+
+    def certificate(self, public: bytes) -> bytes:
+        """There are none."""
+        return b""
+
+    def roles_of(self, public: bytes) -> frozenset[str] | None:
+        """Nobody is restricted."""
+        return None
 
 
 OPEN = OpenDoor()
