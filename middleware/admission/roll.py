@@ -16,7 +16,7 @@ from typing import NamedTuple
 import msgpack
 
 from middleware.admission.certificate import GATEWAY, Member, member_of
-from middleware.admission.statement import Grant, Invite, Revoke, Secret, Statement, opened, sized, unpacked
+from middleware.admission.statement import Grant, Invite, Revoke, Secret, Statement, Terms, opened, sized, unpacked
 from middleware.entangled.errors import Full, Malformed
 
 MAX_ENTRIES = 4096
@@ -162,6 +162,11 @@ class Roll:
         key = self._slots.get(("invite", self._by_id.get(name, b"")))
         held = None if key is None else self._held[key]
         return (held.entry, held.packed) if held is not None and isinstance(held.entry, Invite) else None
+
+    def terms_of(self, invitation: bytes) -> bytes | None:
+        """Return the sealed terms of the invitation with that public key; None where they are not known."""
+        entry = self._at("terms", invitation)
+        return entry.sealed if isinstance(entry, Terms) else None
 
     def admitted(self, public: bytes) -> Admission | None:
         """How the holder of ``public`` was let in."""

@@ -28,6 +28,8 @@ ROLES = ("device", "operator", "viewer", "gateway", "bootstrap")
 NAME = r"[A-Za-z0-9_-]{1,40}"
 MAX_USES = 100
 MAX_STATEMENT = 65_536
+MAX_TERMS = 320
+"""Bytes of the sealed terms of an invitation: a join reply has room for them."""
 MAX_SEALED = 500
 """Members for whom one statement can carry the team's secret; those beyond ask another member for it."""
 MAX_LIFE = 10 * 365 * 86_400
@@ -85,6 +87,31 @@ class Invite:
     def slot(self) -> tuple[str, bytes]:
         """What it is about."""
         return "invite", self.public
+
+    @property
+    def rank(self) -> int:
+        """The later one holds."""
+        return self.not_before
+
+    @property
+    def until(self) -> int:
+        """Until when it is worth being remembered."""
+        return self.not_after + REMEMBERED
+
+
+@dataclass(frozen=True)
+class Terms:
+    """The sealed terms of the invitation ``public`` (``middleware.admission.terms``), until ``not_after``."""
+
+    public: bytes
+    sealed: bytes
+    not_before: int
+    not_after: int
+
+    @property
+    def slot(self) -> tuple[str, bytes]:
+        """What it is about."""
+        return "terms", self.public
 
     @property
     def rank(self) -> int:
@@ -171,9 +198,9 @@ class Secret:
         return len(secret) == SECRET_BYTES and mark_of(secret) == self.mark
 
 
-Statement = Grant | Invite | Revoke | Secret
-_KINDS: tuple[type[Any], ...] = (Grant, Invite, Revoke, Secret)
-_Kind = TypeVar("_Kind", Grant, Invite, Revoke, Secret)
+Statement = Grant | Invite | Revoke | Secret | Terms
+_KINDS: tuple[type[Any], ...] = (Grant, Invite, Revoke, Secret, Terms)
+_Kind = TypeVar("_Kind", Grant, Invite, Revoke, Secret, Terms)
 
 
 def sealed_secret(
@@ -266,6 +293,8 @@ def _fields(statement: Statement) -> list[Any]:
     if isinstance(statement, Secret):
         pairs = [list(pair) for pair in statement.sealed]
         return [kind, statement.number, statement.at, statement.grace, statement.not_after, statement.mark, pairs]
+    if isinstance(statement, Terms):
+        return [kind, statement.public, statement.sealed, statement.not_before, statement.not_after]
     head = [kind, statement.public, statement.name]
     if isinstance(statement, Revoke):
         return [*head, statement.at, statement.not_after]
@@ -301,6 +330,12 @@ def _checked(fields: list[Any]) -> Statement:
             times = moment(at), moment(grace, 0, MAX_LIFE), moment(end)
             secret = Secret(moment(number, 1), *times, sized(mark, _MARK), each)
             return _lasting(secret, secret.at, secret.not_after)
+        if kind == 4:
+            public, sealed, begin, end = rest
+            if not isinstance(sealed, bytes) or len(sealed) > MAX_TERMS:
+                raise Malformed("terms that are too long")
+            terms = Terms(sized(public, _PUBLIC), sealed, moment(begin), moment(end))
+            return _lasting(terms, terms.not_before, terms.not_after)
     except (ValueError, TypeError) as error:
         raise Malformed("a statement with other fields than it should have") from error
     raise Malformed("a statement of no known kind")

@@ -250,7 +250,7 @@ class Team:
         contacts = [contact for contact in self._node.overlay.contacts() if not contact.address.host.startswith("~")]
         picked = self._rng.sample(contacts, min(len(contacts), knock.MAX_CONTACTS))
         secrets = tuple(membership.accepted(self._wall()))
-        return Welcome(membership.operator, membership.team, shown, secrets, tuple(picked), dict(membership.settings))
+        return Welcome(shown, secrets, tuple(picked))
 
     def _keep(self, membership: Membership) -> None:
         try:

@@ -107,11 +107,12 @@ class Village(World):
 
     def invite(self, name: str = "dog", uses: int = 1, expires: float = 3600.0, house: int = 0) -> str:
         """A code that is good from now on."""
-        code, packed = self.signer.invite(name, ("device",), uses, self.wall(), expires, self.dice)
+        code, packed, terms = self.signer.invite(name, ("device",), uses, self.wall(), expires, self.dice)
         told: list[str] = []
-        self.tell(packed, house).addCallback(told.append)
+        for each in (terms, packed):
+            self.tell(each, house).addCallback(told.append)
         self.run(1.0)
-        assert told == ["invite"]
+        assert told == ["terms", "invite"]
         return code.text
 
     def knock(
