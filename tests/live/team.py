@@ -1,7 +1,7 @@
 """A web node with three dogs that stand still: the server of the page's tests, run as a child process.
 
 ``python -m tests.live.team`` prints the port, the code to sign in with, and an operator's token and ticket in its first
-line; whoever has signed in at one is signed in at the next.  Lines on its input change the team: ``gone NAME``, ``back
+line; vaio and pi vouch for each other's sessions.  Lines on its input change the team: ``gone NAME``, ``back
 NAME``, ``status NAME STATUS``, ``freeze SECONDS`` (the whole process stands), ``name NAME`` (of the node that serves),
 ``pages NODE=URL ...`` (the web nodes, itself first), ``strange FILE`` (devices and tasks whose words are those of that
 JSON list), ``session SECONDS`` (that one is signed in for at a time), ``place NAME KEY=NUMBER ...`` (where it says that
@@ -11,10 +11,12 @@ input does.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import random
 import sys
 import time
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,6 +29,7 @@ from twisted.internet.stdio import StandardIO
 from twisted.internet.threads import deferToThread
 from twisted.protocols.basic import LineReceiver
 
+from middleware.entangled.identity import Identity
 from middleware.fault import KINDS
 from swarmnode.gateway import sides
 from webnode.board import (
@@ -40,6 +43,8 @@ from webnode.board import (
     MemorySurvey,
     MemoryTuning,
     Page,
+    Token,
+    Visitor,
 )
 from webnode.camera import OnFrame
 from webnode.chronicle import TeamChronicle
@@ -48,11 +53,13 @@ from webnode.invite import TeamInvites
 from webnode.limits import AddressLimits
 from webnode.password import hashed, is_password
 from webnode.server import WebService, web_service
-from webnode.session import SignedSessions
+from webnode.session import NOBODY, SignedSessions
 from webnode.state import Departed, State, state_of
+from webnode.token import TokenKey
 
 reactor: Any = _reactor
 PASSWORD = hashed("correct horse", bytes(16), 4)
+GATEWAYS = ("vaio", "pi")
 HUES = {"dog1": (70, 90, 150), "dog2": (70, 150, 90), "dog3": (150, 100, 70)}
 
 
@@ -278,7 +285,7 @@ class Orders(LineReceiver):
 
     def connectionMade(self) -> None:
         """Say where the team is, and how to come in."""
-        token = self._sessions.token("operator", "operator", time.time(), 3600.0)
+        token = self._sessions.token(NOBODY, "operator", "operator", time.time(), 3600.0)
         self.sendLine(f"{self._web.port} {self._sessions.code} {token.text} {token.ticket}".encode())
 
     def lineReceived(self, line: bytes) -> None:
@@ -292,9 +299,10 @@ class Orders(LineReceiver):
             next(each for each in self._team.devices if each["name"] == rest[0])["status"] = rest[1]
         elif verb == "name":
             self._team.node = rest[0]
+            self._sessions.key = key_of(rest[0])
         elif verb == "pages":
             named = [each.split("=") for each in rest]
-            self._pages[:] = [Page(node, url, is_self=place == 0) for place, (node, url) in enumerate(named)]
+            self._pages[:] = [Page(key_of(node).node_id.hex(), url, is_self=place == 0) for place, (node, url) in enumerate(named)]
         elif verb == "freeze":
             time.sleep(float(rest[0]))
         elif verb == "place":
@@ -323,12 +331,29 @@ def board(team: Team) -> Board:
     able = [{"uuid": f"{n:02x}" * 16, "name": f"dog{n}", "busy": "Patrol the yard" * (n == 2)} for n in (1, 2)]
     desk.previews["search"] = {"able": able, "refused": {"dog3": ["no gripper", "no lift"]}, "likely": None}
     desk.together["yard"] = [{"id": "t1", "title": "Find and touch the red target"}]
-    sessions = SignedSessions(b"a team of the tests", "quiet-otter", PASSWORD, random.Random(), checked)
+    gateways = {key_of(name).public for name in GATEWAYS}
+    sessions = TeamSessions(
+        key_of(team.node), gateways.__contains__, "quiet-otter", PASSWORD, random.Random(), checked
+    )
     tuning = MemoryTuning({able[0]["uuid"]: KNOBS})
     survey = MemorySurvey(network(), {f"0{n}" * 16: inventory() for n in (1, 2)}, links(), membership())
     parts: dict[str, Any] = {"halts": team.halts, "tuning": tuning, "survey": survey, "chronicle": TeamChronicle()}
     parts["faults"], parts["phones"] = MemoryFaults(*KINDS), MemoryPhones(check=sides)
     return Board(desk, sessions, MemoryAudit(time.time), limits=AddressLimits(), **parts)
+
+
+class TeamSessions(SignedSessions):
+    """Sessions with tokens for gateways alone, whoever is listed."""
+
+    def passes(self, who: Visitor, nodes: Iterable[str], now: float) -> dict[str, Token]:
+        """Those of gateways."""
+        gateways = {key_of(name).node_id.hex() for name in GATEWAYS}
+        return super().passes(who, [node for node in nodes if node in gateways], now)
+
+
+def key_of(name: str) -> TokenKey:
+    """The key of the web node of that name; ``GATEWAYS`` vouch for sessions, no other does."""
+    return TokenKey(Identity(hashlib.blake2s(name.encode()).digest()))
 
 
 def checked(text: str, password: str) -> Deferred[Any]:
