@@ -1,8 +1,9 @@
 """The guard: which requests a page on a LAN may answer, and the headers that keep a browser strict.  Pure.
 
 The page has no cookies, so a foreign site gains nothing but what a visitor's browser reaches for it: it is stopped
-at three doors.  ``Host`` must be an address or a name of this machine (against rebinding of names), ``Origin`` must be the page's own or that of another web node of the team, and a request that changes something
-must be of a kind that a foreign form cannot send.
+at three doors.  ``Host`` must be an address or a name of this machine (against rebinding of names), ``Origin`` must be
+the page's own or that of another web node of the team, and a request that changes something must be of a kind that a
+foreign form cannot send.
 """
 
 from __future__ import annotations

@@ -15,6 +15,7 @@ from twisted.internet.threads import deferToThreadPool
 
 from middleware.errors import BadSetting
 from webnode.board import OpenSessions, Role, Sessions, Token, Visitor
+from webnode.code import draw_code
 from webnode.delay import SOURCES, Delays, network_of
 from webnode.errors import Refusal
 from webnode.fallback import TeamFallbacks, is_loopback
@@ -33,8 +34,6 @@ FREE_EVERYWHERE, LONGEST_EVERYWHERE_S, FORGOTTEN_EVERYWHERE_S = 100, 60.0, 3600.
 """Of all addresses together 100 wrong codes are free; then at last one a minute is looked at, until an hour is quiet.
 The wait is short, as everybody whose address is not known yet waits."""
 EVERYWHERE = "everywhere"
-LETTERS = "abcdefghjkmnpqrstuvwxyz"
-"""Of these is a code that the node makes: none looks like another, or like a digit."""
 AT_ONCE, WAITING = 2, 1
 """Passwords that are checked at the same time, and those that may wait for it: each holds one of the page's four
 workers, and whoever guesses must not hold them all."""
@@ -159,8 +158,8 @@ class SignedSessions:
         return self._signed(replace(claim, parents=who.parents, vouchers=self._through(who)), audience)
 
     def _signed(self, claim: Claim, audience: bytes = b"") -> Token:
-        texts = (self.key.token(each, audience) for each in (claim, claim.ticket))
-        return Token(*texts, claim.role, float(claim.until))
+        text, ticket = (self.key.token(each, audience) for each in (claim, claim.ticket))
+        return Token(text, ticket, claim.role, float(claim.until))
 
     def _through(self, who: Visitor) -> tuple[bytes, ...]:
         """The web nodes beside this one that vouch for ``who``; raises ``Refusal`` where they are too many."""
@@ -230,14 +229,8 @@ def sessions(ground: Ground, team: TeamFallbacks, code: str = "") -> Sessions:
         return deferToThreadPool(ground.reactor, ground.reactor.getThreadPool(), is_password, text, password)
 
     revoked = TeamRevocations(ground.node)
-    code = web.code or code or made(ground.rng)
+    code = web.code or code or draw_code(ground.rng)
     return SignedSessions(key, team.may_vouch, code, web.password, ground.rng, check, revoked)
-
-
-def made(rng: random.Random) -> str:
-    """A code to sign in with."""
-    letters = "".join(rng.choice(LETTERS) for _ in range(8))
-    return f"{letters[:4]}-{letters[4:]}"
 
 
 def _wrong() -> Refusal:

@@ -25,7 +25,7 @@ MAX_NAME = 64
 MAX_VOUCHERS = 3
 """Web nodes, beside the one that signs, through which a session may have come."""
 MAX_PARENTS = 3
-MAX_TEXT = 600
+MAX_TEXT = 700
 REMEMBERED = 512
 """Tokens that are known to be genuine; to verify one takes 80 us, and streams are checked every second."""
 MAX_MOMENT = 2**40
@@ -134,6 +134,8 @@ def unpacked(data: bytes, issuer: bytes, audience: bytes) -> Claim:
         and 0 <= flags < 2 * len(ROLES)
         and all(type(each) is int and 0 <= each < MAX_MOMENT for each in (until, limit))
         and isinstance(name, str)
+        and isinstance(parents, list)
+        and isinstance(vouchers, list)
         and meant == audience
         and all(isinstance(each, bytes) and len(each) == SESSION_BYTES for each in (session, *parents))
         and all(isinstance(each, bytes) and len(each) == len(issuer) for each in vouchers)

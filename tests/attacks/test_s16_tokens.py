@@ -327,7 +327,7 @@ class RebindingTests(SynchronousTestCase):
     """A site on the LAN that points its own name at the web node."""
 
     def test_rebind_a_local_name(self) -> None:
-        """A name of the local network that is not the node's own is refused; its own and those of the settings serve."""
+        """A name of the LAN that is not the node's own is refused; its own and those of the settings serve."""
         board, state = Board(MemoryDesk(), OpenSessions()), state_of([], [], {}, node="vaio")
         client = create_app(lambda: state, board, hosts=("vaio", "vaio.local", "robots.lan")).test_client()
 
@@ -357,6 +357,5 @@ class TlsTests(PageCase):
         for secret in [*self.secrets(), hashlib.blake2s(b"").digest()]:
             page = hashlib.blake2s(secret, person=b"page").hexdigest()
             for known in (secret, hashlib.blake2s(page.encode()).digest()):
-                self.assertNotIn(authority(known, "").key.private_numbers(), [each.key.private_numbers() for each in signers])
-
-
+                mine = authority(known, "").key.private_numbers()
+                self.assertNotIn(mine, [each.key.private_numbers() for each in signers])

@@ -11,7 +11,6 @@ input does.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import random
 import sys
@@ -29,9 +28,9 @@ from twisted.internet.stdio import StandardIO
 from twisted.internet.threads import deferToThread
 from twisted.protocols.basic import LineReceiver
 
-from middleware.entangled.identity import Identity
 from middleware.fault import KINDS
 from swarmnode.gateway import sides
+from tests.live.keys import GATEWAYS, key_of
 from webnode.board import (
     Board,
     Knob,
@@ -55,11 +54,9 @@ from webnode.password import hashed, is_password
 from webnode.server import WebService, web_service
 from webnode.session import NOBODY, SignedSessions
 from webnode.state import Departed, State, state_of
-from webnode.token import TokenKey
 
 reactor: Any = _reactor
 PASSWORD = hashed("correct horse", bytes(16), 4)
-GATEWAYS = ("vaio", "pi")
 HUES = {"dog1": (70, 90, 150), "dog2": (70, 150, 90), "dog3": (150, 100, 70)}
 
 
@@ -302,7 +299,8 @@ class Orders(LineReceiver):
             self._sessions.key = key_of(rest[0])
         elif verb == "pages":
             named = [each.split("=") for each in rest]
-            self._pages[:] = [Page(key_of(node).node_id.hex(), url, is_self=place == 0) for place, (node, url) in enumerate(named)]
+            uuids = [key_of(node).node_id.hex() for node, _ in named]
+            self._pages[:] = [Page(uuids[place], url, is_self=place == 0) for place, (_, url) in enumerate(named)]
         elif verb == "freeze":
             time.sleep(float(rest[0]))
         elif verb == "place":
@@ -332,9 +330,7 @@ def board(team: Team) -> Board:
     desk.previews["search"] = {"able": able, "refused": {"dog3": ["no gripper", "no lift"]}, "likely": None}
     desk.together["yard"] = [{"id": "t1", "title": "Find and touch the red target"}]
     gateways = {key_of(name).public for name in GATEWAYS}
-    sessions = TeamSessions(
-        key_of(team.node), gateways.__contains__, "quiet-otter", PASSWORD, random.Random(), checked
-    )
+    sessions = TeamSessions(key_of(team.node), gateways.__contains__, "quiet-otter", PASSWORD, random.Random(), checked)
     tuning = MemoryTuning({able[0]["uuid"]: KNOBS})
     survey = MemorySurvey(network(), {f"0{n}" * 16: inventory() for n in (1, 2)}, links(), membership())
     parts: dict[str, Any] = {"halts": team.halts, "tuning": tuning, "survey": survey, "chronicle": TeamChronicle()}
@@ -349,11 +345,6 @@ class TeamSessions(SignedSessions):
         """Those of gateways."""
         gateways = {key_of(name).node_id.hex() for name in GATEWAYS}
         return super().passes(who, [node for node in nodes if node in gateways], now)
-
-
-def key_of(name: str) -> TokenKey:
-    """The key of the web node of that name; ``GATEWAYS`` vouch for sessions, no other does."""
-    return TokenKey(Identity(hashlib.blake2s(name.encode()).digest()))
 
 
 def checked(text: str, password: str) -> Deferred[Any]:
@@ -448,7 +439,7 @@ def main() -> None:
     port = int(sys.argv[1]) if len(sys.argv) > 1 else 0
     pages = MemoryFallbacks()
     served = replace(board(team), fallbacks=pages)
-    web = web_service(reactor, "127.0.0.1", port, team.read, served, team, time.time)
+    web = web_service(reactor, "127.0.0.1", port, team.read, served, team, time.time, ("vaio.local",))
     pages_here = ["http://192.168.0.7:8080", "https://192.168.0.7:8443", f"http://127.0.0.1:{port}"]
     served.invites = TeamInvites(lambda: pages_here, b"PEM", "AB:CD:" * 10, reactor, reactor.getThreadPool())
     web.startService()

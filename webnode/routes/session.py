@@ -130,8 +130,8 @@ ROUTES = (
     Route(
         "GET",
         f"{API}/session/passes",
-        "Tokens for the same session at the team's other web nodes, by uuid: each good at that node alone, for minutes; "
-        "there, PUT session makes a session of it",
+        "Tokens for the same session at the team's other web nodes, by uuid: each good at that one, for minutes; "
+        "there PUT session makes a session of it",
         "viewer",
         passes,
         gives="uuid: token, ticket, role, until (unix seconds)",
