@@ -208,7 +208,7 @@ class Attempts:
         return network_of(source) in self._known or is_loopback(source)
 
 
-def sessions(ground: Ground, team: TeamFallbacks, code: str = "") -> Sessions:
+def sessions(ground: Ground, team: TeamFallbacks) -> Sessions:
     """Who may come in; raises ``BadSetting`` where the settings would let in everybody of the network."""
     web, origin = ground.settings.web, ground.settings.origin
     key = TokenKey(ground.node.entangled.identity)
@@ -229,7 +229,7 @@ def sessions(ground: Ground, team: TeamFallbacks, code: str = "") -> Sessions:
         return deferToThreadPool(ground.reactor, ground.reactor.getThreadPool(), is_password, text, password)
 
     revoked = TeamRevocations(ground.node)
-    code = web.code or code or draw_code(ground.rng)
+    code = web.code or draw_code(ground.rng)
     return SignedSessions(key, team.may_vouch, code, web.password, ground.rng, check, revoked)
 
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import os
 import random
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from typing import Any
 
@@ -75,9 +76,10 @@ class PageCase(SynchronousTestCase):
         """The page of a node, which tells the team where it is."""
         service = self.team.services[name]
         node, rng = service.assembly.node, random.Random(name)
-        ground = Ground(service.settings, node, self.team.desk, self.team.clock, self.now, rng)
+        settings = replace(service.settings, web=replace(service.settings.web, code=CODE))
+        ground = Ground(settings, node, self.team.desk, self.team.clock, self.now, rng)
         followed = fallbacks(ground)
-        signed = sessions(ground, followed, CODE)
+        signed = sessions(ground, followed)
         assert isinstance(followed, TeamFallbacks) and isinstance(signed, SignedSessions)
         followed.serves([f"http://127.0.0.1:{port}"])
         return Web(signed, followed, node, ground)
@@ -316,6 +318,7 @@ class LogTests(SynchronousTestCase):
 
     def test_read_the_log(self) -> None:
         """The log says where the page is, and neither the code nor a link with it."""
+        self.patch(os, "environ", {**os.environ, "XDG_RUNTIME_DIR": self.mktemp()})
         with capturedLogs() as said:
             invitation.invited("s16", "127.0.0.1", lambda: 8080, CODE)
         words = "\n".join(formatEvent(each) + str(each) for each in said)
