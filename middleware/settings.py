@@ -181,6 +181,12 @@ class WebSettings:
     password: str = field(default="", metadata=setting.hidden(200), repr=False)
     """The hash of a password to sign in with, as ``swarm password`` prints it.  Empty: the code alone lets in."""
 
+    names: tuple[str, ...] = field(
+        default=(), metadata=setting.patterns(r"[a-z0-9]([a-z0-9.-]{0,98}[a-z0-9])?", 8, '"robots.lan"')
+    )
+    """Further names of this machine by which the page may be opened, at most 8.  Its addresses, its host name (also
+    with ``.local`` and ``.lan``) and the node's name always may."""
+
     sign_in: bool = field(default=True, metadata=setting.truth())
     """False: whoever can open the page is an operator; only where ``host`` is an address of this machine alone."""
 

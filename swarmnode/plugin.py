@@ -24,7 +24,7 @@ from swarmnode.ports import given_way
 from swarmnode.service import NodeService
 from swarmnode.warmth import STARTED_S, warmed_up
 from swarmnode.web import web_page, with_code
-from swarmnode.world import control_socket, real_seams, resolved, with_page_key
+from swarmnode.world import control_socket, real_seams, resolved
 from webnode.errors import PortTaken
 
 use_monotonic_time()
@@ -100,7 +100,6 @@ def makeService(options: Options) -> IService:
         settings = given_way(resolved(settings))
         checked_team(settings)
         seams = real_seams(settings, reactor)
-        settings = with_page_key(settings, seams)
         fronts: list[Callable[[SwarmNode], IService]] = [partial(control_socket, settings, reactor)]
         if "web" in settings.node.roles:
             settings = with_code(settings, seams.rng)

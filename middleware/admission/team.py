@@ -153,6 +153,13 @@ class Team:
         """All that are members now, as far as this node has heard, by name."""
         return self.roll.members(self._wall())
 
+    def roles_of(self, public: bytes) -> frozenset[str]:
+        """The roles that the holder of ``public`` has at this moment; none where it is no member, or revoked."""
+        member = self.door.member(public)
+        if member is None or self.roll.refusal(member, self._wall()):
+            return frozenset()
+        return frozenset(member.roles)
+
     def guest(self, seed: bytes, name: str) -> Membership:
         """The membership of a guest for whom this node vouches; raises ``Malformed`` where its own pass is too long."""
         own, now = self.membership, int(self._wall())
