@@ -8,10 +8,10 @@
 
 The psk follows from the invitation's *public* key, which the team's members know from their roll and whoever has the
 code can make: so a KNOCK that opens comes from who has the code, and strangers cannot read it.  Members are not trusted
-by it.  A WELCOME has three things that they cannot make: the sealed ``terms`` of the invitation, from which the newcomer
-alone learns the operator's key; the answering node's grant by that operator, with the role bootstrap; and that node's
-signature over the content and both keys of the newcomer.  A WELCOME is never longer than its KNOCK.  Codecs only;
-``newcomer`` and ``reception`` have the two sides.
+by it.  A WELCOME has three things that they cannot make: the sealed ``terms`` of the invitation, from which the
+newcomer alone learns the operator's key; the answering node's grant by that operator, with the role bootstrap; and that
+node's signature over the content and both keys of the newcomer.  A WELCOME is never longer than its KNOCK.  Codecs
+only; ``newcomer`` and ``reception`` have the two sides.
 """
 
 from __future__ import annotations

@@ -124,10 +124,14 @@ class JoinTests(SiegeCase):
         self.check_true_team(lambda datagram, heard: knock.welcome(self.invitation, heard, given, signer, self.rng))
 
     def test_a_grant_of_another_node(self) -> None:
-        """The grant of a bootstrap node, which every member knows, does not let another key sign."""
+        """The terms, a grant and the newcomer's own pass, which every member knows, do not let another key sign."""
         boot = self.team.houses[0].team.identity
+        self.team.knock(self.code.text, seed=NEWCOMER.seed)
+        self.team.run(8.0)
+        admission = self.eye.team.roll.admitted(NEWCOMER.public)
+        assert admission is not None
         signer = Signer(self.eye.team.identity, self.grant(boot, "bootstrap"), self.terms)
-        given = Welcome(self.eye.kept.membership.shown, ((9, b"x" * 32, 0),))
+        given = Welcome(admission.shown, ((9, b"x" * 32, 0),))
         self.check_true_team(lambda datagram, heard: knock.welcome(self.invitation, heard, given, signer, self.rng))
 
     def test_terms_of_another_invitation(self) -> None:
