@@ -115,7 +115,7 @@ class TeamFallbacks:
     def may_vouch(self, public: bytes) -> bool:
         """Whether the node with that key may let people in, at this moment."""
         if self._node.team is not None:
-            return GATEWAY in self._node.team.roles_of(public)
+            return GATEWAY in self._node.team.door.roles_of(public)
         now = self._clock()
         return public == self._own or any(each.public == public and each.end > now for each in self._served)
 

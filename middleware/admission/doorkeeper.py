@@ -11,16 +11,18 @@ from collections import OrderedDict
 from collections.abc import Callable, Collection
 from typing import Protocol
 
-from middleware.admission.certificate import ROOM, Member, member_of, pass_of
+from middleware.admission.certificate import ROOM, Member, entry_of, member_of, pass_of
 from middleware.admission.membership import Membership
 from middleware.admission.roll import Roll
 from middleware.entangled.data.store import Store
-from middleware.entangled.errors import RemoteError
+from middleware.entangled.errors import Full, RemoteError
 from middleware.entangled.record import Slot
-from middleware.entangled.wire.door import FOREIGN, NONCE, Life, next_life
+from middleware.entangled.wire.door import FOREIGN, NONCE, UNLISTED, Life, next_life
 
 MAX_MET = 4096
 MAX_PASSES = 1024
+MAX_GUESTS = 64
+"""Guests of one gateway that a node lets in at a time."""
 LIVED = "admission/life"
 """The note of the number of the node's last life."""
 
@@ -78,6 +80,7 @@ class Doorkeeper:
         self._wall = wall
         self._rules = rules
         self._me = membership().member
+        self.list_entry: Callable[[bytes], object] = lambda packed: roll.add(packed, wall())
         self._passes: OrderedDict[bytes, Member] = OrderedDict()
         self._met: OrderedDict[bytes, tuple[Member, bytes]] = OrderedDict()
 
@@ -100,13 +103,44 @@ class Doorkeeper:
             member = self._roll.known_as(self._read(public, shown))
         except RemoteError:
             return FOREIGN
-        refusal = self._roll.refusal(member, self._wall())
+        refusal = self._roll.refusal(member, self._wall()) or self._list(public, shown, member)
         if not refusal:
             self._met[public] = member, shown
             self._met.move_to_end(public)
             if len(self._met) > MAX_MET:
                 self._met.popitem(last=False)
         return refusal
+
+    def _list(self, public: bytes, shown: bytes, member: Member) -> str:
+        """Have a member on the membership list, so that all know it and the operator can revoke it by name.
+
+        Returns the refusal of one for whom the list has no room: who is not on it is no member.  A guest is not listed;
+        its voucher is.
+        """
+        if member.voucher is not None:
+            return self._count_guest(member)
+        entry = entry_of(public, shown)
+        if entry is not None and public != self._me.public and not self._is_listed(member):
+            try:
+                self.list_entry(entry)
+            except (Full, RemoteError):
+                return UNLISTED
+        return ""
+
+    def _is_listed(self, member: Member) -> bool:
+        return self._roll.granted(member.public) is not None or self._roll.admitted(member.public) is not None
+
+    def _count_guest(self, member: Member) -> str:
+        """Return a refusal where the voucher of a guest vouches for too many others at present."""
+        assert member.voucher is not None
+        now = self._wall()
+        guests = [
+            each
+            for each, _ in self._met.values()
+            if each.voucher is not None and each.voucher.public == member.voucher.public and not each.trouble(now)
+        ]
+        others = sum(each.public != member.public for each in guests)
+        return "" if others < MAX_GUESTS else UNLISTED
 
     def may(self, public: bytes, method: str) -> bool:
         """Whether a node that was let in may call ``method``."""

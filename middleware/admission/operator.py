@@ -16,12 +16,14 @@ from middleware.admission.certificate import pass_of
 from middleware.admission.errors import BadKeyFile
 from middleware.admission.membership import Membership
 from middleware.admission.statement import (
+    MAX_KEPT,
     MAX_LIFE,
     SECRET_BYTES,
     Grant,
     Invite,
     Revoke,
     Terms,
+    member_id,
     named,
     sealed_secret,
     signed,
@@ -92,9 +94,16 @@ class Operator:
         terms = Terms(drawn.key.public, sealed, int(now), end)
         return Invitation(drawn, signed(self.identity, invite), signed(self.identity, terms))
 
-    def revoke(self, public: bytes, name: str, now: float) -> bytes:
-        """The end of a member's key or of an invitation's."""
-        return signed(self.identity, Revoke(public, name, int(now), int(now) + MAX_LIFE))
+    def revoke(self, public: bytes, name: str, now: float, kept: Iterable[bytes] = ()) -> bytes:
+        """Sign the end of a member's key or of an invitation's.
+
+        ``kept`` are the public keys of the members that a bootstrap node admitted and that stay; the others go with it.
+        Raises ``ValueError`` where there are too many.
+        """
+        ids = tuple(member_id(each) for each in kept)
+        if len(ids) > MAX_KEPT:
+            raise ValueError(f"a revocation keeps at most {MAX_KEPT} members, not {len(ids)}")
+        return signed(self.identity, Revoke(public, name, int(now), int(now) + MAX_LIFE, ids))
 
     def rotate(self, number: int, members: Iterable[bytes], now: float, grace: float, rng: random.Random) -> bytes:
         """A new secret of the team, for those ``members``; the one before it is accepted for ``grace`` seconds."""

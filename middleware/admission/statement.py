@@ -37,6 +37,9 @@ MAX_LIFE = 10 * 365 * 86_400
 REMEMBERED = 7 * 86_400
 """Seconds for which an invitation is remembered that has run out, so that its code is refused by name."""
 SECRET_BYTES = 32
+MEMBER_ID = 8
+MAX_KEPT = MAX_SEALED
+"""Members that one revocation of a bootstrap node can keep."""
 _LAST = 2**40
 _PUBLIC, _SIGNATURE, _MARK = 32, 64, 16
 
@@ -128,13 +131,15 @@ class Terms:
 class Revoke:
     """The end of a member's key, or of an invitation's and with it of all that came by it; there is no way back.
 
-    ``name`` is what people called it.
+    ``name`` is what people called it.  ``kept`` freezes what a bootstrap node did: of those that it admitted, only the
+    members with these ids (``member_id``) stay, whatever dates their certificates bear.
     """
 
     public: bytes
     name: str
     at: int
     not_after: int
+    kept: tuple[bytes, ...] = ()
 
     @property
     def slot(self) -> tuple[str, bytes]:
@@ -209,6 +214,11 @@ def sealed_secret(
     """The statement that gives ``secret`` to those ``members`` (public keys) and to nobody else."""
     pairs = [(each, sealed(secret, exchange_key(each), _shared(number), b"", rng)) for each in sorted(members)]
     return Secret(number, at, grace, at + MAX_LIFE, mark_of(secret), tuple(pairs))
+
+
+def member_id(public: bytes) -> bytes:
+    """Return the id by which a revocation names a member that it keeps."""
+    return hashlib.blake2s(public, digest_size=MEMBER_ID, person=b"member").digest()
 
 
 def mark_of(secret: bytes) -> bytes:
@@ -297,7 +307,8 @@ def _fields(statement: Statement) -> list[Any]:
         return [kind, statement.public, statement.sealed, statement.not_before, statement.not_after]
     head = [kind, statement.public, statement.name]
     if isinstance(statement, Revoke):
-        return [*head, statement.at, statement.not_after]
+        # An empty list is left out: so is a statement of version 0.1, which knew none.
+        return [*head, statement.at, statement.not_after, *([list(statement.kept)] if statement.kept else [])]
     head.append(bits_of(statement.roles))
     if isinstance(statement, Grant):
         return [*head, statement.not_before, statement.not_after]
@@ -318,8 +329,9 @@ def _checked(fields: list[Any]) -> Statement:
             invite = Invite(sized(public, _PUBLIC), named(name), roles_of(bits), moment(uses, 1, MAX_USES), *times)
             return _lasting(invite, invite.not_before, invite.not_after)
         if kind == 2:
-            public, name, at, end = rest
-            revoke = Revoke(sized(public, _PUBLIC), named(name), moment(at), moment(end))
+            public, name, at, end, *more = rest
+            kept = tuple(sized(each, MEMBER_ID) for [ids] in [more] for each in ids) if more else ()
+            revoke = Revoke(sized(public, _PUBLIC), named(name), moment(at), moment(end), kept)
             return _lasting(revoke, revoke.at, revoke.not_after)
         if kind == 3:
             number, at, grace, end, mark, pairs = rest

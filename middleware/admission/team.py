@@ -76,6 +76,7 @@ class Team:
         self._gossip = Gossip(
             self.roll, endpoint, node.overlay.contacts, self._rng, self._chores, self._wall, self._on_new
         )
+        self.door.list_entry = self._gossip.add
         reception = Reception(
             self.roll,
             self.identity,
@@ -153,13 +154,6 @@ class Team:
         """All that are members now, as far as this node has heard, by name."""
         return self.roll.members(self._wall())
 
-    def roles_of(self, public: bytes) -> frozenset[str]:
-        """The roles that the holder of ``public`` has at this moment; none where it is no member, or revoked."""
-        member = self.door.member(public)
-        if member is None or self.roll.refusal(member, self._wall()):
-            return frozenset()
-        return frozenset(member.roles)
-
     def guest(self, seed: bytes, name: str) -> Membership:
         """The membership of a guest for whom this node vouches; raises ``Malformed`` where its own pass is too long."""
         own, now = self.membership, int(self._wall())
@@ -187,9 +181,9 @@ class Team:
         self._store.note(ROLL, msgpack.packb(self.roll.packed()))
         if isinstance(entry, Revoke):
             self._log.info("revoked: {name}", name=entry.name)
+            self._review_records()
             self._sweep()
             self._part_with(entry.public)
-            self._review_records()
         elif isinstance(entry, Secret):
             self._heard_of(entry)
         elif isinstance(entry, Grant):
@@ -217,9 +211,10 @@ class Team:
 
     def _part_with(self, public: bytes) -> None:
         """Also of who is absent nothing is expected any more."""
-        came = [each.member.public for each in self.roll.admissions() if each.member.invitation == public]
-        for each in (public, *came):
-            if self._node is not None and self._node.overlay.known(node_id(each)) is not None:
+        if self._node is None:
+            return
+        for each in (public, *self.roll.void):
+            if self._node.overlay.known(node_id(each)) is not None:
                 self._node.evict(each, REVOKED)
 
     def _heard_of(self, entry: Secret) -> None:
@@ -248,7 +243,9 @@ class Team:
                 self._take_over(entry, found)
 
     def _answer_secret(self, peer: Contact, number: int) -> bytes | None:
-        """Who asks is a member, or its session would not be."""
+        """Give the secret to a present member, which is on the membership list, or to a guest of one."""
+        if not self.door.roles_of(peer.public):
+            return None
         return next((secret for known, secret, _ in self.membership.secrets if known == number), None)
 
     def _given(self, shown: bytes) -> Welcome:

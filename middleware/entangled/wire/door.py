@@ -26,7 +26,7 @@ MAX_NOTED = 1024
 LINES = 20.0
 
 EXPIRED, EARLY, REVOKED, FOREIGN = "expired", "early", "revoked", "foreign"
-DOUBLED, SUPERSEDED, ROLE = "doubled", "superseded", "role"
+DOUBLED, SUPERSEDED, ROLE, UNLISTED = "doubled", "superseded", "role", "unlisted"
 
 _REFUSALS = {
     EXPIRED: "the certificate has expired, or one of the two clocks is wrong; look at both clocks (swarm doctor tells"
@@ -39,6 +39,8 @@ _REFUSALS = {
     " its own; if the files were stolen, have the operator revoke them (swarm revoke, swarm rotate)",
     SUPERSEDED: "a node with the same identity was started later; stop one of them, for each needs a membership or"
     " store of its own; if the files were stolen, have the operator revoke them (swarm revoke, swarm rotate)",
+    UNLISTED: "the membership list has no room for it, or its invitation or its gateway was used too often; have the"
+    " operator look at the list (swarm members) and revoke those who should not be there (swarm revoke)",
     ROLE: "its role does not allow that; ask the operator for another role",
 }
 
