@@ -17,10 +17,12 @@ from middleware.admission.roll import Roll
 from middleware.entangled.data.store import Store
 from middleware.entangled.errors import RemoteError
 from middleware.entangled.record import Slot
-from middleware.entangled.wire.door import FOREIGN, NONCE, Life, next_life
+from middleware.entangled.wire.door import FOREIGN, NONCE, REVOKED, Authority, Life, next_life
 
 MAX_MET = 4096
 MAX_PASSES = 1024
+JUDGED_S = 1.0
+"""Seconds for which the authority of an owner is remembered, unless the roll changes before."""
 LIVED = "admission/life"
 """The note of the number of the node's last life."""
 
@@ -80,6 +82,9 @@ class Doorkeeper:
         self._me = membership().member
         self._passes: OrderedDict[bytes, Member] = OrderedDict()
         self._met: OrderedDict[bytes, Member] = OrderedDict()
+        self._shown: dict[bytes, bytes] = {}  # the passes of those of ``_met`` that are not on the roll
+        self._authorities: dict[bytes, Authority] = {}
+        self._judged_at = (b"", 0.0)
 
     @property
     def me(self) -> Member:
@@ -104,8 +109,11 @@ class Doorkeeper:
         if not refusal:
             self._met[public] = member
             self._met.move_to_end(public)
+            self._authorities.pop(public, None)
+            if self.is_off_roll(public):
+                self._shown[public] = shown
             if len(self._met) > MAX_MET:
-                self._met.popitem(last=False)
+                self._shown.pop(self._met.popitem(last=False)[0], None)
         return refusal
 
     def may(self, public: bytes, method: str) -> bool:
@@ -114,9 +122,40 @@ class Doorkeeper:
         return member is not None and self._rules.may_call(member.roles, method)
 
     def may_store(self, slot: Slot) -> bool:
-        """Whether the owner of ``slot`` may write there; of an owner whom nobody here knows it says yes."""
-        member = self.member(slot.owner)
-        return member is None or self._rules.may_store(member.roles, slot)
+        """Whether the certificate of the owner of ``slot``, as it is at present, allows it to write there."""
+        authority = self.authority(slot.owner)
+        return not authority.refusal and self._rules.may_store(authority.roles, slot)
+
+    def authority(self, owner: bytes) -> Authority:
+        """Whether the certificate of an owner of records holds at present, and its roles."""
+        now = self._wall()
+        digest, at = self._judged_at
+        if digest != self._roll.digest or not 0.0 <= now - at < JUDGED_S:
+            self._authorities.clear()
+            self._judged_at = (self._roll.digest, now)
+        found = self._authorities.get(owner)
+        if found is None:
+            found = self._authorities[owner] = self._judged(owner, now)
+            if len(self._authorities) > MAX_MET:
+                del self._authorities[next(iter(self._authorities))]
+        return found
+
+    def certificate(self, owner: bytes) -> bytes:
+        """The operator's last word about an owner, or the pass that it showed; empty where neither is known."""
+        if owner == self._me.public:
+            return self.shown
+        grant, admission = self._roll.granted(owner), self._roll.admitted(owner)
+        if grant is not None and (admission is None or grant[0].not_before >= admission.member.not_before):
+            return pass_of(grant[1])
+        return self._shown.get(owner, b"") if admission is None else admission.shown
+
+    def is_off_roll(self, public: bytes) -> bool:
+        """Whether the roll says nothing of the holder of ``public``: a guest, or a member of which it has yet to."""
+        return self._roll.granted(public) is None and self._roll.admitted(public) is None
+
+    def learn(self, owner: bytes, certificate: bytes) -> bool:
+        """Take in the pass of an owner that another node showed; whether it holds."""
+        return not self.judge(owner, certificate)
 
     def member(self, public: bytes) -> Member | None:
         """What is known of the holder of ``public``, met or only heard of."""
@@ -144,7 +183,18 @@ class Doorkeeper:
         ]
         for public, _ in gone:
             del self._met[public]
+            self._shown.pop(public, None)
         return gone
+
+
+    def _judged(self, owner: bytes, now: float) -> Authority:
+        if self._roll.revoked(owner) is not None:
+            return Authority(REVOKED)
+        member = self.member(owner)
+        if member is None:
+            return Authority(FOREIGN)
+        refusal = self._roll.refusal(member, now)
+        return Authority(refusal) if refusal else Authority("", member.roles)
 
     def _read(self, public: bytes, shown: bytes) -> Member:
         key = hashlib.blake2s(public + shown, digest_size=16).digest()

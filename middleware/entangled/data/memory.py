@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from twisted.internet.defer import Deferred, succeed
 
-from middleware.entangled.data.store import HOLD, MAX_BYTES, MAX_ROWS, Origin, Usage, weight
+from middleware.entangled.data.store import HOLD, MAX_BYTES, MAX_ROWS, Origin, Usage, part_of_owner, weight
 from middleware.entangled.errors import Full
 from middleware.entangled.record import Record, Slot
 
@@ -25,8 +25,9 @@ class _Held:
 class MemoryStore:
     """A ``Store`` that lives as long as the program.
 
-    ``max_rows`` slots and ``max_bytes`` at most.  A tombstone is let in above that, for a delete must never fail for
-    want of room, up to as many slots again, for nobody shall fill the memory with them.
+    ``max_rows`` slots and ``max_bytes`` at most, and of these a part for one owner (``part_of_owner``).  A tombstone is
+    let in above that, for a delete must never fail for want of room, up to as many slots again, for nobody shall fill
+    the memory with them.
     """
 
     origin: Origin = "new"
@@ -38,12 +39,14 @@ class MemoryStore:
         self.epoch = epoch
         self._max_rows = max_rows
         self._max_bytes = max_bytes
+        self._owner_rows, self._owner_bytes = part_of_owner(max_rows, max_bytes)
         self._hold = hold
         self._now = float("-inf")
         self._bytes = 0
         self._slots: dict[Slot, _Held] = {}
         self._by_key: dict[bytes, dict[Slot, _Held]] = {}
         self._by_owner: dict[bytes, dict[Slot, _Held]] = {}
+        self._bytes_of: dict[bytes, int] = {}
         # In the order in which they may be let go of.
         self._tombstones: dict[Slot, _Held] = {}
         self._made_room: list[Record] = []
@@ -116,6 +119,10 @@ class MemoryStore:
         slots = self._by_owner.get(owner, {})
         return [slots[slot].record for slot in sorted(slots)]
 
+    def owners(self) -> list[bytes]:
+        """Every owner that has a slot, in the order in which they came."""
+        return list(self._by_owner)
+
     def extend(self, owner: bytes, expires_at: float) -> int:
         """Let all leased records of ``owner`` live until ``expires_at`` at least; returns how many there are."""
         leased = 0
@@ -182,6 +189,7 @@ class MemoryStore:
         size = weight(record) - (0 if held is None else weight(held.record))
         if not rows and size <= 0:
             return
+        self._check_part(record, rows, size)
         leaving: list[Slot] = []
         candidates = self._dispensable(record.slot)
         while not self._fits(record, rows, size):
@@ -191,6 +199,20 @@ class MemoryStore:
             leaving.append(slot)
             rows, size = rows - 1, size - weight(self._slots[slot].record)
         self._made_room += [self._remove(slot) for slot in leaving]
+
+    def _check_part(self, record: Record, rows: int, size: int) -> None:
+        """Raise ``Full`` where ``rows`` and ``size`` more are beyond what one owner may have."""
+        held = len(self._by_owner.get(record.owner, ())) + rows
+        octets = self._bytes_of.get(record.owner, 0) + size
+        if record.is_tombstone:
+            is_within = held <= 2 * self._owner_rows
+        else:
+            is_within = held <= self._owner_rows and octets <= self._owner_bytes
+        if not is_within:
+            raise Full(
+                f"store full for this owner: {held} rows and {octets} bytes it would have, one owner may have"
+                f" {self._owner_rows} rows and {self._owner_bytes} bytes; remove some, or allow the store more"
+            )
 
     def _dispensable(self, spared: Slot) -> Iterator[Slot]:
         """What may be let go of, in that order, but for ``spared``."""
@@ -212,12 +234,16 @@ class MemoryStore:
         self._by_key.setdefault(slot.key, {})[slot] = held
         self._by_owner.setdefault(slot.owner, {})[slot] = held
         self._sorted.pop(slot.key, None)
-        self._bytes += weight(record)
+        self._weigh(slot.owner, weight(record))
         self._sort_in(slot, held)
         self._queue(held)
 
+    def _weigh(self, owner: bytes, more: int) -> None:
+        self._bytes += more
+        self._bytes_of[owner] = self._bytes_of.get(owner, 0) + more
+
     def _replace(self, held: _Held, record: Record, expires_at: float) -> None:
-        self._bytes += weight(record) - weight(held.record)
+        self._weigh(record.owner, weight(record) - weight(held.record))
         held.record, held.expires_at = record, expires_at
         self._sort_in(record.slot, held)
         if expires_at < held.queued_at:
@@ -260,7 +286,9 @@ class MemoryStore:
             if not index[name]:
                 del index[name]
         self._sorted.pop(slot.key, None)
-        self._bytes -= weight(held.record)
+        self._weigh(slot.owner, -weight(held.record))
+        if slot.owner not in self._by_owner:
+            del self._bytes_of[slot.owner]
         self._tombstones.pop(slot, None)
         self._changed(slot, None)
         return held.record

@@ -10,6 +10,9 @@ Where there is no room for a record, room is made in this order, and no further 
 
 Nothing else is ever let go of for the sake of something: if that is not enough, the writer is told ``Full``, with
 figures, and nothing has changed but 1.
+
+One owner has at most a quarter of the rows and bytes.  One that has them is refused, and nothing is let go of for it:
+so the owners that fill a store are at least four, whatever one of them writes.
 """
 
 from __future__ import annotations
@@ -28,6 +31,12 @@ MAX_BYTES = 8 * 2**20
 HOLD = 86_400.0
 """Seconds for which a tombstone stays even where room is short: the longest absence after which a deleted record does
 not come back with whoever was away.  More is safer; less gives room back earlier."""
+OWNER_PART = 4
+"""The part of a store that one owner may have: one in so many.  Less spares others more; more bears with a small team
+in which one node writes nearly all."""
+OWNER_ROWS = 250
+OWNER_BYTES = 2**20 + 4096
+"""What one owner may have of a store however small: some tasks, and a value of the greatest length."""
 FIXED_BYTES = 17
 """Sequence (8), ttl (8) and lifetime (1) of a record."""
 
@@ -77,7 +86,7 @@ class Store(Protocol):
 
         The very record that is already held only stays longer.  ``now``: what has run out by then makes room first.
 
-        Raises ``Full`` where there is no room, ``Unwritable`` where it cannot be written.  It is safe, and may be
+        Raises ``Full`` where there is no room, or its owner has all that one owner may have; ``Unwritable`` where it cannot be written.  It is safe, and may be
         acknowledged, once ``written`` has fired.
         """
 
@@ -95,6 +104,9 @@ class Store(Protocol):
 
     def owned(self, owner: bytes) -> list[Record]:
         """The records of ``owner``, tombstones included, in the order of their slots."""
+
+    def owners(self) -> list[bytes]:
+        """Every owner that has a slot, in the order in which they came."""
 
     def extend(self, owner: bytes, expires_at: float) -> int:
         """Let all leased records of ``owner`` live until ``expires_at`` at least; returns how many there are."""
@@ -128,6 +140,11 @@ class Store(Protocol):
 
     def __len__(self) -> int:
         """How many slots are held, the empty ones included."""
+
+
+def part_of_owner(max_rows: int, max_bytes: int) -> tuple[int, int]:
+    """Rows and bytes that one owner may have of a store that has so many."""
+    return max(max_rows // OWNER_PART, OWNER_ROWS), max(max_bytes // OWNER_PART, OWNER_BYTES)
 
 
 def weight(record: Record) -> int:

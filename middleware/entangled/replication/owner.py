@@ -17,12 +17,12 @@ from twisted.internet.interfaces import IReactorTime
 
 from middleware.entangled.background import Background, paced, until
 from middleware.entangled.data.store import Store
-from middleware.entangled.errors import Conflict, EntangledError, NoAnswer, NotAcknowledged, Refused
+from middleware.entangled.errors import Conflict, EntangledError, Full, NoAnswer, NotAcknowledged, Refused
 from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.overlay import Overlay
 from middleware.entangled.record import TEAM_TTL, TOMBSTONE_TTL, Lifetime, Record, Slot
-from middleware.entangled.replication.replica import FORBIDDEN, HELD, Replica, pages_of
+from middleware.entangled.replication.replica import FORBIDDEN, HELD, NO_ROOM, Replica, pages_of
 from middleware.entangled.replication.shipper import Shipper
 from middleware.entangled.replication.watch import digest_of
 from middleware.entangled.wire.door import ROLE, meaning
@@ -127,6 +127,12 @@ class Owner:
         if record is not None and record.lifetime == "leased":
             self._let_go(slot)
             self._replica.answer_let_go(self._overlay.me(), [digest_of([record])])
+
+    def review(self) -> None:
+        """Look no more after what the role of this node does not allow any more."""
+        if self._replica.certificates.door.authority(self._identity.public).is_final:
+            for slot in [slot for slot in self._own if not self._replica.may_store(slot)]:
+                self._let_go(slot)
 
     def owns(self, slot: Slot) -> bool:
         """Whether this node looks after what is in ``slot``."""
@@ -254,6 +260,8 @@ class Owner:
             return verdict
         if verdict == FORBIDDEN:
             raise Refused(f"{contact.address} does not take {record.name!r} from its owner: {meaning(ROLE)}", ROLE)
+        if verdict == NO_ROOM:
+            raise Full(f"{contact.address} has no room for {record.name!r}; remove some records, or allow it more")
         raise Refused(f"{contact.address} does not take the record")
 
     def left(self, record: Record) -> float | None:

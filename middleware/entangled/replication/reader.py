@@ -89,7 +89,9 @@ class Reader:
         for _ in range(MAX_PAGES):
             if not (isinstance(page, list) and len(page) >= 2 and isinstance(page[0], list)):
                 break
-            records += [r for r in map(unpacked, page[0]) if r is not None and self.is_credible(r, key, contact)]
+            told = [record for record in map(unpacked, page[0]) if record is not None]
+            await self._replica.certificates.learn(contact, (record.owner for record in told))
+            records += [record for record in told if self.is_credible(record, key, contact)]
             # What it was worth at the end counts: it may have fallen behind in between.
             worth = page[2] if len(page) > 2 and page[2] in (SURE, CACHED) else UNSURE
             nearer = contacts_of(page[3]) if len(page) > 3 else []

@@ -53,6 +53,21 @@ class Life(NamedTuple):
 UNCOUNTED = Life()
 
 
+class Authority(NamedTuple):
+    """Why the certificate of an owner of records does not hold at present (``refusal``), and its roles where it does.
+
+    ``FOREIGN`` stands for an owner whose certificate this node has not seen.
+    """
+
+    refusal: str = ""
+    roles: tuple[str, ...] = ()
+
+    @property
+    def is_final(self) -> bool:
+        """Whether no clock and no certificate that is yet to come can make the records good that it does not cover."""
+        return self.refusal in ("", REVOKED, ROLE)
+
+
 class Door(Protocol):
     """Whom a team lets in; the endpoint asks again at each handshake, so what it answers may change.
 
@@ -84,7 +99,16 @@ class Door(Protocol):
         """Whether a node that was let in may call ``method``."""
 
     def may_store(self, slot: Slot) -> bool:
-        """Whether the owner of ``slot`` may write there; of an owner that this node never met it says yes."""
+        """Whether the certificate of the owner of ``slot``, as it is at present, allows it to write there."""
+
+    def authority(self, owner: bytes) -> Authority:
+        """What ``may_store`` goes by for this owner; it changes when that does."""
+
+    def certificate(self, owner: bytes) -> bytes:
+        """The certificate of an owner by which other nodes can judge its records; empty where it is unknown."""
+
+    def learn(self, owner: bytes, certificate: bytes) -> bool:
+        """Take in the certificate of an owner that another node showed; whether it holds."""
 
 
 class OpenDoor:
@@ -106,6 +130,18 @@ class OpenDoor:
     def may_store(self, slot: Slot) -> bool:
         """Everybody may."""
         return True
+
+    def authority(self, owner: bytes) -> Authority:
+        """The same for everybody."""
+        return Authority()
+
+    def certificate(self, owner: bytes) -> bytes:
+        """Nobody has one."""
+        return b""
+
+    def learn(self, owner: bytes, certificate: bytes) -> bool:
+        """Nobody needs one."""
+        return False
 
 
 OPEN = OpenDoor()
