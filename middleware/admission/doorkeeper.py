@@ -186,7 +186,6 @@ class Doorkeeper:
             self._shown.pop(public, None)
         return gone
 
-
     def _judged(self, owner: bytes, now: float) -> Authority:
         if self._roll.revoked(owner) is not None:
             return Authority(REVOKED)

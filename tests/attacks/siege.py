@@ -13,7 +13,7 @@ from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address
 from middleware.entangled.network.switchboard import SwitchboardNetwork
-from middleware.entangled.wire.door import Life
+from middleware.entangled.wire.door import Authority, Life
 from middleware.entangled.wire.endpoint import Endpoint
 from tests.middleware.admission.village import House, Village, VillageCase
 
@@ -61,6 +61,18 @@ class PaperDoor:
 
     def may_store(self, slot: object) -> bool:
         """Everything."""
+        return True
+
+    def authority(self, owner: bytes) -> Authority:
+        """Everybody has it."""
+        return Authority()
+
+    def certificate(self, owner: bytes) -> bytes:
+        """Its own, whoever is meant."""
+        return self.shown
+
+    def learn(self, owner: bytes, certificate: bytes) -> bool:
+        """Any."""
         return True
 
 

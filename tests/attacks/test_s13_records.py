@@ -254,6 +254,21 @@ class FloodTests(RecordCase):
         asked = bad.ask(team.contact(team.houses[0]), "store", [first.packed()], changes=True)
         self.assertEqual(self.outcome(team, asked), [0], "a full owner can still delete")
 
+    def test_it_blocks_no_reads(self) -> None:
+        """A member whose share is full at all replicas but one cannot make the reads of a key fail."""
+        team = self.team
+        bad, own = self.insider(team, "bad", DEVICE)
+        share = team.houses[0].node.store.usage.max_rows // 4
+        for house in team.houses[1:]:
+            for number in range(share):
+                house.node.replica.keep(Record(OTHER, f"{number}", own.public, 1, "team", 3600.0, b"\xc3", bytes(64)))
+        record = written(own, TASKS, "t1")
+        asked = bad.ask(team.contact(team.houses[0]), "store", [record.packed()], changes=True)
+        self.assertEqual(self.outcome(team, asked), [0])
+        for house in team.houses:
+            found = self.outcome(team, house.node.get(TASKS), 5.0)
+            self.assertIsInstance(found, list)
+
 
 class GuestTests(RecordCase):
     """What a guest of a gateway may write reaches those that never met it."""

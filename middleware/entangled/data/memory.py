@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from twisted.internet.defer import Deferred, succeed
 
 from middleware.entangled.data.store import HOLD, MAX_BYTES, MAX_ROWS, Origin, Usage, part_of_owner, weight
-from middleware.entangled.errors import Full
+from middleware.entangled.errors import OWNER_FULL, Full
 from middleware.entangled.record import Record, Slot
 
 
@@ -211,7 +211,8 @@ class MemoryStore:
         if not is_within:
             raise Full(
                 f"store full for this owner: {held} rows and {octets} bytes it would have, one owner may have"
-                f" {self._owner_rows} rows and {self._owner_bytes} bytes; remove some, or allow the store more"
+                f" {self._owner_rows} rows and {self._owner_bytes} bytes; remove some, or allow the store more",
+                OWNER_FULL,
             )
 
     def _dispensable(self, spared: Slot) -> Iterator[Slot]:

@@ -21,7 +21,7 @@ from typing import Literal, NamedTuple, Protocol
 
 from twisted.internet.defer import Deferred
 
-from middleware.entangled.record import Record, Slot
+from middleware.entangled.record import MAX_VALUE, Record, Slot
 
 MAX_ROWS = 12_000
 """Slots that a node holds.  More serves a larger network; less spares memory: 1.2 KiB a row beside what ``weight``
@@ -35,8 +35,8 @@ OWNER_PART = 4
 """The part of a store that one owner may have: one in so many.  Less spares others more; more bears with a small team
 in which one node writes nearly all."""
 OWNER_ROWS = 250
-OWNER_BYTES = 2**20 + 4096
-"""What one owner may have of a store however small: some tasks, and a value of the greatest length."""
+OWNER_BYTES = 2 * (MAX_VALUE + 4096)
+"""What one owner may have of a store however small: some tasks, and two values of the greatest length."""
 FIXED_BYTES = 17
 """Sequence (8), ttl (8) and lifetime (1) of a record."""
 
@@ -86,8 +86,8 @@ class Store(Protocol):
 
         The very record that is already held only stays longer.  ``now``: what has run out by then makes room first.
 
-        Raises ``Full`` where there is no room, or its owner has all that one owner may have; ``Unwritable`` where it cannot be written.  It is safe, and may be
-        acknowledged, once ``written`` has fired.
+        Raises ``Full`` where there is no room, or its owner has all that one owner may have, ``Unwritable`` where it
+        cannot be written.  It is safe, and may be acknowledged, once ``written`` has fired.
         """
 
     def written(self) -> Deferred[None]:

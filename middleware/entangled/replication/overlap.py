@@ -41,9 +41,7 @@ class Overlap:
     ``standing`` says that of this node.
     """
 
-    def __init__(
-        self, replica: Replica, overlay: Overlay, endpoint: Endpoint, clock: IReactorTime
-    ) -> None:
+    def __init__(self, replica: Replica, overlay: Overlay, endpoint: Endpoint, clock: IReactorTime) -> None:
         self.asked_at: dict[bytes, float] = {}
         self.standing: Callable[[], int] = lambda: SURE
         self._replica = replica

@@ -17,7 +17,7 @@ from twisted.internet.interfaces import IReactorTime
 
 from middleware.entangled.background import Background, paced, until
 from middleware.entangled.data.store import Store
-from middleware.entangled.errors import Conflict, EntangledError, Full, NoAnswer, NotAcknowledged, Refused
+from middleware.entangled.errors import OWNER_FULL, Conflict, EntangledError, Full, NoAnswer, NotAcknowledged, Refused
 from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.overlay import Overlay
@@ -48,6 +48,8 @@ LONG = 2**16
 SPARE_S = 0.5
 """Seconds after which the second wave is not held back any longer, whatever became of the first."""
 MAX_SEQUENCE = 2**62
+OWNERS_FAULT = (ROLE, OWNER_FULL)
+"""Codes of refusals that are due to the owner of the record, and no fault of the replica."""
 SEQUENCES = "sequences"
 BLOCK = 1024
 """Sequence numbers that are noted in the store at once, so that not every write has to note one."""
@@ -186,7 +188,7 @@ class Owner:
         """Store at every holder: how many took it, and the highest sequence that stood against it (0: none).
 
         Raises ``NotAcknowledged`` where too few took it and nothing stood against it, ``Refused`` where that is because
-        its owner's role may not write it.
+        its owner's role may not write it, or the owner has as much as one owner may have.
         """
         if concern != "one":
             await self._overlay.met()
@@ -215,7 +217,7 @@ class Owner:
                 verdict = await self._verdict(contact, record, left)
             except EntangledError as error:
                 release()
-                if isinstance(error, Refused) and error.code == ROLE:
+                if isinstance(error, Refused) and error.code in OWNERS_FAULT:
                     forbidden.append(error)
                 raise
             for pause in UNSURE_FOR if concern != "one" and contact.node_id in voters else ():
@@ -243,7 +245,8 @@ class Owner:
         votes = sum(1 for node_id, verdict in answers.items() if verdict in (0, HELD) and is_vote(node_id, verdict))
         if votes < needed and not newest:
             if forbidden:
-                self._let_go(record.slot)  # to say it again would change nothing
+                if forbidden[0].code == ROLE:
+                    self._let_go(record.slot)  # to say it again would change nothing
                 raise forbidden[0]
             raise NotAcknowledged(votes, needed)
         return held, newest
@@ -261,7 +264,8 @@ class Owner:
         if verdict == FORBIDDEN:
             raise Refused(f"{contact.address} does not take {record.name!r} from its owner: {meaning(ROLE)}", ROLE)
         if verdict == NO_ROOM:
-            raise Full(f"{contact.address} has no room for {record.name!r}; remove some records, or allow it more")
+            text = f"{contact.address} holds all that it may of the owner of {record.name!r}; remove some records"
+            raise Full(text, OWNER_FULL)
         raise Refused(f"{contact.address} does not take the record")
 
     def left(self, record: Record) -> float | None:

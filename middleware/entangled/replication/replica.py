@@ -16,7 +16,7 @@ from twisted.internet.interfaces import IReactorTime
 
 from middleware.entangled.background import Background
 from middleware.entangled.data.store import Store
-from middleware.entangled.errors import Full, Refused
+from middleware.entangled.errors import OWNER_FULL, Full, Refused
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.record import KEY_BYTES, Record, Signed, Slot, unpacked
 from middleware.entangled.replication.cache import PathCache
@@ -44,7 +44,8 @@ HELD = -2
 FORBIDDEN = -3
 """Answer to a STORE of what its owner may not write: by its role, or because no certificate of it holds."""
 NO_ROOM = -4
-"""Answer to a STORE of several records for one that has no room; one that comes alone is told why it has none."""
+"""Answer to a STORE of several records for one whose owner has all that one owner may have; one that comes alone is
+refused with the figures."""
 
 OnRecord = Callable[[Record], None]
 
@@ -53,8 +54,8 @@ class Replica:
     """The records of others, held for them; ``keepsakes`` are the node's own copies, which nobody else gets to see.
 
     ``may_store`` says whether the owner of a slot may write there, by its certificate as it is at present; what it may
-    not is not taken, and not shown either.  ``is_sure`` says whether this node has caught up with the others, ``nearest`` whom it knows close to a key, ``belongs`` whether it is one of the closest
-    itself.
+    not is not taken, and not shown either.  ``is_sure`` says whether this node has caught up with the others,
+    ``nearest`` whom it knows close to a key, ``belongs`` whether it is one of the closest itself.
 
     ``on_record`` is told of every record that was accepted, ``on_gone`` of every one that is let go of, ``on_silent``
     of every owner (its public key) whose lease ran out or that said goodbye, ``on_peer`` of every peer that stores,
@@ -293,13 +294,13 @@ class Replica:
         return acknowledged
 
     def _stored(self, peer: Contact, records: list[Record], lives: Sequence[float | None]) -> list[int]:
-        """Keep those of ``records`` that are lawful; one that has no room does not keep the others out."""
+        """Keep those of ``records`` that are lawful; one whose owner has too many does not keep the others out."""
         verdicts = []
         for record, life in zip(records, lives, strict=True):
             try:
                 verdicts.append(self._refusal(record, peer) or self.store(record, life))
-            except Full:
-                if len(records) == 1:
+            except Full as error:
+                if len(records) == 1 or error.code != OWNER_FULL:
                     raise
                 verdicts.append(NO_ROOM)
         return verdicts
