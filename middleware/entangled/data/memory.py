@@ -5,12 +5,16 @@ from __future__ import annotations
 import heapq
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 
 from twisted.internet.defer import Deferred, succeed
 
-from middleware.entangled.data.store import HOLD, MAX_BYTES, MAX_ROWS, Origin, Usage, part_of_owner, weight
+from middleware.entangled.data.store import HOLD, MAX_BYTES, MAX_ROWS, OWNER_BYTES, OWNER_ROWS, Origin, Usage, weight
 from middleware.entangled.errors import OWNER_FULL, Full
 from middleware.entangled.record import Record, Slot
+
+MAX_LOOKED_AT = 1000
+"""Old tombstones that are looked at for those of one owner, the oldest first."""
 
 
 @dataclass(slots=True)
@@ -25,9 +29,9 @@ class _Held:
 class MemoryStore:
     """A ``Store`` that lives as long as the program.
 
-    ``max_rows`` slots and ``max_bytes`` at most, and of these a part for one owner (``part_of_owner``).  A tombstone is
-    let in above that, for a delete must never fail for want of room, up to as many slots again, for nobody shall fill
-    the memory with them.
+    ``max_rows`` slots and ``max_bytes`` at most, and of these one owner may have as much as it leaves free.  A
+    tombstone is let in above that, for a delete must never fail for want of room, up to as many slots again, for nobody
+    shall fill the memory with them.
     """
 
     origin: Origin = "new"
@@ -39,7 +43,6 @@ class MemoryStore:
         self.epoch = epoch
         self._max_rows = max_rows
         self._max_bytes = max_bytes
-        self._owner_rows, self._owner_bytes = part_of_owner(max_rows, max_bytes)
         self._hold = hold
         self._now = float("-inf")
         self._bytes = 0
@@ -189,31 +192,37 @@ class MemoryStore:
         size = weight(record) - (0 if held is None else weight(held.record))
         if not rows and size <= 0:
             return
-        self._check_part(record, rows, size)
-        leaving: list[Slot] = []
-        candidates = self._dispensable(record.slot)
+        leaving: dict[Slot, None] = {}
+        own = (slot for slot in islice(self._dispensable(record.slot), MAX_LOOKED_AT) if slot.owner == record.owner)
+        while not self._is_within_part(record, rows, size):
+            slot = next(own, None)
+            if slot is None:
+                raise Full(
+                    f"store full for this owner, which has {len(self._by_owner[record.owner])} rows and"
+                    f" {self._bytes_of[record.owner]} bytes: the store holds {self.usage}, and one owner may have as"
+                    f" much as it leaves free; remove some, or allow the store more",
+                    OWNER_FULL,
+                )
+            leaving[slot] = None
+            rows, size = rows - 1, size - weight(self._slots[slot].record)
+        candidates = (slot for slot in self._dispensable(record.slot) if slot not in leaving)
         while not self._fits(record, rows, size):
             slot = next(candidates, None)
             if slot is None:
                 raise Full(f"store full: it holds {self.usage}, no room for {size} bytes; remove some, or allow more")
-            leaving.append(slot)
+            leaving[slot] = None
             rows, size = rows - 1, size - weight(self._slots[slot].record)
         self._made_room += [self._remove(slot) for slot in leaving]
 
-    def _check_part(self, record: Record, rows: int, size: int) -> None:
-        """Raise ``Full`` where ``rows`` and ``size`` more are beyond what one owner may have."""
-        held = len(self._by_owner.get(record.owner, ())) + rows
-        octets = self._bytes_of.get(record.owner, 0) + size
-        if record.is_tombstone:
-            is_within = held <= 2 * self._owner_rows
-        else:
-            is_within = held <= self._owner_rows and octets <= self._owner_bytes
-        if not is_within:
-            raise Full(
-                f"store full for this owner: {held} rows and {octets} bytes it would have, one owner may have"
-                f" {self._owner_rows} rows and {self._owner_bytes} bytes; remove some, or allow the store more",
-                OWNER_FULL,
-            )
+    def _is_within_part(self, record: Record, rows: int, size: int) -> bool:
+        """Whether its owner leaves as much free as it has, with ``rows`` and ``size`` more, or has but little."""
+        has_rows = len(self._by_owner.get(record.owner, ())) + rows
+        has_bytes = self._bytes_of.get(record.owner, 0) + size
+        free_rows = self._max_rows - len(self._slots) - rows
+        free_bytes = self._max_bytes - self._bytes - size
+        return has_rows <= max(OWNER_ROWS, free_rows) and (
+            record.is_tombstone or has_bytes <= max(OWNER_BYTES, free_bytes)
+        )
 
     def _dispensable(self, spared: Slot) -> Iterator[Slot]:
         """What may be let go of, in that order, but for ``spared``."""

@@ -11,8 +11,9 @@ Where there is no room for a record, room is made in this order, and no further 
 Nothing else is ever let go of for the sake of something: if that is not enough, the writer is told ``Full``, with
 figures, and nothing has changed but 1.
 
-One owner has at most a quarter of the rows and bytes.  One that has them is refused, and nothing is let go of for it:
-so the owners that fill a store are at least four, whatever one of them writes.
+One owner may have as much as it leaves free: a dynamic threshold, as in switches with a shared buffer (Choudhury and
+Hahne, 1998).  Alone it has up to half of the rows and bytes; k owners that write without end leave 1 in 2**k free to
+the others.  An owner that has more is refused, and only tombstones of its own make room for it.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from typing import Literal, NamedTuple, Protocol
 
 from twisted.internet.defer import Deferred
 
-from middleware.entangled.record import MAX_VALUE, Record, Slot
+from middleware.entangled.record import Record, Slot
 
 MAX_ROWS = 12_000
 """Slots that a node holds.  More serves a larger network; less spares memory: 1.2 KiB a row beside what ``weight``
@@ -31,12 +32,9 @@ MAX_BYTES = 8 * 2**20
 HOLD = 86_400.0
 """Seconds for which a tombstone stays even where room is short: the longest absence after which a deleted record does
 not come back with whoever was away.  More is safer; less gives room back earlier."""
-OWNER_PART = 4
-"""The part of a store that one owner may have: one in so many.  Less spares others more; more bears with a small team
-in which one node writes nearly all."""
 OWNER_ROWS = 250
-OWNER_BYTES = 2 * (MAX_VALUE + 4096)
-"""What one owner may have of a store however small: some tasks, and two values of the greatest length."""
+OWNER_BYTES = 65_536
+"""Rows and bytes that each owner may have as long as there is room at all, however much others have."""
 FIXED_BYTES = 17
 """Sequence (8), ttl (8) and lifetime (1) of a record."""
 
@@ -140,11 +138,6 @@ class Store(Protocol):
 
     def __len__(self) -> int:
         """How many slots are held, the empty ones included."""
-
-
-def part_of_owner(max_rows: int, max_bytes: int) -> tuple[int, int]:
-    """Rows and bytes that one owner may have of a store that has so many."""
-    return max(max_rows // OWNER_PART, OWNER_ROWS), max(max_bytes // OWNER_PART, OWNER_BYTES)
 
 
 def weight(record: Record) -> int:
