@@ -101,13 +101,15 @@ in none of the others."""
 class Namespace(NamedTuple):
     """A kind of record: the roles of the owners that may write it, how it is recognised, and what it is for.
 
-    ``example`` is a slot of it, as the text of its key and the slot's name.
+    ``example`` is a slot of it, as the text of its key and the slot's name.  Where it ``lasts``, a record that replicas
+    hold when its owner is revoked stays there until it runs out: the team remains in the state in which it was.
     """
 
     roles: frozenset[str]
     by: str
     text: str
     example: tuple[str, str]
+    lasts: bool = False
 
     def slot(self, owner: bytes) -> Slot:
         """The slot of ``owner`` that the example names."""
@@ -120,7 +122,7 @@ NAMESPACES: Mapping[str, Namespace] = {
         ALL, BY_KEY, "what a device says of itself, at its own places of the directory", (PRESENCE, "dog1")
     ),
     TASKS: Namespace(WORKING, BY_KEY, "the tasks of the team, and the changes of their councils", (TASKS, "task7")),
-    HALT: Namespace(ORDERING, BY_KEY, "the emergency stop and its release", (HALT, "halt")),
+    HALT: Namespace(ORDERING, BY_KEY, "the emergency stop and its release", (HALT, "halt"), lasts=True),
     DEPLOYMENTS: Namespace(ORDERING, BY_KEY, "the modules that are pushed to the team", (DEPLOYMENTS, "follow")),
     SIGNED_OUT: Namespace(
         frozenset({GATEWAY}), BY_KEY, "the sessions of the page that ended", (SIGNED_OUT, SIGNED_OUT)
@@ -160,3 +162,8 @@ def may_call(roles: Collection[str], method: str) -> bool:
 def may_store(roles: Collection[str], slot: Slot) -> bool:
     """Whether a member with these roles may write in ``slot``, which is its own."""
     return not KINDS[kind_of(slot)].isdisjoint(roles)
+
+
+def lasts(slot: Slot) -> bool:
+    """Whether what is held in ``slot`` stays when its owner is revoked."""
+    return NAMESPACES[kind_of(slot)].lasts

@@ -36,6 +36,9 @@ class Rules(Protocol):
     def may_store(self, roles: Collection[str], slot: Slot) -> bool:
         """Whether a member with these roles may write that slot of its own."""
 
+    def lasts(self, slot: Slot) -> bool:
+        """Whether what is held in that slot stays when its owner is revoked."""
+
 
 class Anything:
     """Rules by which every member may do everything."""
@@ -47,6 +50,10 @@ class Anything:
     def may_store(self, roles: Collection[str], slot: Slot) -> bool:
         """It may."""
         return True
+
+    def lasts(self, slot: Slot) -> bool:
+        """Nothing does."""
+        return False
 
 
 def begun(store: Store, wall: float, rng: random.Random) -> Life:
@@ -125,6 +132,10 @@ class Doorkeeper:
         """Whether the certificate of the owner of ``slot``, as it is at present, allows it to write there."""
         authority = self.authority(slot.owner)
         return not authority.refusal and self._rules.may_store(authority.roles, slot)
+
+    def may_stay(self, slot: Slot) -> bool:
+        """Whether what is held in ``slot`` may be held on and shown."""
+        return self.may_store(slot) or (self.authority(slot.owner).refusal != FOREIGN and self._rules.lasts(slot))
 
     def authority(self, owner: bytes) -> Authority:
         """Whether the certificate of an owner of records holds at present, and its roles."""

@@ -23,12 +23,12 @@ SOURCE = Address("10.6.6.6", 666)
 class ClosedTeam(Village):
     """A village whose members may do what their roles say."""
 
+    rules = roles
     tape: Tape | None = None
 
     def open(self, house: House) -> None:
         """Begin a life of a node, of which the tape hears all."""
         super().open(house)
-        house.team.door._rules = roles
         if self.tape is not None:
             self.tape.tap(network_of(house))
 
@@ -60,6 +60,10 @@ class PaperDoor:
         return True
 
     def may_store(self, slot: object) -> bool:
+        """Everything."""
+        return True
+
+    def may_stay(self, slot: object) -> bool:
         """Everything."""
         return True
 

@@ -69,7 +69,7 @@ class RecordCase(SiegeCase):
     def accomplice(self) -> House:
         """A member whose node holds, hands over and shows whatever it likes."""
         house = self.team.houses[-1]
-        house.node.replica.may_store = lambda slot: True
+        house.node.replica.may_store = house.node.replica.may_stay = lambda slot: True
         return house
 
 
@@ -197,6 +197,28 @@ class RevokedKeyTests(RecordCase):
         self.assertEqual([watch.records for watch in watches], [[]] * len(watches))
         self.assertEqual(self.holders([self.before], self.others), [])
         self.assertEqual(self.read([self.before], self.others[0]), [])
+
+    def test_its_stop_stays(self) -> None:
+        """A stop that it ordered before stays in force, across restarts too, and it cannot lift it itself."""
+        stop = Word(3, True, "boss").packed()
+        self.outcome(self.team, self.boss.node.put(HALT, SLOT, stop))
+        self.revoke()
+        sleeper = self.others[1]
+        self.team.close(sleeper)
+        self.team.open(sleeper)
+        self.team.run(5.0)
+        for house in self.others:
+            found = self.outcome(self.team, house.node.get(HALT))
+            self.assertEqual([record.value for record in found], [stop], house.name)
+        bad, _ = self.insider(self.team, "bad", DEVICE)
+        release = written(
+            self.boss.kept.membership.identity, HALT, SLOT, Word(9, False, "boss").packed(), sequence=2**40
+        )
+        for house in self.others:
+            bad.ask(self.team.contact(house), "store", [release.packed()], [600.0], changes=True)
+        self.team.run(1.0)
+        for house in self.others:
+            self.assertNotEqual(house.node.store.slot(release.slot), release)
 
     def test_what_it_signs_afterwards(self) -> None:
         """What it signs afterwards is refused from the hands of a member, and of an accomplice's whole node."""

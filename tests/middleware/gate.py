@@ -38,6 +38,10 @@ class Gate:
         """As the test says."""
         return (slot.owner, slot.name) not in self.unwritable
 
+    def may_stay(self, slot: Slot) -> bool:
+        """What may be written."""
+        return self.may_store(slot)
+
     def authority(self, owner: bytes) -> Authority:
         """As ``judge`` says of who shows a good pass."""
         return Authority(self.refused.get(owner, ""))

@@ -63,6 +63,10 @@ class RoleDoor:
         """By the table."""
         return self._noted(may_store(self._known[slot.owner], slot), slot.owner, kind_of(slot))
 
+    def may_stay(self, slot: Slot) -> bool:
+        """What may be written."""
+        return may_store(self._known[slot.owner], slot)
+
     def authority(self, owner: bytes) -> Authority:
         """By what the test says."""
         return Authority("", self._known[owner])

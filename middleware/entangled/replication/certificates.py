@@ -39,6 +39,10 @@ class Certificates:
         """Whether the owner of ``slot`` may write there at present."""
         return self.door.may_store(slot)
 
+    def may_stay(self, slot: Slot) -> bool:
+        """Whether what is held in ``slot`` may be held on and shown."""
+        return self.door.may_stay(slot)
+
     def lacking(self, contact: Contact, owners: Iterable[bytes]) -> list[bytes]:
         """Those of ``owners`` whose certificates this node has not seen, and may ask ``contact`` for."""
         lacking = [owner for owner in dict.fromkeys(owners) if self.door.authority(owner).refusal == FOREIGN]

@@ -53,9 +53,10 @@ OnRecord = Callable[[Record], None]
 class Replica:
     """The records of others, held for them; ``keepsakes`` are the node's own copies, which nobody else gets to see.
 
-    ``may_store`` says whether the owner of a slot may write there, by its certificate as it is at present; what it may
-    not is not taken, and not shown either.  ``is_sure`` says whether this node has caught up with the others,
-    ``nearest`` whom it knows close to a key, ``belongs`` whether it is one of the closest itself.
+    ``may_store`` says whether the owner of a slot may write there, by its certificate as it is at present, ``may_stay``
+    whether what is held there may be held on and shown; that is the same but for few slots.  ``is_sure`` says whether
+    this node has caught up with the others, ``nearest`` whom it knows close to a key, ``belongs`` whether it is one of
+    the closest itself.
 
     ``on_record`` is told of every record that was accepted, ``on_gone`` of every one that is let go of, ``on_silent``
     of every owner (its public key) whose lease ran out or that said goodbye, ``on_peer`` of every peer that stores,
@@ -72,6 +73,7 @@ class Replica:
         self._signed = Signed()
         self.certificates = Certificates(endpoint, clock)
         self.may_store: Callable[[Slot], bool] = self.certificates.may_store
+        self.may_stay: Callable[[Slot], bool] = self.certificates.may_stay
         self._authorities: dict[bytes, Authority] = {}
         self.is_sure: Callable[[], bool] = lambda: True
         self.nearest: Callable[[bytes], list[Contact]] = lambda key: []
@@ -102,17 +104,17 @@ class Replica:
     def held(self, key: bytes) -> list[Record]:
         """What is held under ``key`` as a replica, tombstones included."""
         kept = self.keepsakes.under(key)
-        return [r for r in self._store.get(key, tombstones=True) if r.slot not in kept and self.may_store(r.slot)]
+        return [r for r in self._store.get(key, tombstones=True) if r.slot not in kept and self.may_stay(r.slot)]
 
     def shown(self, slot: Slot) -> Record | None:
         """What the slot holds as a replica, for others to see."""
-        return None if slot in self.keepsakes or not self.may_store(slot) else self._store.slot(slot)
+        return None if slot in self.keepsakes or not self.may_stay(slot) else self._store.slot(slot)
 
     def team_records(self) -> list[Record]:
         """The team records that are held as a replica, tombstones included, for others to see."""
         kept = self.keepsakes
         return [
-            r for r in self._store.records() if r.lifetime == "team" and r.slot not in kept and self.may_store(r.slot)
+            r for r in self._store.records() if r.lifetime == "team" and r.slot not in kept and self.may_stay(r.slot)
         ]
 
     def holds(self, record: Record) -> bool:
@@ -309,7 +311,7 @@ class Replica:
         """Let go of what ``owner`` may not write now, or show again what it may."""
         out = []
         for record in self._store.owned(owner):
-            if not self.may_store(record.slot):
+            if not self.may_stay(record.slot):
                 out.append(record)
             elif before is not None and before.refusal and record.slot not in self.keepsakes:
                 self.on_record(record)

@@ -120,8 +120,8 @@ class Subscriber:
     def review(self) -> None:
         """Forget the records that their owners may not write any more."""
         for watch in list(self._watches):
-            if not all(self._replica.may_store(record.slot) for record in watch.records):
-                watch.view.retain(self._replica.may_store)
+            if not all(self._replica.may_stay(record.slot) for record in watch.records):
+                watch.view.retain(self._replica.may_stay)
                 self._settle(watch)
 
     # -- inside -----------------------------------------------------------------------------------------------------

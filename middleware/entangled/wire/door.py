@@ -101,6 +101,9 @@ class Door(Protocol):
     def may_store(self, slot: Slot) -> bool:
         """Whether the certificate of the owner of ``slot``, as it is at present, allows it to write there."""
 
+    def may_stay(self, slot: Slot) -> bool:
+        """Whether what is held in ``slot``, written when its owner was allowed to, may be held on and shown."""
+
     def authority(self, owner: bytes) -> Authority:
         """What ``may_store`` goes by for this owner; it changes when that does."""
 
@@ -129,6 +132,10 @@ class OpenDoor:
 
     def may_store(self, slot: Slot) -> bool:
         """Everybody may."""
+        return True
+
+    def may_stay(self, slot: Slot) -> bool:
+        """Everything may."""
         return True
 
     def authority(self, owner: bytes) -> Authority:
