@@ -56,6 +56,11 @@ class Endpoint:
         return answered
 
 
+def made() -> Any:
+    """An endpoint, as far as it is needed."""
+    return Endpoint()
+
+
 def contact(number: int) -> Contact:
     """Some peer."""
     return Contact(Identity(number.to_bytes(32)).public, Address("10.0.0.1", 1000 + number % 60_000))
@@ -72,7 +77,7 @@ class CertificateTests(SynchronousTestCase):
     def setUp(self) -> None:
         """A door that knows nobody."""
         self.clock = HeapClock()
-        self.endpoint: Any = Endpoint()
+        self.endpoint = made()
         self.certificates = Certificates(self.endpoint, self.clock)
         self.door = self.certificates.door = KnownDoor()
 
