@@ -414,14 +414,30 @@ class SwarmNode(Service):
 
     def _answer_offer(
         self, peer: Contact, auction: list[object], bids: list[object], age_ms: int, is_shared: bool
-    ) -> list[object] | None:
-        return self.dissemination.answer_offer(peer, auction, bids, age_ms, is_shared)
+    ) -> object:
+        offer = partial(self.dissemination.answer_offer, peer, auction, bids, age_ms, is_shared)
+        learnt = self._learn_bidders(peer, bids)
+        return offer() if learnt is None else learnt.addCallback(lambda _: offer())
 
     def _answer_announcement(self, peer: Contact, auction: list[object], announcement: list[object]) -> None:
         self.dissemination.answer_announcement(peer, auction, announcement)
 
     def _take_cry(self, peer: Contact, auction: list[object], bids: list[object]) -> None:
+        learnt = self._learn_bidders(peer, bids)
+        if learnt is not None:
+            self._quietly(learnt.addCallback(lambda _: self.dissemination.take_cry(peer, auction, bids)))
+            return
         self.dissemination.take_cry(peer, auction, bids)
+
+    def _learn_bidders(self, peer: Contact, bids: list[object]) -> Deferred[None] | None:
+        """Ask ``peer`` for the certificates of those bidders that are unknown here; None where all are known."""
+        from middleware.dissemination.errand import MAX_BIDS
+
+        certificates = self.entangled.replica.certificates
+        owners = [each[0] for each in bids[:MAX_BIDS] if isinstance(each, list) and each and type(each[0]) is bytes]
+        if not certificates.lacking(peer, owners):
+            return None
+        return Deferred.fromCoroutine(certificates.learn(peer, owners))
 
     def _answer_message(self, peer: Contact, text: str) -> str:
         if not 0 < len(text) <= 200:

@@ -17,12 +17,14 @@ from middleware.admission.roll import Roll
 from middleware.entangled.data.store import Store
 from middleware.entangled.errors import Full, RemoteError
 from middleware.entangled.record import Slot
-from middleware.entangled.wire.door import FOREIGN, NONCE, UNLISTED, Life, next_life
+from middleware.entangled.wire.door import FOREIGN, NONCE, REVOKED, UNLISTED, Authority, Life, next_life
 
 MAX_MET = 4096
 MAX_PASSES = 1024
-MAX_GUESTS = 64
+MAX_VOUCHED = 64
 """Guests of one gateway that a node lets in at a time."""
+JUDGED_S = 1.0
+"""Seconds for which the authority of an owner is remembered, unless the roll changes before."""
 LIVED = "admission/life"
 """The note of the number of the node's last life."""
 
@@ -36,6 +38,9 @@ class Rules(Protocol):
     def may_store(self, roles: Collection[str], slot: Slot) -> bool:
         """Whether a member with these roles may write that slot of its own."""
 
+    def lasts(self, slot: Slot) -> bool:
+        """Whether what is held in that slot stays when its owner is revoked."""
+
 
 class Anything:
     """Rules by which every member may do everything."""
@@ -47,6 +52,10 @@ class Anything:
     def may_store(self, roles: Collection[str], slot: Slot) -> bool:
         """It may."""
         return True
+
+    def lasts(self, slot: Slot) -> bool:
+        """Nothing does."""
+        return False
 
 
 def begun(store: Store, wall: float, rng: random.Random) -> Life:
@@ -82,7 +91,10 @@ class Doorkeeper:
         self._me = membership().member
         self.list_entry: Callable[[bytes], object] = lambda packed: roll.add(packed, wall())
         self._passes: OrderedDict[bytes, Member] = OrderedDict()
-        self._met: OrderedDict[bytes, tuple[Member, bytes]] = OrderedDict()
+        self._met: OrderedDict[bytes, Member] = OrderedDict()
+        self._shown: dict[bytes, bytes] = {}  # the passes of those of ``_met`` that are not on the roll
+        self._authorities: dict[bytes, Authority] = {}
+        self._judged_at = (b"", 0.0)
 
     @property
     def me(self) -> Member:
@@ -105,11 +117,23 @@ class Doorkeeper:
             return FOREIGN
         refusal = self._roll.refusal(member, self._wall()) or self._list(public, shown, member)
         if not refusal:
-            self._met[public] = member, shown
+            self._met[public] = member
             self._met.move_to_end(public)
+            self._authorities.pop(public, None)
+            if self.is_off_roll(public):
+                self._shown[public] = shown
             if len(self._met) > MAX_MET:
-                self._met.popitem(last=False)
+                self._shown.pop(self._met.popitem(last=False)[0], None)
         return refusal
+
+    def may(self, public: bytes, method: str) -> bool:
+        """Whether a node that was let in may call ``method``."""
+        authority = self.authority(public)
+        return not authority.refusal and self._rules.may_call(authority.roles, method)
+
+    def roles_of(self, public: bytes) -> frozenset[str]:
+        """Return the roles that the holder of that key has now, none for a stranger or a revoked or expired member."""
+        return frozenset(self.authority(public).roles)
 
     def _list(self, public: bytes, shown: bytes, member: Member) -> str:
         """Have a member on the membership list, so that all know it and the operator can revoke it by name.
@@ -120,59 +144,65 @@ class Doorkeeper:
         if member.voucher is not None:
             return self._count_guest(member)
         entry = entry_of(public, shown)
-        if entry is not None and public != self._me.public and not self._is_listed(member):
+        if entry is not None and public != self._me.public and self.is_off_roll(public):
             try:
                 self.list_entry(entry)
             except (Full, RemoteError):
                 return UNLISTED
         return ""
 
-    def _is_listed(self, member: Member) -> bool:
-        return self._roll.granted(member.public) is not None or self._roll.admitted(member.public) is not None
-
     def _count_guest(self, member: Member) -> str:
         """Return a refusal where the voucher of a guest vouches for too many others at present."""
         assert member.voucher is not None
-        now = self._wall()
-        guests = [
-            each
-            for each, _ in self._met.values()
-            if each.voucher is not None and each.voucher.public == member.voucher.public and not each.trouble(now)
-        ]
-        others = sum(each.public != member.public for each in guests)
-        return "" if others < MAX_GUESTS else UNLISTED
-
-    def may(self, public: bytes, method: str) -> bool:
-        """Whether a node that was let in may call ``method``."""
-        roles = self.roles_of(public)
-        return bool(roles) and self._rules.may_call(roles, method)
+        now, voucher = self._wall(), member.voucher.public
+        others = sum(
+            each.voucher is not None
+            and each.voucher.public == voucher
+            and each.public != member.public
+            and not each.trouble(now)
+            for each in self._met.values()
+        )
+        return "" if others < MAX_VOUCHED else UNLISTED
 
     def may_store(self, slot: Slot) -> bool:
-        """Whether the present certificate of the owner of ``slot`` allows it to write there."""
-        roles = self.roles_of(slot.owner)
-        return bool(roles) and self._rules.may_store(roles, slot)
+        """Whether the certificate of the owner of ``slot``, as it is at present, allows it to write there."""
+        authority = self.authority(slot.owner)
+        return not authority.refusal and self._rules.may_store(authority.roles, slot)
 
-    def is_known(self, public: bytes) -> bool:
-        """Whether a certificate of that key is known, be it one that holds no more."""
-        return self.member(public) is not None
+    def may_stay(self, slot: Slot) -> bool:
+        """Whether what is held in ``slot`` may be held on and shown."""
+        return self.may_store(slot) or (self.authority(slot.owner).refusal != FOREIGN and self._rules.lasts(slot))
 
-    def roles_of(self, public: bytes) -> frozenset[str]:
-        """Return the roles that the holder of that key has now, none for a stranger or a revoked or expired member."""
-        member = self.member(public)
-        if member is None or self._roll.refusal(member, self._wall()):
-            return frozenset()
-        return frozenset(member.roles)
+    def authority(self, owner: bytes) -> Authority:
+        """Whether the certificate of an owner of records holds at present, and its roles."""
+        now = self._wall()
+        digest, at = self._judged_at
+        if digest != self._roll.digest or not 0.0 <= now - at < JUDGED_S:
+            self._authorities.clear()
+            self._judged_at = (self._roll.digest, now)
+        found = self._authorities.get(owner)
+        if found is None:
+            found = self._authorities[owner] = self._judged(owner, now)
+            if len(self._authorities) > MAX_MET:
+                del self._authorities[next(iter(self._authorities))]
+        return found
 
-    def certificate(self, public: bytes) -> bytes:
-        """Return the newest certificate of that key which this node knows; empty where it knows none."""
-        if public == self._me.public:
+    def certificate(self, owner: bytes) -> bytes:
+        """The operator's last word about an owner, or the pass that it showed; empty where neither is known."""
+        if owner == self._me.public:
             return self.shown
-        grant, admission, met = self._roll.granted(public), self._roll.admitted(public), self._met.get(public)
-        if grant is not None and (met is None or grant[0].not_before >= met[0].not_before):
+        grant, admission = self._roll.granted(owner), self._roll.admitted(owner)
+        if grant is not None and (admission is None or grant[0].not_before >= admission.member.not_before):
             return pass_of(grant[1])
-        if met is not None:
-            return met[1]
-        return b"" if admission is None else admission.shown
+        return self._shown.get(owner, b"") if admission is None else admission.shown
+
+    def is_off_roll(self, public: bytes) -> bool:
+        """Whether the roll says nothing of the holder of ``public``: a guest, or a member of which it has yet to."""
+        return self._roll.granted(public) is None and self._roll.admitted(public) is None
+
+    def learn(self, owner: bytes, certificate: bytes) -> bool:
+        """Take in the pass of an owner that another node showed; whether it holds."""
+        return not self.judge(owner, certificate)
 
     def member(self, public: bytes) -> Member | None:
         """What is known of the holder of ``public``, met or only heard of."""
@@ -180,7 +210,7 @@ class Doorkeeper:
             return self.me
         met = self._met.get(public)
         if met is not None:
-            return self._roll.known_as(met[0])
+            return self._roll.known_as(met)
         admission = self._roll.admitted(public)
         if admission is not None:
             return self._roll.known_as(admission.member)
@@ -195,12 +225,22 @@ class Doorkeeper:
         now = self._wall()
         gone = [
             (public, refusal)
-            for public, (member, _) in self._met.items()
+            for public, member in self._met.items()
             if (refusal := self._roll.refusal(self._roll.known_as(member), now))
         ]
         for public, _ in gone:
             del self._met[public]
+            self._shown.pop(public, None)
         return gone
+
+    def _judged(self, owner: bytes, now: float) -> Authority:
+        if self._roll.revoked(owner) is not None:
+            return Authority(REVOKED)
+        member = self.member(owner)
+        if member is None:
+            return Authority(FOREIGN)
+        refusal = self._roll.refusal(member, now)
+        return Authority(refusal) if refusal else Authority("", member.roles)
 
     def _read(self, public: bytes, shown: bytes) -> Member:
         key = hashlib.blake2s(public + shown, digest_size=16).digest()

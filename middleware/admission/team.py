@@ -22,7 +22,7 @@ from middleware.admission.reception import Reception
 from middleware.admission.roll import MAX_ENTRIES, Admission, Entry, Roll, invitation_id, packed_admission
 from middleware.admission.statement import Grant, Invite, Revoke, Secret
 from middleware.entangled.background import Background
-from middleware.entangled.data.store import OWNER_SHARE, Store
+from middleware.entangled.data.store import Store
 from middleware.entangled.errors import Full, Refused, RemoteError
 from middleware.entangled.identity import Identity, node_id
 from middleware.entangled.kademlia.contact import Contact
@@ -34,6 +34,10 @@ if TYPE_CHECKING:
 
 ROLL = "admission/roll"
 """The note of what the node knows of its team."""
+GUESTS, NO_GUESTS = "admission/guests", bytes(msgpack.packb([]))
+"""The note of the passes of owners of records that are not on the roll."""
+MAX_GUESTS = 256
+"""Owners whose passes are noted; of others the records are shown again when another member shows the pass."""
 
 
 class Team:
@@ -53,10 +57,10 @@ class Team:
         self.roll = Roll(kept.membership.operator)
         self._remember()
         self.door = Doorkeeper(self.roll, lambda: self.membership, wall, begun(store, wall(), rng), rules)
+        self._remember_guests()
         self._node: EntangledNode | None = None
         self._uses: Uses | None = None
         self._accepted = [secret for _, secret, _ in self.membership.accepted(wall())]
-        store.limit_owners(OWNER_SHARE)
 
     @property
     def membership(self) -> Membership:
@@ -105,6 +109,7 @@ class Team:
 
     def start(self) -> None:
         """Begin to compare with others, and to look after what has run out."""
+        self._sweep()
         self._log.info("member {name} of the closed team {team}", name=self.door.me.name, team=self.membership.team)
         trouble = self.door.me.trouble(self._wall())
         if trouble:
@@ -177,11 +182,19 @@ class Team:
             except (RemoteError, Full):
                 continue
 
+    def _remember_guests(self) -> None:
+        """Take in the passes of guests whose records an earlier life held."""
+        try:
+            noted = msgpack.unpackb(self._store.noted(GUESTS) or NO_GUESTS, max_array_len=MAX_GUESTS)
+            for owner, shown in noted:
+                self.door.learn(owner, shown)
+        except Exception:  # a rotten file may hold anything
+            self._log.warn("the noted passes of guests cannot be read; other members show them again")
+
     def _on_new(self, entry: Entry) -> None:
         self._store.note(ROLL, msgpack.packb(self.roll.packed()))
         if isinstance(entry, Revoke):
             self._log.info("revoked: {name}", name=entry.name)
-            self._review_records()
             self._sweep()
             self._part_with(entry.public)
         elif isinstance(entry, Secret):
@@ -189,7 +202,7 @@ class Team:
         elif isinstance(entry, Grant):
             if entry.public == self.identity.public:
                 self._keep(replace(self.membership, shown=self.door.shown))
-            self._review_records()  # a member may have lost a role
+            self._sweep()
         elif isinstance(entry, Admission):
             self._log.info("{name} is a member now", name=entry.member.name)
 
@@ -204,10 +217,15 @@ class Team:
         if self._node is not None:
             for public, refusal in self.door.swept():
                 self._node.evict(public, refusal)
+            self._node.review()
+            self._note_guests(self._node)
 
-    def _review_records(self) -> None:
-        if self._node is not None:
-            self._node.review_records()
+    def _note_guests(self, node: EntangledNode) -> None:
+        """Note the passes of those owners of records that are not on the roll, for the next start."""
+        owners = [owner for owner in node.store.owners() if self.door.is_off_roll(owner)][-MAX_GUESTS:]
+        noted = msgpack.packb([[owner, self.door.certificate(owner)] for owner in owners])
+        if noted != (self._store.noted(GUESTS) or NO_GUESTS):
+            self._store.note(GUESTS, noted)
 
     def _part_with(self, public: bytes) -> None:
         """Also of who is absent nothing is expected any more."""

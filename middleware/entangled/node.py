@@ -114,6 +114,7 @@ class EntangledNode:
         self.replica.on_silent = self._subscriber.silent
         self.replica.on_peer = self.overlay.heard
         self.replica.on_goodbye = self.overlay.left
+        self.replica.certificates.door = door
         if wall is not None:
             self.endpoint.echoer.wall = wall
         self.endpoint.on_refused = self._refused
@@ -194,10 +195,10 @@ class EntangledNode:
         self.endpoint.evict(public, code)
         self._parted(public)
 
-    def review_records(self) -> None:
-        """Let go of the records that the present certificates of their owners do not allow."""
-        self.replica.drop_forbidden()
-        self._subscriber.review()
+    def review(self) -> None:
+        """Judge all records that are held, owned or watched anew: what the door knows of their owners has changed."""
+        for part in (self._owner, self.replica, self._subscriber):
+            part.review()
 
     # -- verbs ------------------------------------------------------------------------------------------------------
 

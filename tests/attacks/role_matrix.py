@@ -19,10 +19,22 @@ from twisted.internet.defer import maybeDeferred
 from middleware.entangled.errors import NotAdmitted, Refused
 from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact
-from middleware.entangled.record import Record, Slot, hashed_key
+from middleware.entangled.record import Record, Slot
 from middleware.entangled.wire.door import ROLE
 from middleware.entangled.wire.endpoint import Endpoint
-from middleware.roles import DEVICE, GATEWAY, KINDS, METHODS, OPERATOR, PRESENCE, VIEWER, kind_of, may_call, may_store
+from middleware.roles import (
+    DEVICE,
+    GATEWAY,
+    KINDS,
+    METHODS,
+    NAMESPACES,
+    OPERATOR,
+    PRESENCE,
+    VIEWER,
+    kind_of,
+    may_call,
+    may_store,
+)
 from swarmnode.rehearsal import VirtualTeam
 from tests.attacks.siege import PaperDoor
 
@@ -66,10 +78,11 @@ class Counts:
 
 
 def list_slots(owner: bytes) -> list[Slot]:
-    """Slots of ``owner`` in every namespace, and in those keys that hold a namespace under every known name."""
-    keys = ("halt", "tasks", "devices", "deployments", "signed-out", "group/7")
-    names = ("member", "result", "order", "verdict/1", "source", "halt", "x")
-    return [Slot(hashed_key(key), owner, name) for key in keys for name in names]
+    """Slots of ``owner``: the key of each namespace's example, with the name of each."""
+    examples = [namespace.slot(owner) for namespace in NAMESPACES.values()]
+    keys = dict.fromkeys(slot.key for slot in examples)
+    names = dict.fromkeys([*(slot.name for slot in examples), "x"])
+    return [Slot(key, owner, name) for key in keys for name in names]
 
 
 class Insider:

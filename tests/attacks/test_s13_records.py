@@ -1,177 +1,316 @@
-"""Attack S13: to write records with a key that no present certificate allows, and to fill the stores of the others."""
+"""Attack S13: records of owners that no certificate covers: invented keys, revoked keys, and one owner that floods."""
 
 from __future__ import annotations
 
+import random
 from typing import Any
 
-from twisted.internet.defer import Deferred
-
-from middleware.admission.certificate import guest_pass
-from middleware.entangled.data.store import OWNER_SHARE
-from middleware.entangled.errors import Full, NotAcknowledged
 from middleware.entangled.identity import Identity
-from middleware.entangled.kademlia.contact import Contact
-from middleware.entangled.record import Record, Slot, hashed_key
-from middleware.entangled.replication.cache import MAX_AGE
-from middleware.entangled.replication.replica import FORBIDDEN
-from middleware.entangled.wire.endpoint import Endpoint
-from middleware.roles import DEVICE, GATEWAY, OPERATOR, VIEWER
+from middleware.entangled.record import Record, hashed_key
+from middleware.entangled.replication.watch import Watch
+from middleware.entangled.space.tuplespace import TupleSpace
+from middleware.halt import HALT, SLOT, Word
+from middleware.roles import DEVICE, OPERATOR, VIEWER
+from middleware.tasks import TASKS
 from tests.attacks.siege import SOURCE, ClosedTeam, SiegeCase
+from tests.middleware.admission.village import House
 
-KEYS = ("halt", "tasks", "deployments", "anything")
+JUNK = 12_400
+PAGE = 60
+OTHER = hashed_key("whatever")
+
+
+def written(owner: Identity, key: bytes, name: str, value: bytes = b"\xc3", sequence: int = 1) -> Record:
+    """A team record with a good signature of its owner."""
+    return Record(key, name, owner.public, sequence, "team", 3600.0, value).signed(owner)
 
 
 class RecordCase(SiegeCase):
-    """A closed team of three, and an insider."""
+    """A team of four that are in touch."""
 
     def setUp(self) -> None:
-        """Make the team."""
+        """Everybody knows everybody."""
         super().setUp()
         self.team: ClosedTeam = self.siege()
-        for name in ("dog", "cat"):
-            self.team.enlist(name)
+        for name in ("dog1", "dog2", "dog3"):
+            self.team.enlist(name, DEVICE)
+        self.team.run(10.0)
 
-    def hand_over(self, carrier: Endpoint, record: Record) -> list[Any]:
-        """Hand a record to every node by every method that takes one; return the outcomes of the STOREs."""
-        packed, key, found = [record.packed()], record.key, []
-        for house in self.team.houses:
-            contact = self.team.contact(house)
-            for method, arguments in (
-                ("cache", (key, packed, MAX_AGE)),
-                ("push", (key, 1, packed, [])),
-            ):
-                carrier.ask(contact, method, *arguments, changes=True).addErrback(lambda failure: None)
-            for handed in ((packed,), (packed, [600.0])):
-                found.append(self.outcome(self.team, carrier.ask(contact, "store", *handed, changes=True), 1.0))
-        return found
+    def forged(self, owner: Identity) -> list[Record]:
+        """The release of a stop, a task, and something else, as their owner would write them."""
+        release = Word(99, False, "nobody").packed()
+        return [written(owner, HALT, SLOT, release), written(owner, TASKS, "t1"), written(owner, OTHER, "x")]
 
-    def believed(self, key: bytes) -> list[Record]:
-        """Everything that any node of the team reads, holds or hands out of ``key``."""
-        found: list[Record] = []
-        for house in self.team.houses:
-            read = self.outcome(self.team, house.node.get(key))
-            found += read if isinstance(read, list) else []
-            found += house.node.replica.held(key)
-            found += house.node.replica.cache.get(key, self.team.clock.seconds()) or []
-        return found
+    def holders(self, records: list[Record], among: list[House]) -> list[str]:
+        """Which of these houses have any of the records in their stores."""
+        return [h.name for h in among if any(h.node.store.slot(record.slot) is not None for record in records)]
+
+    def read(self, records: list[Record], house: House) -> list[Record]:
+        """Which of the records a house reads, by a majority."""
+        keys = dict.fromkeys(record.key for record in records)
+        found = [self.outcome(self.team, house.node.get(key)) for key in keys]
+        return [record for each in found for record in each if record in records]
+
+    def watch(self, records: list[Record], house: House) -> list[Watch]:
+        """The watches of a house on the keys of the records."""
+        keys = dict.fromkeys(record.key for record in records)
+        return [house.node.watch(key, lambda found: None, keep=True) for key in keys]
+
+    def works(self, house: House) -> None:
+        """A house writes a record and a tuple, and the operator invites somebody there."""
+        put = house.node.put(hashed_key("own"), "slot", b"\xc3")
+        self.assertGreaterEqual(self.outcome(self.team, put), 3)
+        space = TupleSpace(house.node, self.team.clock, random.Random(7), "yard")
+        self.addCleanup(space.stop)
+        self.assertIsNone(self.outcome(self.team, space.put(("ball", 1))))
+        self.assertEqual(self.outcome(self.team, space.get_if_exists(("ball", int))), ("ball", 1))
+        self.team.invite("pup")
+
+    def accomplice(self) -> House:
+        """A member whose node holds, hands over and shows whatever it likes."""
+        house = self.team.houses[-1]
+        house.node.replica.may_store = house.node.replica.may_stay = lambda slot: True
+        return house
 
 
 class InventedKeyTests(RecordCase):
-    """A viewer signs with a key that is on no membership list."""
+    """Records of an owner that is on no membership list."""
 
-    def test_nobody_takes_a_record_of_an_invented_key(self) -> None:
-        """A record that is signed by an invented key is refused first-hand and second-hand, in every namespace."""
-        viewer, _ = self.insider(self.team, "eye", VIEWER)
-        invented = Identity(b"invented" * 4)
-        for name in KEYS:
-            record = Record(hashed_key(name), "x", invented.public, 1, "team", 600.0, b"\xc3").signed(invented)
-            self.assertEqual(self.hand_over(viewer, record), [[FORBIDDEN]] * 6, name)
-            self.assertEqual(self.believed(record.key), [], name)
+    def setUp(self) -> None:
+        """A viewer with a good pass."""
+        super().setUp()
+        self.invented = Identity(b"invented".ljust(32))
+        self.records = self.forged(self.invented)
 
-    def test_junk_fills_nothing(self) -> None:
-        """Junk records of 400 invented keys change no store, and the members go on writing."""
-        viewer, _ = self.insider(self.team, "eye", VIEWER)
-        contact = self.team.contact(self.team.houses[0])
-        rows = [len(house.node.store) for house in self.team.houses]
-        for number in range(400):
-            invented = Identity(number.to_bytes(32))
-            record = Record(hashed_key("junk"), "x", invented.public, 1, "team", 600.0, bytes(64)).signed(invented)
-            viewer.ask(contact, "store", [record.packed()], changes=True).addErrback(lambda failure: None)
-            self.team.run(0.02)
-        self.team.run(2.0)
-        self.assertEqual([len(house.node.store) for house in self.team.houses], rows)
-        put = self.outcome(self.team, self.team.houses[1].node.put(hashed_key("good"), "x", b"\xc3"))
-        self.assertEqual(int(put), 3)
+    def test_brought_by_a_viewer(self) -> None:
+        """By no method that takes records a viewer brings in what it signed with an invented key."""
+        team = self.team
+        viewer, own = self.insider(team, "eye", VIEWER)
+        viewer.expose("watch", lambda peer, key, digest, ttl=8.0: [0, [[], None]], changes=True)
+        watches = [watch for house in team.houses for watch in self.watch(self.records, house)]
+        for house in team.houses:
+            node: Any = house.node
+            for watch in node._subscriber._watches:
+                watch.asked.add(own.node_id)
+            contact = team.contact(house)
+            for record in self.records:
+                packed = [record.packed()]
+                for method, arguments in (
+                    ("store", (packed,)),
+                    ("store", (packed, [600.0])),
+                    ("cache", (record.key, packed, 60.0)),
+                    ("push", (record.key, 1, packed, [])),
+                ):
+                    viewer.ask(contact, method, *arguments, changes=True).addErrback(lambda failure: None)
+        team.run(0.5)
+        self.assertEqual([record for watch in watches for record in watch.records], [])
+        team.run(3.0)
+        self.assertEqual(self.holders(self.records, team.houses), [])
+        cached = [h.node.replica.cache.get(r.key, 0.0) for h in team.houses for r in self.records]
+        self.assertEqual([copy for copy in cached if copy], [])
+        self.assertEqual(self.read(self.records, team.houses[0]), [])
 
-    def test_a_lying_replica_is_not_believed(self) -> None:
-        """A node that answers a read with a record of an invented key and a junk certificate is not believed."""
-        liar, own = self.insider(self.team, "liar", DEVICE)
-        invented = Identity(b"invented" * 4)
-        key = hashed_key("halt")
-        record = Record(key, "halt", invented.public, 9, "team", 600.0, b"\xc2").signed(invented)
-        liar.expose("certificates", lambda peer, owners: [b"junk" for _ in owners])
-        liar.expose("find_value", lambda peer, *rest: [[record.packed()], None, 1])
-        reader = self.team.houses[0].node._reader
-        self.outcome(self.team, liar.ask(self.team.contact(self.team.houses[0]), "ping", bytes(8), changes=True))
-        answer = self.outcome(self.team, Deferred.fromCoroutine(reader.pages(Contact(own.public, SOURCE), key)))
-        self.assertEqual(answer.records, [])
+    def test_told_by_a_lying_replica(self) -> None:
+        """What a replica answers to a read, a watch or a fetch is not believed of an owner that nobody certified."""
+        team, house = self.team, self.team.houses[0]
+        liar, _ = self.insider(team, "eye", VIEWER)
+        by_key = {record.key: record for record in self.records}
+        liar.expose("find_value", lambda peer, key, *rest: [[by_key[key].packed()], None, 1])
+        liar.expose("watch", lambda peer, key, *rest: [1, [[by_key[key].packed()], None]], changes=True)
+        liar.expose("fetch", lambda peer, slots: [[by_key[slot[0]].packed(), 600.0] for slot in slots])
+        self.outcome(team, liar.ask(team.contact(house), "ping", bytes(8), changes=True))
+        contact = next(iter([c for c in house.node.overlay.contacts() if c.address == SOURCE]), None)
+        assert contact is not None
+        node: Any = house.node
+        for record in self.records:
+            reading = node._chores
+            answers: list[Any] = []
+
+            async def read(record: Record = record, answers: list[Any] = answers) -> None:
+                answers.append(await node._reader.pages(contact, record.key))
+
+            reading.fork(read())
+            [watch] = self.watch([record], house)
+            reading.fork(node._subscriber._renew_at(watch, contact))
+            reading.fork(node._handover._fetch(contact, [record.slot]))
+            team.run(1.0)
+            self.assertEqual([answer.records for answer in answers], [[]])
+            self.assertEqual(watch.records, [])
+        self.assertEqual(self.holders(self.records, [house]), [])
+
+    def test_handed_over_by_an_accomplice(self) -> None:
+        """A whole node that keeps such records hands them to nobody, and no read or watch of others shows them."""
+        team = self.team
+        accomplice = self.accomplice()
+        others = [house for house in team.houses if house is not accomplice]
+        watches = [watch for house in others for watch in self.watch(self.records, house)]
+        for record in self.records:
+            accomplice.node.replica.keep(record)
+        team.run(60.0)
+        self.assertEqual(self.holders(self.records, [accomplice]), [accomplice.name])
+        self.assertEqual(self.holders(self.records, others), [])
+        self.assertEqual([record for watch in watches for record in watch.records], [])
+        self.assertEqual([self.read(self.records, house) for house in others], [[], [], []])
+
+    def test_a_flood_of_junk(self) -> None:
+        """12,400 records under invented keys fill no store; afterwards records, tuples and invitations work."""
+        team = self.team
+        viewer, _ = self.insider(team, "eye", VIEWER)
+        junk = [written(self.invented, OTHER, f"{number}") for number in range(JUNK)]
+        for house in team.houses:
+            for begin in range(0, JUNK, PAGE):
+                page = [record.packed() for record in junk[begin : begin + PAGE]]
+                asked = viewer.ask(team.contact(house), "store", page, [600.0] * len(page), changes=True)
+                asked.addErrback(lambda failure: None)
+                team.run(0.05)
+        team.run(2.0)
+        self.assertEqual(self.holders(junk, team.houses), [])
+        self.works(team.houses[1])
 
 
 class RevokedKeyTests(RecordCase):
-    """An operator whose certificate was revoked, and a member that carries its records."""
+    """Records of an operator that was revoked."""
 
-    def test_what_a_revoked_operator_signs_is_refused(self) -> None:
-        """Records of a revoked operator are refused, whoever hands them over, and those it wrote before are dropped."""
-        _, operator = self.insider(self.team, "op", OPERATOR)
-        accomplice, _ = self.insider(self.team, "friend", DEVICE, at=SOURCE._replace(port=667))
-        key = hashed_key("tasks")
-        before = Record(key, "old", operator.public, 1, "team", 600.0, b"\xc3").signed(operator)
-        grant = self.team.signer.grant(operator.public, "op", (OPERATOR,), self.team.wall())
-        self.outcome(self.team, self.team.tell(grant))
+    def setUp(self) -> None:
+        """An operator that has ordered something."""
+        super().setUp()
+        self.boss = self.team.enlist("boss", OPERATOR)
+        self.team.enlist("dog4", DEVICE)
+        self.team.run(10.0)
+        self.others = [house for house in self.team.houses if house is not self.boss]
+        self.outcome(self.team, self.boss.node.put(TASKS, "before", b"\xc3"))
+        [self.before] = self.outcome(self.team, self.others[0].node.get(TASKS))
+        self.later = written(self.boss.kept.membership.identity, TASKS, "later", sequence=2**40)
+
+    def revoke(self) -> None:
+        """The operator of the team revokes it."""
+        self.team.tell(self.team.signer.revoke(self.boss.public, self.boss.name, self.team.wall()))
+        self.team.run(10.0)
+        self.team.close(self.boss, is_sudden=True)
+
+    def test_what_it_ordered_before(self) -> None:
+        """What a revoked operator ordered is gone from every store and every watch when the revocation arrives."""
+        watches = [watch for house in self.others for watch in self.watch([self.before], house)]
+        self.team.run(3.0)
+        self.assertEqual([watch.records for watch in watches], [[self.before]] * len(watches))
+        self.revoke()
+        self.assertEqual([watch.records for watch in watches], [[]] * len(watches))
+        self.assertEqual(self.holders([self.before], self.others), [])
+        self.assertEqual(self.read([self.before], self.others[0]), [])
+
+    def test_its_stop_stays(self) -> None:
+        """A stop that it ordered before stays in force, across restarts too, and it cannot lift it itself."""
+        stop = Word(3, True, "boss").packed()
+        self.outcome(self.team, self.boss.node.put(HALT, SLOT, stop))
+        self.revoke()
+        sleeper = self.others[1]
+        self.team.close(sleeper)
+        self.team.open(sleeper)
+        self.team.run(5.0)
+        for house in self.others:
+            found = self.outcome(self.team, house.node.get(HALT))
+            self.assertEqual([record.value for record in found], [stop], house.name)
+        bad, _ = self.insider(self.team, "bad", DEVICE)
+        release = written(
+            self.boss.kept.membership.identity, HALT, SLOT, Word(9, False, "boss").packed(), sequence=2**40
+        )
+        for house in self.others:
+            bad.ask(self.team.contact(house), "store", [release.packed()], [600.0], changes=True)
         self.team.run(1.0)
-        self.assertEqual(self.hand_over(accomplice, before), [[0]] * 6)
-        self.outcome(self.team, self.team.tell(self.team.signer.revoke(operator.public, "op", self.team.wall())))
-        self.team.run(11.0)
-        self.assertEqual(self.believed(key), [])
-        after = Record(key, "new", operator.public, 2, "team", 600.0, b"\xc3").signed(operator)
-        self.assertEqual(self.hand_over(accomplice, after), [[FORBIDDEN]] * 6)
-        house = self.team.houses[1]
-        self.team.close(house, is_sudden=True)
-        self.team.open(house)
-        self.team.run(2.0)
-        self.assertEqual(self.hand_over(accomplice, after), [[FORBIDDEN]] * 6)
-        self.assertEqual(self.believed(key), [])
+        for house in self.others:
+            self.assertNotEqual(house.node.store.slot(release.slot), release)
+
+    def test_what_it_signs_afterwards(self) -> None:
+        """What it signs afterwards is refused from the hands of a member, and of an accomplice's whole node."""
+        self.revoke()
+        bad, _ = self.insider(self.team, "bad", DEVICE)
+        for house in self.others:
+            asked = bad.ask(self.team.contact(house), "store", [self.later.packed()], [600.0], changes=True)
+            [verdict] = self.outcome(self.team, asked, 0.5)
+            self.assertLess(verdict, 0)
+        accomplice = self.accomplice()
+        accomplice.node.replica.keep(self.later)
+        honest = [house for house in self.others if house is not accomplice]
+        self.team.run(60.0)
+        self.assertEqual(self.holders([self.later], honest), [])
+        self.assertEqual(self.read([self.later], honest[0]), [])
+
+    def test_after_a_restart(self) -> None:
+        """A node that was off meanwhile neither shows nor keeps what its store has of it, once it hears."""
+        sleeper = self.others[1]
+        self.team.close(sleeper)
+        self.revoke()
+        self.assertEqual(self.holders([self.before], [sleeper]), [sleeper.name])
+        self.team.open(sleeper)
+        self.team.run(12.0)
+        self.assertEqual(self.holders([self.before], self.others), [])
+        self.team.close(sleeper)
+        sleeper.node.store.put(self.later, self.team.clock.seconds() + 600.0)
+        self.team.open(sleeper)
+        self.assertEqual(sleeper.node.replica.held(TASKS), [])
+        self.team.run(12.0)
+        self.assertEqual(self.holders([self.later], self.others), [])
+        self.assertEqual(self.read([self.later], sleeper), [])
 
 
-class ShareTests(RecordCase):
-    """A member that fills the stores with records that it may write."""
+class FloodTests(RecordCase):
+    """A member that may write, and does nothing else."""
 
-    def test_a_full_owner_stops_only_itself(self) -> None:
-        """A device that writes until it is refused has its share of each store; the others go on writing."""
-        most = 40
-        for house in self.team.houses:
-            store: Any = house.node.store
-            store._max_rows = most * OWNER_SHARE
-        device, own = self.insider(self.team, "flood", DEVICE)
-        contact = self.team.contact(self.team.houses[0])
+    def test_it_fills_its_own_share_only(self) -> None:
+        """One device that floods every store fills its own share of it, and everybody else goes on."""
+        team = self.team
+        bad, own = self.insider(team, "bad", DEVICE)
+        names = [f"{number}" for number in range(JUNK)]
+        junk = [Record(OTHER, name, own.public, 1, "team", 3600.0, b"\xc3", bytes(64)).packed() for name in names]
         refused = 0
-        for number in range(2 * most):
-            record = Record(hashed_key("flood"), f"{number}", own.public, 1, "team", 600.0, b"\xc3").signed(own)
-            outcome = self.outcome(self.team, device.ask(contact, "store", [record.packed()], changes=True), 0.1)
-            refused += isinstance(outcome, Exception)
-        self.assertGreaterEqual(refused, most)
-        self.assertLessEqual(len(self.team.houses[0].node.store.owned(own.public)), most)
-        for number in range(10):
-            put = self.outcome(self.team, self.team.houses[1].node.put(hashed_key("good"), f"{number}", b"\xc3"))
-            self.assertEqual(int(put), 3)
+        for house in team.houses:
+            for begin in range(0, JUNK, PAGE):
+                asked = bad.ask(team.contact(house), "store", junk[begin : begin + PAGE], changes=True)
+                verdicts = self.outcome(team, asked, 0.05)
+                refused += not isinstance(verdicts, list) or any(verdicts)
+            usage = house.node.store.usage
+            self.assertLessEqual(usage.rows, usage.max_rows // 2)
+        self.assertGreater(refused, 0)
+        self.works(team.houses[1])
+        first = Record(OTHER, names[0], own.public, 2, "team", 3600.0, None, bytes(64))
+        asked = bad.ask(team.contact(team.houses[0]), "store", [first.packed()], changes=True)
+        self.assertEqual(self.outcome(team, asked), [0], "a full owner can still delete")
 
-    def test_a_member_is_told_that_its_share_is_used_up(self) -> None:
-        """The writer itself fails with ``Full`` or is not acknowledged, and nothing of it is half stored."""
-        for house in self.team.houses:
-            store: Any = house.node.store
-            store._max_rows = 4 * OWNER_SHARE
-        node = self.team.houses[1].node
-        outcomes = [self.outcome(self.team, node.put(hashed_key("mine"), f"{number}", b"\xc3")) for number in range(9)]
-        self.assertTrue(any(isinstance(each, Full | NotAcknowledged) for each in outcomes), outcomes)
+    def test_it_blocks_no_reads(self) -> None:
+        """A member whose share is full at all replicas but one cannot make the reads of a key fail."""
+        team = self.team
+        bad, own = self.insider(team, "bad", DEVICE)
+        for house in team.houses[1:]:
+            usage = house.node.store.usage
+            for number in range((usage.max_rows - usage.rows) // 2):
+                house.node.replica.keep(Record(OTHER, f"{number}", own.public, 1, "team", 3600.0, b"\xc3", bytes(64)))
+        record = written(own, TASKS, "t1")
+        asked = bad.ask(team.contact(team.houses[0]), "store", [record.packed()], changes=True)
+        self.assertEqual(self.outcome(team, asked), [0])
+        for house in team.houses:
+            found = self.outcome(team, house.node.get(TASKS), 5.0)
+            self.assertIsInstance(found, list)
 
 
 class GuestTests(RecordCase):
-    """A guest whom only its gateway has met."""
+    """What a guest of a gateway may write reaches those that never met it."""
 
-    def test_records_of_a_guest_are_read_from_others(self) -> None:
-        """A node that never met a guest reads its record from a replica, with the certificate from there."""
-        paper = self.team.paper("gate", GATEWAY)
-        guest = Identity(b"g" * 32)
-        shown = guest_pass(paper.identity, paper.shown, guest.public, "phone", int(self.team.wall()))
-        stranger = self.team.houses[2]
-        self.team.board.cut(SOURCE._replace(port=668), self.team.address_of(stranger))
-        phone = self.attacker(self.team, guest, paper.secrets[0][1], shown, SOURCE._replace(port=668))
-        key = hashed_key("pictures")
-        record = Record(key, "x", guest.public, 1, "team", 600.0, b"\xc3").signed(guest)
-        for house in self.team.houses[:2]:
-            asked = phone.ask(self.team.contact(house), "store", [record.packed()], changes=True)
-            self.assertEqual(self.outcome(self.team, asked), [0])
-        self.assertFalse(stranger.team.door.is_known(guest.public))
-        answer = self.outcome(self.team, stranger.node.get(key))
-        self.assertEqual(answer, [record])
-        self.assertTrue(stranger.team.door.may_store(Slot(key, guest.public, "x")))
+    def test_second_hand(self) -> None:
+        """A node that joined after the guest left has its record, believes it, and still does after a restart."""
+        team = self.team
+        guest = team.move_in(team.houses[0].team.guest(bytes(range(32)), "phone"))
+        team.run(5.0)
+        self.outcome(team, guest.node.put(OTHER, "note", b"\xc3"))
+        [record] = self.outcome(team, guest.node.get(OTHER))
+        team.run(5.0)
+        team.close(guest)
+        team.run(5.0)
+        late = team.enlist("late", DEVICE)
+        team.run(30.0)
+        self.assertEqual(late.node.replica.held(OTHER), [record])
+        self.assertEqual(self.read([record], late), [record])
+        for house in team.houses:
+            if house is not guest:
+                team.close(house)
+        team.open(late)
+        self.assertEqual(late.node.replica.held(OTHER), [record])

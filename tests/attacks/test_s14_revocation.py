@@ -6,7 +6,7 @@ import random
 
 from middleware.admission.certificate import chained, guest_pass, proof
 from middleware.admission.code import Code, read
-from middleware.admission.doorkeeper import MAX_GUESTS
+from middleware.admission.doorkeeper import MAX_VOUCHED
 from middleware.admission.roll import MAX_ENTRIES, RESERVED, Roll, invitation_id, packed_admission
 from middleware.admission.statement import Invite
 from middleware.entangled.errors import Full, NotAdmitted
@@ -50,7 +50,7 @@ class BackdatingTests(SiegeCase):
         return self.outcome(self.team, endpoint.ask(contact, "ping", bytes(8), changes=True), 4.0)
 
     def test_backdated_members(self) -> None:
-        """Whom a revoked bootstrap node lets in is refused whatever dates the certificates bear; who was there stays."""
+        """Members that a revoked bootstrap node makes are refused, whatever their dates; a kept member stays."""
         kept, shown = self.mint(1, int(self.team.wall()))
         self.assertNotIsInstance(self.enter(kept, shown, 701), Exception)
         revoke = self.team.signer.revoke(self.thief.public, "boot1", self.team.wall(), kept=[kept.public])
@@ -143,8 +143,8 @@ class GuestTests(SiegeCase):
         team = self.siege()
         paper = team.paper("gate", "gateway")
         refused = []
-        for number in range(MAX_GUESTS + 3):
+        for number in range(MAX_VOUCHED + 3):
             guest = Identity(number.to_bytes(32))
             shown = guest_pass(paper.identity, paper.shown, guest.public, "phone", int(team.wall()))
             refused.append(team.houses[0].team.door.judge(guest.public, shown))
-        self.assertEqual(refused, [""] * MAX_GUESTS + [UNLISTED] * 3)
+        self.assertEqual(refused, [""] * MAX_VOUCHED + [UNLISTED] * 3)

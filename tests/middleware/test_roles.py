@@ -11,7 +11,7 @@ from middleware import halt, presence, roles, tasks, verdict
 from middleware.deployment.manifest import manifests_key
 from middleware.entangled.identity import Identity
 from middleware.entangled.record import Slot, hashed_key
-from middleware.entangled.wire.door import Life, OpenDoor
+from middleware.entangled.wire.door import Authority, Life, OpenDoor
 from middleware.node import SwarmNode
 from middleware.prefix import places_of
 from middleware.roles import (
@@ -62,6 +62,22 @@ class RoleDoor(OpenDoor):
     def may_store(self, slot: Slot) -> bool:
         """By the table."""
         return self._noted(may_store(self._known[slot.owner], slot), slot.owner, kind_of(slot))
+
+    def may_stay(self, slot: Slot) -> bool:
+        """What may be written."""
+        return may_store(self._known[slot.owner], slot)
+
+    def authority(self, owner: bytes) -> Authority:
+        """By what the test says."""
+        return Authority("", self._known[owner])
+
+    def certificate(self, owner: bytes) -> bytes:
+        """Nobody has one."""
+        return b""
+
+    def learn(self, owner: bytes, certificate: bytes) -> bool:
+        """Nobody needs one."""
+        return False
 
     def _noted(self, is_allowed: bool, public: bytes, what: str) -> bool:
         if not is_allowed:

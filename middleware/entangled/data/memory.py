@@ -5,12 +5,16 @@ from __future__ import annotations
 import heapq
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 
 from twisted.internet.defer import Deferred, succeed
 
-from middleware.entangled.data.store import HOLD, MAX_BYTES, MAX_ROWS, Origin, Usage, weight
-from middleware.entangled.errors import Full
+from middleware.entangled.data.store import HOLD, MAX_BYTES, MAX_ROWS, OWNER_BYTES, OWNER_ROWS, Origin, Usage, weight
+from middleware.entangled.errors import OWNER_FULL, Full
 from middleware.entangled.record import Record, Slot
+
+MAX_LOOKED_AT = 1000
+"""Old tombstones that are looked at for those of one owner, the oldest first."""
 
 
 @dataclass(slots=True)
@@ -25,8 +29,9 @@ class _Held:
 class MemoryStore:
     """A ``Store`` that lives as long as the program.
 
-    ``max_rows`` slots and ``max_bytes`` at most.  A tombstone is let in above that, for a delete must never fail for
-    want of room, up to as many slots again, for nobody shall fill the memory with them.
+    ``max_rows`` slots and ``max_bytes`` at most, and of these one owner may have as much as it leaves free.  A
+    tombstone is let in above that, for a delete must never fail for want of room, up to as many slots again, for nobody
+    shall fill the memory with them.
     """
 
     origin: Origin = "new"
@@ -38,14 +43,13 @@ class MemoryStore:
         self.epoch = epoch
         self._max_rows = max_rows
         self._max_bytes = max_bytes
-        self._owner_share = 1
         self._hold = hold
         self._now = float("-inf")
         self._bytes = 0
         self._slots: dict[Slot, _Held] = {}
         self._by_key: dict[bytes, dict[Slot, _Held]] = {}
         self._by_owner: dict[bytes, dict[Slot, _Held]] = {}
-        self._owner_bytes: dict[bytes, int] = {}
+        self._bytes_of: dict[bytes, int] = {}
         # In the order in which they may be let go of.
         self._tombstones: dict[Slot, _Held] = {}
         self._made_room: list[Record] = []
@@ -56,10 +60,6 @@ class MemoryStore:
     def __len__(self) -> int:
         """How many slots are held, the empty ones included."""
         return len(self._slots)
-
-    def limit_owners(self, share: int) -> None:
-        """Let each owner use one part in ``share`` of the rows and of the bytes; see ``Store.limit_owners``."""
-        self._owner_share = share
 
     @property
     def trouble(self) -> str:
@@ -122,6 +122,10 @@ class MemoryStore:
         slots = self._by_owner.get(owner, {})
         return [slots[slot].record for slot in sorted(slots)]
 
+    def owners(self) -> list[bytes]:
+        """Every owner that has a slot, in the order in which they came."""
+        return list(self._by_owner)
+
     def extend(self, owner: bytes, expires_at: float) -> int:
         """Let all leased records of ``owner`` live until ``expires_at`` at least; returns how many there are."""
         leased = 0
@@ -183,46 +187,42 @@ class MemoryStore:
         return len(self._slots) + rows <= self._max_rows and self._bytes + size <= self._max_bytes
 
     def _make_room(self, record: Record, held: _Held | None) -> None:
-        """Let go of what may go until ``record`` fits in the place of ``held``; raises ``Full``.
-
-        Where its owner is above its share, only that owner's own tombstones go.
-        """
+        """Let go of what may go until ``record`` fits in the place of ``held``; raises ``Full``."""
         rows = 1 if held is None else 0
         size = weight(record) - (0 if held is None else weight(held.record))
         if not rows and size <= 0:
             return
-        leaving: list[Slot] = []
-        own = (slot for slot in self._dispensable(record.slot) if slot.owner == record.owner)
-        own_rows = rows + len(self._by_owner.get(record.owner, ()))
-        own_bytes = size + self._owner_bytes.get(record.owner, 0)
-        while not self._fits_share(record, own_rows, own_bytes):
+        leaving: dict[Slot, None] = {}
+        own = (slot for slot in islice(self._dispensable(record.slot), MAX_LOOKED_AT) if slot.owner == record.owner)
+        while not self._is_within_part(record, rows, size):
             slot = next(own, None)
             if slot is None:
                 raise Full(
-                    f"store full for this owner: it may use one part in {self._owner_share} of {self._max_rows} rows"
-                    f" and {self._max_bytes} bytes; remove some of its records, or allow the store more"
+                    f"store full for this owner, which has {len(self._by_owner[record.owner])} rows and"
+                    f" {self._bytes_of[record.owner]} bytes: the store holds {self.usage}, and one owner may have as"
+                    f" much as it leaves free; remove some, or allow the store more",
+                    OWNER_FULL,
                 )
-            leaving.append(slot)
-            own_rows, own_bytes = own_rows - 1, own_bytes - weight(self._slots[slot].record)
-        rows -= len(leaving)
-        size -= sum(weight(self._slots[slot].record) for slot in leaving)
+            leaving[slot] = None
+            rows, size = rows - 1, size - weight(self._slots[slot].record)
         candidates = (slot for slot in self._dispensable(record.slot) if slot not in leaving)
         while not self._fits(record, rows, size):
             slot = next(candidates, None)
             if slot is None:
                 raise Full(f"store full: it holds {self.usage}, no room for {size} bytes; remove some, or allow more")
-            leaving.append(slot)
+            leaving[slot] = None
             rows, size = rows - 1, size - weight(self._slots[slot].record)
         self._made_room += [self._remove(slot) for slot in leaving]
 
-    def _fits_share(self, record: Record, rows: int, size: int) -> bool:
-        """Whether the owner of ``record`` may have so many rows and bytes; with one share it may have all."""
-        if self._owner_share == 1:
-            return True
-        most_rows, most_bytes = self._max_rows // self._owner_share, self._max_bytes // self._owner_share
-        if record.is_tombstone:
-            return rows <= 2 * most_rows
-        return rows <= most_rows and size <= most_bytes
+    def _is_within_part(self, record: Record, rows: int, size: int) -> bool:
+        """Whether its owner leaves as much free as it has, with ``rows`` and ``size`` more, or has but little."""
+        has_rows = len(self._by_owner.get(record.owner, ())) + rows
+        has_bytes = self._bytes_of.get(record.owner, 0) + size
+        free_rows = self._max_rows - len(self._slots) - rows
+        free_bytes = self._max_bytes - self._bytes - size
+        return has_rows <= max(OWNER_ROWS, free_rows) and (
+            record.is_tombstone or has_bytes <= max(OWNER_BYTES, free_bytes)
+        )
 
     def _dispensable(self, spared: Slot) -> Iterator[Slot]:
         """What may be let go of, in that order, but for ``spared``."""
@@ -244,20 +244,16 @@ class MemoryStore:
         self._by_key.setdefault(slot.key, {})[slot] = held
         self._by_owner.setdefault(slot.owner, {})[slot] = held
         self._sorted.pop(slot.key, None)
-        self._count_bytes(slot.owner, weight(record))
+        self._weigh(slot.owner, weight(record))
         self._sort_in(slot, held)
         self._queue(held)
 
-    def _count_bytes(self, owner: bytes, change: int) -> None:
-        self._bytes += change
-        used = self._owner_bytes.get(owner, 0) + change
-        if used:
-            self._owner_bytes[owner] = used
-        else:
-            del self._owner_bytes[owner]
+    def _weigh(self, owner: bytes, more: int) -> None:
+        self._bytes += more
+        self._bytes_of[owner] = self._bytes_of.get(owner, 0) + more
 
     def _replace(self, held: _Held, record: Record, expires_at: float) -> None:
-        self._count_bytes(record.owner, weight(record) - weight(held.record))
+        self._weigh(record.owner, weight(record) - weight(held.record))
         held.record, held.expires_at = record, expires_at
         self._sort_in(record.slot, held)
         if expires_at < held.queued_at:
@@ -300,7 +296,9 @@ class MemoryStore:
             if not index[name]:
                 del index[name]
         self._sorted.pop(slot.key, None)
-        self._count_bytes(slot.owner, -weight(held.record))
+        self._weigh(slot.owner, -weight(held.record))
+        if slot.owner not in self._by_owner:
+            del self._bytes_of[slot.owner]
         self._tombstones.pop(slot, None)
         self._changed(slot, None)
         return held.record

@@ -11,8 +11,9 @@ Where there is no room for a record, room is made in this order, and no further 
 Nothing else is ever let go of for the sake of something: if that is not enough, the writer is told ``Full``, with
 figures, and nothing has changed but 1.
 
-Where owners are limited (``limit_owners``), a record of an owner above its share makes room only by tombstones of that
-owner, else its writer is told ``Full``; the records of others stay, and they go on writing.
+One owner may have as much as it leaves free: a dynamic threshold, as in switches with a shared buffer (Choudhury and
+Hahne, 1998).  Alone it has up to half of the rows and bytes; k owners that write without end leave 1 in 2**k free to
+the others.  An owner that has more is refused, and only tombstones of its own make room for it.
 """
 
 from __future__ import annotations
@@ -28,12 +29,12 @@ MAX_ROWS = 12_000
 counts.  Full with ``MAX_BYTES`` a store adds some 22 MiB to a node of 40, which a device of 64 MB just bears."""
 MAX_BYTES = 8 * 2**20
 """Bytes that a node holds, as ``weight`` counts them.  More holds more large values; less spares memory and card."""
-OWNER_SHARE = 4
-"""A member of a closed team may use one part in so many of the rows and of the bytes of a store.  In an open team a
-share would protect nothing, as anybody can make one more identity."""
 HOLD = 86_400.0
 """Seconds for which a tombstone stays even where room is short: the longest absence after which a deleted record does
 not come back with whoever was away.  More is safer; less gives room back earlier."""
+OWNER_ROWS = 250
+OWNER_BYTES = 65_536
+"""Rows and bytes that each owner may have as long as there is room at all, however much others have."""
 FIXED_BYTES = 17
 """Sequence (8), ttl (8) and lifetime (1) of a record."""
 
@@ -78,16 +79,13 @@ class Store(Protocol):
     def trouble(self) -> str:
         """Why nothing can be written at present; empty if it can."""
 
-    def limit_owners(self, share: int) -> None:
-        """Let each owner use one part in ``share`` of the rows and of the bytes from now on; 1: all of them."""
-
     def put(self, record: Record, expires_at: float, now: float | None = None) -> bool:
         """Hold ``record`` if it beats what its slot holds, and say whether it did.
 
         The very record that is already held only stays longer.  ``now``: what has run out by then makes room first.
 
-        Raises ``Full`` where there is no room, ``Unwritable`` where it cannot be written.  It is safe, and may be
-        acknowledged, once ``written`` has fired.
+        Raises ``Full`` where there is no room, or its owner has all that one owner may have, ``Unwritable`` where it
+        cannot be written.  It is safe, and may be acknowledged, once ``written`` has fired.
         """
 
     def written(self) -> Deferred[None]:
@@ -104,6 +102,9 @@ class Store(Protocol):
 
     def owned(self, owner: bytes) -> list[Record]:
         """The records of ``owner``, tombstones included, in the order of their slots."""
+
+    def owners(self) -> list[bytes]:
+        """Every owner that has a slot, in the order in which they came."""
 
     def extend(self, owner: bytes, expires_at: float) -> int:
         """Let all leased records of ``owner`` live until ``expires_at`` at least; returns how many there are."""

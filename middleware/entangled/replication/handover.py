@@ -74,7 +74,7 @@ class Handover:
         self._catching_up = False
         self._stored_at: dict[Slot, float] = {}
         self._given: dict[bytes, bytes] = {}
-        self._overlap = Overlap(store, replica, overlay, endpoint, clock)
+        self._overlap = Overlap(replica, overlay, endpoint, clock)
         self._overlap.standing = self._standing_now
         endpoint.expose("settled", self._answer_settled, changes=True, idempotent=True)
 
@@ -209,9 +209,7 @@ class Handover:
         while wanted:
             answer = await self._overlay.ask(contact, "fetch", [list(slot) for slot in wanted[:PLACES]])
             page = answer if isinstance(answer, list) else []
-            unknown = self._replica.certificates.list_unknown(_records_of(page), contact)
-            if unknown:
-                await self._replica.certificates.learn(unknown, contact)
+            await self._replica.certificates.learn(contact, (slot.owner for slot in wanted[: len(page)]))
             for slot, fields in zip(wanted, page, strict=False):
                 self._take(slot, fields)
             wanted = wanted[len(page) :] if page else []
@@ -331,11 +329,6 @@ class Handover:
     async def _spread(self, record: Record) -> Any:
         targets = await self._overlay.holders(record.key)
         return await first(len(targets), [self._give(c, record) for c in targets if c.node_id != self._own_id])
-
-
-def _records_of(page: list[object]) -> list[Record]:
-    pairs = [each for each in page if isinstance(each, list) and len(each) == 2]
-    return [record for fields, _ in pairs if (record := unpacked(fields)) is not None]
 
 
 def _is_list_of(parts: object, kind: type) -> bool:

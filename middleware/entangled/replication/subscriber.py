@@ -100,12 +100,6 @@ class Subscriber:
             watch.forget(replica)
             self._settle(watch)
 
-    def review(self) -> None:
-        """Forget what the present certificates of the owners do not allow."""
-        for watch in list(self._watches):
-            watch.view.keep_only(self._replica.may_store)
-            self._settle(watch)
-
     def silent(self, owner: bytes) -> None:
         """Whoever let its lease run out no longer speaks for others either."""
         if node_id(owner) != self._own_id:
@@ -122,6 +116,13 @@ class Subscriber:
         for watch in [w for w in self._watches if w.key == record.key]:
             watch.view.remove(self._own_id, record.slot)
             self._settle(watch)
+
+    def review(self) -> None:
+        """Forget the records that their owners may not write any more."""
+        for watch in list(self._watches):
+            if not all(self._replica.may_stay(record.slot) for record in watch.records):
+                watch.view.retain(self._replica.may_stay)
+                self._settle(watch)
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
@@ -191,23 +192,9 @@ class Subscriber:
 
     def _answer_push(self, peer: Contact, key: bytes, number: int, packed: list[object], gone: list[object]) -> None:
         self._overlay.heard(peer)
-        found = [record for record in map(unpacked, packed) if record is not None]
-        if not any(watch.key == key and peer.node_id in watch.asked for watch in self._watches):
-            return
-        unknown = self._replica.certificates.list_unknown(found, peer)
-        if unknown:
-            self._chores.fork(self._learn_and_take(peer, unknown, key, number, found, gone))
-        else:
-            self._take_push(peer, key, number, found, gone)
-
-    async def _learn_and_take(
-        self, peer: Contact, unknown: list[bytes], key: bytes, number: int, found: list[Record], gone: list[object]
-    ) -> None:
-        await self._replica.certificates.learn(unknown, peer)
-        self._take_push(peer, key, number, found, gone)
-
-    def _take_push(self, peer: Contact, key: bytes, number: int, found: list[Record], gone: list[object]) -> None:
-        records = [record for record in found if self._reader.is_credible(record, key, peer)]
+        told = [record for record in map(unpacked, packed) if record is not None]
+        is_lacking = bool(self._replica.certificates.lacking(peer, (record.owner for record in told)))
+        records = [record for record in told if self._reader.is_credible(record, key, peer)]
         slots = [slot for place in gone if (slot := _slot_of(key, place)) is not None]
         for watch in [w for w in self._watches if w.key == key and peer.node_id in w.asked]:
             last = watch.pushed.get(peer.node_id, 0)
@@ -218,7 +205,9 @@ class Subscriber:
                 for slot in slots:
                     watch.view.remove(peer.node_id, slot)
             self._settle(watch)
-            if number not in (last, last + 1):  # the last one may be here for the second time
+            # The last one may be here for the second time.  Of an owner that is unknown here, the certificate is asked
+            # for with the records.
+            if is_lacking or number not in (last, last + 1):
                 self._chores.fork(self._renew_at(watch, peer))
 
 

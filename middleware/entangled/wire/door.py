@@ -55,6 +55,21 @@ class Life(NamedTuple):
 UNCOUNTED = Life()
 
 
+class Authority(NamedTuple):
+    """Why the certificate of an owner of records does not hold at present (``refusal``), and its roles where it does.
+
+    ``FOREIGN`` stands for an owner whose certificate this node has not seen.
+    """
+
+    refusal: str = ""
+    roles: tuple[str, ...] = ()
+
+    @property
+    def is_final(self) -> bool:
+        """Whether no clock and no certificate that is yet to come can make the records good that it does not cover."""
+        return self.refusal in ("", REVOKED, ROLE)
+
+
 class Door(Protocol):
     """Whom a team lets in; the endpoint asks again at each handshake, so what it answers may change.
 
@@ -86,19 +101,25 @@ class Door(Protocol):
         """Whether a node that was let in may call ``method``."""
 
     def may_store(self, slot: Slot) -> bool:
-        """Whether the present certificate of the owner of ``slot`` allows it to write there."""
+        """Whether the certificate of the owner of ``slot``, as it is at present, allows it to write there."""
 
-    def is_known(self, public: bytes) -> bool:
-        """Whether a certificate of that key is known, so that ``may_store`` can tell."""
+    def may_stay(self, slot: Slot) -> bool:
+        """Whether what is held in ``slot``, written when its owner was allowed to, may be held on and shown."""
 
-    def certificate(self, public: bytes) -> bytes:
-        """Return the newest certificate of that key which this node knows; empty where it knows none."""
+    def authority(self, owner: bytes) -> Authority:
+        """What ``may_store`` goes by for this owner; it changes when that does."""
 
     def roles_of(self, public: bytes) -> frozenset[str] | None:
         """Return the roles that the holder of that key has now, none for a stranger or a revoked or expired member.
 
         None means that the team is open and restricts nobody.
         """
+
+    def certificate(self, owner: bytes) -> bytes:
+        """The certificate of an owner by which other nodes can judge its records; empty where it is unknown."""
+
+    def learn(self, owner: bytes, certificate: bytes) -> bool:
+        """Take in the certificate of an owner that another node showed; whether it holds."""
 
 
 class OpenDoor:
@@ -121,17 +142,25 @@ class OpenDoor:
         """Everybody may."""
         return True
 
-    def is_known(self, public: bytes) -> bool:
-        """No certificate is needed."""
+    def may_stay(self, slot: Slot) -> bool:
+        """Everything may."""
         return True
 
-    def certificate(self, public: bytes) -> bytes:
-        """There are none."""
-        return b""
+    def authority(self, owner: bytes) -> Authority:
+        """The same for everybody."""
+        return Authority()
 
     def roles_of(self, public: bytes) -> frozenset[str] | None:
         """Nobody is restricted."""
         return None
+
+    def certificate(self, owner: bytes) -> bytes:
+        """Nobody has one."""
+        return b""
+
+    def learn(self, owner: bytes, certificate: bytes) -> bool:
+        """Nobody needs one."""
+        return False
 
 
 OPEN = OpenDoor()
