@@ -49,8 +49,9 @@ class BehaviourKind:
         elif method == LOOK:
             behaviour.look(observation_of(arguments[0]), arguments[1])
         elif method == EXECUTE:
-            *fields, value, choice = arguments
-            result = _plain_action(behaviour.execute(Context(*fields, tuple(value), choice)))
+            now, token, deadline, began, is_resumed, value, choice = arguments
+            context = Context(now, token, deadline, began, is_resumed, tuple(value), choice)
+            result = _plain_action(behaviour.execute(context))
         else:
             result = _plain_action({SEARCH: behaviour.search, HOLD: behaviour.hold}[method](arguments[0]))
         return [result, told(behaviour)]
@@ -68,7 +69,7 @@ class _Embodied:
         is_new = self._means is None
         self._means = means = self._means or Means()
         for name, value in fields.items():
-            setattr(means, name, tuple(value) if isinstance(value, list) else value)
+            setattr(means, name, _tuples(value))
         if is_new and hasattr(self.behaviour, "embody"):
             self.behaviour.embody(means)
 
@@ -95,6 +96,12 @@ def observation_of(fields: list[Any]) -> Observation:
     t_host, t_robot, values, samples, frame = fields
     held = {key: tuple(each) for key, each in samples.items()}
     return Observation(t_host, t_robot, values, held, None if frame is None else Frame(*frame))
+
+
+def _tuples(value: object) -> object:
+    if isinstance(value, dict):
+        return {key: _tuples(each) for key, each in value.items()}
+    return tuple(value) if isinstance(value, list) else value
 
 
 def _plain_action(action: object) -> dict[str, float] | None:

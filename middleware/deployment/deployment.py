@@ -100,6 +100,7 @@ class Deployment:
         self._starting: dict[str, tuple[Runner, Record]] = {}
         self._before: dict[str, Runner] = {}
         self._refused: dict[str, str] = {}
+        self._reported: dict[str, str] = {}
         self._records: dict[tuple[bytes, str], Record] = {}
         self._unfit: dict[tuple[bytes, str], int] = {}
 
@@ -378,7 +379,8 @@ class Deployment:
                 words.append(self._refused[name])
             if words:
                 told[name] = ", ".join(words)
-        if told != self._presence.device.deployed:
+        if told != self._reported:
+            self._reported = told
             self._presence.change(deployed=told)
 
     def _told(self, record: Record, manifest: Manifest | None) -> str:

@@ -71,10 +71,13 @@ class Host:
         number = 0
         try:
             number, verb, arguments = frame.unpack_question(question)
-            work: Callable[..., object] = {LOAD: self._load, MAKE: self._create, CALL: self._call, DROP: self._drop}[
-                verb
-            ]
-            packed = frame.pack([number, True, work(*arguments)])
+            verbs: dict[str, Callable[..., object]] = {
+                LOAD: self._load,
+                MAKE: self._create,
+                CALL: self._call,
+                DROP: self._drop,
+            }
+            packed = frame.pack([number, True, verbs[verb](*arguments)])
             if len(packed) <= frame.MAX_ANSWER:
                 return packed
             why = f"its answer has {len(packed)} bytes, more than {frame.MAX_ANSWER}"
