@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from middleware.entangled.control import word
-from middleware.entangled.control.place import NoControl, found
+from middleware.entangled.control.place import NoControl, check_peer, check_socket, found
 
 FAILED, WRONG = 1, 2
 FORMS = """fields:     7  1.5  true  null  "7"  words       JSON where it is JSON, else text
@@ -112,9 +112,11 @@ def request_of(wishes: argparse.Namespace) -> dict[str, Any]:
 
 def asked(path: Path, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
     """The lines that the node behind the socket at ``path`` answers; raises ``NoControl`` where it does not."""
+    check_socket(path)
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
         try:
             connection.connect(str(path))
+            check_peer(connection, path)
             connection.sendall(json.dumps(request).encode() + b"\n")
             with connection.makefile("rb") as lines:
                 for line in lines:

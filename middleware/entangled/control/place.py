@@ -1,9 +1,14 @@
-"""Place: where the control sockets of this machine's nodes lie, one file a node, for its owner's eyes only."""
+"""Place: where the control sockets of this machine's nodes lie, one file a node, for its owner's eyes only.
+
+In ``/tmp`` any user may make a folder, a link or a socket first.  So node and client look who made what they use.
+"""
 
 from __future__ import annotations
 
 import os
+import socket
 import stat
+import struct
 from pathlib import Path
 
 from middleware.entangled.errors import LocalError
@@ -29,12 +34,9 @@ def made(name: str) -> Path:
     where = folder()
     try:
         where.mkdir(mode=0o700, parents=True, exist_ok=True)
-        state = where.lstat()
     except OSError as error:
         raise NoControl(f"cannot make {where} for the control socket: {error.strerror}") from error
-    # In /tmp anybody may have made it first.
-    if not stat.S_ISDIR(state.st_mode) or state.st_uid != os.getuid() or state.st_mode & 0o077:
-        raise NoControl(f"{where} is not yours alone; remove it, or set XDG_RUNTIME_DIR to a folder of your own")
+    _check_folder(where)
     path = where / f"{name}{ENDING}"
     if len(os.fsencode(path)) > MAX_PATH:
         raise NoControl(f"{path} is longer than the {MAX_PATH} bytes of a socket's path; set a shorter XDG_RUNTIME_DIR")
@@ -43,6 +45,8 @@ def made(name: str) -> Path:
 
 def found(name: str | None) -> Path:
     """The socket of node ``name``, or of the only node here; raises ``NoControl``, which names those there are."""
+    if os.path.lexists(folder()):
+        _check_folder(folder())
     names = sorted(path.name.removesuffix(ENDING) for path in folder().glob(f"*{ENDING}"))
     if name is None and len(names) == 1:
         name = names[0]
@@ -54,3 +58,37 @@ def found(name: str | None) -> Path:
     if name is None:
         raise NoControl(f"several nodes have run on this machine; say which: --node NAME, one of {there}")
     raise NoControl(f"no node {name!r} runs on this machine; there are {there}")
+
+
+def check_socket(path: Path) -> None:
+    """Raise ``NoControl`` where ``path`` is no socket, or one of another user."""
+    try:
+        state = path.lstat()
+    except OSError as error:
+        raise NoControl(
+            f"the node behind {path} does not answer ({error.strerror}); start it, or remove that file"
+        ) from (error)
+    if not stat.S_ISSOCK(state.st_mode):
+        raise NoControl(f"{path} is no socket; remove it, and start the node anew")
+    if state.st_uid != os.getuid():
+        raise NoControl(f"{path} belongs to another user; remove it, or set XDG_RUNTIME_DIR to a folder of your own")
+
+
+def check_peer(connection: socket.socket, path: Path) -> None:
+    """Raise ``NoControl`` where the process at the other end is another user's, as far as the system tells."""
+    option = getattr(socket, "SO_PEERCRED", None)
+    if option is None:
+        return
+    credentials = struct.Struct("3i")
+    _, user, _ = credentials.unpack(connection.getsockopt(socket.SOL_SOCKET, option, credentials.size))
+    if user not in (os.getuid(), 0):
+        raise NoControl(f"another user's process listens at {path}; remove it, and start the node anew")
+
+
+def _check_folder(where: Path) -> None:
+    try:
+        state = where.lstat()
+    except OSError as error:
+        raise NoControl(f"cannot use {where} for the control socket: {error.strerror}") from error
+    if not stat.S_ISDIR(state.st_mode) or state.st_uid != os.getuid() or state.st_mode & 0o077:
+        raise NoControl(f"{where} is not yours alone; remove it, or set XDG_RUNTIME_DIR to a folder of your own")
