@@ -80,14 +80,29 @@ class ControlSocketTests(SynchronousTestCase):
         for each in (file, link):
             self.assertIn("is no socket", str(self.assertRaises(NoControl, list, asked(each, {}))))
         self.be_another()
-        self.assertIn("belongs to another user", str(self.assertRaises(NoControl, list, asked(path, {}))))
+        self.assertIn("not yours alone", str(self.assertRaises(NoControl, list, asked(path, {}))))
+
+    def test_service_of_another_user(self) -> None:
+        """Root asks a service of another user where it names the folder, and never in the shared folder."""
+        made("vaio")
+        path = self.listening("vaio")
+        for each in (folder(), path):
+            if self.me == 0:
+                os.chown(each, 12345, 12345)
+        self.patch(os, "getuid", lambda: 0)
+        self.assertEqual(found("vaio"), path)
+        place.check_socket(path)
+        self.assertRaises(NoControl, made, "vaio")
+        del os.environ["XDG_RUNTIME_DIR"]
+        self.assertRaises(NoControl, place.check_socket, path)
 
     def test_process_of_another(self) -> None:
         """Nor is a socket behind which another user's process listens."""
         here, there = socket.socketpair(socket.AF_UNIX)
         self.addCleanup(here.close)
         self.addCleanup(there.close)
-        place.check_peer(here, Path("vaio.control"))
+        path = made("vaio")
+        place.check_peer(here, path)
 
         class Connection:
             """A connection to a process of the user ``user``."""
@@ -99,8 +114,8 @@ class ControlSocketTests(SynchronousTestCase):
                 """Its process, user and group."""
                 return struct.pack("3i", 1, self.user, 1)
 
-        place.check_peer(Connection(0), Path("vaio.control"))  # type: ignore[arg-type]
-        error = self.assertRaises(NoControl, place.check_peer, Connection(self.me + 1), Path("vaio.control"))
+        place.check_peer(Connection(0), path)  # type: ignore[arg-type]
+        error = self.assertRaises(NoControl, place.check_peer, Connection(self.me + 1), path)
         self.assertIn("another user", str(error))
 
 

@@ -178,8 +178,8 @@ class OptionsTests(SynchronousTestCase):
         values = {
             "name": "a", "kind": "k", "host": "127.0.0.1", "port": "0", "known-nodes": "10.0.0.1:1",
             "store": "s.sqlite", "membership": "m", "team-key-file": self.key_file(), "roles": "edge",
-            "agent-module": "search", "driver-kind": "sim", "web-host": "127.0.0.1", "web-port": "0", "web-tls": "auto", "web-tls-port": "0",
-            "web-yard": "10.0.0.1:1", "tunnels": "wss://a", "tunnel-port": "443", "lan": "false",
+            "agent-module": "search", "driver-kind": "sim", "web-host": "127.0.0.1", "web-port": "0", "web-tls": "auto",
+            "web-tls-port": "0", "web-yard": "10.0.0.1:1", "tunnels": "wss://a", "tunnel-port": "443", "lan": "false",
         }  # fmt: skip
         self.assertEqual(set(values), {str(row[0]) for row in Options.optParameters} - {"config"})
         Options().parseOptions([word for name, value in values.items() for word in (f"--{name}", value)])

@@ -36,7 +36,8 @@ def made(name: str) -> Path:
         where.mkdir(mode=0o700, parents=True, exist_ok=True)
     except OSError as error:
         raise NoControl(f"cannot make {where} for the control socket: {error.strerror}") from error
-    _check_folder(where)
+    if _owner_of(where) != os.getuid():
+        raise _foreign(where)
     path = where / f"{name}{ENDING}"
     if len(os.fsencode(path)) > MAX_PATH:
         raise NoControl(f"{path} is longer than the {MAX_PATH} bytes of a socket's path; set a shorter XDG_RUNTIME_DIR")
@@ -46,7 +47,7 @@ def made(name: str) -> Path:
 def found(name: str | None) -> Path:
     """The socket of node ``name``, or of the only node here; raises ``NoControl``, which names those there are."""
     if os.path.lexists(folder()):
-        _check_folder(folder())
+        _owner_of(folder())
     names = sorted(path.name.removesuffix(ENDING) for path in folder().glob(f"*{ENDING}"))
     if name is None and len(names) == 1:
         name = names[0]
@@ -61,34 +62,45 @@ def found(name: str | None) -> Path:
 
 
 def check_socket(path: Path) -> None:
-    """Raise ``NoControl`` where ``path`` is no socket, or one of another user."""
+    """Raise ``NoControl`` where ``path`` is no socket, or one of another user than its folder's."""
+    owner = _owner_of(path.parent)
     try:
         state = path.lstat()
     except OSError as error:
-        raise NoControl(
-            f"the node behind {path} does not answer ({error.strerror}); start it, or remove that file"
-        ) from (error)
+        why = error.strerror
+        raise NoControl(f"the node behind {path} does not answer ({why}); start it, or remove that file") from error
     if not stat.S_ISSOCK(state.st_mode):
         raise NoControl(f"{path} is no socket; remove it, and start the node anew")
-    if state.st_uid != os.getuid():
-        raise NoControl(f"{path} belongs to another user; remove it, or set XDG_RUNTIME_DIR to a folder of your own")
+    if state.st_uid != owner:
+        raise _foreign(path)
 
 
 def check_peer(connection: socket.socket, path: Path) -> None:
-    """Raise ``NoControl`` where the process at the other end is another user's, as far as the system tells."""
+    """Raise ``NoControl`` where another user's process is at the other end, as far as the system tells."""
     option = getattr(socket, "SO_PEERCRED", None)
     if option is None:
         return
     credentials = struct.Struct("3i")
     _, user, _ = credentials.unpack(connection.getsockopt(socket.SOL_SOCKET, option, credentials.size))
-    if user not in (os.getuid(), 0):
+    if user not in (_owner_of(path.parent), 0):
         raise NoControl(f"another user's process listens at {path}; remove it, and start the node anew")
 
 
-def _check_folder(where: Path) -> None:
+def _owner_of(where: Path) -> int:
+    """The user of the folder ``where``, in which no other user can make anything; raises ``NoControl``.
+
+    That is this user, or for root the user of a service, where ``XDG_RUNTIME_DIR`` names its folder.
+    """
     try:
         state = where.lstat()
     except OSError as error:
         raise NoControl(f"cannot use {where} for the control socket: {error.strerror}") from error
-    if not stat.S_ISDIR(state.st_mode) or state.st_uid != os.getuid() or state.st_mode & 0o077:
-        raise NoControl(f"{where} is not yours alone; remove it, or set XDG_RUNTIME_DIR to a folder of your own")
+    is_served = os.getuid() == 0 and bool(os.environ.get("XDG_RUNTIME_DIR"))
+    is_trusted = state.st_uid == os.getuid() or is_served
+    if not stat.S_ISDIR(state.st_mode) or state.st_mode & 0o077 or not is_trusted:
+        raise _foreign(where)
+    return state.st_uid
+
+
+def _foreign(path: Path) -> NoControl:
+    return NoControl(f"{path} is not yours alone; remove it, or set XDG_RUNTIME_DIR to a folder of your own")
