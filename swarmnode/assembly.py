@@ -202,8 +202,8 @@ def _camera_knob(driver: Filming) -> Knob:
 def _deployable(node: SwarmNode, settings: Settings, seams: Seams) -> None:
     """Let the node run what its operators push; a node that does not allow it loads none of this."""
     from middleware.deployment.deployment import Author, Deployment
+    from middleware.deployment.process import ProcessChannel
     from middleware.deployment.shelf import MemoryShelf
-    from swarmnode.sandbox import process
 
     def author_of(public: bytes) -> Author:
         if node.team is None:
@@ -219,7 +219,7 @@ def _deployable(node: SwarmNode, settings: Settings, seams: Seams) -> None:
         settings.deployment,
         MemoryShelf() if seams.shelf is None else seams.shelf,
         author_of,
-        process if seams.spawn is None else seams.spawn,
+        ProcessChannel if seams.spawn is None else seams.spawn,
         node.clock.seconds,
     )
     node.deployed, node.stop_deployed = deployment.modules, deployment.stop

@@ -16,10 +16,11 @@ from functools import partial
 
 from agents.pushed import BehaviourKind
 from middleware.deployed import BEHAVIOUR, STRATEGY
-from middleware.deployment.channel import Channel, MemoryChannel
+from middleware.deployment.channel import Channel
 from middleware.deployment.confinement import confine
 from middleware.deployment.frame import MAX_QUESTION, Splitter
 from middleware.deployment.host import Host, Kind, StrategyKind
+from middleware.deployment.twin import MemoryChannel
 
 READ_BYTES = 64 * 1024
 LIBRARIES = (
@@ -41,13 +42,6 @@ def kinds() -> Mapping[str, Kind]:
 def simulated() -> Channel:
     """The twin of a process, for simulated teams."""
     return MemoryChannel(kinds())
-
-
-def process() -> Channel:
-    """A process of its own."""
-    from middleware.deployment.process import ProcessChannel
-
-    return ProcessChannel("swarmnode.sandbox")
 
 
 def wanted(source: bytes) -> list[str]:

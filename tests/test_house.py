@@ -384,6 +384,15 @@ class PurityTests(SynchronousTestCase):
         unwanted = [name for name in child.stdout.split() if _within(name, *ON_DEMAND)]
         self.assertEqual((child.returncode, unwanted), (0, []), child.stderr)
 
+    def test_node_runs_no_pushed_code(self) -> None:
+        """What a node that allows deployment loads for it does not lead to the module that runs pushed source."""
+        known, left = set[str](), ["middleware.deployment.deployment", "middleware.deployment.process"]
+        while left:
+            module = left.pop()
+            known.add(module)
+            left += [name for name in _ours(module) if name in FILES and name not in known]
+        self.assertEqual(known & {"middleware.deployment.module", "middleware.deployment.host"}, set())
+
 
 class PackagingTests(SynchronousTestCase):
     """What is in the tree is what gets installed."""

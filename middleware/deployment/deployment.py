@@ -98,7 +98,7 @@ class Deployment:
         self._wanted: dict[str, tuple[Manifest, Record]] = {}
         self._running: dict[str, tuple[Runner, Record]] = {}
         self._starting: dict[str, tuple[Runner, Record]] = {}
-        self._before: dict[str, Runner] = {}
+        self._before: dict[str, tuple[Runner, Record]] = {}
         self._refused: dict[str, str] = {}
         self._reported: dict[str, str] = {}
         self._records: dict[tuple[bytes, str], Record] = {}
@@ -136,9 +136,7 @@ class Deployment:
 
     def stop(self) -> None:
         """End all processes."""
-        for runner, _ in (*self._running.values(), *self._starting.values()):
-            runner.stop("the node has left")
-        for runner in self._before.values():
+        for runner, _ in (*self._running.values(), *self._starting.values(), *self._before.values()):
             runner.stop("the node has left")
 
     # -- what is pushed ---------------------------------------------------------------------------------------------
@@ -285,8 +283,8 @@ class Deployment:
         if before is not None:
             older = self._before.get(manifest.name)
             if older is not None:
-                older.stop("two newer ones were pushed")
-            self._before[manifest.name] = before[0]
+                older[0].stop("two newer ones were pushed")
+            self._before[manifest.name] = before
         self._running[manifest.name] = (runner, candidate.record)
         is_strategy = manifest.kind == STRATEGY
         self.modules[manifest.kind, manifest.name] = (
@@ -309,10 +307,12 @@ class Deployment:
                 self._expel(runner, record, reason)
             else:
                 runner.look()
-        for name, runner in list(self._before.items()):
+        for name, (runner, record) in list(self._before.items()):
             runner.look()
-            if runner.state is State.OUT or (not runner.instances and now - runner.asked_at > IDLE_S):
-                runner.stop("a newer one was pushed")
+            is_idle = not runner.instances and now - runner.asked_at > IDLE_S
+            reason = self._objection(record, runner.manifest) or ("a newer one was pushed" if is_idle else "")
+            if reason or runner.state is State.OUT:
+                runner.stop(reason)
                 del self._before[name]
         for slot, sequence in list(self._unfit.items()):
             known = self._records.get(slot)
@@ -332,7 +332,7 @@ class Deployment:
             self.modules.pop((manifest.kind, manifest.name), None)
             before = self._before.pop(manifest.name, None)
             if before is not None:
-                before.stop(reason)
+                before[0].stop(reason)
         for known in [each for each in self._records.values() if each.name == manifest.name]:
             self._judge(known)
         self._refuse(record, manifest, reason)

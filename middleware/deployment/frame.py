@@ -12,6 +12,10 @@ from typing import Any
 
 import msgpack
 
+LOAD, MAKE, CALL, DROP = "load", "make", "call", "drop"
+"""Verbs: load the module; make an instance; call a method of one; drop it."""
+FIRST = 0
+"""The instance of a strategy: strategies are pure, so one serves all tasks."""
 MAX_QUESTION = 4 * 1024 * 1024
 """Bytes of a question: an observation with a picture, or a module's source."""
 MAX_ANSWER = 64 * 1024

@@ -14,13 +14,11 @@ from middleware.consensus.remote import answer as answer_of
 from middleware.consensus.strategy import reads_of
 from middleware.deployed import STRATEGY, Make
 from middleware.deployment import frame
+from middleware.deployment.frame import CALL, DROP, FIRST, LOAD, MAKE
 from middleware.deployment.manifest import Manifest
 from middleware.deployment.module import loaded
 from middleware.errors import Undeployable
 
-LOAD, MAKE, CALL, DROP = "load", "make", "call", "drop"
-FIRST = 0
-"""The instance of a strategy: strategies are pure, so one serves all tasks."""
 MAX_INSTANCES = 64
 MAX_REASON = 1000
 

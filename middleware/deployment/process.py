@@ -28,10 +28,14 @@ ENVIRONMENT = {
 }
 
 
+SANDBOX = "swarmnode.sandbox"
+"""The program that runs a module."""
+
+
 class ProcessChannel:
     """A process that runs ``python -m program``, with none of this process's files, environment or folders."""
 
-    def __init__(self, program: str) -> None:
+    def __init__(self, program: str = SANDBOX) -> None:
         self._folder = tempfile.mkdtemp(prefix="swarm-module-")
         path = os.pathsep.join([*filter(None, sys.path), os.getcwd()])
         try:

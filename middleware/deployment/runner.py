@@ -21,7 +21,7 @@ from middleware.consensus.strategy import READABLE
 from middleware.deployed import PREFIX
 from middleware.deployment import frame
 from middleware.deployment.channel import Channel, Gone, Spawn
-from middleware.deployment.host import CALL, DROP, FIRST, LOAD, MAKE
+from middleware.deployment.frame import CALL, DROP, FIRST, LOAD, MAKE
 from middleware.deployment.manifest import Manifest
 from middleware.errors import UnknownTask
 

@@ -13,9 +13,8 @@ from pathlib import Path
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.entangled.control import place
-from middleware.entangled.control.command import asked
-from middleware.entangled.control.place import NoControl, folder, found, made
+from middleware.entangled.control.command import asked, check_peer
+from middleware.entangled.control.place import NoControl, check_socket, folder, found, made
 from swarmnode.plugin import Options
 
 SECRET = "the secret of a classroom"
@@ -91,10 +90,10 @@ class ControlSocketTests(SynchronousTestCase):
                 os.chown(each, 12345, 12345)
         self.patch(os, "getuid", lambda: 0)
         self.assertEqual(found("vaio"), path)
-        place.check_socket(path)
+        check_socket(path)
         self.assertRaises(NoControl, made, "vaio")
         del os.environ["XDG_RUNTIME_DIR"]
-        self.assertRaises(NoControl, place.check_socket, path)
+        self.assertRaises(NoControl, check_socket, path)
 
     def test_process_of_another(self) -> None:
         """Nor is a socket behind which another user's process listens."""
@@ -102,7 +101,7 @@ class ControlSocketTests(SynchronousTestCase):
         self.addCleanup(here.close)
         self.addCleanup(there.close)
         path = made("vaio")
-        place.check_peer(here, path)
+        check_peer(here, path)
 
         class Connection:
             """A connection to a process of the user ``user``."""
@@ -114,8 +113,8 @@ class ControlSocketTests(SynchronousTestCase):
                 """Its process, user and group."""
                 return struct.pack("3i", 1, self.user, 1)
 
-        place.check_peer(Connection(0), path)  # type: ignore[arg-type]
-        error = self.assertRaises(NoControl, place.check_peer, Connection(self.me + 1), path)
+        check_peer(Connection(0), path)  # type: ignore[arg-type]
+        error = self.assertRaises(NoControl, check_peer, Connection(self.me + 1), path)
         self.assertIn("another user", str(error))
 
 

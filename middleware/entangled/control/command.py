@@ -8,13 +8,14 @@ from __future__ import annotations
 import argparse
 import json
 import socket
+import struct
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
 from middleware.entangled.control import word
-from middleware.entangled.control.place import NoControl, check_peer, check_socket, found
+from middleware.entangled.control.place import NoControl, check_socket, found, owner_of
 
 FAILED, WRONG = 1, 2
 FORMS = """fields:     7  1.5  true  null  "7"  words       JSON where it is JSON, else text
@@ -124,6 +125,17 @@ def asked(path: Path, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
         except (OSError, ValueError) as error:
             why = getattr(error, "strerror", None) or error
             raise NoControl(f"the node behind {path} does not answer ({why}); start it, or remove that file") from error
+
+
+def check_peer(connection: socket.socket, path: Path) -> None:
+    """Raise ``NoControl`` where another user's process is at the other end, as far as the system tells."""
+    option = getattr(socket, "SO_PEERCRED", None)
+    if option is None:
+        return
+    credentials = struct.Struct("3i")
+    _, user, _ = credentials.unpack(connection.getsockopt(socket.SOL_SOCKET, option, credentials.size))
+    if user not in (owner_of(path.parent), 0):
+        raise NoControl(f"another user's process listens at {path}; remove it, and start the node anew")
 
 
 def main(group: str, words: Sequence[str], out: TextIO | None = None, ask: Ask = asked) -> int:

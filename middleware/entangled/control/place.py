@@ -6,9 +6,7 @@ In ``/tmp`` any user may make a folder, a link or a socket first.  So node and c
 from __future__ import annotations
 
 import os
-import socket
 import stat
-import struct
 from pathlib import Path
 
 from middleware.entangled.errors import LocalError
@@ -36,7 +34,7 @@ def made(name: str) -> Path:
         where.mkdir(mode=0o700, parents=True, exist_ok=True)
     except OSError as error:
         raise NoControl(f"cannot make {where} for the control socket: {error.strerror}") from error
-    if _owner_of(where) != os.getuid():
+    if owner_of(where) != os.getuid():
         raise _foreign(where)
     path = where / f"{name}{ENDING}"
     if len(os.fsencode(path)) > MAX_PATH:
@@ -47,7 +45,7 @@ def made(name: str) -> Path:
 def found(name: str | None) -> Path:
     """The socket of node ``name``, or of the only node here; raises ``NoControl``, which names those there are."""
     if os.path.lexists(folder()):
-        _owner_of(folder())
+        owner_of(folder())
     names = sorted(path.name.removesuffix(ENDING) for path in folder().glob(f"*{ENDING}"))
     if name is None and len(names) == 1:
         name = names[0]
@@ -63,7 +61,7 @@ def found(name: str | None) -> Path:
 
 def check_socket(path: Path) -> None:
     """Raise ``NoControl`` where ``path`` is no socket, or one of another user than its folder's."""
-    owner = _owner_of(path.parent)
+    owner = owner_of(path.parent)
     try:
         state = path.lstat()
     except OSError as error:
@@ -75,18 +73,7 @@ def check_socket(path: Path) -> None:
         raise _foreign(path)
 
 
-def check_peer(connection: socket.socket, path: Path) -> None:
-    """Raise ``NoControl`` where another user's process is at the other end, as far as the system tells."""
-    option = getattr(socket, "SO_PEERCRED", None)
-    if option is None:
-        return
-    credentials = struct.Struct("3i")
-    _, user, _ = credentials.unpack(connection.getsockopt(socket.SOL_SOCKET, option, credentials.size))
-    if user not in (_owner_of(path.parent), 0):
-        raise NoControl(f"another user's process listens at {path}; remove it, and start the node anew")
-
-
-def _owner_of(where: Path) -> int:
+def owner_of(where: Path) -> int:
     """The user of the folder ``where``, in which no other user can make anything; raises ``NoControl``.
 
     That is this user, or for root the user of a service, where ``XDG_RUNTIME_DIR`` names its folder.
