@@ -29,8 +29,10 @@ LIBRARIES = (
     *("json", "math", "numbers", "operator", "random", "re", "statistics", "string", "struct", "textwrap", "time"),
     *("traceback", "types", "typing", "zlib", "cv2", "numpy"),
 )
-HOUSE = ("agents.", "drivers.reading", "middleware.consensus.", "middleware.value")
+PREFIXES = ("agents.", "drivers.reading", "middleware.consensus.", "middleware.value", "numpy.")
 """Where else a module may import from: names that begin so."""
+LATER = {"numpy": ("numpy.fft", "numpy.random")}
+"""What a library imports only when it is used, and so too late."""
 _IMPORT = re.compile(rb"^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import|import[ \t]+([\w., \t]+))", re.MULTILINE)
 
 
@@ -50,7 +52,8 @@ def wanted(source: bytes) -> list[str]:
     for one, several in _IMPORT.findall(source):
         words = [one] if one else [part.split()[0] for part in several.split(b",") if part.split()]
         named.update(word.decode("ascii", "replace") for word in words)
-    return sorted(name for name in named if name in LIBRARIES or name.startswith(HOUSE))
+    known = {name for name in named if name in LIBRARIES or name.startswith(PREFIXES)}
+    return sorted(known.union(*(LATER.get(name, ()) for name in known)))
 
 
 def _prepared(parent: int, kind: str, source: bytes) -> list[str]:
