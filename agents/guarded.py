@@ -1,7 +1,7 @@
 """Guarded: a behaviour in another process, which may raise, hang or end without harm to the agent.
 
-The agent never waits: each call asks, and gives what was answered last, if that is fresh and was asked for the same
-method and lease.  Else the body stands.  Once the behaviour has failed it is asked no more: the body stands, and there
+The agent never waits: each call asks, and returns the last answer if it is fresh and belongs to the same method and
+lease.  Else the body stands.  Once the behaviour has failed it is asked no more: the body stands, and there
 is no cost to report, so that another goes.
 """
 
@@ -49,14 +49,14 @@ class Conversation(Protocol):
         """Ask without waiting; whether it could be asked."""
 
     def look(self) -> None:
-        """Take in what was answered."""
+        """Take in the answers."""
 
     def close(self) -> None:
         """End it."""
 
 
 class Guarded:
-    """The behaviour behind ``inner`` for as long as it does not fail, and ``stand`` from then on."""
+    """The behaviour behind ``inner`` while it does not fail, and ``stand`` from then on."""
 
     _log = Logger()
 
@@ -79,12 +79,12 @@ class Guarded:
         return self._has_failed
 
     def embody(self, means: Means) -> None:
-        """Tell it what its body can do; what the body learns of itself is told before each look."""
+        """Tell it the means of its body; changes of them are told before each look."""
         self._means = means
         self._send_means()
 
     def look(self, seen: Observation, now: float) -> None:
-        """Take in what the body senses now; left out while it has not answered the look before."""
+        """Take in an observation; left out while the previous look is unanswered."""
         self._look()
         self._send_means()
         if not self._inner.is_behind:
@@ -92,7 +92,7 @@ class Guarded:
 
     @property
     def cost(self) -> float | None:
-        """What doing the task would cost this body; None where it cannot tell, or has failed."""
+        """The cost of the task for this body; None if it cannot tell, or has failed."""
         self._look()
         cost = self._cost
         is_lawful = isinstance(cost, int | float) and not isinstance(cost, bool) and 0 <= cost < float("inf")
@@ -116,7 +116,7 @@ class Guarded:
         self._inner.close()
 
     def __getattr__(self, name: str) -> object:
-        """What it may have beside; ``AttributeError`` for anything else."""
+        """An optional attribute; ``AttributeError`` for anything else."""
         if name not in OPTIONAL:
             raise AttributeError(name)
         self._look()

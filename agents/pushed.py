@@ -22,12 +22,12 @@ OPTIONAL: Mapping[str, object] = {
     "weight": 1.0,
     "electorate": 0.0,
 }
-"""What a behaviour may have beside what it must, and what holds where it has none (``agents.behaviour``)."""
+"""The optional attributes of a behaviour, each with its default (``agents.behaviour``)."""
 LOOK, SEARCH, HOLD, EXECUTE, EMBODY = "look", "search", "hold", "execute", "embody"
 
 
 class BehaviourKind:
-    """Behaviours, in their own process.  Each answer is the result, the cost, and what else the behaviour tells."""
+    """Behaviours, in their own process.  Each answer is the result, the cost, and the optional attributes."""
 
     def make(self, make: Make, arguments: list[Any]) -> object:
         """A behaviour for the parameters of a task, with its own random generator."""
@@ -35,12 +35,12 @@ class BehaviourKind:
         return _Embodied(make(parameters, random.Random(seed)))
 
     def facts(self, thing: object) -> dict[str, Any]:
-        """What it tells before it has looked."""
+        """Its cost and attributes before the first look."""
         assert isinstance(thing, _Embodied)
         return {"told": told(thing.behaviour)}
 
     def call(self, thing: object, method: str, arguments: list[Any]) -> object:
-        """The result of one method, and what the behaviour tells after it."""
+        """The result of one method, with the cost and attributes after it."""
         assert isinstance(thing, _Embodied)
         behaviour = thing.behaviour
         result = None
@@ -65,7 +65,7 @@ class _Embodied:
         self._means: Means | None = None
 
     def embody(self, fields: dict[str, Any]) -> None:
-        """Tell it what its body can do; afterwards the same object changes with what the body learns of itself."""
+        """Tell it the means of its body; later calls update the same object."""
         is_new = self._means is None
         self._means = means = self._means or Means()
         for name, value in fields.items():
@@ -75,12 +75,12 @@ class _Embodied:
 
 
 def told(thing: object) -> list[Any]:
-    """The cost, and what a behaviour may have beside what it must, in the order of ``OPTIONAL``."""
+    """The cost and the optional attributes of a behaviour, in the order of ``OPTIONAL``."""
     return [getattr(thing, "cost", None), *(getattr(thing, name, usual) for name, usual in OPTIONAL.items())]
 
 
 def plain_means(means: Means) -> dict[str, Any]:
-    """What a body can do, as plain values."""
+    """The means of a body as plain values."""
     return {name: dict(value) if isinstance(value, Mapping) else value for name, value in vars(means).items()}
 
 

@@ -24,7 +24,7 @@ WORKS: dict[str, tuple[str, str]] = {
     "invite": ("swarmnode.team.invite", "a code that lets a newcomer into the team"),
     "join": ("swarmnode.team.join", "become a member of a team, by such a code"),
     "members": ("swarmnode.team.members", "who belongs to the team"),
-    "invitations": ("swarmnode.team.invitations", "which codes can be used, and who came by them"),
+    "invitations": ("swarmnode.team.invitations", "the codes that can be used, and the members that used them"),
     "revoke": ("swarmnode.team.revoke", "put a member out, or end an invitation"),
     "rotate": ("swarmnode.team.rotate", "a new secret for the team"),
     "promote": ("swarmnode.team.promote", "let a member let others in"),

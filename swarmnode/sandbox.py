@@ -1,7 +1,7 @@
 """Sandbox: the process in which one pushed module runs; ``python -m swarmnode.sandbox PARENT``.
 
-It reads questions from standard input and writes answers to standard output.  What the module's imports name, of a
-fixed list, is imported first; then the process gives up its rights, and only then the source is read as Python.
+It reads questions from standard input and writes answers to standard output.  It first imports the libraries of a fixed
+list that the module names, then gives up its rights, and only then reads the source as Python.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ LIBRARIES = (
 PREFIXES = ("agents.", "drivers.reading", "middleware.consensus.", "middleware.value", "numpy.")
 """Where else a module may import from: names that begin so."""
 LATER = {"numpy": ("numpy.fft", "numpy.random")}
-"""What a library imports only when it is used, and so too late."""
+"""Modules that a library imports at first use, which is too late here."""
 _IMPORT = re.compile(rb"^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import|import[ \t]+([\w., \t]+))", re.MULTILINE)
 
 
@@ -47,7 +47,7 @@ def simulated() -> Channel:
 
 
 def wanted(source: bytes) -> list[str]:
-    """The modules to be imported before the rights are given up: of those that ``source`` names, the allowed ones."""
+    """The allowed libraries that ``source`` names, to be imported before the rights are given up."""
     named: set[str] = set()
     for one, several in _IMPORT.findall(source):
         words = [one] if one else [part.split()[0] for part in several.split(b",") if part.split()]
@@ -58,7 +58,7 @@ def wanted(source: bytes) -> list[str]:
 
 def _prepared(parent: int, kind: str, source: bytes) -> list[str]:
     for name in wanted(source):
-        with suppress(Exception):  # the module itself says what it misses
+        with suppress(Exception):  # the module's own import raises again
             importlib.import_module(name)
     os.environ.clear()
     sys.path.clear()
@@ -69,7 +69,7 @@ def main() -> None:
     """Answer until the node closes the pipe."""
     out = os.dup(1)
     null = os.open(os.devnull, os.O_RDWR)
-    os.dup2(null, 1)  # what a module prints is no answer
+    os.dup2(null, 1)  # output of the module is no answer
     os.close(null)
     with suppress(OSError):
         os.rmdir(os.getcwd())  # the folder is empty, and stays so

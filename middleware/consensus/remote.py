@@ -19,11 +19,11 @@ class RemoteStrategy:
         raise NotImplementedError
 
     def find(self, contacts: Sequence[Report]) -> Consensus:
-        """What the strategy finds."""
+        """The consensus point of the strategy."""
         return _consensus(self.ask("find", [astuple(r) for r in contacts]))
 
     def find_group(self, contacts: Sequence[Report], items: Sequence[Item]) -> tuple[Consensus, ...]:
-        """What the strategy finds, if it is one for several tasks; raises ``NotImplementedError`` otherwise."""
+        """The points of a strategy for several tasks; raises ``NotImplementedError`` for any other."""
         answer = self.ask("find_group", [[astuple(r) for r in contacts], [astuple(i) for i in items]])
         if answer is None:
             raise NotImplementedError
@@ -32,12 +32,12 @@ class RemoteStrategy:
         return tuple(_consensus(point) for point in answer)
 
     def improves(self, current: Report, offer: Report, hysteresis: float) -> bool:
-        """What the strategy says."""
+        """The answer of the strategy."""
         answer: bool = self.ask("improves", [astuple(current), astuple(offer), hysteresis])
         return answer
 
     def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
-        """What the strategy makes of both."""
+        """The summary of the strategy."""
         answer = self.ask("merge", [[astuple(r) for r in a], [astuple(r) for r in b]])
         try:
             return tuple(report_of(fields) for fields in answer)

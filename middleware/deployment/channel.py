@@ -14,14 +14,14 @@ class Channel(Protocol):
     """A running process; ``receive`` and ``send`` raise ``Gone``."""
 
     def send(self, message: bytes) -> None:
-        """Send a message; what the process does not take at once is sent by the next ``receive``."""
+        """Send a message; the next ``receive`` sends the rest that the pipe does not take now."""
 
     @property
     def is_behind(self) -> bool:
         """Whether something is left to be sent."""
 
     def receive(self, within_s: float) -> list[bytes]:
-        """The messages that came; where there is none yet, waits for one at most ``within_s`` seconds."""
+        """The received messages; if there is none yet, wait for one at most ``within_s`` seconds."""
 
     def end(self) -> None:
         """End the process at once; may be called again."""

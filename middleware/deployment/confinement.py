@@ -1,8 +1,8 @@
-"""Confinement: a process gives up what the code that it is about to run shall not have; once done it cannot be undone.
+"""Confinement: a process gives up its rights before it runs pushed code; this cannot be undone.
 
-On Linux: no new file, socket, process or thread (seccomp, an allow list of system calls), no network (a network
-namespace of its own), no capabilities, no other user's rights, an empty root folder where that is allowed, a death with
-its parent, and limits of memory and processor time.  On other systems only the limits.  ``confine`` says what holds.
+On Linux: no new file, socket, process or thread (seccomp, an allow list of system calls), no network (an
+empty network namespace), no capabilities, no rights of root, an empty root folder if that is allowed, an end with the
+parent, and limits of memory and processor time.  On other systems only the limits.  ``confine`` says what holds.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from collections.abc import Callable
 from contextlib import suppress
 
 MEMORY = 256 * 1024 * 1024
-"""Bytes of address space beside what the libraries have taken."""
+"""Bytes of address space in addition to the libraries."""
 CPU_S = 3600
 """Seconds of processor time of one process; then it is ended, and started again when it is needed."""
 NOBODY = 65534

@@ -1,8 +1,8 @@
 """Deployment: one node's acceptance of what its operators push; off where the owner has not allowed it.
 
 In this order: is the module listed, is its author's key, is the author an operator of the team now, is the signature
-good, is it newer than what is held, is the source what was signed, does it load and conform.  A module runs in a
-process of its own (``runner``), and none of it before all this is checked.  The author is judged again every second:
+good, is it newer than the held version, has the source the signed digest, does it load and conform.  Each module runs
+in a separate process (``runner``), and none of it before all this is checked.  The author is judged again every second:
 the modules of one that is an operator no longer stop.
 """
 
@@ -35,7 +35,7 @@ WATCHING_S = 1.0
 STARTING_S = 0.05
 """Seconds between two looks at a process that starts."""
 IDLE_S = 60.0
-"""Seconds after which the process of the version before is ended, if nobody has asked it."""
+"""Seconds after which the process of the version before is ended, if it was not asked."""
 EDITIONS = 2
 """Editions of one module on the shelf: the one that runs, and the one before."""
 MAX_JUDGED = 256
@@ -49,7 +49,7 @@ Later = Callable[..., object]
 
 @dataclass(frozen=True)
 class Author:
-    """What the team says of the holder of a key: ``roles`` now, None where the team is open."""
+    """The member with a key: its ``roles`` now, None in an open team."""
 
     name: str
     roles: frozenset[str] | None
@@ -191,7 +191,7 @@ class Deployment:
         return ""
 
     def _author_objection(self, record: Record) -> str:
-        """Why its author may push nothing now; empty where it may."""
+        """Why its author may push nothing now; empty if it may."""
         author = self._author_of(record.owner)
         if author.roles is None or OPERATOR in author.roles:
             return ""
@@ -277,7 +277,7 @@ class Deployment:
         self._report()
 
     def _adopt(self, runner: Runner, candidate: _Candidate) -> None:
-        """Have the module run from now on; whoever uses the one before goes on with it."""
+        """Use this version from now on; tasks under way continue with the previous one."""
         manifest = runner.manifest
         before = self._running.get(manifest.name)
         if before is not None:
@@ -323,7 +323,7 @@ class Deployment:
         self._report()
 
     def _expel(self, runner: Runner, record: Record, reason: str) -> None:
-        """End a module whose author may push no longer, and judge again what others pushed."""
+        """End a module whose author may push no longer, and judge the modules of other authors again."""
         manifest = runner.manifest
         runner.stop(reason)
         self._starting.pop(manifest.name, None)

@@ -2,7 +2,7 @@
 
 A question is ``[number, verb, arguments]``, its answer ``[number, is_well, content]``, each in msgpack behind its
 length in four bytes.  The node trusts nothing in an answer: its size is limited before it is read, and its number has
-to be that of a question.
+to belong to an open question.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class BadFrame(ValueError):
 
 
 def pack(content: object) -> bytes:
-    """A message with its length; raises ``BadFrame`` for what is no plain value."""
+    """A message with its length; raises ``BadFrame`` if ``content`` is no plain value."""
     try:
         packed = bytes(msgpack.packb(content))
     except Exception as error:  # msgpack raises many things

@@ -32,7 +32,7 @@ class Kind(Protocol):
         """One instance."""
 
     def facts(self, thing: object) -> dict[str, Any]:
-        """What the node has to know of an instance."""
+        """The facts that the node needs about an instance."""
 
     def call(self, thing: object, method: str, arguments: list[Any]) -> object:
         """The answer of an instance."""
@@ -46,16 +46,16 @@ class StrategyKind:
         return make()
 
     def facts(self, thing: object) -> dict[str, Any]:
-        """What it reads beside the cost."""
+        """The fields of a report that it reads, apart from the cost."""
         return {"reads": list(reads_of(thing))}
 
     def call(self, thing: object, method: str, arguments: list[Any]) -> object:
-        """What it finds."""
+        """Its answer."""
         return answer_of(thing, method, arguments)
 
 
 class Host:
-    """One module, of which there are several instances where it is a behaviour."""
+    """One module, with several instances if it is a behaviour."""
 
     def __init__(self, kinds: Mapping[str, Kind], confine: Confine) -> None:
         self._kinds = kinds

@@ -16,12 +16,12 @@ from middleware.deployment.channel import Gone
 from middleware.deployment.frame import MAX_ANSWER, MAX_QUESTION, BadFrame, Splitter
 
 PIPE_BYTES = 1024 * 1024
-"""Room that is asked for in the pipe to the process, so that a picture goes in at once."""
+"""Requested size of the pipe to the process, so that a picture fits into it."""
 READ_BYTES = 64 * 1024
 MAX_READ = 1024 * 1024
 """Bytes that are read at a time at most."""
 ENVIRONMENT = {
-    # Sets come out in the same order on every machine; libraries start no threads.
+    # Sets have the same order on every machine; libraries start no threads.
     "PYTHONHASHSEED": "0",
     "OPENBLAS_NUM_THREADS": "1",
     "OMP_NUM_THREADS": "1",
@@ -79,7 +79,7 @@ class ProcessChannel:
         self._flush()
 
     def receive(self, within_s: float) -> list[bytes]:
-        """The messages that came; where there is none yet, waits for one at most ``within_s`` seconds."""
+        """The received messages; if there is none yet, wait for one at most ``within_s`` seconds."""
         end = time.monotonic() + within_s
         found: list[bytes] = []
         while True:

@@ -1,8 +1,8 @@
-"""Runner: one pushed module in a process of its own, as its node sees it: started, asked, watched and ended.
+"""Runner: start, ask, watch and end the process of one pushed module.
 
 The node never waits for a behaviour: it asks, and looks later whether there is an answer.  For a strategy it waits at
-most ``DEADLINE_S``.  A process that is late, dies, or says what was not asked is ended; it is started again when
-somebody asks, until it was lost ``STRIKES`` times.
+most ``DEADLINE_S``.  A process that is late, dies, or sends an unexpected answer is ended; the next question
+starts it again, until it was lost ``STRIKES`` times.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class Runner:
     """The process of the module of ``manifest``, pushed with ``source``.
 
     ``seconds`` is the node's monotonic clock.  ``objection`` is asked before each start: why the module may not run
-    now, empty where it may.  ``why`` says why it is out or was lost, ``limits`` which limits hold in its process.
+    now, empty if it may.  ``why`` says why it is out or was lost, ``limits`` which limits hold in its process.
     """
 
     _log = Logger()
@@ -109,7 +109,7 @@ class Runner:
             self._lose(f"its process cannot be started: {error}")
 
     def look(self) -> None:
-        """Take in what was answered, and end a process that is late."""
+        """Take in the answers, and end a process that is late."""
         self._pump(0.0)
         if self._channel is None:
             return
@@ -177,7 +177,7 @@ class Runner:
         return self._channel is not None and self._channel.is_behind
 
     def create(self, parameters: Mapping[str, Any], rng: random.Random) -> Instance:
-        """One instance of a behaviour; raises ``UnknownTask`` where it may not run."""
+        """One instance of a behaviour; raises ``UnknownTask`` if it may not run."""
         if self.state is State.LOST:
             self.start()
         if self.state not in (State.STARTING, State.READY):
@@ -187,7 +187,7 @@ class Runner:
     # -- inside -----------------------------------------------------------------------------------------------------
 
     def _pump(self, within_s: float, is_done: Callable[[], bool] = lambda: True) -> None:
-        """Take in answers; where none is there yet, wait so long for what makes it done."""
+        """Take in answers; wait at most ``within_s`` seconds until ``is_done``."""
         end = self._seconds() + within_s
         try:
             while self._channel is not None:
@@ -255,7 +255,7 @@ class PushedStrategy(RemoteStrategy):
 class Instance:
     """One instance of a behaviour; it ends with the process in which it is made.
 
-    ``fault`` says why it cannot be asked any more, empty while it can.
+    ``fault`` says why it cannot be asked, empty while it can.
     """
 
     def __init__(self, runner: Runner, parameters: dict[str, Any], seed: int) -> None:
@@ -282,7 +282,7 @@ class Instance:
         return not self.fault
 
     def look(self) -> None:
-        """Take in what was answered."""
+        """Take in the answers."""
         if not self.fault:
             self._runner.look()
             self._settle()

@@ -1,4 +1,4 @@
-"""Invitations: ``swarm invitations``, which codes the operator gave out, and who came by each."""
+"""Invitations: ``swarm invitations``, the codes of the operator, and the members that used each."""
 
 from __future__ import annotations
 

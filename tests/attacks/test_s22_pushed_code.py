@@ -1,4 +1,4 @@
-"""Attack S22: to have code run on a node by whoever is not, or is no longer, an operator of its team."""
+"""Attack S22: an author that is not, or is no longer, an operator of the team has code run on a node."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ class PushedCodeTests(SynchronousTestCase):
         self.team.clock.advance(IN_FORCE)
 
     def team_told(self, work: object) -> object:
-        """What a statement was taken for."""
+        """The kind of a statement."""
         from twisted.internet.defer import Deferred
 
         done = Deferred.fromCoroutine(work)  # type: ignore[arg-type,var-annotated]
@@ -91,7 +91,7 @@ class PushedCodeTests(SynchronousTestCase):
         return self.successResultOf(done)
 
     def shown(self) -> str:
-        """What the page says of the module on the dog."""
+        """The state of the module on the dog, as the page shows it."""
         (device,) = [each for each in self.team.state()["devices"] if each["name"] == "dog1"]
         return str(device["deployed"].get("best", ""))
 
@@ -140,7 +140,7 @@ class PushedCodeTests(SynchronousTestCase):
         self.assert_nothing_runs(dog)
 
     def test_another_operator_follows_a_revoked_one(self) -> None:
-        """What a revoked operator pushed, with whatever version, does not stand in the way of the next operator."""
+        """A module of a revoked operator, with any version, does not block the next operator."""
         author, second = self.join("author", "operator"), self.join("second", "operator")
         dog = self.allow(author, second)
         self.push(author)
@@ -151,7 +151,7 @@ class PushedCodeTests(SynchronousTestCase):
         self.assertEqual(list(dog.deployed), [("strategy", "best")])
 
     def test_author_and_digest_are_shown(self) -> None:
-        """The page says who pushed what runs, by name and key, and with which digest; also of what is refused."""
+        """The page shows name and key of the author and the digest, of a running and of a refused module."""
         author = self.join("author", "operator")
         dog = self.allow(author)
         self.push(author)

@@ -21,7 +21,7 @@ SECRET = "the secret of a classroom"
 
 
 class ControlSocketTests(SynchronousTestCase):
-    """Somebody else made the folder, or the socket, before the node did."""
+    """Another user made the folder, or the socket, before the node did."""
 
     def setUp(self) -> None:
         """A folder for sockets."""
@@ -32,11 +32,11 @@ class ControlSocketTests(SynchronousTestCase):
         self.me = os.getuid()
 
     def be_another(self) -> None:
-        """From now on this is another user's process: all that is there belongs to somebody else."""
+        """From now on this is another user's process: all that is there belongs to the first user."""
         self.patch(os, "getuid", lambda: self.me + 1)
 
     def listening(self, name: str) -> Path:
-        """A socket that somebody listens on."""
+        """A socket with a listener."""
         path = folder() / f"{name}.control"
         server = socket.socket(socket.AF_UNIX)
         self.addCleanup(server.close)
@@ -82,7 +82,7 @@ class ControlSocketTests(SynchronousTestCase):
         self.assertIn("not yours alone", str(self.assertRaises(NoControl, list, asked(path, {}))))
 
     def test_service_of_another_user(self) -> None:
-        """Root asks a service of another user where it names the folder, and never in the shared folder."""
+        """Root asks a service of another user if it names the folder, and never in the shared folder."""
         made("vaio")
         path = self.listening("vaio")
         for each in (folder(), path):
@@ -119,7 +119,7 @@ class ControlSocketTests(SynchronousTestCase):
 
 
 class TeamKeyTests(SynchronousTestCase):
-    """The secret of an open team, which whoever lists the processes must not see."""
+    """The secret of an open team, which the list of processes must not show."""
 
     def setUp(self) -> None:
         """A file that holds it."""
@@ -128,13 +128,13 @@ class TeamKeyTests(SynchronousTestCase):
         self.path.write_text(f"{SECRET}\n", encoding="utf-8")
 
     def options(self, *words: str) -> Options:
-        """What a command line means."""
+        """The options of a command line."""
         options = Options()
         options.parseOptions(["--name", "a", *words])
         return options
 
     def refusal(self, *words: str) -> str:
-        """What is said of a command line that is refused."""
+        """The error of a command line that is refused."""
         said = io.StringIO()
         self.patch(sys, "stderr", said)
         self.assertEqual(self.assertRaises(SystemExit, self.options, *words).code, 2)

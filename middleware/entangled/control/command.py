@@ -128,7 +128,7 @@ def asked(path: Path, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
 
 
 def check_peer(connection: socket.socket, path: Path) -> None:
-    """Raise ``NoControl`` where another user's process is at the other end, as far as the system tells."""
+    """Raise ``NoControl`` where another user's process is at the other end, if the system tells."""
     option = getattr(socket, "SO_PEERCRED", None)
     if option is None:
         return

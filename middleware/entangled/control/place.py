@@ -1,6 +1,6 @@
 """Place: where the control sockets of this machine's nodes lie, one file a node, for its owner's eyes only.
 
-In ``/tmp`` any user may make a folder, a link or a socket first.  So node and client look who made what they use.
+In ``/tmp`` any user may make a folder, a link or a socket first.  So node and client check the owner of each.
 """
 
 from __future__ import annotations
