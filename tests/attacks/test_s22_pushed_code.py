@@ -6,6 +6,7 @@ import os
 import shutil
 import sys
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 from twisted.trial.unittest import SynchronousTestCase
@@ -14,6 +15,7 @@ from middleware.admission.membership import MemoryMembership
 from middleware.deployment.shelf import MemoryShelf
 from middleware.entangled.control.place import made
 from middleware.node import SwarmNode
+from middleware.tasks import Task
 from swarmnode.deploy import main
 from swarmnode.rehearsal import VirtualTeam
 from tests.swarmnode.shell import Shell
@@ -27,6 +29,17 @@ sys.modules["{CANARY}"] = sys
 
 class Strategy(Nearest):
     pass
+"""
+WALK = """
+class Behaviour:
+    cost = 1.0
+    def __init__(self, parameters, rng): self.left = parameters["steps"]
+    def look(self, seen, now): self.progress = 1.0 / (1.0 + self.left)
+    def search(self, now): return {}
+    def hold(self, now): return {}
+    def execute(self, context):
+        self.left -= 1
+        return {"base.vx": 0.05, "base.vy": 0.0, "base.wz": 0.3} if self.left > 0 else None
 """
 IN_FORCE = 10.0
 
@@ -64,12 +77,12 @@ class PushedCodeTests(SynchronousTestCase):
         self.team.clock.advance(1.0)
         return self.team.services["dog1"].assembly.node
 
-    def push(self, author: SwarmNode, source: str = SOURCE) -> int:
+    def push(self, author: SwarmNode, source: str = SOURCE, kind: str = "strategy") -> int:
         """Push a module at the author's node; returns the exit code."""
         path = self.folder / "best.py"
         path.write_text(source)
         shell = Shell(self.team, author)
-        code, _ = shell.run(main, ["push", str(path), "--name", "best", "--kind", "strategy"])
+        code, _ = shell.run(main, ["push", str(path), "--name", "best", "--kind", kind])
         self.team.clock.advance(2.0)
         return int(code)
 
@@ -81,6 +94,17 @@ class PushedCodeTests(SynchronousTestCase):
         told = self.team_told(team.tell(packed))
         self.assertEqual(told, "revoke")
         self.team.clock.advance(IN_FORCE)
+
+    def submit(self, steps: int) -> None:
+        """A task for the pushed behaviour, which ends after so many steps."""
+        task = Task("t1", "deployed:best", "Walk", parameters={"steps": steps}, requirements={"base2d": {}})
+        task = replace(task, created=self.team.clock.seconds())
+        self.team_told(self.team.services["vaio"].assembly.node.submit(task))
+
+    def pose(self) -> tuple[float, ...]:
+        """Where the dog is."""
+        (robot,) = [each for each in self.team.truth()["dogs"] if each["name"] == "dog1"]
+        return tuple(round(robot[key], 4) for key in ("x", "y", "heading"))
 
     def team_told(self, work: object) -> object:
         """The kind of a statement."""
@@ -149,6 +173,32 @@ class PushedCodeTests(SynchronousTestCase):
         made("second").touch()
         self.assertEqual(self.push(second, SOURCE + "# two\n"), 0)
         self.assertEqual(list(dog.deployed), [("strategy", "best")])
+
+    def test_behaviour_does_its_task(self) -> None:
+        """A behaviour of an operator moves the robot, and ends the task."""
+        author = self.join("author", "operator")
+        self.allow(author)
+        self.push(author, WALK, "behaviour")
+        before = self.pose()
+        self.submit(60)
+        self.team.clock.advance(15.0)
+        self.assertNotEqual(self.pose(), before)
+        self.assertEqual([task["status"] for task in self.team.state()["tasks"]], ["COMPLETED"])
+
+    def test_robot_stands_when_its_author_is_revoked(self) -> None:
+        """A robot that a behaviour moves stands when the author of the behaviour is revoked."""
+        author = self.join("author", "operator")
+        dog = self.allow(author)
+        self.push(author, WALK, "behaviour")
+        self.submit(10**6)
+        self.team.clock.advance(10.0)
+        before = self.pose()
+        self.team.clock.advance(2.0)
+        self.assertNotEqual(self.pose(), before)
+        self.revoke(author, "author")
+        before = self.pose()
+        self.team.clock.advance(5.0)
+        self.assertEqual((self.pose(), dict(dog.deployed)), (before, {}))
 
     def test_author_and_digest_are_shown(self) -> None:
         """The page shows name and key of the author and the digest, of a running and of a refused module."""
