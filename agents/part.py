@@ -43,6 +43,7 @@ class Part:
         self._node = node
         self._clock = clock
         self._told = told
+        self._close: Callable[[], None] = getattr(behaviour, "close", lambda: None)
         me = Member(node.uuid, node.presence.device.name, IDLE)
         age = max(0.0, node.wall() - task.created)
         self.engagement = Engagement(
@@ -66,6 +67,7 @@ class Part:
         """
         self.is_left = True
         told = self.engagement.abandon()
+        self._close()
         self._group.leave()
         if is_running:
             self._group.withdraw()

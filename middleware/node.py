@@ -74,7 +74,8 @@ class SwarmNode(Service):
 
     ``team`` is the closed team whose ``door`` the node has, None in an open one; it starts and stops with the node.
     ``device`` is what the node says of itself; ``wall`` gives seconds of the wall clock, for people only.  ``deployed``
-    is what operators pushed and its owner allowed; ``halt`` says whether the whole team is to stand.
+    is what operators pushed and its owner allowed, ``stop_deployed`` ends its processes; ``halt`` says whether the
+    whole team is to stand.
     ``later(seconds, call, ...)`` is a timer that ends with the node.
     """
 
@@ -105,6 +106,7 @@ class SwarmNode(Service):
         self.later = self._chores.later
         self.team: Team | None = None
         self.deployed: Deployed = {}
+        self.stop_deployed: Callable[[], None] = lambda: None
         self.halt = Halt()
         self.directory = Directory(self.entangled, self._chores, self._quietly)
         self.presence = Presence(device, self._announce, self._chores.later)
@@ -154,6 +156,7 @@ class SwarmNode(Service):
         leave()
         if "_strategies" in self.__dict__:
             self._strategies.stop()
+        self.stop_deployed()
         super().stopService()
 
     async def _join(self) -> None:

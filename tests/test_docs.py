@@ -11,7 +11,7 @@ from random import Random
 from twisted.internet.task import Clock
 from twisted.trial.unittest import SynchronousTestCase
 
-from agents import body, engagement, loop, means
+from agents import body, engagement, guarded, loop, means
 from agents.catalogue import TASKS
 from drivers import rules
 from drivers.aibo.option import PORTS
@@ -24,7 +24,7 @@ from drivers.registry import KINDS, describe
 from middleware import fault, gauge, halt, survey, takeover
 from middleware.commitment import ballot, lessee
 from middleware.consensus import guard, strategy, worker
-from middleware.deployment import manifest, module
+from middleware.deployment import confinement, deployment, frame, manifest, module, runner
 from middleware.dissemination import check, party, scale, teller, tree
 from middleware.entangled.control import port
 from middleware.entangled.kademlia import detour, membership, roster
@@ -80,6 +80,13 @@ FIGURES: Sequence[tuple[str, str]] = (
     ("demo", f"an AIBO walks on until {aibo.DEAD_MAN_S:g} s after its last command"),
     ("deployment", f"the source has at most {manifest.MAX_SOURCE // 1024} KiB"),
     ("deployment", f"takes at most {module.STEPS:,} instructions"),
+    ("deployment", f"seccomp: {len(confinement.CALLS)} system calls"),
+    ("deployment", f"{confinement.MEMORY // 2**20} MiB beside its libraries; {confinement.CPU_S} s"),
+    ("deployment", f"does not answer within {runner.DEADLINE_S:g} s"),
+    ("deployment", f"answer is older than {guarded.FRESH_S:g} s"),
+    ("deployment", f"does not answer within {runner.PATIENCE_S:g} s, raises"),
+    ("deployment", f"an answer has more than {frame.MAX_ANSWER // 1024} KiB"),
+    ("deployment", f"nobody has asked it for {deployment.IDLE_S:g} s"),
     ("drivers", f"in every state, at rest within {rules.HALT_S:g} s"),
     ("drivers", f"While driving a key counts for {pilot.KEY_S:g} s"),
     ("faults", f"Seconds are {fault.MIN_S:g} to {fault.MAX_S:g}, {fault.USUAL_S:g} where"),
