@@ -204,13 +204,6 @@ class Doorkeeper:
         """Take in the pass of an owner that another node showed; whether it holds."""
         return not self.judge(owner, certificate)
 
-    def roles_of(self, public: bytes) -> frozenset[str] | None:
-        """The roles that the holder of ``public`` has now; empty for one that is no member."""
-        member = self.member(public)
-        if member is None or self._roll.refusal(member, self._wall()):
-            return frozenset()
-        return frozenset(member.roles)
-
     def member(self, public: bytes) -> Member | None:
         """What is known of the holder of ``public``, met or only heard of."""
         if public == self._me.public:
