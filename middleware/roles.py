@@ -21,6 +21,7 @@ ROLES = (DEVICE, OPERATOR, VIEWER, GATEWAY, BOOTSTRAP)
 ALL = frozenset(ROLES)
 ACTING = frozenset({DEVICE, GATEWAY})
 ORDERING = frozenset({OPERATOR, GATEWAY})
+PUSHING = frozenset({OPERATOR})
 WORKING = ACTING | ORDERING
 WRITING = ALL - {VIEWER}
 
@@ -123,11 +124,11 @@ NAMESPACES: Mapping[str, Namespace] = {
     ),
     TASKS: Namespace(WORKING, BY_KEY, "the tasks of the team, and the changes of their councils", (TASKS, "task7")),
     HALT: Namespace(ORDERING, BY_KEY, "the emergency stop and its release", (HALT, "halt"), lasts=True),
-    DEPLOYMENTS: Namespace(ORDERING, BY_KEY, "the modules that are pushed to the team", (DEPLOYMENTS, "follow")),
+    DEPLOYMENTS: Namespace(PUSHING, BY_KEY, "the modules that are pushed to the team", (DEPLOYMENTS, "follow")),
     SIGNED_OUT: Namespace(
         frozenset({GATEWAY}), BY_KEY, "the sessions of the page that ended", (SIGNED_OUT, SIGNED_OUT)
     ),
-    SOURCE: Namespace(ORDERING, BY_NAME, "the source of a pushed module", ("source/7", SOURCE)),
+    SOURCE: Namespace(PUSHING, BY_NAME, "the source of a pushed module", ("source/7", SOURCE)),
     MEMBER: Namespace(ACTING, BY_NAME, "the report of a device in the group of a task", ("task/task7", MEMBER)),
     RESULT: Namespace(WORKING, BY_NAME, "how a task ended", ("task/task7", RESULT)),
     ORDER: Namespace(ORDERING, BY_NAME, "what an operator wants of a task under way", ("task/task7", ORDER)),

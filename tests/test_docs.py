@@ -43,6 +43,7 @@ from sim.yard import Yard
 from standards.head import MAX_HEAD
 from swarmnode import gateway
 from swarmnode.driver import pilot
+from tests.role_table import write_tables
 from webnode import channel, limits, live, team
 from webnode.board import AUDITED
 from webnode.routes import orders, phones
@@ -210,6 +211,10 @@ class DocumentTests(SynchronousTestCase):
         for name, said in FIGURES:
             text = " ".join((ROOT / "docs" / f"{name}.md").read_text(encoding="utf-8").split())
             self.assertTrue(said in text, f"docs/{name}.md does not say: {said}")
+
+    def test_role_tables_are_those_of_the_code(self) -> None:
+        """The tables of roles on the security page are made from the role table."""
+        self.assertIn(write_tables(), (ROOT / "docs" / "security.md").read_text(encoding="utf-8"))
 
     def test_every_robot_is_listed(self) -> None:
         """The table of robots in the README has each kind of driver and no other, and leads to its page."""
