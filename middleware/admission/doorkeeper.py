@@ -109,9 +109,11 @@ class Doorkeeper:
         return refusal
 
     def may(self, public: bytes, method: str) -> bool:
-        """Whether a node that was let in may call ``method``."""
+        """Whether ``public`` is the key of a present member that may call ``method``."""
         member = self.member(public)
-        return member is not None and self._rules.may_call(member.roles, method)
+        if member is None or self._roll.refusal(member, self._wall()):
+            return False
+        return self._rules.may_call(member.roles, method)
 
     def may_store(self, slot: Slot) -> bool:
         """Whether the owner of ``slot`` may write there; of an owner whom nobody here knows it says yes."""

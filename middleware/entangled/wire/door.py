@@ -81,7 +81,7 @@ class Door(Protocol):
         """The name of the refusal of a node with this key that shows this pass; empty where it is let in."""
 
     def may(self, public: bytes, method: str) -> bool:
-        """Whether a node that was let in may call ``method``."""
+        """Whether ``public`` is the key of a present member that may call ``method``; no, where it is not known."""
 
     def may_store(self, slot: Slot) -> bool:
         """Whether the owner of ``slot`` may write there; of an owner that this node never met it says yes."""
