@@ -19,6 +19,8 @@ from typing import Any
 
 import msgpack
 
+from middleware.value import is_whole
+
 ID_BYTES = 16
 MAX_NAMED = 8
 """Stops that one statement names."""
@@ -139,9 +141,9 @@ def statement_in(owner: bytes, value: bytes | None) -> Statement | None:
         fields: Any = msgpack.unpackb(value or b"")
     except Exception:  # the decoder raises many kinds on crafted bytes
         return None
-    if isinstance(fields, list) and len(fields) == 3 and fields[1] is True and type(fields[0]) is int:
-        by = fields[2] if _is_name(fields[2]) else ""
-        return Statement({derived_id(owner, value or b""): clipped(by)}, (), clipped(by))
+    if isinstance(fields, list) and len(fields) == 3 and fields[1] is True and is_whole(fields[0]) and _is_name(fields[2]):
+        by = clipped(fields[2])
+        return Statement({derived_id(owner, value or b""): by}, (), by)
     return statement_of(fields)
 
 

@@ -352,9 +352,6 @@ class Halts(Protocol):
     def release(self, by: str, stops: Sequence[str] | None = None) -> Deferred[dict[str, str]]:
         """End these stops, ids in hex, and no other ones; all that are known where none are named."""
 
-    def is_halted(self) -> bool:
-        """Whether the team is stopped and every robot says that it stands."""
-
 
 class MemoryHalts:
     """The button of a team that obeys; ``devices`` are the uuids of those that say so, ``said`` who pressed what."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
 
 from twisted.internet.defer import Deferred
 
@@ -16,8 +15,6 @@ from middleware.stop_set import ID_BYTES
 from webnode.board import Halts
 from webnode.errors import Refusal
 from webnode.ground import Ground
-from webnode.state import device_view
-from webnode.stopped import stopped_view
 
 
 def halts(ground: Ground) -> Halts | None:
@@ -40,12 +37,6 @@ class TeamHalts:
         """End these stops, or all that this node knows and all that a device says it obeys; raises ``Refusal``."""
         named = self._known() if stops is None else [_id(stop) for stop in stops]
         return self._node.halt.release(named, by, self._contacts())
-
-    def is_halted(self) -> bool:
-        """Whether the team is stopped and every robot says that it stands."""
-        views = [device_view(asdict(device)) for device, _ in devices_of(self._devices())]
-        stops = {stop.hex(): by for stop, by in self._node.halt.stops.items()}
-        return bool(stopped_view(stops, views)["halted"])
 
     def _known(self) -> list[bytes]:
         said = [stop for device, _ in devices_of(self._devices()) for stop in device.stops]

@@ -14,7 +14,8 @@ from webnode.route import API, Ask, Field, Route
 
 def is_halted(ask: Ask) -> Json:
     """Whether all of it stands."""
-    return {"halted": _halts(ask).is_halted()}
+    _halts(ask)
+    return {"halted": bool(ask.state.get("halted"))}
 
 
 def halt(ask: Ask) -> Any:
