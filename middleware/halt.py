@@ -1,8 +1,8 @@
 """Halt: the stops of the whole team as this node knows them, which what acts obeys.
 
-A stop goes to every device at once, and stays as a record for those that come later or did not hear it.  It is in force
-until a release names it (``middleware.stop_set``).  Stops and releases count only from members that may order.  Where the
-role of a record's owner is not known, its stops count and its releases do not.
+A stop goes to every device at once, and stays as a record for those that come later or did not hear it.  It is in
+force until a release names it (``middleware.stop_set``).  Stops and releases count only from members that may order.
+Where the role of a record's owner is not known, its stops count and its releases do not.
 
 A node keeps the stops in its store and acknowledges one when it is written, so that a restart releases nothing.  Where
 no record names a stop any more, because its author left or was revoked, a node that may order names it in its own.
@@ -52,7 +52,7 @@ RECORDED_RELEASES = 16
 MADE = ADOPTED = MAX_NAMED // 2
 """Stops that a node has in force itself, where a new one replaces its oldest, and those of others that it names."""
 REVIEW = 10.0
-"""Least seconds between two looks, while the team is stopped, for a stop that no record names; at most twice as many."""
+"""Least seconds between two looks, while the team is stopped, for a stop that no record names; at most twice that."""
 
 Report = Callable[[Collection[bytes], str], None]
 """Called with the stops that are obeyed, and with what this node does, in a few words."""
@@ -292,11 +292,11 @@ class Halt:
         if (stops, released) == self._written or not self._may_order():
             return
         value = bounded(msgpack.packb(Statement(stops, released, self._by).packed()))
+        before, self._written = self._written, (stops, released)
         try:
             self._entangled.put(HALT, SLOT, value, "team").addErrback(_unwritten)
         except NotRunning:
-            return
-        self._written = (stops, released)
+            self._written = before
 
     def _review_later(self) -> None:
         if self._rng is not None and self._watch is not None and self.is_stopped and not self._is_reviewing:

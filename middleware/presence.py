@@ -110,7 +110,10 @@ def device_of(record: Record) -> Device | None:
     texts = (device.name, device.kind, device.description, device.address, device.task, device.status, *device.roles)
     texts += (device.laptop, device.agent, device.obeys)
     lawful = (
-        all(isinstance(text, str) for text in (*texts, *device.pages, *device.stops, *(text for _, text in device.messages)))
+        all(
+            isinstance(text, str)
+            for text in (*texts, *device.pages, *device.stops, *(text for _, text in device.messages))
+        )
         and device.status in STATUSES
         and is_whole(device.joined)
         and is_whole(device.depth)

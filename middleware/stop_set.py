@@ -1,13 +1,13 @@
 """StopSet: the stops that a node knows, and the releases that ended some of them.  Pure.
 
-A stop has a random id, and a release names the ids of the stops that it ends.  The team is stopped while any stop is not
-released.  Stops and releases are merged as in a two-phase set: in whatever order they arrive, and however often, the
-result is the same, and a released stop does not come back.  No stop outranks another one, so there is no number by which
-a sender could disable later stops.
+A stop has a random id, and a release names the ids of the stops that it ends.  The team is stopped while any stop is
+not released.  Stops and releases are merged as in a two-phase set: in whatever order they arrive, and however often,
+the result is the same, and a released stop does not come back.  No stop outranks another one, so there is no number by
+which a sender could disable later stops.
 
 Each sender has places of its own, so no sender can displace the stop of another one.  Where a table is full the node
-stands for longer, never for less: the two oldest stops of a sender are joined to one under an id of its own, which has to
-be released; of the releases the oldest is forgotten, and its stop may have to be released again.
+stands for longer, never for less: the two oldest stops of a sender are joined to one under an id of its own, which has
+to be released; of the releases the oldest is forgotten, and its stop may have to be released again.
 """
 
 from __future__ import annotations
@@ -134,14 +134,20 @@ def statement_of(fields: object) -> Statement | None:
 def statement_in(owner: bytes, value: bytes | None) -> Statement | None:
     """The statement in a record of ``owner``, or None where there is none; never raises.
 
-    An earlier version wrote ``[number, is on, by]``.  Where that is on it counts as a stop, which a release has to name;
-    where it is off it names no stop, and ends none.
+    An earlier version wrote ``[number, is on, by]``.  Where that is on it counts as a stop, which a release has to
+    name; where it is off it names no stop, and ends none.
     """
     try:
         fields: Any = msgpack.unpackb(value or b"")
     except Exception:  # the decoder raises many kinds on crafted bytes
         return None
-    if isinstance(fields, list) and len(fields) == 3 and fields[1] is True and is_whole(fields[0]) and _is_name(fields[2]):
+    if (
+        isinstance(fields, list)
+        and len(fields) == 3
+        and fields[1] is True
+        and is_whole(fields[0])
+        and _is_name(fields[2])
+    ):
         by = clipped(fields[2])
         return Statement({derived_id(owner, value or b""): by}, (), by)
     return statement_of(fields)

@@ -1,4 +1,4 @@
-"""Attack S17: a member, or the keys of one, tries to release a stop, to disable later stops, or to have one forgotten."""
+"""Attack S17: a member tries to release a stop, to disable later ones, or to have one forgotten."""
 
 from __future__ import annotations
 
@@ -18,6 +18,8 @@ from middleware.roles import DEVICE, GATEWAY, OPERATOR, ROLES, VIEWER, may_call
 from middleware.stop_set import ID_BYTES, MAX_NAMED, MAX_OF_SENDER, MAX_RELEASED, MAX_SENDERS
 from tests.attacks.siege import SOURCE, ClosedTeam, SiegeCase, Tape
 from tests.middleware.admission.village import House
+
+SEQUENCES, STEPS = 6, 25
 
 
 class HaltingTeam(ClosedTeam):
@@ -140,7 +142,7 @@ class DisablingTests(StopCase):
         self.assertEqual(set(self.team.is_on().values()), {True})
 
     def test_thousands_of_stops_displace_none(self) -> None:
-        """An operator's key that sends thousands of stops fills its own places: another's stop needs its own release."""
+        """An operator's key that sends thousands of stops fills its own places; others' stops need their release."""
         [stop] = self.only_stop(self.ann)
         _, own = self.insider(self.team, "thief", OPERATOR)
         dice = random.Random(1)
@@ -283,9 +285,7 @@ class LossTests(StopCase):
         self.assertEqual(set(self.team.is_on().values()), {False})
 
     def test_a_stop_outlives_its_author(self) -> None:
-        """Its author is revoked and its record is gone: robots stand, newcomers too, until another operator
-        releases it by the id that they name.
-        """
+        """Its author is revoked and its record is gone: all stand, newcomers too, until its id is released."""
         self.stop(self.bob)
         stop = self.stops(self.dogs[0])
         self.team.tell(self.team.signer.revoke(self.bob.public, "bob", self.team.wall()))
@@ -329,7 +329,7 @@ class LossTests(StopCase):
         self.assertEqual(set(self.team.is_on().values()), {False})
 
     def test_a_stop_of_an_earlier_version_stands(self) -> None:
-        """The word of an earlier version that stops counts as a stop, which has to be named; one that releases does not."""
+        """A stop of an earlier version has to be released by its id; a release of an earlier version ends none."""
         own = self.bob.kept.membership.identity
         bare, _ = self.insider(self.team, "dog3", DEVICE)
         self.store(bare, self.record(own, [7, True, "bob"]))
@@ -351,3 +351,59 @@ class LossTests(StopCase):
         self.release(self.ann, list(dog.stops), [self.dogs[0]])
         self.assertFalse(dog.is_on)
 
+
+class SequenceTests(StopCase):
+    """Random sequences over whole nodes."""
+
+    def test_stop_holds_on_whole_nodes(self) -> None:
+        """Stops, releases, partitions, restarts, a viewer's messages: a stop is kept until a release names it."""
+        bare, own = self.insider(self.team, "eye", VIEWER)
+        for seed in range(SEQUENCES):
+            dice = random.Random(seed)
+            for number in range(STEPS):
+                self.step(dice, bare, own, number)
+            self.team.board.heal()
+            self.team.run(20.0)
+            self.release(self.ann, sorted({stop for house in self.team.houses for stop in self.stops(house)}))
+            self.team.run(20.0)
+            self.assertEqual(set(self.team.is_on().values()), {False}, seed)
+
+    def step(self, dice: random.Random, bare: Any, own: Identity, number: int) -> None:
+        """One thing that happens, and what must hold after it."""
+        house = dice.choice((self.ann, self.bob))
+        known = self.stops(house)
+        match dice.randrange(6):
+            case 0 | 1:
+                asked = self.team.halt(house).stop(house.name, self.contacts(None))
+                [stop] = set(self.stops(house)) - set(known)
+                told = self.said(asked)
+                for dog in self.dogs:
+                    if told.get(dog.name) == STANDS:
+                        self.assertIn(stop, self.stops(dog))
+            case 2:
+                named = dice.sample(known, dice.randrange(len(known) + 1))
+                before = {dog.name: set(self.stops(dog)) for dog in self.dogs}
+                self.release(house, named)
+                for dog in self.dogs:
+                    self.assertLessEqual(before[dog.name] - set(self.stops(dog)), set(named) | self.released(dog))
+            case 3:
+                near = [self.team.address_of(each) for each in self.team.houses if dice.random() < 0.5]
+                self.team.board.partition(near) if dice.random() < 0.6 else self.team.board.heal()
+            case 4:
+                dog = dice.choice(self.dogs)
+                before_restart = self.stops(dog)
+                self.team.reopen(dog)
+                self.assertEqual(self.stops(dog), before_restart)
+            case 5:
+                for dog in self.dogs:
+                    self.ask(bare, dog, [], self.stops(dog), "eye")
+                record = self.record(own, [[], self.stops(self.dogs[0]), "eye"], number + 1)
+                bare.ask(self.team.contact(self.dogs[0]), "store", [record.packed()], changes=True).addErrback(str)
+        held = {dog.name: set(self.stops(dog)) for dog in self.dogs}
+        self.team.run(dice.random() * 5.0)
+        for dog in self.dogs:
+            self.assertLessEqual(held[dog.name] - set(self.stops(dog)), self.released(dog))
+
+    def released(self, dog: House) -> set[bytes]:
+        """What an operator released, of what a robot knew."""
+        return {stop for house in (self.ann, self.bob) for stop in self.team.halt(house)._ordered}

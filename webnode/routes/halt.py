@@ -54,7 +54,9 @@ STOPS = Field(
     is_required=False,
 )
 ROUTES = (
-    Route("GET", f"{API}/halt", "Whether the team is stopped and every robot stands", "viewer", is_halted, gives="halted"),
+    Route(
+        "GET", f"{API}/halt", "Whether the team is stopped and every robot stands", "viewer", is_halted, gives="halted"
+    ),
     Route(
         "POST",
         f"{API}/halt",
