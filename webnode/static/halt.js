@@ -5,29 +5,25 @@ import { panel } from "./panel.js";
 
 const STANDS = "stands";
 const GOES_ON = "goes on";
-const NO_ROBOT = "has no robot";
 const MOST = 8;
 
-const robots = (count) => `${count} ${count === 1 ? "robot stands" : "robots stand"}`;
-const some = (lines) => (lines.length > MOST ? [...lines.slice(0, MOST), ` And so on: ${lines.length} in all.`] : lines).join("");
+const some = (said) => said.slice(0, MOST).map((line) => ` ${line}.`).join("") + (said.length > MOST ? ` And so on: ${said.length} in all.` : "");
 
 // What came of it: how many stand, and by name each device that says something else than was wanted.
 function outcome(devices, told, wanted) {
-  const name = (uuid) => devices.get(uuid)?.name ?? uuid.slice(0, 8);
-  const strange = Object.entries(told).filter(([, said]) => ![wanted, NO_ROBOT].includes(said)).map(([uuid, said]) => ` ${name(uuid)} ${said}.`);
-  const count = Object.values(told).filter((said) => said === STANDS).length;
-  if (wanted === GOES_ON) return `${count ? "Not every robot goes on." : "The team goes on."}${some(strange)}`;
-  return `${strange.length ? "Stopping" : "Stopped"}: ${robots(count)}.${some(strange)}`;
+  const robots = Object.entries(told).filter(([, said]) => said !== "has no robot");
+  const odd = robots.filter(([, said]) => said !== wanted).map(([uuid, said]) => `${devices.get(uuid)?.name ?? uuid.slice(0, 8)} ${said}`);
+  const count = robots.length - odd.length;
+  if (wanted === GOES_ON) return `${odd.length ? "Not every robot" : "The team"} goes on.${some(odd)}`;
+  return `${odd.length ? "Stopping" : "Stopped"}: ${count} ${count === 1 ? "robot stands" : "robots stand"}.${some(odd)}`;
 }
 
 // What the line says: "stopped" only where every robot says that it stands.
-function standing({ halted, halt }) {
-  const by = [...new Set((halt?.stops ?? []).map((stop) => stop.by).filter(Boolean))].join(", ");
-  if (halted) return ["The team is stopped.", `${by ? ` By ${by}.` : ""} Whoever had a task keeps it. `];
-  const { standing: still = [], others = [] } = halt ?? {};
-  if (!halt?.ordered) return ["Not every robot goes on.", ` ${some(still.map((name) => ` ${name} stands.`)).trim()} `];
-  const rest = some(others.map(({ name, says }) => ` ${name} ${says}.`));
-  return ["Stopping.", ` ${still.length} of ${still.length + others.length} robots stand.${rest} `];
+function state({ halted, halt }) {
+  if (halted) return ["The team is stopped.", " Whoever had a task keeps it. "];
+  const { ordered, standing = [], others = [] } = halt ?? {};
+  if (!ordered) return ["Not every robot goes on.", some(standing.map((name) => `${name} stands`))];
+  return ["Stopping.", ` ${standing.length} of ${standing.length + others.length} robots stand.${some(others.map(({ name, says }) => `${name} ${says}`))}`];
 }
 
 // Behind an open dialog nothing can be pressed: the button goes where it can.
@@ -39,9 +35,8 @@ function before(dialog, button, root) {
 export function make(root, { model }) {
   const stop = element("button", { class: "stop", title: "All robots stand at once" }, "Stop");
   const go = element("button", {}, "Let it go on");
-  const title = element("b", {});
-  const rest = element("span", {});
-  const banner = element("p", { class: "halted" }, title, rest, go);
+  const parts = [element("b", {}), element("span", {})];
+  const banner = element("p", { class: "halted" }, ...parts, go);
   banner.hidden = true;
   root.classList.add("halt");
   root.append(stop, banner);
@@ -57,9 +52,7 @@ export function make(root, { model }) {
   return {
     update() {
       banner.hidden = !(model.halted || model.halt?.stops.length);
-      const [first, more] = standing(model);
-      words(title, first);
-      words(rest, more);
+      state(model).forEach((said, n) => words(parts[n], said));
       attribute(document.body, "data-halted", model.halted);
     },
     close() {
