@@ -7,7 +7,7 @@ on every node.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
 
@@ -24,6 +24,8 @@ MAX_DEPTH = 16
 """The directory is split no further: 2**16 places are enough for a million devices."""
 MESSAGES_KEPT = 5
 MESSAGE_CHARACTERS = 70
+STOPS_SHOWN = 4
+"""Stops that a device says it obeys; each takes 34 bytes of its record."""
 
 Capabilities = Mapping[str, Mapping[str, float | str]]
 
@@ -38,7 +40,8 @@ class Device:
     page; ``position`` is where it says that it is: ``x`` and ``y`` in metres and ``heading`` in radians in the yard's
     frame, or ``lat`` and ``lon`` in degrees with ``accuracy`` in metres; ``laptop`` and ``agent`` are what people call
     the computer that its node runs on and the agent that acts for it (thesis, Table 5.1); ``depth`` is how far the
-    directory is split where it stands (``middleware.prefix``).
+    directory is split where it stands (``middleware.prefix``); ``stops`` are the ids in hex of the stops that it obeys,
+    ``STOPS_SHOWN`` at most, and ``obeys`` is what it does while the team is stopped (``middleware.halt``).
     """
 
     uuid: str
@@ -60,6 +63,8 @@ class Device:
     laptop: str = ""
     agent: str = ""
     depth: int = 0
+    stops: tuple[str, ...] = ()
+    obeys: str = ""
 
     def with_message(self, now: float, text: str) -> Device:
         """This device with one more line; the oldest goes when there are more than ``MESSAGES_KEPT``."""
@@ -72,7 +77,7 @@ class Device:
         while True:
             content = asdict(device)
             # Most devices have none of them, and each byte of a record is sent again and again.
-            for name in ("pages", "position", "laptop", "agent", "depth"):
+            for name in ("pages", "position", "laptop", "agent", "depth", "stops", "obeys"):
                 if not content[name]:
                     del content[name]
             value = bytes(msgpack.packb(content))
@@ -97,17 +102,23 @@ def device_of(record: Record) -> Device | None:
         content["roles"] = tuple(content.get("roles", Device.roles))
         pages = content.get("pages", [])
         content["pages"] = tuple(pages) if isinstance(pages, list) else (None,)
+        stops = content.get("stops", [])
+        content["stops"] = tuple(stops) if isinstance(stops, list) else (None,)
         device = Device(**content)
     except (TypeError, ValueError, OverflowError):
         return None
     texts = (device.name, device.kind, device.description, device.address, device.task, device.status, *device.roles)
-    texts += (device.laptop, device.agent)
+    texts += (device.laptop, device.agent, device.obeys)
     lawful = (
-        all(isinstance(text, str) for text in (*texts, *device.pages, *(text for _, text in device.messages)))
+        all(
+            isinstance(text, str)
+            for text in (*texts, *device.pages, *device.stops, *(text for _, text in device.messages))
+        )
         and device.status in STATUSES
         and is_whole(device.joined)
         and is_whole(device.depth)
         and device.depth <= MAX_DEPTH
+        and len(device.stops) <= STOPS_SHOWN
         and all(is_number(n) for n in (device.since, *(t for t, _ in device.messages)))
         and are_capabilities(device.capabilities)
         and isinstance(device.network, dict)
@@ -161,6 +172,10 @@ class Presence:
     def say(self, now: float, text: str) -> None:
         """Add a line to the device's messages."""
         self.change(messages=self.device.with_message(now, text).messages)
+
+    def obey(self, stops: Collection[bytes], words: str) -> None:
+        """Say which stops the device obeys, and what it does; no stops: it goes on."""
+        self.change(stops=tuple(stop.hex() for stop in list(stops)[-STOPS_SHOWN:]), obeys=words)
 
     def _tell(self) -> None:
         self._pending = False

@@ -167,7 +167,7 @@ def _answer(node: SwarmNode, settings: Settings, driver: Driver | None) -> None:
     filming: object = driver
     if isinstance(filming, Filming) and "camera" in node.presence.device.capabilities:
         tuning.add(_camera_knob(filming))
-    node.halt = answer_halt(node.entangled)
+    node.halt = answer_halt(node.entangled, node.rng, node.later, node.presence.obey)
 
 
 def _agent(node: SwarmNode, settings: Settings, driver: Driver | None, seams: Seams) -> Service | None:

@@ -239,7 +239,7 @@ class _Phone:
 
     def _words(self, device: Device, is_seen: bool) -> str:
         """What whoever holds it is asked to do."""
-        if self._node.halt.word.is_on:
+        if self._node.halt.is_stopped:
             return "The team is stopped. Wait."
         if device.status == EXECUTING:
             return (

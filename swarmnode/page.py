@@ -164,7 +164,7 @@ def _events(ground: Ground, board: Board, live: Read) -> Events:
         ground.desk.yard,
         board.fallbacks.here,
         board.chronicle,
-        lambda: (ground.desk.version, board.halts is not None and board.halts.is_halted()),
+        lambda: (ground.desk.version, tuple(ground.node.halt.stops)),
         board.sessions,
     )
 

@@ -21,7 +21,7 @@ from drivers.deadman import keeper, process
 from drivers.errors import UsageError
 from drivers.phone import driver, option
 from drivers.registry import KINDS, describe
-from middleware import fault, gauge, halt, survey, takeover
+from middleware import fault, gauge, halt, stop_set, survey, takeover
 from middleware.commitment import ballot, lessee
 from middleware.consensus import guard, strategy, worker
 from middleware.deployment import confinement, deployment, frame, manifest, module, runner
@@ -166,7 +166,9 @@ FIGURES: Sequence[tuple[str, str]] = (
     ("tunnel", f"| {websocket.MAX_PAYLOAD} bytes; what breaks"),
     ("actions", f"after {team.PATIENCE:g} s at the latest"),
     ("actions", f"place the target, {team.PLACING:g} s later"),
-    ("protocol", f"is on: bool, by: at most {halt.MAX_NAME} characters"),
+    ("protocol", f"at most {stop_set.MAX_NAMED} stops `[id, by]`, at most {stop_set.MAX_RELEASED} ids of stops"),
+    ("protocol", f"by: at most {stop_set.MAX_BY} characters; an id has {stop_set.ID_BYTES} bytes"),
+    ("protocol", f"the newest {halt.RECORDED_RELEASES} ids that it released"),
     ("web", f"`text`, 1 to {orders.MAX_MESSAGE} characters"),
     ("web", f"`seconds`, {orders.MIN_AWAY_S:g} to {orders.MAX_AWAY_S:g}, default {orders.AWAY_S:g}"),
     ("web", f"At most {live.MAX_VIEWERS} streams"),

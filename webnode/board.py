@@ -368,11 +368,8 @@ class Halts(Protocol):
     def halt(self, by: str) -> Deferred[dict[str, str]]:
         """Let everything stand, and stay."""
 
-    def release(self, by: str) -> Deferred[dict[str, str]]:
-        """Let it go on."""
-
-    def is_halted(self) -> bool:
-        """Whether the team is halted."""
+    def release(self, by: str, stops: Sequence[str] | None = None) -> Deferred[dict[str, str]]:
+        """End these stops, ids in hex, and no other ones; all that are known where none are named."""
 
 
 class MemoryHalts:
@@ -387,7 +384,7 @@ class MemoryHalts:
         self.said.append(("halt", by))
         return succeed(dict.fromkeys(self.devices, "stands"))
 
-    def release(self, by: str) -> Deferred[dict[str, str]]:
+    def release(self, by: str, stops: Sequence[str] | None = None) -> Deferred[dict[str, str]]:
         """All go on."""
         self.said.append(("release", by))
         return succeed(dict.fromkeys(self.devices, "goes on"))

@@ -12,12 +12,13 @@ from typing import Any
 
 from middleware.entangled.record import Record
 from middleware.explanation import explained
-from middleware.halt import HALT, word_of
+from middleware.halt import HALT, stops_in
 from middleware.order import PAUSE, order_of
 from middleware.presence import DEVICES, Device, devices_of
 from middleware.tasks import TASKS, Task, group_key, member_of, outcome_of, refusals, tasks_of
 from middleware.verdict import verdict_of, verdicts_key
 from webnode.state import Departed, State, state_of
+from webnode.stopped import stopped_view
 
 Read = Callable[[bytes], list[Record]]
 TASKS_SHOWN = 20
@@ -54,7 +55,8 @@ def state_from(read: Read, departed: Departed, node: str, now: float) -> State:
         rows.append({**_task_row(task, records, devices), "why": _why(task, read(verdicts_key(task.task_id)))})
     views = [_device_row(device) for device in devices]
     state = state_of(views, rows, groups, departed=departed.of(views, now), node=node)
-    return {**state, "halted": word_of(read(HALT)).is_on}
+    stops = {stop.hex(): by for stop, by in stops_in(read(HALT)).items()}
+    return {**state, **stopped_view(stops, state["devices"])}
 
 
 def refused_by(task: Task, devices: list[Device]) -> dict[str, list[str]]:

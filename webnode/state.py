@@ -82,6 +82,8 @@ def device_view(fields: Fields) -> State:
         "position": _position(fields.get("position")),
         "laptop": text(fields.get("laptop"), limit=64),
         "agent": text(fields.get("agent"), limit=64),
+        "stops": texts(fields.get("stops")),
+        "obeys": text(fields.get("obeys"), limit=64),
         "gone": None,
     }
 

@@ -127,7 +127,7 @@ class Doorkeeper:
         return refusal
 
     def may(self, public: bytes, method: str) -> bool:
-        """Whether a node that was let in may call ``method``."""
+        """Whether ``public`` is the key of a present member that may call ``method``."""
         authority = self.authority(public)
         return not authority.refusal and self._rules.may_call(authority.roles, method)
 

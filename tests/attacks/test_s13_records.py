@@ -5,12 +5,15 @@ from __future__ import annotations
 import random
 from typing import Any
 
+import msgpack
+
 from middleware.entangled.identity import Identity
 from middleware.entangled.record import Record, hashed_key
 from middleware.entangled.replication.watch import Watch
 from middleware.entangled.space.tuplespace import TupleSpace
-from middleware.halt import HALT, SLOT, Word
+from middleware.halt import HALT, SLOT
 from middleware.roles import DEVICE, OPERATOR, VIEWER
+from middleware.stop_set import Statement
 from middleware.tasks import TASKS
 from tests.attacks.siege import SOURCE, ClosedTeam, SiegeCase
 from tests.middleware.admission.village import House
@@ -18,6 +21,7 @@ from tests.middleware.admission.village import House
 JUNK = 12_400
 PAGE = 60
 OTHER = hashed_key("whatever")
+STOP = bytes(range(16))
 
 
 def written(owner: Identity, key: bytes, name: str, value: bytes = b"\xc3", sequence: int = 1) -> Record:
@@ -38,7 +42,7 @@ class RecordCase(SiegeCase):
 
     def forged(self, owner: Identity) -> list[Record]:
         """The release of a stop, a task, and something else, as their owner would write them."""
-        release = Word(99, False, "nobody").packed()
+        release = msgpack.packb(Statement({}, (STOP,), "nobody").packed())
         return [written(owner, HALT, SLOT, release), written(owner, TASKS, "t1"), written(owner, OTHER, "x")]
 
     def holders(self, records: list[Record], among: list[House]) -> list[str]:
@@ -200,7 +204,7 @@ class RevokedKeyTests(RecordCase):
 
     def test_its_stop_stays(self) -> None:
         """A stop that it ordered before stays in force, across restarts too, and it cannot lift it itself."""
-        stop = Word(3, True, "boss").packed()
+        stop = msgpack.packb(Statement({STOP: "boss"}).packed())
         self.outcome(self.team, self.boss.node.put(HALT, SLOT, stop))
         self.revoke()
         sleeper = self.others[1]
@@ -211,9 +215,8 @@ class RevokedKeyTests(RecordCase):
             found = self.outcome(self.team, house.node.get(HALT))
             self.assertEqual([record.value for record in found], [stop], house.name)
         bad, _ = self.insider(self.team, "bad", DEVICE)
-        release = written(
-            self.boss.kept.membership.identity, HALT, SLOT, Word(9, False, "boss").packed(), sequence=2**40
-        )
+        lifted = msgpack.packb(Statement({}, (STOP,), "boss").packed())
+        release = written(self.boss.kept.membership.identity, HALT, SLOT, lifted, sequence=2**40)
         for house in self.others:
             bad.ask(self.team.contact(house), "store", [release.packed()], [600.0], changes=True)
         self.team.run(1.0)

@@ -98,7 +98,7 @@ class Door(Protocol):
         """The name of the refusal of a node with this key that shows this pass; empty where it is let in."""
 
     def may(self, public: bytes, method: str) -> bool:
-        """Whether a node that was let in may call ``method``."""
+        """Whether ``public`` is the key of a present member that may call ``method``; no, where it is not known."""
 
     def may_store(self, slot: Slot) -> bool:
         """Whether the certificate of the owner of ``slot``, as it is at present, allows it to write there."""
