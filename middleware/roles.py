@@ -57,12 +57,13 @@ METHODS: Mapping[str, frozenset[str]] = {
     "reach.introduce": ALL,
     "reach.meet": ALL,
     "reach.seen": ALL,
-    # The right to act.  Who sits in a council is whoever is near the task's key.
+    # The right to act.  Members of a council are nodes near the task's key that may say ``lease.freed``.
     "lease.prepare": WORKING,
     "lease.propose": ACTING,
     "lease.release": ACTING,
-    "lease.freed": ALL,  # the word of a council
-    "lease.close": WORKING,
+    "lease.freed": WRITING,  # the word of a council
+    "lease.close": ACTING,  # under the token that was granted
+    "lease.cancel": ORDERING,
     "lease.change": WORKING,
     "lease.install": WORKING,
     # Bids are signed and carried by others; who may bid at all is a matter of its kind of record.
@@ -89,23 +90,26 @@ OTHER_METHODS = WORKING
 
 PRESENCE, TASKS, HALT, DEPLOYMENTS, SIGNED_OUT = "devices", "tasks", "halt", "deployments", "signed-out"
 MEMBER, RESULT, ORDER, VERDICT, SOURCE = "member", "result", "order", "verdict", "source"
+COUNCIL, ENDED = "council", "done"
 OTHER = "other"
 
 KINDS: Mapping[str, frozenset[str]] = {
     PRESENCE: ALL,
-    TASKS: WORKING,  # whoever acts writes the changes of a task's council
+    TASKS: ORDERING,
     HALT: ORDERING,
     DEPLOYMENTS: ORDERING,
     SOURCE: ORDERING,
     SIGNED_OUT: frozenset({GATEWAY}),
     MEMBER: ACTING,
-    RESULT: WORKING,
+    RESULT: ORDERING,
+    COUNCIL: WORKING,  # read with the signatures of the council before it only
+    ENDED: ACTING,  # read with the signatures of the council that granted the lease only
     ORDER: ORDERING,
     VERDICT: ACTING,
     OTHER: WRITING,
 }
 _BY_KEY = {hashed_key(kind): kind for kind in (PRESENCE, TASKS, HALT, DEPLOYMENTS, SIGNED_OUT)}
-_BY_NAME = frozenset({MEMBER, RESULT, ORDER, VERDICT, SOURCE})
+_BY_NAME = frozenset({MEMBER, RESULT, ORDER, VERDICT, SOURCE, COUNCIL, ENDED})
 
 
 def kind_of(slot: Slot) -> str:

@@ -15,7 +15,7 @@ from middleware.explanation import explained
 from middleware.halt import HALT, word_of
 from middleware.order import PAUSE, order_of
 from middleware.presence import DEVICES, Device, devices_of
-from middleware.tasks import TASKS, Task, group_key, member_of, outcome_of, refusals, tasks_of
+from middleware.tasks import TASKS, Task, council_of, group_key, member_of, outcome_of, refusals, tasks_of
 from middleware.verdict import verdict_of, verdicts_key
 from webnode.state import Departed, State, state_of
 
@@ -68,7 +68,7 @@ def _device_row(device: Device) -> dict[str, Any]:
 
 
 def _task_row(task: Task, records: list[Record], devices: list[Device]) -> dict[str, Any]:
-    outcome = outcome_of(records)
+    outcome = outcome_of(task, records)
     members = [m for r in records if (m := member_of(r)) is not None]
     order = order_of(records)
     is_paused = outcome is None and order is not None and order.word == PAUSE
@@ -99,7 +99,7 @@ def _task_row(task: Task, records: list[Record], devices: list[Device]) -> dict[
         "strategy": task.strategy,
         "group": task.group,
         "created": task.created,
-        "council": [str(contact.address) for contact in task.council],
+        "council": [str(contact.address) for contact in council_of(task, records).council],
         "status": status,
         "note": note,
         "paused": is_paused,
