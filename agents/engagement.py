@@ -219,8 +219,10 @@ class Engagement:
         if self._is_late(now) and self.lessee is not None and self._may_fail(now):
             if self.lessee.lease is not None:
                 self._finish(FAILED, f"past its deadline of {self.task.deadline:g} s")
-                return None
-            self.lessee.want()  # who ends a task holds it
+            else:
+                self._stop(State.FENCED)
+                self.lessee.want()  # an agent ends only what it holds
+            return None
         if self.is_paused or (self.lessee is None and not self.is_lent):
             self._rest_aside("paused" if self.is_paused else self.me.why)
             return None

@@ -108,7 +108,7 @@ class SwarmNode(Service):
         self.deployed: Deployed = {}
         self.halt = Halt()
         self.directory = Directory(self.entangled, self._chores, self._quietly)
-        self.presence = Presence(device, self._announce, self._chores.later)
+        self.presence = Presence(self._named(device), self._announce, self._chores.later)
         self.streams = Streams(self.entangled.endpoint, clock)
         self.joined: Deferred[None] = Deferred()
         self._known = list(known_nodes)
@@ -178,7 +178,7 @@ class SwarmNode(Service):
         entangled, now = self.entangled, self.clock.seconds()
         if now - self._reviewed_at >= REVIEWING:
             self._reviewed_at = now
-            self.presence.change(depth=self.directory.review())
+            self.presence.change(depth=self.directory.review(), name=self._named(self.presence.device).name)
         if self.directory.depth and now - self._counted_at < LONGEST:
             return
         self._counted_at = now
@@ -213,6 +213,10 @@ class SwarmNode(Service):
             except EntangledError as error:
                 self._log.info("nobody says who is here; asking again: {error}", error=error)
                 await self._chores.sleep(LOOK_AGAIN)
+
+    def _named(self, device: Device) -> Device:
+        """The device under the name of its certificate, where the team gives certificates."""
+        return replace(device, name=self._door.name_of(self.entangled.identity.public) or device.name)
 
     def _addressed(self, device: Device) -> Device:
         return replace(device, uuid=self.uuid, address=str(self._network.address), since=self.wall())

@@ -129,6 +129,11 @@ def may_call(roles: Collection[str], method: str) -> bool:
     return not METHODS.get(method, OTHER_METHODS).isdisjoint(roles)
 
 
-def may_store(roles: Collection[str], slot: Slot) -> bool:
-    """Whether a member with these roles may write in ``slot``, which is its own."""
-    return not KINDS[kind_of(slot)].isdisjoint(roles)
+def may_store(roles: Collection[str], slot: Slot, name: str = "") -> bool:
+    """Whether a member with these roles may write in ``slot``, which is its own.
+
+    A member announces itself under the ``name`` of its certificate only, where it has one.
+    """
+    kind = kind_of(slot)
+    is_named = kind != PRESENCE or not name or slot.name == name
+    return is_named and not KINDS[kind].isdisjoint(roles)

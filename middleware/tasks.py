@@ -2,8 +2,8 @@
 
 A task is a team record under one key, written once by the node that submits it; each participant writes a slot of its
 own under the task's group key, and the outcome is one more team record there.  So nothing is ever read, changed and
-written back.  What nodes write that may not order tasks carries a proof: another council (``COUNCIL``) the signatures of
-the council before it, the end of a task (``DONE``) those of the council that granted the lease.
+written back.  What is written by nodes that may not order tasks carries a proof: another council (``COUNCIL``) the
+signatures of the council before it, the end of a task (``DONE``) those of the council that granted the lease.
 """
 
 from __future__ import annotations

@@ -46,11 +46,12 @@ def state_from(read: Read, departed: Departed, node: str, now: float) -> State:
     """The whole state at ``now`` (unix s); ``departed`` remembers who left, ``node`` is the name of who serves."""
     devices = [device for device, _ in devices_of(read(DEVICES))]
     tasks = sorted(tasks_of(read(TASKS)).values(), key=lambda task: (-task.created, task.task_id))
+    names = {device.uuid: device.name for device in devices}
     rows, groups = [], {}
     for task in tasks[:TASKS_SHOWN]:
         records = read(group_key(task.task_id))
         members = [m for r in records if (m := member_of(r)) is not None]
-        groups[task.task_id] = [asdict(member) for member in members]
+        groups[task.task_id] = [{**asdict(member), "name": names.get(member.uuid, member.name)} for member in members]
         rows.append({**_task_row(task, records, devices), "why": _why(task, read(verdicts_key(task.task_id)))})
     views = [_device_row(device) for device in devices]
     state = state_of(views, rows, groups, departed=departed.of(views, now), node=node)

@@ -31,8 +31,8 @@ class Rules(Protocol):
     def may_call(self, roles: Collection[str], method: str) -> bool:
         """Whether a member with these roles may call that method."""
 
-    def may_store(self, roles: Collection[str], slot: Slot) -> bool:
-        """Whether a member with these roles may write that slot of its own."""
+    def may_store(self, roles: Collection[str], slot: Slot, name: str) -> bool:
+        """Whether a member with these roles and that name may write that slot of its own."""
 
 
 class Anything:
@@ -42,7 +42,7 @@ class Anything:
         """It may."""
         return True
 
-    def may_store(self, roles: Collection[str], slot: Slot) -> bool:
+    def may_store(self, roles: Collection[str], slot: Slot, name: str) -> bool:
         """It may."""
         return True
 
@@ -116,7 +116,12 @@ class Doorkeeper:
     def may_store(self, slot: Slot) -> bool:
         """Whether the owner of ``slot`` may write there; of an owner whom nobody here knows it says yes."""
         member = self.member(slot.owner)
-        return member is None or self._rules.may_store(member.roles, slot)
+        return member is None or self._rules.may_store(member.roles, slot, member.name)
+
+    def name_of(self, public: bytes) -> str:
+        """The name in the certificate of the holder of ``public``; empty where nobody here knows it."""
+        member = self.member(public)
+        return "" if member is None else member.name
 
     def member(self, public: bytes) -> Member | None:
         """What is known of the holder of ``public``, met or only heard of."""

@@ -31,8 +31,8 @@ SILENT = 10.0
 class Councils:
     """The councils of tasks, as ``entangled`` reaches them.
 
-    ``born_at`` is when the node began; ``moved`` is told a task whose council has changed, with the new one; ``may_sit``
-    says whether the holder of a key may be a member of a council.
+    ``born_at`` is when the node began; ``moved`` is told a task whose council has changed, with the new one;
+    ``may_sit`` says whether the holder of a key may be a member of a council.
     """
 
     def __init__(

@@ -1,6 +1,7 @@
 """Desk: where peers reach this node's acceptor; it checks what they send; answers wait until they are kept.
 
-Which role may call which method is decided before (``middleware.roles``): only those who may order call ``lease.cancel``.
+Which role may call which method is decided before (``middleware.roles``): only nodes that may order tasks reach
+``lease.cancel``.
 """
 
 from __future__ import annotations

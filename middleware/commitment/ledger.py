@@ -137,8 +137,9 @@ class Ledger:
         state = _unpacked(store.noted(_STATE))
         if isinstance(state, list) and len(state) == 2:
             state = [*state, state[0]]  # of a version that had one floor for both
-        is_state = isinstance(state, list) and len(state) == 3 and isinstance(state[1], float)
-        if is_state and is_number(state[0]) and is_number(state[2]):
+        if not isinstance(state, list) or len(state) != 3:
+            state = [None, None, None]
+        if isinstance(state[1], float) and all(map(is_number, state[::2])):
             self.floor, self.longest, self.token = Ballot(state[0], ""), state[1], state[2]
             self.is_whole = store.origin != "replaced"
         for number in range(BUCKETS):

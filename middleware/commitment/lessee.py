@@ -179,9 +179,10 @@ class Lessee:
         return Deferred.fromCoroutine(self._move(members))
 
     def end(self, token: int) -> Deferred[bytes]:
-        """Have no lease granted any more (stop the device first): the task was done under ``token``, or a later own one.
+        """Have no lease granted any more (stop the device first): the task was done under ``token``.
 
-        Fires with the proof of that, signed by a majority of the council.  Fails as ``Council.close`` does.
+        Where this agent holds a later one by now, that one counts.  Fires with the proof, signed by a
+        majority of the council; fails as ``Council.close`` does.
         """
         return self.council.close(max(token, self.token)).addCallback(lambda _: self.council.ending)
 

@@ -29,8 +29,9 @@ class Round:
     """``outcome`` fires with the round as soon as it is decided whether a majority answers with one of ``kinds``.
 
     A member where another's lease ends within ``short`` seconds is asked again then, or soon where that is long.
-    An answer that is not genuine is none.  It also fires, undecided, when everybody answered or ``patience`` seconds have passed, and soon after a majority has
-    answered.  Who has not answered is asked every 100 ms until it is decided, and at least three times in all.
+    An answer that is not genuine is none.  It also fires, undecided, when everybody answered or ``patience`` seconds
+    have passed, and soon after a majority has answered.  A member that has not answered is asked every 100 ms until it
+    is decided, and at least three times in all.
     """
 
     def __init__(

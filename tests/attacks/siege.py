@@ -63,6 +63,10 @@ class PaperDoor:
         """Everything."""
         return True
 
+    def name_of(self, public: bytes) -> str:
+        """Nothing."""
+        return ""
+
 
 class SiegeCase(VillageCase):
     """A test of a closed team and of those who attack it."""

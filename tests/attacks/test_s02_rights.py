@@ -19,7 +19,7 @@ from tests.attacks.siege import SOURCE, SiegeCase
 from tests.middleware.admission.paper import NOW
 
 KEYS = ("halt", "tasks", "devices", "deployments", "signed-out", "group/7")
-NAMES = ("order", "member", "result", "verdict/1", "source", "anything")
+NAMES = ("order", "member", "result", "council", "done", "verdict/1", "source", "anything")
 
 
 class MethodTests(SiegeCase):

@@ -14,6 +14,7 @@ from middleware.commitment.lessee import Lessee
 from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.record import Record
+from middleware.group import Group
 from middleware.node import SwarmNode
 from middleware.presence import DEVICES, Device, devices_of
 from middleware.tasks import COMPLETED, RESULT, TASKS, Result, Task, group_key, tasks_of
@@ -250,7 +251,7 @@ class TaskTests(LeaseCase):
     def test_task_made_or_altered(self) -> None:
         """A device makes no task and changes none, its council included."""
         before = self.seen()
-        other = replace(self.task, generation=9, configuration=9, priority=9, council=self.task.council[:1])
+        other = replace(self.task, generation=9, priority=9, council=self.task.council[:1], charter=b"")
         self.store(
             self.record(TASKS, "t1", other.packed()), self.record(TASKS, "t2", replace(other, task_id="t2").packed())
         )
@@ -259,10 +260,12 @@ class TaskTests(LeaseCase):
     def test_task_concluded(self) -> None:
         """What a device writes about the end of a task that it does not hold is no end for any node."""
         heard: dict[int, Result | None] = {}
-        groups = [
-            node.group(self.task, lambda members, outcome, place=place: heard.update({place: outcome}))
-            for place, node in enumerate(self.team.nodes)
-        ]
+
+        def follow(place: int) -> Group:
+            node = self.team.nodes[place]
+            return node.group(self.task, lambda members, outcome: heard.update({place: outcome}))
+
+        groups = [follow(place) for place in range(len(self.team.nodes))]
         holder = self.held_by(self.members()[0])
         forged = Result(COMPLETED, "dog1", 1.0, holder.token + 1).packed()
         key = group_key(TASK.task_id)
@@ -278,11 +281,29 @@ class NameTests(LeaseCase):
     """The name of another device."""
 
     def test_name_of_another(self) -> None:
-        """A device that announces itself under another's name is seen under the name of its certificate."""
+        """A device that announces itself under another's name, in the slot or in the value, is not shown under it."""
         device = Device(self.own.node_id.hex(), DEVICE_NAME, capabilities={"camera": {"width": 208}}, joined=9)
-        record = Record(DEVICES, DEVICE_NAME, self.own.public, 1, "leased", 60.0, device.packed()).signed(self.own)
-        self.store(record)
+        for slot in (DEVICE_NAME, "bad"):
+            self.store(Record(DEVICES, slot, self.own.public, 1, "leased", 60.0, device.packed()).signed(self.own))
+        right = replace(device, name="bad")
         listing = self.outcome(self.team, self.team.nodes[0].list_devices(), 2.0)
-        named = {seen.uuid: seen.name for seen, _ in devices_of(listing.records)}
-        self.assertEqual(named.get(self.own.node_id.hex()), "bad")
-        self.assertEqual(sorted(name for name in named.values()).count(DEVICE_NAME), 1)
+        self.assertEqual(self.names(listing.records), ["dog1", "dog2", "dog3", "dog4", "vaio"])
+        self.store(Record(DEVICES, "bad", self.own.public, 2, "leased", 60.0, right.packed()).signed(self.own))
+        listing = self.outcome(self.team, self.team.nodes[0].list_devices(), 2.0)
+        self.assertEqual(self.names(listing.records), ["bad", "dog1", "dog2", "dog3", "dog4", "vaio"])
+
+    def test_two_members_of_one_name(self) -> None:
+        """Of two members to whom the operator gave one name each is shown with the beginning of its id."""
+        self.team.enlist("dog2", "device")
+        self.team.run(2.0)
+        listing = self.outcome(self.team, self.team.nodes[0].list_devices(), 2.0)
+        twins = [name for name in self.names(listing.records) if name.startswith("dog2")]
+        self.assertEqual(twins, sorted(f"dog2-{node.uuid[:6]}" for node in self.twins()))
+
+    def twins(self) -> list[SwarmNode]:
+        """The nodes of that name."""
+        return [node for node in self.team.nodes if node.presence.device.name == "dog2"]
+
+    def names(self, records: list[Record]) -> list[str]:
+        """The names under which devices are shown."""
+        return sorted(device.name for device, _ in devices_of(records))

@@ -86,6 +86,9 @@ class Door(Protocol):
     def may_store(self, slot: Slot) -> bool:
         """Whether the owner of ``slot`` may write there; of an owner that this node never met it says yes."""
 
+    def name_of(self, public: bytes) -> str:
+        """The name that the team gave to the holder of a key; empty where it gives none, or none is known."""
+
 
 class OpenDoor:
     """The door of an open team: who holds the key is in, and may do everything."""
@@ -106,6 +109,10 @@ class OpenDoor:
     def may_store(self, slot: Slot) -> bool:
         """Everybody may."""
         return True
+
+    def name_of(self, public: bytes) -> str:
+        """Nobody has a certificate."""
+        return ""
 
 
 OPEN = OpenDoor()
