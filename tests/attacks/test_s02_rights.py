@@ -89,7 +89,7 @@ class RecordTests(SiegeCase):
                     asked = attacker.ask(team.contact(house), "store", [record.packed()], changes=True)
                     [verdict] = self.outcome(team, asked, 0.1)
                     held = house.node.replica.holds(record)
-                    self.assertEqual(held, may_store((role,), record.slot), (role, key, name))
+                    self.assertEqual(held, may_store((role,), record.slot, role), (role, key, name))
                     self.assertEqual(verdict == FORBIDDEN, not held, (role, key, name))
         self.assertEqual(kinds, set(KINDS))
 

@@ -37,3 +37,7 @@ class Gate:
     def may_store(self, slot: Slot) -> bool:
         """As the test says."""
         return (slot.owner, slot.name) not in self.unwritable
+
+    def name_of(self, public: bytes) -> str:
+        """The team gives none."""
+        return ""

@@ -55,7 +55,7 @@ class CharterTests(RoomCase):
             self.assertFalse(replace(charter, links=links).is_genuine(T), links)
         self.assertFalse(charter.is_genuine("t1"))
         self.assertFalse(replace(charter, owner=forged.public).is_genuine(T))
-        self.assertFalse(replace(charter, first=self.room.contacts[:3]).is_genuine(T))
+        self.assertFalse(replace(charter, first=tuple(self.room.contacts[:3])).is_genuine(T))
 
     def test_one_signer_is_no_majority(self) -> None:
         """What a single member of three signed is no council, and no council of fewer than three is one."""
