@@ -11,6 +11,7 @@ from middleware import roles
 from middleware.admission.team import Team
 from middleware.commitment.ballot import GRANTED, MOVED, OVER, Reply
 from middleware.commitment.lessee import Lessee
+from middleware.entangled.errors import Refused
 from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.record import Record
@@ -153,6 +154,31 @@ class ReconfigurationTests(LeaseCase):
         self.assertIsNotNone(holder.lease)
         self.assertIsNone(second.lease)
         self.assertEqual(second.council.members, self.task.council)
+
+    def test_council_of_the_device_alone(self) -> None:
+        """Members of a council accept no next one in which a device, with keys that it made up, is a majority."""
+        own = Contact(self.own.public, SOURCE).packed()
+        invented = [Contact(Identity(bytes([n]) * 32).public, SOURCE).packed() for n in range(2)]
+        viewer = Contact(self.insider(self.team, "eye", "viewer", at=SOURCE._replace(port=7))[1].public, SOURCE)
+        honest = [self.team.contact(house).packed() for house in self.team.houses]
+        for council in ([own], [own, honest[0]], [own, *invented], [*honest[:2], viewer.packed()]):
+            self.attack("lease.prepare", TASK.task_id, 1, 2**20, 1.5)
+            answers = self.attack("lease.change", TASK.task_id, 1, 2**20, council, 0, False)
+            self.assertTrue(all(isinstance(answer, Refused) for answer in answers))
+        self.held_by(self.outsiders()[0])
+
+    def test_certified_council(self) -> None:
+        """With the signatures of the old council a new one is installed, and it goes on above the old tokens."""
+        holder = self.held_by(self.members()[0])
+        token = holder.token
+        contacts = [self.team.contact(house) for house in self.team.houses]
+        following = [self.task.council[0], *(contacts[place] for place in self.outsiders())]
+        self.assertIsNone(self.outcome(self.team, holder.move(following), 2.0))
+        self.assertEqual((holder.council.configuration, list(holder.council.members)), (2, following))
+        self.assert_won(holder)
+        self.assertGreater(holder.token, token)
+        links = [holder.council.charter.links[0]] if holder.council.charter is not None else []
+        self.assertEqual([len(link.votes) for link in links], [2])
 
 
 class ClosingTests(LeaseCase):
