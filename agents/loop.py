@@ -119,7 +119,7 @@ class Agent(Service):
     def _checked(self, records: list[Record], task: Task) -> None:
         """A task heard of: it may be an old one that is done."""
         self._checking.discard(task.task_id)
-        if outcome_of(records) is not None:
+        if outcome_of(task, records) is not None:
             self._docket.bury(task.task_id, self._clock.seconds())
         elif self._docket.add(task):
             self._arrange()

@@ -7,6 +7,7 @@ on every node.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
@@ -22,6 +23,7 @@ IDLE, ASSIGNED, SEARCHING, WAITING, EXECUTING, DONE = "IDLE", "ASSIGNED", "SEARC
 STATUSES = (IDLE, ASSIGNED, SEARCHING, WAITING, EXECUTING, DONE)
 MAX_DEPTH = 16
 """The directory is split no further: 2**16 places are enough for a million devices."""
+ID_SHOWN = 6
 MESSAGES_KEPT = 5
 MESSAGE_CHARACTERS = 70
 STOPS_SHOWN = 4
@@ -92,9 +94,12 @@ class Device:
 
 
 def device_of(record: Record) -> Device | None:
-    """The device that a record announces, or None where its value is not one, or one of another node."""
+    """The device that a record announces, or None where its value is not one, or one of another node.
+
+    It is announced under the name of the record's slot, which replicas compare with the certificate of its owner.
+    """
     value = mapping_of(record)
-    if value is None or value.get("uuid") != node_id(record.owner).hex():
+    if value is None or value.get("uuid") != node_id(record.owner).hex() or value.get("name") != record.name:
         return None
     content = {f.name: value[f.name] for f in fields(Device) if f.name in value}
     try:
@@ -132,8 +137,16 @@ def device_of(record: Record) -> Device | None:
 
 
 def devices_of(records: list[Record]) -> list[tuple[Device, Record]]:
-    """The devices in ``records`` in the order of joining, each with its record."""
+    """The devices in ``records`` in the order of joining, each with its record.
+
+    Where several have the same name each is told apart by the beginning of its id.
+    """
     known = [(device, record) for record in records if (device := device_of(record)) is not None]
+    counts = Counter(name for name, _ in {(device.name, device.uuid) for device, _ in known})
+    known = [
+        (replace(device, name=f"{device.name}-{device.uuid[:ID_SHOWN]}") if counts[device.name] > 1 else device, record)
+        for device, record in known
+    ]
     return sorted(known, key=lambda pair: (pair[0].joined, pair[0].uuid))
 
 

@@ -60,12 +60,13 @@ METHODS: Mapping[str, frozenset[str]] = {
     "reach.introduce": ALL,
     "reach.meet": ALL,
     "reach.seen": ALL,
-    # The right to act.  Who sits in a council is whoever is near the task's key.
+    # The right to act.  Members of a council are nodes near the task's key that may say ``lease.freed``.
     "lease.prepare": WORKING,
     "lease.propose": ACTING,
     "lease.release": ACTING,
-    "lease.freed": ALL,  # the word of a council
-    "lease.close": WORKING,
+    "lease.freed": WRITING,  # the word of a council
+    "lease.close": ACTING,  # under the token that was granted
+    "lease.cancel": ORDERING,
     "lease.change": WORKING,
     "lease.install": WORKING,
     # Bids are signed and carried by others; who may bid at all is a matter of its kind of record.
@@ -92,6 +93,7 @@ OTHER_METHODS = WORKING
 
 PRESENCE, TASKS, HALT, DEPLOYMENTS, SIGNED_OUT = "devices", "tasks", "halt", "deployments", "signed-out"
 MEMBER, RESULT, ORDER, VERDICT, SOURCE = "member", "result", "order", "verdict", "source"
+COUNCIL, ENDED = "council", "done"
 OTHER = "other"
 
 BY_KEY, BY_NAME, REST = "key", "name", "rest"
@@ -122,7 +124,7 @@ NAMESPACES: Mapping[str, Namespace] = {
     PRESENCE: Namespace(
         ALL, BY_KEY, "what a device says of itself, at its own places of the directory", (PRESENCE, "dog1")
     ),
-    TASKS: Namespace(WORKING, BY_KEY, "the tasks of the team, and the changes of their councils", (TASKS, "task7")),
+    TASKS: Namespace(ORDERING, BY_KEY, "the tasks of the team", (TASKS, "task7")),
     HALT: Namespace(ORDERING, BY_KEY, "the emergency stop and its release", (HALT, "halt"), lasts=True),
     DEPLOYMENTS: Namespace(PUSHING, BY_KEY, "the modules that are pushed to the team", (DEPLOYMENTS, "follow")),
     SIGNED_OUT: Namespace(
@@ -130,7 +132,13 @@ NAMESPACES: Mapping[str, Namespace] = {
     ),
     SOURCE: Namespace(PUSHING, BY_NAME, "the source of a pushed module", ("source/7", SOURCE)),
     MEMBER: Namespace(ACTING, BY_NAME, "the report of a device in the group of a task", ("task/task7", MEMBER)),
-    RESULT: Namespace(WORKING, BY_NAME, "how a task ended", ("task/task7", RESULT)),
+    RESULT: Namespace(ORDERING, BY_NAME, "how a task ended, by an operator", ("task/task7", RESULT)),
+    COUNCIL: Namespace(
+        WORKING, BY_NAME, "the council of a task, signed by the council before it", ("task/task7", COUNCIL)
+    ),
+    ENDED: Namespace(
+        ACTING, BY_NAME, "how a task ended, signed by the council that granted the lease", ("task/task7", ENDED)
+    ),
     ORDER: Namespace(ORDERING, BY_NAME, "what an operator wants of a task under way", ("task/task7", ORDER)),
     VERDICT: Namespace(ACTING, BY_NAME, "why an agent decided as it did", ("task/task7/why", f"{VERDICT}/1")),
     OTHER: Namespace(WRITING, REST, "tuples, and whatever programs keep in the DHT", ("group/7", "anything")),
@@ -160,9 +168,14 @@ def may_call(roles: Collection[str], method: str) -> bool:
     return not METHODS.get(method, OTHER_METHODS).isdisjoint(roles)
 
 
-def may_store(roles: Collection[str], slot: Slot) -> bool:
-    """Whether a member with these roles may write in ``slot``, which is its own."""
-    return not KINDS[kind_of(slot)].isdisjoint(roles)
+def may_store(roles: Collection[str], slot: Slot, name: str = "") -> bool:
+    """Whether a member with these roles may write in ``slot``, which is its own.
+
+    A member announces itself under the ``name`` of its certificate only, where it has one.
+    """
+    kind = kind_of(slot)
+    is_named = kind != PRESENCE or not name or slot.name == name
+    return is_named and not KINDS[kind].isdisjoint(roles)
 
 
 def lasts(slot: Slot) -> bool:

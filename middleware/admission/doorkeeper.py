@@ -35,8 +35,8 @@ class Rules(Protocol):
     def may_call(self, roles: Collection[str], method: str) -> bool:
         """Whether a member with these roles may call that method."""
 
-    def may_store(self, roles: Collection[str], slot: Slot) -> bool:
-        """Whether a member with these roles may write that slot of its own."""
+    def may_store(self, roles: Collection[str], slot: Slot, name: str) -> bool:
+        """Whether a member with these roles and that name may write that slot of its own."""
 
     def lasts(self, slot: Slot) -> bool:
         """Whether what is held in that slot stays when its owner is revoked."""
@@ -49,7 +49,7 @@ class Anything:
         """It may."""
         return True
 
-    def may_store(self, roles: Collection[str], slot: Slot) -> bool:
+    def may_store(self, roles: Collection[str], slot: Slot, name: str) -> bool:
         """It may."""
         return True
 
@@ -167,14 +167,14 @@ class Doorkeeper:
     def may_store(self, slot: Slot) -> bool:
         """Whether the certificate of the owner of ``slot``, as it is at present, allows it to write there."""
         authority = self.authority(slot.owner)
-        return not authority.refusal and self._rules.may_store(authority.roles, slot)
+        return not authority.refusal and self._rules.may_store(authority.roles, slot, authority.name)
 
     def may_stay(self, slot: Slot) -> bool:
         """Whether what is held in ``slot`` may be held on and shown."""
         return self.may_store(slot) or (self.authority(slot.owner).refusal != FOREIGN and self._rules.lasts(slot))
 
     def authority(self, owner: bytes) -> Authority:
-        """Whether the certificate of an owner of records holds at present, and its roles."""
+        """Whether the certificate of an owner of records holds at present, its roles and its name."""
         now = self._wall()
         digest, at = self._judged_at
         if digest != self._roll.digest or not 0.0 <= now - at < JUDGED_S:
@@ -240,7 +240,7 @@ class Doorkeeper:
         if member is None:
             return Authority(FOREIGN)
         refusal = self._roll.refusal(member, now)
-        return Authority(refusal) if refusal else Authority("", member.roles)
+        return Authority(refusal) if refusal else Authority("", member.roles, member.name)
 
     def _read(self, public: bytes, shown: bytes) -> Member:
         key = hashlib.blake2s(public + shown, digest_size=16).digest()

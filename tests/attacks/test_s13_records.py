@@ -282,7 +282,7 @@ class FloodTests(RecordCase):
     def test_it_blocks_no_reads(self) -> None:
         """A member whose share is full at all replicas but one cannot make the reads of a key fail."""
         team = self.team
-        bad, own = self.insider(team, "bad", DEVICE)
+        bad, own = self.insider(team, "bad", OPERATOR)
         for house in team.houses[1:]:
             usage = house.node.store.usage
             for number in range((usage.max_rows - usage.rows) // 2):

@@ -149,6 +149,8 @@ class TableTests(SynchronousTestCase):
             tasks.MEMBER: roles.MEMBER,
             tasks.RESULT: roles.RESULT,
             tasks.ORDER: roles.ORDER,
+            tasks.COUNCIL: roles.COUNCIL,
+            tasks.DONE: roles.ENDED,
             verdict.slot_of(7): roles.VERDICT,
             deploy.SOURCE: roles.SOURCE,
             "0": OTHER,
@@ -171,6 +173,10 @@ class TableTests(SynchronousTestCase):
         for method in ("device.halt", "device.tune", "device.message", "device.disconnect", "device.fault"):
             self.assertEqual([role for role in ROLES if may_call((role,), method)], [OPERATOR, GATEWAY])
         self.assertEqual([role for role in ROLES if may_call((role,), "lease.propose")], [DEVICE, GATEWAY])
+        self.assertEqual([role for role in ROLES if may_call((role,), "lease.close")], [DEVICE, GATEWAY])
+        self.assertEqual([role for role in ROLES if may_call((role,), "lease.cancel")], [OPERATOR, GATEWAY])
+        for written in (slot(tasks.TASKS), slot(tasks.group_key("t"), tasks.RESULT)):
+            self.assertEqual([role for role in ROLES if may_store((role,), written)], [OPERATOR, GATEWAY])
         self.assertEqual([role for role in ROLES if may_store((role,), slot(halt.HALT))], [OPERATOR, GATEWAY])
         self.assertTrue(may_store((BOOTSTRAP,), slot(hashed_key("tuples/admission/2"))))
 
@@ -205,5 +211,7 @@ class TeamTests(SynchronousTestCase):
 
             self.patch(assembly, "SwarmNode", made)
             outcome = trial(partial(VirtualTeam, others=("looker",)), experiment, 3)
+            # Whether a viewer may be a member of a council is asked, and it may not.
+            refusals = [refusal for refusal in refusals if refusal != ((VIEWER,), "lease.freed")]
             self.assertEqual((outcome.broken, refusals), ([], []))
             self.assertTrue(outcome.found)

@@ -56,13 +56,14 @@ UNCOUNTED = Life()
 
 
 class Authority(NamedTuple):
-    """Why the certificate of an owner of records does not hold at present (``refusal``), and its roles where it does.
+    """Why the certificate of an owner of records does not hold at present (``refusal``); else its roles and its name.
 
     ``FOREIGN`` stands for an owner whose certificate this node has not seen.
     """
 
     refusal: str = ""
     roles: tuple[str, ...] = ()
+    name: str = ""
 
     @property
     def is_final(self) -> bool:
