@@ -16,8 +16,8 @@ from twisted.internet.error import CannotListenError
 from drivers.errors import UsageError
 from drivers.link import Accept, TcpLinkFactory
 from drivers.registry import describe
+from middleware.faults.stream import StreamFaults
 from sim.emulator.body import Body
-from sim.emulator.foul import Foul
 from sim.emulator.pty import PtyPort
 from sim.world import NotPossible
 from sim.yard import Yard
@@ -30,7 +30,7 @@ Table = Mapping[str, Any]
 class Wire(Protocol):
     """One thing that a driver calls: a robot, or a part of one."""
 
-    foul: Foul
+    faults: StreamFaults
 
     def start(self) -> None:
         """Serve it; raises ``CannotListenError`` or ``OSError`` where its address is taken."""
@@ -92,7 +92,7 @@ class Robots:
         if name not in self._wires:
             raise NotPossible(f"{name!r} has no wire of its own; here are {', '.join(self._wires)}")
         for wire in self._wires[name]:
-            wire.foul.half_open = is_silent
+            wire.faults.half_open = is_silent
 
 
 class _TcpWire:
@@ -101,7 +101,7 @@ class _TcpWire:
     def __init__(
         self, reactor: Any, emulator: Any, accept: Accept, host: str, port: int, has_switch: bool = True
     ) -> None:
-        self.foul = emulator.foul
+        self.faults = emulator.faults
         self._reactor = reactor
         self._emulator = emulator
         self._accept = accept
@@ -124,7 +124,7 @@ class _CableWire:
     """An emulator at the end of a cable: a pseudo-terminal whose path is the link ``path``."""
 
     def __init__(self, reactor: Any, emulator: Any, path: str, has_switch: bool = False) -> None:
-        self.foul = emulator.foul
+        self.faults = emulator.faults
         self._reactor = reactor
         self._emulator = emulator
         self._path = path

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -78,19 +78,19 @@ def assembled(settings: Settings, seams: Seams) -> Assembly:
     if seams.membership is None:
         checked_team(settings)
     _checked_body(settings)
-    frailty = None
+    injector = None
     if settings.faults.allow:
-        from swarmnode.frailty import Frailty  # any other node is spared the memory
+        from agents.catalogue import task_named
+        from middleware.faults.injector import FaultInjector  # any other node is spared the memory
 
-        frailty = Frailty(seams)
-        seams = frailty.seams
+        injector = FaultInjector(seams.clock, seams.wall, seams.rng, seams.network, seams.process)
+        seams = replace(seams, network=injector.open_network, wall=injector.wall)
     device, driver = _device(settings), _driver(settings, seams)
-    if driver is not None and frailty is not None:
-        driver = frailty.drained(driver)
     node = _node(device, settings, seams)
     _answer(node, settings, driver)
-    if frailty is not None:
-        frailty.answer(node)
+    if injector is not None:
+        driver = None if driver is None else injector.wrap_driver(driver)
+        injector.expose(node, task_named)
     if settings.deployment.allow:
         _deployable(node, settings, seams)
     return Assembly(node, _agent(node, settings, driver, seams), driver)

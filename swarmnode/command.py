@@ -17,7 +17,7 @@ WORKS: dict[str, tuple[str, str]] = {
     "yard": ("sim.server", "the yard alone, and the robots that it plays"),
     "trials": ("swarmnode.rehearsal", "both experiments, many times"),
     "crowd": ("swarmnode.crowd", "a yard for many: agents by the hundred among robots by the thousand"),
-    "chaos": ("swarmnode.chaos", "let a device of a team fail, to see another take over"),
+    "chaos": ("swarmnode.faults", "let a device of a team fail, to see another take over"),
     "driver": ("swarmnode.driver.command", "find a robot, and try it in a terminal before it joins"),
     "deploy": ("swarmnode.deploy", "push a strategy or a behaviour to the team, see who runs it, go back"),
     "init": ("swarmnode.team.init", "make a closed team: the operator's key, and its first node"),

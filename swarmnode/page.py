@@ -28,6 +28,7 @@ from webnode.audit import audit
 from webnode.board import Board, Phones
 from webnode.chronicle import chronicle
 from webnode.fallback import fallbacks
+from webnode.faults import faults
 from webnode.ground import Ground
 from webnode.guard import LOCAL_ENDS
 from webnode.halting import halts
@@ -35,7 +36,6 @@ from webnode.invite import TeamInvites
 from webnode.ledger import Glance, state_from
 from webnode.limits import limits
 from webnode.live import Events, Shots
-from webnode.mischief import faults
 from webnode.server import Files, WebService, caller
 from webnode.session import sessions
 from webnode.state import Departed, State

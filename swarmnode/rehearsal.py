@@ -111,7 +111,7 @@ class VirtualTeam:
             self.clock.seconds,
             frost.connector(connector),
             shelf,
-            _Plug(self, name),
+            _Process(self, name),
             membership=self._membership(name),
             spawn=simulated,
         )
@@ -178,7 +178,7 @@ class VirtualTeam:
         self.yard.stop()
 
 
-class _Plug:
+class _Process:
     def __init__(self, team: VirtualTeam, name: str) -> None:
         self._team = team
         self._name = name

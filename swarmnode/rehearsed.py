@@ -6,11 +6,10 @@ from typing import Any
 
 from twisted.internet.defer import Deferred
 
-from middleware.fault import CAUSE, Fault, begins_in
+from middleware.faults.kinds import ASSIGN, CAUSE, Fault, begins_in
 from middleware.presence import Device, devices_of
 from middleware.tasks import TASKS, group_key, outcome_of, tasks_of
 from swarmnode.asker import Refusal
-from swarmnode.frailty import ASSIGN
 from swarmnode.rehearsal import VirtualTeam
 
 HERE_S = 2.0

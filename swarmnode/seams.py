@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from twisted.internet.interfaces import IReactorTime
 
@@ -16,16 +16,7 @@ from middleware.entangled.network.network import Network
 if TYPE_CHECKING:
     from middleware.admission.membership import Kept
     from middleware.deployment.channel import Channel
-
-
-class Plug(Protocol):
-    """How the machine below a node is made to fail."""
-
-    def kill(self) -> None:
-        """End the node as a power cut would."""
-
-    def freeze(self, seconds: float) -> None:
-        """Let it stand still for so long, and then go on."""
+    from middleware.faults.injector import Process
 
 
 @dataclass(frozen=True)
@@ -34,7 +25,7 @@ class Seams:
 
     ``network`` makes the node's port each time that it enters the network; ``connector`` opens links to robots and
     yards (None: TCP); ``wall`` is unix time, for people; ``shelf`` is where deployed modules are kept (None: they are
-    forgotten when the node ends); ``plug`` is what a fault on purpose pulls (None: neither killed nor frozen);
+    forgotten when the node ends); ``process`` is what an injected fault kills or freezes (None: neither);
     ``lan`` makes its place in the group of the LAN (None: it does not look there).
     ``spawn`` starts the process of a deployed module (None: a process of this machine, confined).
     ``membership`` is the node's place in a closed team (None: the team is open).
@@ -47,7 +38,7 @@ class Seams:
     wall: Callable[[], float]
     connector: Any = None
     shelf: Any = None
-    plug: Plug | None = None
+    process: Process | None = None
     lan: Callable[[], Multicast] | None = None
     membership: Kept | None = None
     spawn: Callable[[], Channel] | None = None

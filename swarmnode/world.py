@@ -60,12 +60,12 @@ def real_seams(settings: Settings, reactor: Any) -> Seams:
         from middleware.deployment.shelf import FileShelf
 
         shelf = FileShelf(Path(f"{path}.deployed"))
-    plug = None
+    process = None
     if settings.faults.allow:
-        from swarmnode.plug import ProcessPlug
+        from middleware.faults.process import OwnProcess
 
-        plug = ProcessPlug()
-    return Seams(reactor, network, store, rng, time.time, shelf=shelf, plug=plug, membership=membership, lan=lan)
+        process = OwnProcess()
+    return Seams(reactor, network, store, rng, time.time, shelf=shelf, process=process, membership=membership, lan=lan)
 
 
 LookUp = Callable[..., Sequence[tuple[Any, ...]]]

@@ -21,7 +21,7 @@ from drivers.deadman import keeper, process
 from drivers.errors import UsageError
 from drivers.phone import driver, option
 from drivers.registry import KINDS, describe
-from middleware import fault, gauge, halt, stop_set, survey, takeover
+from middleware import gauge, halt, stop_set, survey
 from middleware.commitment import ballot, lessee
 from middleware.consensus import guard, strategy, worker
 from middleware.deployment import confinement, deployment, frame, manifest, module, runner
@@ -32,6 +32,7 @@ from middleware.entangled.network import bundle, link, tcp, tunnel, websocket
 from middleware.entangled.replication import handover, pusher, replica, subscriber
 from middleware.entangled.space import shelf, template
 from middleware.entangled.wire import rebuff
+from middleware.faults import kinds, takeover
 from middleware.settings import Settings
 from sim import dog, scene, sensor, world
 from sim.crowd import crowd, ray
@@ -90,7 +91,7 @@ FIGURES: Sequence[tuple[str, str]] = (
     ("deployment", f"nobody has asked it for {deployment.IDLE_S:g} s"),
     ("drivers", f"in every state, at rest within {rules.HALT_S:g} s"),
     ("drivers", f"While driving a key counts for {pilot.KEY_S:g} s"),
-    ("faults", f"Seconds are {fault.MIN_S:g} to {fault.MAX_S:g}, {fault.USUAL_S:g} where"),
+    ("faults", f"Seconds are {kinds.MIN_S:g} to {kinds.MAX_S:g}, {kinds.USUAL_S:g} where"),
     ("faults", f"later than {takeover.TARGET_S:g} s, or nobody took over"),
     ("faults", f"below {body.EMPTY:g} its agent takes its report back"),
     ("library", f"After about {membership.SILENCE + roster.STRUCK_S:g} s the absent are struck"),

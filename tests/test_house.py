@@ -17,14 +17,17 @@ ROOT = Path(__file__).resolve().parent.parent
 BELOW = ("agents", "drivers", "middleware", "sim", "standards", "webnode")
 ROOMS = (*BELOW, "swarmnode")
 
+FAULTS_USE = tuple(f"middleware.{name}" for name in ("errors", "node", "presence", "tasks", "value"))
+
 # From the most special name to the room: what a module may import of the house.  The longest name that fits holds.
 MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "standards": ("standards",),
     "middleware": ("middleware",),
     "middleware.entangled": ("middleware.entangled", "standards"),
+    "middleware.faults": ("middleware.faults", "middleware.entangled", *FAULTS_USE),
     "middleware.admission": ("middleware.admission", "middleware.entangled"),
     "drivers": ("drivers", "standards"),
-    "sim": ("sim", "drivers"),
+    "sim": ("sim", "drivers", "middleware.faults.stream"),
     "sim.team": ("sim.team", "middleware"),
     "webnode": ("webnode", "middleware"),
     "agents": ("agents", "middleware", "drivers.driver", "drivers.reading", "drivers.errors"),
@@ -132,7 +135,9 @@ PURE = (
     "middleware.entangled.wire.rebuff",
     "middleware.entangled.wire.session",
     "middleware.errors",
-    "middleware.fault",
+    "middleware.faults.kinds",
+    "middleware.faults.stream",
+    "middleware.faults.takeover",
     "middleware.link",
     "middleware.listing",
     "middleware.order",
@@ -142,7 +147,6 @@ PURE = (
     "middleware.prefix",
     "middleware.roles",
     "middleware.settings",
-    "middleware.takeover",
     "middleware.tasks",
     "middleware.verdict",
     "sim.crowd.body",
@@ -207,6 +211,7 @@ EDGES = (
     "middleware.entangled.network.tcp",
     "middleware.entangled.network.udp",
     "middleware.entangled.data.writer",
+    "middleware.faults.process",
 )
 WORLD = ("time", "socket", "threading", "asyncio", "selectors", "subprocess", "secrets", "twisted.internet.reactor")
 GUARDED = ("standards", "middleware", "agents", "drivers")

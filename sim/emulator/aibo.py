@@ -17,9 +17,9 @@ from drivers.aibo import picture, sense
 from drivers.aibo.codec import T2, T4, CommandReader, Gains, LineReader, encoded, encoded_gains
 from drivers.aibo.option import ASIDE, BACKWARD, FORWARD, PORTS, TURN
 from drivers.link import Link, MemoryConnector, Receiver
+from middleware.faults.stream import StreamFaults
 from sim.emulator.aibo_menu import AiboMenu
 from sim.emulator.body import Body
-from sim.emulator.foul import Foul
 
 FRAME_S = 0.032
 CAMERA_S = 1.0 / 30.0
@@ -46,7 +46,7 @@ class AiboEmulator:
         ports: dict[str, int] | None = None,
         is_raw: bool = False,
     ) -> None:
-        self.foul = Foul()
+        self.faults = StreamFaults()
         self.ports = {**EMULATED, **(ports or {})}
         self.on_ports: Callable[[], None] = lambda: None
         self.is_engaged = True
@@ -121,14 +121,14 @@ class AiboEmulator:
 
     def datagram(self, data: bytes, answer: Callable[[bytes], None]) -> None:
         """Take a datagram to the camera's port; ``answer`` sends one back."""
-        if data == picture.REQUEST and self._is_udp and "camera" in self.menu.running and not self.foul.half_open:
+        if data == picture.REQUEST and self._is_udp and "camera" in self.menu.running and not self.faults.half_open:
             self._peer = answer
 
     # -- what the clients say ---------------------------------------------------------------------------------------
 
     def on_bytes(self, client: _Client, data: bytes) -> None:
         """A client wrote."""
-        if self.foul.half_open:
+        if self.faults.half_open:
             return
         match client.service:
             case "main":
@@ -209,7 +209,7 @@ class AiboEmulator:
         data = self._pictured()
         if self._is_udp:
             if self._peer is not None:
-                for piece in Foul(self.foul.drop, self.foul.garbage, half_open=self.foul.half_open).wire(
+                for piece in StreamFaults(self.faults.drop, self.faults.garbage, half_open=self.faults.half_open).wire(
                     data, self._rng
                 ):
                     self._peer(piece)
@@ -237,9 +237,9 @@ class AiboEmulator:
         return joints
 
     def _say(self, client: _Client, data: bytes) -> None:
-        for piece in self.foul.wire(data, self._rng) if data else ():
-            if self.foul.delay:
-                self._clock.callLater(self.foul.delay, client.link.send, piece)
+        for piece in self.faults.wire(data, self._rng) if data else ():
+            if self.faults.delay:
+                self._clock.callLater(self.faults.delay, client.link.send, piece)
             else:
                 client.link.send(piece)
 

@@ -16,7 +16,7 @@ class AiboServer:
     """Serves ``dog`` on ``interface`` of ``reactor``, under the port numbers that the dog has."""
 
     def __init__(self, reactor: Any, dog: AiboEmulator, interface: str = "127.0.0.1") -> None:
-        self.foul = dog.foul
+        self.faults = dog.faults
         self._reactor = reactor
         self._dog = dog
         self._interface = interface

@@ -17,8 +17,8 @@ from drivers.bittle.gait import GAITS, Velocity
 from drivers.bittle.option import BEHAVIOURS, POSTURES
 from drivers.link import Link
 from drivers.reading import Value
+from middleware.faults.stream import StreamFaults
 from sim.emulator.body import Body
-from sim.emulator.foul import Foul
 from sim.emulator.outlet import Outlet
 
 VERSIONS = {"biboard": "B10_250712", "nyboard": "N_250224"}
@@ -40,7 +40,7 @@ NEVER = frozenset("csa!")
 class Bittle:
     """One dog; ``accept`` is its serial port, ``accept_http`` its web server.
 
-    ``foul`` spoils what it says; ``resets`` says whether opening the port starts the board anew, as most do.
+    ``faults`` spoils what it says; ``resets`` says whether opening the port starts the board anew, as most do.
     ``heard`` are the commands that it took, in their order.
     """
 
@@ -49,12 +49,12 @@ class Bittle:
         body: Body,
         clock: IReactorTime,
         rng: random.Random,
-        foul: Foul | None = None,
+        faults: StreamFaults | None = None,
         board: str = "biboard",
         resets: bool = False,
         gaits: Mapping[str, Velocity] = GAITS,
     ) -> None:
-        self.foul = Foul() if foul is None else foul
+        self.faults = StreamFaults() if faults is None else faults
         self.board = board
         self.heard: list[bytes] = []
         self.joints = [0] * 16
@@ -67,7 +67,7 @@ class Bittle:
         self._rng = rng
         self._resets = resets
         self._gaits = gaits
-        self._outlet = Outlet(clock, rng, self.foul)
+        self._outlet = Outlet(clock, rng, self.faults)
         self._rest = bytearray()
         self._unfinished: Any = None
         self._boot: Any = None
@@ -318,5 +318,5 @@ class BittlePage:
         head = (
             f"HTTP/1.1 {status}\r\nContent-Type: text/plain\r\nContent-Length: {len(text)}\r\nConnection: close\r\n\r\n"
         )
-        for piece in self._robot.foul.wire((head + text).encode(), self._rng):
+        for piece in self._robot.faults.wire((head + text).encode(), self._rng):
             self._link.send(piece)

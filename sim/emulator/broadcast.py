@@ -8,8 +8,8 @@ from typing import Any, Generic, Protocol, TypeVar
 from twisted.internet.interfaces import IReactorTime
 
 from drivers.link import Link
+from middleware.faults.stream import StreamFaults
 from sim.emulator.body import Body
-from sim.emulator.foul import Foul
 
 
 class Listener(Protocol):
@@ -24,13 +24,13 @@ Client = TypeVar("Client", bound=Listener)
 class Broadcast(Generic[Client]):
     """What emulated cameras and compasses share: ``clients``, and a beat of ``rate`` a second for ``_tell``.
 
-    ``foul`` spoils what it says.
+    ``faults`` spoils what it says.
     """
 
     def __init__(
-        self, clock: IReactorTime, body: Body, rate: float, rng: random.Random | None, foul: Foul | None
+        self, clock: IReactorTime, body: Body, rate: float, rng: random.Random | None, faults: StreamFaults | None
     ) -> None:
-        self.foul = Foul() if foul is None else foul
+        self.faults = StreamFaults() if faults is None else faults
         self.clients: list[Client] = []
         self._clock = clock
         self._body = body

@@ -12,8 +12,8 @@ from twisted.internet.interfaces import IReactorTime
 from drivers.create2 import codec
 from drivers.link import Link
 from drivers.reading import Value
+from middleware.faults.stream import StreamFaults
 from sim.emulator.body import Body
-from sim.emulator.foul import Foul
 from sim.emulator.outlet import Outlet
 
 MM_PER_COUNT = math.pi * 72.0 / 508.8
@@ -30,17 +30,17 @@ OFF, PASSIVE, SAFE, FULL = range(4)
 class Create2:
     """One robot; ``accept`` is its serial port.  Without a cable it goes on as it was, as the real one does.
 
-    ``foul`` spoils what it says; ``reboot`` is a power cut; ``left`` and ``right`` are its wheel counters, in counts.
+    ``faults`` spoils what it says; ``reboot`` is a power cut; ``left`` and ``right`` are its wheel counters, in counts.
     """
 
-    def __init__(self, body: Body, clock: IReactorTime, rng: random.Random, foul: Foul | None = None) -> None:
-        self.foul = Foul() if foul is None else foul
+    def __init__(self, body: Body, clock: IReactorTime, rng: random.Random, faults: StreamFaults | None = None) -> None:
+        self.faults = StreamFaults() if faults is None else faults
         self.mode = OFF
         self.left = self.right = 0.0
         self.played: list[int] = []
         self._body = body
         self._clock = clock
-        self._outlet = Outlet(clock, rng, self.foul)
+        self._outlet = Outlet(clock, rng, self.faults)
         self._reader = codec.CommandReader()
         self._ids: tuple[int, ...] = ()
         self._streams = False

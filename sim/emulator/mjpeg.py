@@ -8,9 +8,9 @@ from twisted.internet.interfaces import IReactorTime
 
 from drivers.camera import codec
 from drivers.link import Link
+from middleware.faults.stream import StreamFaults
 from sim.emulator.body import Body
 from sim.emulator.broadcast import Broadcast
-from sim.emulator.foul import Foul
 from sim.emulator.outlet import Outlet
 
 MOST_REQUEST = 8192
@@ -20,7 +20,7 @@ MOST_REQUEST = 8192
 class MjpegCamera(Broadcast["_Client"]):
     """One camera; ``accept`` takes its clients, any number, on whatever path they ask for.
 
-    ``foul`` spoils what it says.  ``status`` other than ``200 OK`` turns clients away; without ``has_length`` the
+    ``faults`` spoils what it says.  ``status`` other than ``200 OK`` turns clients away; without ``has_length`` the
     boundaries alone tell the pictures apart; ``is_chunked`` is the way of an ESP32-CAM.  Pictures for a client that
     does not take them are dropped, and those of a body without one left out.
     """
@@ -31,9 +31,9 @@ class MjpegCamera(Broadcast["_Client"]):
         body: Body,
         fps: float = 15.0,
         rng: random.Random | None = None,
-        foul: Foul | None = None,
+        faults: StreamFaults | None = None,
     ) -> None:
-        super().__init__(clock, body, fps, rng, foul)
+        super().__init__(clock, body, fps, rng, faults)
         self.status = "200 OK"
         self.kind = f"{codec.KIND};boundary={codec.BOUNDARY}"
         self.has_length = True
@@ -42,7 +42,7 @@ class MjpegCamera(Broadcast["_Client"]):
 
     def accept(self, link: Link) -> _Client:
         """Take a client."""
-        client = _Client(self, link, Outlet(self._clock, self._rng, self.foul))
+        client = _Client(self, link, Outlet(self._clock, self._rng, self.faults))
         self.clients.append(client)
         return client
 

@@ -9,9 +9,9 @@ from twisted.internet.interfaces import IReactorTime
 
 from drivers.compass.codec import eastward, sentence
 from drivers.link import Link
+from middleware.faults.stream import StreamFaults
 from sim.emulator.body import Body
 from sim.emulator.broadcast import Broadcast
-from sim.emulator.foul import Foul
 from sim.emulator.outlet import Outlet
 
 
@@ -20,7 +20,7 @@ class NmeaCompass(Broadcast["_Client"]):
 
     ``kinds`` are the sentences that it sends each time.  Its needle is off by ``deviation``, and the place's magnetic
     north by ``variation``, degrees to the east; ``HDG`` tells both, ``HDM`` the needle without its deviation.  A body
-    without ``compass.heading`` has an empty field.  ``foul`` spoils what it says.
+    without ``compass.heading`` has an empty field.  ``faults`` spoils what it says.
     """
 
     def __init__(
@@ -29,16 +29,16 @@ class NmeaCompass(Broadcast["_Client"]):
         body: Body,
         rate: float = 10.0,
         rng: random.Random | None = None,
-        foul: Foul | None = None,
+        faults: StreamFaults | None = None,
     ) -> None:
-        super().__init__(clock, body, rate, rng, foul)
+        super().__init__(clock, body, rate, rng, faults)
         self.kinds: tuple[str, ...] = ("HDG",)
         self.deviation = 0.0
         self.variation = 0.0
 
     def accept(self, link: Link) -> _Client:
         """Take a client."""
-        outlet = Outlet(self._clock, self._rng, self.foul)
+        outlet = Outlet(self._clock, self._rng, self.faults)
         outlet.link = link
         client = _Client(self, link, outlet)
         self.clients.append(client)

@@ -14,8 +14,8 @@ from twisted.internet.interfaces import IReactorTime
 from drivers.link import Link, Receiver
 from drivers.reading import Value
 from drivers.rosbridge.websocket import WebSocket
+from middleware.faults.stream import StreamFaults
 from sim.emulator.body import Body
-from sim.emulator.foul import Foul
 
 BASE_STOPS_S = 0.5
 """A base that hears no velocity for so long stands still, as those of most robots do."""
@@ -50,11 +50,11 @@ class RosbridgeRobot:
         clock: IReactorTime,
         body: Body,
         rng: Random,
-        foul: Foul | None = None,
+        faults: StreamFaults | None = None,
         velocity_type: str = "geometry_msgs/msg/Twist",
         has_rosapi: bool = True,
     ) -> None:
-        self.foul = foul or Foul()
+        self.faults = faults or StreamFaults()
         self.velocity_type = velocity_type
         self.has_rosapi = has_rosapi
         self.rosapi_s = 0.0
@@ -97,9 +97,9 @@ class RosbridgeRobot:
 
     def send(self, link: Link, data: bytes) -> None:
         """Let some bytes leave as the wire has them."""
-        for piece in self.foul.wire(data, self._rng):
-            if self.foul.delay > 0:
-                self._clock.callLater(self.foul.delay, link.send, piece)
+        for piece in self.faults.wire(data, self._rng):
+            if self.faults.delay > 0:
+                self._clock.callLater(self.faults.delay, link.send, piece)
             else:
                 link.send(piece)
 
@@ -240,7 +240,7 @@ class _Client:
 
     def received(self, data: bytes) -> None:
         """Take bytes from the client."""
-        if self._robot.foul.half_open:
+        if self._robot.faults.half_open:
             return
         messages, reply = self._socket.received(data)
         if reply:

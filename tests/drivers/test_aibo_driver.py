@@ -49,7 +49,7 @@ class AiboDriverTests(BodyContract, _Case):
             driver.disconnect()
         self.pass_time(0.02)
         self.dog.stop()
-        self.pass_time(0.02 + self.dog.foul.delay)
+        self.pass_time(0.02 + self.dog.faults.delay)
         self.assertEqual(self.clock.getDelayedCalls(), [])
 
     def make_driver(self, **options: object) -> AiboDriver:
@@ -105,7 +105,7 @@ class AiboDriverTests(BodyContract, _Case):
         driver = self.ready()
         driver.act({"base.vx": 0.1}, self.permit(seconds=20.0))
         self.pass_time(0.1)
-        self.dog.foul.half_open = True
+        self.dog.faults.half_open = True
         self.pass_time(2.5)
         self.assertGreater(self.true_speed(), 0.05)
         self.assertEqual(driver.state, "stale")
@@ -124,11 +124,11 @@ class AiboDriverTests(BodyContract, _Case):
         """Half a second without a world state makes it stale; when the dog speaks again it is ready, at rest."""
         driver = self.ready()
         driver.act({"base.vx": 0.1}, self.permit(seconds=20.0))
-        self.dog.foul.drop = 1.0
+        self.dog.faults.drop = 1.0
         self.pass_time(0.7)
         self.assertEqual(driver.state, "stale")
         self.assertEqual(self.true_speed(), 0.0)
-        self.dog.foul.drop = 0.0
+        self.dog.faults.drop = 0.0
         self.pass_time(4.0)
         self.assertEqual(driver.state, "ready")
         self.assertEqual(self.true_speed(), 0.0)
@@ -170,12 +170,12 @@ class AiboDriverTests(BodyContract, _Case):
     def test_recovers_from_a_reboot_that_nobody_told(self) -> None:
         """A dog that fell silent and comes back without its servers is asked for them again."""
         driver = self.ready()
-        self.dog.foul.half_open = True
+        self.dog.faults.half_open = True
         self.pass_time(0.4)
         self.dog.menu.reset()
         for service in ("state", "walk", "head"):
             self.dog.clients[service].link.close()
-        self.dog.foul.half_open = False
+        self.dog.faults.half_open = False
         self.pass_time(5.0)
         self.assertEqual(driver.state, "ready")
 
@@ -240,11 +240,11 @@ class AiboDriverTests(BodyContract, _Case):
     def test_drops_what_is_spoilt(self) -> None:
         """Garbage on the wire is counted and never raises; with a clean wire the dog is ready again."""
         driver = self.ready()
-        self.dog.foul.garbage = 0.3
-        self.dog.foul.split = True
+        self.dog.faults.garbage = 0.3
+        self.dog.faults.split = True
         self.pass_time(10.0)
         self.assertGreater(driver.diagnostics()["bad_frames"], 0)
-        self.dog.foul.garbage = 0.0
+        self.dog.faults.garbage = 0.0
         self.pass_time(12.0)
         self.assertIn(driver.state, ("ready", "stopped"))
 
@@ -262,8 +262,8 @@ class AiboDriverTests(BodyContract, _Case):
 
     def test_stands_a_late_and_broken_wire(self) -> None:
         """Writes that come 100 ms late, in pieces, are the same dog."""
-        self.dog.foul.split = True
-        self.dog.foul.delay = 0.1
+        self.dog.faults.split = True
+        self.dog.faults.delay = 0.1
         driver = self.make_driver()
         connected = driver.connect()
         self.pass_time(1.5)
@@ -474,9 +474,9 @@ class AiboCameraTests(_Case):
     def test_asks_again_when_datagrams_cease(self) -> None:
         """A dog that was switched off and on is asked for datagrams again, and spoilt ones are counted."""
         driver, dog = self.pictures("udp")
-        dog.foul.garbage = 1.0
+        dog.faults.garbage = 1.0
         self.clock.pump([STEP_S] * 100)
-        dog.foul.garbage = 0.0
+        dog.faults.garbage = 0.0
         self.assertGreater(driver.diagnostics()["bad_frames"], 0)
         dog.reboot()
         before = driver.diagnostics()["pictures"]

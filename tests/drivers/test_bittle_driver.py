@@ -16,9 +16,9 @@ from drivers.errors import LinkLost, NotEnabled, Unsupported
 from drivers.link import MemoryConnector
 from drivers.reading import Value
 from drivers.registry import driver_for
+from middleware.faults.stream import StreamFaults
 from sim.emulator.bittle import BEHAVIOUR_S, NEVER, Bittle
 from sim.emulator.body import MemoryBody
-from sim.emulator.foul import Foul
 from tests.drivers.contract import DriverContract
 
 STEP = 0.005
@@ -36,9 +36,9 @@ class Dog(SynchronousTestCase):
         """The dog and its wire."""
         self.clock = Clock()
         self.body = MemoryBody()
-        self.foul = Foul()
+        self.faults = StreamFaults()
         self.robot = Bittle(
-            self.body, self.clock, Random(1), self.foul, self.board, self.resets,
+            self.body, self.clock, Random(1), self.faults, self.board, self.resets,
             {**gait.GAITS, "wkF": gait.Velocity(0.1, 0.0)},
         )  # fmt: skip
         self.connector = MemoryConnector(self.clock, self.robot.accept)
@@ -194,7 +194,7 @@ class BittleDriverTests(Dog, DriverContract):
     def test_asks_again_for_a_gait_whose_answer_was_lost(self) -> None:
         """A stop that the dog has not confirmed within a second is sent again."""
         driver = self.enabled()
-        self.foul.half_open = True
+        self.faults.half_open = True
         driver.stop()
         self.pass_time(1.3)
         self.assertGreaterEqual(self.robot.heard.count(b"kup"), 3)
@@ -220,10 +220,10 @@ class BittleDriverTests(Dog, DriverContract):
         driver = self.enabled()
         driver.act({"base.vx": 0.1}, self.permit(seconds=9.0))
         self.pass_time(0.5)
-        self.foul.drop = 1.0
+        self.faults.drop = 1.0
         self.robot.reboot()
         self.pass_time(1.6)
-        self.foul.drop = 0.0
+        self.faults.drop = 0.0
         self.pass_time(1.0)
         driver.act({"base.vx": 0.1}, self.permit())
         self.pass_time(0.1)
@@ -233,19 +233,19 @@ class BittleDriverTests(Dog, DriverContract):
         """Silence has a name, and ends as soon as the dog answers again; it was stopped meanwhile."""
         driver = self.enabled()
         driver.act({"base.vx": 0.1}, self.permit(seconds=2.0))
-        self.foul.half_open = True
+        self.faults.half_open = True
         self.pass_time(9.0)
         self.assertEqual((driver.state, self.true_speed()), ("stale", 0.0))
         self.assertIn("switched on", driver.problem)
-        self.foul.half_open = False
+        self.faults.half_open = False
         self.pass_time(8.0)
         self.assertEqual((driver.state, driver.problem), ("ready", ""))
 
     def test_lives_with_a_foul_wire(self) -> None:
         """With a tenth of the lines lost and a tenth spoilt, cut anyhow and late, it walks, stops, and counts."""
         driver = self.enabled()
-        self.foul.drop = self.foul.garbage = 0.1
-        self.foul.split, self.foul.delay = True, 0.01
+        self.faults.drop = self.faults.garbage = 0.1
+        self.faults.split, self.faults.delay = True, 0.01
         for _ in range(40):
             if driver.state == "ready":
                 driver.act({"base.vx": 0.1}, self.permit())
@@ -366,7 +366,7 @@ class WifiTests(Dog):
         for is_dead in (False, True):
             driver = self.walking()
             self.robot.heard.clear()
-            self.foul.half_open = is_dead
+            self.faults.half_open = is_dead
             self.connector.is_open = not is_dead
             left = driver.disconnect()
             began = self.now()
@@ -374,7 +374,7 @@ class WifiTests(Dog):
                 self.pass_time(STEP)
             self.successResultOf(left)
             self.assertEqual(self.robot.heard[-1:], [] if is_dead else [b"d"])
-            self.foul.half_open, self.connector.is_open = False, True
+            self.faults.half_open, self.connector.is_open = False, True
             self.pass_time(3.0)
 
     def test_outlives_a_lost_network(self) -> None:
@@ -392,13 +392,13 @@ class WifiTests(Dog):
     def test_lives_with_a_foul_network(self) -> None:
         """Responses that are lost, spoilt and cut cost time, never an exception; the dog still stops."""
         driver = self.walking()
-        self.foul.drop = self.foul.garbage = 0.1
-        self.foul.split = True
+        self.faults.drop = self.faults.garbage = 0.1
+        self.faults.split = True
         for _ in range(60):
             with contextlib.suppress(NotEnabled):  # where the link was lost, it lies down first, and stands up again
                 driver.act({"base.vx": 0.1}, self.permit())
             self.pass_time(0.2)
-        self.foul.drop = self.foul.garbage = 0.0
+        self.faults.drop = self.faults.garbage = 0.0
         self.pass_time(8.0)
         self.assertEqual((driver.state, self.true_speed()), ("ready", 0.0))
         driver.act({"base.vx": 0.1}, self.permit())

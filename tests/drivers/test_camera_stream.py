@@ -19,8 +19,8 @@ from drivers.driver import Driver, Filming
 from drivers.errors import LinkLost, UsageError
 from drivers.link import MemoryConnector
 from drivers.registry import describe, driver_for
+from middleware.faults.stream import StreamFaults
 from sim.emulator.body import MemoryBody
-from sim.emulator.foul import Foul
 from sim.emulator.mjpeg import MjpegCamera
 from tests.drivers.contract import SensingContract
 from tests.drivers.test_camera_driver import jpeg
@@ -35,8 +35,8 @@ class StreamTests(SensingContract, SynchronousTestCase):
         """A camera board, a network of memory, and a clock that is turned by hand."""
         self.clock = Clock()
         self.body = MemoryBody(jpeg=jpeg(1))
-        self.foul = Foul()
-        self.camera = MjpegCamera(self.clock, self.body, 30.0, foul=self.foul)
+        self.faults = StreamFaults()
+        self.camera = MjpegCamera(self.clock, self.body, 30.0, faults=self.faults)
         self.camera.start()
         self.connector = MemoryConnector(self.clock, self.camera.accept)
         self.drivers: list[Driver] = []
@@ -79,7 +79,7 @@ class StreamTests(SensingContract, SynchronousTestCase):
         for has_length in (True, False):
             for is_chunked in (True, False):
                 self.camera.has_length, self.camera.is_chunked = has_length, is_chunked
-                self.foul.split = is_chunked
+                self.faults.split = is_chunked
                 driver, numbers = self.make_driver(), list[int]()
                 driver.subscribe(lambda seen, numbers=numbers: numbers.append(seen.frame.seq))  # type: ignore[misc]
                 driver.connect()
@@ -190,12 +190,12 @@ class StreamTests(SensingContract, SynchronousTestCase):
         """A camera that is connected and sends nothing is hung up on and called again, until it sends."""
         driver = self.ready()
         assert isinstance(driver, CameraDriver)
-        self.foul.half_open = True
+        self.faults.half_open = True
         self.pass_time(1.0)
         self.assertEqual(driver.state, "stale")
         self.pass_time(SILENCE_S)
         self.assertIn("no pictures come", driver.problem)
-        self.foul.half_open = False
+        self.faults.half_open = False
         self.pass_time(2.0)
         self.assertEqual(driver.state, "ready")
 
@@ -225,10 +225,10 @@ class StreamTests(SensingContract, SynchronousTestCase):
         """Lost, spoilt, late and cut pieces cost pictures, and are over when the network is well again."""
         driver = self.make_driver()
         driver.connect()
-        self.foul.drop, self.foul.garbage, self.foul.split, self.foul.delay = 0.1, 0.2, True, 0.03
+        self.faults.drop, self.faults.garbage, self.faults.split, self.faults.delay = 0.1, 0.2, True, 0.03
         self.pass_time(30.0)
         self.assertGreater(driver.diagnostics()["pictures"], 50)
-        self.foul.drop = self.foul.garbage = 0.0
+        self.faults.drop = self.faults.garbage = 0.0
         self.pass_time(12.0)
         before = driver.diagnostics()
         self.pass_time(1.0)

@@ -29,7 +29,7 @@ class CompassDriverTests(SensingContract, SynchronousTestCase):
         self.compass = NmeaCompass(self.clock, self.body, 20.0)
         self.compass.start()
         self.compass.start()
-        self.foul = self.compass.foul
+        self.faults = self.compass.faults
         self.connector = MemoryConnector(self.clock, self.compass.accept)
         self.drivers: list[Driver] = []
 
@@ -140,10 +140,10 @@ class CompassDriverTests(SensingContract, SynchronousTestCase):
         connected = driver.connect()
         self.pass_time(SILENCE_S + 0.1)
         self.assertEqual(driver.problem, "nothing answers at 10.0.0.8:10110; is it on, and in this network?")
-        self.connector.is_open, self.foul.half_open = True, True
+        self.connector.is_open, self.faults.half_open = True, True
         self.pass_time(60.0)
         self.assertIn("sends nothing", driver.problem)
-        self.foul.half_open = False
+        self.faults.half_open = False
         self.body.values.clear()
         self.pass_time(60.0)
         self.assertIn("no sentences", driver.problem)
@@ -162,10 +162,10 @@ class CompassDriverTests(SensingContract, SynchronousTestCase):
         """A link on which nothing comes any more is closed and opened anew, for the other end may be long gone."""
         driver = self.ready()
         silent = self.compass.clients[0]
-        self.foul.half_open = True
+        self.faults.half_open = True
         self.pass_time(SILENCE_S + 0.5)
         self.assertNotIn(silent, self.compass.clients)
-        self.foul.half_open = False
+        self.faults.half_open = False
         self.pass_time(1.0)
         self.assertEqual((driver.state, driver.diagnostics()["reconnects"]), ("ready", 1.0))
 
@@ -191,7 +191,7 @@ class CompassDriverTests(SensingContract, SynchronousTestCase):
         """No spoilt sentence becomes a heading, however the bytes are cut, and headings flow on between them."""
         driver, seen = self.make_driver(), set[float]()
         driver.connect()
-        self.foul.garbage, self.foul.split, self.foul.drop = 0.3, True, 0.1
+        self.faults.garbage, self.faults.split, self.faults.drop = 0.3, True, 0.1
         self.pass_time(0.5)
         driver.subscribe(lambda one: seen.add(round(math.degrees(float(one.values[HEADING])), 3)))
         self.pass_time(60.0)

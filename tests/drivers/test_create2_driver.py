@@ -15,9 +15,9 @@ from drivers.errors import LinkLost, NoReply, NotEnabled, Unsupported, UsageErro
 from drivers.link import MemoryConnector
 from drivers.reading import Value
 from drivers.registry import driver_for
+from middleware.faults.stream import StreamFaults
 from sim.emulator.body import MemoryBody
 from sim.emulator.create2 import Create2
-from sim.emulator.foul import Foul
 from tests.drivers.contract import BodyContract
 
 STEP = 0.005
@@ -30,8 +30,8 @@ class Create2DriverTests(BodyContract, SynchronousTestCase):
         """A robot on an endless floor, with a cable of memory, on a clock that is turned by hand."""
         self.clock = Clock()
         self.body = MemoryBody()
-        self.foul = Foul()
-        self.robot = Create2(self.body, self.clock, Random(1), self.foul)
+        self.faults = StreamFaults()
+        self.robot = Create2(self.body, self.clock, Random(1), self.faults)
         self.connector = MemoryConnector(self.clock, self.robot.accept)
         self.drivers: list[Create2Driver] = []
 
@@ -245,24 +245,24 @@ class Create2DriverTests(BodyContract, SynchronousTestCase):
         driver = self.ready()
         driver.act({"base.vx": 0.2}, self.permit(seconds=9.0))
         self.pass_time(0.2)
-        self.foul.half_open = True
+        self.faults.half_open = True
         self.pass_time(1.0)
         self.assertEqual(driver.state, "stale")
         self.assertLess(self.true_speed(), 0.01)
         self.assertIn("switched on", driver.problem)
-        self.foul.half_open = False
+        self.faults.half_open = False
         self.pass_time(5.0)
         self.assertEqual(driver.state, "ready")
 
     def test_names_a_wrong_baud_rate(self) -> None:
         """Bytes that never are a frame are named as what they are probably caused by."""
-        self.foul.garbage = 1.0
+        self.faults.garbage = 1.0
         driver = self.make_driver()
         connected = driver.connect()
         self.pass_time(2.0)
         self.assertNoResult(connected)
         self.assertIn("115200 baud", driver.problem)
-        self.foul.garbage = 0.0
+        self.faults.garbage = 0.0
         self.pass_time(5.0)
         self.successResultOf(connected)
         self.assertGreater(driver.diagnostics()["bad_frames"], 2)
@@ -270,8 +270,8 @@ class Create2DriverTests(BodyContract, SynchronousTestCase):
     def test_lives_with_a_foul_wire(self) -> None:
         """With a tenth of the frames lost, a tenth spoilt, all late and cut anyhow, it goes on and counts them."""
         driver = self.ready()
-        self.foul.drop = self.foul.garbage = 0.1
-        self.foul.split, self.foul.delay = True, 0.02
+        self.faults.drop = self.faults.garbage = 0.1
+        self.faults.split, self.faults.delay = True, 0.02
         driver.act({"base.vx": 0.2}, self.permit(seconds=9.0))
         self.pass_time(3.0)
         self.assertEqual(driver.state, "ready")

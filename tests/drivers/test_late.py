@@ -122,7 +122,7 @@ class LateTests(SynchronousTestCase):
         """A gait that was not answered is not asked for again after its deadline."""
         robot = Bittle(self.body, self.clock, Random(1))
         driver = self.enabled("bittle", MemoryConnector(self.clock, robot.accept), port="memory")
-        robot.foul.half_open = True
+        robot.faults.half_open = True
         self.freeze(driver, 1.2, before=0.1)
 
     def test_bittle_over_wifi(self) -> None:

@@ -253,7 +253,7 @@ class RosbridgeDriverTests(BodyContract, SynchronousTestCase):
         self.failureResultOf(lost, LinkLost)
         self.failureResultOf(driver.invoke("dock"), LinkLost)
         self.pass_time(1.0)
-        self.robot.foul.half_open = True
+        self.robot.faults.half_open = True
         late = driver.invoke("dock")
         self.pass_time(SILENCE_S + CALL_S + 1.0)
         self.failureResultOf(late, LinkLost)
@@ -303,26 +303,26 @@ class RosbridgeDriverTests(BodyContract, SynchronousTestCase):
     def test_lives_with_a_foul_wire(self) -> None:
         """Garbage, losses, delay and cuts anywhere cost frames and links, and never the driver."""
         driver = self.connected(image_topic=IMAGE)
-        self.robot.foul.garbage, self.robot.foul.drop = 0.1, 0.05
-        self.robot.foul.split, self.robot.foul.delay = True, 0.02
+        self.robot.faults.garbage, self.robot.faults.drop = 0.1, 0.05
+        self.robot.faults.split, self.robot.faults.delay = True, 0.02
         self.pass_time(20.0)
         counts = driver.diagnostics()
         self.assertGreater(counts["bad_frames"] + counts["faults"], 0)
-        self.robot.foul.garbage = self.robot.foul.drop = 0.0
+        self.robot.faults.garbage = self.robot.faults.drop = 0.0
         self.pass_time(12.0)
         self.assertEqual(driver.state, "ready")
         driver.act({"base.vx": 0.1}, self.permit())
-        self.robot.foul.delay = 0.0
+        self.robot.faults.delay = 0.0
 
     def test_notices_a_link_that_is_half_open(self) -> None:
         """A robot that says nothing more over an open link is stale at once, and called again after three seconds."""
         driver = self.connected()
-        self.robot.foul.half_open = True
+        self.robot.faults.half_open = True
         self.pass_time(0.7)
         self.assertEqual(driver.state, "stale")
         self.pass_time(SILENCE_S + 2.0)
         self.assertGreater(driver.diagnostics()["faults"], 0)
-        self.robot.foul.half_open = False
+        self.robot.faults.half_open = False
         self.pass_time(9.0)
         self.assertEqual(driver.state, "ready")
 

@@ -171,7 +171,7 @@ def lost(photographer: Photographer, demo: Demonstration) -> None:
     groups = photographer.seen(phones["dark"])
     uuid = next(device["uuid"] for device in demo.api("devices") if device["name"] == name)
     desk.evaluate(f"location.hash = 'device/{uuid}'")
-    desk.locator(".chaos button").first.wait_for()
+    desk.locator(".fault-buttons button").first.wait_for()
     desk.get_by_role("button", name="Cut radio").click()
     desk.locator("#place-device .fault", has_text="took over after").wait_for()
     desk.locator("#place-device .fault").evaluate("e => e.scrollIntoView({ block: 'end' })")

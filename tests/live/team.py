@@ -28,7 +28,7 @@ from twisted.internet.stdio import StandardIO
 from twisted.internet.threads import deferToThread
 from twisted.protocols.basic import LineReceiver
 
-from middleware.fault import KINDS
+from middleware.faults.kinds import KINDS
 from swarmnode.gateway import sides
 from tests.live.keys import GATEWAYS, key_of
 from webnode.board import (

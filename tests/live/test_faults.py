@@ -12,7 +12,7 @@ class FaultPageTests(PageCase):
         """The page with dog2 open, and its faults there."""
         page = super().opened(screen, scheme)
         page.evaluate("location.hash = 'device/' + '02'.repeat(16)")
-        page.locator(".chaos button").first.wait_for()
+        page.locator(".fault-buttons button").first.wait_for()
         return page
 
     def test_let_it_fail(self) -> None:

@@ -9,13 +9,13 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact, unpacked
-from middleware.entangled.network.foul import FoulNetwork
 from middleware.entangled.network.joint import JointNetwork
 from middleware.entangled.network.network import Address, relayed
 from middleware.entangled.network.pipes import Pipes
 from middleware.entangled.network.tunnel import TunnelNetwork
 from middleware.entangled.network.url import Url
 from middleware.entangled.node import EntangledNode
+from middleware.faults.network import FaultyNetwork
 from tests.fleet import TEAM, World
 
 BOOTSTRAP, LATE = 0, 9
@@ -27,7 +27,7 @@ class Site:
     def __init__(self, world: TunnelWorld, place: int, urls: list[Url], is_served: bool = False) -> None:
         rng = world.rng(place)
         udp = world.board.network(*world.address(place))
-        self.udp = FoulNetwork(udp, world.clock, random.Random(place))
+        self.udp = FaultyNetwork(udp, world.clock, random.Random(place))
         carrier = world.pipes.carrier(f"10.2.0.{place}", 443)
         self.tunnel = TunnelNetwork(carrier, world.clock, rng, urls, is_served)
         network = JointNetwork(self.udp, self.tunnel)

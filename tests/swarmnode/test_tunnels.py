@@ -9,11 +9,11 @@ from twisted.internet.testing import MemoryReactorClock
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.clock import HeapClock
-from middleware.entangled.network.foul import FoulNetwork
 from middleware.entangled.network.joint import JointNetwork
 from middleware.entangled.network.network import Network, detours_of
 from middleware.entangled.network.switchboard import Switchboard
 from middleware.entangled.network.url import Proxy, Url
+from middleware.faults.network import FaultyNetwork
 from middleware.settings import Settings
 from swarmnode.tunnels import proxy_for, with_tunnels
 
@@ -27,7 +27,7 @@ class WiringTests(SynchronousTestCase):
         network = with_tunnels(settings, board.network, reactor, random.Random(1), {})()
         network.listen(lambda datagram, source: None)
         self.addCleanup(network.close)
-        return network, detours_of(FoulNetwork(network, HeapClock(), random.Random(1))), reactor
+        return network, detours_of(FaultyNetwork(network, HeapClock(), random.Random(1))), reactor
 
     def test_nothing_without_tunnels(self) -> None:
         """A node with neither tunnels nor a port for them has its plain network, and listens at no TCP port."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from middleware.fault import KINDS, MAX_S, MIN_S, USUAL_S
+from middleware.faults.kinds import KINDS, MAX_S, MIN_S, USUAL_S
 from webnode.errors import Refusal
 from webnode.field import Json
 from webnode.route import API, Ask, Field, Route, device

@@ -82,7 +82,7 @@ export function takeovers(root) {
 export function buttons(root) {
   let uuid = "";
   const seconds = element("input", { id: "f-seconds", type: "number", min: 1, max: 600, value: 15, required: "" });
-  const grid = element("div", { class: "chaos" });
+  const grid = element("div", { class: "fault-buttons" });
   const line = element("p", { role: "status" });
   const rows = element("ol", { class: "faults" });
   const none = element("p", { class: "empty" }, "This device allows no faults.");

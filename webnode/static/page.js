@@ -35,5 +35,5 @@ await enter((me) => onEvent("session", me));
 open({ onEvent });
 // The team is there first; what else there is to see comes after it.
 import("./views.js");
-import("./chaos.js");
+import("./fault-panels.js");
 import("./keep.js");

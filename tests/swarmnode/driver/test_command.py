@@ -107,7 +107,7 @@ class DriverCommandTests(SynchronousTestCase):
 
     def test_probe_sees_a_slow_and_spoilt_robot(self) -> None:
         """Lost world states and a camera without pictures are said."""
-        self.dog.foul.drop = 0.5
+        self.dog.faults.drop = 0.5
         _, output, _ = self.ground.swarm_driver(f"probe {BLIND}")
         self.assertIn("! it is slow", output)
 

@@ -1,4 +1,4 @@
-"""Tests of ``middleware.entangled.network.foul``: one node's network that fails on purpose."""
+"""Tests of ``middleware.faults.network``: one node's network that fails on purpose."""
 
 from __future__ import annotations
 
@@ -7,78 +7,78 @@ import random
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.clock import HeapClock
-from middleware.entangled.network.foul import FoulNetwork
 from middleware.entangled.network.network import Address
 from middleware.entangled.network.switchboard import CALM, Switchboard, Weather
+from middleware.faults.network import FaultyNetwork
 
 
-class FoulTests(SynchronousTestCase):
+class FaultyNetworkTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.clock = HeapClock()
         board = Switchboard(self.clock, random.Random(1))
-        self.foul = FoulNetwork(board.network(), self.clock, random.Random(2))
+        self.network = FaultyNetwork(board.network(), self.clock, random.Random(2))
         self.other = board.network()
         self.came: list[bytes] = []
         self.answers: list[bytes] = []
-        self.foul.listen(lambda datagram, source: self.came.append(datagram))
+        self.network.listen(lambda datagram, source: self.came.append(datagram))
         self.other.listen(lambda datagram, source: self.answers.append(datagram))
 
     def exchange(self, seconds: float = 0.01, times: int = 1) -> tuple[int, int]:
         """How many datagrams came in and went out, of as many sent each way."""
         before = len(self.came), len(self.answers)
         for _ in range(times):
-            self.other.send(b"in", self.foul.address)
-            self.foul.send(b"out", self.other.address)
+            self.other.send(b"in", self.network.address)
+            self.network.send(b"out", self.other.address)
         self.clock.advance(seconds)
         return len(self.came) - before[0], len(self.answers) - before[1]
 
     def test_changes_nothing_as_made(self) -> None:
         """Without a fault everything passes both ways, at once."""
         self.assertEqual(self.exchange(0.0, 20), (20, 20))
-        self.assertEqual(self.foul.eaten.total(), 0)
+        self.assertEqual(self.network.eaten.total(), 0)
 
     def test_deaf_and_mute(self) -> None:
         """A deaf node sends and hears nothing, a mute one hears and sends nothing, one that is both is cut off."""
         for deaf, mute, passes in ((True, False, (0, 1)), (False, True, (1, 0)), (True, True, (0, 0))):
-            self.foul.is_deaf, self.foul.is_mute = deaf, mute
+            self.network.is_deaf, self.network.is_mute = deaf, mute
             self.assertEqual(self.exchange(), passes)
-        self.foul.is_deaf = self.foul.is_mute = False
+        self.network.is_deaf = self.network.is_mute = False
         self.assertEqual(self.exchange(), (1, 1))
-        self.assertEqual(self.foul.eaten["silenced"], 4)
+        self.assertEqual(self.network.eaten["silenced"], 4)
 
     def test_loss(self) -> None:
         """Of a lossy node's datagrams the said share is lost, each way; the rest comes at once."""
-        self.foul.weather = Weather(loss=0.2)
+        self.network.weather = Weather(loss=0.2)
         came, went = self.exchange(times=1000)
         self.assertTrue(750 < came < 850 and 750 < went < 850, (came, went))
-        self.assertEqual(self.foul.eaten["lost"], 2000 - came - went)
+        self.assertEqual(self.network.eaten["lost"], 2000 - came - went)
 
     def test_duplicates_and_jitter(self) -> None:
         """Doubled datagrams come twice, jitter keeps within its bounds, reordered ones come last."""
-        self.foul.weather = Weather(delay_s=0.1, jitter_s=0.05, duplicate=1.0, reorder=1.0)
+        self.network.weather = Weather(delay_s=0.1, jitter_s=0.05, duplicate=1.0, reorder=1.0)
         self.assertEqual(self.exchange(0.14), (0, 0))
         self.assertEqual(self.exchange(0.12)[0], 2)
 
     def test_delay(self) -> None:
         """What is delayed comes late by that much, and what is on its way when the port closes never comes."""
-        self.foul.weather = Weather(delay_s=0.3)
+        self.network.weather = Weather(delay_s=0.3)
         self.assertEqual(self.exchange(0.29), (0, 0))
         self.clock.advance(0.02)
         self.assertEqual((len(self.came), len(self.answers)), (1, 1))
         self.exchange(0.1)
-        self.foul.weather = CALM
-        self.foul.close()
+        self.network.weather = CALM
+        self.network.close()
         self.clock.advance(1.0)
         self.assertEqual((len(self.came), len(self.answers)), (1, 1))
 
     def test_cut_catches_what_is_on_its_way(self) -> None:
         """A node that is cut off while something is on its way does not get it, nor does it go out."""
-        self.foul.weather = Weather(delay_s=0.3)
+        self.network.weather = Weather(delay_s=0.3)
         self.exchange(0.1)
-        self.foul.is_deaf = self.foul.is_mute = True
+        self.network.is_deaf = self.network.is_mute = True
         self.clock.advance(1.0)
         self.assertEqual((self.came, self.answers), ([], []))
 
     def test_address(self) -> None:
         """Its address is that of the network below."""
-        self.assertEqual(self.foul.address, Address("127.0.0.1", self.foul.address.port))
+        self.assertEqual(self.network.address, Address("127.0.0.1", self.network.address.port))

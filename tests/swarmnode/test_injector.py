@@ -1,4 +1,4 @@
-"""Tests of ``swarmnode.frailty``: faults on purpose reach a device, change what they say, and heal by themselves."""
+"""Tests of ``middleware.faults.injector``: injected faults reach a device, take effect, and end by themselves."""
 
 from __future__ import annotations
 
@@ -6,15 +6,16 @@ from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.fault import ASKED, CAUSE, KINDS, Fault
+from middleware.faults.injector import TRANSITIONS, State
+from middleware.faults.kinds import ASKED, CAUSE, KINDS, Fault
+from middleware.faults.takeover import TARGET_S, Takeover, acting
 from middleware.presence import devices_of
-from middleware.takeover import TARGET_S, Takeover, acting
 from swarmnode.asker import Refusal
 from swarmnode.rehearsal import VirtualTeam
 from swarmnode.rehearsed import RehearsedStage
 
 
-class FrailtyTests(SynchronousTestCase):
+class InjectorTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.stage = RehearsedStage(3)
         self.addCleanup(self.stage.stop)
@@ -112,6 +113,20 @@ class FrailtyTests(SynchronousTestCase):
         self.assertIn("seconds", str(error))
         error = self.assertRaises(Refusal, self.stage.assign, "fly")
         self.assertIn("turn-around", str(error))
+
+
+class TransitionTests(SynchronousTestCase):
+    def test_every_order_ends(self) -> None:
+        """From each state an ordered fault gets to its end, only by events that the table has; the end is final."""
+        for state in State:
+            reached, left = {state}, [state]
+            while left:
+                here = left.pop()
+                after = {there for (source, _), there in TRANSITIONS.items() if source is here} - reached
+                reached |= after
+                left += after
+            self.assertIn(State.OVER, reached)
+        self.assertEqual({there for (source, _), there in TRANSITIONS.items() if source is State.OVER}, {State.OVER})
 
 
 class ForbiddenTests(SynchronousTestCase):

@@ -1,4 +1,4 @@
-"""Foul: a network whose one node can be cut off, made deaf or mute, or given bad weather while it runs.
+"""A network whose one node can be cut off, made deaf or mute, or given bad weather while it runs.
 
 It goes around any other ``Network``: what the switchboard does between nodes in one process, this does at the port of
 a real one.  As it was made it changes nothing.
@@ -16,7 +16,7 @@ from middleware.entangled.network.network import Address, Network, Ports, Receiv
 from middleware.entangled.network.switchboard import CALM
 
 
-class FoulNetwork:
+class FaultyNetwork:
     """``network``, as it is for a node that fails.
 
     ``weather`` is met by each datagram that goes out and by each that comes in, so a question and its answer meet it

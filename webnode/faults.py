@@ -1,4 +1,4 @@
-"""Mischief: faults that are caused on purpose, in devices of the team that allow it, with a clock for each takeover."""
+"""Faults that the page injects into devices of the team that allow it, with the time of each takeover."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from twisted.logger import Logger
 from middleware.entangled.errors import EntangledError, NoAnswer
 from middleware.entangled.record import Record
 from middleware.errors import BadFault
-from middleware.fault import ASKED, CAUSE, KINDS, Fault, begins_in, fault_of
+from middleware.faults.kinds import ASKED, CAUSE, KINDS, Fault, begins_in, parse_fault
+from middleware.faults.takeover import Takeover, acting
 from middleware.node import SwarmNode
 from middleware.presence import devices_of
-from middleware.takeover import Takeover, acting
 from webnode.board import Faults
 from webnode.errors import Refusal
 from webnode.field import Json, text
@@ -38,7 +38,7 @@ class _Caused:
     clock: Takeover
 
 
-class Mischief:
+class FaultControl:
     """The faults that were caused through this node; ``clock`` gives seconds that only go forward."""
 
     _log = Logger()
@@ -60,7 +60,7 @@ class Mischief:
     def cause(self, uuid: str, kind: str, seconds: float, amount: float | None) -> Deferred[None]:
         """Ask the device; the clock runs from when it said in its answer that it would begin."""
         try:
-            fault = fault_of(kind, seconds, amount)
+            fault = parse_fault(kind, seconds, amount)
         except BadFault as error:
             return fail(Refusal(error.field, error.problem, error.remedy))
         record = next((each for device, each in devices_of(self._watch.records) if device.uuid == uuid), None)
@@ -157,4 +157,4 @@ def faults(ground: Ground) -> Faults | None:
     """The faults that this node can cause; None where its own settings do not allow them."""
     if not ground.settings.faults.allow:
         return None
-    return Mischief(ground.node, ground.reactor.seconds)
+    return FaultControl(ground.node, ground.reactor.seconds)

@@ -1,4 +1,4 @@
-"""Plug: the process of a node, killed or frozen by itself, for faults on purpose."""
+"""Kill or freeze the process of a node."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ import signal
 import subprocess
 
 
-class ProcessPlug:
-    """This process."""
+class OwnProcess:
+    """The process that runs this code."""
 
     def kill(self) -> None:
-        """End at once: nothing is said, nothing is written."""
+        """End at once by SIGKILL: nothing is sent, nothing is written."""
         os.kill(os.getpid(), signal.SIGKILL)
 
     def freeze(self, seconds: float) -> None:
-        """Stand still; a child that is started before wakes us, for who stands still hears no alarm."""
+        """Stop by SIGSTOP; a child started before sends SIGCONT, since a stopped process has no timers."""
         wake = f"sleep {seconds:.3f}; kill -CONT {os.getpid()}"
         quiet = subprocess.DEVNULL
-        # A session of its own: what stops our group is not to stop it, too.
+        # The child has a session of its own, so that a signal which stops this process group does not stop it.
         subprocess.Popen(["/bin/sh", "-c", wake], stdin=quiet, stdout=quiet, stderr=quiet, start_new_session=True)
         os.kill(os.getpid(), signal.SIGSTOP)

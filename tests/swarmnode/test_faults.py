@@ -1,4 +1,4 @@
-"""Tests of ``swarmnode.chaos``, ``havoc`` and ``scenario``: what a person reads who lets devices fail."""
+"""Tests of ``swarmnode.faults`` and ``middleware.faults.scenario``: what a person reads who lets devices fail."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.control.place import made
 from middleware.errors import BadSetting
-from middleware.fault import Fault
-from swarmnode.chaos import main
+from middleware.faults.kinds import Fault
+from middleware.faults.scenario import loaded, scenario_of
+from swarmnode.faults import main
 from swarmnode.rehearsal import VirtualTeam
-from swarmnode.scenario import loaded, scenario_of
 from tests.swarmnode.shell import Shell
 
 SCENARIOS = Path(__file__).parents[2] / "examples" / "scenarios"

@@ -1,4 +1,4 @@
-"""Chaos: ``swarm chaos``, faults of a running team on purpose, and how soon another took over."""
+"""``swarm chaos``: inject faults into a running team, and measure how soon another device takes over."""
 
 from __future__ import annotations
 
@@ -13,13 +13,12 @@ from middleware.entangled.control.command import FAILED, WRONG, Ask, asked
 from middleware.entangled.control.place import NoControl
 from middleware.entangled.control.word import printable
 from middleware.errors import BadFault, BadSetting
-from middleware.fault import ASKED, CAUSE, KINDS, MAX_S, MIN_S, USUAL_S, Fault, begins_in, fault_of
+from middleware.faults.kinds import ASKED, ASSIGN, CAUSE, KINDS, MAX_S, MIN_S, USUAL_S, Fault, begins_in, parse_fault
+from middleware.faults.play import NobodyThere, play
+from middleware.faults.scenario import Scenario, Step, loaded
 from middleware.presence import Device
 from middleware.tasks import outcome_of, tasks_of
 from swarmnode.asker import Asker, Refusal
-from swarmnode.frailty import ASSIGN
-from swarmnode.havoc import NobodyThere, play
-from swarmnode.scenario import Scenario, Step, loaded
 
 RUN, LIST = "run", "list"
 
@@ -138,7 +137,7 @@ def main(
             return 0
         else:
             wishes = parser().parse_args(given)
-            fault = fault_of(wishes.kind, wishes.seconds, wishes.amount)
+            fault = parse_fault(wishes.kind, wishes.seconds, wishes.amount)
             scenario = Scenario("", (Step(0.0, wishes.device, fault),))
         stage = TeamStage(Asker(wishes.node, ask), seconds, wait)
         losses = play(scenario, scenario.seed if wishes.seed is None else wishes.seed, stage, say)

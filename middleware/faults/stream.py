@@ -1,4 +1,4 @@
-"""Foul: how an emulator's wire misbehaves, by switches that tests and people set."""
+"""Faults of a byte stream, such as the link of an emulated robot, by switches that tests and people set."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 
 @dataclass
-class Foul:
+class StreamFaults:
     """The switches; ``wire`` says what of some bytes leaves the robot, and when.
 
     ``drop`` and ``garbage`` are the shares of writes that are lost and spoilt, ``delay`` the seconds that all of them

@@ -1,6 +1,6 @@
-"""Fault: what a node can be made to suffer on purpose; words and bounds of page, command and node.  Pure.
+"""The faults that can be injected into a node, with their bounds, for page, command line, scenarios and node.  Pure.
 
-A fault that is let loose heals by itself: a device that is cut off would not hear that it is over.
+Every fault ends by itself: a device that is cut off would not receive an order to end it.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from middleware.errors import BadFault
 from middleware.value import is_number
 
-CAUSE, ASKED = "device.fault", "device.faults"
-"""Methods of a node that allows faults: cause one, and say what can be caused and what goes on."""
+CAUSE, ASKED, ASSIGN = "device.fault", "device.faults", "device.assign"
+"""Methods of a node that allows faults: inject one; list its kinds and the active ones; publish a predefined task."""
 MIN_S, MAX_S, USUAL_S = 0.1, 600.0, 15.0
 MOST_AHEAD_S = 2.0
 """What a device says at most of how long it has until it suffers."""
@@ -56,7 +56,7 @@ class Fault:
     amount: float = 0.0
 
 
-def fault_of(kind: object, seconds: object = None, amount: object = None) -> Fault:
+def parse_fault(kind: object, seconds: object = None, amount: object = None) -> Fault:
     """The fault that foreign words mean; None stands for what is usual.  Raises ``BadFault``."""
     if not isinstance(kind, str) or kind not in KINDS:
         raise BadFault("kind", f"there is no fault {str(kind)[:40]!r}", f"choose one of {', '.join(KINDS)}")

@@ -1,4 +1,4 @@
-"""Takeover: a clock that runs from a fault until another device goes on with the task.  Pure."""
+"""A clock that runs from a fault until another device goes on with the task.  Pure."""
 
 from __future__ import annotations
 

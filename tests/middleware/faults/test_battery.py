@@ -1,4 +1,4 @@
-"""Tests of ``drivers.drained``: a robot whose battery reads low on purpose."""
+"""Tests of ``middleware.faults.battery``: a robot whose battery reads low on purpose."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from drivers.drained import DrainedDriver
 from drivers.driver import Permit
 from drivers.link import MemoryConnector
 from drivers.reading import Observation
 from drivers.sim.driver import SimDriver
 from middleware.entangled.clock import HeapClock
+from middleware.faults.battery import LowBattery
 
 
 class _Robot(SimDriver):
@@ -33,11 +33,11 @@ class _Robot(SimDriver):
         return action
 
 
-class DrainedTests(SynchronousTestCase):
+class LowBatteryTests(SynchronousTestCase):
     def test_only_the_battery_reads_low(self) -> None:
         """A drained robot tells of less charge, and of all else as before; healed, of the charge that it has."""
         robot = _Robot()
-        driver = DrainedDriver(robot)
+        driver = LowBattery(robot)
         seen: list[Any] = []
         driver.subscribe(seen.append)
         for level, told in ((None, 0.8), (0.03, 0.03), (0.9, 0.8), (None, 0.8)):
@@ -52,14 +52,14 @@ class DrainedTests(SynchronousTestCase):
         """A robot that tells of no charge is left as it is."""
         robot = _Robot()
         robot.shown = Observation(1.0, 1.0, {"odom.x": 2.0})
-        driver = DrainedDriver(robot)
+        driver = LowBattery(robot)
         driver.level = 0.01
         self.assertIs(driver.observe(), robot.shown)
 
     def test_all_else_is_the_robot(self) -> None:
         """What it is, its state, its token and its motion are those of the robot."""
         robot = _Robot()
-        driver = DrainedDriver(robot)
+        driver = LowBattery(robot)
         self.assertIs(driver.description, robot.description)
         self.assertEqual((driver.state, driver.token), (robot.state, robot.token))
         self.assertEqual(driver.act({"base.vx": 0.1}, Permit(1, 2.0)), {"base.vx": 0.1})

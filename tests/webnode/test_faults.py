@@ -1,4 +1,4 @@
-"""Tests of ``webnode.mischief`` and its routes: faults that a visitor causes, and the clock beside them."""
+"""Tests of ``webnode.faults`` and its routes: faults that a visitor causes, and the clock beside them."""
 
 from __future__ import annotations
 
@@ -7,22 +7,22 @@ from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.fault import KINDS
+from middleware.faults.kinds import KINDS
 from swarmnode.rehearsal import VirtualTeam
 from webnode.app import create_app
 from webnode.board import Board, MemoryChronicle, MemoryFaults, OpenSessions
 from webnode.desk import MemoryDesk
 from webnode.errors import Refusal
-from webnode.mischief import TOLD_S, Mischief, faults
+from webnode.faults import TOLD_S, FaultControl, faults
 from webnode.state import state_of
 
 
-class MischiefTests(SynchronousTestCase):
+class FaultControlTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.team = VirtualTeam(4, faults=True)
         self.addCleanup(self.team.stop)
         self.node = self.team.services["vaio"].assembly.node
-        self.mischief = Mischief(self.node, self.team.clock.seconds)
+        self.control = FaultControl(self.node, self.team.clock.seconds)
         self.team.clock.advance(2.0)
 
     def uuid(self, name: str) -> str:
@@ -32,7 +32,7 @@ class MischiefTests(SynchronousTestCase):
     def cause(self, uuid: str, kind: str, seconds: float = 4.0, amount: float | None = None) -> Any:
         """The outcome of an order within two seconds: None, or the refusal."""
         came: list[Any] = []
-        self.mischief.cause(uuid, kind, seconds, amount).addCallbacks(came.append, lambda f: came.append(f.value))
+        self.control.cause(uuid, kind, seconds, amount).addCallbacks(came.append, lambda f: came.append(f.value))
         for _ in range(40):
             if came:
                 break
@@ -50,12 +50,12 @@ class MischiefTests(SynchronousTestCase):
 
     def test_learn_what_can_fail(self) -> None:
         """Each device is asked what it can suffer; of one that never came nothing is known."""
-        self.assertEqual(list(self.mischief.kinds(self.uuid("dog1"))), list(KINDS))
-        self.assertNotIn("battery", self.mischief.kinds(self.uuid("vaio")))
-        self.assertEqual(list(self.mischief.kinds("00" * 20)), [])
+        self.assertEqual(list(self.control.kinds(self.uuid("dog1"))), list(KINDS))
+        self.assertNotIn("battery", self.control.kinds(self.uuid("vaio")))
+        self.assertEqual(list(self.control.kinds("00" * 20)), [])
         self.assertIsNone(self.cause(self.uuid("dog1"), "kill"))
         self.team.clock.advance(5.0)
-        self.assertEqual(list(self.mischief.kinds(self.uuid("dog1"))), list(KINDS))
+        self.assertEqual(list(self.control.kinds(self.uuid("dog1"))), list(KINDS))
         self.assertEqual(self.cause(self.uuid("dog1"), "loss").problem, "it has left the network")
         self.team.clock.advance(20.0)
         self.assertIsNone(self.cause(self.uuid("dog1"), "loss"))
@@ -66,20 +66,20 @@ class MischiefTests(SynchronousTestCase):
         lost = self.acting()
         self.assertIsNone(self.cause(lost, "radio"))
         self.team.clock.advance(0.6)
-        (row,) = self.mischief.active()
+        (row,) = self.control.active()
         self.assertEqual((row["uuid"], row["kind"], row["takeover_s"], row["watched"]), (lost, "radio", None, True))
         self.team.clock.advance(2.0)
-        (row,) = self.mischief.active()
+        (row,) = self.control.active()
         self.assertLess(float(str(row["takeover_s"])), 2.0)
         self.assertIn(row["to"], {"dog1", "dog2", "dog3"} - {row["name"]})
         self.assertTrue(0.0 < float(str(row["left_s"])) < 2.0)
         self.team.clock.advance(4.0 + TOLD_S)
-        self.assertEqual(self.mischief.active(), [])
+        self.assertEqual(self.control.active(), [])
 
     def test_idle_device(self) -> None:
         """Where the device was at no task, no clock runs."""
         self.assertIsNone(self.cause(self.uuid("dog2"), "loss", 4.0, 0.3))
-        (row,) = self.mischief.active()
+        (row,) = self.control.active()
         self.assertEqual((row["task"], row["watched"], row["amount"]), ("", False, 0.3))
 
     def test_refuse(self) -> None:
@@ -97,7 +97,7 @@ class MischiefTests(SynchronousTestCase):
         self.team.silence("dog3")
         refusal = self.cause(dog, "loss")
         self.assertEqual((refusal.status, refusal.problem), (504, "dog3 does not answer"))
-        self.assertEqual(self.mischief.active(), [])
+        self.assertEqual(self.control.active(), [])
 
     def test_only_where_allowed(self) -> None:
         """A web node whose own settings do not allow faults offers none; devices that do not allow them say so."""
@@ -110,11 +110,11 @@ class MischiefTests(SynchronousTestCase):
         self.addCleanup(plain.stop)
         Bare.settings = plain.services["vaio"].settings
         self.assertIsNone(faults(Bare()))  # type: ignore[arg-type]
-        mischief = Mischief(plain.services["vaio"].assembly.node, plain.clock.seconds)
+        control = FaultControl(plain.services["vaio"].assembly.node, plain.clock.seconds)
         plain.clock.advance(2.0)
         dog = plain.services["dog1"].assembly.node.uuid
-        self.assertEqual(list(mischief.kinds(dog)), [])
-        refusal = self.failureResultOf(mischief.cause(dog, "kill", 4.0, None), Refusal).value
+        self.assertEqual(list(control.kinds(dog)), [])
+        refusal = self.failureResultOf(control.cause(dog, "kill", 4.0, None), Refusal).value
         self.assertIn("allow = true", refusal.remedy)
 
 

@@ -1,6 +1,6 @@
-"""Havoc: a scenario carried out on a stage, with a clock for each takeover.
+"""Run a scenario of faults on a stage, and measure the time of each takeover.
 
-The stage is a running team (``swarm chaos``) or one in memory, on a turned clock; the same happens on both.
+The stage is a running team (``swarm chaos``) or a simulated one in virtual time; both run the same steps.
 """
 
 from __future__ import annotations
@@ -10,10 +10,10 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Protocol
 
-from middleware.fault import KINDS, Fault
+from middleware.faults.kinds import KINDS, Fault
+from middleware.faults.scenario import ANY, WHO_ACTS, Scenario
+from middleware.faults.takeover import TARGET_S, Takeover, acting
 from middleware.presence import Device
-from middleware.takeover import TARGET_S, Takeover, acting
-from swarmnode.scenario import ANY, WHO_ACTS, Scenario
 
 LOOK_S = 0.05
 PATIENCE_S = 60.0

@@ -1,4 +1,4 @@
-"""Tests of ``middleware.fault`` and ``middleware.takeover``: lawful faults, and the clock beside them."""
+"""Tests of ``middleware.faults.kinds`` and ``middleware.faults.takeover``: lawful faults, and the clock beside them."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from typing import Any
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.errors import BadFault
-from middleware.fault import KINDS, Fault, begins_in, fault_of
+from middleware.faults.kinds import KINDS, Fault, begins_in, parse_fault
+from middleware.faults.takeover import WATCHED_S, Takeover, acting
 from middleware.presence import EXECUTING, SEARCHING, Device
-from middleware.takeover import WATCHED_S, Takeover, acting
 
 
 class FaultTests(SynchronousTestCase):
     def test_usual(self) -> None:
         """Of each kind there is a usual fault, and its own amount is lawful."""
         for kind, rule in KINDS.items():
-            self.assertEqual(fault_of(kind), Fault(kind, 15.0, rule.amount))
-        self.assertEqual(fault_of("loss", 3, 0.5), Fault("loss", 3.0, 0.5))
-        self.assertEqual(fault_of("kill", None, 0), Fault("kill"))
+            self.assertEqual(parse_fault(kind), Fault(kind, 15.0, rule.amount))
+        self.assertEqual(parse_fault("loss", 3, 0.5), Fault("loss", 3.0, 0.5))
+        self.assertEqual(parse_fault("kill", None, 0), Fault("kill"))
 
     def test_begins(self) -> None:
         """A device says when its fault begins; an answer that no node gives counts for at once."""
@@ -42,7 +42,7 @@ class FaultTests(SynchronousTestCase):
             (("radio", 5, 0.5), "amount"),
         ]
         for words, field in wrong:
-            error = self.assertRaises(BadFault, fault_of, *words)
+            error = self.assertRaises(BadFault, parse_fault, *words)
             self.assertEqual(error.field, field, words)
             self.assertNotIn("\n", str(error))
 

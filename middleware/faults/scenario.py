@@ -1,4 +1,4 @@
-"""Scenario: faults in their order, out of a TOML file, so that a bad day can be had again."""
+"""A scenario: faults with their times from a TOML file, so that a run can be repeated."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from middleware.errors import BadFault, BadSetting
-from middleware.fault import Fault, fault_of
+from middleware.faults.kinds import Fault, parse_fault
 from middleware.value import is_number, is_whole
 
 WHO_ACTS, ANY = "executing", "any"
@@ -78,7 +78,7 @@ def _step(table: Any, origin: str, where: str) -> Step:
             origin, f"{where} device", "must be a text", f'write "{WHO_ACTS}", "{ANY}" or a device\'s name'
         )
     try:
-        return Step(float(at), device, fault_of(table.get("kind"), table.get("seconds"), table.get("amount")))
+        return Step(float(at), device, parse_fault(table.get("kind"), table.get("seconds"), table.get("amount")))
     except BadFault as error:
         raise BadSetting(origin, f"{where} {error.field}", error.problem, error.remedy) from error
 

@@ -1,4 +1,4 @@
-// Chaos: where operators may let devices fail, the page has two panels for it; elsewhere nothing of them is loaded.
+// Panels of faults: where operators may let devices fail, the page has two panels for it; elsewhere nothing of them is loaded.
 import { get } from "./link.js";
 import { panel } from "./panel.js";
 

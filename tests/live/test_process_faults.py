@@ -1,4 +1,4 @@
-"""Tests of ``swarmnode.plug`` with real processes: one that freezes itself goes on, one that kills itself is gone."""
+"""Tests of ``middleware.faults.process`` with real processes: a frozen one continues, a killed one is gone."""
 
 from __future__ import annotations
 
@@ -12,15 +12,20 @@ from twisted.trial.unittest import SynchronousTestCase
 ROOT = Path(__file__).parents[2]
 FREEZE = """
 import time
-from swarmnode.plug import ProcessPlug
+from middleware.faults.process import OwnProcess
 began = time.monotonic()
-ProcessPlug().freeze(0.5)
+OwnProcess().freeze(0.5)
 print(time.monotonic() - began)
 """
-KILL = "from swarmnode.plug import ProcessPlug; print('here', flush=True); ProcessPlug().kill(); print('still here')"
+KILL = """
+from middleware.faults.process import OwnProcess
+print('here', flush=True)
+OwnProcess().kill()
+print('still here')
+"""
 
 
-class PlugTests(SynchronousTestCase):
+class OwnProcessTests(SynchronousTestCase):
     def run_program(self, program: str) -> subprocess.CompletedProcess[str]:
         """Run it in a process of its own."""
         return subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=60)

@@ -1,0 +1,209 @@
+"""The faults of one node: take orders, apply each fault for its seconds, and remove it.
+
+An ordered fault goes through ``TRANSITIONS``.  Faults of different kinds are active side by side; a new one of the same
+kind replaces the one before.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any, Protocol
+
+from twisted.internet.defer import Deferred
+from twisted.internet.interfaces import IReactorTime
+from twisted.logger import Logger
+
+from middleware.entangled.errors import Refused
+from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.network.network import Network
+from middleware.entangled.network.switchboard import CALM, Weather
+from middleware.errors import BadFault, UnknownTask
+from middleware.faults.battery import LowBattery
+from middleware.faults.kinds import ASKED, ASSIGN, CAUSE, KINDS, Fault, parse_fault
+from middleware.faults.network import FaultyNetwork
+from middleware.node import SwarmNode
+from middleware.tasks import Task
+
+MakeTask = Callable[[str, str, float], Task]
+"""A predefined task by its name, a new task id, and the wall clock."""
+AFTER_ANSWERS = 0.5
+"""Seconds from the answer to the fault: a node that is cut off or dead could not confirm the order.  Where datagrams
+get lost, it may have to send its answer several times."""
+
+
+class State(Enum):
+    """How far an ordered fault is."""
+
+    ORDERED = "ordered"
+    ACTIVE = "active"
+    OVER = "over"
+
+
+class Event(Enum):
+    """What happens to an ordered fault."""
+
+    BEGIN = "begin"
+    END = "end"
+    REPLACE = "replace"
+
+
+TRANSITIONS: Mapping[tuple[State, Event], State] = {
+    (State.ORDERED, Event.BEGIN): State.ACTIVE,
+    (State.ACTIVE, Event.REPLACE): State.OVER,
+    (State.ACTIVE, Event.END): State.OVER,
+    (State.OVER, Event.END): State.OVER,
+}
+"""The end of a fault that was replaced comes too, and changes nothing.  Every other pair is a programming error."""
+
+
+class Process(Protocol):
+    """The process of a node."""
+
+    def kill(self) -> None:
+        """End the node as a power failure does."""
+
+    def freeze(self, seconds: float) -> None:
+        """Stop the node for so long, then let it continue."""
+
+
+@dataclass(eq=False)
+class _Order:
+    fault: Fault
+    until: float = 0.0
+    state: State = State.ORDERED
+
+    def advance(self, event: Event) -> bool:
+        """Go on to the next state; whether it is another one."""
+        before, self.state = self.state, TRANSITIONS[self.state, event]
+        return self.state is not before
+
+
+class SkewedClock:
+    """A wall clock that is ``ahead`` by so many seconds."""
+
+    def __init__(self, wall: Callable[[], float]) -> None:
+        self.ahead = 0.0
+        self._wall = wall
+
+    def __call__(self) -> float:
+        """The seconds that it shows."""
+        return self._wall() + self.ahead
+
+
+class FaultInjector:
+    """Faults of one node.
+
+    The node must use ``wall`` as its wall clock, open its port through ``open_network``, and its agent the driver from
+    ``wrap_driver``.  Without a ``process`` the node can be neither killed nor frozen, without a driver not discharged.
+    """
+
+    _log = Logger()
+
+    def __init__(
+        self,
+        clock: IReactorTime,
+        wall: Callable[[], float],
+        rng: random.Random,
+        make_network: Callable[[], Network],
+        process: Process | None,
+    ) -> None:
+        self.wall = SkewedClock(wall)
+        self._clock = clock
+        self._rng = rng
+        self._make_network = make_network
+        self._process = process
+        self._network: FaultyNetwork | None = None
+        self._battery: LowBattery | None = None
+        self._active: dict[str, _Order] = {}
+
+    def open_network(self) -> Network:
+        """Make the node's network, which can be made to fail."""
+        rng = random.Random(self._rng.getrandbits(64))
+        self._network = FaultyNetwork(self._make_network(), self._clock, rng)
+        return self._network
+
+    def wrap_driver(self, driver: Any) -> Any:
+        """Return ``driver`` with a battery level that can be made to read low."""
+        self._battery = LowBattery(driver)
+        return self._battery
+
+    def expose(self, node: SwarmNode, make_task: MakeTask) -> None:
+        """Let other nodes order faults of ``node``, list them, and publish a predefined task for a scenario.
+
+        ``make_task`` raises ``UnknownTask`` where it knows no task of that name.
+        """
+
+        def cause(peer: Contact, kind: object, seconds: object, amount: object) -> float:
+            try:
+                fault = parse_fault(kind, seconds, amount)
+            except BadFault as error:
+                raise Refused(str(error)) from error
+            if fault.kind not in self.kinds():
+                raise Refused(f"kind: this device cannot suffer {fault.kind}; choose one of {', '.join(self.kinds())}")
+            node.later(AFTER_ANSWERS, self._begin, node, _Order(fault))
+            return AFTER_ANSWERS
+
+        def list_faults(peer: Contact) -> dict[str, Any]:
+            now = self._clock.seconds()
+            active = [[each.fault.kind, each.until - now, each.fault.amount] for each in self._active.values()]
+            return {"kinds": self.kinds(), "active": active}
+
+        def assign(peer: Contact, name: str) -> Deferred[str]:
+            try:
+                task = make_task(name, node.rng.randbytes(6).hex(), node.wall())
+            except UnknownTask as error:
+                raise Refused(str(error)) from error
+            return Deferred.fromCoroutine(node.submit(task)).addCallback(lambda task: task.task_id)
+
+        expose = node.entangled.endpoint.expose
+        expose(CAUSE, cause, changes=True)
+        expose(ASKED, list_faults)
+        expose(ASSIGN, assign, changes=True)
+
+    def kinds(self) -> list[str]:
+        """The kinds of faults that this node can have."""
+        lacks = {*(() if self._process else ("kill", "freeze")), *(() if self._battery else ("battery",))}
+        return [kind for kind in KINDS if kind not in lacks]
+
+    # -- inside -----------------------------------------------------------------------------------------------------
+
+    def _begin(self, node: SwarmNode, order: _Order) -> None:
+        fault, name = order.fault, node.presence.device.name
+        self._log.warn("{name} suffers {kind} for {s:g} s, on purpose", name=name, kind=fault.kind, s=fault.seconds)
+        if fault.kind == "kill" and self._process is not None:
+            return self._process.kill()
+        order.advance(Event.BEGIN)
+        order.until = self._clock.seconds() + fault.seconds
+        former = self._active.get(fault.kind)
+        if former is not None:
+            former.advance(Event.REPLACE)
+        self._active[fault.kind] = order
+        self._apply()
+        node.later(fault.seconds, self._end, order)
+        if fault.kind == "freeze" and self._process is not None:
+            self._process.freeze(fault.seconds)
+
+    def _end(self, order: _Order) -> None:
+        if order.advance(Event.END):
+            del self._active[order.fault.kind]
+            self._apply()
+
+    def _apply(self) -> None:
+        """Let the active faults take effect, and no others."""
+
+        def amount(kind: str, otherwise: float = 0.0) -> float:
+            return self._active[kind].fault.amount if kind in self._active else otherwise
+
+        self.wall.ahead = amount("skew")
+        if self._network is not None:
+            weather = Weather(delay_s=amount("delay"), loss=amount("loss"))
+            self._network.weather = CALM if weather == CALM else weather
+            self._network.is_deaf = "radio" in self._active
+            self._network.is_mute = "radio" in self._active or "one-way" in self._active
+        if self._battery is not None:
+            level = amount("battery", math.inf)
+            self._battery.level = None if level == math.inf else level
