@@ -22,8 +22,8 @@ from middleware.entangled.network.switchboard import Switchboard, Weather
 from middleware.settings import Settings
 from sim.demo.trials import main as run_trials
 from sim.scene import loaded
+from sim.team.machine import Machine, MachineConnector, MachineNetwork
 from sim.yard import Yard
-from swarmnode.frost import Frost
 from swarmnode.sandbox import simulated
 from swarmnode.seams import Seams
 from swarmnode.service import NodeService
@@ -67,7 +67,7 @@ class VirtualTeam:
         self.yard = Yard(self.clock, random.Random(f"{seed}/yard"), loaded("three-dogs"))
         self.yard.start()
         self.services: dict[str, NodeService] = {}
-        self.frosts: dict[str, Frost] = {}
+        self.machines: dict[str, Machine] = {}
         self.connectors: dict[str, MemoryConnector] = {}
         self.operator = drawn(f"team-{seed}", random.Random(f"{seed}/operator"))
         self._dice = random.Random(f"{seed}/members")
@@ -101,15 +101,15 @@ class VirtualTeam:
         if self._faults:
             mapping["faults"] = {"allow": True}
         mapping.update(tables or {})
-        frost = self.frosts[name] = Frost(self.clock)
+        machine = self.machines[name] = Machine(self.clock)
         connector = self.connectors[name] = self.yard.connector()
         seams = Seams(
-            frost,
-            lambda: frost.network(self.board.network(*self.address(name))),
+            machine,
+            lambda: MachineNetwork(machine, self.board.network(*self.address(name))),
             MemoryStore(),
             random.Random(f"{self._seed}/{name}"),
             self.clock.seconds,
-            frost.connector(connector),
+            MachineConnector(machine, connector),
             shelf,
             _Process(self, name),
             membership=self._membership(name),
@@ -152,11 +152,11 @@ class VirtualTeam:
 
     def freeze(self, name: str) -> None:
         """Stop a node as SIGSTOP does; its body is another machine, and goes on."""
-        self.frosts[name].freeze()
+        self.machines[name].freeze()
 
     def thaw(self, name: str) -> None:
         """Let a frozen node go on."""
-        self.frosts[name].thaw()
+        self.machines[name].thaw()
 
     def silence(self, name: str, one_way: bool = False) -> None:
         """Let nothing pass between a node and the others; ``one_way``: it still hears them."""

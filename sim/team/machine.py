@@ -1,7 +1,8 @@
-"""Machine: the computer of one place, with a clock of its own; it may run fast or slow, stand still, and die.
+"""The computer of one simulated node, with a clock of its own: it can be fast or slow, frozen, suspended, and die.
 
-It is the clock of the node there and what its datagrams come in through.  Nothing of a machine that stands still runs;
-when it goes on, first what was due is done, then what came in meanwhile, as a reactor does after SIGCONT.
+It is the clock of the node, and receives the node's datagrams and the bytes of its robot.  Nothing runs on a frozen
+machine; when it continues, first its timers run that are overdue, then it receives what arrived, as a reactor does
+after SIGCONT.
 """
 
 from __future__ import annotations
@@ -13,8 +14,8 @@ from twisted.internet.error import AlreadyCalled, AlreadyCancelled
 from twisted.internet.interfaces import IDelayedCall, IReactorTime
 from zope.interface import implementer
 
-from middleware.entangled.network.network import Address, Receiver
-from middleware.entangled.network.switchboard import SwitchboardNetwork
+from drivers.link import Caller, Connector, Line, Link
+from middleware.entangled.network.network import Address, Network, Receiver, ports_of
 
 LEAST = 1e-6
 """Seconds that a timer takes at least, unless it is due at once.  What is left of a wait after rounding two clocks may
@@ -89,6 +90,9 @@ class _MachineCall:
 class Machine:
     """A computer whose clock runs ``rate`` times as fast as the world's, and began at ``offset``."""
 
+    COUNTS_SUSPENSION = True
+    """Whether its clock goes on while it is suspended (CLOCK_BOOTTIME does, CLOCK_MONOTONIC does not)."""
+
     def __init__(self, world: IReactorTime, rate: float = 1.0, offset: float = 0.0) -> None:
         self.rate = rate
         self.is_alive = True
@@ -99,6 +103,8 @@ class Machine:
         # What the clock showed, and when, the last time that its rate was set.
         self._shown = offset
         self._since = 0.0
+        self._lost = 0.0
+        self._stopped_at: float | None = None
 
     def seconds(self) -> float:
         """The machine's own moment; it goes on while the machine stands still."""
@@ -106,7 +112,17 @@ class Machine:
 
     def shown_at(self, moment: float) -> float:
         """What its clock shows at a ``moment`` of the world's, if its rate stays."""
+        if self._stopped_at is not None:
+            moment = self._stopped_at
         return self._shown + self.rate * (moment - self._since)
+
+    def at(self, shown: float) -> float:
+        """The world's moment at which the clock shows that, if its rate stays."""
+        return self._since + (shown - self._shown) / self.rate
+
+    def unstopped_at(self, shown: float) -> float:
+        """The world's moment at which the clock would show that if it had never stopped in a suspension."""
+        return self.at(shown) - self._lost
 
     def set_rate(self, rate: float) -> None:
         """Run so fast from now on; timers that are set already are due when they were to be."""
@@ -130,18 +146,25 @@ class Machine:
         elif self.is_alive:
             receive(*arguments)
 
-    def take(self, receiver: Receiver, datagram: bytes, source: Address) -> None:
+    def take(self, receive: Callable[..., object], *arguments: Any) -> None:
         """Hand in a datagram; while the machine stands still only so many wait."""
         if not self.is_still or len(self._arrived) < MOST_WAITING:
-            self.heard(receiver, datagram, source)
+            self.heard(receive, *arguments)
 
-    def freeze(self) -> None:
-        """Stand still, as a process does after SIGSTOP; its clock goes on."""
+    def freeze(self, is_suspended: bool = False) -> None:
+        """Stop the process, as SIGSTOP does, or suspend the whole machine."""
         self.is_still = True
+        if is_suspended and not self.COUNTS_SUSPENSION:
+            self._stopped_at = self._world.seconds()
 
     def thaw(self) -> None:
         """Go on, with everything that is overdue."""
         self.is_still = False
+        if self._stopped_at is not None:
+            stopped = self._world.seconds() - self._stopped_at
+            self._stopped_at = None
+            self._lost += stopped
+            self._since += stopped
         timers, self.timers = self.timers, []
         arrived, self._arrived = self._arrived, []
         for call in timers:
@@ -158,14 +181,14 @@ class Machine:
 
 
 class MachineNetwork:
-    """A port of the switchboard that a machine hears by."""
+    """A network whose datagrams a machine receives."""
 
-    def __init__(self, machine: Machine, network: SwitchboardNetwork) -> None:
+    def __init__(self, machine: Machine, network: Network) -> None:
         self._machine = machine
         self._network = network
         self.send = network.send
         self.close = network.close
-        self.ports = network
+        self.ports = ports_of(network)
 
     @property
     def address(self) -> Address:
@@ -175,3 +198,30 @@ class MachineNetwork:
     def listen(self, receiver: Receiver) -> None:
         """Open the port; what comes in goes to ``receiver`` by way of the machine."""
         self._network.listen(lambda datagram, source: self._machine.take(receiver, datagram, source))
+
+
+class MachineConnector:
+    """A connector whose links a machine reads."""
+
+    def __init__(self, machine: Machine, connector: Connector) -> None:
+        self._machine = machine
+        self._connector = connector
+
+    def call(self, host: str, port: int, caller: Caller) -> Line:
+        """Open a link; what arrives on it goes to ``caller`` by way of the machine."""
+        return self._connector.call(host, port, _MachineCaller(self._machine, caller))
+
+
+class _MachineCaller:
+    def __init__(self, machine: Machine, caller: Caller) -> None:
+        self._machine = machine
+        self._caller = caller
+
+    def link_up(self, link: Link) -> None:
+        self._machine.heard(self._caller.link_up, link)
+
+    def link_down(self) -> None:
+        self._machine.heard(self._caller.link_down)
+
+    def received(self, data: bytes) -> None:
+        self._machine.heard(self._caller.received, data)

@@ -21,7 +21,7 @@ from middleware.commitment.patience import in_time
 from middleware.entangled.data.store import Store
 from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact
-from tests.invariants.machine import Machine
+from sim.team.machine import Machine
 
 if TYPE_CHECKING:
     from tests.invariants.team import Team

@@ -45,8 +45,8 @@ from middleware.entangled.wire import greeting
 from middleware.entangled.wire.greeting import Cookies, Greeter
 from middleware.entangled.wire.method import Ledger
 from middleware.entangled.wire.session import Session
+from sim.team.machine import Machine
 from tests.invariants.leases import Leases
-from tests.invariants.machine import Machine
 
 
 async def _nothing(*_: object) -> None:

@@ -61,14 +61,14 @@ class Referee:
 
     def on_issue(self, bidder: Bidder, task_id: str, permit: Permit) -> None:
         """An agent sends a command under its lease, perhaps when it has just been thawed."""
-        truly = bidder.machine.truly(permit.deadline)
+        truly = bidder.machine.unstopped_at(permit.deadline)
         self.history.note(Issued, task_id, bidder.place, bidder.machine.at(permit.deadline), truly)
 
     def on_command(self, bidder: Bidder, task_id: str, permit: Permit, told: float, remaining: float) -> None:
         """The device, shared by all, takes a command or refuses it."""
         now, gate = self._world.clock.seconds(), self.gates[task_id]
         deadline = min(told, now) + remaining
-        truly, is_accepted = bidder.machine.truly(permit.deadline), True
+        truly, is_accepted = bidder.machine.unstopped_at(permit.deadline), True
         try:
             gate.admit(Permit(permit.token, deadline), now)
         except StaleCommand:

@@ -16,8 +16,8 @@ from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address
 from sim.team.event import Born, Died
+from sim.team.machine import Machine
 from tests.invariants.bidder import TICK, Bidder
-from tests.invariants.machine import Machine
 from tests.invariants.radio import Radio
 from tests.invariants.referee import Referee
 

@@ -13,8 +13,8 @@ from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.kademlia.distance import closest
 from middleware.entangled.record import Record
 from middleware.tasks import COMPLETED, RESULT, Result, Task, group_key, outcome_of
+from sim.team.machine import Machine
 from tests.fleet import FleetCase
-from tests.invariants.machine import Machine
 from tests.middleware.commitment.room import TTL, RoomCase, T
 
 

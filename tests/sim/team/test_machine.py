@@ -70,12 +70,39 @@ class MachineTests(SynchronousTestCase):
         machine.thaw()
         self.assertEqual(self.seen, ["first", "second", b"hello"])
 
+    def test_overdue_timer_can_be_cancelled(self) -> None:
+        """A timer that is overdue counts as waiting: the one that runs before it may cancel it."""
+        machine = Machine(self.world)
+        first = machine.callLater(1.0, lambda: second.cancel())
+        second = machine.callLater(1.0, self.seen.append, "second")
+        machine.freeze()
+        self.world.advance(5.0)
+        self.assertTrue(second.active())
+        machine.thaw()
+        self.assertEqual(self.seen, [])
+        self.assertRaises(AlreadyCancelled, second.cancel)
+        self.assertRaises(AlreadyCalled, first.cancel)
+
+    def test_clock_that_stops_while_suspended(self) -> None:
+        """A clock counts a suspension, unless it is made not to; then it is late by as much from then on."""
+        for counts, shown in ((True, 8.0), (False, 2.0)):
+            self.world = HeapClock()
+            machine = Machine(self.world, 2.0)
+            machine.COUNTS_SUSPENSION = counts
+            self.world.advance(1.0)
+            machine.freeze(is_suspended=True)
+            self.world.advance(3.0)
+            self.assertEqual(machine.seconds(), shown)
+            machine.thaw()
+            self.assertEqual((machine.seconds(), machine.at(shown + 2.0)), (shown, 5.0))
+            self.assertEqual(machine.unstopped_at(shown), shown / 2.0)
+
     def test_buffer_holds_so_many_datagrams(self) -> None:
         """A machine that stands still for long keeps the first datagrams and drops the rest."""
         machine = Machine(self.world)
         machine.freeze()
         for number in range(MOST_WAITING + 50):
-            machine.take(lambda datagram, source: self.seen.append(datagram), b"%d" % number, None)  # type: ignore[arg-type]
+            machine.take(lambda datagram, source: self.seen.append(datagram), b"%d" % number, None)
         machine.thaw()
         self.assertEqual((len(self.seen), self.seen[0]), (MOST_WAITING, b"0"))
 
