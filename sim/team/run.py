@@ -11,10 +11,10 @@ from twisted.logger import ILogObserver, LogEvent, Logger, globalLogPublisher
 
 from sim.team.checker import check
 from sim.team.event import Settled
+from sim.team.faults.injector import TeamFaults
 from sim.team.figure import Bound, Figure
 from sim.team.scenario import Scenario
 from sim.team.team import Team
-from sim.team.trouble import Troubles
 from sim.team.workload import Kinds, Workload
 
 ASKED = 10.0
@@ -93,7 +93,7 @@ class Run:
         self._watched = watched
         self._seconds = seconds
         self._grain = SLICE
-        self._troubles = Troubles(self.team)
+        self._faults = TeamFaults(self.team)
         self._is_ended = False
 
     def go(self) -> Outcome:
@@ -170,7 +170,7 @@ class Run:
         """Let faults and sessions befall the team while the workloads act."""
         scenario, clock = self.scenario, self.team.clock
         self.began_at = began = clock.seconds()
-        self._troubles.begin()
+        self._faults.begin()
         end = began + scenario.seconds
         while not self._is_ended and clock.seconds() < end - NONE:
             if clock.seconds() >= began + scenario.lead - NONE:
@@ -180,7 +180,7 @@ class Run:
 
     def _repair(self) -> None:
         if self.scenario.repair:
-            self._troubles.end()
+            self._faults.end()
         self._pass(self.scenario.repair)
 
     def _ask(self) -> None:

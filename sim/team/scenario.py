@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 from middleware import setting
 from middleware.errors import BadSetting
-from sim.team.fault import Fault, fault_problem
+from sim.team.faults.settings import Fault, fault_problem
 from sim.team.figure import Bound, bound_of
 from sim.team.link import LinkSettings
 from sim.team.session import KINDS, Session

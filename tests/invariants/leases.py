@@ -17,16 +17,41 @@ from middleware.commitment.lessee import STAGGER
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.kademlia.contact import Contact
 from sim.team.event import Awaited
+from sim.team.faults.timeline import TimedFault, Timeline
 from sim.team.shrink import WHOLE, Trim
 from tests.invariants.radio import CALM, Air
 from tests.invariants.team import Team
-from tests.invariants.trouble import Trouble, drawn
 
 TTL = 1.5
 SLACK = 0.8
 """E3: seconds beyond the ttl within which another executes when the executor is gone and the rest is well."""
 LEAVE = 0.2
 """Seconds within which a stand-by holds what was given back, beside the time to stop."""
+
+
+KINDS = (
+    "cut", "cut", "one way", "swizzle", "kill", "kill", "wipe", "freeze", "freeze", "suspend", "change", "change",
+    "torn change", "leave", "air", "step", "blackout",
+)  # fmt: skip
+
+
+def draw_faults(dice: random.Random, n: int, agents: Sequence[int], has_stores: bool) -> list[TimedFault]:
+    """The faults of one schedule of ``n`` places; those of agents come up more often."""
+    faults = []
+    for _ in range(dice.choice([1, 2, 3, 3, 4, 6])):
+        at = dice.uniform(0.5, 12.0)
+        kind = dice.choice(KINDS)
+        seconds = dice.choice([0.5, 1.0, 2.0, 2.0, 3.0, 5.0, 10.0])
+        count = dice.choice([1, 1, 2, 3]) if kind in ("kill", "wipe", "freeze", "cut") else 1
+        places = tuple(dice.sample(range(n), min(count, n - 1)))
+        if dice.random() < 0.4:
+            places = (dice.choice(agents), *places[1:])
+        if kind == "blackout":
+            kind, places = "kill", tuple(range(n))
+        if kind == "wipe" and has_stores:
+            kind = "kill"
+        faults.append(TimedFault(at, at + seconds, kind, places))
+    return faults
 
 
 class Leases(Team):
@@ -52,7 +77,7 @@ class Leases(Team):
         )
         if trim.calm:
             self.air = Air(self.air.delay)
-        self.faults = drawn(dice, n, self.agents, has_stores)
+        self.faults = draw_faults(dice, n, self.agents, has_stores)
         self._trim = trim
         self.seconds = 0.0
         self._is_well = False
@@ -75,18 +100,16 @@ class Leases(Team):
         )
 
     def run(self) -> list[str]:
-        """Troubles, then health; the violations, a line each."""
+        """Faults, then health; the violations, a line each."""
         self.clock.advance(self.ttl + 0.1)
         self.radio.air = self.air
         self.referee.agree()
-        kept = [(number, fault) for number, fault in enumerate(self.faults) if self._trim.keeps(number)]
-        ahead = sorted([(fault.at, 0, n) for n, fault in kept] + [(fault.until, 1, n) for n, fault in kept])
+        timeline = Timeline(self.faults, self._trim)
         self.seconds = end = self._trim.within(self._dice.choice([8.0, 12.0, 16.0]))
         began = self.clock.seconds()
         while self.clock.seconds() - began < end:
-            while ahead and ahead[0][0] <= self.clock.seconds() - began:
-                _, is_end, number = ahead.pop(0)
-                (self._end if is_end else self._begin)(self.faults[number])
+            for fault, is_end in timeline.due(self.clock.seconds() - began):
+                (self._end if is_end else self._begin)(fault)
             self._choose()
             self.clock.advance(0.25)
         self._heal()
@@ -159,7 +182,7 @@ class Leases(Team):
         spare = [place for place in members if place not in self.agents]
         also = [dice.choice(spare)] if spare and holder not in members else []
         how = dice.choice(["kill", "freeze", "suspend", "cut"])
-        self._begin(Trouble(0, 0, how, (holder, *also)))
+        self._begin(TimedFault(0, 0, how, (holder, *also)))
         others = [place for place in self.agents if place != holder]
         within = self.ttl / (1.0 - self.drift) + SLACK + STAGGER * (len(self.agents) - 1)
         if len(others) > 1 and dice.random() < 0.75:
@@ -215,49 +238,47 @@ class Leases(Team):
             self.clock.advance(0.02)
         return False
 
-    # -- troubles ---------------------------------------------------------------------------------------------------
+    # -- faults -----------------------------------------------------------------------------------------------------
 
-    def _begin(self, trouble: Trouble) -> None:
-        match trouble.kind:
+    def _begin(self, fault: TimedFault) -> None:
+        match fault.kind:
             case "cut":
-                self._part(trouble.places)
+                self._part(fault.places)
             case "one way":
-                self.radio.cut |= {
-                    (a, b) for a in trouble.places for b in set(range(self.n)).difference(trouble.places)
-                }
+                self.radio.cut |= {(a, b) for a in fault.places for b in set(range(self.n)).difference(fault.places)}
             case "swizzle":
                 order = self._dice.sample(range(self.n), self.n // 2)
                 for number, place in enumerate(order):
                     self.clock.callLater(0.2 * number, self._clog, place)
             case "kill" | "wipe":
-                for place in trouble.places:
+                for place in fault.places:
                     self.kill(place)
             case "freeze" | "suspend":
-                for place in trouble.places:
+                for place in fault.places:
                     if self.bidders[place].machine.is_alive and not self.bidders[place].machine.is_still:
-                        self.bidders[place].machine.freeze(trouble.kind == "suspend")
+                        self.bidders[place].machine.freeze(fault.kind == "suspend")
             case "change":
-                self._change(trouble.places[0])
+                self._change(fault.places[0])
             case "torn change":
-                self._change(trouble.places[0], is_torn=True)
+                self._change(fault.places[0], is_torn=True)
             case "leave":
                 for task_id in self.councils:
-                    if self.is_up(trouble.places[0]):
-                        self.bidders[trouble.places[0]].leave(task_id)
+                    if self.is_up(fault.places[0]):
+                        self.bidders[fault.places[0]].leave(task_id)
             case "air":
                 self.radio.air = Air(self.air.delay, self.air.jitter, 0.5, 0.3, 5.0)
         self.referee.look_at_cuts()
 
-    def _end(self, trouble: Trouble) -> None:
-        match trouble.kind:
+    def _end(self, fault: TimedFault) -> None:
+        match fault.kind:
             case "cut" | "one way" | "swizzle" | "torn change":
                 self.radio.cut.clear()
             case "kill" | "wipe":
-                for place in trouble.places:
+                for place in fault.places:
                     if not self.bidders[place].machine.is_alive:
                         self.bidders[place] = self.born(place)
             case "freeze" | "suspend":
-                for place in trouble.places:
+                for place in fault.places:
                     if self.bidders[place].machine.is_still:
                         self.bidders[place].machine.thaw()
             case "air":

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Protocol
 
 from middleware.entangled.errors import NotRunning
@@ -17,6 +16,7 @@ from middleware.entangled.network.switchboard import CALM, Weather
 from middleware.entangled.node import EntangledNode
 from sim.team.checker import check
 from sim.team.event import Born, Died, Settled
+from sim.team.faults.timeline import TimedFault, Timeline
 from sim.team.history import History
 from sim.team.shrink import WHOLE, Trim
 from tests.fleet import Fleet
@@ -43,19 +43,6 @@ class Workload(Protocol):
 
     def verdict(self) -> list[str]:
         """Write down how things stand at the end; what only the workload itself can judge, a line each."""
-
-
-@dataclass(frozen=True)
-class Fault:
-    """Something that happens at ``at`` and ends at ``until``, in seconds of the schedule."""
-
-    at: float
-    until: float
-    kind: str
-    places: tuple[int, ...]
-
-    def __str__(self) -> str:
-        return f"{self.at:.0f}-{self.until:.0f} {self.kind} {','.join(map(str, self.places))}"
 
 
 class Schedule:
@@ -125,15 +112,10 @@ class Schedule:
         fleet = self.fleet
         fleet.run(2.0)
         fleet.board.weather = self.weather
-        kept = [(number, fault) for number, fault in enumerate(self.faults) if self.trim.keeps(number)]
-        ahead = sorted(
-            [(fault.at, 0, number) for number, fault in kept] + [(fault.until, 1, number) for number, fault in kept]
-        )
-        now = 0.0
+        timeline, now = Timeline(self.faults, self.trim), 0.0
         while now < self.seconds:
-            while ahead and ahead[0][0] <= now:
-                _, is_end, number = ahead.pop(0)
-                (self._end if is_end else self._begin)(self.faults[number])
+            for fault, is_end in timeline.due(now):
+                (self._end if is_end else self._begin)(fault)
             for workload in workloads:
                 workload.step()
             fleet.run(STEP)
@@ -169,7 +151,7 @@ class Schedule:
         identity, address = node.identity, self.fleet.address(place)
         self.history.note(Born, place, life, identity.public, identity.node_id, str(address))
 
-    def _faults(self, dice: random.Random) -> list[Fault]:
+    def _faults(self, dice: random.Random) -> list[TimedFault]:
         places, faults = list(range(self.n)), []
         # As many may die for good as a majority can do without, one quorum of the smallest record kept.
         mortal = dice.sample(places, max(0, (min(self.n, 8) - 1) // 2))
@@ -187,17 +169,17 @@ class Schedule:
                 chosen = places if dice.random() < 0.3 else places[:1]
             else:
                 chosen = [mortal.pop()] if mortal and dice.random() < 0.5 else []
-            faults.append(Fault(at, until, kind, tuple(chosen)))
+            faults.append(TimedFault(at, until, kind, tuple(chosen)))
         return faults
 
-    def _stranded(self, dice: random.Random) -> list[Fault]:
+    def _stranded(self, dice: random.Random) -> list[TimedFault]:
         """Less than half are cut off, and so many newcomers join them that together they are more than half."""
         few = dice.sample(range(self.n), (self.n - 1) // 2)
         newcomers = range(self.n, 2 * self.n - 2 * len(few) + 1)
         at = dice.uniform(2.0, self.seconds * 0.5)
-        faults = [Fault(at, at + dice.choice([8.0, 15.0]), "cut", (*few, *newcomers))]
+        faults = [TimedFault(at, at + dice.choice([8.0, 15.0]), "cut", (*few, *newcomers))]
         first = at + dice.choice([0.5, 2.0, 5.0])
-        return faults + [Fault(first + n, first + n, "join", (place, *few)) for n, place in enumerate(newcomers)]
+        return faults + [TimedFault(first + n, first + n, "join", (place, *few)) for n, place in enumerate(newcomers)]
 
     def _join(self, place: int, known: Sequence[int]) -> None:
         """A newcomer joins through ``known``."""
@@ -208,7 +190,7 @@ class Schedule:
             born(place, node)
         self.fleet.enter(node, self.addresses(known)).addErrback(lambda failure: failure.trap(NotRunning))
 
-    def _begin(self, fault: Fault) -> None:
+    def _begin(self, fault: TimedFault) -> None:
         board = self.fleet.board
         if fault.kind == "join":
             place, *known = len(self.fleet.nodes), *fault.places[1:]
@@ -229,7 +211,7 @@ class Schedule:
                     died(place, self.node(place))
                 self.fleet.kill(place)
 
-    def _end(self, fault: Fault) -> None:
+    def _end(self, fault: TimedFault) -> None:
         if fault.kind in ("cut", "one way"):
             self.fleet.board.heal()
         elif fault.kind not in ("die", "join"):

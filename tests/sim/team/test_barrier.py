@@ -7,7 +7,7 @@ from itertools import combinations
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.network.network import Address
-from sim.team.barrier import clog, cut, deaf, mute, pairs
+from sim.team.faults.barrier import clog, cut, deaf, mute, pairs
 
 A, B, C = (Address(host, 7000) for host in ("a", "b", "c"))
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.errors import BadSetting
-from sim.team.fault import Fault
+from sim.team.faults.settings import Fault
 from sim.team.memory import BASE, KIB, NO_LIMIT, check, foreseen, free, resident
 from sim.team.scenario import Scenario
 

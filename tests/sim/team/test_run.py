@@ -9,7 +9,7 @@ from twisted.python.failure import Failure
 from twisted.trial.unittest import SynchronousTestCase
 
 from sim.team.disk import Disk
-from sim.team.fault import Fault
+from sim.team.faults.settings import Fault
 from sim.team.figure import Bound, Figure
 from sim.team.link import LinkSettings
 from sim.team.run import DONE, JOINING, RUNNING, Run

@@ -1,4 +1,4 @@
-"""Fault: what happens to a team at a moment of its scenario, and how it is taken back."""
+"""The faults of a scenario: what happens to the team at a moment, and for how long."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Trouble: the faults and sessions of a scenario, as they befall a team."""
+"""Carry out the faults and sessions of a scenario in a simulated team."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ from collections.abc import Callable
 from functools import partial
 
 from middleware.entangled.network.switchboard import Barrier
-from sim.team import barrier
 from sim.team.disk import Disk
-from sim.team.fault import Fault
+from sim.team.faults import barrier
+from sim.team.faults.settings import Fault
 from sim.team.team import Node, Team
 
 FEW = 2
 """So many nodes stay, whatever the sessions say: who is alone has no network to come back to."""
 
 
-class Troubles:
-    """What befalls a team from ``begin`` to ``end``.
+class TeamFaults:
+    """The faults and sessions of a team from ``begin`` to ``end``.
 
     Whom a fault befalls is drawn when it comes, from those that are in the network then.
     """

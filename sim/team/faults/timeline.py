@@ -1,0 +1,38 @@
+"""Faults with a beginning and an end, in the order in which they are due."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from sim.team.shrink import Trim
+
+
+@dataclass(frozen=True)
+class TimedFault:
+    """A fault of ``kind`` that befalls ``places`` from ``at`` to ``until``, in seconds of its schedule."""
+
+    at: float
+    until: float
+    kind: str
+    places: tuple[int, ...]
+
+    def __str__(self) -> str:
+        return f"{self.at:.1f}-{self.until:.1f} {self.kind} {','.join(map(str, self.places))}"
+
+
+class Timeline:
+    """The beginnings and ends of ``faults`` that ``trim`` keeps; at one moment beginnings come first."""
+
+    def __init__(self, faults: Sequence[TimedFault], trim: Trim) -> None:
+        kept = [(number, fault) for number, fault in enumerate(faults) if trim.keeps(number)]
+        ends = [(fault.until, True, number, fault) for number, fault in kept]
+        self._ahead = sorted(
+            [(fault.at, False, number, fault) for number, fault in kept] + ends, key=lambda one: one[:3]
+        )
+
+    def due(self, now: float) -> Iterator[tuple[TimedFault, bool]]:
+        """Each fault that begins (False) or ends (True) until ``now``, once."""
+        while self._ahead and self._ahead[0][0] <= now:
+            _, is_end, _, fault = self._ahead.pop(0)
+            yield fault, is_end
