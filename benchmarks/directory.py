@@ -16,22 +16,17 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 
 from benchmarks.dissemination import BITS, K, Ring
-from middleware.entangled.clock import HeapClock
-from middleware.entangled.data.memory import MemoryStore
-from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.distance import closest
-from middleware.entangled.network.network import Address
-from middleware.entangled.network.switchboard import Switchboard, Weather
+from middleware.entangled.network.switchboard import Weather
 from middleware.entangled.record import Record
 from middleware.listing import Listing
-from middleware.node import SwarmNode
 from middleware.prefix import WHOLE, depth_for, lease_at, places_of, size_of
 from middleware.presence import MAX_DEPTH, Device, device_of
+from sim.team.world import SwarmFleet
 
 SHARE = 0.01
 """Of the directory, the most that one node is to hold where there are 10,000 devices."""
-TEAM = b"t" * 32
 LINK = Weather(delay_s=0.02, jitter_s=0.01)
 SMALL = 40
 PAUSE = 0.05
@@ -126,23 +121,11 @@ HEAD = [
 ]
 
 
-class Team:
-    """``n`` real nodes that join one after the other through the first, on a turned clock."""
+class Team(SwarmFleet):
+    """``n`` real nodes that join one after the other through the first, in virtual time."""
 
     def __init__(self, n: int, seed: int) -> None:
-        self.clock = HeapClock()
-        self.board = Switchboard(self.clock, random.Random(f"{seed}/board"), LINK)
-        self.nodes: list[SwarmNode] = []
-        first = Address("10.0.0.1", 7000)
-        for place in range(n):
-            network = self.board.network("10.0.0.1", 7000 + place)
-            identity = Identity(random.Random(f"{seed}/{place}").randbytes(32))
-            dice, wall = random.Random(f"{seed}/{place}/dice"), self.clock.seconds
-            known = [first] if place else []
-            device = Device("", f"dog{place}", capabilities={"camera": {"width": 208}})
-            self.nodes.append(SwarmNode(device, identity, TEAM, known, network, MemoryStore(), self.clock, dice, wall))
-            self.nodes[-1].startService()
-            self.clock.advance(PAUSE)
+        super().__init__(n, seed, LINK, PAUSE)
 
     def held(self) -> list[int]:
         """How many devices each live node holds."""

@@ -19,10 +19,7 @@ from typing import Any
 
 from twisted.internet.defer import Deferred
 
-from benchmarks.idle import Meter, Team
-from middleware.entangled.data.memory import MemoryStore
-from middleware.entangled.identity import Identity
-from middleware.entangled.network.network import Address
+from benchmarks.idle import Team
 from middleware.entangled.node import EntangledNode
 from middleware.entangled.record import hashed_key
 
@@ -50,7 +47,7 @@ class Hot:
         """The cost of one of ``times`` operations, ``wide`` of them at a time; the time is that of the best quarter."""
         self.failed = 0
         gc.collect()
-        sent, moment = Meter.datagrams, self.team.clock.seconds()
+        sent, moment = self.team.total_traffic.sent, self.team.clock.seconds()
         quarter, best = -(-times // QUARTERS), math.inf
         for start in range(0, times, quarter):
             began, end = time.process_time(), min(times, start + quarter)
@@ -59,7 +56,7 @@ class Hot:
                     self.wait(waiting)
             best = min(best, (time.process_time() - began) / (end - start))
         span = self.team.clock.seconds() - moment
-        cost = f"{best * 1e6:7.0f} us of CPU {(Meter.datagrams - sent) / times:6.1f} datagrams"
+        cost = f"{best * 1e6:7.0f} us of CPU {(self.team.total_traffic.sent - sent) / times:6.1f} datagrams"
         return f"{cost} {span / times * 1e3:6.2f} ms, {self.failed} failed"
 
     def _count(self, failure: Any) -> None:
@@ -68,18 +65,16 @@ class Hot:
     def join(self, place: int) -> str:
         """What a newcomer costs until it has joined, until it has read an old key, and in the five seconds after."""
         clock = self.team.clock
-        seed = place.to_bytes(32, "big")
-        network = Meter(self.team.board, Address("10.0.0.1", 7000 + place))
-        newcomer = EntangledNode(Identity(seed), b"t" * 32, network, MemoryStore(), clock, self.team.rng)
+        newcomer = self.team.made(place)
         lines = []
-        sent, moment, began = Meter.datagrams, clock.seconds(), time.process_time()
+        sent, moment, began = self.team.total_traffic.sent, clock.seconds(), time.process_time()
 
         def lap(what: str) -> None:
             cpu, span = (time.process_time() - began) * 1e3, (clock.seconds() - moment) * 1e3
-            lines.append(f"{what} {cpu:.1f} ms of CPU, {Meter.datagrams - sent} datagrams, {span:.1f} ms")
+            lines.append(f"{what} {cpu:.1f} ms of CPU, {self.team.total_traffic.sent - sent} datagrams, {span:.1f} ms")
 
         newcomer.start()
-        self.wait(newcomer.join([Address("10.0.0.1", 7000)]))
+        self.wait(newcomer.join([self.team.address(0)]))
         lap("joined:")
         self.wait(newcomer.get(hashed_key("h7"), "fast"))
         lap("read:")

@@ -15,14 +15,11 @@ from typing import Any
 
 from twisted.internet.defer import Deferred
 
-from middleware.entangled.clock import HeapClock
-from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.errors import EntangledError
-from middleware.entangled.identity import Identity
-from middleware.entangled.network.network import Address
-from middleware.entangled.network.switchboard import Switchboard, SwitchboardNetwork, Weather
+from middleware.entangled.network.switchboard import Weather
 from middleware.entangled.node import EntangledNode
 from middleware.entangled.record import hashed_key
+from sim.team.world import Fleet
 
 MAX_BYTES_S = 1000.0
 MAX_CORE = 0.001
@@ -30,60 +27,41 @@ HEADER = 28
 """Bytes of IP and UDP around a datagram."""
 
 
-class Meter(SwitchboardNetwork):
-    """A network that counts what it sends."""
-
-    datagrams = 0
-    octets = 0
-
-    def send(self, datagram: bytes, to: Address) -> None:
-        """Count a datagram and send it."""
-        Meter.datagrams += 1
-        Meter.octets += len(datagram) + HEADER
-        super().send(datagram, to)
-
-
-class Team:
+class Team(Fleet):
     """``n`` nodes that have found each other, 0.2 ms apart."""
 
     def __init__(self, n: int, seed: int) -> None:
-        self.clock = HeapClock()
-        self.rng = random.Random(seed)
-        self.board = Switchboard(self.clock, random.Random(f"{seed}/board"), Weather(delay_s=0.0002))
-        self.nodes = []
-        for place in range(n):
-            network = Meter(self.board, Address("10.0.0.1", 7000 + place))
-            identity = Identity(random.Random(f"{seed}/{place}").randbytes(32))
-            dice = random.Random(f"{seed}/{place}/dice")
-            node = EntangledNode(identity, b"t" * 32, network, MemoryStore(), self.clock, dice)
-            node.start()
-            node.join([Address("10.0.0.1", 7000)] if place else [])
-            self.nodes.append(node)
-            self.clock.advance(0.3)
+        super().__init__(n, seed, Weather(delay_s=0.0002))
+        self.dice = random.Random(seed)
+
+    def sent(self) -> tuple[int, int]:
+        """Datagrams and bytes that all nodes have sent."""
+        return self.total_traffic.sent, self.total_traffic.sent_bytes + HEADER * self.total_traffic.sent
 
     def spent(self, seconds: float) -> tuple[float, float, float]:
         """Datagrams and bytes that a node sends in a second of rest, and its share of a core."""
-        before, began = (Meter.datagrams, Meter.octets), time.process_time()
+        before, began = self.sent(), time.process_time()
         self.clock.advance(seconds)
         took = time.process_time() - began
         each = seconds * len(self.nodes)
-        return (Meter.datagrams - before[0]) / each, (Meter.octets - before[1]) / each, took / each
+        datagrams, octets = self.sent()
+        return (datagrams - before[0]) / each, (octets - before[1]) / each, took / each
 
     def cost(self, work: Callable[[EntangledNode], Deferred[Any]], times: int) -> tuple[float, list[float], int]:
         """Datagrams for one of ``times`` operations at random nodes, how long each took, and how many failed."""
-        before, failed = Meter.datagrams, 0
+        before, failed = self.total_traffic.sent, 0
         took: list[float] = []
         for _ in range(times):
             began = self.clock.seconds()
             ended: list[Any] = []
-            done = work(self.rng.choice([node for node in self.nodes if node._running]))
+            done = work(self.dice.choice([node for node in self.nodes if node._running]))
             done.addErrback(lambda failure: failure.trap(EntangledError)).addCallback(ended.append)
             while not ended:
                 self.clock.advance(0.0001)
             took.append(self.clock.seconds() - began)
             failed += isinstance(ended[0], type) or ended[0] == []
         self.clock.advance(0.05)
-        return (Meter.datagrams - before) / times, sorted(took), failed
+        return (self.total_traffic.sent - before) / times, sorted(took), failed
 
 
 def main() -> int:
@@ -101,12 +79,12 @@ def main() -> int:
     numbers = iter(range(10**6))
     puts = team.cost(lambda node: node.put(hashed_key(f"k{next(numbers)}"), "v", b"x" * 100), 200)
     report("put", puts)
-    report("get fast", team.cost(lambda node: node.get(some(team.rng), "fast"), 200))
-    report("get majority", team.cost(lambda node: node.get(some(team.rng), "majority"), 200))
+    report("get fast", team.cost(lambda node: node.get(some(team.dice), "fast"), 200))
+    report("get majority", team.cost(lambda node: node.get(some(team.dice), "majority"), 200))
     if arguments.loss:
-        for node in team.rng.sample(team.nodes, len(team.nodes) // 2):
+        for node in team.dice.sample(team.nodes, len(team.nodes) // 2):
             node.vanish()
-        report("get fast, half silent", team.cost(lambda node: node.get(some(team.rng), "fast"), 100))
+        report("get fast, half silent", team.cost(lambda node: node.get(some(team.dice), "fast"), 100))
     return int(octets > MAX_BYTES_S or core > MAX_CORE)
 
 

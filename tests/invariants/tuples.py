@@ -9,7 +9,6 @@ from typing import Any
 from twisted.internet.defer import Deferred
 from twisted.python.failure import Failure
 
-from benchmarks.takers import Witness
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.node import EntangledNode
 from middleware.entangled.record import Record
@@ -21,6 +20,7 @@ from middleware.entangled.space.tuplespace import TupleSpace
 from sim.team import event
 from sim.team.history import History
 from sim.team.invariant.taking import PUT, RING, SURVEY, TAKE, WAIT
+from sim.team.takers.witness import Witness
 from tests.invariants.schedule import Schedule
 
 JOB = ("job", int, ANY)

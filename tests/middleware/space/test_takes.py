@@ -9,8 +9,6 @@ from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from benchmarks.takers import Trial
-from benchmarks.village import VillageTrial
 from middleware.entangled.node import EntangledNode
 from middleware.entangled.space.council import Council
 from middleware.entangled.space.decree import Ballot, Outcome, Reply, Stand, Vote
@@ -18,31 +16,33 @@ from middleware.entangled.space.keeper import Keeper
 from middleware.entangled.space.posting import Place, Posted
 from middleware.entangled.space.seat import Answers, Seat
 from middleware.entangled.space.tuplespace import TupleSpace
+from sim.team.takers.light import LightTrial
+from sim.team.takers.trial import Trial
 
 TUPLES = 100
 
 
 class TakesTests(SynchronousTestCase):
     def _checked(self, trial: Trial) -> Trial:
-        trial.run()
+        trial.play()
         trial.stop()
         self.assertEqual(trial.violations(), [], f"seed {trial.seed}, loss {trial.storm.loss}")
         return trial
 
     def test_calm(self) -> None:
         """Eight takers share two hundred tuples, and each tuple is told to exactly one of them."""
-        trial = self._checked(VillageTrial(1, 200))
+        trial = self._checked(LightTrial(1, 200))
         self.assertEqual(len(trial.told), 200)
 
     def test_loss(self) -> None:
         """With up to half of the datagrams lost, each tuple is still confirmed exactly once."""
         for seed, loss in [(2, 0.1), (3, 0.3), (4, 0.5)]:
-            self._checked(VillageTrial(seed, TUPLES, loss))
+            self._checked(LightTrial(seed, TUPLES, loss))
 
     def test_churn_and_partitions(self) -> None:
         """Publishers, members and takers die in the middle and come back, links are cut: once each, and none lost."""
         for seed in range(10, 14):
-            self._checked(VillageTrial(seed, TUPLES, (seed % 6) / 10, True))
+            self._checked(LightTrial(seed, TUPLES, (seed % 6) / 10, True))
 
     def test_whole_nodes(self) -> None:
         """So it is with records that are replicated by whole nodes, some of which die, over a wire that loses some."""
@@ -52,8 +52,8 @@ class TakesTests(SynchronousTestCase):
         """The same seed makes the same run, to the last datagram."""
         digests = []
         for _ in range(2):
-            trial = VillageTrial(5, 40, 0.2, True)
-            trial.run()
+            trial = LightTrial(5, 40, 0.2, True)
+            trial.play()
             trial.stop()
             digests.append(trial.board.digest())
         self.assertEqual(digests[0], digests[1])
@@ -63,12 +63,12 @@ class TakesTests(SynchronousTestCase):
         for seed in range(30, 33):
             trial = ForgottenLife(seed, TUPLES, 0.1, True)
             trial.aftermath = 20.0
-            trial.run()
+            trial.play()
             trial.stop()
             self.assertEqual(trial.witness.split() + trial.twice(), [], f"seed {seed}")
 
 
-class ForgottenLife(VillageTrial):
+class ForgottenLife(LightTrial):
     def start(self, place: int) -> None:
         if self.nodes[place] is None:
             self.stores[place].note("decree/incarnation", b"")
@@ -81,12 +81,12 @@ class ForgottenLife(VillageTrial):
 class FaultTests(SynchronousTestCase):
     """Each of these faults is noticed: the checks above can fail."""
 
-    def _noticed(self, fault: type[VillageTrial], word: str, seeds: Sequence[int] = range(30, 36)) -> None:
+    def _noticed(self, fault: type[LightTrial], word: str, seeds: Sequence[int] = range(30, 36)) -> None:
         """Some of ``seeds`` shows a violation with ``word`` in it."""
         for seed in seeds:
             trial = fault(seed, TUPLES, 0.2, True)
             trial.aftermath = 20.0
-            trial.run()
+            trial.play()
             trial.stop()
             if any(word in text for text in trial.violations()):
                 return
@@ -137,7 +137,7 @@ class FaultySeat(Seat):
         return self._votes[place].claim(ballot, lease, now)
 
 
-class NoBallots(VillageTrial):
+class NoBallots(LightTrial):
     kind: type[Vote] = AgreeableVote
 
     def furnish(self, node: EntangledNode, space: TupleSpace, rng: random.Random) -> None:
@@ -154,7 +154,7 @@ class HastyCouncil(Council):
         return await super().confirm([replace(one, council=one.council[:1]) for one in posted], ballot, value)
 
 
-class MinorityConfirm(VillageTrial):
+class MinorityConfirm(LightTrial):
     def furnish(self, node: EntangledNode, space: TupleSpace, rng: random.Random) -> None:
         space._taker._council = HastyCouncil(space._taker._ask, rng, space._chores)
 
@@ -167,7 +167,7 @@ class ForgetfulSeat(Seat):
         return super().answer_claim(*question)
 
 
-class ForgottenVotes(VillageTrial):
+class ForgottenVotes(LightTrial):
     def furnish(self, node: EntangledNode, space: TupleSpace, rng: random.Random) -> None:
         node.seat = ForgetfulSeat(node.endpoint, node.store, self.clock, rng)
 
@@ -183,7 +183,7 @@ class OneSlotKeeper(Keeper):
         return "only"
 
 
-class NoNotes(VillageTrial):
+class NoNotes(LightTrial):
     kind: type[Keeper] = SilentKeeper
 
     def furnish(self, node: EntangledNode, space: TupleSpace, rng: random.Random) -> None:

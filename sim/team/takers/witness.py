@@ -1,0 +1,78 @@
+"""A record of every vote of every council member of a tuple space, over all lives of its nodes."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable
+from typing import Any
+
+from twisted.internet.defer import maybeDeferred
+
+from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.record import Record
+from middleware.entangled.space.decree import Kind, Reply, reply_unpacked
+from middleware.entangled.space.posting import Place, Posted, place_unpacked, posting
+from middleware.entangled.space.seat import Seat
+
+
+class Witness:
+    """Writes down every acceptance of every council member, in all of its lives."""
+
+    def __init__(self) -> None:
+        self.posted: dict[Place, Posted] = {}
+        self.bids: dict[Place, dict[tuple[int, bytes, bytes], set[bytes]]] = defaultdict(lambda: defaultdict(set))
+
+    def stored(self, record: Record) -> None:
+        """Take note of a tuple that some replica holds now."""
+        said = posting(record)
+        if isinstance(said, Posted):
+            self.posted[said.place] = said
+
+    def attend(self, seat: Seat, expose: Callable[..., object], member: bytes) -> None:
+        """Look over the shoulder of the council member ``member`` as it confirms takes, and tells what it accepted."""
+        confirm: Callable[..., Any] = seat.answer_confirm
+        claim: Callable[..., Any] = seat.answer_claim
+
+        def told(key: bytes, places: list[object], answers: list[object]) -> list[tuple[Place, Reply]]:
+            pairs = [(place_unpacked(key, p), reply_unpacked(a)) for p, a in zip(places, answers, strict=True)]
+            return [(place, reply) for place, reply in pairs if place is not None and reply is not None]
+
+        def confirmed(peer: Contact, key: bytes, places: list[object], incarnation: bytes, *ballot: Any) -> Any:
+            def noted(answers: list[object]) -> list[object]:
+                for place, reply in told(key, places, answers):
+                    if reply.kind is Kind.ACCEPTED:
+                        self.accepted(place, ballot, member)
+                return answers
+
+            return maybeDeferred(confirm, peer, key, places, incarnation, *ballot).addCallback(noted)
+
+        def claimed(peer: Contact, key: bytes, places: list[object], *rest: Any) -> Any:
+            def noted(answers: list[object]) -> list[object]:
+                # One whose disk was full when it accepted could not say so, and tells it with the next it can write.
+                for place, reply in told(key, places, answers):
+                    if reply.accepted is not None and reply.value is not None:
+                        self.accepted(place, (*reply.accepted, reply.value), member)
+                return answers
+
+            return maybeDeferred(claim, peer, key, places, *rest).addCallback(noted)
+
+        seat.answer_confirm, seat.answer_claim = confirmed, claimed  # type: ignore[method-assign, assignment]
+        expose("decree.confirm", confirmed, changes=True)
+        expose("decree.claim", claimed, changes=True)
+
+    def accepted(self, place: Place, ballot: tuple[int, bytes, bytes], member: bytes) -> None:
+        """Take note of what a member of the council accepted."""
+        self.bids[place][ballot].add(member)
+
+    def takers(self, place: Place) -> set[bytes]:
+        """Everybody for whom a majority of the council ever accepted a take; more than one is a violation."""
+        quorum = len(self.posted[place].council) // 2 + 1
+        return {value for (_, _, value), members in self.bids[place].items() if len(members) >= quorum}
+
+    def open(self) -> list[Posted]:
+        """The tuples that no majority has given to anybody."""
+        return [posted for place, posted in self.posted.items() if not self.takers(place)]
+
+    def split(self) -> list[str]:
+        """Tuples that two majorities gave to different takers, at any two moments."""
+        return [f"{p.fields} was accepted for two" for place, p in self.posted.items() if len(self.takers(place)) > 1]
