@@ -71,7 +71,7 @@ help:
 	@echo 'make clean                            remove what the above left behind, the environment included'
 
 demo: $(RUNTIME)
-	@exec $(PY) -m $(if $(filter-out 0,$(NAT)),benchmarks.nat.demo,sim.demo) --seed $(SEED) --robot $(ROBOT) --lose $(LOSE) $(if $(filter-out 0,$(HEADLESS)),--headless) $(if $(filter-out 0,$(TLS)),--tls) \
+	@exec $(PY) -m $(if $(filter-out 0,$(NAT)),sim.namespaces.demo,sim.demo) --seed $(SEED) --robot $(ROBOT) --lose $(LOSE) $(if $(filter-out 0,$(HEADLESS)),--headless) $(if $(filter-out 0,$(TLS)),--tls) \
 	    --web-host $(WEB_HOST) $(if $(WEB_PORT),--web-port $(WEB_PORT))
 
 # One worker for each processor.
@@ -114,7 +114,7 @@ live: $(DEV)
 
 # Wants root, or namespaces for users, and says so.
 live-nat: $(RUNTIME)
-	$(PY) -m benchmarks.nat --count $(if $(filter file,$(origin N)),5,$(N)) $(if $(filter-out 0,$(DOCS)),--docs)
+	$(PY) -m sim.namespaces --count $(if $(filter file,$(origin N)),5,$(N)) $(if $(filter-out 0,$(DOCS)),--docs)
 
 contract: $(CONTRACT)/.stamp
 	$(CONTRACT)/bin/python -m twisted.trial tests.live.test_contract

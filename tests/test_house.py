@@ -28,6 +28,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "middleware.admission": ("middleware.admission", "middleware.entangled"),
     "drivers": ("drivers", "standards"),
     "sim": ("sim", "drivers", "middleware.faults.stream"),
+    "sim.namespaces": ("sim", "middleware"),
     "sim.team": ("sim.team", "middleware", "drivers.link"),
     "webnode": ("webnode", "middleware"),
     "agents": ("agents", "middleware", "drivers.driver", "drivers.reading", "drivers.errors"),

@@ -11,7 +11,7 @@ from functools import cache
 
 from twisted.trial.unittest import SkipTest, SynchronousTestCase
 
-from benchmarks.nat.room import refusal
+from sim.namespaces.room import refusal
 
 
 class NamespaceCase(SynchronousTestCase):

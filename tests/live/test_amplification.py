@@ -7,11 +7,11 @@ import sys
 from pathlib import Path
 from random import Random
 
-from benchmarks.nat.capture import Capture, datagrams
-from benchmarks.nat.fleet import Fleet
-from benchmarks.nat.internet import PUB, PUBS, Internet, Site
-from benchmarks.nat.kind import Kind
-from benchmarks.nat.matrix import Pair, Trial
+from sim.namespaces.capture import Capture, datagrams
+from sim.namespaces.hosts import Hosts
+from sim.namespaces.internet import PUB, PUBS, Internet, Site
+from sim.namespaces.kind import Kind
+from sim.namespaces.matrix import Pair, Trial
 from tests.live.namespaces import NamespaceCase
 
 STRANGER = """
@@ -38,7 +38,7 @@ class AmplificationTests(NamespaceCase):
             self.assertGreater(port, 0)
 
     async def _attacked(self, net: Internet, folder: Path) -> int:
-        async with Fleet(net, [PUB, "a1", "b1"], folder) as fleet:
+        async with Hosts(net, [PUB, "a1", "b1"], folder) as fleet:
             trial = Trial(fleet, Pair("plain", "port", "port", "a1", "b1"), 1, Random(1))
             net.record(folder / "join.pcap")
             await trial.run(5.0, 5.0)

@@ -11,9 +11,9 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
-from benchmarks.nat.internet import PUB, Internet, Site
-from benchmarks.nat.kind import Kind
-from benchmarks.nat.room import environment
+from sim.namespaces.internet import PUB, Internet, Site
+from sim.namespaces.kind import Kind
+from sim.namespaces.room import environment
 from tests.live.namespaces import NamespaceCase
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -10,8 +10,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.nat.internet import PUBS, Internet, Site
-from benchmarks.nat.kind import Kind
+from sim.namespaces.internet import PUBS, Internet, Site
+from sim.namespaces.kind import Kind
 from tests.live.namespaces import NamespaceCase
 
 LIMIT_S = 30.0

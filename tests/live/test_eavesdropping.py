@@ -15,7 +15,6 @@ from twisted.internet.defer import Deferred, inlineCallbacks
 from twisted.internet.task import deferLater
 from twisted.trial.unittest import SkipTest, TestCase
 
-from benchmarks.nat.capture import payload, readable
 from middleware import roles
 from middleware.admission.membership import Membership, MemoryMembership
 from middleware.admission.operator import drawn
@@ -26,6 +25,7 @@ from middleware.entangled.network.network import Address
 from middleware.entangled.network.udp import UdpNetwork
 from middleware.entangled.node import EntangledNode
 from middleware.entangled.record import hashed_key
+from sim.namespaces.capture import payload, readable
 
 reactor: Any = _reactor
 EVERYTHING = 0x0003

@@ -7,9 +7,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-from benchmarks.nat.capture import datagrams as datagrams_of
-from benchmarks.nat.capture import readable
-from benchmarks.nat.internet import ROOT
+from sim.namespaces.capture import datagrams as datagrams_of
+from sim.namespaces.capture import readable
+from sim.namespaces.internet import ROOT
 from tests.live.namespaces import NamespaceCase
 
 LIMIT_S = 150.0
@@ -25,7 +25,7 @@ class ExperimentsBehindRoutersTests(NamespaceCase):
         folder = Path(self.mktemp()).absolute()
         report = folder.parent / "report.json"
         folder.parent.mkdir(parents=True, exist_ok=True)
-        command = [sys.executable, "-m", "benchmarks.nat.demo", "--robot", "sim", "--run-dir", str(folder)]
+        command = [sys.executable, "-m", "sim.namespaces.demo", "--robot", "sim", "--run-dir", str(folder)]
         record = folder.parent / "wide.pcap"
         command += ["--report", str(report), "--record", str(record)]
         ran = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=LIMIT_S)

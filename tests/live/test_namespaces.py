@@ -9,9 +9,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-from benchmarks.nat.capture import Capture
-from benchmarks.nat.internet import PUBS, ROOT, Internet, Site
-from benchmarks.nat.kind import Kind
+from sim.namespaces.capture import Capture
+from sim.namespaces.internet import PUBS, ROOT, Internet, Site
+from sim.namespaces.kind import Kind
 from tests.live.namespaces import NamespaceCase
 
 LIMIT_S = 60.0
@@ -127,7 +127,7 @@ class InternetTests(NamespaceCase):
         """After an exception, and after a kill of whoever made it, no process of an internet is left."""
         program = (
             "import os, sys, time\n"
-            "from benchmarks.nat.internet import Internet, Site\nfrom benchmarks.nat.kind import Kind\n"
+            "from sim.namespaces.internet import Internet, Site\nfrom sim.namespaces.kind import Kind\n"
             "with Internet([Site('a', Kind.PORT)]) as net:\n"
             "    started = net.start('a1', ['sleep', '600'])\n"
             "    print(started.pid, *[net.room(name).pid for name in ('', 'a1', 'a-gw')], flush=True)\n"
@@ -172,7 +172,7 @@ class MatrixTests(NamespaceCase):
     def test_whoever_can_reach_each_other_does(self) -> None:
         """One round of the matrix: nodes without a router meet at once, and table, JSON and picture are written."""
         folder = Path(self.mktemp()).absolute()
-        command = [sys.executable, "-m", "benchmarks.nat", "--count", "1", "--lossy", "0", "--out", str(folder)]
+        command = [sys.executable, "-m", "sim.namespaces", "--count", "1", "--lossy", "0", "--out", str(folder)]
         ran = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
         self.assertIn(ran.returncode, (0, 1), ran.stderr)
         found = json.loads((folder / "live-nat.json").read_text())["trials"]

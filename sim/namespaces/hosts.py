@@ -1,4 +1,4 @@
-"""Fleet: the computers of an internet, and what is ordered of them."""
+"""The computers of an internet of network namespaces, and the orders that they take."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from benchmarks.nat.internet import ROOT, Internet
-from benchmarks.nat.room import environment
-from benchmarks.remote import Lost, Remote, Unable
+from sim.namespaces.internet import ROOT, Internet
+from sim.namespaces.remote import Lost, Remote, Unable
+from sim.namespaces.room import environment
 
 SPAWN_S = 60.0
 MARGIN_S = 10.0
@@ -29,7 +29,7 @@ class Computer(Remote):
             raise Lost(f"{self.name} could not {do}: {error}") from None
 
 
-class Fleet:
+class Hosts:
     """A computer on each of ``hosts``, between ``async with`` and its end."""
 
     def __init__(self, net: Internet, hosts: Iterable[str], folder: Path) -> None:
@@ -41,7 +41,7 @@ class Fleet:
     def __getitem__(self, host: str) -> Computer:
         return self._computers[host]
 
-    async def __aenter__(self) -> Fleet:
+    async def __aenter__(self) -> Hosts:
         try:
             for host in self._hosts:
                 self._computers[host] = await self._spawn(host)
@@ -56,7 +56,7 @@ class Fleet:
 
     async def _spawn(self, host: str) -> Computer:
         said, pipe = self._folder / f"{host}.errors", asyncio.subprocess.PIPE
-        command = self.net.command(host, [sys.executable, "-m", "benchmarks.nat.computer"])
+        command = self.net.command(host, [sys.executable, "-m", "swarmnode.trial_host"])
         with said.open("wb") as errors:
             # In a session of its own: what is typed at the terminal is for the one who ends it.
             process = await asyncio.create_subprocess_exec(

@@ -1,6 +1,6 @@
-"""Computer: real nodes on one host of the internet; it does what it is told in JSON lines.
+"""Real nodes on one host of the internet of network namespaces (``sim.namespaces``), ordered by JSON lines.
 
-``python -m benchmarks.nat.computer``.  A trial is a team of its own, so many can run beside each other in one process.
+``python -m swarmnode.trial_host``.  A trial is a team of its own, so many can run beside each other in one process.
 What is measured of a node is the node's own doing: the first moment at which it asks a peer anything, and the first
 answer that it gets.
 """

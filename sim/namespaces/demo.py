@@ -1,4 +1,4 @@
-"""The demonstration across an internet: ``make demo NAT=1``, or ``python -m benchmarks.nat.demo``.
+"""The demonstration across an internet: ``make demo NAT=1``, or ``python -m sim.namespaces.demo``.
 
 Two dogs' computers are behind routers of their own, one of them a symmetric one; the third is on the LAN of the
 bootstrap and web node, whose router hands two ports on to it; and whoever looks at the page sits behind a fourth.  Each
@@ -19,11 +19,11 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from benchmarks.nat.internet import Internet, Site
-from benchmarks.nat.kind import Kind
-from benchmarks.nat.room import refusal
 from sim.demo.cast import CASTS, LOOPBACK, MOST_PORTS, Robot, chosen
 from sim.demo.configuration import BOOTSTRAP, DOGS, JUDGE, RESERVE, YARD, Place, Plan
+from sim.namespaces.internet import Internet, Site
+from sim.namespaces.kind import Kind
+from sim.namespaces.room import refusal
 
 NODE_PORT, WEB_PORT, YARD_PORT, ROBOT_PORT = 7000, 8080, 7400, 7500
 HOME, KINDS = "home", (Kind.PORT, Kind.SYM)
@@ -105,7 +105,7 @@ def inside(given: argparse.Namespace) -> None:
 def main(arguments: Sequence[str] = tuple(sys.argv[1:])) -> int:
     """The command line; returns 0 where both experiments held, 2 where namespaces are refused."""
     parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.nat.demo", description="Both experiments, behind routers."
+        prog="python -m sim.namespaces.demo", description="Both experiments, behind routers."
     )
     parser.add_argument("--robot", choices=sorted(CASTS), default="aibo", help="what the three are (%(default)s)")
     parser.add_argument(
@@ -137,7 +137,7 @@ def main(arguments: Sequence[str] = tuple(sys.argv[1:])) -> int:
             net.weather(site, loss=given.loss)
         net.record(given.record)
         _say(f"dog1 behind a router ({KINDS[0].meaning}), dog2 behind another ({KINDS[1].meaning}), dog3 at home")
-        command = [sys.executable, "-m", "benchmarks.nat.demo", "--inside", *arguments]
+        command = [sys.executable, "-m", "sim.namespaces.demo", "--inside", *arguments]
         process = net.start(HOSTS[JUDGE], command, stdin=subprocess.PIPE, cwd=Path.cwd(), text=True)
         assert process.stdin is not None
         process.stdin.write(json.dumps({name: asdict(place) for name, place in places.items()}) + "\n")

@@ -17,11 +17,11 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from benchmarks.nat.internet import Internet
-from benchmarks.nat.outcome import PLAIN, Outcome, promises
-from benchmarks.nat.picture import drawn
-from benchmarks.nat.report import table, written
-from benchmarks.nat.room import refusal
+from sim.namespaces.internet import Internet
+from sim.namespaces.outcome import PLAIN, Outcome, promises
+from sim.namespaces.picture import drawn
+from sim.namespaces.report import table, written
+from sim.namespaces.room import refusal
 
 DOCUMENT = Path("docs/nat.md")
 PICTURE = "images/nat.svg"
@@ -42,8 +42,8 @@ def say(line: str) -> None:
 
 async def run(count: int, lossy: int, seed: int) -> list[Outcome]:
     """The whole matrix; ends well on SIGTERM, too."""
-    from benchmarks.nat.fleet import Fleet
-    from benchmarks.nat.matrix import Matrix, sites
+    from sim.namespaces.hosts import Hosts
+    from sim.namespaces.matrix import Matrix, sites
 
     task = asyncio.current_task()
     assert task is not None
@@ -51,7 +51,7 @@ async def run(count: int, lossy: int, seed: int) -> list[Outcome]:
         asyncio.get_running_loop().add_signal_handler(number, task.cancel)
     with tempfile.TemporaryDirectory(prefix="nat-") as folder, Internet(sites(), seed) as net:
         say(f"{len(net.hosts)} hosts on {len(net.sites)} sites")
-        async with Fleet(net, net.hosts, Path(folder)) as fleet:
+        async with Hosts(net, net.hosts, Path(folder)) as fleet:
             matrix = Matrix(net, fleet, seed, say)
             await matrix.run(count, lossy)
             return matrix.outcomes
@@ -59,7 +59,7 @@ async def run(count: int, lossy: int, seed: int) -> list[Outcome]:
 
 def main(arguments: Sequence[str] = tuple(sys.argv[1:])) -> int:
     """The command line."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.nat", description="Who reaches whom behind routers.")
+    parser = argparse.ArgumentParser(prog="python -m sim.namespaces", description="Who reaches whom behind routers.")
     parser.add_argument("--count", type=whole, default=5, help="rounds of every pair (%(default)s)")
     parser.add_argument("--lossy", type=whole, default=4, help="rounds with 30 %% lost (%(default)s)")
     parser.add_argument("--seed", type=int, default=1, help="seed of losses and keys (%(default)s)")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from benchmarks.nat.outcome import ALONE, FORGOTTEN, LOSS, MATRIX, PLAIN, RENUMBERED, Outcome, cell, promises
+from sim.namespaces.outcome import ALONE, FORGOTTEN, LOSS, MATRIX, PLAIN, RENUMBERED, Outcome, cell, promises
 
 WHOLE = (PLAIN, LOSS, FORGOTTEN, RENUMBERED)
 """The parts in which every pair is tried."""

@@ -10,13 +10,13 @@ from dataclasses import dataclass
 from random import Random
 from typing import Any
 
-from benchmarks.nat.fleet import Fleet
-from benchmarks.nat.internet import PUB, PUBS, Internet, Site
-from benchmarks.nat.kind import Kind
-from benchmarks.nat.outcome import ALONE, FORGOTTEN, HOME, IDLE, LEAKY, LOSS, MATRIX, MOVED, PLAIN, RENUMBERED, Outcome
-from benchmarks.remote import Lost
 from middleware.entangled.identity import Identity
 from middleware.settings import NodeSettings
+from sim.namespaces.hosts import Hosts
+from sim.namespaces.internet import PUB, PUBS, Internet, Site
+from sim.namespaces.kind import Kind
+from sim.namespaces.outcome import ALONE, FORGOTTEN, HOME, IDLE, LEAKY, LOSS, MATRIX, MOVED, PLAIN, RENUMBERED, Outcome
+from sim.namespaces.remote import Lost
 
 JOIN_S, LOSSY_JOIN_S = 6.0, 20.0
 MEET_S, LOSSY_MEET_S = 6.0, 10.0
@@ -87,7 +87,7 @@ IDLE_PAIR = Pair(IDLE, "port", "port", "short1", "portb1", "mappings of the firs
 class Trial:
     """One team of three: a bootstrap node on the public host, and the two of a pair."""
 
-    def __init__(self, fleet: Fleet, pair: Pair, number: int, rng: Random) -> None:
+    def __init__(self, fleet: Hosts, pair: Pair, number: int, rng: Random) -> None:
         self.pair = pair
         self._fleet = fleet
         self._name = f"t{number}"
@@ -188,7 +188,7 @@ class Trial:
 class Matrix:
     """One run: ``count`` rounds of every pair, ``lossy`` of them again with losses; ``say`` is told what happens."""
 
-    def __init__(self, net: Internet, fleet: Fleet, seed: int, say: Callable[[str], None]) -> None:
+    def __init__(self, net: Internet, fleet: Hosts, seed: int, say: Callable[[str], None]) -> None:
         self.outcomes: list[Outcome] = []
         self._net = net
         self._fleet = fleet

@@ -4,7 +4,7 @@
         ...
     seen.found([b"red target"]), seen.traffic["198.18.1.2:7000"].amplification
 
-``python -m benchmarks.nat.capture INTERFACE FILE`` is the part of it that runs on the host; it needs no ``tcpdump``.
+``python -m sim.namespaces.capture INTERFACE FILE`` is the part of it that runs on the host; it needs no ``tcpdump``.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO
 
-from benchmarks.nat.internet import Internet
-from benchmarks.nat.kind import WAN
-from benchmarks.nat.switch import EVERYTHING, FILE_HEADER, SNAP
+from sim.namespaces.internet import Internet
+from sim.namespaces.kind import WAN
+from sim.namespaces.switch import EVERYTHING, FILE_HEADER, SNAP
 
 OUTGOING = 4
 IPV4, UDP = 0x0800, 17
@@ -55,7 +55,7 @@ class Capture:
     def __init__(self, net: Internet, host: str, file: Path, interface: str = WAN) -> None:
         self.traffic: dict[str, Traffic] = {}
         self.file = file
-        arguments = [sys.executable, "-m", "benchmarks.nat.capture", interface, str(file.absolute())]
+        arguments = [sys.executable, "-m", "sim.namespaces.capture", interface, str(file.absolute())]
         self._process = net.start(host, arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
     def __enter__(self) -> Capture:

@@ -1,4 +1,4 @@
-"""What ``benchmarks.nat`` makes of its trials: promises, table, document and picture; nothing is run."""
+"""What ``sim.namespaces`` makes of its trials: promises, table, document and picture; nothing is run."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import math
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from benchmarks.nat.kind import Kind
-from benchmarks.nat.matrix import plain_pairs, sites, special_pairs
-from benchmarks.nat.outcome import LOSS, MATRIX, PLAIN, Outcome, cell, is_punchable, percentile, promises
-from benchmarks.nat.picture import drawn
-from benchmarks.nat.report import BEGIN, END, table, written
+from sim.namespaces.kind import Kind
+from sim.namespaces.matrix import plain_pairs, sites, special_pairs
+from sim.namespaces.outcome import LOSS, MATRIX, PLAIN, Outcome, cell, is_punchable, percentile, promises
+from sim.namespaces.picture import drawn
+from sim.namespaces.report import BEGIN, END, table, written
 
 
 def good(part: str = PLAIN) -> list[Outcome]:

@@ -7,11 +7,11 @@ from pathlib import Path
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from benchmarks.nat.demo import HOSTS, NODE_PORT, SITES, planned
-from benchmarks.nat.kind import Kind
 from middleware.settings import Settings
 from sim.demo.cast import CASTS, LOOPBACK
 from sim.demo.configuration import DOGS, JUDGE, Place
+from sim.namespaces.demo import HOSTS, NODE_PORT, SITES, planned
+from sim.namespaces.kind import Kind
 
 
 def places() -> dict[str, Place]:

@@ -7,7 +7,7 @@ from random import Random
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from benchmarks.nat.line import Line, Weather
+from sim.namespaces.line import Line, Weather
 
 MANY = 20_000
 

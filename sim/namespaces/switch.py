@@ -1,6 +1,6 @@
 """Switch: the wide area as one process: it carries every frame between the sites by hand, and makes the lines bad.
 
-``python -m benchmarks.nat.switch SEED NAME=INTERFACE ..`` joins those interfaces of its namespace by raw sockets, so it
+``python -m sim.namespaces.switch SEED NAME=INTERFACE ..`` joins those interfaces of its namespace by raw sockets, so it
 needs no traffic control in the kernel.  Orders come as JSON lines, each is repeated when it is in force; it ends with
 its input.  A frame passes three lines: out of its site, along the way between the two sites, and into the other.
 """
@@ -20,7 +20,7 @@ from collections.abc import Iterator
 from random import Random
 from typing import Any, BinaryIO
 
-from benchmarks.nat.line import Line, Weather
+from sim.namespaces.line import Line, Weather
 
 EVERYTHING = 3
 PACKET, IGNORE_OUTGOING = 263, 23

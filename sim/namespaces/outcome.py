@@ -7,7 +7,7 @@ import statistics
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 
-from benchmarks.nat.kind import Kind
+from sim.namespaces.kind import Kind
 
 MATRIX = (Kind.NONE, Kind.FULL, Kind.ADDR, Kind.PORT, Kind.SYM, Kind.NOUDP)
 PLAIN, ALONE, LOSS, HOME, LEAKY, FORGOTTEN, RENUMBERED, MOVED, IDLE = (

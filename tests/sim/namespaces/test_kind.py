@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from benchmarks.nat.kind import Kind
+from sim.namespaces.kind import Kind
 
 
 class KindTests(SynchronousTestCase):

@@ -20,9 +20,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal
 
-from benchmarks.nat.kind import LAN, WAN, Forward, Kind
-from benchmarks.nat.line import Weather
-from benchmarks.nat.room import Room, environment
+from sim.namespaces.kind import LAN, WAN, Forward, Kind
+from sim.namespaces.line import Weather
+from sim.namespaces.room import Room, environment
 
 ROOT = Path(__file__).resolve().parents[2]
 PUB = "pub"
@@ -247,7 +247,7 @@ class Internet:
                 self._plug(f"{name}{number}", name, number)
         ports = [f"{name}={interface}" for name, interface in self._ports.items()]
         pipe = subprocess.PIPE
-        arguments = [sys.executable, "-m", "benchmarks.nat.switch", str(self._seed), *ports]
+        arguments = [sys.executable, "-m", "sim.namespaces.switch", str(self._seed), *ports]
         self._switch = self.start("", arguments, stdin=pipe, stdout=pipe, text=True)
         assert self._switch.stdout is not None
         if not self._switch.stdout.readline():

@@ -7,7 +7,7 @@ import statistics
 from collections.abc import Sequence
 from html import escape
 
-from benchmarks.nat.outcome import MATRIX, Outcome
+from sim.namespaces.outcome import MATRIX, Outcome
 
 LEFT, TOP, WIDE, HIGH = 150, 46, 112, 52
 COLOURS = {"direct": "#cfe8d5", "relayed": "#fbe7b2", "tunnel": "#cfdcf2", "": "#f3c6c0"}
