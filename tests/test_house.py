@@ -29,7 +29,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "drivers": ("drivers", "standards"),
     "sim": ("sim", "drivers", "middleware.faults.stream"),
     "sim.namespaces": ("sim", "middleware"),
-    "sim.team": ("sim.team", "middleware", "drivers.link"),
+    "sim.team": ("sim.team", "middleware", *(f"drivers.{name}" for name in ("driver", "errors", "gate", "link"))),
     "webnode": ("webnode", "middleware"),
     "agents": ("agents", "middleware", "drivers.driver", "drivers.reading", "drivers.errors"),
     "swarmnode": ROOMS,

@@ -15,7 +15,7 @@ from benchmarks.consensus.mission import Mission
 from middleware.consensus import bidder
 from middleware.consensus.nearest import Nearest
 from middleware.consensus.strategy import Report
-from tests.invariants.schedule import Schedule
+from sim.team.schedule import Schedule
 
 LINE = 12
 

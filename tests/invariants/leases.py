@@ -18,9 +18,9 @@ from middleware.entangled.errors import EntangledError
 from middleware.entangled.kademlia.contact import Contact
 from sim.team.event import Awaited
 from sim.team.faults.timeline import TimedFault, Timeline
+from sim.team.leases.radio import CALM, Air
+from sim.team.leases.team import Team
 from sim.team.shrink import WHOLE, Trim
-from tests.invariants.radio import CALM, Air
-from tests.invariants.team import Team
 
 TTL = 1.5
 SLACK = 0.8

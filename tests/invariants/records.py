@@ -15,7 +15,7 @@ from middleware.entangled.record import Record, hashed_key
 from sim.team.clients import REMOVE, Clients
 from sim.team.event import Counted, Met, Stored
 from sim.team.invariant.durability import Slot
-from tests.invariants.schedule import Schedule
+from sim.team.schedule import Schedule
 
 KEYS = [hashed_key(f"key {number}") for number in range(4)]
 NAMES = ("a", "b")

@@ -8,16 +8,16 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Protocol
 
+from sim.team.files import DiskFleet
+from sim.team.schedule import Schedule, Workload
 from sim.team.shrink import WHOLE, Trim
 from sim.team.sweep import sweep
-from tests.fleet import Fleet
+from sim.team.world import Fleet
 from tests.invariants.bug import BUGS, FINDERS, seeded
 from tests.invariants.deciders import Deciders
-from tests.invariants.disk import DiskFleet
 from tests.invariants.groups import Groups
 from tests.invariants.leases import Leases
 from tests.invariants.records import Records
-from tests.invariants.schedule import Schedule, Workload
 from tests.invariants.stores import Stores
 from tests.invariants.tasks import Tasks
 from tests.invariants.tuples import Tuples

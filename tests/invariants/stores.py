@@ -10,9 +10,9 @@ from twisted.python.failure import Failure
 from middleware.entangled.errors import EntangledError, Unwritable
 from middleware.entangled.node import EntangledNode
 from middleware.entangled.record import Record, hashed_key
-from tests.invariants.disk import DiskFleet, DiskStore
+from sim.team.files import DiskFleet, DiskStore
+from sim.team.schedule import Schedule
 from tests.invariants.records import KEYS
-from tests.invariants.schedule import Schedule
 
 PROBE = hashed_key("probe of a full disk")
 FULL = "database or disk is full"

@@ -20,8 +20,8 @@ from middleware.entangled.space.tuplespace import TupleSpace
 from sim.team import event
 from sim.team.history import History
 from sim.team.invariant.taking import PUT, RING, SURVEY, TAKE, WAIT
+from sim.team.schedule import Schedule
 from sim.team.takers.witness import Witness
-from tests.invariants.schedule import Schedule
 
 JOB = ("job", int, ANY)
 BELL = ("bell", int)

@@ -36,9 +36,9 @@ from middleware.entangled.wire.session import (
     derived_key,
 )
 from sim.team.event import Ran, Shot, Size, Strange
-from tests.fleet import TEAM
+from sim.team.schedule import Schedule
+from sim.team.world import TEAM
 from tests.fuzz.ground import state_of
-from tests.invariants.schedule import Schedule
 
 KINDS = ("replayed", "replayed", "forged", "forged", "truncated", "misdirected", "malformed", "greeting")
 STRANGER = Address("10.66.6.6", 666)

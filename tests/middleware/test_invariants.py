@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from twisted.trial.unittest import SynchronousTestCase
 
+from sim.team.files import DiskFleet
+from sim.team.schedule import Schedule
 from sim.team.shrink import Trim
 from tests.invariants.bug import FINDERS, seeded
-from tests.invariants.disk import DiskFleet
 from tests.invariants.leases import Leases
 from tests.invariants.least import least, line
 from tests.invariants.records import Records
 from tests.invariants.run import WORKLOADS, run, run_all
-from tests.invariants.schedule import Schedule
 from tests.invariants.tasks import Tasks
 from tests.replay import replayed
 

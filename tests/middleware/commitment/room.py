@@ -11,7 +11,7 @@ from twisted.trial.unittest import SynchronousTestCase
 from middleware.commitment.ballot import Ballot
 from middleware.commitment.charter import Charter, sign_change
 from middleware.commitment.lessee import Lessee
-from tests.invariants.team import Team
+from sim.team.leases.team import Team
 
 TTL = 1.5
 T = "t0"

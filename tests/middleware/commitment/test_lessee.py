@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 from middleware.entangled.data.memory import MemoryStore
-from tests.invariants.radio import Air
-from tests.invariants.takeover import takeover, upkeep
+from sim.team.leases.radio import Air
+from sim.team.leases.takeover import takeover, upkeep
 from tests.middleware.commitment.room import TTL, RoomCase, T
 
 

@@ -25,7 +25,7 @@ from middleware.entangled.data.store import Store
 from middleware.entangled.data.writer import COMMIT_AFTER, TRY_AGAIN, Writer, _Owed
 from middleware.entangled.network.switchboard import CALM, Weather
 from middleware.entangled.record import Record, Slot
-from tests.fleet import Fleet
+from sim.team.world import Fleet
 
 PARTS = ("", "-wal")
 MEMORY = "/dev/shm"

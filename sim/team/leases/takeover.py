@@ -1,6 +1,6 @@
 """Takeover: trials of one executor and its stand-bys on a link of one-way 20 ms + Exp(10 ms), clocks off by 1 %.
 
-``python -m tests.invariants.takeover [--trials 500] [--hours 24]`` prints what leases alone promise; what whole teams
+``python -m sim.team.leases.takeover [--trials 500] [--hours 24]`` prints what leases alone promise; what whole teams
 make of it prints ``make bench-takeover``.
 """
 
@@ -11,8 +11,8 @@ import math
 import random
 import sys
 
-from tests.invariants.radio import Air
-from tests.invariants.team import Team
+from sim.team.leases.radio import Air
+from sim.team.leases.team import Team
 
 TASK = "t0"
 DELAY, JITTER, DRIFT = 0.02, 0.01, 0.01
@@ -90,7 +90,7 @@ MOST_MESSAGES = 12.0
 
 def main(arguments: list[str]) -> int:
     """Print the table; 1 where a target is missed."""
-    parser = argparse.ArgumentParser(prog="python -m tests.invariants.takeover")
+    parser = argparse.ArgumentParser(prog="python -m sim.team.leases.takeover")
     parser.add_argument("--trials", type=int, default=500, help="of each case (default %(default)s)")
     parser.add_argument("--hours", type=int, default=24, help="of a healthy executor, virtual (default %(default)s)")
     given = parser.parse_args(arguments)

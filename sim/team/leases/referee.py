@@ -11,10 +11,10 @@ from middleware.commitment.ballot import quorum
 from sim.team.checker import check
 from sim.team.event import Commanded, Halted, Held, Issued, Reached, Terms, Won
 from sim.team.history import History
-from tests.invariants.bidder import WIRE, Bidder
+from sim.team.leases.bidder import WIRE, Bidder
 
 if TYPE_CHECKING:
-    from tests.invariants.team import Team
+    from sim.team.leases.team import Team
 
 
 class Referee:

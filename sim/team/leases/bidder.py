@@ -24,7 +24,7 @@ from middleware.entangled.kademlia.contact import Contact
 from sim.team.machine import Machine
 
 if TYPE_CHECKING:
-    from tests.invariants.team import Team
+    from sim.team.leases.team import Team
 
 TICK = 0.1
 ACT = 0.002

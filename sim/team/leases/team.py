@@ -16,10 +16,10 @@ from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address
 from sim.team.event import Born, Died
+from sim.team.leases.bidder import TICK, Bidder
+from sim.team.leases.radio import Radio
+from sim.team.leases.referee import Referee
 from sim.team.machine import Machine
-from tests.invariants.bidder import TICK, Bidder
-from tests.invariants.radio import Radio
-from tests.invariants.referee import Referee
 
 
 class Team:

@@ -19,7 +19,7 @@ from sim.team.event import Born, Died, Settled
 from sim.team.faults.timeline import TimedFault, Timeline
 from sim.team.history import History
 from sim.team.shrink import WHOLE, Trim
-from tests.fleet import Fleet
+from sim.team.world import Fleet
 
 STRANDED = 0.15
 """The share of schedules in which a cut leaves a few with newcomers of their own."""
