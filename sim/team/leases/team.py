@@ -1,4 +1,7 @@
-"""Team: places with machines, acceptors and agents on a simulated link, for schedules and trials of leases."""
+"""Places with machines, acceptors, agents and devices on a simulated link, for schedules and trials of leases.
+
+``Bidder`` is one life of a place, ``Team`` all places, ``Referee`` what is written down of them (E1 to E9).
+"""
 
 from __future__ import annotations
 
@@ -6,20 +9,288 @@ import random
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from twisted.internet.defer import Deferred
+from twisted.internet.defer import Deferred, maybeDeferred
 
-from middleware.commitment.charter import Charter, Judge, pin
+from drivers.driver import Permit
+from drivers.errors import StaleCommand
+from drivers.gate import Gate
+from middleware.commitment.acceptor import Acceptor
+from middleware.commitment.ballot import GRANTED, NONE, OVER, SEALED, Ballot, Reply, members_of, quorum
+from middleware.commitment.charter import Charter, Judge, pin, sign_change, sign_end
 from middleware.commitment.council import Council
+from middleware.commitment.ledger import Ledger
+from middleware.commitment.lessee import Lessee
+from middleware.commitment.patience import in_time
 from middleware.entangled.clock import HeapClock
 from middleware.entangled.data.memory import MemoryStore
+from middleware.entangled.data.store import Store
 from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address
-from sim.team.event import Born, Died
-from sim.team.leases.bidder import TICK, Bidder
+from sim.team.checker import check
+from sim.team.event import Born, Commanded, Died, Halted, Held, Issued, Reached, Terms, Won
+from sim.team.history import History
 from sim.team.leases.radio import Radio
-from sim.team.leases.referee import Referee
 from sim.team.machine import Machine
+
+TICK = 0.1
+ACT = 0.002
+"""Seconds between an agent's look at its lease and the command on the wire."""
+WIRE = 0.001
+
+
+class Bidder:
+    """One life of a place: its acceptor, its claims, its robot."""
+
+    def __init__(self, world: Team, place: int, machine: Machine, store: Store, rng: random.Random) -> None:
+        self.world = world
+        self.place = place
+        self.machine = machine
+        self.acceptor = Acceptor(Ledger(store, machine.seconds()), machine.seconds())
+        self.lessees: dict[str, Lessee] = {}
+        self._gates: dict[str, Gate] = {}
+        self._rng = rng
+        self._methods: dict[str, Callable[..., object]] = {
+            "lease.prepare": self._prepare,
+            "lease.propose": self._propose,
+            "lease.release": self._release,
+            "lease.close": self._close,
+            "lease.cancel": self._cancel,
+            "lease.change": self._change,
+            "lease.install": self._install,
+            "lease.freed": self.freed,
+        }
+        machine.callLater(rng.random() * world.tick, self._tick)
+
+    # -- the agent --------------------------------------------------------------------------------------------------
+
+    def lessee(self, task_id: str) -> Lessee:
+        """This agent's claim on a task."""
+        if task_id not in self.lessees:
+            charter = self.world.council_for(self.place, task_id)
+            council = Council(
+                task_id,
+                self.world.contacts[self.place].node_id.hex(),
+                self.world.ttl,
+                charter.members,
+                self._ask,
+                self.machine,
+                self._rng,
+                charter,
+                self.world.judge.read,
+                charter.configuration,
+                self.world.referee.floor(self.place, task_id),
+            )
+            council.moved = lambda: self.world.moved(task_id, council)
+            changed = lambda: self.world.referee.on_change(self, task_id)  # noqa: E731
+            self.lessees[task_id] = Lessee(council, self.machine, self._rng, changed, self.world.stop_time)
+            self._gates[task_id] = Gate()
+        return self.lessees[task_id]
+
+    def holds(self, task_id: str) -> bool:
+        """Whether this agent lives and believes to hold a lease."""
+        lessee = self.lessees.get(task_id)
+        return lessee is not None and lessee.lease is not None and self.machine.is_alive
+
+    def leave(self, task_id: str, heirs: Sequence[int] = ()) -> None:
+        """Stop the robot, then give the lease back."""
+        self.world.referee.stop(self.place, task_id)
+        lessee = self.lessees.get(task_id)
+        if lessee is not None:
+            lessee.release([self.world.contacts[heir] for heir in heirs])
+
+    def freed(self, agent: str, task_id: str, token: int, rest: float) -> None:
+        """Hear that the lease was given back."""
+        self._tell(self.acceptor.freed(task_id, agent, token, self.machine.seconds(), rest), task_id, rest)
+        lessee = self.lessees.get(task_id)
+        if lessee is not None:
+            lessee.freed(token, rest)
+
+    def _tick(self) -> None:
+        for task_id, lessee in self.lessees.items():
+            lease = lessee.lease
+            if lease is not None:
+                now = self.machine.seconds()
+                permit = Permit(lease.token, lease.deadline)
+                # As a driver does: the device's time as it was told lately, and how long the lease lasts from then on.
+                told = self.world.clock.seconds() - self._rng.random() * 0.02
+                self.machine.callLater(ACT, self._act, task_id, permit, told, lease.deadline - now)
+        self.machine.callLater(self.world.tick, self._tick)
+
+    def _act(self, task_id: str, permit: Permit, told: float, remaining: float) -> None:
+        lessee = self.lessees[task_id]
+        gate = self._gates[task_id]
+        try:
+            gate.admit(permit, self.machine.seconds())
+        except StaleCommand:
+            return
+        if lessee.lease is None and not lessee.token:
+            return  # it was given back meanwhile
+        self.world.referee.on_issue(self, task_id, permit)
+        self.world.clock.callLater(WIRE, self.world.referee.on_command, self, task_id, permit, told, remaining)
+
+    # -- the wire ---------------------------------------------------------------------------------------------------
+
+    def _ask(self, member: Contact, method: str, arguments: tuple[Any, ...]) -> Deferred[Any]:
+        answered: Deferred[Any] = Deferred()
+        to = self.world.place_of(member)
+        if to == self.place:
+            maybeDeferred(self.answer, self.place, method, arguments).chainDeferred(answered)
+            return answered
+
+        def come_back(answer: object) -> None:
+            if not answered.called:
+                answered.callback(answer)
+
+        def ask() -> None:
+            self.world.ask(self, to, method, arguments, come_back)
+
+        ask()
+        if method == "lease.release":
+            self.machine.callLater(0.15, ask)
+        return answered
+
+    def answer(self, source: int, method: str, arguments: tuple[Any, ...]) -> object:
+        """Do what a peer asks; an answer that is not there yet is a Deferred."""
+        agent = self.world.contacts[source].node_id.hex()
+        reply = self._methods[method](agent, *arguments)
+        if isinstance(reply, Deferred):
+            packed: Deferred[object] = reply.addCallback(Reply.packed)
+            return packed.result if packed.called else packed
+        return reply.packed() if isinstance(reply, Reply) else reply
+
+    def _prepare(self, agent: str, task_id: str, configuration: int, counter: int, ttl: float) -> Reply:
+        return self.acceptor.prepare(task_id, configuration, Ballot(counter, agent), ttl, self.machine.seconds())
+
+    def _propose(
+        self, agent: str, task_id: str, configuration: int, counter: int, token: int, ttl: float
+    ) -> Deferred[Reply]:
+        def proposed() -> Reply:
+            ballot, now = Ballot(counter, agent), self.machine.seconds()
+            return self.acceptor.propose(task_id, configuration, ballot, token, ttl, now)
+
+        return in_time(proposed, self.machine)
+
+    def _release(self, agent: str, task_id: str, counter: int, rest: float) -> None:
+        freed = self.acceptor.release(task_id, Ballot(counter, agent), self.machine.seconds(), rest)
+        self._tell(freed, task_id, rest)
+
+    def _tell(self, listeners: Sequence[str], task_id: str, rest: float) -> None:
+        for listener in listeners:
+            self.world.tell_freed(self.place, listener, task_id, rest)
+
+    def _close(self, agent: str, task_id: str, configuration: int, token: int) -> Reply:
+        reply = self.acceptor.close(task_id, agent, configuration, token, self.machine.seconds())
+        signature = sign_end(self._identity, task_id, configuration, agent, token)
+        return reply._replace(proof=signature) if reply.kind in (OVER, SEALED) else reply
+
+    def _cancel(self, agent: str, task_id: str, configuration: int) -> Reply:
+        return self.acceptor.close(task_id, "", configuration, 0, self.machine.seconds())
+
+    def _change(
+        self, agent: str, task_id: str, configuration: int, counter: int, packed: list[object], token: int, keep: bool
+    ) -> Reply:
+        members, ballot = members_of(packed) or (), Ballot(counter, agent)
+        reply = self.acceptor.change(task_id, configuration, ballot, members, token, self.machine.seconds(), keep)
+        signature = sign_change(self._identity, task_id, configuration, ballot, members, reply.token)
+        return reply._replace(proof=signature) if reply.kind == GRANTED else reply
+
+    def _install(self, agent: str, task_id: str, packed: bytes, keep: bool, ttl: float) -> Reply | None:
+        charter = self.world.judge.read(task_id, packed)
+        if charter is None or not charter.links:
+            return None
+        ballot = charter.ballot if keep and charter.ballot.agent == agent else NONE
+        told = charter.configuration, charter.members, charter.token, self.machine.seconds(), ballot, ttl, packed
+        return self.acceptor.install(task_id, *told)
+
+    @property
+    def _identity(self) -> Identity:
+        return self.world.identities[self.place]
+
+
+class Referee:
+    """The history of a team, and of each task its device's gate, what that accepted, and who won."""
+
+    def __init__(self, world: Team) -> None:
+        self.history = History(world.clock.seconds)
+        self.gates: dict[str, Gate] = {}
+        self.accepted: dict[str, list[tuple[float, int, int]]] = {}
+        self.wins = 0
+        self._world = world
+        self._won: dict[tuple[str, int], tuple[int, int]] = {}
+        self._is_cut: set[tuple[str, int]] = set()
+
+    @property
+    def found(self) -> list[str]:
+        """Every violation so far, a line each."""
+        return check(self.history)
+
+    def agree(self) -> None:
+        """Write down what is assumed from now on."""
+        world = self._world
+        self.history.note(Terms, world.ttl, world.drift, world.stop_time, world.radio.longest_way)
+
+    def add(self, task_id: str) -> None:
+        """Watch one more task."""
+        self.gates[task_id] = Gate()
+        self.accepted[task_id] = []
+
+    def on_change(self, bidder: Bidder, task_id: str) -> None:
+        """A lease was won or renewed: write down who else holds it by his own clock."""
+        lease = bidder.lessees[task_id].lease
+        if lease is None:
+            return
+        mine = (task_id, bidder.place)
+        is_new = self._won.get(mine) != (lease.token, id(bidder))
+        self._won[mine] = lease.token, id(bidder)
+        others = [other.place for other in self._world.bidders if other is not bidder and other.holds(task_id)]
+        self.history.note(Held, task_id, bidder.place, tuple(others))
+        if is_new:
+            self.wins += 1
+            self._world.radio.note("won", task_id, bidder.place, lease.token, self._world.clock.seconds())
+            self.history.note(Won, task_id, bidder.place, lease.token)
+
+    def on_issue(self, bidder: Bidder, task_id: str, permit: Permit) -> None:
+        """An agent sends a command under its lease, perhaps when it has just been thawed."""
+        truly = bidder.machine.unstopped_at(permit.deadline)
+        self.history.note(Issued, task_id, bidder.place, bidder.machine.at(permit.deadline), truly)
+
+    def on_command(self, bidder: Bidder, task_id: str, permit: Permit, told: float, remaining: float) -> None:
+        """The device, shared by all, takes a command or refuses it."""
+        now, gate = self._world.clock.seconds(), self.gates[task_id]
+        deadline = min(told, now) + remaining
+        truly, is_accepted = bidder.machine.unstopped_at(permit.deadline), True
+        try:
+            gate.admit(Permit(permit.token, deadline), now)
+        except StaleCommand:
+            is_accepted = False
+            if gate.token is not None and permit.token < gate.token and bidder.machine.is_alive:
+                bidder.machine.take(bidder.lessees[task_id].outrank, gate.token)
+        else:
+            self.accepted[task_id].append((now, permit.token, bidder.place))
+        self.history.note(Commanded, task_id, bidder.place, permit.token, is_accepted, deadline, truly)
+
+    def floor(self, place: int, task_id: str) -> int:
+        """The highest token that the robot of a place has obeyed, and tells its agent."""
+        return max((token for _, token, one in self.accepted[task_id] if one == place), default=0)
+
+    def stop(self, place: int, task_id: str) -> None:
+        """The agent stops its robot, which comes to rest; on the wire a stop does not overtake a command."""
+        self._world.clock.callLater(WIRE, self._stop, place, task_id)
+
+    def _stop(self, place: int, task_id: str) -> None:
+        self.history.note(Halted, task_id, place, self._world.clock.seconds() + self._world.stop_time)
+
+    def look_at_cuts(self) -> None:
+        """Note who no longer reaches a majority of the council, both ways, and who does again."""
+        for task_id, charter in self._world.councils.items():
+            places = [self._world.place_of(member) for member in charter.members]
+            for agent in self._world.agents:
+                near = [p for p in places if not {(agent, p), (p, agent)} & self._world.radio.cut]
+                is_reached, mine = len(near) >= quorum(len(places)), (task_id, agent)
+                if is_reached == (mine in self._is_cut):
+                    self._is_cut ^= {mine}
+                    self.history.note(Reached, *mine, is_reached)
 
 
 class Team:

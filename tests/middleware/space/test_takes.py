@@ -71,7 +71,7 @@ class TakesTests(SynchronousTestCase):
 class ForgottenLife(LightTrial):
     def start(self, place: int) -> None:
         if self.nodes[place] is None:
-            self.stores[place].note("decree/incarnation", b"")
+            self.store(place).note("decree/incarnation", b"")
         super().start(place)
 
 
