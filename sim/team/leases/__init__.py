@@ -1,1 +1,1 @@
-"""Simulated agents, acceptors and devices of task leases, without the rest of a node: a thousand schedules in a minute."""
+"""Simulated agents, acceptors and devices of task leases; a schedule takes some milliseconds."""
