@@ -17,7 +17,7 @@ from twisted.internet.defer import Deferred, DeferredList, fail, maybeDeferred, 
 from twisted.internet.interfaces import IDelayedCall
 from twisted.logger import Logger
 
-from drivers.jpeg import size_of
+from standards.jpeg import size_of
 from drivers.phone.driver import SIGHT, PhoneDriver
 from drivers.phone.option import FPS, MOST_SIDE
 from middleware.admission.certificate import GATEWAY

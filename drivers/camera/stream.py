@@ -13,7 +13,7 @@ from drivers.camera.option import Place
 from drivers.camera.shots import Shot
 from drivers.camera.thread import Retry, Viewer
 from drivers.errors import BadFrame
-from drivers.jpeg import size_of
+from standards.jpeg import size_of
 from drivers.link import Connector, Line, Link
 
 SILENCE_S = 5.0

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from drivers.errors import BadFrame
-from drivers.jpeg import size_of
+from standards.jpeg import size_of
 from drivers.reading import Value
 
 FAR_M, FAST, PULL = 1e6, 100.0, 1000.0

@@ -14,7 +14,7 @@ from twisted.trial.unittest import SynchronousTestCase
 from drivers.aibo.driver import AiboDriver
 from drivers.driver import Permit
 from drivers.errors import UsageError
-from drivers.jpeg import size_of
+from standards.jpeg import size_of
 from drivers.registry import describe
 from sim.dog import LIMITS
 from sim.emulator.aibo import AiboEmulator
