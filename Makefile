@@ -32,7 +32,7 @@ BROWSER := $(VENV)/.stamp-browser
 BENCH   := $(VENV)/.stamp-bench
 CONTRACT := $(VENV)/contract
 
-.PHONY: help demo test trials check format cov live contract schedules bugs slice browser \
+.PHONY: help demo test trials check format cov live contract schedules stops bugs slice browser \
     live-nat bench-demo bench-page bench-dht bench-consensus bench-takeover bench-flood bench-robots bench-crowd \
     bench-scale api dist clean
 
@@ -50,6 +50,7 @@ help:
 	@echo 'make schedules [N=2000] [SEED=1]      so many random schedules of faults, and the invariants of the library'
 	@echo '          [LOG=docs/scale/schedules.jsonl]   log them, and leave out those that are logged'
 	@echo '          [SCHEDULER=tcp://HOST:8786]        on the machines that wait there: dask scheduler, dask worker'
+	@echo 'make stops [N=10000] [SEED=1]         so many random sequences of stops, releases, faults and hostile messages'
 	@echo 'make bugs                             each of the seeded bugs in turn, until a schedule shows it'
 	@echo 'make slice                            a thousand simulated nodes, a tenth of which are killed'
 	@echo 'make live                             only the tests with real sockets and processes'
@@ -97,6 +98,9 @@ cov: $(DEV)
 schedules: $(DEV)
 	$(PY) -m tests.invariants --schedules $(if $(filter file,$(origin N)),2000,$(N)) --seed $(SEED) --jobs $(JOBS) \
 	    $(if $(LOG),--log $(LOG) --resume) $(if $(SCHEDULER),--scheduler $(SCHEDULER))
+
+stops: $(DEV)
+	$(PY) -m tests.invariants.stops --sequences $(if $(filter file,$(origin N)),10000,$(N)) --seed $(SEED)
 
 # A thousand nodes, a tenth of which are killed.
 slice: $(RUNTIME)

@@ -33,8 +33,9 @@ class Behaviour(Protocol):
     A behaviour may also have: ``is_safe``, whether the task may change hands now (usually it always may);
     ``progress``, the share that is done, 0 to 1; ``valid_for``, the seconds for which its cost counts (usually as long
     as its node lives); ``angle`` and ``take_post``, see ``agents.formation``; ``embody``, which is given what the
-    body can do before the first look, see ``agents.means``.  For strategies that go by it: ``value``, the number or the
-    place that it has to offer (a tuple; metres), ``choice``, the option that it is for, the ``weight`` of both, and
+    body can do before the first look, see ``agents.means``; ``close``, called when its agent has left the task.  For
+    strategies that go by it: ``value``, the number or the place that it has to offer (a tuple; metres), ``choice``, the
+    option that it is for, the ``weight`` of both, and
     ``electorate``, the weight of all that may vote.
     """
 
@@ -101,8 +102,4 @@ def _installed(task: Task, rng: random.Random) -> Behaviour:
 def _deployed(task: Task, rng: random.Random, deployed: Deployed) -> Behaviour:
     from agents.guarded import Guarded  # most nodes never come here
 
-    make = maker_of(BEHAVIOUR, task.kind, deployed)
-    try:
-        return Guarded(make(task.parameters, rng), STAND)
-    except Exception as error:  # a module of somebody else may fail in any way
-        raise UnknownTask(f"a task of kind {task.kind!r} cannot have these parameters: {error}") from error
+    return Guarded(maker_of(BEHAVIOUR, task.kind, deployed)(task.parameters, rng), STAND)

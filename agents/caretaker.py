@@ -53,7 +53,7 @@ class Caretaker:
         task = self._engagement.task
         if self._council is None:
             self._council = self._node.councils.of(task)
-        self._council.learn(task.configuration, task.council)
+        self._council.learn(task.charter)
         self._council.visit()
         return self._council
 

@@ -178,10 +178,10 @@ class Engagement:
             self._say(f"{'paused' if self.is_paused else 'resumed'} by {order.by}")
 
     def renewed(self, task: Task) -> None:
-        """Take in what the record of the task says now."""
-        self.task = task
+        """Take in what the records of the task say now; of its councils the newest stays."""
+        self.task = task.with_newer_council(self.task)
         if self.lessee is not None:
-            self.lessee.council.learn(task.configuration, task.council)
+            self.lessee.council.learn(self.task.charter)
 
     def hand_council(self, members: Sequence[Contact]) -> None:
         """Have ``members`` be the council of the task that it acts for, when the body comes to a safe point."""
@@ -216,8 +216,12 @@ class Engagement:
         if self.is_over or self._concluding:
             return None
         now = self._clock.seconds()
-        if self._is_late(now) and (self.course.state is State.EXECUTING or self._conference.is_first(now)):
-            self._finish(FAILED, f"past its deadline of {self.task.deadline:g} s")
+        if self._is_late(now) and self.lessee is not None and self._may_fail(now):
+            if self.lessee.lease is not None:
+                self._finish(FAILED, f"past its deadline of {self.task.deadline:g} s")
+            else:
+                self._stop(State.FENCED)
+                self.lessee.want()  # an agent ends only what it holds
             return None
         if self.is_paused or (self.lessee is None and not self.is_lent):
             self._rest_aside("paused" if self.is_paused else self.me.why)
@@ -275,8 +279,6 @@ class Engagement:
         """
         if self.lessee is None:
             return succeed(None)
-        if self._concluding and self.result is not None:
-            return self.lessee.end()
         self._stop(State.RELEASING)
         return self.lessee.release(self.reached(self._heirs), self._rest)
 
@@ -442,6 +444,16 @@ class Engagement:
         bids = sorted((m.name, m.cost) for m in members if m.cost is not None)
         token = 0 if lease is None else lease.token
         self._conclude(Result(outcome, self.me.name, round(now - self._began, 2), token, tuple(bids), why))
+
+    def reopen(self) -> None:
+        """The task is another's by now: a higher token was granted before the end under this one was recorded."""
+        self._concluding = False
+        if self.lessee is not None:
+            self.lessee.release()
+
+    def _may_fail(self, now: float) -> bool:
+        """Whether it falls to this agent to end the task without success: it acts, or is the first of those present."""
+        return self.course.state is State.EXECUTING or self._conference.is_first(now)
 
     def _is_late(self, now: float) -> bool:
         return 0.0 < self.task.deadline < self._age + now - self._began

@@ -48,7 +48,7 @@ class Agent(Service):
         self._holder: Part | None = None
         self._tick: IDelayedCall | None = None
         self._token = 0
-        self._was_halted = False
+        self._was_stopped = False
         node.halt.watch(self._obey)
 
     @property
@@ -119,7 +119,7 @@ class Agent(Service):
     def _checked(self, records: list[Record], task: Task) -> None:
         """A task heard of: it may be an old one that is done."""
         self._checking.discard(task.task_id)
-        if outcome_of(records) is not None:
+        if outcome_of(task, records) is not None:
             self._docket.bury(task.task_id, self._clock.seconds())
         elif self._docket.add(task):
             self._arrange()
@@ -236,7 +236,8 @@ class Agent(Service):
             part.caretaker.look()
             if part is not self._holder:
                 part.engagement.step()
-        if self._stands():
+        if self._node.halt.is_on:
+            self._node.halt.refresh()
             return
         engagement = self.engagement
         if engagement is None:
@@ -254,24 +255,19 @@ class Agent(Service):
         if deed is not None and has_body and not self._body.do(deed):
             engagement.fence()
 
-    def _stands(self) -> bool:
-        """Whether the team is halted: then the body stands, and what is held is kept, so that nobody takes over."""
-        if not self._node.halt.is_on:
-            return False
-        self._node.halt.learn()  # nobody may have answered so far
-        self._body.driver.stop()
-        return True
-
     def _obey(self) -> str:
-        """The team is halted or released: do so at once, and say what the body does."""
+        """Stand while the team is stopped, and say what the body does; what is held is kept, so nobody takes over."""
         if not self.running:
             return NO_ROBOT
-        word = self._node.halt.word
-        if word.is_on != self._was_halted:
-            self._was_halted = word.is_on
-            self._say(f"{'stopped' if word.is_on else 'released'} by {word.by}")
-        if not self._stands():
+        halt = self._node.halt
+        if halt.is_stopped != self._was_stopped:
+            self._was_stopped = halt.is_stopped
+            self._say(f"stopped by {halt.by}" if halt.is_stopped else f"released by {halt.released_by}")
+        if not halt.is_on:
             return GOES_ON
+        if not halt.is_known:
+            halt.learn()  # no node has answered so far
+        self._body.driver.stop()
         return STANDS if self._body.driver.state == "ready" else "does not reach its robot, which stops by itself"
 
     def _finished(self, part: Part) -> None:

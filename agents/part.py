@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 from twisted.internet.defer import Deferred
@@ -11,6 +12,7 @@ from twisted.internet.interfaces import IReactorTime
 from agents.behaviour import Behaviour
 from agents.caretaker import Caretaker
 from agents.engagement import Engagement
+from middleware.commitment.ballot import Superseded
 from middleware.consensus.strategy import ConsensusAlgorithm
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.record import Record
@@ -18,7 +20,7 @@ from middleware.node import SwarmNode
 from middleware.order import order_of
 from middleware.panel import panel_of
 from middleware.presence import IDLE
-from middleware.tasks import Member, Result, Task, group_key
+from middleware.tasks import Member, Result, Task, council_of, group_key
 from middleware.verdict import Verdict
 
 AGAIN = 0.5
@@ -43,6 +45,7 @@ class Part:
         self._node = node
         self._clock = clock
         self._told = told
+        self._close: Callable[[], None] = getattr(behaviour, "close", lambda: None)
         me = Member(node.uuid, node.presence.device.name, IDLE)
         age = max(0.0, node.wall() - task.created)
         self.engagement = Engagement(
@@ -66,6 +69,7 @@ class Part:
         """
         self.is_left = True
         told = self.engagement.abandon()
+        self._close()
         self._group.leave()
         if is_running:
             self._group.withdraw()
@@ -73,6 +77,9 @@ class Part:
 
     def _ordered(self, records: list[Record]) -> None:
         self.engagement.ordered(order_of(records))
+        task = council_of(self.engagement.task, records)
+        if task is not self.engagement.task:
+            self.engagement.renewed(task)
 
     def _tell(self, member: Member) -> None:
         self._group.report(member)
@@ -83,12 +90,19 @@ class Part:
             self._node.justify(verdict)
 
     def _conclude(self, result: Result) -> None:
-        if not self.is_left:
-            self._group.conclude(result).addErrback(self._not_concluded, result)
+        lessee = self.engagement.lessee
+        if self.is_left or lessee is None:
+            return
+        result = replace(result, token=max(result.token, lessee.token))
+        proved = lessee.end(result.token)
+        proved.addCallback(lambda proof: self._group.conclude(result, proof))
+        proved.addErrback(self._not_concluded, result)
 
     def _not_concluded(self, failure: Any, result: Result) -> None:
-        """No majority could be told: try again for as long as the task is ours to conclude."""
+        """No majority could be told: try again for as long as the task is this agent's to conclude."""
         failure.trap(EntangledError)
+        if failure.check(Superseded) is not None:
+            return self.engagement.reopen()
         if not self.is_left and not self.engagement.is_over:
             self._clock.callLater(AGAIN, self._conclude, result)
 

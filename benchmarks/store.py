@@ -173,7 +173,7 @@ def restarted(folder: str, rows: int, times: int = 5) -> bool:
     held = True
     for count in (0, rows):
         path = os.path.join(folder, f"{count}.sqlite")
-        with closing(SqliteStore.open(path, 0.0, max_rows=max(1, count))) as store:
+        with closing(SqliteStore.open(path, 0.0, max_rows=max(1, 4 * count))) as store:
             dice = random.Random(count)
             for number in range(count):
                 value, signature = dice.randbytes(200), dice.randbytes(64)

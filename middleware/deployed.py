@@ -17,7 +17,7 @@ PREFIX = "deployed:"
 ERRORS: Mapping[str, type[SwarmError]] = {STRATEGY: UnknownStrategy, BEHAVIOUR: UnknownTask}
 
 Make = Callable[..., Any]
-"""What makes a strategy (no arguments) or a behaviour (parameters and dice)."""
+"""What makes a strategy (no arguments) or the way to a behaviour (parameters and random generator)."""
 Deployed = Mapping[tuple[str, str], Make]
 """(kind, name without ``PREFIX``) to what makes it: the modules that run on one node."""
 

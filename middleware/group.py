@@ -18,7 +18,7 @@ from middleware.entangled.record import Record
 from middleware.entangled.replication.owner import Stored
 from middleware.panel import BELIEVED, Panel
 from middleware.presence import WAITING
-from middleware.tasks import MEMBER, RESULT, Member, Result, group_key, member_of, outcome_of
+from middleware.tasks import DONE, MEMBER, Member, Result, Task, done_packed, group_key, member_of, outcome_of
 
 if TYPE_CHECKING:
     from middleware.dissemination.bidding import Bidding
@@ -34,7 +34,7 @@ Later = Callable[[float, Callable[[], None]], Callable[[], None]]
 
 
 class Group:
-    """One participant's place in the group of ``task_id``.
+    """One participant's place in the group of ``task``.
 
     ``quietly`` takes what may fail without anybody waiting, ``ordered`` all records there are, for an operator's orders
     among them.  With ``enter`` bids go to the task's council as well (``dissemination``), which announces those that
@@ -45,7 +45,7 @@ class Group:
 
     def __init__(
         self,
-        task_id: str,
+        task: Task,
         entangled: EntangledNode,
         heard: Heard,
         quietly: Callable[[Deferred[Stored]], None],
@@ -57,7 +57,8 @@ class Group:
         seconds: Callable[[], float],
         later: Later,
     ) -> None:
-        self._key = group_key(task_id)
+        self._task = task
+        self._key = group_key(task.task_id)
         self._entangled = entangled
         self._heard = heard
         self._ordered = ordered
@@ -101,9 +102,9 @@ class Group:
         if self._bidding is not None:
             self._bidding.withdraw()
 
-    def conclude(self, result: Result) -> Deferred[Stored]:
-        """Record how the task ended; stays when this node goes."""
-        return self._entangled.put(self._key, RESULT, result.packed(), "team")
+    def conclude(self, result: Result, proof: bytes) -> Deferred[Stored]:
+        """Record how the task ended, with the proof of its council; stays when this node goes."""
+        return self._entangled.put(self._key, DONE, done_packed(result, proof), "team")
 
     def leave(self) -> None:
         """Hear no more of it."""
@@ -115,7 +116,7 @@ class Group:
 
     def _changed(self, records: list[Record]) -> None:
         self._roll.present(m for record in records if (m := member_of(record)) is not None)
-        self._outcome = outcome_of(records)
+        self._outcome = outcome_of(self._task, records)
         self._panel.heard(self._roll.uuids(), self._devices(), self._seconds())
         if self._bidding is not None:
             self._bidding.expect(self._expected())

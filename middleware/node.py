@@ -41,7 +41,7 @@ from middleware.listing import Listing
 from middleware.prefix import LONGEST
 from middleware.presence import Device, Presence, devices_of
 from middleware.streams import Streams
-from middleware.tasks import MEMBER, ORDER, RESULT, TASKS, Result, Task, group_key, tasks_of
+from middleware.tasks import COUNCIL, MEMBER, ORDER, RESULT, TASKS, Result, Task, council_of, group_key
 from middleware.value import bounded
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ if TYPE_CHECKING:
     from middleware.verdict import Verdict
 
 CAMERA = "camera"
-LEASE_VERBS = ("prepare", "propose", "release", "close", "change", "install", "freed")
+LEASE_VERBS = ("prepare", "propose", "release", "close", "cancel", "change", "install", "freed")
 LOOK_AGAIN = 0.3
 """Seconds after which a newcomer looks whether others took the same place in the order of joining."""
 LOOKS = 10
@@ -74,7 +74,8 @@ class SwarmNode(Service):
 
     ``team`` is the closed team whose ``door`` the node has, None in an open one; it starts and stops with the node.
     ``device`` is what the node says of itself; ``wall`` gives seconds of the wall clock, for people only.  ``deployed``
-    is what operators pushed and its owner allowed; ``halt`` says whether the whole team is to stand.
+    is what operators pushed and its owner allowed, ``stop_deployed`` ends its processes; ``halt`` says whether the
+    whole team is to stand.
     ``later(seconds, call, ...)`` is a timer that ends with the node.
     """
 
@@ -101,13 +102,15 @@ class SwarmNode(Service):
         self.store = store
         self.entangled = EntangledNode(identity, team_key, network, store, clock, rng, lease, wall, door, lan)
         self.uuid = identity.node_id.hex()
+        self._door = door
         self._chores = Background(clock)
         self.later = self._chores.later
         self.team: Team | None = None
         self.deployed: Deployed = {}
+        self.stop_deployed: Callable[[], None] = lambda: None
         self.halt = Halt()
         self.directory = Directory(self.entangled, self._chores, self._quietly)
-        self.presence = Presence(device, self._announce, self._chores.later)
+        self.presence = Presence(self._named(device), self._announce, self._chores.later)
         self.streams = Streams(self.entangled.endpoint, clock)
         self.joined: Deferred[None] = Deferred()
         self._known = list(known_nodes)
@@ -154,6 +157,7 @@ class SwarmNode(Service):
         leave()
         if "_strategies" in self.__dict__:
             self._strategies.stop()
+        self.stop_deployed()
         super().stopService()
 
     async def _join(self) -> None:
@@ -177,7 +181,7 @@ class SwarmNode(Service):
         entangled, now = self.entangled, self.clock.seconds()
         if now - self._reviewed_at >= REVIEWING:
             self._reviewed_at = now
-            self.presence.change(depth=self.directory.review())
+            self.presence.change(depth=self.directory.review(), name=self._named(self.presence.device).name)
         if self.directory.depth and now - self._counted_at < LONGEST:
             return
         self._counted_at = now
@@ -212,6 +216,10 @@ class SwarmNode(Service):
             except EntangledError as error:
                 self._log.info("nobody says who is here; asking again: {error}", error=error)
                 await self._chores.sleep(LOOK_AGAIN)
+
+    def _named(self, device: Device) -> Device:
+        """The device under the name of its certificate, where the team gives certificates."""
+        return replace(device, name=self._door.authority(self.entangled.identity.public).name or device.name)
 
     def _addressed(self, device: Device) -> Device:
         return replace(device, uuid=self.uuid, address=str(self._network.address), since=self.wall())
@@ -276,7 +284,7 @@ class SwarmNode(Service):
         """
         if not is_deployed(task.strategy):  # those are the business of the nodes that have them
             place_of(task.strategy)
-        task = replace(task, council=await self.councils.nearest(task))
+        task = await self.councils.pinned(task)
         await self.entangled.put(TASKS, task.task_id, task.packed(), "team")
         return task
 
@@ -302,7 +310,7 @@ class SwarmNode(Service):
         view = self._view(task.strategy) if task.council else None
         devices = self.team_size if task.council and not task.group else lambda: 1
         told = (heard, self._quietly, ordered, enter, view)
-        return Group(task.task_id, self.entangled, *told, panel, devices, self.clock.seconds, self.later)
+        return Group(task, self.entangled, *told, panel, devices, self.clock.seconds, self.later)
 
     def bidding(self, task: Task, epoch: int, on_summary: OnSummary) -> Bidding:
         """Bid for ``task`` in ``epoch``: ``on_summary`` is told which bids the task's council announces."""
@@ -317,7 +325,7 @@ class SwarmNode(Service):
         return self.entangled.put(group_key(task_id), ORDER, order, "team")
 
     def conclude(self, task_id: str, result: Result) -> Deferred[Stored]:
-        """Record how a task ended, as somebody who takes no part in it."""
+        """Record how a task ended, as a node that may order tasks."""
         return self.entangled.put(group_key(task_id), RESULT, result.packed(), "team")
 
     def justify(self, verdict: Verdict) -> None:
@@ -332,7 +340,7 @@ class SwarmNode(Service):
         """
         written = self.conclude(task.task_id, result)
         with suppress(EntangledError):
-            await self.councils.of(task).close()
+            await self.councils.of(await self._present(task)).close()
         return await written
 
     def strategy(self, name: str) -> Guard:
@@ -359,10 +367,18 @@ class SwarmNode(Service):
         return self.councils.lessee(task, changed, floor)
 
     async def _record(self, task: Task) -> None:
-        """Have the record of ``task`` name its present council, unless it names that or a newer one already."""
-        known = tasks_of(await self.entangled.get(TASKS)).get(task.task_id)
-        if known is None or known.configuration < task.configuration:
-            await self.entangled.put(TASKS, task.task_id, task.packed(), "team")
+        """Record the present council of ``task``, unless that or a newer one is recorded already."""
+        from middleware.commitment.charter import charter_of
+
+        charter = charter_of(task.charter)
+        if charter is not None:
+            known = await self._present(task.with_council(replace(charter, links=())))
+            if known.configuration < task.configuration:
+                await self.entangled.put(group_key(task.task_id), COUNCIL, task.charter, "team")
+
+    async def _present(self, task: Task) -> Task:
+        """``task`` with its present council, as far as it is recorded."""
+        return council_of(task, await self.entangled.get(group_key(task.task_id)))
 
     @cached_property
     def councils(self) -> Councils:
@@ -373,7 +389,10 @@ class SwarmNode(Service):
         def moved(task: Task) -> None:
             self._quietly(Deferred.fromCoroutine(self._record(task)))
 
-        return Councils(self.entangled, self.store, self.clock, self.rng, self._born_at, moved)
+        def may_sit(public: bytes) -> bool:
+            return self._door.may(public, "lease.freed")
+
+        return Councils(self.entangled, self.store, self.clock, self.rng, self._born_at, moved, may_sit)
 
     @cached_property
     def gauge(self) -> Gauge:
@@ -414,14 +433,30 @@ class SwarmNode(Service):
 
     def _answer_offer(
         self, peer: Contact, auction: list[object], bids: list[object], age_ms: int, is_shared: bool
-    ) -> list[object] | None:
-        return self.dissemination.answer_offer(peer, auction, bids, age_ms, is_shared)
+    ) -> object:
+        offer = partial(self.dissemination.answer_offer, peer, auction, bids, age_ms, is_shared)
+        learnt = self._learn_bidders(peer, bids)
+        return offer() if learnt is None else learnt.addCallback(lambda _: offer())
 
     def _answer_announcement(self, peer: Contact, auction: list[object], announcement: list[object]) -> None:
         self.dissemination.answer_announcement(peer, auction, announcement)
 
     def _take_cry(self, peer: Contact, auction: list[object], bids: list[object]) -> None:
+        learnt = self._learn_bidders(peer, bids)
+        if learnt is not None:
+            self._quietly(learnt.addCallback(lambda _: self.dissemination.take_cry(peer, auction, bids)))
+            return
         self.dissemination.take_cry(peer, auction, bids)
+
+    def _learn_bidders(self, peer: Contact, bids: list[object]) -> Deferred[None] | None:
+        """Ask ``peer`` for the certificates of those bidders that are unknown here; None where all are known."""
+        from middleware.dissemination.errand import MAX_BIDS
+
+        certificates = self.entangled.replica.certificates
+        owners = [each[0] for each in bids[:MAX_BIDS] if isinstance(each, list) and each and type(each[0]) is bytes]
+        if not certificates.lacking(peer, owners):
+            return None
+        return Deferred.fromCoroutine(certificates.learn(peer, owners))
 
     def _answer_message(self, peer: Contact, text: str) -> str:
         if not 0 < len(text) <= 200:

@@ -7,7 +7,8 @@ on every node.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections import Counter
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
 
@@ -22,8 +23,11 @@ IDLE, ASSIGNED, SEARCHING, WAITING, EXECUTING, DONE = "IDLE", "ASSIGNED", "SEARC
 STATUSES = (IDLE, ASSIGNED, SEARCHING, WAITING, EXECUTING, DONE)
 MAX_DEPTH = 16
 """The directory is split no further: 2**16 places are enough for a million devices."""
+ID_SHOWN = 6
 MESSAGES_KEPT = 5
 MESSAGE_CHARACTERS = 70
+STOPS_SHOWN = 4
+"""Stops that a device says it obeys; each takes 34 bytes of its record."""
 
 Capabilities = Mapping[str, Mapping[str, float | str]]
 
@@ -38,7 +42,8 @@ class Device:
     page; ``position`` is where it says that it is: ``x`` and ``y`` in metres and ``heading`` in radians in the yard's
     frame, or ``lat`` and ``lon`` in degrees with ``accuracy`` in metres; ``laptop`` and ``agent`` are what people call
     the computer that its node runs on and the agent that acts for it (thesis, Table 5.1); ``depth`` is how far the
-    directory is split where it stands (``middleware.prefix``).
+    directory is split where it stands (``middleware.prefix``); ``stops`` are the ids in hex of the stops that it obeys,
+    ``STOPS_SHOWN`` at most, and ``obeys`` is what it does while the team is stopped (``middleware.halt``).
     """
 
     uuid: str
@@ -60,6 +65,8 @@ class Device:
     laptop: str = ""
     agent: str = ""
     depth: int = 0
+    stops: tuple[str, ...] = ()
+    obeys: str = ""
 
     def with_message(self, now: float, text: str) -> Device:
         """This device with one more line; the oldest goes when there are more than ``MESSAGES_KEPT``."""
@@ -72,7 +79,7 @@ class Device:
         while True:
             content = asdict(device)
             # Most devices have none of them, and each byte of a record is sent again and again.
-            for name in ("pages", "position", "laptop", "agent", "depth"):
+            for name in ("pages", "position", "laptop", "agent", "depth", "stops", "obeys"):
                 if not content[name]:
                     del content[name]
             value = bytes(msgpack.packb(content))
@@ -87,9 +94,12 @@ class Device:
 
 
 def device_of(record: Record) -> Device | None:
-    """The device that a record announces, or None where its value is not one, or one of another node."""
+    """The device that a record announces, or None where its value is not one, or one of another node.
+
+    It is announced under the name of the record's slot, which replicas compare with the certificate of its owner.
+    """
     value = mapping_of(record)
-    if value is None or value.get("uuid") != node_id(record.owner).hex():
+    if value is None or value.get("uuid") != node_id(record.owner).hex() or value.get("name") != record.name:
         return None
     content = {f.name: value[f.name] for f in fields(Device) if f.name in value}
     try:
@@ -97,17 +107,23 @@ def device_of(record: Record) -> Device | None:
         content["roles"] = tuple(content.get("roles", Device.roles))
         pages = content.get("pages", [])
         content["pages"] = tuple(pages) if isinstance(pages, list) else (None,)
+        stops = content.get("stops", [])
+        content["stops"] = tuple(stops) if isinstance(stops, list) else (None,)
         device = Device(**content)
     except (TypeError, ValueError, OverflowError):
         return None
     texts = (device.name, device.kind, device.description, device.address, device.task, device.status, *device.roles)
-    texts += (device.laptop, device.agent)
+    texts += (device.laptop, device.agent, device.obeys)
     lawful = (
-        all(isinstance(text, str) for text in (*texts, *device.pages, *(text for _, text in device.messages)))
+        all(
+            isinstance(text, str)
+            for text in (*texts, *device.pages, *device.stops, *(text for _, text in device.messages))
+        )
         and device.status in STATUSES
         and is_whole(device.joined)
         and is_whole(device.depth)
         and device.depth <= MAX_DEPTH
+        and len(device.stops) <= STOPS_SHOWN
         and all(is_number(n) for n in (device.since, *(t for t, _ in device.messages)))
         and are_capabilities(device.capabilities)
         and isinstance(device.network, dict)
@@ -121,8 +137,16 @@ def device_of(record: Record) -> Device | None:
 
 
 def devices_of(records: list[Record]) -> list[tuple[Device, Record]]:
-    """The devices in ``records`` in the order of joining, each with its record."""
+    """The devices in ``records`` in the order of joining, each with its record.
+
+    Where several have the same name each is told apart by the beginning of its id.
+    """
     known = [(device, record) for record in records if (device := device_of(record)) is not None]
+    counts = Counter(name for name, _ in {(device.name, device.uuid) for device, _ in known})
+    known = [
+        (replace(device, name=f"{device.name}-{device.uuid[:ID_SHOWN]}") if counts[device.name] > 1 else device, record)
+        for device, record in known
+    ]
     return sorted(known, key=lambda pair: (pair[0].joined, pair[0].uuid))
 
 
@@ -161,6 +185,10 @@ class Presence:
     def say(self, now: float, text: str) -> None:
         """Add a line to the device's messages."""
         self.change(messages=self.device.with_message(now, text).messages)
+
+    def obey(self, stops: Collection[bytes], words: str) -> None:
+        """Say which stops the device obeys, and what it does; no stops: it goes on."""
+        self.change(stops=tuple(stop.hex() for stop in list(stops)[-STOPS_SHOWN:]), obeys=words)
 
     def _tell(self) -> None:
         self._pending = False

@@ -181,6 +181,12 @@ class WebSettings:
     password: str = field(default="", metadata=setting.hidden(200), repr=False)
     """The hash of a password to sign in with, as ``swarm password`` prints it.  Empty: the code alone lets in."""
 
+    names: tuple[str, ...] = field(
+        default=(), metadata=setting.patterns(r"[a-z0-9]([a-z0-9.-]{0,98}[a-z0-9])?", 8, '"robots.lan"')
+    )
+    """Further names of this machine by which the page may be opened, at most 8.  Its addresses, its host name (also
+    with ``.local`` and ``.lan``) and the node's name always may."""
+
     sign_in: bool = field(default=True, metadata=setting.truth())
     """False: whoever can open the page is an operator; only where ``host`` is an address of this machine alone."""
 
@@ -198,13 +204,15 @@ class DeploymentSettings:
     """``[deployment]``: whether code that operators push into the running team may run on this node."""
 
     allow: bool = field(default=False, metadata=setting.truth())
-    """**Whoever may push can do on this machine whatever the node can.**  The signature says from whom a module comes,
-    not that it is harmless; there is no cage.  False: nothing is ever fetched, loaded or run."""
+    """**The author of a behaviour decides where this robot goes.**  The signature says from whom a module comes, not
+    that it is harmless.  It runs in a process of its own without rights, as far as the system allows
+    (``docs/deployment.md``).  False: nothing is ever fetched, loaded or run."""
 
     operators: tuple[str, ...] = field(
         default=(), metadata=setting.patterns(r"[0-9a-f]{64}", 8, '"5f0c...", as `swarm deploy keys` shows them')
     )
-    """Public keys of the nodes whose operators may push, each 64 hexadecimal digits.  Empty: nobody may."""
+    """Public keys of the nodes that may push, each 64 hexadecimal digits; in a closed team they need the role operator
+    as well.  Empty: none may."""
 
     modules: tuple[str, ...] = field(
         default=(), metadata=setting.patterns(r"[a-z][a-z0-9_-]{0,31}", 8, '"nearest-left"')

@@ -1,23 +1,26 @@
 """Tasks: what is to be done, who can do it (Algorithm 4.4), and the record that says so.
 
-A task is a team record under one key, written once by whoever submits it; each participant writes a slot of its own
-under the task's group key, and the outcome is one more team record there.  So nothing is ever read, changed and
-written back.
+A task is a team record under one key, written once by the node that submits it; each participant writes a slot of its
+own under the task's group key, and the outcome is one more team record there.  So nothing is ever read, changed and
+written back.  What is written by nodes that may not order tasks carries a proof: another council (``COUNCIL``) the
+signatures of the council before it, the end of a task (``DONE``) those of the council that granted the lease.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, asdict, dataclass, field, fields, replace
+from functools import lru_cache
 from typing import Any
 
 import msgpack
 
+from middleware.commitment.charter import MAX_BYTES, Charter, charter_of, ending_of
 from middleware.entangled.identity import node_id
 from middleware.entangled.kademlia.contact import Contact, unpacked
 from middleware.entangled.record import Record, hashed_key
 from middleware.presence import Capabilities
-from middleware.value import are_capabilities, are_properties, bounded, is_number, is_whole, mapping_of
+from middleware.value import MAX_VALUE, are_capabilities, are_properties, bounded, is_number, is_whole, mapping_of
 
 TASKS = hashed_key("tasks")
 COMPLETED, FAILED, CANCELLED = "COMPLETED", "FAILED", "CANCELLED"
@@ -27,6 +30,8 @@ MAX_TOLERATED = 3
 MEMBER = "member"
 RESULT = "result"
 ORDER = "order"
+COUNCIL, DONE = "council", "done"
+MAX_DONE = 2 * MAX_BYTES
 MAX_PRIORITY = 1000
 MAX_CHOICE = 64
 MAX_PLACES = 8
@@ -48,7 +53,7 @@ class Task:
     act outlives a silent holder; ``hysteresis`` by which share a late report must be better to take the task over;
     ``council`` are the nodes whose majority grants that right, pinned when the task is made: so many that ``tolerates``
     of them may be lost at once, where the team has as many; ``configuration`` counts
-    its changes.
+    its changes.  ``charter`` is the proof of both (``middleware.commitment.charter``).
 
     Of several tasks the one with the highest ``priority`` has an agent's body, then the oldest; ``preemptible`` ones
     are put aside for it and resumed.  ``deadline`` is in seconds after its creation, and ``stall_limit`` in seconds
@@ -79,11 +84,25 @@ class Task:
     exclusive: bool = True
     configuration: int = 1
     stall_limit: float = 0.0
+    charter: bytes = b""
+
+    def with_council(self, charter: Charter) -> Task:
+        """This task with the council that ``charter`` names."""
+        return replace(self, council=charter.members, configuration=charter.configuration, charter=charter.packed)
+
+    def with_newer_council(self, other: Task) -> Task:
+        """This task with the council of ``other``, where that is a later one of the same task."""
+        mine, its = charter_of(self.charter), charter_of(other.charter)
+        is_newer = mine is not None and its is not None and mine.pin == its.pin and len(mine.links) < len(its.links)
+        return self.with_council(its) if is_newer and its is not None else self
 
     def packed(self) -> bytes:
-        """The value of the task's record; what is as usual is left out."""
+        """The value of the task's record; what is as usual is left out, and what stands in its charter."""
         content = _unusual(self)
-        if self.council:
+        if self.charter:
+            content.pop("council", None)
+            content.pop("configuration", None)
+        elif self.council:
             content["council"] = [contact.packed() for contact in self.council]
         return bounded(bytes(msgpack.packb(content)))
 
@@ -190,9 +209,14 @@ def task_of(record: Record) -> Task | None:
         task = Task(**content)
     except TypeError:
         return None
+    if task.charter:
+        charter = charter_of(task.charter)
+        if charter is None:
+            return None
+        task = task.with_council(charter)
     times = (task.waiting_period, task.lease_ttl, task.created, task.deadline, task.stop_time, task.stall_limit)
     lawful = (
-        len(task.council) == len(council)
+        (bool(task.charter) or len(task.council) == len(council))
         and type(task.tolerates) is int
         and 1 <= task.tolerates <= MAX_TOLERATED
         and all(isinstance(text, str) for text in (task.task_id, task.kind, task.title, task.strategy, task.group))
@@ -284,9 +308,9 @@ def is_stale(member: Member, since: float) -> bool:
     return 0.0 < member.valid_for < member.age + since
 
 
-def result_of(record: Record) -> Result | None:
+def result_of(record: Record, most: int = MAX_VALUE) -> Result | None:
     """The outcome in a record, or None."""
-    content = mapping_of(record)
+    content = mapping_of(record, most)
     if record.name != RESULT or content is None:
         return None
     content = {f.name: content[f.name] for f in fields(Result) if f.name in content}
@@ -306,10 +330,53 @@ def result_of(record: Record) -> Result | None:
     return result if lawful else None
 
 
-def outcome_of(records: list[Record]) -> Result | None:
-    """How the task of a group ended, or None while it is open; of several results the highest token holds."""
-    results = [result for record in records if (result := result_of(record)) is not None]
+def done_packed(result: Result, proof: bytes) -> bytes:
+    """The value of the record in which an agent says how the task ended that it held, with the proof that it did."""
+    return bytes(msgpack.packb({**asdict(result), "proof": proof}))
+
+
+def outcome_of(task: Task, records: Iterable[Record]) -> Result | None:
+    """How ``task`` ended, or None while it is open; of several results the highest token holds.
+
+    Those count that were written by who may order tasks (``RESULT``), and those of an agent of which a majority of the
+    council says that it ended the task under its token (``DONE``).
+    """
+    results = [
+        result
+        for record in records
+        if (result := result_of(record) if record.name == RESULT else _done(task, record)) is not None
+    ]
     return max(results, key=lambda result: result.rank, default=None)
+
+
+def council_of(task: Task, records: Iterable[Record]) -> Task:
+    """``task`` with its newest council, as far as the records of its group prove one."""
+    pinned = charter_of(task.charter)
+    newest = pinned
+    for record in records:
+        charter = charter_of(record.value) if record.name == COUNCIL and newest is not None else None
+        if charter is None or newest is None or charter.configuration <= newest.configuration:
+            continue
+        if charter.pin == newest.pin and charter.is_genuine(task.task_id):
+            newest = charter
+    return task if newest is pinned or newest is None else task.with_council(newest)
+
+
+def _done(task: Task, record: Record) -> Result | None:
+    if record.name != DONE or record.value is None or len(record.value) > MAX_DONE:
+        return None
+    return _done_of(task.task_id, task.charter, record)
+
+
+@lru_cache(maxsize=64)  # signatures are checked, and the same record is read again and again
+def _done_of(task_id: str, charter: bytes, record: Record) -> Result | None:
+    result = result_of(replace(record, name=RESULT), MAX_DONE)
+    pinned, content = charter_of(charter), mapping_of(record, MAX_DONE)
+    if result is None or pinned is None or content is None:
+        return None
+    ending = ending_of(content.get("proof"), pinned)
+    is_proved = ending is not None and ending.is_genuine(task_id, node_id(record.owner).hex(), result.token)
+    return result if is_proved else None
 
 
 def _unusual(one: Task | Member) -> dict[str, Any]:

@@ -167,7 +167,7 @@ def _answer(node: SwarmNode, settings: Settings, driver: Driver | None) -> None:
     filming: object = driver
     if isinstance(filming, Filming) and "camera" in node.presence.device.capabilities:
         tuning.add(_camera_knob(filming))
-    node.halt = answer_halt(node.entangled)
+    node.halt = answer_halt(node.entangled, node.rng, node.later, node.presence.obey)
 
 
 def _agent(node: SwarmNode, settings: Settings, driver: Driver | None, seams: Seams) -> Service | None:
@@ -201,13 +201,29 @@ def _camera_knob(driver: Filming) -> Knob:
 
 def _deployable(node: SwarmNode, settings: Settings, seams: Seams) -> None:
     """Let the node run what its operators push; a node that does not allow it loads none of this."""
-    from middleware.deployment.deployment import Deployment
+    from middleware.deployment.deployment import Author, Deployment
+    from middleware.deployment.process import ProcessChannel
     from middleware.deployment.shelf import MemoryShelf
 
-    shelf = MemoryShelf() if seams.shelf is None else seams.shelf
-    deployment = Deployment(node.entangled, node.presence, node.wall, node.later, settings.deployment, shelf)
-    node.deployed = deployment.modules
-    deployment.open()
+    def author_of(public: bytes) -> Author:
+        if node.team is None:
+            return Author("", None)
+        member = node.team.door.member(public)
+        return Author("" if member is None else member.name, node.team.door.roles_of(public))
+
+    deployment = Deployment(
+        node.entangled,
+        node.presence,
+        node.wall,
+        node.later,
+        settings.deployment,
+        MemoryShelf() if seams.shelf is None else seams.shelf,
+        author_of,
+        ProcessChannel if seams.spawn is None else seams.spawn,
+        node.clock.seconds,
+    )
+    node.deployed, node.stop_deployed = deployment.modules, deployment.stop
+    node.later(0.0, deployment.open)  # not before the program has become a daemon: processes end with their parent
 
     def follow(_: None) -> None:
         if node.running:

@@ -15,7 +15,7 @@ from middleware.entangled.control.word import printable
 from middleware.errors import BadFault, BadSetting
 from middleware.fault import ASKED, CAUSE, KINDS, MAX_S, MIN_S, USUAL_S, Fault, begins_in, fault_of
 from middleware.presence import Device
-from middleware.tasks import outcome_of
+from middleware.tasks import outcome_of, tasks_of
 from swarmnode.asker import Asker, Refusal
 from swarmnode.frailty import ASSIGN
 from swarmnode.havoc import NobodyThere, play
@@ -55,7 +55,8 @@ class TeamStage:
 
     def is_over(self, task_id: str) -> bool:
         """Whether its outcome is recorded."""
-        return outcome_of(self._asker.records(f"task/{task_id}", "fast")) is not None
+        task = tasks_of(self._asker.records("tasks", "fast")).get(task_id)
+        return task is not None and outcome_of(task, self._asker.records(f"task/{task_id}", "fast")) is not None
 
     def suffers(self, device: Device) -> str:
         """What it can suffer, and what it suffers, in words."""

@@ -24,6 +24,7 @@ WORKS: dict[str, tuple[str, str]] = {
     "invite": ("swarmnode.team.invite", "a code that lets a newcomer into the team"),
     "join": ("swarmnode.team.join", "become a member of a team, by such a code"),
     "members": ("swarmnode.team.members", "who belongs to the team"),
+    "invitations": ("swarmnode.team.invitations", "the codes that can be used, and the members that used them"),
     "revoke": ("swarmnode.team.revoke", "put a member out, or end an invitation"),
     "rotate": ("swarmnode.team.rotate", "a new secret for the team"),
     "promote": ("swarmnode.team.promote", "let a member let others in"),
@@ -57,7 +58,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if verb not in ("", "--help", "-h"):
             sys.stderr.write(f"swarm: no verb {verb!r}; there are {', '.join(about)}; swarm --help says more\n")
             return 2
-        lines = "".join(f"  {name:9}{purpose}\n" for name, purpose in about.items())
+        lines = "".join(f"  {name:13}{purpose}\n" for name, purpose in about.items())
         sys.stdout.write(f"usage: swarm VERB [options]\n\n{lines}\nswarm VERB --help says more.\n")
         return 0
     drop_tls()

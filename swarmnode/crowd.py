@@ -18,7 +18,7 @@ from middleware.entangled.network.network import Address
 from middleware.entangled.network.switchboard import Switchboard, Weather
 from middleware.entangled.replication.watch import Watch
 from middleware.settings import Settings
-from middleware.tasks import outcome_of
+from middleware.tasks import Task, outcome_of
 from sim.crowd.command import main as run_crowd
 from sim.crowd.controller import Controller, wander
 from sim.crowd.ground import Ground
@@ -64,6 +64,7 @@ class CrowdTeam:
         self._seed = seed
         self._fps = camera_fps
         self._group: Watch | None = None
+        self._task: Task | None = None
         for name in (DESK, *self.yard.names):
             self._add(name)
             self.clock.advance(JOINING)
@@ -73,7 +74,8 @@ class CrowdTeam:
         """Have whoever can do it search the red target."""
         node = self.services[DESK].assembly.node
         self._group = node.watch_group(TASK, lambda records: None, keep=True)
-        Deferred.fromCoroutine(node.submit(task_named(DEMO, TASK, self.clock.seconds())))
+        submitted = Deferred.fromCoroutine(node.submit(task_named(DEMO, TASK, self.clock.seconds())))
+        submitted.addCallback(self._submitted)
 
     def words(self) -> Mapping[str, Word]:
         """What each agent that takes part says, by its name."""
@@ -87,7 +89,9 @@ class CrowdTeam:
 
     def done_by(self) -> str | None:
         """Who ended the task, None while it is open."""
-        outcome = None if self._group is None else outcome_of(self._group.records)
+        if self._group is None or self._task is None:
+            return None
+        outcome = outcome_of(self._task, self._group.records)
         return None if outcome is None else outcome.by
 
     def stop(self) -> None:
@@ -95,6 +99,9 @@ class CrowdTeam:
         for service in self.services.values():
             service.vanish()
         self.yard.stop()
+
+    def _submitted(self, task: Task) -> None:
+        self._task = task
 
     def _add(self, name: str) -> None:
         number = len(self.services)

@@ -1,7 +1,7 @@
 """Gateway: the way of phones into the team, through the node that serves the page.
 
 Each phone is a node of its own, with identity, port, agent and a driver that is handed what the phone sees.  Its
-identity follows from the team's secret and from one of the phone's, so it is the same device at every web node.
+identity follows from a secret of the phone and from the team, so it is the same device at every web node.
 """
 
 from __future__ import annotations
@@ -61,9 +61,9 @@ PLACE: Mapping[str, int] = {"lat": 5, "lon": 5, "accuracy": 0}
 PERSON = b"phone"
 
 
-def seed_of(team_secret: bytes, secret: bytes) -> bytes:
-    """The seed of a phone's identity: of the phone alone, and of no use in another team."""
-    return hashlib.blake2s(secret, key=team_secret, person=PERSON).digest()
+def seed_of(team: bytes, secret: bytes) -> bytes:
+    """The seed of a phone's identity, by its own ``secret``; another one in each team, which ``team`` names."""
+    return hashlib.blake2s(secret, key=team, person=PERSON).digest()
 
 
 def sides(jpeg: bytes) -> tuple[int, int]:
@@ -98,7 +98,8 @@ class Gateway:
 
     def join(self, secret: bytes, name: str, can: Mapping[str, Any]) -> Deferred[str]:
         """Let a phone take part; fires with its uuid, fails with ``Refusal`` 409, 429 or 503."""
-        seed = seed_of(self._settings.node.team_secret, secret)
+        closed = self._node.team
+        seed = seed_of(self._settings.node.team_secret if closed is None else closed.roll.operator, secret)
         uuid = Identity(seed).node_id.hex()
         if uuid in self._phones:
             self._phones[uuid].wait(FIRST_S)
@@ -238,7 +239,7 @@ class _Phone:
 
     def _words(self, device: Device, is_seen: bool) -> str:
         """What whoever holds it is asked to do."""
-        if self._node.halt.word.is_on:
+        if self._node.halt.is_stopped:
             return "The team is stopped. Wait."
         if device.status == EXECUTING:
             return (

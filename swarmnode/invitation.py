@@ -1,16 +1,19 @@
-"""Invitation: where the page of a node of this machine is and how to sign in there, in the log and in a note.
+"""Invitation: where the page of a node of this machine is and how to sign in there, in a note and at a terminal.
 
-The note lies beside the node's control socket, for the eyes of the node's user alone; ``swarm web`` reads it.
+The note lies beside the node's control socket, for the eyes of the node's user alone; ``swarm web`` reads it.  The log,
+which is kept, sent on and read by others, says where the page is and never how to sign in.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import sys
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import TextIO
 
 from twisted.logger import Logger
 
@@ -47,13 +50,21 @@ def url_of(host: str, port: int, scheme: str = "http") -> str:
     return f"{scheme}://[{here}]:{port}/" if ":" in here else f"{scheme}://{here}:{port}/"
 
 
-def invited(name: str, host: str, port: Callable[[], int], code: str, secure_port: int = 0) -> None:
-    """Say in the log where the page is, and leave the note; where none can be left, the log says why."""
+def invited(
+    name: str, host: str, port: Callable[[], int], code: str, secure_port: int = 0, terminal: TextIO | None = None
+) -> None:
+    """Say in the log where the page is, and leave the note; where none can be left, the log says why.
+
+    ``terminal`` is where a person looks on who may know the code.
+    """
     secure = url_of(host, secure_port, "https") if secure_port else ""
     invitation = Invitation(name, url_of(host, port()), code, os.getpid(), secure)
-    how = f"; sign in with the code {code}, or open {invitation.link}" if code else "; whoever opens it is an operator"
+    how = "; the command swarm web tells how to sign in" if code else "; whoever opens it is an operator"
     also = f", and over TLS at {secure}" if secure else ""
     _log.info("the page is at {url}{also}{how}", url=invitation.url, also=also, how=how)
+    if code and terminal is not None:
+        terminal.write(f"{name}: sign in with the code {code}, or open {invitation.link}\n")
+        terminal.flush()
     try:
         path = made(name).with_suffix(ENDING)
         fresh = path.with_suffix(f"{ENDING}.new")
@@ -64,6 +75,16 @@ def invited(name: str, host: str, port: Callable[[], int], code: str, secure_por
         fresh.replace(path)
     except (NoControl, OSError) as error:
         _log.warn("swarm web will not know of the page: {error}", error=error)
+
+
+def at_terminal() -> TextIO | None:
+    """The terminal from which this process was started, where there is one and it is no log."""
+    # Once twistd logs, what is written to sys.stderr ends up in the log.
+    stream = sys.__stderr__
+    try:
+        return stream if stream is not None and stream.isatty() else None
+    except ValueError:  # closed by a daemon
+        return None
 
 
 def invitations(where: Path | None = None) -> list[Invitation]:

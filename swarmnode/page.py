@@ -21,7 +21,7 @@ from middleware.entangled.data.sqlite import read_records
 from middleware.node import SwarmNode
 from middleware.settings import IN_MEMORY, Settings
 from swarmnode.gateway import gateway
-from swarmnode.invitation import invited
+from swarmnode.invitation import at_terminal, invited
 from swarmnode.seams import Seams
 from webnode.app import create_app
 from webnode.audit import audit
@@ -29,6 +29,7 @@ from webnode.board import Board, Phones
 from webnode.chronicle import chronicle
 from webnode.fallback import fallbacks
 from webnode.ground import Ground
+from webnode.guard import LOCAL_ENDS
 from webnode.halting import halts
 from webnode.invite import TeamInvites
 from webnode.ledger import Glance, state_from
@@ -92,16 +93,20 @@ def page(
     def urls() -> list[str]:
         return web.urls(_names())
 
+    hosts = hosts_of(settings, socket.gethostname())
     board = _board(ground, phones := gateway(ground), _invites(reactor, tls, urls))
     live = _live(ground)
     stored = live if settings.node.store == IN_MEMORY else _on_file(ground)
-    app = create_app(Glance(lambda: stored(seams.wall()), reactor.seconds), board, caller(reactor), wall=seams.wall)
+    glance = Glance(lambda: stored(seams.wall()), reactor.seconds)
+    app = create_app(glance, board, caller(reactor), hosts, seams.wall)
     events, shots, address = _events(ground, board, live), Shots(desk, reactor), settings.web
     doors = [] if tls is None else [tls.open]
-    web = WebService(reactor, address.host, address.port, app, events, shots, Files(), board, seams.wall, doors=doors)
+    parts = app, events, shots, Files(), board, seams.wall, hosts, doors
+    web = WebService(reactor, address.host, address.port, *parts)
 
     def tell() -> None:
-        invited(settings.node.name, address.host, lambda: web.port, board.sessions.code, web.secure_port)
+        where = address.host, lambda: web.port
+        invited(settings.node.name, *where, board.sessions.code, web.secure_port, at_terminal())
         board.fallbacks.serves(urls())
 
     return PageService(web, operator, tell, phones)
@@ -121,12 +126,13 @@ def _invites(reactor: Any, tls: TlsDoor | None, urls: Callable[[], Sequence[str]
 
 def _board(ground: Ground, phones: Phones, invites: TeamInvites) -> Board:
     """What the page's routes act on."""
+    team = fallbacks(ground)
     return Board(
         ground.desk,
-        sessions(ground),
+        sessions(ground, team),
         audit(ground),
         chronicle(ground),
-        fallbacks(ground),
+        team,
         limits(ground),
         survey(ground),
         tuning(ground),
@@ -158,9 +164,16 @@ def _events(ground: Ground, board: Board, live: Read) -> Events:
         ground.desk.yard,
         board.fallbacks.here,
         board.chronicle,
-        lambda: (ground.desk.version, board.halts is not None and board.halts.is_halted()),
+        lambda: (ground.desk.version, tuple(ground.node.halt.stops)),
         board.sessions,
     )
+
+
+def hosts_of(settings: Settings, machine: str) -> frozenset[str]:
+    """The names by which a browser may open the page of this ``machine``, beside its addresses."""
+    short = {machine.split(".")[0].lower(), settings.node.name.lower()}
+    local = {f"{name}{end}" for name in short for end in ("", *LOCAL_ENDS)}
+    return frozenset({machine.lower(), *local, *settings.web.names})
 
 
 def _names() -> Sequence[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Sequence
 from functools import partial
+from pathlib import Path
 from typing import NoReturn
 
 from twisted.application.service import IService
@@ -13,6 +14,7 @@ from twisted.python import usage
 
 from drivers.errors import DriverError
 from middleware.admission.errors import BadKeyFile
+from middleware.admission.keyfile import MAX_FILE, read_bytes
 from middleware.entangled.clock import use_monotonic_time
 from middleware.entangled.errors import BadStore, PortInUse, TunnelPortInUse
 from middleware.errors import BadSetting, MissingExtra, SwarmError, UnknownAgent
@@ -24,7 +26,7 @@ from swarmnode.ports import given_way
 from swarmnode.service import NodeService
 from swarmnode.warmth import STARTED_S, warmed_up
 from swarmnode.web import web_page, with_code
-from swarmnode.world import control_socket, real_seams, resolved, with_page_key
+from swarmnode.world import control_socket, real_seams, resolved
 from webnode.errors import PortTaken
 
 use_monotonic_time()
@@ -40,6 +42,9 @@ KEYS: Sequence[tuple[type[Exception], str]] = (
     (MissingExtra, "[node] roles"),
 )
 """Which setting to look at for which fault."""
+
+
+KEY_FILE = "team-key-file"
 
 
 class Options(usage.Options):
@@ -59,7 +64,7 @@ class Options(usage.Options):
         ["known-nodes", None, None, "nodes to join through, as HOST:PORT,HOST:PORT"],
         ["store", "s", None, "path of the data store, or :memory:"],
         ["membership", None, None, "file of a member of a closed team"],
-        ["team-key", None, None, "the secret of an open team"],
+        ["team-key-file", None, None, "file with the secret of an open team; - for standard input"],
         ["tunnels", None, None, "ways in over TLS where UDP is blocked, as wss://HOST:PORT,wss://HOST:PORT"],
         ["tunnel-port", None, None, "TCP port that lets those in to whom UDP is blocked; 0: none"],
         ["roles", "r", None, "of edge,bootstrap,web"],
@@ -73,10 +78,20 @@ class Options(usage.Options):
     ]
     settings: Settings
 
+    def opt_team_key(self, key: str) -> None:
+        """Refused: every user of the computer can read a command line; see --team-key-file."""
+        problem = "can be read by every user of this computer"
+        remedy = (
+            "write the secret to a file of mode 0600 and say --team-key-file FILE, and change the one that was here"
+        )
+        _refuse(BadSetting(COMMAND_LINE, "--team-key", problem, remedy))
+
     def postOptions(self) -> None:
         """Read the file and the flags; what is wrong is said in one line, with exit code 2."""
-        flags = {name.replace("-", "_"): value for name, value in self.items() if name != "config"}
+        flags = {name.replace("-", "_"): value for name, value in self.items() if name not in ("config", KEY_FILE)}
         try:
+            if self[KEY_FILE] is not None:
+                flags["team_key"] = _team_key(self[KEY_FILE])
             if self["config"]:
                 settings = Settings.load(self["config"])
             elif self["name"] is None:
@@ -84,11 +99,20 @@ class Options(usage.Options):
             else:
                 settings = Settings.from_mapping({"node": {"name": "unnamed"}}, COMMAND_LINE)
             self.settings = settings.with_flags(**flags)
-        except SwarmError as error:
+        except (SwarmError, BadKeyFile) as error:
             _refuse(error)
         # Here at the latest, as the reactor comes next.
         if not ("web" in self.settings.node.roles and self.settings.web.tls):
             drop_tls()
+
+
+def _team_key(file: str) -> str:
+    """The secret in a file of the owner alone, or on standard input, without the end of its line."""
+    content = sys.stdin.buffer.read(MAX_FILE + 1) if file == "-" else read_bytes(Path(file))
+    try:
+        return content.decode().rstrip("\r\n")
+    except UnicodeDecodeError:
+        raise BadKeyFile(f"{file} holds no text; write the secret of the team into it") from None
 
 
 def makeService(options: Options) -> IService:
@@ -100,7 +124,6 @@ def makeService(options: Options) -> IService:
         settings = given_way(resolved(settings))
         checked_team(settings)
         seams = real_seams(settings, reactor)
-        settings = with_page_key(settings, seams)
         fronts: list[Callable[[SwarmNode], IService]] = [partial(control_socket, settings, reactor)]
         if "web" in settings.node.roles:
             settings = with_code(settings, seams.rng)

@@ -24,6 +24,7 @@ from sim.demo.trials import main as run_trials
 from sim.scene import loaded
 from sim.yard import Yard
 from swarmnode.frost import Frost
+from swarmnode.sandbox import simulated
 from swarmnode.seams import Seams
 from swarmnode.service import NodeService
 from webnode.ledger import state_from
@@ -112,6 +113,7 @@ class VirtualTeam:
             shelf,
             _Plug(self, name),
             membership=self._membership(name),
+            spawn=simulated,
         )
         self.services[name] = NodeService(Settings.from_mapping(mapping, f"seed {self._seed}"), seams)
         self.services[name].startService()

@@ -8,7 +8,7 @@ from twisted.internet.defer import Deferred
 
 from middleware.fault import CAUSE, Fault, begins_in
 from middleware.presence import Device, devices_of
-from middleware.tasks import group_key, outcome_of
+from middleware.tasks import TASKS, group_key, outcome_of, tasks_of
 from swarmnode.asker import Refusal
 from swarmnode.frailty import ASSIGN
 from swarmnode.rehearsal import VirtualTeam
@@ -48,7 +48,9 @@ class RehearsedStage:
 
     def is_over(self, task_id: str) -> bool:
         """Whether its outcome is recorded."""
-        return outcome_of(self._answer(self._node.entangled.get(group_key(task_id)))) is not None
+        task = tasks_of(self._answer(self._node.entangled.get(TASKS))).get(task_id)
+        records = self._answer(self._node.entangled.get(group_key(task_id)))
+        return task is not None and outcome_of(task, records) is not None
 
     def digest(self) -> str:
         """The running hash over every delivery."""

@@ -15,6 +15,7 @@ from middleware.entangled.network.network import Network
 
 if TYPE_CHECKING:
     from middleware.admission.membership import Kept
+    from middleware.deployment.channel import Channel
 
 
 class Plug(Protocol):
@@ -35,6 +36,7 @@ class Seams:
     yards (None: TCP); ``wall`` is unix time, for people; ``shelf`` is where deployed modules are kept (None: they are
     forgotten when the node ends); ``plug`` is what a fault on purpose pulls (None: neither killed nor frozen);
     ``lan`` makes its place in the group of the LAN (None: it does not look there).
+    ``spawn`` starts the process of a deployed module (None: a process of this machine, confined).
     ``membership`` is the node's place in a closed team (None: the team is open).
     """
 
@@ -48,3 +50,4 @@ class Seams:
     plug: Plug | None = None
     lan: Callable[[], Multicast] | None = None
     membership: Kept | None = None
+    spawn: Callable[[], Channel] | None = None

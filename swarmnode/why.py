@@ -40,7 +40,7 @@ def main(words: Sequence[str] | None = None, out: TextIO | None = None, ask: Ask
     try:
         asker = Asker(wishes.node, ask)
         task = chosen(wishes.task, list(tasks_of(asker.records("tasks")).values()))
-        outcome = outcome_of(asker.records(f"task/{task.task_id}"))
+        outcome = outcome_of(task, asker.records(f"task/{task.task_id}"))
         records = asker.records(verdicts_text(task.task_id))
     except (Refusal, NoControl) as problem:
         sys.stderr.write(printable(f"swarm why: {problem}") + "\n")

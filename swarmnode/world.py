@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import random
 import socket
@@ -67,15 +66,6 @@ def real_seams(settings: Settings, reactor: Any) -> Seams:
 
         plug = ProcessPlug()
     return Seams(reactor, network, store, rng, time.time, shelf=shelf, plug=plug, membership=membership, lan=lan)
-
-
-def with_page_key(settings: Settings, seams: Seams) -> Settings:
-    """``settings`` in which the team's own secret stands for the team key, for what the page signs."""
-    if seams.membership is None:
-        return settings
-    secret = seams.membership.membership.secrets[0][1]
-    key = hashlib.blake2s(secret, person=b"page").hexdigest()
-    return replace(settings, node=replace(settings.node, team_key=key))
 
 
 LookUp = Callable[..., Sequence[tuple[Any, ...]]]

@@ -11,7 +11,7 @@ from random import Random
 from twisted.internet.task import Clock
 from twisted.trial.unittest import SynchronousTestCase
 
-from agents import body, engagement, loop, means
+from agents import body, engagement, guarded, loop, means
 from agents.catalogue import TASKS
 from drivers import rules
 from drivers.aibo.option import PORTS
@@ -21,10 +21,10 @@ from drivers.deadman import keeper, process
 from drivers.errors import UsageError
 from drivers.phone import driver, option
 from drivers.registry import KINDS, describe
-from middleware import fault, gauge, halt, survey, takeover
+from middleware import fault, gauge, halt, stop_set, survey, takeover
 from middleware.commitment import ballot, lessee
 from middleware.consensus import guard, strategy, worker
-from middleware.deployment import manifest, module
+from middleware.deployment import confinement, deployment, frame, manifest, module, runner
 from middleware.dissemination import check, party, scale, teller, tree
 from middleware.entangled.control import port
 from middleware.entangled.kademlia import detour, membership, roster
@@ -43,6 +43,7 @@ from sim.yard import Yard
 from standards.head import MAX_HEAD
 from swarmnode import gateway
 from swarmnode.driver import pilot
+from tests.role_table import write_tables
 from webnode import channel, limits, live, team
 from webnode.board import AUDITED
 from webnode.routes import orders, phones
@@ -80,6 +81,13 @@ FIGURES: Sequence[tuple[str, str]] = (
     ("demo", f"an AIBO walks on until {aibo.DEAD_MAN_S:g} s after its last command"),
     ("deployment", f"the source has at most {manifest.MAX_SOURCE // 1024} KiB"),
     ("deployment", f"takes at most {module.STEPS:,} instructions"),
+    ("deployment", f"seccomp: {len(confinement.CALLS)} system calls"),
+    ("deployment", f"{confinement.MEMORY // 2**20} MiB beside its libraries; {confinement.CPU_S} s"),
+    ("deployment", f"does not answer within {runner.DEADLINE_S:g} s"),
+    ("deployment", f"answer is older than {guarded.FRESH_S:g} s"),
+    ("deployment", f"does not answer within {runner.PATIENCE_S:g} s, raises"),
+    ("deployment", f"an answer has more than {frame.MAX_ANSWER // 1024} KiB"),
+    ("deployment", f"nobody has asked it for {deployment.IDLE_S:g} s"),
     ("drivers", f"in every state, at rest within {rules.HALT_S:g} s"),
     ("drivers", f"While driving a key counts for {pilot.KEY_S:g} s"),
     ("faults", f"Seconds are {fault.MIN_S:g} to {fault.MAX_S:g}, {fault.USUAL_S:g} where"),
@@ -158,7 +166,9 @@ FIGURES: Sequence[tuple[str, str]] = (
     ("tunnel", f"| {websocket.MAX_PAYLOAD} bytes; what breaks"),
     ("actions", f"after {team.PATIENCE:g} s at the latest"),
     ("actions", f"place the target, {team.PLACING:g} s later"),
-    ("protocol", f"is on: bool, by: at most {halt.MAX_NAME} characters"),
+    ("protocol", f"at most {stop_set.MAX_NAMED} stops `[id, by]`, at most {stop_set.MAX_RELEASED} ids of stops"),
+    ("protocol", f"by: at most {stop_set.MAX_BY} characters; an id has {stop_set.ID_BYTES} bytes"),
+    ("protocol", f"the newest {halt.RECORDED_RELEASES} ids that it released"),
     ("web", f"`text`, 1 to {orders.MAX_MESSAGE} characters"),
     ("web", f"`seconds`, {orders.MIN_AWAY_S:g} to {orders.MAX_AWAY_S:g}, default {orders.AWAY_S:g}"),
     ("web", f"At most {live.MAX_VIEWERS} streams"),
@@ -203,6 +213,10 @@ class DocumentTests(SynchronousTestCase):
         for name, said in FIGURES:
             text = " ".join((ROOT / "docs" / f"{name}.md").read_text(encoding="utf-8").split())
             self.assertTrue(said in text, f"docs/{name}.md does not say: {said}")
+
+    def test_role_tables_are_those_of_the_code(self) -> None:
+        """The tables of roles on the security page are made from the role table."""
+        self.assertIn(write_tables(), (ROOT / "docs" / "security.md").read_text(encoding="utf-8"))
 
     def test_every_robot_is_listed(self) -> None:
         """The table of robots in the README has each kind of driver and no other, and leads to its page."""

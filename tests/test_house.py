@@ -45,6 +45,7 @@ PURE = (
     "agents.execution",
     "agents.formation",
     "agents.means",
+    "agents.pushed",
     "agents.state",
     "drivers.aibo.cursor",
     "drivers.aibo.menu",
@@ -75,6 +76,7 @@ PURE = (
     "middleware.consensus.item",
     "middleware.consensus.nearest",
     "middleware.consensus.push_sum",
+    "middleware.consensus.remote",
     "middleware.consensus.rendezvous",
     "middleware.consensus.sequential",
     "middleware.consensus.strategy",
@@ -99,6 +101,7 @@ PURE = (
     "middleware.consensus.view",
     "middleware.consensus.weighted_vote",
     "middleware.deployed",
+    "middleware.deployment.frame",
     "middleware.deployment.manifest",
     "middleware.entangled.replication.cache",
     "middleware.entangled.errors",
@@ -196,6 +199,7 @@ EDGES = (
     "drivers.link",
     "drivers.serial",
     "middleware.consensus.worker",
+    "middleware.deployment.process",
     "middleware.entangled.control.command",
     "middleware.entangled.clock",
     "middleware.entangled.network.interface",
@@ -379,6 +383,15 @@ class PurityTests(SynchronousTestCase):
         child = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=60)
         unwanted = [name for name in child.stdout.split() if _within(name, *ON_DEMAND)]
         self.assertEqual((child.returncode, unwanted), (0, []), child.stderr)
+
+    def test_node_runs_no_pushed_code(self) -> None:
+        """What a node that allows deployment loads for it does not lead to the module that runs pushed source."""
+        known, left = set[str](), ["middleware.deployment.deployment", "middleware.deployment.process"]
+        while left:
+            module = left.pop()
+            known.add(module)
+            left += [name for name in _ours(module) if name in FILES and name not in known]
+        self.assertEqual(known & {"middleware.deployment.module", "middleware.deployment.host"}, set())
 
 
 class PackagingTests(SynchronousTestCase):

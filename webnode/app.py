@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from typing import Any
 
-from flask import Flask, Response, jsonify, render_template, request
+from flask import Flask, Response, g, jsonify, render_template, request
 from twisted.internet.defer import Deferred
 from twisted.python.failure import Failure
 from werkzeug.exceptions import HTTPException
@@ -19,7 +19,7 @@ from werkzeug.exceptions import HTTPException
 from webnode.board import Board
 from webnode.dispatch import Dispatch
 from webnode.errors import Refusal
-from webnode.guard import MAX_BODY, headers, refusal, token_of
+from webnode.guard import HEADERS, MAX_BODY, LetsIn, headers, is_own_origin, refusal, token_of
 from webnode.route import API, Ask, Content, Route, checked, guarded
 from webnode.routes.table import TABLE
 from webnode.state import State
@@ -61,24 +61,27 @@ def create_app(
 
     # A phone whose page is being closed can still send a last word, but no header with it.
     unmarked = {(str(route.method), _rule(route.path)) for route in table if route.role == "phone"}
-    _guard(app, board, hosts, lambda: (request.method, str(request.url_rule)) not in unmarked)
+    lets_in = partial(on_reactor, board.fallbacks.lets_in)
+    _guard(app, lets_in, hosts, lambda: (request.method, str(request.url_rule)) not in unmarked)
     _explain(app)
     _serve_page(app, read)
     dispatch = Dispatch()
     for route in table:
         if route.answer is not None:
-            _serve(app, route, tuple(table), read, board, wall, partial(on_reactor, dispatch.carry_out))
+            _serve(app, route, tuple(table), read, board, wall, on_reactor, dispatch)
     return app
 
 
-def _guard(app: Flask, board: Board, hosts: Collection[str], needs_mark: Callable[[], bool]) -> None:
+def _guard(app: Flask, lets_in: LetsIn, hosts: Collection[str], needs_mark: Callable[[], bool]) -> None:
     """Let in who comes by a name of this machine and from a page of the team, and send the headers that keep it so."""
 
     @app.before_request
     def admit() -> Response | None:
         marked = not needs_mark() or request.headers.get("X-Swarm") == "1" or request.is_json
         host, origin = request.headers.get("Host", ""), request.headers.get("Origin")
-        problem = refusal(request.method, host, origin, marked, hosts, board.fallbacks.lets_in)
+        is_let_in = not is_own_origin(origin, host) and lets_in(origin or "")
+        g.headers = headers(host, origin, lambda _: is_let_in)
+        problem = refusal(request.method, host, origin, marked, hosts, lambda _: is_let_in)
         if problem is not None:
             raise problem
         # A browser asks first before it lets a page of another node give an order.
@@ -86,8 +89,7 @@ def _guard(app: Flask, board: Board, hosts: Collection[str], needs_mark: Callabl
 
     @app.after_request
     def strict(response: Response) -> Response:
-        host, origin = request.headers.get("Host", ""), request.headers.get("Origin")
-        response.headers.update(headers(host, origin, board.fallbacks.lets_in))
+        response.headers.update(g.get("headers", HEADERS))
         response.headers.setdefault("Cache-Control", "no-store")
         return response
 
@@ -132,15 +134,16 @@ def _serve(
     read: Callable[[], State],
     board: Board,
     wall: Callable[[], float],
-    carry_out: Callable[..., Any],
+    on_reactor: OnReactor,
+    dispatch: Dispatch,
 ) -> None:
     def answer(**path: str) -> Response:
         now = wall()
-        who = board.sessions.visitor(_token(), now)
+        who = on_reactor(board.sessions.visitor, _token(), now)
         guarded(route.role, who)
         given = checked(route, path, request.args, {} if route.method == "GET" else _body())
         ask = Ask(given, who, board, read(), _id(), request.remote_addr or "", now, table)
-        told = carry_out(route, ask, limit_s=route.limit_s)
+        told = on_reactor(dispatch.carry_out, route, ask, limit_s=route.limit_s)
         is_content = isinstance(told, Content)
         response = app.response_class(told.body, content_type=told.kind) if is_content else jsonify(told)
         response.status_code = route.status

@@ -2,8 +2,7 @@
 
 Whoever needs a part asks for it here, so that no route knows how it is done.  The parts that every web node has come
 with a twin in memory; what is None the node does not have, and the page, told by ``has``, shows nothing of it.
-Everything is called on the reactor's thread but ``Sessions.visitor`` and ``Fallbacks.lets_in``, which may be called on
-any.
+Everything is called on the reactor's thread.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ class Visitor:
     """Who asks; ``token_id`` names what it signed in with, and is no secret.
 
     It is let in ``until`` then (unix seconds), which it may have put off, no further than to ``limit``, unless it shows
-    a ticket.
+    a ticket.  It ends with the sessions ``parents``, too; ``vouchers`` are the keys of the web nodes that vouch for it.
     """
 
     name: str = ""
@@ -39,6 +38,8 @@ class Visitor:
     until: float = math.inf
     limit: float = math.inf
     is_ticket: bool = False
+    parents: tuple[str, ...] = ()
+    vouchers: tuple[bytes, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -67,36 +68,54 @@ class Sessions(Protocol):
     def visitor(self, token: str, now: float) -> Visitor:
         """Who shows this token or ticket; never raises, and changes nothing.  Without one: anyone."""
 
-    def token(self, name: str, role: Role, now: float, seconds: float) -> Token:
-        """A token for somebody who need not sign in."""
+    def token(self, who: Visitor, name: str, role: Role, now: float, seconds: float) -> Token:
+        """A token for somebody whom ``who`` brings in, for no longer than ``who`` can stay."""
+
+    def derived(self, who: Visitor, name: str, role: Role, now: float, seconds: float) -> Token:
+        """A token for ``who`` under another name, which ends with the session."""
 
     def renewed(self, who: Visitor, now: float) -> Token:
         """Another token for the same session, good for longer; raises ``Refusal`` 401 for anyone and for a ticket."""
+
+    def passes(self, who: Visitor, nodes: Iterable[str], now: float) -> dict[str, Token]:
+        """Tokens for the same session at the web nodes with the uuids ``nodes``, each good there alone, for minutes.
+
+        Raises ``Refusal`` 401 for anyone and for a ticket.
+        """
 
     def revoke(self, token_id: str, until: float = math.inf) -> None:
         """Let in nobody with this token any more, nor with one that was made of it; it runs out ``until`` then."""
 
 
 class OpenSessions:
-    """Everybody is an operator: for a page of this machine alone, and for tests."""
+    """Everybody is an operator while ``may_serve``: for a page of this machine alone, and for tests."""
 
     code = ""
 
+    def __init__(self, may_serve: Callable[[], bool] = lambda: True) -> None:
+        self._may_serve = may_serve
+
     def sign_in(self, proof: str, source: str, now: float) -> Deferred[Token]:
         """Let in whoever asks, for a day."""
-        return succeed(self.token("visitor", "operator", now, 86400.0))
+        return succeed(self.token(Visitor(), "visitor", "operator", now, 86400.0))
 
     def visitor(self, token: str, now: float) -> Visitor:
         """Return an operator."""
-        return Visitor("visitor", "operator")
+        return Visitor("visitor", "operator") if self._may_serve() else Visitor()
 
-    def token(self, name: str, role: Role, now: float, seconds: float) -> Token:
+    def token(self, who: Visitor, name: str, role: Role, now: float, seconds: float) -> Token:
         """Return one that says nothing."""
         return Token("open", "open", role, now + seconds)
 
+    derived = token
+
     def renewed(self, who: Visitor, now: float) -> Token:
         """Return one that says nothing."""
-        return self.token(who.name, who.role, now, 86400.0)
+        return self.token(who, who.name, who.role, now, 86400.0)
+
+    def passes(self, who: Visitor, nodes: Iterable[str], now: float) -> dict[str, Token]:
+        """Return one that says nothing for each."""
+        return {node: self.renewed(who, now) for node in nodes}
 
     def revoke(self, token_id: str, until: float = math.inf) -> None:
         """Do nothing."""
@@ -349,11 +368,8 @@ class Halts(Protocol):
     def halt(self, by: str) -> Deferred[dict[str, str]]:
         """Let everything stand, and stay."""
 
-    def release(self, by: str) -> Deferred[dict[str, str]]:
-        """Let it go on."""
-
-    def is_halted(self) -> bool:
-        """Whether the team is halted."""
+    def release(self, by: str, stops: Sequence[str] | None = None) -> Deferred[dict[str, str]]:
+        """End these stops, ids in hex, and no other ones; all that are known where none are named."""
 
 
 class MemoryHalts:
@@ -368,7 +384,7 @@ class MemoryHalts:
         self.said.append(("halt", by))
         return succeed(dict.fromkeys(self.devices, "stands"))
 
-    def release(self, by: str) -> Deferred[dict[str, str]]:
+    def release(self, by: str, stops: Sequence[str] | None = None) -> Deferred[dict[str, str]]:
         """All go on."""
         self.said.append(("release", by))
         return succeed(dict.fromkeys(self.devices, "goes on"))

@@ -1,8 +1,8 @@
-"""Certificate: the team's authority, and what it signs for a web node, so that the page can be served over TLS.  Pure.
+"""Certificate: a web node's authority, and what it signs for the node's page to be served over TLS.  Pure.
 
-Each web node makes the authority by itself from the team's secret, byte for byte the same: who trusts it once trusts
-the page of every web node of the team.  It can vouch for addresses and names of a local network and for nothing else:
-who comes to know the secret cannot pass for a site of the internet before the phones that trust it.
+Each web node has an authority of its own, which follows from random bytes that the node keeps, so that it is the same
+after each start; no member of the team can make it of what members share.  It can vouch for addresses and names of a
+local network and for nothing else: a web node cannot pass for a site of the internet before the phones that trust it.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ PERSON = b"swarm-page-tls"
 ORDER = 0xFFFFFFFF00000000FFFFFFFFFFFFFFFFBCE6FAADA7179E84F3B9CAC2FC632551
 """How many points the group of P-256 has; a private key is a number below it."""
 FROM, UNTIL = datetime(2025, 1, 1, tzinfo=UTC), datetime(2049, 12, 31, tzinfo=UTC)
-"""When the authority is valid: said here, as it must be the same at every node, whatever its clock says."""
+"""When the authority is valid: said here, as it must be the same after each start, whatever the clock says."""
 LASTS = timedelta(days=365)
 """Of a node's certificate; phones take none that lasts longer than 825 days."""
 EARLIER = timedelta(days=2)
@@ -61,7 +61,7 @@ class Credential:
 
 
 class Authority(Credential):
-    """What signs for the web nodes of a team."""
+    """What signs for a web node."""
 
     @property
     def fingerprint(self) -> str:
@@ -69,12 +69,12 @@ class Authority(Credential):
         return bytes(self.certificate.fingerprint(SHA256())).hex(":").upper()
 
 
-def authority(secret: bytes) -> Authority:
-    """The authority of the team that has this secret."""
+def authority(secret: bytes, title: str) -> Authority:
+    """The authority of the node that keeps this secret, and that people call ``title``."""
     key = _key(secret, b"authority")
-    # A phone lists authorities by name: those of two teams should be told apart.
+    # A phone lists authorities by name: those of two nodes should be told apart.
     mark = hashlib.blake2s(_point(key), digest_size=3).hexdigest()
-    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, f"Swarm team {mark}")])
+    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, f"Swarm {title} {mark}")])
     constraints = x509.NameConstraints(
         [
             *(x509.DNSName(domain) for domain in DOMAINS),
@@ -107,7 +107,7 @@ class Leaf(Credential):
         try:
             certificate.verify_directly_issued_by(signer.certificate)
         except (InvalidSignature, ValueError, TypeError):
-            return "the authority of another team signed it"
+            return "another authority signed it"
         if moment < certificate.not_valid_before_utc:
             return "it is not valid yet"
         if moment > certificate.not_valid_after_utc - LEFT:

@@ -65,8 +65,7 @@ class TeamChronicle:
         confer = [group for group in _rows(state, "groups") if group["task"] not in ended]
         self._groups(_by(before, "groups", "task"), confer, now)
         self._takeovers(state, titles, ended, now)
-        if bool(state.get("halted")) != bool(before.get("halted")):
-            self._add(now, "halt", text="the team is halted" if state.get("halted") else "the team goes on")
+        self._stops(before, state, now)
 
     def faulted(self, uuid: str, kind: str, now: float) -> None:
         """Remember that a fault was caused on purpose, so that the takeover is timed from it."""
@@ -89,6 +88,16 @@ class TeamChronicle:
     ) -> None:
         self._n += 1
         self._entries.append(Entry(self._n, at, kind, uuid, task, text, seconds))
+
+    def _stops(self, before: State, state: State, now: float) -> None:
+        """Who stopped the team, when all of its robots stood, and when it went on."""
+        known = {stop["id"] for stop in before.get("halt", {}).get("stops", ())}
+        stops = state.get("halt", {}).get("stops", ())
+        for by in dict.fromkeys(stop["by"] for stop in stops if stop["id"] not in known and stop["by"]):
+            self._add(now, "halt", text=f"{by} stops the team")
+        if bool(state.get("halted")) != bool(before.get("halted")):
+            lost = "not every robot stands" if stops else "the team goes on"
+            self._add(now, "halt", text="the team is halted" if state.get("halted") else lost)
 
     def _devices(self, before: Mapping[str, State], devices: Iterable[State], now: float) -> None:
         for device in devices:

@@ -1,27 +1,32 @@
 """Fallback: the other web nodes of the team, to which a page goes when its own is lost.
 
-Each web node says in its device record at which URLs it serves the page.  The record is signed, so that only the team
-can name one; what a URL may be is checked all the same, as a page follows it.
+Each web node says in its device record at which URLs it serves the page.  Any member can say so of itself; in a closed
+team a page follows those alone that have the role ``gateway`` at this moment, as certified by the operator.  What a URL
+may be is checked all the same.
 """
 
 from __future__ import annotations
 
 import ipaddress
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
 from math import inf
 from urllib.parse import urlsplit
 
 from middleware.entangled.record import Record
 from middleware.node import SwarmNode
 from middleware.presence import Device, devices_of
-from webnode.board import Fallbacks, Page
+from middleware.roles import GATEWAY
+from webnode.board import Page
 from webnode.ground import Ground
-from webnode.guard import is_local_host
+from webnode.guard import is_local_name
 
 REMEMBERED_S = 3600.0
 """How long a page may come from a web node that is gone: it still runs in the visitor's browser."""
 MAX_URL = 100
 MAX_URLS = 4
+MAX_GONE = 256
+"""Pages that are gone and remembered, the newest."""
 PORTS = {"http": 80, "https": 443}
 ANY = ("0.0.0.0", "::", "")
 
@@ -39,7 +44,7 @@ def origin_of(url: str) -> str:
     except ValueError:
         return ""
     is_bare = parts.path in ("", "/") and not (parts.query or parts.fragment or "@" in parts.netloc)
-    if parts.scheme not in PORTS or not is_bare or not is_local_host(f"[{host}]" if ":" in host else host):
+    if parts.scheme not in PORTS or not is_bare or not is_local_name(f"[{host}]" if ":" in host else host):
         return ""
     host = "127.0.0.1" if is_loopback(host) else f"[{host}]" if ":" in host else host
     return f"{parts.scheme}://{host}:{PORTS[parts.scheme] if port is None else port}"
@@ -72,14 +77,27 @@ def urls_at(host: str, port: int, names: Iterable[str], is_secure: bool = False)
     return [f"{scheme}://{f'[{name}]' if ':' in name else name}:{port}" for name in hosts][:MAX_URLS]
 
 
+@dataclass(frozen=True)
+class _Served:
+    """A page that was heard of, by the node with the key ``public``; ``end`` is when it is forgotten."""
+
+    public: bytes
+    page: Page
+    end: float = inf
+
+
 class TeamFallbacks:
-    """The web nodes of a running team; ``clock`` counts seconds and may be asked on any thread."""
+    """The web nodes of a running team; ``clock`` counts seconds.
+
+    Those that count are gateways: in a closed team whoever has that role now, in an open one, where everybody may do
+    everything, whoever serves the page or did within the hour.
+    """
 
     def __init__(self, node: SwarmNode, clock: Callable[[], float]) -> None:
         self._node = node
         self._clock = clock
-        self._ends: dict[str, float] = {}
-        self._here: list[Page] = []
+        self._own = node.entangled.identity.public
+        self._served: list[_Served] = []
         self._watch = node.watch_devices(self._follow, keep=True)
 
     def serves(self, urls: Iterable[str]) -> None:
@@ -89,35 +107,53 @@ class TeamFallbacks:
         self._follow(self._watch.records)
 
     def here(self) -> list[Page]:
-        """Where the page is served now, this node's own first."""
-        return self._here
+        """Where gateways serve the page now, this node's own first."""
+        here = [each for each in self._served if each.end == inf]
+        may = {public for public in {each.public for each in here} if self.may_vouch(public) or public == self._own}
+        return [each.page for each in here if each.public in may]
+
+    def may_vouch(self, public: bytes) -> bool:
+        """Whether the node with that key may let people in, at this moment."""
+        if self._node.team is not None:
+            return GATEWAY in self._node.team.door.roles_of(public)
+        now = self._clock()
+        return public == self._own or any(each.public == public and each.end > now for each in self._served)
 
     def lets_in(self, origin: str) -> bool:
-        """Whether a web node of the team is at ``origin``, or was within the hour.
+        """Whether a gateway serves the page at ``origin``, or did within the hour.
 
         A page that was opened at ``localhost`` comes from the port of one, and from this machine.
         """
         asked, now = origin_of(origin), self._clock()
         if not asked:
             return False
-        ends = self._ends
-        if ends.get(asked, 0.0) > now:
-            return True
         here = urlsplit(asked)
-        ports = {(parts.scheme, parts.port) for known, end in ends.items() if end > now for parts in [urlsplit(known)]}
-        return is_loopback(here.hostname or "") and (here.scheme, here.port) in ports
+
+        def is_there(url: str) -> bool:
+            known = urlsplit(origin_of(url))
+            is_port = (known.scheme, known.port) == (here.scheme, here.port)
+            return is_port and (known.hostname == here.hostname or is_loopback(here.hostname or ""))
+
+        found = {each.public for each in self._served if each.end > now and is_there(each.page.url)}
+        return any(public == self._own or self.may_vouch(public) for public in found)
 
     def _follow(self, records: list[Record]) -> None:
-        others = [device for device, _ in devices_of(records) if device.uuid != self._node.uuid]
+        devices = [(device, record.owner) for device, record in devices_of(records) if device.uuid != self._node.uuid]
         own = self._node.presence.device
-        pages = pages_of([Device(self._node.uuid, own.name, pages=own.pages), *others], self._node.uuid)
-        now = self._clock()
-        kept = {known: min(end, now + REMEMBERED_S) for known, end in self._ends.items() if end > now}
-        # A new table each time: whoever looks on another thread has the old one in hand.
-        self._ends = {**kept, **{origin_of(page.url): inf for page in pages}}
-        self._here = pages
+        here = [
+            _Served(public, page)
+            for device, public in [(Device(self._node.uuid, own.name, pages=own.pages), self._own), *devices]
+            for page in pages_of([device], self._node.uuid)
+        ]
+        now, known = self._clock(), {(each.public, each.page.url) for each in here}
+        gone = [
+            replace(each, end=min(each.end, now + REMEMBERED_S))
+            for each in self._served
+            if each.end > now and (each.public, each.page.url) not in known
+        ]
+        self._served = here + sorted(gone, key=lambda each: -each.end)[:MAX_GONE]
 
 
-def fallbacks(ground: Ground) -> Fallbacks:
+def fallbacks(ground: Ground) -> TeamFallbacks:
     """The web nodes of the team."""
     return TeamFallbacks(ground.node, ground.reactor.seconds)

@@ -1,9 +1,9 @@
 """The guard: which requests a page on a LAN may answer, and the headers that keep a browser strict.  Pure.
 
 The page has no cookies, so a foreign site gains nothing but what a visitor's browser reaches for it: it is stopped
-at three doors.  ``Host`` must name this machine in a way that nobody outside can register (against rebinding of
-names), ``Origin`` must be the page's own or that of another web node of the team, and a request that changes something
-must be of a kind that a foreign form cannot send.
+at three doors.  ``Host`` must be an address or a name of this machine (against rebinding of names), ``Origin`` must be
+the page's own or that of another web node of the team, and a request that changes something must be of a kind that a
+foreign form cannot send.
 """
 
 from __future__ import annotations
@@ -39,12 +39,29 @@ SHARED = {
 LetsIn = Callable[[str], bool]
 
 
-def is_local_host(host: str, names: Collection[str] = ()) -> bool:
-    """Whether a ``Host`` header names a machine by address, by a name of the local network, or by one of ``names``."""
+def is_local_name(host: str) -> bool:
+    """Whether a ``Host`` header can name a machine of the local network: an address, or a name from no outside."""
+    name = _name_of(host)
+    is_plain = bool(name) and all(c.isalnum() or c in "-_" for c in name)
+    return is_plain or name.endswith(LOCAL_ENDS) or _is_address(name)
+
+
+def is_own_host(host: str, names: Collection[str] = ()) -> bool:
+    """Whether a ``Host`` header names this machine: by address, as localhost, or by one of ``names``.
+
+    Any machine of a LAN can have itself called by a name such as evil.local, and have it mean this machine a moment
+    later; an address it cannot.
+    """
+    name = _name_of(host)
+    return name == "localhost" or name.endswith(".localhost") or _is_address(name) or name in names
+
+
+def _name_of(host: str) -> str:
     name = host.rsplit("]", 1)[0].lstrip("[") if host.startswith("[") else host.rsplit(":", 1)[0]
-    name = name.rstrip(".").lower()
-    if name in names or name.endswith(LOCAL_ENDS) or (name and all(c.isalnum() or c in "-_" for c in name)):
-        return True
+    return name.rstrip(".").lower()
+
+
+def _is_address(name: str) -> bool:
     try:
         ipaddress.ip_address(name)
     except ValueError:
@@ -64,9 +81,9 @@ def refusal(
 
     ``is_marked``: it carries what no form of a foreign site can send.  ``lets_in`` knows the team's other web nodes.
     """
-    if not is_local_host(host, names):
+    if not is_own_host(host, names):
         return Refusal(
-            "Host", "this name is not one of the node's", "use its address, or add the name to the settings", 403
+            "Host", "this name is not one of the node's", "use its address, or add the name to [web] names", 403
         )
     if method in ("GET", "HEAD"):
         return None

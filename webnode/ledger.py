@@ -12,12 +12,13 @@ from typing import Any
 
 from middleware.entangled.record import Record
 from middleware.explanation import explained
-from middleware.halt import HALT, word_of
+from middleware.halt import HALT, stops_in
 from middleware.order import PAUSE, order_of
 from middleware.presence import DEVICES, Device, devices_of
-from middleware.tasks import TASKS, Task, group_key, member_of, outcome_of, refusals, tasks_of
+from middleware.tasks import TASKS, Task, council_of, group_key, member_of, outcome_of, refusals, tasks_of
 from middleware.verdict import verdict_of, verdicts_key
 from webnode.state import Departed, State, state_of
+from webnode.stopped import stopped_view
 
 Read = Callable[[bytes], list[Record]]
 TASKS_SHOWN = 20
@@ -46,15 +47,17 @@ def state_from(read: Read, departed: Departed, node: str, now: float) -> State:
     """The whole state at ``now`` (unix s); ``departed`` remembers who left, ``node`` is the name of who serves."""
     devices = [device for device, _ in devices_of(read(DEVICES))]
     tasks = sorted(tasks_of(read(TASKS)).values(), key=lambda task: (-task.created, task.task_id))
+    names = {device.uuid: device.name for device in devices}
     rows, groups = [], {}
     for task in tasks[:TASKS_SHOWN]:
         records = read(group_key(task.task_id))
         members = [m for r in records if (m := member_of(r)) is not None]
-        groups[task.task_id] = [asdict(member) for member in members]
+        groups[task.task_id] = [{**asdict(member), "name": names.get(member.uuid, member.name)} for member in members]
         rows.append({**_task_row(task, records, devices), "why": _why(task, read(verdicts_key(task.task_id)))})
     views = [_device_row(device) for device in devices]
     state = state_of(views, rows, groups, departed=departed.of(views, now), node=node)
-    return {**state, "halted": word_of(read(HALT)).is_on}
+    stops = {stop.hex(): by for stop, by in stops_in(read(HALT)).items()}
+    return {**state, **stopped_view(stops, state["devices"])}
 
 
 def refused_by(task: Task, devices: list[Device]) -> dict[str, list[str]]:
@@ -68,7 +71,7 @@ def _device_row(device: Device) -> dict[str, Any]:
 
 
 def _task_row(task: Task, records: list[Record], devices: list[Device]) -> dict[str, Any]:
-    outcome = outcome_of(records)
+    outcome = outcome_of(task, records)
     members = [m for r in records if (m := member_of(r)) is not None]
     order = order_of(records)
     is_paused = outcome is None and order is not None and order.word == PAUSE
@@ -99,7 +102,7 @@ def _task_row(task: Task, records: list[Record], devices: list[Device]) -> dict[
         "strategy": task.strategy,
         "group": task.group,
         "created": task.created,
-        "council": [str(contact.address) for contact in task.council],
+        "council": [str(contact.address) for contact in council_of(task, records).council],
         "status": status,
         "note": note,
         "paused": is_paused,

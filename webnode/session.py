@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import hmac
-import ipaddress
 import math
 import random
-from collections.abc import Callable
+from collections import OrderedDict
+from collections.abc import Callable, Iterable
+from dataclasses import replace
 from typing import Any
 
 from twisted.internet.defer import Deferred, DeferredSemaphore, fail, succeed
@@ -14,39 +15,54 @@ from twisted.internet.threads import deferToThreadPool
 
 from middleware.errors import BadSetting
 from webnode.board import OpenSessions, Role, Sessions, Token, Visitor
-from webnode.delay import Delays
+from webnode.code import draw_code
+from webnode.delay import SOURCES, Delays, network_of
 from webnode.errors import Refusal
+from webnode.fallback import TeamFallbacks, is_loopback
 from webnode.ground import Ground
 from webnode.password import is_password, read
-from webnode.revocation import ID_BYTES, MemoryRevocations, Revocations, TeamRevocations
-from webnode.seal import Claim, Seal
+from webnode.revocation import MemoryRevocations, Revocations, TeamRevocations
+from webnode.token import MAX_PARENTS, MAX_VOUCHERS, SESSION_BYTES, Claim, TokenKey
 
 SIGNED_S = 12 * 3600.0
 """How long one is signed in, unless the page has it renewed."""
 MAX_SIGNED_S = 30 * 86400.0
 """How long a session lasts at most, however often it is renewed."""
-LETTERS = "abcdefghjkmnpqrstuvwxyz"
-"""Of these is a code that the node makes: none looks like another, or like a digit."""
+PASS_S = 600.0
+"""How long a token is good that takes a page to another web node; there it is renewed."""
+FREE_EVERYWHERE, LONGEST_EVERYWHERE_S, FORGOTTEN_EVERYWHERE_S = 100, 60.0, 3600.0
+"""Of all addresses together 100 wrong codes are free; then at last one a minute is looked at, until an hour is quiet.
+The wait is short, as everybody whose address is not known yet waits."""
+EVERYWHERE = "everywhere"
 AT_ONCE, WAITING = 2, 1
 """Passwords that are checked at the same time, and those that may wait for it: each holds one of the page's four
 workers, and whoever guesses must not hold them all."""
 
+NOBODY = Visitor()
+NO_GATEWAY = Refusal(
+    "node",
+    "it may let nobody in: it has not the role gateway in its team",
+    "sign in at another web node, or have the operator say: swarm promote NAME --role gateway",
+    403,
+)
 Check = Callable[[str, str], Deferred[bool]]
 """Whether a hash is that of a password, worked out beside the reactor's thread."""
 
 
 class SignedSessions:
-    """Sessions that are sealed tokens, and so are valid at every web node of the team.
+    """Sessions that are signed tokens, each good at one web node.
 
     ``code`` lets in operators; so does the password whose hash is ``password``, where there is one.  A token of a
     visitor who is let in can be given as a code, too, and is good for the same role until the same moment: that is an
-    invitation.  ``revoked`` are the sessions that were ended; one holds for ``signed_s``, and as long again when it is
-    renewed.
+    invitation.  ``key`` signs in the name of this web node.  ``may_vouch`` says whether the node with a public key is a
+    gateway of the team at this moment: a session counts while all are that vouch for it, this node included.
+    ``revoked`` are the sessions that were ended; one holds for ``signed_s``, and as long again when it is renewed.
     """
 
     def __init__(
         self,
-        secret: bytes,
+        key: TokenKey,
+        may_vouch: Callable[[bytes], bool],
         code: str,
         password: str,
         rng: random.Random,
@@ -55,26 +71,30 @@ class SignedSessions:
         signed_s: float = SIGNED_S,
     ) -> None:
         self.code = code
-        self._seal = Seal(secret)
+        self.key = key
+        self._may_vouch = may_vouch
         self._password = password
         self._rng = rng
         self._check = check
-        self._delays = Delays()
+        self._attempts = Attempts()
         self._revoked = MemoryRevocations() if revoked is None else revoked
         self.signed_s = signed_s
         self._gate = DeferredSemaphore(AT_ONCE)
 
     def sign_in(self, proof: str, source: str, now: float) -> Deferred[Token]:
-        """Sign in with a code, a password or an invitation; fails with ``Refusal`` 401, 429 or 503."""
-        wait = self._delays.wait(source, now)
+        """Sign in with a code, a password or an invitation; fails with ``Refusal`` 401, 403, 429 or 503."""
+        if not self._may_vouch(self.key.public):
+            return fail(NO_GATEWAY)
+        # Nobody guesses a signature: an invitation lets in however many guess codes.
+        invited = self.visitor(proof.strip(), now)
+        if invited.role != "anyone" and not invited.is_ticket:
+            return succeed(self._begin(invited.name, invited.role, now, invited.until, invited))
+        wait = self._attempts.wait(source, now)
         if wait > 0.0:
-            return fail(Refusal("code", "too many wrong ones came from here", f"wait {math.ceil(wait)} s", 429))
-        self._delays.tried(source, now)
-        invited = self._claim(proof.strip(), now)
-        if invited is not None and not invited.is_ticket:
-            return succeed(self._held(source, invited.name, invited.role, now, invited.until))
+            return fail(Refusal("code", "there were too many wrong ones", f"wait {math.ceil(wait)} s", 429))
+        self._attempts.tried(source, now)
         if hmac.compare_digest(_plain(proof), _plain(self.code)):
-            return succeed(self._held(source, "operator", "operator", now, now + MAX_SIGNED_S))
+            return succeed(self._operator(source, now))
         if not self._password:
             return fail(_wrong())
         if len(self._gate.waiting) >= WAITING:
@@ -83,56 +103,120 @@ class SignedSessions:
         def judged(is_right: bool) -> Token:
             if not is_right:
                 raise _wrong()
-            return self._held(source, "operator", "operator", now, now + MAX_SIGNED_S)
+            return self._operator(source, now)
 
         return self._gate.run(self._check, self._password, proof).addCallback(judged)
 
     def visitor(self, token: str, now: float) -> Visitor:
-        """Who shows this token or ticket; on any thread."""
-        claim = self._claim(token, now)
-        if claim is None:
-            return Visitor()
-        return Visitor(claim.name, claim.role, claim.id, claim.until, max(claim.until, claim.limit), claim.is_ticket)
+        """Who shows this token or ticket."""
+        claim = self.key.claim(token)
+        if claim is None or now >= claim.until or any(self._revoked.has(each) for each in (claim.id, *claim.parents)):
+            return NOBODY
+        if not all(self._may_vouch(public) for public in (self.key.public, *claim.vouchers)):
+            return NOBODY
+        limit = max(claim.until, claim.limit)
+        who = Visitor(claim.name, claim.role, claim.id, claim.until, limit, claim.is_ticket)
+        return replace(who, parents=claim.parents, vouchers=claim.vouchers)
 
-    def token(self, name: str, role: Role, now: float, seconds: float) -> Token:
-        """A token for somebody who need not sign in."""
-        return self._sealed(self._fresh_id(), name, role, now + seconds, now + seconds)
+    def token(self, who: Visitor, name: str, role: Role, now: float, seconds: float) -> Token:
+        """A token for somebody whom ``who`` brings in, until ``who`` could stay at most."""
+        end = min(now + seconds, who.limit)
+        claim = Claim(self._fresh_id(), name, role, int(end), limit=int(end), vouchers=self._through(who))
+        return self._signed(claim)
+
+    def derived(self, who: Visitor, name: str, role: Role, now: float, seconds: float) -> Token:
+        """A token for ``who`` under another name, which ends with the session."""
+        token = Claim(self._fresh_id(), name, role, int(min(now + seconds, who.limit)), vouchers=self._through(who))
+        return self._signed(replace(token, limit=token.until, parents=_lineage(who)))
 
     def renewed(self, who: Visitor, now: float) -> Token:
         """Another token for the same session; one that is revoked ends both."""
-        if who.role == "anyone" or who.is_ticket:
-            problem = "a ticket is not enough" if who.is_ticket else "nobody is signed in"
-            raise Refusal("Authorization", problem, "send the token, as 'Bearer TOKEN', or sign in", 401)
-        return self._sealed(who.token_id, who.name, who.role, now + self.signed_s, who.limit)
+        _checked_session(who)
+        return self._session(who, now + self.signed_s, who.limit)
+
+    def passes(self, who: Visitor, nodes: Iterable[str], now: float) -> dict[str, Token]:
+        """Tokens for the same session at other web nodes, by uuid; each is good at its node alone, for ``PASS_S``."""
+        _checked_session(who)
+        until = min(now + PASS_S, who.limit)
+        return {node: self._session(who, until, who.limit, bytes.fromhex(node)) for node in dict.fromkeys(nodes)}
 
     def revoke(self, token_id: str, until: float = math.inf) -> None:
         """Let in nobody with this token any more, at any web node of the team."""
         self._revoked.add(token_id, until)
 
-    def _claim(self, token: str, now: float) -> Claim | None:
-        claim = self._seal.claim(token)
-        return claim if claim is not None and now < claim.until and not self._revoked.has(claim.id) else None
+    def _operator(self, source: str, now: float) -> Token:
+        self._attempts.held(source, now)
+        return self._begin("operator", "operator", now, now + MAX_SIGNED_S)
 
-    def _held(self, source: str, name: str, role: Role, now: float, limit: float) -> Token:
-        self._delays.held(source)
-        return self._sealed(self._fresh_id(), name, role, now + self.signed_s, limit)
+    def _begin(self, name: str, role: Role, now: float, limit: float, invited: Visitor = NOBODY) -> Token:
+        """A new session, which ends with the invitation by which it came."""
+        who = Visitor(name, role, self._fresh_id(), parents=_lineage(invited), vouchers=invited.vouchers)
+        return self._session(who, now + self.signed_s, limit)
+
+    def _session(self, who: Visitor, until: float, limit: float, audience: bytes = b"") -> Token:
+        claim = Claim(who.token_id, who.name, who.role, int(min(until, limit)), limit=int(limit))
+        return self._signed(replace(claim, parents=who.parents, vouchers=self._through(who)), audience)
+
+    def _signed(self, claim: Claim, audience: bytes = b"") -> Token:
+        text, ticket = (self.key.token(each, audience) for each in (claim, claim.ticket))
+        return Token(text, ticket, claim.role, float(claim.until))
+
+    def _through(self, who: Visitor) -> tuple[bytes, ...]:
+        """The web nodes beside this one that vouch for ``who``; raises ``Refusal`` where they are too many."""
+        others = tuple(each for each in who.vouchers if each != self.key.public)
+        if len(others) > MAX_VOUCHERS:
+            raise Refusal("Authorization", "the session came by too many web nodes", "sign in here", 401)
+        return others
 
     def _fresh_id(self) -> str:
-        return self._rng.randbytes(ID_BYTES).hex()
-
-    def _sealed(self, token_id: str, name: str, role: Role, until: float, limit: float) -> Token:
-        claim = Claim(token_id, name, role, int(min(until, limit)), limit=int(limit))
-        return Token(self._seal.text(claim), self._seal.text(claim.ticket), role, float(claim.until))
+        return self._rng.randbytes(SESSION_BYTES).hex()
 
 
-def sessions(ground: Ground) -> Sessions:
+class Attempts:
+    """Attempts to sign in with a code or password: each address has its own, and all together have some.
+
+    Those of all together do not hold up this machine, nor a network from which somebody signed in before.
+    """
+
+    def __init__(self) -> None:
+        self._here = Delays()
+        self._everywhere = Delays(FREE_EVERYWHERE, LONGEST_EVERYWHERE_S, FORGOTTEN_EVERYWHERE_S)
+        self._known: OrderedDict[str, None] = OrderedDict()
+
+    def wait(self, source: str, now: float) -> float:
+        """Seconds until ``source`` may try again; 0 where it may now."""
+        wait = self._here.wait(source, now)
+        return wait if self._is_known(source) else max(wait, self._everywhere.wait(EVERYWHERE, now))
+
+    def tried(self, source: str, now: float) -> None:
+        """Count an attempt."""
+        self._here.tried(source, now)
+        if not self._is_known(source):
+            self._everywhere.tried(EVERYWHERE, now)
+
+    def held(self, source: str, now: float) -> None:
+        """Take note that the last attempt of ``source`` was right."""
+        self._here.held(source)
+        if not self._is_known(source):
+            self._everywhere.undo(EVERYWHERE)
+        self._known[network_of(source)] = None
+        self._known.move_to_end(network_of(source))
+        if len(self._known) > SOURCES:
+            self._known.popitem(last=False)
+
+    def _is_known(self, source: str) -> bool:
+        return network_of(source) in self._known or is_loopback(source)
+
+
+def sessions(ground: Ground, team: TeamFallbacks) -> Sessions:
     """Who may come in; raises ``BadSetting`` where the settings would let in everybody of the network."""
     web, origin = ground.settings.web, ground.settings.origin
+    key = TokenKey(ground.node.entangled.identity)
     if not web.sign_in:
-        if not _is_loopback(web.host):
+        if not is_loopback(web.host):
             problem = f"is false, and {web.host} serves more than this machine"
             raise BadSetting(origin, "[web] sign_in", problem, "set host = '127.0.0.1', or leave sign_in out")
-        return OpenSessions()
+        return OpenSessions(lambda: team.may_vouch(key.public))
     if web.password:
         try:
             read(web.password)
@@ -140,19 +224,13 @@ def sessions(ground: Ground) -> Sessions:
             raise BadSetting(
                 origin, "[web] password", f"is no hash of a password ({error})", "make one by: swarm password"
             ) from error
-    secret = ground.settings.node.team_secret
 
     def check(text: str, password: str) -> Deferred[Any]:
         return deferToThreadPool(ground.reactor, ground.reactor.getThreadPool(), is_password, text, password)
 
     revoked = TeamRevocations(ground.node)
-    return SignedSessions(secret, web.code or made(ground.rng), web.password, ground.rng, check, revoked)
-
-
-def made(rng: random.Random) -> str:
-    """A code to sign in with."""
-    letters = "".join(rng.choice(LETTERS) for _ in range(8))
-    return f"{letters[:4]}-{letters[4:]}"
+    code = web.code or draw_code(ground.rng)
+    return SignedSessions(key, team.may_vouch, code, web.password, ground.rng, check, revoked)
 
 
 def _wrong() -> Refusal:
@@ -164,5 +242,12 @@ def _plain(code: str) -> bytes:
     return "".join(c for c in code.lower() if not c.isspace() and c != "-").encode()
 
 
-def _is_loopback(host: str) -> bool:
-    return ipaddress.ip_address(host).is_loopback
+def _lineage(who: Visitor) -> tuple[str, ...]:
+    """The ids with which whatever ``who`` begins ends, too."""
+    return tuple(each for each in (who.token_id, *who.parents) if each)[:MAX_PARENTS]
+
+
+def _checked_session(who: Visitor) -> None:
+    if who.role == "anyone" or who.is_ticket:
+        problem = "a ticket is not enough" if who.is_ticket else "nobody is signed in"
+        raise Refusal("Authorization", problem, "send the token, as 'Bearer TOKEN', or sign in", 401)

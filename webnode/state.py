@@ -78,10 +78,12 @@ def device_view(fields: Fields) -> State:
         "status": _status(fields.get("status"), DEVICE_STATUSES),
         "messages": _messages(fields.get("messages")),
         "network": {text(key): number(value) for key, value in network.items()} if isinstance(network, Mapping) else {},
-        "deployed": {text(key): text(value, limit=64) for key, value in deployed.items()},
+        "deployed": {text(key): text(value, limit=200) for key, value in deployed.items()},
         "position": _position(fields.get("position")),
         "laptop": text(fields.get("laptop"), limit=64),
         "agent": text(fields.get("agent"), limit=64),
+        "stops": texts(fields.get("stops")),
+        "obeys": text(fields.get("obeys"), limit=64),
         "gone": None,
     }
 

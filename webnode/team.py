@@ -304,7 +304,7 @@ class TeamDesk:
 
     def _open_tasks(self) -> list[Task]:
         tasks = tasks_of(self._tasks.records).values()
-        return [task for task in tasks if outcome_of(self.read(group_key(task.task_id))) is None]
+        return [task for task in tasks if outcome_of(task, self.read(group_key(task.task_id))) is None]
 
     def _record_of(self, uuid: str) -> Record | None:
         return next((record for device, record in devices_of(self._devices.records) if device.uuid == uuid), None)

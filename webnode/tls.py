@@ -20,6 +20,7 @@ from twisted.protocols.tls import BufferingTLSTransport, TLSMemoryBIOFactory
 from twisted.web.server import Site
 from zope.interface import implementer
 
+from middleware.entangled.data.store import Store
 from middleware.settings import IN_MEMORY
 from webnode.certificate import Authority, Leaf, authority, leaf, nameable, plain, read
 from webnode.ground import Ground
@@ -28,6 +29,9 @@ from webnode.server import listening
 
 LEAF = ".tls"
 """Beside the node's store: its certificate with the key."""
+AUTHORITY = "page/authority"
+"""The note in the node's store with the seed of its authority."""
+SEED_BYTES = 32
 LOOK_S = 60.0
 """So often, at most, is it asked whether the certificate will still do, when somebody connects."""
 MOST_REACHED = 8
@@ -172,8 +176,17 @@ def door(ground: Ground, names: Names) -> TlsDoor:
     """The page's port over TLS."""
     web, node = ground.settings.web, ground.settings.node
     store = None if node.store == IN_MEMORY else node.store
-    signer = authority(node.team_secret)
+    signer = authority(_seed(ground.node.store, ground.rng), node.name)
     path = None if store is None else Path(f"{store}{LEAF}")
     certified = Certified(signer, node.name, path, names, ground.wall, ground.rng)
-    _log.info("phones that trust the authority {fingerprint} trust the page", fingerprint=signer.fingerprint)
+    _log.info("phones that trust the authority {fingerprint} trust this node's page", fingerprint=signer.fingerprint)
     return TlsDoor(ground.reactor, web.host, web.tls_port, signer, certified)
+
+
+def _seed(store: Store, rng: random.Random) -> bytes:
+    """The seed of this node's authority: its own, drawn at the first start."""
+    seed = store.noted(AUTHORITY)
+    if seed is None or len(seed) != SEED_BYTES:
+        seed = rng.randbytes(SEED_BYTES)
+        store.note(AUTHORITY, seed)
+    return seed

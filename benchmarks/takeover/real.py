@@ -25,7 +25,7 @@ from drivers.link import TcpConnector
 from drivers.sim.operator import YardOperator
 from middleware.entangled.data.sqlite import read_records
 from middleware.entangled.errors import EntangledError
-from middleware.tasks import group_key, outcome_of
+from middleware.tasks import TASKS, group_key, outcome_of, tasks_of
 from sim.demo.configuration import BOOTSTRAP, DOGS, toml
 from sim.demo.processes import on_leash
 
@@ -95,7 +95,9 @@ class Team:
         for name in DOGS:
             if name != lost:
                 try:
-                    outcome = outcome_of(read_records(self._folder / f"{name}.sqlite", group_key(task_id)))
+                    file = self._folder / f"{name}.sqlite"
+                    task = tasks_of(read_records(file, TASKS)).get(task_id)
+                    outcome = None if task is None else outcome_of(task, read_records(file, group_key(task_id)))
                 except (EntangledError, sqlite3.Error):
                     continue
                 if outcome is not None:

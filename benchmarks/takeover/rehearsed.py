@@ -12,7 +12,7 @@ from benchmarks.takeover.cause import PHASE_S, WEB, WITNESSES, Cause, Trial
 from benchmarks.takeover.judge import LOOK_S, Judge
 from middleware.entangled.network.switchboard import Weather
 from middleware.entangled.record import Record
-from middleware.tasks import outcome_of
+from middleware.tasks import Task, outcome_of
 from swarmnode.rehearsal import VirtualTeam
 
 WEATHER = Weather(delay_s=0.03, jitter_s=0.01)
@@ -31,7 +31,8 @@ def trial(cause: Cause, seed: int, loss: float = 0.1) -> Trial:
     task = replace(task_named("turn-around", f"turn{seed}", 0.0), waiting_period=1.0)
     if cause is Cause.TRIPLE_KILL:
         task = replace(task, tolerates=3)
-    Deferred.fromCoroutine(node.submit(task))
+    submitted: list[Task] = []
+    Deferred.fromCoroutine(node.submit(task)).addCallback(submitted.append)
     team.board.weather = replace(WEATHER, loss=loss)
     watcher = team.services[WITNESSES[0] if others else asker].assembly.node
     group: list[Record] = []
@@ -48,7 +49,7 @@ def trial(cause: Cause, seed: int, loss: float = 0.1) -> Trial:
         now = team.clock.seconds()
         if judge.thaws(now):
             team.thaw(lost)
-        judge.look(now, _moving(team), outcome_of(group))
+        judge.look(now, _moving(team), outcome_of(submitted[0], group))
     team.stop()
     return judge.verdict()
 

@@ -27,6 +27,8 @@ SKEW = 300
 """Seconds by which two clocks of one team may differ."""
 BOOTSTRAP = "bootstrap"
 GATEWAY = "gateway"
+ADMISSION = 9
+"""The kind of an admission among the entries of the membership list, beside those of statements."""
 GUEST_LIFE = 86_400
 """Seconds for which a gateway vouches for a guest at most."""
 _GUEST = b"swarm-guest-1 "
@@ -38,8 +40,9 @@ _ADMIT = b"swarm-admit-1 "
 class Member:
     """What a pass says of who holds ``public``.
 
-    ``invitation`` is the public key of that by which it came, ``admitter`` that of the bootstrap node; both are empty
-    where the operator named the member itself.  ``voucher`` is the member that vouches for a guest.
+    ``invitation`` is the public key of that by which it came, good for ``uses`` newcomers, ``admitter`` that of the
+    bootstrap node; both are empty where the operator named the member itself.  ``voucher`` is the member that vouches
+    for a guest.
     """
 
     public: bytes
@@ -50,6 +53,7 @@ class Member:
     invitation: bytes = b""
     admitter: bytes = b""
     voucher: Member | None = None
+    uses: int = 0
 
     def trouble(self, now: float) -> str:
         """``early`` or ``expired``, or nothing where the pass is valid at that moment of the wall clock."""
@@ -87,6 +91,14 @@ def chained(
     end = now + terms.life
     admission = bootstrap.sign(_admitted(terms.public, public, name, now, end))
     return bytes(msgpack.packb([1, packed, wish, signature, name, now, end, admission, grant]))
+
+
+def entry_of(public: bytes, shown: bytes) -> bytes | None:
+    """Return the entry of the membership list that a good pass of ``public`` has in it; None for that of a guest."""
+    kind, *rest = unpacked(shown)
+    if kind == 0:
+        return bytes(rest[0])
+    return bytes(msgpack.packb([ADMISSION, public, shown])) if kind == 1 else None
 
 
 def guest_pass(gateway: Identity, own: bytes, public: bytes, name: str, now: int, life: int = GUEST_LIFE) -> bytes:
@@ -144,7 +156,7 @@ def _chain(operator: bytes, public: bytes, fields: list[Any]) -> Member:
         raise Forged("who let this key in was no bootstrap node then")
     if not verified(grant.public, _admitted(invite.public, public, named(name), begin, end), sized(admission, 64)):
         raise Forged("no bootstrap node let this key in")
-    return Member(public, name, invite.roles, begin, end, invite.public, grant.public)
+    return Member(public, name, invite.roles, begin, end, invite.public, grant.public, uses=invite.uses)
 
 
 def _guest(operator: bytes, public: bytes, fields: list[Any]) -> Member:

@@ -1,6 +1,8 @@
 """Code: what an operator reads out and a newcomer types, 20 characters that stand for the key of an invitation.
 
-75 bits are the secret, 20 the fingerprint of the operator's public key, and 5 a check over both.  The letters are those
+75 bits are the secret, 20 the fingerprint of the operator's public key, and 5 a check over both.  Two keys follow from
+them: that of the invitation, whose public half every member knows, and that of its terms, which only the operator and
+the newcomer can make.  The letters are those
 of Crockford's base 32: no I, L, O and U, and what looks like one of these is read as the digit.  The check is a sum
 over GF(32) with another weight for each place, so every single wrong character, and every two that changed places, is
 noticed before anything is sent.
@@ -43,6 +45,15 @@ class Code:
         """The key pair of the invitation, which whoever has the code can make."""
         content = self.secret.to_bytes(10) + self.mark.to_bytes(3)
         return Identity(hashlib.blake2s(content, person=b"code").digest())
+
+    @property
+    def terms_key(self) -> bytes:
+        """The 32 bytes under which the operator seals the terms of the invitation (``terms``).
+
+        They cannot be computed from the public key of the invitation but by trying all 2**75 secrets.
+        """
+        content = self.secret.to_bytes(10) + self.mark.to_bytes(3)
+        return hashlib.blake2s(content, person=b"terms").digest()
 
     def fits(self, operator: bytes) -> bool:
         """Whether the code can come from the operator with that public key."""

@@ -11,16 +11,20 @@ from collections import OrderedDict
 from collections.abc import Callable, Collection
 from typing import Protocol
 
-from middleware.admission.certificate import ROOM, Member, member_of, pass_of
+from middleware.admission.certificate import ROOM, Member, entry_of, member_of, pass_of
 from middleware.admission.membership import Membership
 from middleware.admission.roll import Roll
 from middleware.entangled.data.store import Store
-from middleware.entangled.errors import RemoteError
+from middleware.entangled.errors import Full, RemoteError
 from middleware.entangled.record import Slot
-from middleware.entangled.wire.door import FOREIGN, NONCE, Life, next_life
+from middleware.entangled.wire.door import FOREIGN, NONCE, REVOKED, UNLISTED, Authority, Life, next_life
 
 MAX_MET = 4096
 MAX_PASSES = 1024
+MAX_VOUCHED = 64
+"""Guests of one gateway that a node lets in at a time."""
+JUDGED_S = 1.0
+"""Seconds for which the authority of an owner is remembered, unless the roll changes before."""
 LIVED = "admission/life"
 """The note of the number of the node's last life."""
 
@@ -31,8 +35,11 @@ class Rules(Protocol):
     def may_call(self, roles: Collection[str], method: str) -> bool:
         """Whether a member with these roles may call that method."""
 
-    def may_store(self, roles: Collection[str], slot: Slot) -> bool:
-        """Whether a member with these roles may write that slot of its own."""
+    def may_store(self, roles: Collection[str], slot: Slot, name: str) -> bool:
+        """Whether a member with these roles and that name may write that slot of its own."""
+
+    def lasts(self, slot: Slot) -> bool:
+        """Whether what is held in that slot stays when its owner is revoked."""
 
 
 class Anything:
@@ -42,9 +49,13 @@ class Anything:
         """It may."""
         return True
 
-    def may_store(self, roles: Collection[str], slot: Slot) -> bool:
+    def may_store(self, roles: Collection[str], slot: Slot, name: str) -> bool:
         """It may."""
         return True
+
+    def lasts(self, slot: Slot) -> bool:
+        """Nothing does."""
+        return False
 
 
 def begun(store: Store, wall: float, rng: random.Random) -> Life:
@@ -78,8 +89,12 @@ class Doorkeeper:
         self._wall = wall
         self._rules = rules
         self._me = membership().member
+        self.list_entry: Callable[[bytes], object] = lambda packed: roll.add(packed, wall())
         self._passes: OrderedDict[bytes, Member] = OrderedDict()
         self._met: OrderedDict[bytes, Member] = OrderedDict()
+        self._shown: dict[bytes, bytes] = {}  # the passes of those of ``_met`` that are not on the roll
+        self._authorities: dict[bytes, Authority] = {}
+        self._judged_at = (b"", 0.0)
 
     @property
     def me(self) -> Member:
@@ -100,23 +115,94 @@ class Doorkeeper:
             member = self._roll.known_as(self._read(public, shown))
         except RemoteError:
             return FOREIGN
-        refusal = self._roll.refusal(member, self._wall())
+        refusal = self._roll.refusal(member, self._wall()) or self._list(public, shown, member)
         if not refusal:
             self._met[public] = member
             self._met.move_to_end(public)
+            self._authorities.pop(public, None)
+            if self.is_off_roll(public):
+                self._shown[public] = shown
             if len(self._met) > MAX_MET:
-                self._met.popitem(last=False)
+                self._shown.pop(self._met.popitem(last=False)[0], None)
         return refusal
 
     def may(self, public: bytes, method: str) -> bool:
-        """Whether a node that was let in may call ``method``."""
-        member = self.member(public)
-        return member is not None and self._rules.may_call(member.roles, method)
+        """Whether ``public`` is the key of a present member that may call ``method``."""
+        authority = self.authority(public)
+        return not authority.refusal and self._rules.may_call(authority.roles, method)
+
+    def roles_of(self, public: bytes) -> frozenset[str]:
+        """Return the roles that the holder of that key has now, none for a stranger or a revoked or expired member."""
+        return frozenset(self.authority(public).roles)
+
+    def _list(self, public: bytes, shown: bytes, member: Member) -> str:
+        """Have a member on the membership list, so that all know it and the operator can revoke it by name.
+
+        Returns the refusal of one for whom the list has no room: who is not on it is no member.  A guest is not listed;
+        its voucher is.
+        """
+        if member.voucher is not None:
+            return self._count_guest(member)
+        entry = entry_of(public, shown)
+        if entry is not None and public != self._me.public and self.is_off_roll(public):
+            try:
+                self.list_entry(entry)
+            except (Full, RemoteError):
+                return UNLISTED
+        return ""
+
+    def _count_guest(self, member: Member) -> str:
+        """Return a refusal where the voucher of a guest vouches for too many others at present."""
+        assert member.voucher is not None
+        now, voucher = self._wall(), member.voucher.public
+        others = sum(
+            each.voucher is not None
+            and each.voucher.public == voucher
+            and each.public != member.public
+            and not each.trouble(now)
+            for each in self._met.values()
+        )
+        return "" if others < MAX_VOUCHED else UNLISTED
 
     def may_store(self, slot: Slot) -> bool:
-        """Whether the owner of ``slot`` may write there; of an owner whom nobody here knows it says yes."""
-        member = self.member(slot.owner)
-        return member is None or self._rules.may_store(member.roles, slot)
+        """Whether the certificate of the owner of ``slot``, as it is at present, allows it to write there."""
+        authority = self.authority(slot.owner)
+        return not authority.refusal and self._rules.may_store(authority.roles, slot, authority.name)
+
+    def may_stay(self, slot: Slot) -> bool:
+        """Whether what is held in ``slot`` may be held on and shown."""
+        return self.may_store(slot) or (self.authority(slot.owner).refusal != FOREIGN and self._rules.lasts(slot))
+
+    def authority(self, owner: bytes) -> Authority:
+        """Whether the certificate of an owner of records holds at present, its roles and its name."""
+        now = self._wall()
+        digest, at = self._judged_at
+        if digest != self._roll.digest or not 0.0 <= now - at < JUDGED_S:
+            self._authorities.clear()
+            self._judged_at = (self._roll.digest, now)
+        found = self._authorities.get(owner)
+        if found is None:
+            found = self._authorities[owner] = self._judged(owner, now)
+            if len(self._authorities) > MAX_MET:
+                del self._authorities[next(iter(self._authorities))]
+        return found
+
+    def certificate(self, owner: bytes) -> bytes:
+        """The operator's last word about an owner, or the pass that it showed; empty where neither is known."""
+        if owner == self._me.public:
+            return self.shown
+        grant, admission = self._roll.granted(owner), self._roll.admitted(owner)
+        if grant is not None and (admission is None or grant[0].not_before >= admission.member.not_before):
+            return pass_of(grant[1])
+        return self._shown.get(owner, b"") if admission is None else admission.shown
+
+    def is_off_roll(self, public: bytes) -> bool:
+        """Whether the roll says nothing of the holder of ``public``: a guest, or a member of which it has yet to."""
+        return self._roll.granted(public) is None and self._roll.admitted(public) is None
+
+    def learn(self, owner: bytes, certificate: bytes) -> bool:
+        """Take in the pass of an owner that another node showed; whether it holds."""
+        return not self.judge(owner, certificate)
 
     def member(self, public: bytes) -> Member | None:
         """What is known of the holder of ``public``, met or only heard of."""
@@ -144,7 +230,17 @@ class Doorkeeper:
         ]
         for public, _ in gone:
             del self._met[public]
+            self._shown.pop(public, None)
         return gone
+
+    def _judged(self, owner: bytes, now: float) -> Authority:
+        if self._roll.revoked(owner) is not None:
+            return Authority(REVOKED)
+        member = self.member(owner)
+        if member is None:
+            return Authority(FOREIGN)
+        refusal = self._roll.refusal(member, now)
+        return Authority(refusal) if refusal else Authority("", member.roles, member.name)
 
     def _read(self, public: bytes, shown: bytes) -> Member:
         key = hashlib.blake2s(public + shown, digest_size=16).digest()

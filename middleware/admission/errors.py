@@ -24,6 +24,7 @@ WHY = {
     "name": "another member has this name; choose another one (swarm join CODE --name NAME)",
     "later": "too few of the team can be reached to say whether this code was used; try again when more are there",
     "role": "the node asked lets nobody in; name a bootstrap node, or make it one (swarm promote NAME)",
+    "old": f"this code was made by an older version of the software; {_ASK}",
     "foreign": "the answer comes from another team than the code; read it again, or ask the operator",
 }
 """What each refusal of a newcomer means, and what to do."""

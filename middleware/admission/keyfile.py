@@ -17,7 +17,19 @@ MAX_FILE = 2**20
 
 
 def read(path: Path) -> dict[str, Any]:
-    """What the file at ``path`` holds; raises ``BadKeyFile``, also where others than its owner can read it."""
+    """The mapping that the file at ``path`` holds; raises ``BadKeyFile``, also where others can read it."""
+    content = read_bytes(path)
+    try:
+        found = json.loads(content)
+    except (ValueError, RecursionError):
+        found = None
+    if not isinstance(found, dict) or len(content) > MAX_FILE:
+        raise BadKeyFile(f"{path} is not what it should be; take it from a backup, or have it made again")
+    return found
+
+
+def read_bytes(path: Path) -> bytes:
+    """The bytes of the file at ``path``, at most one more than ``MAX_FILE``; raises ``BadKeyFile`` as ``read`` does."""
     try:
         with open(path, "rb") as file:
             state = os.fstat(file.fileno())
@@ -29,16 +41,9 @@ def read(path: Path) -> dict[str, Any]:
                     f"{path} holds secrets and can be read or changed by others (mode {mode:04o}); "
                     f"say chmod 600 {path}, and have the key replaced if somebody may have read it"
                 )
-            content = file.read(MAX_FILE + 1)
+            return file.read(MAX_FILE + 1)
     except OSError as error:
         raise BadKeyFile(f"{path} cannot be read: {error.strerror or error}; name the right file") from error
-    try:
-        found = json.loads(content)
-    except (ValueError, RecursionError):
-        found = None
-    if not isinstance(found, dict) or len(content) > MAX_FILE:
-        raise BadKeyFile(f"{path} is not what it should be; take it from a backup, or have it made again")
-    return found
 
 
 def write(path: Path, content: Mapping[str, Any], is_new: bool = False) -> None:

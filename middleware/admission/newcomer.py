@@ -16,8 +16,9 @@ from middleware.admission import knock
 from middleware.admission.certificate import member_of
 from middleware.admission.code import Code
 from middleware.admission.errors import NotWelcome
-from middleware.admission.knock import Welcome
+from middleware.admission.knock import Hint, Welcome
 from middleware.admission.membership import Membership
+from middleware.admission.terms import TermsContent
 from middleware.entangled.errors import NoAnswer, RemoteError
 from middleware.entangled.identity import Identity
 from middleware.entangled.network.network import Address, Network
@@ -98,31 +99,35 @@ class Newcomer:
         if self._done is None or datagram[:1] != bytes([knock.WELCOME]) or source not in self._doors:
             return
         try:
-            said = knock.opened_welcome(datagram, self._key.public, self._ephemeral)
+            reply = knock.opened_welcome(datagram, self._code, self._public, self._ephemeral)
+        except RemoteError:
+            return  # a member that is no bootstrap node may have made it: the right answer may still come
+        if isinstance(reply, Hint):
+            self._put_off(reply.code, source)
+        elif isinstance(reply.said, Welcome):
+            self._welcomed(reply.terms, reply.said, source)
+        elif reply.said in FINAL:
+            self._failed(NotWelcome(reply.said))
+        else:
+            self._put_off(reply.said, source)
+
+    def _put_off(self, code: str, source: Address) -> None:
+        """Ask another node: that one may open, or the same one a moment later."""
+        self._hint = code
+        if source == self._doors[self._place % len(self._doors)]:
+            self._next_door()
+
+    def _welcomed(self, terms: TermsContent, said: Welcome, source: Address) -> None:
+        try:
+            member = member_of(terms.operator, self._public, said.shown)
         except RemoteError:
             return
-        if isinstance(said, Welcome):
-            self._welcomed(said, source)
-        elif said in FINAL:
-            self._failed(NotWelcome(said))
-        else:
-            # Somebody else may open, or the same one a moment later.
-            self._hint = said
-            if source == self._doors[self._place % len(self._doors)]:
-                self._next_door()
-
-    def _welcomed(self, said: Welcome, source: Address) -> None:
-        try:
-            member = member_of(said.operator, self._public, said.shown)
-        except RemoteError:
-            member = None
-        if member is None or not self._code.fits(said.operator) or member.invitation != self._key.public:
-            self._failed(NotWelcome("foreign"))
+        if member.invitation != self._key.public:
             return
         known = dict.fromkeys([source, *(contact.address for contact in said.contacts)])
         secrets = tuple(sorted(said.secrets, key=lambda each: -each[0]))
         membership = Membership(
-            said.team, self._seed, said.operator, said.shown, secrets, tuple(known), dict(said.settings)
+            terms.team, self._seed, terms.operator, said.shown, secrets, tuple(known), dict(terms.settings)
         )
         done = self._over()
         if done is not None:

@@ -6,26 +6,30 @@ Whoever has the file is the operator; who has lost it cannot invite or revoke an
 from __future__ import annotations
 
 import random
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from middleware.admission import code, keyfile
 from middleware.admission.certificate import pass_of
 from middleware.admission.errors import BadKeyFile
 from middleware.admission.membership import Membership
 from middleware.admission.statement import (
+    MAX_KEPT,
     MAX_LIFE,
     SECRET_BYTES,
     Grant,
     Invite,
     Revoke,
+    Terms,
+    member_id,
     named,
     sealed_secret,
     signed,
     sized,
 )
+from middleware.admission.terms import TermsContent, seal_terms
 from middleware.entangled.errors import RemoteError
 from middleware.entangled.identity import Identity
 
@@ -36,12 +40,24 @@ FIRST = ("device", "operator", "gateway", "bootstrap")
 """What the first node of a team may do: everything."""
 
 
+class Invitation(NamedTuple):
+    """A code, and the two statements that make it good: the ``terms`` have to be known before the ``invite``."""
+
+    code: code.Code
+    invite: bytes
+    terms: bytes
+
+
 @dataclass(frozen=True)
 class Operator:
-    """The operator of the team that people call ``team``; all moments are seconds of the wall clock."""
+    """The operator of the team that people call ``team``; all moments are seconds of the wall clock.
+
+    ``settings`` are those that newcomers get.
+    """
 
     team: str
     seed: bytes = field(repr=False)
+    settings: Mapping[str, str | int | float | bool] = field(default_factory=dict)
 
     @property
     def identity(self) -> Identity:
@@ -66,15 +82,28 @@ class Operator:
         expires: float,
         rng: random.Random,
         life: float = YEAR,
-    ) -> tuple[code.Code, bytes]:
-        """A code that lets in ``uses`` newcomers within ``expires`` seconds, and the statement that makes it so."""
-        drawn = code.drawn(self.public, rng)
-        invite = Invite(drawn.key.public, name, tuple(roles), uses, int(now), int(now + expires), int(life))
-        return drawn, signed(self.identity, invite)
+    ) -> Invitation:
+        """Make a code that lets in ``uses`` newcomers within ``expires`` seconds, each for ``life`` seconds.
 
-    def revoke(self, public: bytes, name: str, now: float) -> bytes:
-        """The end of a member's key or of an invitation's."""
-        return signed(self.identity, Revoke(public, name, int(now), int(now) + MAX_LIFE))
+        Raises ``ValueError`` for what no invitation can have.
+        """
+        drawn = code.drawn(self.public, rng)
+        end = int(now + expires)
+        invite = Invite(drawn.key.public, name, tuple(roles), uses, int(now), end, int(life))
+        sealed = seal_terms(drawn, TermsContent(self.public, self.team, self.settings), rng)
+        terms = Terms(drawn.key.public, sealed, int(now), end)
+        return Invitation(drawn, signed(self.identity, invite), signed(self.identity, terms))
+
+    def revoke(self, public: bytes, name: str, now: float, kept: Iterable[bytes] = ()) -> bytes:
+        """Sign the end of a member's key or of an invitation's.
+
+        ``kept`` are the public keys of the members that a bootstrap node admitted and that stay; the others go with it.
+        Raises ``ValueError`` where there are too many.
+        """
+        ids = tuple(member_id(each) for each in kept)
+        if len(ids) > MAX_KEPT:
+            raise ValueError(f"a revocation keeps at most {MAX_KEPT} members, not {len(ids)}")
+        return signed(self.identity, Revoke(public, name, int(now), int(now) + MAX_LIFE, ids))
 
     def rotate(self, number: int, members: Iterable[bytes], now: float, grace: float, rng: random.Random) -> bytes:
         """A new secret of the team, for those ``members``; the one before it is accepted for ``grace`` seconds."""
@@ -105,11 +134,15 @@ def load(path: Path) -> Operator:
     try:
         if found["kind"] != KIND:
             raise ValueError("another kind of file")
-        return Operator(named(found["team"]), sized(bytes.fromhex(found["seed"]), 32))
+        settings = found.get("settings", {})
+        if not isinstance(settings, dict):
+            raise ValueError("settings that are no mapping")
+        return Operator(named(found["team"]), sized(bytes.fromhex(found["seed"]), 32), settings)
     except (KeyError, ValueError, TypeError, RemoteError) as error:
         raise BadKeyFile(f"{path} is no operator's key ({error}); name the file that swarm init made") from error
 
 
 def made(path: Path, operator: Operator) -> None:
     """Make the file of a new operator; raises ``BadKeyFile``, also where there is one already."""
-    keyfile.write(path, {"kind": KIND, "team": operator.team, "seed": operator.seed.hex()}, is_new=True)
+    content = {"kind": KIND, "team": operator.team, "seed": operator.seed.hex(), "settings": dict(operator.settings)}
+    keyfile.write(path, content, is_new=True)

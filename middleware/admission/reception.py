@@ -19,8 +19,8 @@ from twisted.python.failure import Failure
 from middleware.admission import knock
 from middleware.admission.certificate import BOOTSTRAP, SKEW, chained, is_proof
 from middleware.admission.errors import WHY
-from middleware.admission.knock import Knock, Welcome
-from middleware.admission.roll import Roll, packed_admission
+from middleware.admission.knock import Knock, Signer, Welcome
+from middleware.admission.roll import Roll, invitation_id, packed_admission
 from middleware.admission.statement import Invite
 from middleware.entangled.errors import EntangledError, RemoteError
 from middleware.entangled.identity import Identity
@@ -87,7 +87,7 @@ class Reception:
             if known is None:
                 if self._hinting.take(self._now()):
                     self._say(name, "unknown", source)
-                    self._send(knock.unknown(name), source)
+                    self._send(knock.hint(name), source)
                 return
             invite, packed = known
             heard = knock.opened_knock(datagram, invite.public)
@@ -110,6 +110,8 @@ class Reception:
         me = self._roll.granted(self._identity.public)
         if me is None or BOOTSTRAP not in me[0].roles:
             return "role"
+        if self._roll.terms_of(invite.public) is None:
+            return "old"
         if self._roll.revoked(invite.public) is not None or self._roll.revoked(heard.public) is not None:
             return "revoked"
         before = self._roll.admitted(heard.public)
@@ -155,18 +157,30 @@ class Reception:
             result.trap(EntangledError)
             self._log.warn("a newcomer cannot be let in: {problem}", problem=result.getErrorMessage())
             result = "later"
-        if isinstance(result, bytes):
-            answer = knock.welcome(invite.public, heard.ephemeral, self._given(result), self._rng)
+        signer = self._signer(invite)
+        if isinstance(result, bytes) and signer is not None:
+            answer = knock.welcome(invite.public, heard, self._given(result), signer, self._rng)
             self._log.info("let in by the invitation of {name}: {public}", name=invite.name, public=heard.public.hex())
         else:
-            self._say(heard.public, result, source, invite.name)
-            answer = knock.refusal(invite.public, heard.ephemeral, result, self._rng)
-        if result not in ("later", "role", "name"):  # these may be otherwise in a moment
+            code = result if isinstance(result, str) else "role"
+            self._say(heard.public, code, source, invite.name)
+            if signer is None:
+                answer = knock.hint(invitation_id(invite.public), code)
+            else:
+                answer = knock.refusal(invite.public, heard, code, signer, self._rng)
+        if result not in ("later", "role", "name", "old"):  # these may be otherwise in a moment
             self._answers[digest] = answer
             if len(self._answers) > MAX_ANSWERS:
                 self._answers.popitem(last=False)
         self._send(answer, source)
         return None
+
+    def _signer(self, invite: Invite) -> Signer | None:
+        """Return what this node signs an answer with; None where it is no bootstrap node or has not got the terms."""
+        me, terms = self._roll.granted(self._identity.public), self._roll.terms_of(invite.public)
+        if me is None or BOOTSTRAP not in me[0].roles or terms is None:
+            return None
+        return Signer(self._identity, me[1], terms)
 
     def _failed(self, failure: Failure) -> None:
         if failure.check(RemoteError) is None:  # an ephemeral key that is none is the newcomer's own fault

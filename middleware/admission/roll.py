@@ -9,24 +9,36 @@ newcomer that asks another bootstrap node gets the same answer, and the operator
 from __future__ import annotations
 
 import hashlib
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import msgpack
 
-from middleware.admission.certificate import GATEWAY, Member, member_of
-from middleware.admission.statement import Grant, Invite, Revoke, Secret, Statement, opened, sized, unpacked
+from middleware.admission.certificate import ADMISSION, GATEWAY, Member, member_of
+from middleware.admission.statement import (
+    Grant,
+    Invite,
+    Revoke,
+    Secret,
+    Statement,
+    Terms,
+    member_id,
+    opened,
+    sized,
+    unpacked,
+)
 from middleware.entangled.errors import Full, Malformed
 
 MAX_ENTRIES = 4096
 MAX_BYTES = 2**20
+RESERVED, RESERVED_BYTES = 1024, 2**18
+"""Of these, what admissions, which bootstrap nodes sign, leave to the statements of the operator."""
 MAX_SECRETS = 4
 """Secrets of the team that are remembered, the newest."""
 DIGEST = 8
 ID = 8
-_ADMISSION = 9
-"""The kind of an admission, beside those of statements."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +86,7 @@ def invitation_id(public: bytes) -> bytes:
 
 def packed_admission(public: bytes, shown: bytes) -> bytes:
     """An admission as it travels; it needs no signature of its own."""
-    return bytes(msgpack.packb([_ADMISSION, public, shown]))
+    return bytes(msgpack.packb([ADMISSION, public, shown]))
 
 
 class Roll:
@@ -88,6 +100,9 @@ class Roll:
         self._held: dict[bytes, Held] = {}
         self._slots: dict[tuple[str, bytes], bytes] = {}
         self._by_id: dict[bytes, bytes] = {}
+        self.void: list[bytes] = []
+        """The keys of those whose admissions the last revocation made void."""
+        self._uses: Counter[bytes] = Counter()
         self._digest = 0
         self._bytes = 0
 
@@ -123,6 +138,8 @@ class Roll:
         entry = self._read(packed)
         if entry.until <= now:
             return None
+        if isinstance(entry, Admission) and self.refusal(entry.member, now) == "revoked":
+            return None
         before = self._slots.get(entry.slot)
         if before is not None and (entry.rank, packed) <= (self._held[before].entry.rank, self._held[before].packed):
             return None
@@ -130,11 +147,10 @@ class Roll:
             self._let_go(before)
         if isinstance(entry, Secret) and not self._has_room_for_secret(entry):
             return None
-        if len(self._held) >= MAX_ENTRIES or self._bytes + len(packed) > MAX_BYTES:
-            raise Full(
-                f"the roll of the team holds {len(self)} statements, {self._bytes} bytes; it has no room for more"
-            )
+        self._check_room(entry, packed)
         self._hold(key, Held(entry, packed))
+        if isinstance(entry, Revoke):
+            self._drop_void(now)
         return entry
 
     def expire(self, now: float) -> int:
@@ -162,6 +178,11 @@ class Roll:
         key = self._slots.get(("invite", self._by_id.get(name, b"")))
         held = None if key is None else self._held[key]
         return (held.entry, held.packed) if held is not None and isinstance(held.entry, Invite) else None
+
+    def terms_of(self, invitation: bytes) -> bytes | None:
+        """Return the sealed terms of the invitation with that public key; None where they are not known."""
+        entry = self._at("terms", invitation)
+        return entry.sealed if isinstance(entry, Terms) else None
 
     def admitted(self, public: bytes) -> Admission | None:
         """How the holder of ``public`` was let in."""
@@ -192,9 +213,9 @@ class Roll:
         ):
             return "revoked"
         if member.admitter:
-            # Whom a bootstrap node let in after its own end was let in by a thief.
+            # Dates say nothing: who has the key of a revoked bootstrap node can sign any.
             end = self.revoked(member.admitter)
-            if end is not None and member.not_before >= end.at:
+            if end is not None and member_id(member.public) not in end.kept:
                 return "revoked"
         if member.voucher is not None:
             voucher = self.known_as(member.voucher)
@@ -227,7 +248,7 @@ class Roll:
 
     def _read(self, packed: bytes) -> Entry:
         fields = unpacked(packed)
-        if len(fields) == 3 and fields[0] == _ADMISSION:
+        if len(fields) == 3 and fields[0] == ADMISSION:
             public, shown = sized(fields[1], 32), fields[2]
             if not isinstance(shown, bytes):
                 raise Malformed("an admission without a pass")
@@ -236,6 +257,30 @@ class Roll:
                 raise Malformed("an admission without an invitation")
             return Admission(member, shown)
         return opened(self.operator, packed)
+
+    def _check_room(self, entry: Entry, packed: bytes) -> None:
+        """Raise ``Full`` where there is no room for ``entry``; a part of the room is for the operator alone."""
+        most, most_bytes = MAX_ENTRIES, MAX_BYTES
+        if isinstance(entry, Admission):
+            most, most_bytes = MAX_ENTRIES - RESERVED, MAX_BYTES - RESERVED_BYTES
+            used = self._uses[entry.member.invitation]
+            if used >= entry.member.uses:
+                raise Full(f"the invitation by which {entry.member.name} came was used {used} times already")
+        if len(self._held) >= most or self._bytes + len(packed) > most_bytes:
+            raise Full(
+                f"the roll of the team holds {len(self)} statements, {self._bytes} bytes; it has no room for more"
+            )
+
+    def _drop_void(self, now: float) -> None:
+        """Let go of the admissions that a revocation made void; whoever shows one is refused by the revocation."""
+        void = [
+            key
+            for key, held in self._held.items()
+            if isinstance(held.entry, Admission) and self.refusal(held.entry.member, now) == "revoked"
+        ]
+        self.void = [held.entry.member.public for key in void if isinstance((held := self._held[key]).entry, Admission)]
+        for key in void:
+            self._let_go(key)
 
     def _has_room_for_secret(self, secret: Secret) -> bool:
         known = self.secrets()
@@ -259,6 +304,8 @@ class Roll:
         self._slots[held.entry.slot] = key
         if isinstance(held.entry, Invite):
             self._by_id[invitation_id(held.entry.public)] = held.entry.public
+        if isinstance(held.entry, Admission):
+            self._uses[held.entry.member.invitation] += 1
         self._digest ^= int.from_bytes(key)
         self._bytes += len(held.packed)
 
@@ -267,5 +314,8 @@ class Roll:
         self._slots.pop(held.entry.slot, None)
         if isinstance(held.entry, Invite):
             self._by_id.pop(invitation_id(held.entry.public), None)
+        if isinstance(held.entry, Admission):
+            self._uses[held.entry.member.invitation] -= 1
+            self._uses += Counter()  # drops the invitations that have no admission left
         self._digest ^= int.from_bytes(key)
         self._bytes -= len(held.packed)

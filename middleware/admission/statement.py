@@ -28,6 +28,8 @@ ROLES = ("device", "operator", "viewer", "gateway", "bootstrap")
 NAME = r"[A-Za-z0-9_-]{1,40}"
 MAX_USES = 100
 MAX_STATEMENT = 65_536
+MAX_TERMS = 320
+"""Bytes of the sealed terms of an invitation: a join reply has room for them."""
 MAX_SEALED = 500
 """Members for whom one statement can carry the team's secret; those beyond ask another member for it."""
 MAX_LIFE = 10 * 365 * 86_400
@@ -35,6 +37,9 @@ MAX_LIFE = 10 * 365 * 86_400
 REMEMBERED = 7 * 86_400
 """Seconds for which an invitation is remembered that has run out, so that its code is refused by name."""
 SECRET_BYTES = 32
+MEMBER_ID = 8
+MAX_KEPT = MAX_SEALED
+"""Members that one revocation of a bootstrap node can keep."""
 _LAST = 2**40
 _PUBLIC, _SIGNATURE, _MARK = 32, 64, 16
 
@@ -98,16 +103,43 @@ class Invite:
 
 
 @dataclass(frozen=True)
+class Terms:
+    """The sealed terms of the invitation ``public`` (``middleware.admission.terms``), until ``not_after``."""
+
+    public: bytes
+    sealed: bytes
+    not_before: int
+    not_after: int
+
+    @property
+    def slot(self) -> tuple[str, bytes]:
+        """What it is about."""
+        return "terms", self.public
+
+    @property
+    def rank(self) -> int:
+        """The later one holds."""
+        return self.not_before
+
+    @property
+    def until(self) -> int:
+        """Until when it is worth being remembered."""
+        return self.not_after + REMEMBERED
+
+
+@dataclass(frozen=True)
 class Revoke:
     """The end of a member's key, or of an invitation's and with it of all that came by it; there is no way back.
 
-    ``name`` is what people called it.
+    ``name`` is what people called it.  ``kept`` freezes what a bootstrap node did: of those that it admitted, only the
+    members with these ids (``member_id``) stay, whatever dates their certificates bear.
     """
 
     public: bytes
     name: str
     at: int
     not_after: int
+    kept: tuple[bytes, ...] = ()
 
     @property
     def slot(self) -> tuple[str, bytes]:
@@ -171,9 +203,9 @@ class Secret:
         return len(secret) == SECRET_BYTES and mark_of(secret) == self.mark
 
 
-Statement = Grant | Invite | Revoke | Secret
-_KINDS: tuple[type[Any], ...] = (Grant, Invite, Revoke, Secret)
-_Kind = TypeVar("_Kind", Grant, Invite, Revoke, Secret)
+Statement = Grant | Invite | Revoke | Secret | Terms
+_KINDS: tuple[type[Any], ...] = (Grant, Invite, Revoke, Secret, Terms)
+_Kind = TypeVar("_Kind", Grant, Invite, Revoke, Secret, Terms)
 
 
 def sealed_secret(
@@ -182,6 +214,11 @@ def sealed_secret(
     """The statement that gives ``secret`` to those ``members`` (public keys) and to nobody else."""
     pairs = [(each, sealed(secret, exchange_key(each), _shared(number), b"", rng)) for each in sorted(members)]
     return Secret(number, at, grace, at + MAX_LIFE, mark_of(secret), tuple(pairs))
+
+
+def member_id(public: bytes) -> bytes:
+    """Return the id by which a revocation names a member that it keeps."""
+    return hashlib.blake2s(public, digest_size=MEMBER_ID, person=b"member").digest()
 
 
 def mark_of(secret: bytes) -> bytes:
@@ -266,9 +303,12 @@ def _fields(statement: Statement) -> list[Any]:
     if isinstance(statement, Secret):
         pairs = [list(pair) for pair in statement.sealed]
         return [kind, statement.number, statement.at, statement.grace, statement.not_after, statement.mark, pairs]
+    if isinstance(statement, Terms):
+        return [kind, statement.public, statement.sealed, statement.not_before, statement.not_after]
     head = [kind, statement.public, statement.name]
     if isinstance(statement, Revoke):
-        return [*head, statement.at, statement.not_after]
+        # An empty list is left out: so is a statement of version 0.1, which knew none.
+        return [*head, statement.at, statement.not_after, *([list(statement.kept)] if statement.kept else [])]
     head.append(bits_of(statement.roles))
     if isinstance(statement, Grant):
         return [*head, statement.not_before, statement.not_after]
@@ -289,8 +329,9 @@ def _checked(fields: list[Any]) -> Statement:
             invite = Invite(sized(public, _PUBLIC), named(name), roles_of(bits), moment(uses, 1, MAX_USES), *times)
             return _lasting(invite, invite.not_before, invite.not_after)
         if kind == 2:
-            public, name, at, end = rest
-            revoke = Revoke(sized(public, _PUBLIC), named(name), moment(at), moment(end))
+            public, name, at, end, *more = rest
+            kept = tuple(sized(each, MEMBER_ID) for [ids] in [more] for each in ids) if more else ()
+            revoke = Revoke(sized(public, _PUBLIC), named(name), moment(at), moment(end), kept)
             return _lasting(revoke, revoke.at, revoke.not_after)
         if kind == 3:
             number, at, grace, end, mark, pairs = rest
@@ -301,6 +342,12 @@ def _checked(fields: list[Any]) -> Statement:
             times = moment(at), moment(grace, 0, MAX_LIFE), moment(end)
             secret = Secret(moment(number, 1), *times, sized(mark, _MARK), each)
             return _lasting(secret, secret.at, secret.not_after)
+        if kind == 4:
+            public, sealed, begin, end = rest
+            if not isinstance(sealed, bytes) or len(sealed) > MAX_TERMS:
+                raise Malformed("terms that are too long")
+            terms = Terms(sized(public, _PUBLIC), sealed, moment(begin), moment(end))
+            return _lasting(terms, terms.not_before, terms.not_after)
     except (ValueError, TypeError) as error:
         raise Malformed("a statement with other fields than it should have") from error
     raise Malformed("a statement of no known kind")

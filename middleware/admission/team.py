@@ -34,6 +34,10 @@ if TYPE_CHECKING:
 
 ROLL = "admission/roll"
 """The note of what the node knows of its team."""
+GUESTS, NO_GUESTS = "admission/guests", bytes(msgpack.packb([]))
+"""The note of the passes of owners of records that are not on the roll."""
+MAX_GUESTS = 256
+"""Owners whose passes are noted; of others the records are shown again when another member shows the pass."""
 
 
 class Team:
@@ -53,6 +57,7 @@ class Team:
         self.roll = Roll(kept.membership.operator)
         self._remember()
         self.door = Doorkeeper(self.roll, lambda: self.membership, wall, begun(store, wall(), rng), rules)
+        self._remember_guests()
         self._node: EntangledNode | None = None
         self._uses: Uses | None = None
         self._accepted = [secret for _, secret, _ in self.membership.accepted(wall())]
@@ -75,6 +80,7 @@ class Team:
         self._gossip = Gossip(
             self.roll, endpoint, node.overlay.contacts, self._rng, self._chores, self._wall, self._on_new
         )
+        self.door.list_entry = self._gossip.add
         reception = Reception(
             self.roll,
             self.identity,
@@ -103,6 +109,7 @@ class Team:
 
     def start(self) -> None:
         """Begin to compare with others, and to look after what has run out."""
+        self._sweep()
         self._log.info("member {name} of the closed team {team}", name=self.door.me.name, team=self.membership.team)
         trouble = self.door.me.trouble(self._wall())
         if trouble:
@@ -175,6 +182,15 @@ class Team:
             except (RemoteError, Full):
                 continue
 
+    def _remember_guests(self) -> None:
+        """Take in the passes of guests whose records an earlier life held."""
+        try:
+            noted = msgpack.unpackb(self._store.noted(GUESTS) or NO_GUESTS, max_array_len=MAX_GUESTS)
+            for owner, shown in noted:
+                self.door.learn(owner, shown)
+        except Exception:  # a rotten file may hold anything
+            self._log.warn("the noted passes of guests cannot be read; other members show them again")
+
     def _on_new(self, entry: Entry) -> None:
         self._store.note(ROLL, msgpack.packb(self.roll.packed()))
         if isinstance(entry, Revoke):
@@ -183,8 +199,10 @@ class Team:
             self._part_with(entry.public)
         elif isinstance(entry, Secret):
             self._heard_of(entry)
-        elif isinstance(entry, Grant) and entry.public == self.identity.public:
-            self._keep(replace(self.membership, shown=self.door.shown))
+        elif isinstance(entry, Grant):
+            if entry.public == self.identity.public:
+                self._keep(replace(self.membership, shown=self.door.shown))
+            self._sweep()
         elif isinstance(entry, Admission):
             self._log.info("{name} is a member now", name=entry.member.name)
 
@@ -199,12 +217,22 @@ class Team:
         if self._node is not None:
             for public, refusal in self.door.swept():
                 self._node.evict(public, refusal)
+            self._node.review()
+            self._note_guests(self._node)
+
+    def _note_guests(self, node: EntangledNode) -> None:
+        """Note the passes of those owners of records that are not on the roll, for the next start."""
+        owners = [owner for owner in node.store.owners() if self.door.is_off_roll(owner)][-MAX_GUESTS:]
+        noted = msgpack.packb([[owner, self.door.certificate(owner)] for owner in owners])
+        if noted != (self._store.noted(GUESTS) or NO_GUESTS):
+            self._store.note(GUESTS, noted)
 
     def _part_with(self, public: bytes) -> None:
         """Also of who is absent nothing is expected any more."""
-        came = [each.member.public for each in self.roll.admissions() if each.member.invitation == public]
-        for each in (public, *came):
-            if self._node is not None and self._node.overlay.known(node_id(each)) is not None:
+        if self._node is None:
+            return
+        for each in (public, *self.roll.void):
+            if self._node.overlay.known(node_id(each)) is not None:
                 self._node.evict(each, REVOKED)
 
     def _heard_of(self, entry: Secret) -> None:
@@ -233,7 +261,9 @@ class Team:
                 self._take_over(entry, found)
 
     def _answer_secret(self, peer: Contact, number: int) -> bytes | None:
-        """Who asks is a member, or its session would not be."""
+        """Give the secret to a present member, which is on the membership list, or to a guest of one."""
+        if not self.door.roles_of(peer.public):
+            return None
         return next((secret for known, secret, _ in self.membership.secrets if known == number), None)
 
     def _given(self, shown: bytes) -> Welcome:
@@ -242,7 +272,7 @@ class Team:
         contacts = [contact for contact in self._node.overlay.contacts() if not contact.address.host.startswith("~")]
         picked = self._rng.sample(contacts, min(len(contacts), knock.MAX_CONTACTS))
         secrets = tuple(membership.accepted(self._wall()))
-        return Welcome(membership.operator, membership.team, shown, secrets, tuple(picked), dict(membership.settings))
+        return Welcome(shown, secrets, tuple(picked))
 
     def _keep(self, membership: Membership) -> None:
         try:

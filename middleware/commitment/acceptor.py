@@ -21,6 +21,7 @@ from middleware.commitment.ballot import (
     QUIET,
     SEALED,
     Ballot,
+    Ceiling,
     Reply,
 )
 from middleware.commitment.ledger import Entry, Ledger
@@ -58,7 +59,7 @@ class Acceptor:
             self._listen(entry, ballot.agent, now + ttl)
             if ballot.counter == 0 or entry.until - now > AHEAD * entry.ttl:
                 return self._reply(HELD, entry, now)
-        if ballot.counter > 0 and ballot < entry.promised:
+        if ballot.counter > 0 and (ballot < entry.promised or not entry.ceiling.admits(now, ballot.counter)):
             return self._reply(OUTBID, entry, now)
         entry.touched_at = now
         if ballot > entry.promised:
@@ -81,7 +82,8 @@ class Acceptor:
         # What was promised to another for the time after a lease does not end it: who holds it renews it all the same.
         is_own = entry.ballot.is_kin(ballot)
         is_renewal = is_held and is_own and token == entry.token and not entry.is_given_back
-        if (ballot < entry.promised and not is_renewal) or ballot <= entry.spent or is_lower:
+        is_bounded = entry.ceiling.admits(now, ballot.counter, token)
+        if (ballot < entry.promised and not is_renewal) or ballot <= entry.spent or is_lower or not is_bounded:
             return self._reply(OUTBID, entry, now)
         if is_held and not is_own:
             return self._reply(HELD, entry, now)
@@ -130,14 +132,14 @@ class Acceptor:
     def close(self, task_id: str, agent: str, configuration: int, token: int, now: float) -> Reply:
         """Grant no more leases on a task that has ended; ``remaining`` is how long another may still act on it.
 
-        Who concludes names its token, and is refused where a higher one was granted; token 0 is an operator's.  Where
-        the council is another one by now, or may be, that one has to be asked as well.
+        An agent names the token that it was granted here, and is refused where it was not; token 0 is an operator's.
+        Where the council is another one by now, or may be, that one has to be asked as well.
         """
         entry = self._ledger.get(task_id) or self._ledger.add(task_id, FIRST, now)
         if entry is None:
             return Reply(QUIET, remaining=ROOM)
-        if 0 < token < entry.token:
-            return self._reply(OUTBID, entry, now)
+        if token and (entry.token, entry.ballot.agent) != (token, agent):
+            return self._reply(OUTBID if token < entry.token else BEHIND, entry, now)
         if not entry.is_over:
             entry.is_over, entry.touched_at = True, now
             self._ledger.keep(task_id)
@@ -165,7 +167,7 @@ class Acceptor:
             return entry
         if entry.until > now and not (keep and entry.ballot.is_kin(ballot)):
             return self._reply(HELD, entry, now)
-        if ballot < entry.promised or ballot <= entry.spent:
+        if ballot < entry.promised or ballot <= entry.spent or not entry.ceiling.admits(now, ballot.counter, token):
             return self._reply(OUTBID, entry, now)
         entry.promised = entry.sealed = ballot
         entry.members, entry.token, entry.touched_at = members, max(entry.token, token), now
@@ -181,10 +183,12 @@ class Acceptor:
         now: float,
         ballot: Ballot = NONE,
         ttl: float = 0.0,
+        charter: bytes = b"",
     ) -> Reply:
         """Learn that a majority of the council before has chosen ``members``, and above which token they go on.
 
-        Nobody but the agent of ``ballot`` is granted the lease for ``ttl`` seconds.
+        The caller has checked that: ``charter`` proves it to those who ask here later.  Nobody but the agent of
+        ``ballot`` is granted the lease for ``ttl`` seconds.
         """
         entry = self._ledger.get(task_id) or self._ledger.add(task_id, FIRST, now)
         if entry is None:
@@ -192,7 +196,8 @@ class Acceptor:
         if configuration > entry.configuration:
             entry.configuration, entry.members, entry.sealed = configuration, members, NONE
             entry.ballot, entry.until = ballot, now if ballot == NONE else now + ttl
-            entry.token, entry.touched_at = max(entry.token, token), now
+            entry.token, entry.touched_at, entry.charter = max(entry.token, token), now, charter
+            entry.ceiling = Ceiling(now, entry.promised, entry.token)
             self._ledger.keep(task_id)
         return self._reply(GRANTED if configuration == entry.configuration else MOVED, entry, now)
 
@@ -227,6 +232,7 @@ class Acceptor:
         entry.listeners[agent] = until
 
     def _reply(self, kind: str, entry: Entry, now: float) -> Reply:
-        members = entry.members if kind in (MOVED, SEALED) else ()
+        members = entry.members if kind == SEALED else ()
         remaining = max(0.0, entry.until - now)
-        return Reply(kind, entry.promised, entry.token, remaining, entry.configuration, members)
+        proof = entry.charter if kind == MOVED else b""
+        return Reply(kind, entry.promised, entry.token, remaining, entry.configuration, members, proof)

@@ -1,7 +1,8 @@
 """Council: the nodes whose majority says who may act on a task, as a claimant knows them; pinned, never "the closest".
 
 Which nodes these are stands in the task's record with a number, its configuration.  A change is decided by a majority
-of the old council and by nobody else, never while a claim is open (consensus rules 1 and 2).
+of the old council and by nobody else, never while a claim is open (consensus rules 1 and 2).  The signatures of that
+majority are kept in the ``charter``; what a single member says of another council is not believed.
 """
 
 from __future__ import annotations
@@ -30,11 +31,17 @@ from middleware.commitment.ballot import (
     OpenClaim,
     Reply,
     Superseded,
+    believed,
+    quorum,
 )
+from middleware.commitment.charter import Charter, Ending, is_change_signed, is_end_signed
 from middleware.commitment.round import PAUSE, Ask, Round
 from middleware.entangled.errors import Refused
 from middleware.entangled.kademlia.contact import Contact
 
+IsGenuine = Callable[[int, Reply], bool]
+Read = Callable[[str, object], Charter | None]
+"""Makes a charter of what a member sent, where it holds: (task id, packed)."""
 LEAP = 16
 """More ballots than a holder needs until a stand-by looks."""
 
@@ -43,7 +50,8 @@ class Council:
     """The council of one task, in the name of ``agent``.
 
     ``moved`` is called when it has become another one, so that the task's record can say so.  ``token`` is the highest
-    that was ever seen: whatever is claimed next lies above it.
+    that was ever seen: whatever is claimed next lies above it.  ``charter`` proves which council it is, ``read`` makes
+    one of what a member sent, and ``ending`` is the proof that the task was closed under a token.
     """
 
     def __init__(
@@ -55,6 +63,8 @@ class Council:
         ask: Ask,
         clock: IReactorTime,
         rng: random.Random,
+        charter: Charter | None = None,
+        read: Read = lambda task_id, packed: None,
         configuration: int = FIRST,
         token: int = 0,
         moved: Callable[[], None] = lambda: None,
@@ -65,7 +75,10 @@ class Council:
         self.members = tuple(members)
         self.configuration = configuration
         self.token = token
+        self.charter = charter
+        self.ending = b""
         self.moved = moved
+        self._read = read
         self._ask = ask
         self._clock = clock
         self._rounds = 0
@@ -82,11 +95,19 @@ class Council:
         """Have the next ballot be above those of which nobody has told here; there are more than enough."""
         self._rounds += LEAP
 
-    def round(self, method: str, *arguments: Any, kinds: tuple[str, ...] = (GRANTED,), short: float = PAUSE) -> Round:
+    def round(
+        self,
+        method: str,
+        *arguments: Any,
+        kinds: tuple[str, ...] = (GRANTED,),
+        short: float = PAUSE,
+        is_genuine: IsGenuine = lambda place, reply: True,
+    ) -> Round:
         """Ask every member; tell ``hear`` what came of it.  ``short`` is the wait for another's lease that is one."""
         self._note_silence()
         question = (self.task_id, self.configuration, *arguments)
-        self._last = Round(self.members, self._ask, self._clock, method, question, kinds, self.ttl / 3, short)
+        told = method, question, kinds, self.ttl / 3, short, is_genuine
+        self._last = Round(self.members, self._ask, self._clock, *told)
         return self._last
 
     def visit(self) -> None:
@@ -99,23 +120,29 @@ class Council:
         latest = self._clock.seconds() - seconds
         return tuple(m for m in self.members if self._silent_since.get(m.node_id, math.inf) <= latest)
 
-    def learn(self, configuration: int, members: Sequence[Contact]) -> None:
-        """The record of the task names the council of that configuration."""
-        if configuration > self.configuration and members:
-            self.configuration, self.members = configuration, tuple(members)
+    def learn(self, packed: bytes) -> None:
+        """A record of the task has the charter of a council; what is older, or does not hold, changes nothing."""
+        charter = self._read(self.task_id, packed)
+        if charter is not None:
+            self._adopt(charter, is_news=False)
+
+    def note_token(self, token: int) -> None:
+        """Some node says that ``token`` was granted; it may have invented it."""
+        self.token = max(self.token, believed([token], len(self.members)))
 
     def hear(self, round_: Round) -> None:
         """Learn from answers which numbers are taken, and whether the council is another one now."""
-        for reply in round_.replies.values():
-            self._rounds = max(self._rounds, reply.ballot.counter // LIFE)
-            self.token = max(self.token, reply.token)
-        newest = max(round_.replies.values(), key=lambda reply: reply.configuration, default=None)
-        if newest is not None and newest.kind == MOVED and newest.members:
-            self._adopt(newest.configuration, newest.members)
+        replies, size = round_.replies.values(), len(self.members)
+        self._rounds = max(self._rounds, believed((reply.ballot.counter // LIFE for reply in replies), size))
+        self.token = max(self.token, believed((reply.token for reply in replies), size))
+        told = [self._read(self.task_id, reply.proof) for reply in replies if reply.kind == MOVED]
+        newest = max((each for each in told if each is not None), key=_configuration, default=None)
+        if newest is not None and newest.configuration > self.configuration:
+            self._adopt(newest)
             return
         # Who was away when this council was chosen is told by whoever meets it.
         for place, reply in round_.replies.items():
-            if reply.kind == BEHIND and newest is not None and newest.configuration == self.configuration:
+            if reply.kind == BEHIND and reply.configuration < self.configuration:
                 self._install(self.members[place])
 
     def let_go(self, ballot: Ballot, heirs: Sequence[Contact] = (), rest: float = 0.0) -> Deferred[Any]:
@@ -131,8 +158,8 @@ class Council:
     def close(self, token: int = 0) -> Deferred[None]:
         """Have no more leases granted on the task, which has ended; fires when nobody can act on it any more.
 
-        ``token`` is that of the lease under which it was done (the device stands still by now), 0 an operator's word.
-        Fails with ``NoMajority``, or with ``Superseded`` where a higher token was granted.
+        ``token`` is that of the lease under which it was done (the device stands still by now), 0 the word of a node
+        that may order.  Fails with ``NoMajority``, or with ``Superseded`` where a higher token was granted.
         """
         return Deferred.fromCoroutine(self._close(token))
 
@@ -165,29 +192,50 @@ class Council:
 
     async def _close(self, token: int) -> None:
         over_at = 0.0
+        question = ("lease.close", token) if token else ("lease.cancel",)
+        ended = (OVER, SEALED)
         while True:
-            configuration = self.configuration
-            done = await self.round("lease.close", token, kinds=(OVER, SEALED)).outcome
+            configuration, members = self.configuration, self.members
+
+            def is_genuine(place: int, reply: Reply) -> bool:
+                signed = self.task_id, configuration, self.agent, token, reply.proof  # noqa: B023
+                return not token or reply.kind not in ended or is_end_signed(members[place], *signed)  # noqa: B023
+
+            done = await self.round(*question, kinds=ended, is_genuine=is_genuine).outcome
             self.hear(done)
+            over_at = max(over_at, self._over_at(done))
+            if self.configuration != configuration:
+                done.close()
+                continue  # there is another council by now
+            sealed = [reply for reply in done.replies.values() if reply.kind == SEALED]
+            if done.is_won and sealed and len(done.yes) - len(sealed) < quorum(len(self.members)):
+                # A change was accepted by some: it may be decided, so the council to come has to know as well.
+                if token:
+                    raise NoMajority("the end of the task is not recorded: its council is changing; try again")
+                following = max(sealed, key=lambda reply: reply.ballot).members
+                asked = (self.task_id, configuration + 1)
+                done = await Round(
+                    following, self._ask, self._clock, "lease.cancel", asked, ended, self.ttl / 3
+                ).outcome
+                over_at = max(over_at, self._over_at(done))
             if not done.is_won:
                 done.close()
-                if self.configuration == configuration:
-                    _raise(done, "the end of the task is not recorded")
-                continue  # there is another council by now
-            # Among any majority that closed is a member that granted whatever lease is still in force.
-            rest = max(done.replies[place].remaining for place in done.yes)
-            over_at = max(over_at, self._clock.seconds() + rest)
-            sealed = [reply for reply in done.replies.values() if reply.kind == SEALED]
-            if self.configuration == configuration and not sealed:
-                break
-            if sealed and self.configuration == configuration:
-                # A change was accepted by some: it may be decided, so the council to come has to know as well.
-                self._adopt(configuration + 1, max(sealed, key=lambda reply: reply.ballot).members)
+                if any(reply.kind == OUTBID for reply in done.replies.values()):
+                    raise Superseded("the end of the task is not recorded: a higher token was granted")
+                _raise(done, "the end of the task is not recorded")
+            break
+        if token and self.charter is not None:
+            votes = [(place, reply.proof) for place, reply in sorted(done.replies.items()) if reply.kind == OVER]
+            self.ending = Ending(self.charter, tuple(votes[: quorum(len(self.members))])).packed
         rest = over_at - self._clock.seconds()
         if rest > 0.0:
             waited: Deferred[None] = Deferred()
             self._clock.callLater(rest, waited.callback, None)
             await waited
+
+    def _over_at(self, done: Round) -> float:
+        """When a lease ends that may be in force: a member that granted it is among any majority that closed."""
+        return self._clock.seconds() + max((done.replies[place].remaining for place in done.yes), default=0.0)
 
     async def _change(self, wanted: tuple[Contact, ...], keep: bool) -> None:
         before = self.configuration
@@ -210,41 +258,56 @@ class Council:
     async def _decide(self, ballot: Ballot, members: tuple[Contact, ...], keep: bool) -> None:
         """Let a majority of the old council accept ``members``, then tell these; a majority of them must know."""
         # The council of this object may become another one while answers are awaited; this decision is of this one.
-        old, following = self.members, self.configuration + 1
-        packed = [member.packed() for member in members]
-        accepted = await self._decision(ballot, packed, keep)
+        old, before = self.members, self.charter
+        if before is None or before.configuration != self.configuration:
+            raise Refused("the council of this task was not signed when it was published; make the task anew")
+        accepted = await self._decision(ballot, members, keep)
         accepted.close()
         if not accepted.is_won:
             self.hear(accepted)
             self.let_go(ballot, rest=self.ttl)  # a lease that this agent holds goes on
             _raise(accepted, "the council stays as it is")
-        token = max(self.token, *(reply.token for reply in accepted.replies.values()))
-        news = (self.task_id, following, packed, token)
-        question = (*news, ballot.counter if keep else 0, self.ttl)
+        votes = [(place, accepted.replies[place]) for place in sorted(accepted.yes)[: quorum(len(old))]]
+        charter = before.extended(members, ballot, tuple((place, reply.token, reply.proof) for place, reply in votes))
+        question = (self.task_id, charter.packed, keep, self.ttl)
         told = Round(members, self._ask, self._clock, "lease.install", question, (GRANTED, MOVED), self.ttl / 3)
         installed = await told.outcome
         if not installed.is_won:
             raise NoMajority("the new council is chosen, but too few of its members know; ask for the change again")
-        self._adopt(following, members)
+        self._adopt(charter)
         for member in old:
             # So that who leaves can tell where the council is now.
             if member not in members:
-                self._ask(member, "lease.install", (*news, 0, self.ttl)).addErrback(lambda _: None)
+                self._install(member, charter)
 
-    async def _decision(self, ballot: Ballot, packed: list[list[object]], keep: bool) -> Round:
+    async def _decision(self, ballot: Ballot, members: tuple[Contact, ...], keep: bool) -> Round:
         """A majority of the *old* council decides: so no lease of it can be open, nor another change be chosen."""
-        return await self.round("lease.change", ballot.counter, packed, self.token, keep).outcome
+        old, configuration = self.members, self.configuration
 
-    def _install(self, member: Contact) -> None:
+        def is_genuine(place: int, reply: Reply) -> bool:
+            change = self.task_id, configuration, ballot, members, reply
+            return reply.kind != GRANTED or is_change_signed(old[place], *change)
+
+        packed = [member.packed() for member in members]
+        question = ballot.counter, packed, self.token, keep
+        return await self.round("lease.change", *question, is_genuine=is_genuine).outcome
+
+    def _install(self, member: Contact, charter: Charter | None = None) -> None:
         """Tell ``member`` of the present council, which was chosen by the one before."""
-        packed = [one.packed() for one in self.members]
-        news = (self.task_id, self.configuration, packed, self.token, 0, self.ttl)
-        self._ask(member, "lease.install", news).addErrback(lambda _: None)
+        charter = charter or self.charter
+        if charter is not None and charter.links:
+            news = (self.task_id, charter.packed, False, self.ttl)
+            self._ask(member, "lease.install", news).addErrback(lambda _: None)
 
-    def _adopt(self, configuration: int, members: tuple[Contact, ...]) -> None:
-        if configuration > self.configuration:
-            self.configuration, self.members = configuration, members
-            self.moved()
+    def _adopt(self, charter: Charter, is_news: bool = True) -> None:
+        if charter.configuration > self.configuration:
+            self.charter, self.configuration, self.members = charter, charter.configuration, charter.members
+            if is_news:
+                self.moved()
+
+
+def _configuration(charter: Charter) -> int:
+    return charter.configuration
 
 
 def _raise(round_: Round, what: str) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorTime
 
+from middleware.commitment.charter import Judge, charter_of, pin
 from middleware.commitment.council import Council
 from middleware.commitment.desk import Desk
 from middleware.commitment.lessee import Lessee
@@ -18,7 +19,8 @@ from middleware.entangled.data.store import Store
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.distance import closest
 from middleware.entangled.node import EntangledNode
-from middleware.tasks import Task, group_key
+from middleware.entangled.record import Slot
+from middleware.tasks import TASKS, Task, group_key
 
 LARGE = 50
 """Members from which on a council has five instead of three."""
@@ -29,7 +31,8 @@ SILENT = 10.0
 class Councils:
     """The councils of tasks, as ``entangled`` reaches them.
 
-    ``born_at`` is when the node began; ``moved`` is told a task whose council has changed, with the new one.
+    ``born_at`` is when the node began; ``moved`` is told a task whose council has changed, with the new one;
+    ``may_sit`` says whether the holder of a key may be a member of a council.
     """
 
     def __init__(
@@ -40,18 +43,24 @@ class Councils:
         rng: random.Random,
         born_at: float,
         moved: Callable[[Task], object],
+        may_sit: Callable[[bytes], bool],
     ) -> None:
         self._entangled = entangled
         self._clock = clock
         self._rng = rng
         self._moved = moved
-        self.desk = Desk(entangled.endpoint, store, clock, born_at)
+        self._may_sit = may_sit
+        self.judge = Judge(self._may_publish)
+        self.desk = Desk(entangled.endpoint, entangled.identity, store, clock, born_at, self.judge, self._may_sit)
 
-    async def nearest(self, task: Task) -> tuple[Contact, ...]:
-        """Who is the council of a new ``task``: the nodes closest to its key now (consensus rule 1)."""
+    async def pinned(self, task: Task) -> Task:
+        """A new ``task`` with its council: the nodes closest to its key now (consensus rule 1), signed by this node."""
         key = group_key(task.task_id)
         found = await self._entangled.find_node(key)
-        return odd(closest([*found, self._entangled.contact], key, self._seats(task)))
+        candidates = [node for node in [*found, self._entangled.contact] if self._may_sit(node.public)]
+        members = odd(closest(candidates, key, self._seats(task)))
+        charter = pin(self._entangled.identity, task.task_id, members)
+        return replace(task, council=members, charter=charter.packed)
 
     def of(self, task: Task, floor: int = 0) -> Council:
         """The council of ``task``, asked in this node's name; what is claimed lies above the token ``floor``."""
@@ -61,10 +70,13 @@ class Councils:
             return self.desk.ask(self._entangled.contact, member, method, arguments, ttl / 3)
 
         def moved() -> None:
-            self._moved(replace(task, council=council.members, configuration=council.configuration))
+            self._moved(task.with_council(council.charter) if council.charter is not None else task)
 
         pinned = task.task_id, self._entangled.contact.node_id.hex(), ttl, task.council
-        council = Council(*pinned, ask, self._clock, self._rng, task.configuration, floor, moved)
+        read = self.judge.read
+        council = Council(
+            *pinned, ask, self._clock, self._rng, charter_of(task.charter), read, task.configuration, floor, moved
+        )
         return council
 
     def lessee(self, task: Task, changed: Callable[[], None], floor: int) -> Lessee:
@@ -84,9 +96,13 @@ class Councils:
         """
         key, silent = group_key(task.task_id), council.silent(SILENT)
         gone = {member.node_id for member in silent}
-        found = [node for node in await self._entangled.find_node(key) if node.node_id not in gone]
+        nodes = await self._entangled.find_node(key)
+        found = [node for node in nodes if node.node_id not in gone and self._may_sit(node.public)]
         candidates = closest([*found, self._entangled.contact], key, len(found) + 1)
         return filled(council.members, silent, candidates, self._seats(task))
+
+    def _may_publish(self, public: bytes, task_id: str) -> bool:
+        return self._entangled.replica.may_store(Slot(TASKS, public, task_id))
 
     def _seats(self, task: Task) -> int:
         tolerates = max(task.tolerates, 2 if len(self._entangled.overlay.contacts()) >= LARGE else 1)

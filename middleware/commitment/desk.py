@@ -1,7 +1,12 @@
-"""Desk: where peers reach this node's acceptor; it checks what they send; answers wait until they are kept."""
+"""Desk: where peers reach this node's acceptor; it checks what they send; answers wait until they are kept.
+
+Which role may call which method is decided before (``middleware.roles``): only nodes that may order tasks reach
+``lease.cancel``.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 from weakref import WeakValueDictionary
 
@@ -9,11 +14,13 @@ from twisted.internet.defer import Deferred, maybeDeferred
 from twisted.internet.interfaces import IReactorTime
 
 from middleware.commitment.acceptor import Acceptor
-from middleware.commitment.ballot import MAX_NUMBER, NONE, Ballot, Reply, members_of
+from middleware.commitment.ballot import GRANTED, MAX_COUNCIL, MAX_NUMBER, NONE, OVER, SEALED, Ballot, Reply, members_of
+from middleware.commitment.charter import LEAST, Judge, sign_change, sign_end
 from middleware.commitment.ledger import Ledger
 from middleware.commitment.patience import in_time
 from middleware.entangled.data.store import Store
 from middleware.entangled.errors import Refused
+from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.record import MAX_NAME
 from middleware.entangled.wire.endpoint import Endpoint
@@ -31,10 +38,23 @@ class Desk:
     """The acceptor of one node, and the lessees that wait for news from others' acceptors.
 
     It may be made when the first peer asks: ``born_at`` is when the node began, for silence counts from then.
+    ``judge`` reads the charters of councils; ``may_sit`` says whether the holder of a key may be a member of one.
     """
 
-    def __init__(self, endpoint: Endpoint, store: Store, clock: IReactorTime, born_at: float) -> None:
+    def __init__(
+        self,
+        endpoint: Endpoint,
+        identity: Identity,
+        store: Store,
+        clock: IReactorTime,
+        born_at: float,
+        judge: Judge,
+        may_sit: Callable[[bytes], bool],
+    ) -> None:
         self._endpoint = endpoint
+        self._identity = identity
+        self._judge = judge
+        self._may_sit = may_sit
         self._store = store
         self._clock = clock
         self._acceptor = Acceptor(Ledger(store, born_at), born_at)
@@ -47,6 +67,7 @@ class Desk:
                 ("lease.propose", self._propose),
                 ("lease.release", self._release),
                 ("lease.close", self._close),
+                ("lease.cancel", self._cancel),
                 ("lease.change", self._change),
                 ("lease.install", self._install),
                 ("lease.freed", self._freed),
@@ -92,9 +113,16 @@ class Desk:
         self._tell(self._acceptor.release(task_id, ballot, self._clock.seconds(), float(rest)), task_id, rest)
 
     def _close(self, peer: Contact, task_id: str, configuration: int, token: int) -> Answer:
-        _check(task_id, configuration, token + 1)
+        _check(task_id, configuration, token)
         agent, now = peer.node_id.hex(), self._clock.seconds()
-        return self._kept(self._acceptor.close(task_id, agent, configuration, token, now))
+        reply = self._acceptor.close(task_id, agent, configuration, token, now)
+        if reply.kind in (OVER, SEALED):
+            reply = reply._replace(proof=sign_end(self._identity, task_id, configuration, agent, token))
+        return self._kept(reply)
+
+    def _cancel(self, peer: Contact, task_id: str, configuration: int) -> Answer:
+        _check(task_id, configuration)
+        return self._kept(self._acceptor.close(task_id, "", configuration, 0, self._clock.seconds()))
 
     def _change(
         self,
@@ -107,24 +135,33 @@ class Desk:
         keep: bool,
     ) -> Answer:
         _check(task_id, configuration, counter, token + 1)
-        members = _checked(packed)
+        members = members_of(packed)
+        if members is None or len(members) < LEAST or not all(self._may_sit(member.public) for member in members):
+            raise Refused(f"the next council has {LEAST} to {MAX_COUNCIL} members of the team that are no viewers")
         ballot, now = Ballot(counter, peer.node_id.hex()), self._clock.seconds()
-        return self._kept(self._acceptor.change(task_id, configuration, ballot, members, token, now, keep))
+        reply = self._acceptor.change(task_id, configuration, ballot, members, token, now, keep)
+        if reply.kind == GRANTED:
+            signature = sign_change(self._identity, task_id, configuration, ballot, members, reply.token)
+            reply = reply._replace(proof=signature)
+        return self._kept(reply)
 
-    def _install(
-        self,
-        peer: Contact,
-        task_id: str,
-        configuration: int,
-        packed: list[object],
-        token: int,
-        counter: int,
-        ttl: float,
-    ) -> Answer:
-        _check(task_id, configuration, token + 1, counter + 1, ttl=ttl)
-        members, now = _checked(packed), self._clock.seconds()
-        ballot = Ballot(counter, peer.node_id.hex()) if counter else NONE
-        return self._kept(self._acceptor.install(task_id, configuration, members, token, now, ballot, float(ttl)))
+    def _install(self, peer: Contact, task_id: str, packed: bytes, keep: bool, ttl: float) -> Answer:
+        _check(task_id, ttl=ttl)
+        charter = self._judge.read(task_id, packed)
+        if charter is None or not charter.links:
+            raise Refused("a council is installed with the signatures of a majority of the one before it")
+        mine = keep and charter.ballot.agent == peer.node_id.hex()
+        reply = self._acceptor.install(
+            task_id,
+            charter.configuration,
+            charter.members,
+            charter.token,
+            self._clock.seconds(),
+            charter.ballot if mine else NONE,
+            float(ttl),
+            packed,
+        )
+        return self._kept(reply)
 
     def _freed(self, peer: Contact, task_id: str, token: int, rest: float) -> None:
         _check(task_id, token + 1, rest=rest)
@@ -166,10 +203,3 @@ def _check(task_id: str, *numbers: int, ttl: float = 1.0, rest: float = 0.0) -> 
         raise Refused(f"a lease lasts more than 0 and at most {MAX_TTL:g} seconds")
     if not 0.0 <= rest <= MAX_TTL:
         raise Refused(f"a robot comes to rest within 0 to {MAX_TTL:g} seconds")
-
-
-def _checked(packed: list[object]) -> tuple[Contact, ...]:
-    members = members_of(packed)
-    if not members:
-        raise Refused("a council has one to seven members, each [public key, host, port]")
-    return members

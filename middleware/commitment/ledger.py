@@ -10,7 +10,8 @@ from dataclasses import dataclass, field
 
 import msgpack
 
-from middleware.commitment.ballot import FIRST, NONE, Ballot, is_number, members_of
+from middleware.commitment.ballot import FIRST, NONE, Ballot, Ceiling, is_number, members_of
+from middleware.commitment.charter import MAX_BYTES
 from middleware.entangled.data.store import Store
 from middleware.entangled.kademlia.contact import Contact
 
@@ -31,7 +32,7 @@ class Entry:
     (its ``agent`` holds it); ``spent`` is the highest ballot whose lease was given back, by an agent whose robot comes
     to rest until ``until``.  ``token`` never falls.
     ``sealed`` is the ballot under which ``members`` were accepted as the next council; where it is none they are the
-    present one, as far as known.
+    present one, as far as known, and ``charter`` is the proof of that.  ``ceiling`` bounds the numbers that are taken.
     """
 
     configuration: int = FIRST
@@ -43,6 +44,8 @@ class Entry:
     sealed: Ballot = NONE
     members: tuple[Contact, ...] = ()
     is_over: bool = False
+    charter: bytes = b""
+    ceiling: Ceiling = field(default_factory=lambda: Ceiling(0.0))
     until: float = 0.0
     touched_at: float = 0.0
     listeners: dict[str, float] = field(default_factory=dict)
@@ -56,7 +59,7 @@ class Entry:
         """The entry as it stands in a note; moments mean nothing to a later life and stay behind."""
         ballots = [*self.promised, *self.ballot, *self.spent, *self.sealed]
         members = [member.packed() for member in self.members]
-        return [self.configuration, ballots, self.token, self.ttl, members, self.is_over]
+        return [self.configuration, ballots, self.token, self.ttl, members, self.is_over, self.charter]
 
 
 class Ledger:
@@ -67,7 +70,8 @@ class Ledger:
 
     def __init__(self, store: Store | None = None, now: float = 0.0) -> None:
         self.is_whole = False
-        self.floor = 0
+        self.floor = NONE
+        self.token = 0
         self.longest = 0.0
         self._store = store
         self._entries: dict[str, Entry] = {}
@@ -87,8 +91,8 @@ class Ledger:
         """A new entry, its numbers above everything forgotten; None where there is no room."""
         if len(self._entries) >= MAX_TASKS and not self._make_room(now):
             return None
-        floor = Ballot(self.floor, "")
-        entry = Entry(configuration, promised=floor if self.floor else NONE, token=self.floor, touched_at=now)
+        ceiling = Ceiling(now, self.floor, self.token)
+        entry = Entry(configuration, promised=self.floor, token=self.token, ceiling=ceiling, touched_at=now)
         self._enter(task_id, entry)
         return entry
 
@@ -112,7 +116,8 @@ class Ledger:
             if max(entry.until, entry.touched_at) + age > now or (entry.configuration > FIRST and not entry.is_over):
                 self._entries[task_id] = self._entries.pop(task_id)  # to the end of the queue
                 continue
-            self.floor = max(self.floor, entry.token, entry.promised.counter)
+            self.floor = max(self.floor, Ballot(entry.promised.counter, ""))
+            self.token = max(self.token, entry.token)
             del self._entries[task_id], self._buckets[_bucket(task_id)][task_id]
             self._keep_state()
             self._note(_bucket(task_id))
@@ -125,13 +130,17 @@ class Ledger:
 
     def _keep_state(self) -> None:
         if self._store is not None:
-            self._store.note(_STATE, bytes(msgpack.packb([self.floor, self.longest])))
+            self._store.note(_STATE, bytes(msgpack.packb([self.floor.counter, self.longest, self.token])))
 
     def _load(self, store: Store, now: float) -> None:
         """Take up an earlier life; what was leased in it is leased for as long again from ``now`` on."""
         state = _unpacked(store.noted(_STATE))
-        if isinstance(state, list) and len(state) == 2 and is_number(state[0]) and isinstance(state[1], float):
-            self.floor, self.longest = state
+        if isinstance(state, list) and len(state) == 2:
+            state = [*state, state[0]]  # of a version that had one floor for both
+        if not isinstance(state, list) or len(state) != 3:
+            state = [None, None, None]
+        if isinstance(state[1], float) and all(map(is_number, state[::2])):
+            self.floor, self.longest, self.token = Ballot(state[0], ""), state[1], state[2]
             self.is_whole = store.origin != "replaced"
         for number in range(BUCKETS):
             noted = store.noted(f"lease/{number}")
@@ -142,26 +151,32 @@ class Ledger:
                     self.is_whole = False
                     continue
                 entry.touched_at, entry.until = now, now + entry.ttl if entry.ballot != NONE else 0.0
+                entry.ceiling = Ceiling(now, entry.promised, entry.token)
                 self._enter(task_id, entry)
             self.is_whole = self.is_whole and isinstance(rows, dict)
 
 
 def entry_of(row: object) -> Entry | None:
     """The entry that ``packed`` made, or None where the row cannot be one; never raises."""
-    if not isinstance(row, list) or len(row) != 6 or not isinstance(row[1], list) or len(row[1]) != 8:
+    if not isinstance(row, list) or not 6 <= len(row) <= 7:
         return None
-    configuration, ballots, token, ttl, packed, is_over = row
+    configuration, ballots, token, ttl, packed, is_over = row[:6]
+    charter = row[6] if len(row) > 6 else b""  # the version before kept none
+    if not isinstance(ballots, list) or len(ballots) != 8:
+        return None
     members = members_of(packed)
     lawful = (
         all(map(is_number, (configuration, token, *ballots[::2])))
         and all(isinstance(agent, str) for agent in ballots[1::2])
         and isinstance(ttl, float)
         and isinstance(is_over, bool)
+        and isinstance(charter, bytes)
+        and len(charter) <= MAX_BYTES
     )
     if not lawful or members is None:
         return None
     promised, ballot, spent, sealed = (Ballot(ballots[n], ballots[n + 1]) for n in range(0, 8, 2))
-    return Entry(configuration, promised, ballot, token, ttl, spent, sealed, members, is_over)
+    return Entry(configuration, promised, ballot, token, ttl, spent, sealed, members, is_over, charter)
 
 
 def _unpacked(noted: bytes | None) -> object:

@@ -18,7 +18,7 @@ from twisted.internet.defer import Deferred, succeed
 from twisted.internet.interfaces import IDelayedCall, IReactorTime
 from twisted.internet.task import deferLater
 
-from middleware.commitment.ballot import AHEAD, GRANTED, NONE, OUTBID, OVER, QUIET, SEALED, Ballot
+from middleware.commitment.ballot import AHEAD, GRANTED, NONE, OUTBID, OVER, QUIET, SEALED, Ballot, quorum
 from middleware.commitment.council import Council
 from middleware.commitment.round import PAUSE, Round
 from middleware.entangled.errors import EntangledError
@@ -130,7 +130,7 @@ class Lessee:
 
         The first in line asks for it at once, so that only the grant is left to ask for when that robot stands still.
         """
-        self.council.token = max(self.council.token, token)
+        self.council.note_token(token)
         if self._is_wanted and self.lease is None:
             is_news = not self._is_freed
             self._free_at = self._ends_at = self._clock.seconds() + rest
@@ -178,12 +178,13 @@ class Lessee:
         """
         return Deferred.fromCoroutine(self._move(members))
 
-    def end(self) -> Deferred[object]:
-        """Give the lease back (stop the device first) and have none granted any more: the task has ended."""
-        closed: Deferred[object] = self.council.close(self.token).addErrback(
-            lambda failure: failure.trap(EntangledError)
-        )
-        return closed.addCallback(lambda _: self.release())
+    def end(self, token: int) -> Deferred[bytes]:
+        """Have no lease granted any more (stop the device first): the task was done under ``token``.
+
+        Where this agent holds a later one by now, that one counts.  Fires with the proof, signed by a
+        majority of the council; fails as ``Council.close`` does.
+        """
+        return self.council.close(max(token, self.token)).addCallback(lambda _: self.council.ending)
 
     async def _move(self, members: Sequence[Contact]) -> None:
         self._cancel()
@@ -361,8 +362,9 @@ class Lessee:
         self._changed()
 
     def _has_ended(self, asked: Round) -> bool:
-        """Whether a member says that the task has ended: then nobody may act, not even whoever could for a while."""
-        if any(reply.kind == OVER for reply in asked.replies.values()):
+        """Whether a majority says that the task has ended: then nobody may act, not even whoever could for a while."""
+        over = [reply for reply in asked.replies.values() if reply.kind == OVER]
+        if len(over) >= quorum(len(self.council.members)):
             self.is_over, self._is_wanted = True, False
             self._cancel()
             self._lose()

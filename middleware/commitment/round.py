@@ -29,8 +29,9 @@ class Round:
     """``outcome`` fires with the round as soon as it is decided whether a majority answers with one of ``kinds``.
 
     A member where another's lease ends within ``short`` seconds is asked again then, or soon where that is long.
-    It also fires, undecided, when everybody answered or ``patience`` seconds have passed, and soon after a majority has
-    answered.  Who has not answered is asked every 100 ms until it is decided, and at least three times in all.
+    An answer that is not genuine is none.  It also fires, undecided, when everybody answered or ``patience`` seconds
+    have passed, and soon after a majority has answered.  A member that has not answered is asked every 100 ms until it
+    is decided, and at least three times in all.
     """
 
     def __init__(
@@ -43,6 +44,7 @@ class Round:
         kinds: tuple[str, ...],
         patience: float,
         short: float = PAUSE,
+        is_genuine: Callable[[int, Reply], bool] = lambda place, reply: True,
     ) -> None:
         self.replies: dict[int, Reply] = {}
         self.outcome: Deferred[Round] = Deferred()
@@ -54,6 +56,7 @@ class Round:
         self._needed = quorum(len(members))
         self._patience = patience
         self._short = short
+        self._is_genuine = is_genuine
         self._sent: dict[int, float] = {}
         self._heard: dict[int, tuple[float, float, float]] = {}
         self.began_at = clock.seconds()
@@ -130,7 +133,7 @@ class Round:
     def _answered(self, answer: object, place: int, sent: float) -> None:
         """Take in the answer of one member; its silence (a Failure) and what is no answer count for nothing."""
         reply = reply_of(answer)
-        if self._is_closed or reply is None or place in self.replies:
+        if self._is_closed or reply is None or place in self.replies or not self._is_genuine(place, reply):
             return
         self._heard[place] = sent, self._clock.seconds(), reply.remaining
         if reply.kind == HELD and reply.remaining < self._short:

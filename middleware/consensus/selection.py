@@ -45,8 +45,8 @@ class Strategies:
 def guarded(name: str, dotted: bool = False, deployed: Deployed | None = None) -> Guard:
     """The strategy of that name: built-in ones run here, all others in a process of their own with a deadline.
 
-    What an operator deployed was checked when it came: it runs here, unbounded from then on, and is asked twice.
-    Whoever gets one with a process has to ``stop`` it.  Raises ``UnknownStrategy`` where there is none of that name.
+    What an operator deployed has its process already (``middleware.deployment``), and is asked twice.
+    Any other one with a process has to be stopped.  Raises ``UnknownStrategy`` if there is none of that name.
     """
     if _runs_here(name, dotted):
         return Guard(strategy_for(name, dotted, deployed), twice=is_deployed(name))
@@ -56,5 +56,5 @@ def guarded(name: str, dotted: bool = False, deployed: Deployed | None = None) -
 
 
 def _runs_here(name: str, dotted: bool = False) -> bool:
-    """Whether a strategy needs no process of its own; raises ``UnknownStrategy``."""
+    """Whether no process has to be started for a strategy; raises ``UnknownStrategy``."""
     return is_deployed(name) or place_of(name, dotted) in BUILT_IN.values()

@@ -9,37 +9,15 @@ import signal
 import struct
 import sys
 import traceback
-from dataclasses import astuple
 from typing import Any, BinaryIO
 
 import msgpack
 
-from middleware.consensus.item import Item
-from middleware.consensus.strategy import Report
+from middleware.consensus.remote import answer as answer_of
 
 LENGTH = struct.Struct("!I")
 MEMORY = 512 * 1024 * 1024
 MAX_TRACE = 4000
-
-
-def served(strategy: Any, method: str, arguments: list[Any]) -> Any:
-    """One answer, as plain values."""
-    if method == "find":
-        return astuple(strategy.find([_report(r) for r in arguments]))
-    if method == "improves":
-        return strategy.improves(_report(arguments[0]), _report(arguments[1]), arguments[2])
-    if method == "find_group":
-        if not hasattr(strategy, "find_group"):
-            return None
-        items = [Item(task, tuple(position), slots) for task, position, slots in arguments[1]]
-        return [astuple(point) for point in strategy.find_group([_report(r) for r in arguments[0]], items)]
-    a, b = ([_report(r) for r in part] for part in arguments)
-    return [astuple(r) for r in strategy.merge(a, b)]
-
-
-def _report(fields: list[Any]) -> Report:
-    values: list[Any] = [tuple(field) if isinstance(field, list) else field for field in fields]
-    return Report(*values)
 
 
 def _say(out: BinaryIO, is_well: bool, content: Any) -> None:
@@ -70,7 +48,7 @@ def main() -> None:
         method, arguments = msgpack.unpackb(into.read(LENGTH.unpack(head)[0]))
         signal.setitimer(signal.ITIMER_REAL, patience)
         try:
-            answer = served(strategy, method, arguments)
+            answer = answer_of(strategy, method, arguments)
         except BaseException:  # the strategy of somebody else may raise anything
             signal.setitimer(signal.ITIMER_REAL, 0.0)
             _say(out, False, traceback.format_exc()[-MAX_TRACE:])

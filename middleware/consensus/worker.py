@@ -13,14 +13,12 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import astuple
 from typing import Any
 
 import msgpack
 
 from middleware.consensus.guard import Lost, NoOpinion
-from middleware.consensus.item import Item
-from middleware.consensus.strategy import Consensus, Report
+from middleware.consensus.remote import RemoteStrategy
 
 DEADLINE_S = 0.2
 """How long the node stands still at most for one question; well below the third of a lease."""
@@ -29,7 +27,7 @@ MAX_ANSWER = 65_536
 LENGTH = struct.Struct("!I")
 
 
-class Worker:
+class Worker(RemoteStrategy):
     """The strategy at ``place`` (``module:Class``), asked through pipes; each method raises what went wrong.
 
     ``path`` comes before this process's own path for imports.
@@ -48,32 +46,6 @@ class Worker:
         self._broken = ""
         self._is_stopped = False
         self._start()
-
-    def find(self, contacts: Sequence[Report]) -> Consensus:
-        """What the strategy finds."""
-        return _consensus(self._asked("find", [astuple(r) for r in contacts]))
-
-    def find_group(self, contacts: Sequence[Report], items: Sequence[Item]) -> tuple[Consensus, ...]:
-        """What the strategy finds, if it is one for several tasks; raises ``NotImplementedError`` otherwise."""
-        answer = self._asked("find_group", [[astuple(r) for r in contacts], [astuple(i) for i in items]])
-        if answer is None:
-            raise NotImplementedError
-        if not isinstance(answer, list):
-            raise NoOpinion(f"find_group answers {answer!r:.60}")
-        return tuple(_consensus(point) for point in answer)
-
-    def improves(self, current: Report, offer: Report, hysteresis: float) -> bool:
-        """What the strategy says."""
-        answer: bool = self._asked("improves", [astuple(current), astuple(offer), hysteresis])
-        return answer
-
-    def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
-        """What the strategy makes of both."""
-        answer = self._asked("merge", [[astuple(r) for r in a], [astuple(r) for r in b]])
-        try:
-            return tuple(report_of(fields) for fields in answer)
-        except TypeError as error:
-            raise NoOpinion("merge answers no reports") from error
 
     def stop(self) -> None:
         """End the process for good: whoever still asks gets no answer, and no new process."""
@@ -102,7 +74,8 @@ class Worker:
                     pipe.close()
             process.wait()
 
-    def _asked(self, method: str, arguments: list[Any]) -> Any:
+    def ask(self, method: str, arguments: list[Any]) -> Any:
+        """The answer of its process; raises ``NoOpinion``."""
         end = time.monotonic() + self._deadline
         if self._broken:
             raise Raised(self._broken)
@@ -168,22 +141,6 @@ class Worker:
 
 class Raised(NoOpinion):
     """The strategy raised; the text is its trace."""
-
-
-def report_of(fields: Sequence[Any]) -> Report:
-    """A report out of what ``astuple`` made of it and a pipe carried."""
-    return Report(*_fields(fields))
-
-
-def _consensus(answer: Any) -> Consensus:
-    try:
-        return Consensus(*_fields(answer))
-    except TypeError as error:
-        raise NoOpinion(f"it answers {answer!r:.60}, not Consensus") from error
-
-
-def _fields(values: Sequence[Any]) -> list[Any]:
-    return [tuple(value) if isinstance(value, list) else value for value in values]
 
 
 def _wait(pipe: int, event: int, end: float) -> None:

@@ -1,8 +1,8 @@
-"""Module: from an operator's source to something that can be called; the only place where foreign code first runs.
+"""Module: from an operator's source to something that can be called; the only place where pushed code is run.
 
-Whoever calls this has checked who signed it.  A module has the name of no file and cannot be imported by others; its
-code is ordinary Python with all that the node may do, so to allow it is a matter of trust and not of a cage.  What is
-kept out are mistakes: what does not parse, raises, or never comes to an end.
+It is called in the module's own process, after its rights were given up, and by the twin of that process in simulators.
+The caller has checked who signed the source.  What is refused here are mistakes: what does not parse, raises, or never
+comes to an end.
 """
 
 from __future__ import annotations

@@ -116,8 +116,15 @@ class Refused(EntangledError):
             self.code = code
 
 
+OWNER_FULL = "owner-full"
+"""The code of ``Full`` where the store has room, though not for more of this owner."""
+
+
 class Full(Refused):
-    """The store has no room and nothing that it may let go of; remove some, or allow it more rows or bytes."""
+    """The store has no room and nothing that it may let go of; remove some, or allow it more rows or bytes.
+
+    With the code ``OWNER_FULL`` it is the owner of the record that has all that one owner may have.
+    """
 
 
 class Unwritable(Refused):

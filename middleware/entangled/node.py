@@ -114,7 +114,7 @@ class EntangledNode:
         self.replica.on_silent = self._subscriber.silent
         self.replica.on_peer = self.overlay.heard
         self.replica.on_goodbye = self.overlay.left
-        self.replica.may_store = door.may_store
+        self.replica.certificates.door = door
         if wall is not None:
             self.endpoint.echoer.wall = wall
         self.endpoint.on_refused = self._refused
@@ -194,6 +194,11 @@ class EntangledNode:
         """
         self.endpoint.evict(public, code)
         self._parted(public)
+
+    def review(self) -> None:
+        """Judge all records that are held, owned or watched anew: what the door knows of their owners has changed."""
+        for part in (self._owner, self.replica, self._subscriber):
+            part.review()
 
     # -- verbs ------------------------------------------------------------------------------------------------------
 

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import json
 import os
-import tomllib
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +17,12 @@ from middleware.admission.statement import ROLES
 from middleware.entangled.network.interface import is_loopback
 from middleware.entangled.network.network import EVERYWHERE
 from middleware.errors import BadSetting
-from middleware.settings import COMMAND_LINE, NODE_PORT, NodeSettings, Settings
+from middleware.settings import COMMAND_LINE, NODE_PORT, Settings
 from swarmnode.team.office import ENDING, Desk, Wrong, key_folder, options, run
 
 MEMBERSHIP, SETTINGS = ".membership", ".toml"
+SHARED = ("port", "lan", "store_rows", "store_bytes", "durable", "presence_lease")
+"""Keys of ``[node]`` that an operator may give to newcomers: none runs code, opens a page or grants a right."""
 ANYWHERE = f"{EVERYWHERE}:{NODE_PORT}"
 """Every address of the machine: what a laptop has today it may not have tomorrow."""
 
@@ -72,9 +72,9 @@ def main(words: Sequence[str] | None = None, desk: Desk | None = None) -> int:
 
 
 def _made(wishes: argparse.Namespace, desk: Desk) -> tuple[Any, list[str]]:
-    operator = operators.drawn(wishes.team, desk.rng)
+    operator = replace(operators.drawn(wishes.team, desk.rng), settings=team_settings(wishes.set))
     key = wishes.operator or key_folder() / f"{wishes.team}{ENDING}"
-    team = team_settings(wishes.set)
+    team = dict(operator.settings)
     first = _Member(wishes.first, FIRST, wishes.folder)
     members = [first]
     for text in wishes.member:
@@ -117,7 +117,7 @@ def _member(text: str, folder: Path) -> _Member:
     return _Member(name, found, folder)
 
 
-def _texts(members: Sequence[_Member], at: str | None, has_page: bool, team: dict[str, Any]) -> dict[Path, str]:
+def _texts(members: Sequence[_Member], at: str | None, has_page: bool, team: Mapping[str, Any]) -> dict[Path, str]:
     """The settings file of each: the first node listens where it is told, the others know it from there."""
     first, *others = members
     does = ["bootstrap", "edge", *(["web"] if has_page else [])]
@@ -152,46 +152,41 @@ def _make_folders(keys: Path, members: Path) -> None:
 
 
 def team_settings(given: Sequence[str]) -> dict[str, Any]:
-    """The settings that ``KEY=VALUE`` mean, each held to the rule of its key; raises ``Wrong``."""
+    """Return the settings that ``KEY=VALUE`` mean, each checked by the rule of its key; raises ``Wrong``."""
     found: dict[str, Any] = {}
     for each in given:
         key, sign, value = each.partition("=")
-        if not sign or key in ("name", "membership", "team_key", "store"):
-            raise Wrong(f"--set {each}: write KEY=VALUE, with a key of [node] that all can share")
+        if not sign or key not in SHARED:
+            raise Wrong(f"--set {each}: write KEY=VALUE, with one of the keys {', '.join(SHARED)}")
         try:
             whole = Settings.from_mapping({"node": {"name": "any"}}, COMMAND_LINE).with_flags(**{key: value})
         except BadSetting as error:
             raise Wrong(str(error)) from error
-        plain = getattr(whole.node, key, None)
-        if not isinstance(plain, str | int | float | bool) or not hasattr(NodeSettings, key):
-            raise Wrong(f"--set {each}: only numbers, words, true and false can be shared")
-        found[key] = plain
+        found[key] = getattr(whole.node, key)
     return found
 
 
 def settings_text(
-    name: str, membership: str, roles: Sequence[str], at: str | None, known: Sequence[str], team: dict[str, Any]
+    name: str, membership: str, roles: Sequence[str], at: str | None, known: Sequence[str], team: Mapping[str, Any]
 ) -> str:
-    """The text of a settings file for a new member; raises ``Wrong`` where a value is none."""
-    lines = ["[node]", f'name = "{name}"', f'membership = "{membership}"', f'store = "{name}.sqlite"']
-    lines.append(f"roles = {json.dumps(list(roles))}")
+    """Return the text of a settings file for a new member; raises ``Wrong`` where a value is none."""
+    import tomli_w
+
+    node: dict[str, Any] = {"name": name, "membership": membership, "store": f"{name}.sqlite", "roles": list(roles)}
+    if known:
+        node["known_nodes"] = list(known)
+    node.update(team)
     if at is not None:
         host, colon, port = at.rpartition(":")
         if not colon or not port.isdecimal():
             raise Wrong(f"--at {at}: write HOST:PORT")
-        team = {**team, "host": host.strip("[]"), "port": int(port)}
-    if known:
-        lines.append(f"known_nodes = {json.dumps(list(known))}")
-    # JSON's words, numbers, true and false are lawful TOML.
-    lines += [f"{key} = {json.dumps(value)}" for key, value in team.items()]
-    if "web" in roles:
-        lines += ["", "[web]", 'host = "0.0.0.0"']
-    text = "\n".join(lines) + "\n"
+        node.update(host=host.strip("[]"), port=int(port))
+    tables = {"node": node, **({"web": {"host": "0.0.0.0"}} if "web" in roles else {})}
     try:
-        Settings.from_mapping(tomllib.loads(text), COMMAND_LINE)
+        Settings.from_mapping(tables, COMMAND_LINE)
     except BadSetting as error:
         raise Wrong(str(error)) from error
-    return text
+    return tomli_w.dumps(tables)
 
 
 def written(path: Path, text: str) -> None:

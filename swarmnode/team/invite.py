@@ -35,7 +35,7 @@ def _invited(wishes: argparse.Namespace, desk: Desk) -> tuple[Any, list[str]]:
     operator = operator_in(wishes.operator)
     roles = wishes.role or ["device"]
     try:
-        code, statement = operator.invite(
+        code, statement, terms = operator.invite(
             wishes.name, roles, wishes.uses, desk.wall(), wishes.expires, desk.rng, wishes.life
         )
     except ValueError as error:
@@ -44,6 +44,7 @@ def _invited(wishes: argparse.Namespace, desk: Desk) -> tuple[Any, list[str]]:
     if wishes.uses == 1 and wishes.name in {each.name for each in found.members(desk.wall())}:
         raise Refusal(f"a member is called {wishes.name} already; choose another name, or revoke that one first")
     doors = found.doors
+    tell(wishes.node, desk, terms)
     tell(wishes.node, desk, statement)
     whole = f"{code.text}@{','.join(doors)}" if doors else code.text
     answer = {"code": code.text, "at": list(doors), "text": whole, "name": wishes.name, "roles": list(roles)}

@@ -28,7 +28,7 @@ from middleware.entangled.network.network import EVERYWHERE, Address
 from middleware.errors import BadSetting
 from middleware.settings import COMMAND_LINE, NodeSettings, Settings
 from swarmnode.asker import Refusal
-from swarmnode.team.init import settings_text, written
+from swarmnode.team.init import SHARED, settings_text, written
 from swarmnode.team.office import Desk, Wrong, options, run, seconds
 
 JOINING = "swarm-node joining 1"
@@ -99,7 +99,8 @@ def _joined(wishes: argparse.Namespace, desk: Desk, knocking: Knocking, around: 
     # Without a host it would hear its own machine alone; by every address, since a laptop has another one tomorrow.
     host = {} if all(is_loopback(address.host) for address in membership.known) else {"host": EVERYWHERE}
     own = {**host, **({"tunnels": ["auto", *wishes.tunnel]} if wishes.tunnel else {})}
-    text = settings_text(name, path.name, ["edge"], None, known, {**own, **membership.settings})
+    given = {key: value for key, value in membership.settings.items() if key in SHARED}
+    text = settings_text(name, path.name, ["edge"], None, known, {**given, **own})
     is_kept = settings.exists() and settings.read_text(encoding="utf-8", errors="replace") != text
     written(settings, text)
     # The membership comes last: who finds it has all the rest.
@@ -112,6 +113,9 @@ def _joined(wishes: argparse.Namespace, desk: Desk, knocking: Knocking, around: 
     ]
     if is_kept:
         lines.append(f"{settings} was there already and is left as it is: see that its name and known_nodes are right")
+    ignored = sorted(set(membership.settings) - set(given))
+    if ignored:
+        lines.append(f"Ignored settings of the invitation, which a team cannot give: {', '.join(map(repr, ignored))}")
     if membership.member.trouble(desk.wall()):
         lines.append(
             "The clock of this machine, or that of the bootstrap node, is wrong; set it right before the start"

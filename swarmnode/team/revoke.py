@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from typing import Any
 
+from middleware.admission.certificate import Member
 from swarmnode.asker import Refusal
 from swarmnode.team.office import Desk, Known, known, operator_in, options, run, tell
 
@@ -15,19 +17,33 @@ def main(words: Sequence[str] | None = None, desk: Desk | None = None) -> int:
     revoke = options("revoke", "Put a member out of the team, or end an invitation and put out all that came by it.")
     revoke.add_argument("name", metavar="NAME", help="of a member, or of an invitation; or its key in hexadecimal")
     revoke.add_argument("--invitation", action="store_true", help="the invitation of that name, not the member")
+    revoke.add_argument("--all", action="store_true", help="a bootstrap node: with all that it let in")
     wishes = revoke.parse_args(words)
 
     def work() -> tuple[Any, list[str]]:
         operator = operator_in(wishes.operator)
         found = known(wishes.node, desk, operator)
         public, what, came = _meant(found, wishes.name, wishes.invitation, desk.wall())
-        tell(wishes.node, desk, operator.revoke(public, wishes.name[:40], desk.wall()))
+        kept = [] if wishes.all else _admitted_by(found, public, desk.wall())
+        try:
+            statement = operator.revoke(public, wishes.name[:40], desk.wall(), [each.public for each in kept])
+        except ValueError as error:
+            raise Refusal(f"{error}; say --all, and invite those that are to stay anew") from error
+        tell(wishes.node, desk, statement)
         lines = [f"{what} {wishes.name} is revoked; in force at all that can be reached within 10 seconds"]
         lines += [f"  with it: {name}" for name in came]
+        lines += [f"  stays, though {wishes.name} let it in: {each.name}" for each in kept]
         lines.append("What it knew stays known to it: give the team a new secret by swarm rotate")
-        return {"revoked": public.hex(), "what": what, "with": came}, lines
+        kept_names = [each.name for each in kept]
+        return {"revoked": public.hex(), "what": what, "with": came, "kept": kept_names}, lines
 
     return run("revoke", work, wishes.json, desk.out)
+
+
+def _admitted_by(found: Known, public: bytes, now: float) -> list[Member]:
+    """Return the present members that the bootstrap node ``public`` let in."""
+    admissions = [each.member for each in found.roll.admissions()]
+    return [each for each in admissions if each.admitter == public and not found.roll.refusal(each, now)]
 
 
 def _meant(found: Known, name: str, is_invitation: bool, now: float) -> tuple[bytes, str, list[str]]:
@@ -39,6 +55,8 @@ def _meant(found: Known, name: str, is_invitation: bool, now: float) -> tuple[by
             raise Refusal(f"no invitation is called {name!r}")
         return found.member(name, now).public, "the member", []
     except Refusal:
+        if not invites and re.fullmatch(r"[0-9a-f]{64}", name):
+            return bytes.fromhex(name), "the key", []  # also of one that is on no list
         if not invites:
             raise
     if len(invites) > 1:

@@ -13,6 +13,7 @@ from agents.behaviour import KINDS, behaviour_for
 from agents.means import Means
 from middleware.errors import MissingExtra, UnknownTask
 from middleware.tasks import Task
+from tests.agents.loopback import Loopback
 
 TASK = Task("t1", "turn-around", "Turn")
 
@@ -41,10 +42,10 @@ class BehaviourTests(SynchronousTestCase):
             def __init__(self, parameters: object, rng: object) -> None: ...
 
         means = Means()
-        deployed = {("behaviour", "bodied"): Bodied, ("behaviour", "other"): Other}
+        deployed = {("behaviour", "bodied"): Loopback.of(Bodied), ("behaviour", "other"): Loopback.of(Other)}
         for kind in ("deployed:bodied", "deployed:other"):
             behaviour_for(replace(TASK, kind=kind), random.Random(1), deployed, means)
-        self.assertEqual(told, [means])
+        self.assertEqual([vars(each) for each in told], [vars(means)])
         turn: Any = behaviour_for(TASK, random.Random(1), None, means)
         self.assertIs(turn._means, means)
 

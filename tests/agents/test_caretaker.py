@@ -10,10 +10,11 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from agents.caretaker import AGAIN, VISIT
 from agents.catalogue import task_named
+from middleware.commitment.charter import pin
 from middleware.commitment.councils import SILENT
 from middleware.entangled.record import Record
 from middleware.order import PAUSE, RESUME, Order
-from middleware.tasks import COMPLETED, TASKS, Task, outcome_of, tasks_of
+from middleware.tasks import COMPLETED, TASKS, Task, council_of, outcome_of, tasks_of
 from swarmnode.rehearsal import VirtualTeam
 
 OTHERS = ("witness1", "witness2", "witness3")
@@ -40,14 +41,15 @@ class CaretakerTests(SynchronousTestCase):
         """A task to turn around for a long time, with these nodes as its council."""
         task = replace(task_named("turn-around", "turn", 0.0), waiting_period=1.0, parameters={"turns": turns})
         members = tuple(self.team.services[name].assembly.node.entangled.contact for name in council)
-        put = self.node.entangled.put(TASKS, "turn", replace(task, council=members).packed(), "team")
+        task = task.with_council(pin(self.node.entangled.identity, "turn", members))
+        put = self.node.entangled.put(TASKS, "turn", task.packed(), "team")
         self.team.clock.advance(0.5)
         self.successResultOf(put)
 
     @property
     def task(self) -> Task:
         """The task as its newest record tells it."""
-        return tasks_of(self.records)["turn"]
+        return council_of(tasks_of(self.records)["turn"], self.group)
 
     @property
     def council(self) -> list[str]:
@@ -80,10 +82,10 @@ class CaretakerTests(SynchronousTestCase):
             self.team.kill(gone)
             self.run_for(LATEST)
             self.assertNotIn(gone, self.council)
-        outcome = outcome_of(self.group)
+        outcome = outcome_of(self.task, self.group)
         while outcome is None and self.team.clock.seconds() < 400.0:
             self.run_for(5.0)
-            outcome = outcome_of(self.group)
+            outcome = outcome_of(self.task, self.group)
         assert outcome is not None
         self.assertEqual(outcome.outcome, COMPLETED)
         self.assertNotEqual(outcome.by, first)

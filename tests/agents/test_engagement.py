@@ -88,11 +88,8 @@ class Council:
         """Note the wish."""
         self.is_wanted = True
 
-    def end(self) -> Deferred[object]:
-        """Give it back for good."""
-        self._events.append("ended")
-        self.is_wanted, self.token = False, 0
-        return succeed(None)
+    def learn(self, packed: bytes) -> None:
+        """It is the council."""
 
     def stand_by(self, rank: int = 1) -> None:
         """Note the place in the line."""
@@ -431,7 +428,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.events, ["halted"])
         self.end(COMPLETED, "dog1")
         self.engagement.abandon()
-        self.assertEqual(self.events[-1], "ended")
+        self.assertEqual(self.events[-1], "released")
 
     def test_outcome_of_another_ends_it_at_once(self) -> None:
         """A task that was cancelled or done by another is over: the body stops and no step follows."""
@@ -528,7 +525,7 @@ class EngagementTests(SynchronousTestCase):
         self.assertEqual(self.events, ["halted"])
         self.end(COMPLETED, "dog1")
         self.engagement.abandon()
-        self.assertEqual(self.events, ["halted", "ended"])
+        self.assertEqual(self.events, ["halted", "released"])
 
     def test_deadline_fails_the_task_once(self) -> None:
         """Past its deadline the task fails by whoever acts, or by the first of those present, and by nobody else."""
@@ -551,6 +548,29 @@ class EngagementTests(SynchronousTestCase):
         self.hear(self.report(2, 1.0), self.report(3, 1.0))
         self.engagement.step()
         self.assertEqual(len(self.results), int(lowest is ME))
+
+    def test_deadline_is_told_by_who_holds_the_task(self) -> None:
+        """Who is to end a task that nobody acts on claims it first: its council lets no other end it."""
+        self.engagement.task = replace(TASK, deadline=5.0)
+        self.patch(self.engagement._conference, "is_first", lambda now: True)
+        self.acting()
+        self.clock.advance(5.1)
+        for _ in range(2):
+            self.assertIsNone(self.engagement.step())
+            self.assertEqual((self.results, self.council.is_wanted), ([], True))
+        self.council.grant(6)
+        self.assertIsNone(self.engagement.step())
+        self.assertEqual([result.token for result in self.results], [6])
+
+    def test_higher_token_reopens_the_task(self) -> None:
+        """An agent that learns at the end that another was granted a higher token takes part again."""
+        self.dog.steps = 1
+        self.acting()
+        self.step()
+        self.assertIsNone(self.engagement.step())
+        self.engagement.reopen()
+        self.assertEqual(self.events[-1], "released")
+        self.assertIsNotNone(self.engagement.step())
 
     def test_no_progress_gives_the_task_to_another(self) -> None:
         """Who comes no further within the stall limit gives the lease back and does not bid for as long."""

@@ -13,7 +13,7 @@ from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address
 from middleware.entangled.network.switchboard import SwitchboardNetwork
-from middleware.entangled.wire.door import Life
+from middleware.entangled.wire.door import Authority, Life, OpenDoor
 from middleware.entangled.wire.endpoint import Endpoint
 from tests.middleware.admission.village import House, Village, VillageCase
 
@@ -23,12 +23,12 @@ SOURCE = Address("10.6.6.6", 666)
 class ClosedTeam(Village):
     """A village whose members may do what their roles say."""
 
+    rules = roles
     tape: Tape | None = None
 
     def open(self, house: House) -> None:
         """Begin a life of a node, of which the tape hears all."""
         super().open(house)
-        house.team.door._rules = roles
         if self.tape is not None:
             self.tape.tap(network_of(house))
 
@@ -42,7 +42,7 @@ class ClosedTeam(Village):
         return self.signer.founded(name, which or ("device",), self.wall(), self.dice, secret)
 
 
-class PaperDoor:
+class PaperDoor(OpenDoor):
     """The door of an attacker: shows whatever it likes, and lets in everybody."""
 
     def __init__(self, shown: bytes, room: int = 640, life: int = 1) -> None:
@@ -61,6 +61,22 @@ class PaperDoor:
 
     def may_store(self, slot: object) -> bool:
         """Everything."""
+        return True
+
+    def may_stay(self, slot: object) -> bool:
+        """Everything."""
+        return True
+
+    def authority(self, owner: bytes) -> Authority:
+        """Everybody has it."""
+        return Authority()
+
+    def certificate(self, owner: bytes) -> bytes:
+        """Its own, whoever is meant."""
+        return self.shown
+
+    def learn(self, owner: bytes, certificate: bytes) -> bool:
+        """Any."""
         return True
 
 

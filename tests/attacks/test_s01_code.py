@@ -31,6 +31,7 @@ ALLOWED = {
 }
 LOADERS = {
     # Named by the settings of the node's owner, or by a table in the tree.
+    "swarmnode.sandbox",
     *("agents.behaviour", "agents.registry", "drivers.registry", "middleware.consensus.servant"),
     *("middleware.consensus.strategy", "swarmnode.driver.catalogue", "swarmnode.command", "drivers.foreign"),
 }

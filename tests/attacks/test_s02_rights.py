@@ -19,7 +19,7 @@ from tests.attacks.siege import SOURCE, SiegeCase
 from tests.middleware.admission.paper import NOW
 
 KEYS = ("halt", "tasks", "devices", "deployments", "signed-out", "group/7")
-NAMES = ("order", "member", "result", "verdict/1", "source", "anything")
+NAMES = ("order", "member", "result", "council", "done", "verdict/1", "source", "anything")
 
 
 class MethodTests(SiegeCase):
@@ -89,7 +89,7 @@ class RecordTests(SiegeCase):
                     asked = attacker.ask(team.contact(house), "store", [record.packed()], changes=True)
                     [verdict] = self.outcome(team, asked, 0.1)
                     held = house.node.replica.holds(record)
-                    self.assertEqual(held, may_store((role,), record.slot), (role, key, name))
+                    self.assertEqual(held, may_store((role,), record.slot, role), (role, key, name))
                     self.assertEqual(verdict == FORBIDDEN, not held, (role, key, name))
         self.assertEqual(kinds, set(KINDS))
 

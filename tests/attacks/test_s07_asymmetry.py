@@ -161,7 +161,8 @@ class FloodTests(FloodCase):
 
     def test_knocks_of_who_has_the_code(self) -> None:
         """Of KNOCKs with a true code, each by another key, so many signatures are checked as one second has."""
-        code, packed = self.team.signer.invite("pig", ("device",), 1, self.team.wall(), 900.0, random.Random(5))
+        code, packed, terms = self.team.signer.invite("pig", ("device",), 1, self.team.wall(), 900.0, random.Random(5))
+        self.team.tell(terms)
         self.team.tell(packed)
         self.team.run(1.0)
         dice = random.Random(6)

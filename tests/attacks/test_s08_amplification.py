@@ -65,7 +65,8 @@ class AmplificationTests(SiegeCase):
         question = encoded(Question(1, "find_node", (bytes(20),)))
         paper = self.team.paper("ape")
         passes = {"no": b"", "good": paper.shown, "long": paper.shown.ljust(640, b"x")}
-        code, packed = self.team.signer.invite("cub", ("device",), 1, self.team.wall(), 900.0, self.dice)
+        code, packed, terms = self.team.signer.invite("cub", ("device",), 1, self.team.wall(), 900.0, self.dice)
+        self.team.tell(terms)
         self.team.tell(packed)
         self.team.run(2.0)
         cub = Identity(b"c" * 32)

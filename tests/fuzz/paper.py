@@ -15,23 +15,27 @@ from twisted.internet.defer import Deferred, succeed
 
 from middleware.admission import knock
 from middleware.admission.certificate import member_of, pass_of
-from middleware.admission.knock import Welcome, opened_knock, opened_welcome
+from middleware.admission.knock import Knock, Reply, Signer, Welcome, opened_knock, opened_welcome
 from middleware.admission.reception import Reception
 from middleware.admission.roll import Roll, packed_admission
 from middleware.admission.statement import Invite, opened
+from middleware.admission.terms import TermsContent, seal_terms
 from middleware.entangled.errors import Full, RemoteError
 from middleware.entangled.identity import exchange_key
 from middleware.entangled.network.network import Address
 from tests.fuzz.ground import STRANGER, Violation
 from tests.fuzz.raw import RECORDED
 from tests.fuzz.runner import main
-from tests.middleware.admission.paper import NOW, admitted, granted, identity, invited, operator
+from tests.middleware.admission.paper import LATER, NOW, admitted, granted, identity, invited, operator
 
 KINDS = ("statement", "pass", "knock", "welcome")
 SIGNER = operator(1)
 CODE, PACKED, INVITE = invited(SIGNER, "dog")
 NEWCOMER = identity("dog")
 DICE = random.Random(9)
+TERMS = seal_terms(CODE, TermsContent(SIGNER.public, "yard", {"port": 7}), random.Random(8))
+INVITATION = SIGNER.invite("dog", ("device",), 1, NOW, LATER, random.Random(1))
+ANSWERER = Signer(identity("vaio"), granted(SIGNER, "vaio", "bootstrap"), TERMS)
 EPHEMERAL = bytes(range(32))
 
 
@@ -42,10 +46,10 @@ def lawful() -> dict[str, list[bytes]]:
     secret = SIGNER.rotate(2, [NEWCOMER.public], NOW, 60, random.Random(2))
     end = SIGNER.revoke(identity("cat").public, "cat", NOW)
     knocked = knock.knock(CODE.key, NEWCOMER.public, exchange_key(NEWCOMER.public), "", random.Random(3))
-    given = Welcome(SIGNER.public, "yard", chain, ((1, bytes(32), 0),), (), {"port": 7})
-    shared = exchange_key(NEWCOMER.public)
-    told = [knock.welcome(INVITE.public, shared, given, random.Random(4))]
-    told += [knock.refusal(INVITE.public, shared, "used", random.Random(5)), knock.unknown(knock.id_of(knocked))]
+    given = Welcome(chain, ((1, bytes(32), 0),))
+    heard = Knock(NEWCOMER.public, exchange_key(NEWCOMER.public), "", b"")
+    told = [knock.welcome(INVITE.public, heard, given, ANSWERER, random.Random(4))]
+    told += [knock.refusal(INVITE.public, heard, "used", ANSWERER, random.Random(5)), knock.hint(knock.id_of(knocked))]
     admission = packed_admission(NEWCOMER.public, chain)
     return {
         "statement": [PACKED, grant, secret, end, admission],
@@ -109,7 +113,7 @@ def _knock(whole: bytes) -> None:
     sent: list[tuple[bytes, Address]] = []
     admissions: list[bytes] = []
     roll = Roll(SIGNER.public)
-    for each in (PACKED, LAWFUL["statement"][1]):
+    for each in (PACKED, INVITATION.terms, LAWFUL["statement"][1]):
         roll.add(each, NOW)
 
     def take(invite: Invite) -> Deferred[bool]:
@@ -119,7 +123,7 @@ def _knock(whole: bytes) -> None:
         sent.append((datagram, to))
 
     def given(shown: bytes) -> Welcome:
-        return Welcome(SIGNER.public, "yard", shown, ((1, bytes(32), 0),))
+        return Welcome(shown, ((1, bytes(32), 0),))
 
     bootstrap = Reception(
         roll, identity("vaio"), take, admissions.append, given, send, lambda: 1.0, lambda: float(NOW), DICE
@@ -135,8 +139,8 @@ def _knock(whole: bytes) -> None:
 
 def _welcome(whole: bytes) -> None:
     with contextlib.suppress(RemoteError):
-        found = opened_welcome(whole, INVITE.public, NEWCOMER.exchange_secret)
-        if isinstance(found, Welcome) and whole not in GENUINE:
+        found = opened_welcome(whole, CODE, NEWCOMER.public, NEWCOMER.exchange_secret)
+        if isinstance(found, Reply) and whole not in GENUINE:
             raise Violation("a welcome that nobody said")
 
 

@@ -12,12 +12,14 @@ from drivers.driver import Permit
 from drivers.errors import StaleCommand
 from drivers.gate import Gate
 from middleware.commitment.acceptor import Acceptor
-from middleware.commitment.ballot import NONE, Ballot, Reply, members_of
+from middleware.commitment.ballot import GRANTED, NONE, OVER, SEALED, Ballot, Reply, members_of
+from middleware.commitment.charter import sign_change, sign_end
 from middleware.commitment.council import Council
 from middleware.commitment.ledger import Ledger
 from middleware.commitment.lessee import Lessee
 from middleware.commitment.patience import in_time
 from middleware.entangled.data.store import Store
+from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact
 from tests.invariants.machine import Machine
 
@@ -46,6 +48,7 @@ class Bidder:
             "lease.propose": self._propose,
             "lease.release": self._release,
             "lease.close": self._close,
+            "lease.cancel": self._cancel,
             "lease.change": self._change,
             "lease.install": self._install,
             "lease.freed": self.freed,
@@ -57,16 +60,18 @@ class Bidder:
     def lessee(self, task_id: str) -> Lessee:
         """This agent's claim on a task."""
         if task_id not in self.lessees:
-            members, configuration = self.world.council_for(self.place, task_id)
+            charter = self.world.council_for(self.place, task_id)
             council = Council(
                 task_id,
                 self.world.contacts[self.place].node_id.hex(),
                 self.world.ttl,
-                members,
+                charter.members,
                 self._ask,
                 self.machine,
                 self._rng,
-                configuration,
+                charter,
+                self.world.judge.read,
+                charter.configuration,
                 self.world.referee.floor(self.place, task_id),
             )
             council.moved = lambda: self.world.moved(task_id, council)
@@ -168,17 +173,29 @@ class Bidder:
             self.world.tell_freed(self.place, listener, task_id, rest)
 
     def _close(self, agent: str, task_id: str, configuration: int, token: int) -> Reply:
-        return self.acceptor.close(task_id, agent, configuration, token, self.machine.seconds())
+        reply = self.acceptor.close(task_id, agent, configuration, token, self.machine.seconds())
+        signature = sign_end(self._identity, task_id, configuration, agent, token)
+        return reply._replace(proof=signature) if reply.kind in (OVER, SEALED) else reply
+
+    def _cancel(self, agent: str, task_id: str, configuration: int) -> Reply:
+        return self.acceptor.close(task_id, "", configuration, 0, self.machine.seconds())
 
     def _change(
         self, agent: str, task_id: str, configuration: int, counter: int, packed: list[object], token: int, keep: bool
     ) -> Reply:
-        members, now = members_of(packed) or (), self.machine.seconds()
-        return self.acceptor.change(task_id, configuration, Ballot(counter, agent), members, token, now, keep)
+        members, ballot = members_of(packed) or (), Ballot(counter, agent)
+        reply = self.acceptor.change(task_id, configuration, ballot, members, token, self.machine.seconds(), keep)
+        signature = sign_change(self._identity, task_id, configuration, ballot, members, reply.token)
+        return reply._replace(proof=signature) if reply.kind == GRANTED else reply
 
-    def _install(
-        self, agent: str, task_id: str, configuration: int, packed: list[object], token: int, counter: int, ttl: float
-    ) -> Reply:
-        members, now = members_of(packed) or (), self.machine.seconds()
-        ballot = Ballot(counter, agent) if counter else NONE
-        return self.acceptor.install(task_id, configuration, members, token, now, ballot, ttl)
+    def _install(self, agent: str, task_id: str, packed: bytes, keep: bool, ttl: float) -> Reply | None:
+        charter = self.world.judge.read(task_id, packed)
+        if charter is None or not charter.links:
+            return None
+        ballot = charter.ballot if keep and charter.ballot.agent == agent else NONE
+        told = charter.configuration, charter.members, charter.token, self.machine.seconds(), ballot, ttl, packed
+        return self.acceptor.install(task_id, *told)
+
+    @property
+    def _identity(self) -> Identity:
+        return self.world.identities[self.place]

@@ -13,10 +13,11 @@ from agents import circle
 from agents.docket import Docket
 from drivers.errors import StaleCommand
 from drivers.gate import Gate
-from middleware.commitment import ledger, lessee
+from middleware.commitment import charter, ledger, lessee
 from middleware.commitment import round as round_
 from middleware.commitment.acceptor import Acceptor
-from middleware.commitment.ballot import GRANTED, OVER, Reply, members_of
+from middleware.commitment.ballot import GRANTED, OVER, Reply
+from middleware.commitment.charter import pin
 from middleware.commitment.council import Council
 from middleware.commitment.lessee import Lease, Lessee
 from middleware.commitment.round import Round
@@ -179,7 +180,7 @@ def _only_listens(self: Lessee, asked: Round) -> None:
 
 def _closest_now(self: Leases, place: int, task_id: str) -> Any:
     near = [n for n in range(self.n) if not {(place, n), (n, place)} & self.radio.cut and self.is_up(n)]
-    return tuple(self.contacts[n] for n in near[:3]), 1
+    return pin(self.operator, task_id, tuple(self.contacts[n] for n in near[:3]))
 
 
 def _forgets_tokens(self: ledger.Ledger, task_id: str) -> None:
@@ -195,8 +196,8 @@ def _admits_lower_tokens(self: Gate, permit: Any, now: float) -> None:
     self._token, self._deadline = permit.token, permit.deadline
 
 
-async def _decided_by_the_new(self: Council, ballot: Any, packed: Any, keep: bool) -> Round:
-    members = members_of(packed) or ()
+async def _decided_by_the_new(self: Council, ballot: Any, members: Any, keep: bool) -> Round:
+    packed = [member.packed() for member in members]
     question = (self.task_id, self.configuration, ballot.counter, packed, self.token, keep)
     return await Round(members, self._ask, self._clock, "lease.change", question, (GRANTED,), self.ttl / 3).outcome
 
@@ -262,7 +263,10 @@ BUGS: dict[str, list[tuple[Any, str, Any]]] = {
     "granted before it stands still": [(Acceptor, "release", _released_at_rest)],
     "the device takes lower tokens": [(Gate, "admit", _admits_lower_tokens)],
     "a restarted member grants at once": [(Acceptor, "_silence", lambda self, ttl: 0.0)],
-    "the new council decides the change": [(Council, "_decision", _decided_by_the_new)],
+    "the new council decides the change": [
+        (Council, "_decision", _decided_by_the_new),
+        (charter, "_is_majority", lambda members, signed: True),
+    ],
 }
 LEASE_BUGS = tuple(list(BUGS)[-16:])
 

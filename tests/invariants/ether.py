@@ -214,7 +214,7 @@ class Ether:
 class Council:
     """A council of the operator alone, which never changes."""
 
-    def learn(self, configuration: int, members: object) -> None:
+    def learn(self, packed: bytes) -> None:
         """The record tells nothing new."""
 
     def visit(self) -> None:
@@ -253,9 +253,9 @@ class Lessee:
     def suspect(self) -> None:
         """Who wants it asks often enough."""
 
-    def end(self) -> Deferred[object]:
-        """Give back, as the task has ended."""
-        return self.release()
+    def end(self, token: int) -> Deferred[bytes]:
+        """The council lets everybody end a task here."""
+        return succeed(b"")
 
     def stand_by(self, rank: int = 1) -> None:
         """Nobody is told here when a lease is free: only who wants it asks."""
@@ -349,7 +349,7 @@ class Node:
             report=report,
             withdraw=withdraw,
             leave=lambda: followers.remove((heard, ordered)),
-            conclude=lambda result: ether.conclude(place, task_id, result),
+            conclude=lambda result, proof: ether.conclude(place, task_id, result),
         )
 
     def lessee(self, task: Task, changed: Callable[[], None], floor: int) -> Lessee:

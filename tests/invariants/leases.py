@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Sequence
+from typing import Any
 
 from twisted.internet.defer import Deferred
 from twisted.python.failure import Failure
@@ -154,7 +155,7 @@ class Leases(Team):
     def _depart_suddenly(self, task_id: str, token: int, holder: int) -> None:
         """The executor is killed, frozen or cut off; one member of the council goes with it."""
         gone_at, dice = self.clock.seconds(), self._dice
-        members = [self.place_of(member) for member in self.councils[task_id][0]]
+        members = [self.place_of(member) for member in self.councils[task_id].members]
         spare = [place for place in members if place not in self.agents]
         also = [dice.choice(spare)] if spare and holder not in members else []
         how = dice.choice(["kill", "freeze", "suspend", "cut"])
@@ -186,15 +187,18 @@ class Leases(Team):
             self.referee.stop(holder, task_id)
         history = self.referee.history
         asked = history.asked(place, "close", task_id)
-        closing = self.bidders[place].lessee(task_id).council.close(token if place == holder else 0)
-        if place == holder:
-            self.bidders[holder].lessee(task_id).release()
+        lessee = self.bidders[place].lessee(task_id)
+        closing: Deferred[Any] = lessee.end(token) if place == holder else lessee.council.close()
+
+        def ended(_: object) -> None:
+            lessee.release()
+            history.answered(asked)
 
         def failed(failure: Failure) -> None:
             failure.trap(EntangledError)
             history.unanswered(asked, failure.value)
 
-        closing.addCallbacks(lambda _: history.answered(asked), failed)
+        closing.addCallbacks(ended, failed)
         self.clock.advance(2 * self.ttl)
         for agent in self.agents:
             self.bidders[agent].lessee(task_id).want()
@@ -284,7 +288,7 @@ class Leases(Team):
                         self.bidders[agent].leave(task_id)
             chosen = sorted(self._dice.sample(range(self.n), 3))
             if is_torn:
-                sitting = [self.place_of(member) for member in self.councils[task_id][0]]
+                sitting = [self.place_of(member) for member in self.councils[task_id].members]
                 chosen = sorted(range(self.n), key=lambda n: n in sitting)[:3]
                 self.clock.callLater(0.4 + self.stop_time, self._clog, place, *chosen)
             members = [self.contacts[n] for n in chosen]

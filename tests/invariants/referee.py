@@ -92,8 +92,8 @@ class Referee:
 
     def look_at_cuts(self) -> None:
         """Note who no longer reaches a majority of the council, both ways, and who does again."""
-        for task_id, (members, _) in self._world.councils.items():
-            places = [self._world.place_of(member) for member in members]
+        for task_id, charter in self._world.councils.items():
+            places = [self._world.place_of(member) for member in charter.members]
             for agent in self._world.agents:
                 near = [p for p in places if not {(agent, p), (p, agent)} & self._world.radio.cut]
                 is_reached, mine = len(near) >= quorum(len(places)), (task_id, agent)

@@ -8,10 +8,11 @@ from typing import Any
 
 from twisted.internet.defer import Deferred
 
-from middleware.commitment.ballot import FIRST
+from middleware.commitment.charter import Charter, Judge, pin
 from middleware.commitment.council import Council
 from middleware.entangled.clock import HeapClock
 from middleware.entangled.data.memory import MemoryStore
+from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address
 from sim.team.event import Born, Died
@@ -50,8 +51,12 @@ class Team:
         self.referee = Referee(self)
         self.referee.agree()
         keys = random.Random(f"{seed}/keys")
-        self.contacts = [Contact(keys.randbytes(32), Address("10.0.0.1", 7000 + n)) for n in range(self.n)]
-        self.councils: dict[str, tuple[tuple[Contact, ...], int]] = {}
+        self.identities = [Identity(keys.randbytes(32)) for _ in range(self.n)]
+        self.operator = Identity(keys.randbytes(32))
+        self.judge = Judge(lambda public, task_id: public == self.operator.public)
+        places = enumerate(self.identities)
+        self.contacts = [Contact(one.public, Address("10.0.0.1", 7000 + n)) for n, one in places]
+        self.councils: dict[str, Charter] = {}
         self._seed = seed
         self._rates = rates
         self._places = {contact.public: n for n, contact in enumerate(self.contacts)}
@@ -62,7 +67,8 @@ class Team:
 
     def add_task(self, task_id: str, council: Sequence[int]) -> None:
         """One more task, with its council pinned."""
-        self.councils[task_id] = tuple(self.contacts[place] for place in council), FIRST
+        members = tuple(self.contacts[place] for place in council)
+        self.councils[task_id] = pin(self.operator, task_id, members)
         self.referee.add(task_id)
 
     # -- what bidders need ------------------------------------------------------------------------------------------
@@ -71,14 +77,14 @@ class Team:
         """Where a contact is."""
         return self._places[contact.public]
 
-    def council_for(self, place: int, task_id: str) -> tuple[tuple[Contact, ...], int]:
-        """The council as the task's record names it."""
+    def council_for(self, place: int, task_id: str) -> Charter:
+        """The council as the records of the task prove it."""
         return self.councils[task_id]
 
     def moved(self, task_id: str, council: Council) -> None:
         """Let the record name a newer council."""
-        if council.configuration > self.councils[task_id][1]:
-            self.councils[task_id] = council.members, council.configuration
+        if council.charter is not None and council.configuration > self.councils[task_id].configuration:
+            self.councils[task_id] = council.charter
             self.referee.look_at_cuts()
 
     def ask(

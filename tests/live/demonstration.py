@@ -44,8 +44,8 @@ class Demonstration:
         self._token = ""
         try:
             self.invitation = self._invitation("Over TLS: " if is_secure else "The page: ", log)
-            self.url, _, self.code = self.invitation.partition("#code=")
-            self._token = self.api("session", {"code": self.code})["token"]
+            url, _, self.code = self.invitation.partition("#code=")
+            self.sign_in(url)
         except BaseException:
             self.stop()
             raise
@@ -64,6 +64,11 @@ class Demonstration:
             raise AssertionError("".join(said) + log.read_text(encoding="utf-8"))
         threading.Thread(target=self._process.stdout.read, daemon=True).start()
         return said[-1].split()[2]
+
+    def sign_in(self, url: str) -> None:
+        """Ask the node of the page at ``url`` from now on."""
+        self.url = url
+        self._token = self.api("session", {"code": self.code})["token"]
 
     def api(self, path: str, body: Any = None) -> Any:
         """What the node of the page at ``url`` answers an operator; ``body`` is sent as JSON."""

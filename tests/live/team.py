@@ -1,7 +1,7 @@
 """A web node with three dogs that stand still: the server of the page's tests, run as a child process.
 
 ``python -m tests.live.team`` prints the port, the code to sign in with, and an operator's token and ticket in its first
-line; whoever has signed in at one is signed in at the next.  Lines on its input change the team: ``gone NAME``, ``back
+line; vaio and pi vouch for each other's sessions.  Lines on its input change the team: ``gone NAME``, ``back
 NAME``, ``status NAME STATUS``, ``freeze SECONDS`` (the whole process stands), ``name NAME`` (of the node that serves),
 ``pages NODE=URL ...`` (the web nodes, itself first), ``strange FILE`` (devices and tasks whose words are those of that
 JSON list), ``session SECONDS`` (that one is signed in for at a time), ``place NAME KEY=NUMBER ...`` (where it says that
@@ -15,6 +15,7 @@ import json
 import random
 import sys
 import time
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,7 @@ from twisted.protocols.basic import LineReceiver
 
 from middleware.fault import KINDS
 from swarmnode.gateway import sides
+from tests.live.keys import GATEWAYS, key_of
 from webnode.board import (
     Board,
     Knob,
@@ -40,6 +42,8 @@ from webnode.board import (
     MemorySurvey,
     MemoryTuning,
     Page,
+    Token,
+    Visitor,
 )
 from webnode.camera import OnFrame
 from webnode.chronicle import TeamChronicle
@@ -48,7 +52,7 @@ from webnode.invite import TeamInvites
 from webnode.limits import AddressLimits
 from webnode.password import hashed, is_password
 from webnode.server import WebService, web_service
-from webnode.session import SignedSessions
+from webnode.session import NOBODY, SignedSessions
 from webnode.state import Departed, State, state_of
 
 reactor: Any = _reactor
@@ -278,7 +282,7 @@ class Orders(LineReceiver):
 
     def connectionMade(self) -> None:
         """Say where the team is, and how to come in."""
-        token = self._sessions.token("operator", "operator", time.time(), 3600.0)
+        token = self._sessions.token(NOBODY, "operator", "operator", time.time(), 3600.0)
         self.sendLine(f"{self._web.port} {self._sessions.code} {token.text} {token.ticket}".encode())
 
     def lineReceived(self, line: bytes) -> None:
@@ -292,9 +296,11 @@ class Orders(LineReceiver):
             next(each for each in self._team.devices if each["name"] == rest[0])["status"] = rest[1]
         elif verb == "name":
             self._team.node = rest[0]
+            self._sessions.key = key_of(rest[0])
         elif verb == "pages":
             named = [each.split("=") for each in rest]
-            self._pages[:] = [Page(node, url, is_self=place == 0) for place, (node, url) in enumerate(named)]
+            uuids = [key_of(node).node_id.hex() for node, _ in named]
+            self._pages[:] = [Page(uuids[place], url, is_self=place == 0) for place, (_, url) in enumerate(named)]
         elif verb == "freeze":
             time.sleep(float(rest[0]))
         elif verb == "place":
@@ -323,12 +329,22 @@ def board(team: Team) -> Board:
     able = [{"uuid": f"{n:02x}" * 16, "name": f"dog{n}", "busy": "Patrol the yard" * (n == 2)} for n in (1, 2)]
     desk.previews["search"] = {"able": able, "refused": {"dog3": ["no gripper", "no lift"]}, "likely": None}
     desk.together["yard"] = [{"id": "t1", "title": "Find and touch the red target"}]
-    sessions = SignedSessions(b"a team of the tests", "quiet-otter", PASSWORD, random.Random(), checked)
+    gateways = {key_of(name).public for name in GATEWAYS}
+    sessions = TeamSessions(key_of(team.node), gateways.__contains__, "quiet-otter", PASSWORD, random.Random(), checked)
     tuning = MemoryTuning({able[0]["uuid"]: KNOBS})
     survey = MemorySurvey(network(), {f"0{n}" * 16: inventory() for n in (1, 2)}, links(), membership())
     parts: dict[str, Any] = {"halts": team.halts, "tuning": tuning, "survey": survey, "chronicle": TeamChronicle()}
     parts["faults"], parts["phones"] = MemoryFaults(*KINDS), MemoryPhones(check=sides)
     return Board(desk, sessions, MemoryAudit(time.time), limits=AddressLimits(), **parts)
+
+
+class TeamSessions(SignedSessions):
+    """Sessions with tokens for gateways alone, whoever is listed."""
+
+    def passes(self, who: Visitor, nodes: Iterable[str], now: float) -> dict[str, Token]:
+        """Those of gateways."""
+        gateways = {key_of(name).node_id.hex() for name in GATEWAYS}
+        return super().passes(who, [node for node in nodes if node in gateways], now)
 
 
 def checked(text: str, password: str) -> Deferred[Any]:
@@ -423,7 +439,7 @@ def main() -> None:
     port = int(sys.argv[1]) if len(sys.argv) > 1 else 0
     pages = MemoryFallbacks()
     served = replace(board(team), fallbacks=pages)
-    web = web_service(reactor, "127.0.0.1", port, team.read, served, team, time.time)
+    web = web_service(reactor, "127.0.0.1", port, team.read, served, team, time.time, ("vaio.local",))
     pages_here = ["http://192.168.0.7:8080", "https://192.168.0.7:8443", f"http://127.0.0.1:{port}"]
     served.invites = TeamInvites(lambda: pages_here, b"PEM", "AB:CD:" * 10, reactor, reactor.getThreadPool())
     web.startService()

@@ -137,9 +137,11 @@ class UnreachableBootstrapTests(LiveTests):
         with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as silent:
             silent.bind(("127.0.0.1", 0))
             port = silent.getsockname()[1]
-            child = self.start(
-                "--name", "a", "--team-key", "t", "--known-nodes", f"127.0.0.1:{port}", "--store", "a.sqlite"
-            )
+            key = self.folder / "team.key"
+            key.touch(mode=0o600)
+            key.write_text("t\n")
+            flags = ("--name", "a", "--team-key-file", str(key), "--known-nodes", f"127.0.0.1:{port}")
+            child = self.start(*flags, "--store", "a.sqlite")
             self.addCleanup(child.kill)
             assert child.stdout is not None and child.stderr is not None
             self.addCleanup(child.stdout.close)

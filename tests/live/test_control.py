@@ -28,7 +28,10 @@ class ControlTests(SynchronousTestCase):
     def start(self, *flags: str) -> subprocess.Popen[bytes]:
         """A node that has joined."""
         twistd = str(Path(sys.executable).parent / "twistd")
-        flags = flags or ("--name", "a", "--store", "a.sqlite", "--team-key", "t")
+        key = self.runtime / "team.key"
+        key.touch(mode=0o600)
+        key.write_text("t\n")
+        flags = flags or ("--name", "a", "--store", "a.sqlite", "--team-key-file", str(key))
         command = [sys.executable, twistd, "-n", "--pidfile=", "swarm-node", *flags]
         child = subprocess.Popen(
             command, cwd=self.runtime, env=self.environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT

@@ -88,6 +88,30 @@ class FallbackTests(BrowserCase):
         self.page.locator("#line", has_text="The demo runs").wait_for()
         self.served("pi")
 
+    def test_go_past_an_impostor(self) -> None:
+        """A page that is listed and has no token, as its node is no gateway, is asked nothing; no URL has a token."""
+        eve = Team()
+        self.addCleanup(eve.stop)
+        eve.order("name eve")
+        urls = [f"{name}={web.url[:-1]}" for name, web in (("vaio", self.webs[0]), ("eve", eve), ("pi", self.webs[1]))]
+        self.webs[0].order(f"pages {' '.join(urls)}")
+        shown: list[tuple[str, str]] = []
+        self.page.on("request", lambda request: shown.append((request.url, request.headers.get("authorization", ""))))
+        self.opened()
+        held = self.page.evaluate("JSON.parse(localStorage.getItem('swarm.sessions'))")
+        self.assertEqual(sorted(held), sorted(web.url[:-1] for web in self.webs))
+        self.lose(signal.SIGSTOP)
+        self.served("pi")
+        self.page.get_by_role("button", name="Run Demo").click()
+        self.page.locator("#line", has_text="The demo runs").wait_for()
+        self.assertEqual([url for url, _ in shown if url.startswith(eve.url)], [])
+        tokens = {url: session["token"] for url, session in held.items()}
+        for url, token in tokens.items():
+            self.assertEqual([asked for asked, _ in shown if token in asked], [])
+            strays = [asked for asked, header in shown if token in header and not asked.startswith(f"{url}/")]
+            self.assertEqual(strays, [])
+        os.kill(self.pid(0), signal.SIGCONT)
+
     def test_new_task_is_asked_for_again(self) -> None:
         """A task that is asked of a node which is frozen is asked of the other, by the same name for the wish."""
         self.opened()

@@ -107,11 +107,12 @@ class InviteTests(PageCase):
         phone.goto(f"{self.team.url}#{link.partition('#')[2]}")
         # The address is mended at once, the session is there only when the node has answered.
         phone.wait_for_function(
-            "() => location.hash === '#phone' && JSON.parse(localStorage['swarm-session'] ?? '{}').token"
+            "() => location.hash === '#phone' && "
+            "JSON.parse(localStorage['swarm.sessions'] ?? '{}')[location.origin]?.token"
         )
         self.assertNotIn("code", phone.url)
         role = phone.evaluate(
             "fetch('/api/v1/session', {headers: {Authorization: 'Bearer ' + "
-            "JSON.parse(localStorage['swarm-session']).token}}).then(answer => answer.json())"
+            "JSON.parse(localStorage['swarm.sessions'])[location.origin].token}}).then(answer => answer.json())"
         )
         self.assertEqual(role["role"], "phone")

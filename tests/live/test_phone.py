@@ -295,7 +295,7 @@ class DemonstrationPhoneTests(Browser, DemonstrationCase):
         before = self.devices()["anna"]
         os.kill(next(pid for pid, name in family(self.demo.pid).items() if name == "vaio"), signal.SIGKILL)
         page.locator("#node", has_text="pi").wait_for()
-        self.demo.url = page.evaluate("import('/static/link.js').then(({ base }) => base())") + "/"
+        self.demo.sign_in(page.evaluate("import('/static/link.js').then(({ base }) => base())") + "/")
         self.until(lambda: self.devices().get("anna", before)["address"] != before["address"], 15.0 * stretch(), page)
         page.locator(".phone .said", has_text="Nothing to do").wait_for()
         after = self.devices()["anna"]

@@ -12,13 +12,14 @@ from email.message import Message
 from importlib.util import find_spec
 from typing import Any, get_args
 
+from tests.live.keys import key_of
 from tests.live.page import TeamCase
 from webnode.board import Role
 from webnode.guard import HEADERS
 from webnode.route import ALLOWED, Route
 from webnode.routes.phones import BOUND
 from webnode.routes.table import TABLE
-from webnode.seal import Claim, Seal
+from webnode.token import Claim
 
 MISSING = [name for name in ("flask", "cv2") if find_spec(name) is None]
 NAMES = {"uuid": "01" * 16, "task_id": "t1", "file": "page.js"}
@@ -38,7 +39,7 @@ class SafetyTests(TeamCase):
 
     def setUp(self) -> None:
         super().setUp()
-        self._seal = Seal(b"a team of the tests")
+        self._key = key_of("vaio")
         self._number = 0
 
     def token(self, role: Role, ticket: bool = False, name: str = "") -> str:
@@ -47,7 +48,7 @@ class SafetyTests(TeamCase):
             return ""
         self._number += 1
         claim = Claim(f"{self._number:016x}", name or role, role, int(time.time()) + 600)
-        return self._seal.text(claim.ticket if ticket else claim)
+        return self._key.token(claim.ticket if ticket else claim)
 
     def asked(self, method: str, path: str, body: bytes | None = None, **headers: str) -> Answer:
         """One request on a connection of its own; of a stream only its beginning is read."""
@@ -93,11 +94,21 @@ class SafetyTests(TeamCase):
         self.assertEqual(wrong, [])
 
     def test_take_no_other_token(self) -> None:
-        """Tokens that have run out, of another team, cut short, or made up open nothing."""
+        """Tokens that have run out, by a node that is no gateway, for another one, cut or made up open nothing."""
         old = Claim("ab" * 8, "x", "operator", int(time.time()) - 1)
         good = self.token("operator")
-        forged = Seal(b"another team").text(Claim("ab" * 8, "x", "operator", int(time.time()) + 600))
-        for token in (self._seal.text(old), forged, good[:-2], good[:-1] + "%", "null", "operator", "A" * 4000):
+        forged = key_of("eve").token(Claim("ab" * 8, "x", "operator", int(time.time()) + 600))
+        elsewhere = key_of("pi").token(Claim("ab" * 8, "x", "operator", int(time.time()) + 600))
+        for token in (
+            self._key.token(old),
+            forged,
+            elsewhere,
+            good[:-2],
+            good[:-1] + "%",
+            "null",
+            "operator",
+            "A" * 4000,
+        ):
             status, _, body = self.asked("GET", "/api/v1/state", Authorization=f"Bearer {token}")
             self.assertEqual(status, 401, token[:40])
             self.assertNotIn(token.encode(), body)
@@ -123,7 +134,7 @@ class SafetyTests(TeamCase):
         yield "host", self.asked("GET", "/", Host="evil.example")
         for data in (b"nonsense\r\n\r\n", b"GET / HTTP/1.1\r\nno colon\r\n\r\n"):
             yield data.decode(), self.raw(data)
-        yield "413", self.raw(b"POST / HTTP/1.1\r\nHost: vaio\r\nContent-Length: 10485760\r\n\r\n")
+        yield "413", self.raw(b"POST / HTTP/1.1\r\nHost: localhost\r\nContent-Length: 10485760\r\n\r\n")
 
     def raw(self, data: bytes) -> Answer:
         """What bytes are answered with that no client would send."""
@@ -141,7 +152,7 @@ class SafetyTests(TeamCase):
         def told(path: str, body: bytes, method: str = "POST", **headers: str) -> Any:
             return lambda: self.asked(method, path, body, **{**signed, **headers})
 
-        head = b"POST /api/v1/message HTTP/1.1\r\nHost: vaio\r\n"
+        head = b"POST /api/v1/message HTTP/1.1\r\nHost: localhost\r\n"
         cases = (
             ("10 MiB", 413, lambda: self.raw(head + b"Content-Length: 10485760\r\n\r\n")),
             ("65 KiB", 413, told("/api/v1/message", b"x" * 65 * 1024 + b"x")),

@@ -63,7 +63,7 @@ class SigningInTests(PageCase):
         viewer.locator("figure[data-camera=live]").first.wait_for()
         told = viewer.evaluate(
             "fetch('/api/v1/demo', {method: 'POST', headers: {'X-Swarm': '1', Authorization: 'Bearer ' + "
-            "JSON.parse(localStorage['swarm-session']).token}}).then(answer => answer.status)"
+            "JSON.parse(localStorage['swarm.sessions'])[location.origin].token}}).then(answer => answer.status)"
         )
         self.assertEqual(told, 403)
 
@@ -101,7 +101,7 @@ class SigningInTests(PageCase):
         page = self.opened(DESK)
         page.evaluate(
             "fetch('/api/v1/session', {method: 'DELETE', headers: {'X-Swarm': '1', Authorization: 'Bearer ' + "
-            "JSON.parse(localStorage['swarm-session']).token}})"
+            "JSON.parse(localStorage['swarm.sessions'])[location.origin].token}})"
         )
         self.team.order("freeze 3")
         page.locator("#signin-code").fill(self.team.code, timeout=15_000)
@@ -113,11 +113,13 @@ class SigningInTests(PageCase):
         # The page is told an hour before.
         self.team.order("session 3603")
         page = self.opened(DESK)
-        first = page.evaluate("JSON.parse(localStorage['swarm-session']).token")
+        first = page.evaluate("JSON.parse(localStorage['swarm.sessions'])[location.origin].token")
         held = first
         for _ in range(2):
-            page.wait_for_function("held => JSON.parse(localStorage['swarm-session']).token !== held", arg=held)
-            held = page.evaluate("JSON.parse(localStorage['swarm-session']).token")
+            page.wait_for_function(
+                "held => JSON.parse(localStorage['swarm.sessions'])[location.origin].token !== held", arg=held
+            )
+            held = page.evaluate("JSON.parse(localStorage['swarm.sessions'])[location.origin].token")
         self.assertNotEqual(page.locator("#link").get_attribute("data-link"), "lost")
         self.team.order("status dog3 IDLE")
         page.locator(".device[data-state=IDLE]", has_text="dog3").wait_for()

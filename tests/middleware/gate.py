@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from middleware.entangled.record import Slot
-from middleware.entangled.wire.door import FOREIGN, NONCE, Life
+from middleware.entangled.wire.door import FOREIGN, NONCE, Authority, Life, OpenDoor
 
 ROOM = 640
 
 
-class Gate:
+class Gate(OpenDoor):
     """Lets in who shows a pass that begins with ``pass``, unless its key is among ``refused``.
 
     ``forbidden`` are pairs of a public key and a method, ``unwritable`` pairs of a public key and a slot's name.
@@ -37,3 +37,19 @@ class Gate:
     def may_store(self, slot: Slot) -> bool:
         """As the test says."""
         return (slot.owner, slot.name) not in self.unwritable
+
+    def may_stay(self, slot: Slot) -> bool:
+        """What may be written."""
+        return self.may_store(slot)
+
+    def authority(self, owner: bytes) -> Authority:
+        """As ``judge`` says of who shows a good pass."""
+        return Authority(self.refused.get(owner, ""))
+
+    def certificate(self, owner: bytes) -> bytes:
+        """The same for all."""
+        return self.shown
+
+    def learn(self, owner: bytes, certificate: bytes) -> bool:
+        """As ``judge`` says."""
+        return not self.judge(owner, certificate)

@@ -88,7 +88,7 @@ class VerbTests(NodeCase):
         fleet = self.fleet(2)
         for place in range(12):
             name = f"{place:02}" + "ä" * (MAX_NAME // 2 - 1)
-            fleet.nodes[0].put(KEY, name, bytes([place]) * (MAX_VALUE if place < 4 else 1))
+            fleet.nodes[0].put(KEY, name, bytes([place]) * (MAX_VALUE if place < 3 else 1))
         fleet.run(1.0)
         self.assertEqual(len(self.values(fleet, 1)), 12)
 

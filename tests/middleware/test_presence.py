@@ -35,10 +35,10 @@ DEVICE = Device(
 )
 
 
-def record(value: object, owner: Identity = DOG) -> Record:
-    """A record with this value; anything but bytes is packed."""
+def record(value: object, owner: Identity = DOG, name: str = "dog") -> Record:
+    """A record with this value in the slot of that name; anything but bytes is packed."""
     packed = value if isinstance(value, bytes) or value is None else bytes(msgpack.packb(value))
-    return Record(DEVICES, "dog", owner.public, 1, "leased", 1.0, packed, bytes(64))
+    return Record(DEVICES, name, owner.public, 1, "leased", 1.0, packed, bytes(64))
 
 
 def content(**changes: object) -> dict[str, object]:
@@ -118,9 +118,17 @@ class DeviceTests(SynchronousTestCase):
     def test_order_of_joining(self) -> None:
         """Devices come in the order in which they joined, equal ones by uuid, and what is no device is left out."""
         cat = Device(CAT.node_id.hex(), "cat", joined=1)
-        records = [record(DEVICE.packed()), record(cat.packed(), CAT), record(b"?")]
+        records = [record(DEVICE.packed()), record(cat.packed(), CAT, "cat"), record(b"?")]
         self.assertEqual([d.name for d, _ in devices_of(records)], ["cat", "dog"])
         self.assertEqual(devices_of(records)[0][1], records[1])
+        self.assertEqual(devices_of([record(cat.packed(), CAT, "dog")]), [])
+
+    def test_one_name_twice(self) -> None:
+        """Devices of one name are told apart by their ids; a device that stands at two places is one."""
+        cat = Device(CAT.node_id.hex(), "dog", joined=1)
+        records = [record(DEVICE.packed()), record(cat.packed(), CAT)]
+        self.assertEqual([d.name for d, _ in devices_of(records)], [f"dog-{d.uuid[:6]}" for d in (cat, DEVICE)])
+        self.assertEqual([d.name for d, _ in devices_of([records[0], records[0]])], ["dog", "dog"])
 
     def test_message_lines(self) -> None:
         """Only the newest lines are kept, each cut to its length."""

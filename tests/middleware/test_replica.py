@@ -73,7 +73,9 @@ class ReplicaTests(SynchronousTestCase):
 
     def stored(self, *records: Record, peer: Contact | None = None) -> list[int]:
         """What the replica answers to a STORE."""
-        return self.replica.answer_store(peer or self.dog, [r.packed() for r in records])
+        answers = self.replica.answer_store(peer or self.dog, [r.packed() for r in records])
+        assert isinstance(answers, list)
+        return answers
 
     def test_the_stronger_record_is_kept(self) -> None:
         """A newer record is taken, the same one again too, and against an older one the number that holds is told."""

@@ -11,7 +11,7 @@ from middleware import halt, presence, roles, tasks, verdict
 from middleware.deployment.manifest import manifests_key
 from middleware.entangled.identity import Identity
 from middleware.entangled.record import Slot, hashed_key
-from middleware.entangled.wire.door import Life
+from middleware.entangled.wire.door import Authority, Life, OpenDoor
 from middleware.node import SwarmNode
 from middleware.prefix import places_of
 from middleware.roles import (
@@ -39,7 +39,7 @@ ABSENT = ("roll.", "reach.")
 """What the methods begin with that not every node has."""
 
 
-class RoleDoor:
+class RoleDoor(OpenDoor):
     """Lets everybody in; ``roles`` by public key say what each may, and ``refusals`` has what was not allowed."""
 
     room = 0
@@ -62,6 +62,22 @@ class RoleDoor:
     def may_store(self, slot: Slot) -> bool:
         """By the table."""
         return self._noted(may_store(self._known[slot.owner], slot), slot.owner, kind_of(slot))
+
+    def may_stay(self, slot: Slot) -> bool:
+        """What may be written."""
+        return may_store(self._known[slot.owner], slot)
+
+    def authority(self, owner: bytes) -> Authority:
+        """By what the test says."""
+        return Authority("", self._known[owner])
+
+    def certificate(self, owner: bytes) -> bytes:
+        """Nobody has one."""
+        return b""
+
+    def learn(self, owner: bytes, certificate: bytes) -> bool:
+        """Nobody needs one."""
+        return False
 
     def _noted(self, is_allowed: bool, public: bytes, what: str) -> bool:
         if not is_allowed:
@@ -133,6 +149,8 @@ class TableTests(SynchronousTestCase):
             tasks.MEMBER: roles.MEMBER,
             tasks.RESULT: roles.RESULT,
             tasks.ORDER: roles.ORDER,
+            tasks.COUNCIL: roles.COUNCIL,
+            tasks.DONE: roles.ENDED,
             verdict.slot_of(7): roles.VERDICT,
             deploy.SOURCE: roles.SOURCE,
             "0": OTHER,
@@ -155,6 +173,10 @@ class TableTests(SynchronousTestCase):
         for method in ("device.halt", "device.tune", "device.message", "device.disconnect", "device.fault"):
             self.assertEqual([role for role in ROLES if may_call((role,), method)], [OPERATOR, GATEWAY])
         self.assertEqual([role for role in ROLES if may_call((role,), "lease.propose")], [DEVICE, GATEWAY])
+        self.assertEqual([role for role in ROLES if may_call((role,), "lease.close")], [DEVICE, GATEWAY])
+        self.assertEqual([role for role in ROLES if may_call((role,), "lease.cancel")], [OPERATOR, GATEWAY])
+        for written in (slot(tasks.TASKS), slot(tasks.group_key("t"), tasks.RESULT)):
+            self.assertEqual([role for role in ROLES if may_store((role,), written)], [OPERATOR, GATEWAY])
         self.assertEqual([role for role in ROLES if may_store((role,), slot(halt.HALT))], [OPERATOR, GATEWAY])
         self.assertTrue(may_store((BOOTSTRAP,), slot(hashed_key("tuples/admission/2"))))
 
@@ -189,5 +211,7 @@ class TeamTests(SynchronousTestCase):
 
             self.patch(assembly, "SwarmNode", made)
             outcome = trial(partial(VirtualTeam, others=("looker",)), experiment, 3)
+            # Whether a viewer may be a member of a council is asked, and it may not.
+            refusals = [refusal for refusal in refusals if refusal != ((VIEWER,), "lease.freed")]
             self.assertEqual((outcome.broken, refusals), ([], []))
             self.assertTrue(outcome.found)

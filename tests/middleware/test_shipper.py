@@ -41,7 +41,7 @@ class ShipperTests(FleetCase):
         """Note how many records each question brings."""
         replica, answer = self.world.nodes[1].replica, Replica.answer_store
 
-        def counted(peer: Contact, packed: list[object], *left: Any) -> list[int]:
+        def counted(peer: Contact, packed: list[object], *left: Any) -> object:
             self.asked.append(len(packed))
             return answer(replica, peer, packed, *left)
 

@@ -180,7 +180,8 @@ class ReopenTest(SynchronousTestCase):
 
     def test_large_values(self) -> None:
         """Values as large as a record carries come back byte by byte, and are counted to the byte."""
-        kept = [record(str(number), value=bytes([number]) * MAX_VALUE) for number in range(4)]
+        owners = (DOG, DOG, CAT, CAT)
+        kept = [record(str(n), value=bytes([n]) * MAX_VALUE, owner=owner) for n, owner in enumerate(owners)]
         for one in kept:
             self.store.put(one, FOREVER)
         store = self.after_restart()

@@ -11,7 +11,7 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.data.store import MAX_BYTES, Store, weight
-from middleware.entangled.errors import Full, Refused
+from middleware.entangled.errors import OWNER_FULL, Full, Refused
 from middleware.entangled.identity import Identity
 from middleware.entangled.record import Lifetime, Record, Slot, hashed_key
 
@@ -232,6 +232,40 @@ class StoreContract(_Case):
         self.assertTrue(store.put(record("a", 2, value=bytes(499)), FOREVER))
         self.assertTrue(store.put(record("b", 3, value=b"1"), FOREVER))
         self.assertRaises(Full, store.put, record("c", value=bytes(600)), FOREVER)
+
+    def test_one_owner_leaves_as_much_as_it_has(self) -> None:
+        """Alone an owner gets half of the rows and bytes; the next one half of the rest, and a few whatever happens."""
+        for rows, octets, value in ((1000, MAX_BYTES, b""), (10_000, 1_000_000, bytes(10_000))):
+            store = self.make(rows, octets)
+            shares = [self.fill(store, owner, value) for owner in (DOG, CAT)]
+            self.assertEqual(shares, [500, 250] if rows == 1000 else [49, 24])
+            self.assertEqual(self.assertRaises(Full, store.put, record("x", value=value), FOREVER).code, OWNER_FULL)
+            self.assertTrue(store.put(record("x", value=value, owner=Identity(b"n" * 32)), FOREVER))
+            self.assertTrue(store.put(record("0", sequence=2, value=None), FOREVER))
+            self.assertTrue(store.put(record("1", sequence=2, value=b""), FOREVER))
+
+    def test_room_of_an_owner_comes_back(self) -> None:
+        """Tombstones count for their owner; old ones of its own make room for it, those of others do not."""
+        store = self.make(1000, hold=30.0)
+        store.put(record("old", value=None, owner=CAT), 60.0)
+        for number in range(499):
+            store.put(record(str(number), value=None), 60.0)
+        self.assertRaises(Full, store.put, record("x"), FOREVER)
+        store.expire(31.0)
+        self.assertTrue(store.put(record("x"), FOREVER, now=31.0))
+        self.assertIsNone(store.slot(record("0").slot))
+        self.assertIsNotNone(store.slot(record("old", owner=CAT).slot))
+        store.discard(record("x").slot)
+        self.assertTrue(store.put(record("y"), FOREVER))
+
+    def fill(self, store: Store, owner: Identity, value: bytes) -> int:
+        """Put records of an owner until it is refused; how many were taken."""
+        for number in range(100_000):
+            try:
+                store.put(replace(record("", value=value), name=str(number), owner=owner.public), FOREVER)
+            except Full:
+                return number
+        return -1
 
     def test_what_has_run_out_makes_room(self) -> None:
         """Where the time is told, what has run out goes before anything else, and the next sweep tells of it."""

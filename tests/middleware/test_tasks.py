@@ -214,7 +214,7 @@ class DecoderTests(SynchronousTestCase):
                 lacking = refusals({"camera": {"width": 1}}, task.requirements)
                 self.assertTrue(all(isinstance(line, str) for line in lacking), lacking)
             self.assertIsInstance(member_of(record(MEMBER, one)), Member | None)
-            self.assertIsInstance(outcome_of([record(RESULT, one)]), Result | None)
+            self.assertIsInstance(outcome_of(TASK, [record(RESULT, one)]), Result | None)
 
 
 class OutcomeTests(SynchronousTestCase):
@@ -222,10 +222,10 @@ class OutcomeTests(SynchronousTestCase):
         """Of several results the one with the highest token holds, in any order; without any the task is open."""
         late = Result(FAILED, "cat", 1.0, 7)
         records = [record(RESULT, DONE.packed()), record(RESULT, late.packed(), CAT), record(MEMBER, REPORT.packed())]
-        self.assertEqual(outcome_of(records), late)
-        self.assertEqual(outcome_of(records[::-1]), late)
-        self.assertIsNone(outcome_of(records[2:]))
-        self.assertEqual(outcome_of([record(RESULT, Result(CANCELLED, "x").packed())]), Result(CANCELLED, "x"))
+        self.assertEqual(outcome_of(TASK, records), late)
+        self.assertEqual(outcome_of(TASK, records[::-1]), late)
+        self.assertIsNone(outcome_of(TASK, records[2:]))
+        self.assertEqual(outcome_of(TASK, [record(RESULT, Result(CANCELLED, "x").packed())]), Result(CANCELLED, "x"))
 
     def test_groups_are_apart(self) -> None:
         """Two tasks never share a key."""

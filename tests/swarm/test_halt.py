@@ -7,7 +7,7 @@ from typing import Any
 from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.halt import HALT, SLOT, UNHEARD, Word
+from middleware.halt import HALT, SLOT, UNHEARD
 from middleware.presence import DEVICES
 from swarmnode.rehearsal import VirtualTeam
 from webnode.halting import TeamHalts
@@ -104,7 +104,7 @@ class HaltTests(SynchronousTestCase):
             team.clock.advance(0.05)
             moved.update(dog.name for dog in team.yard.world.dogs.values() if dog.is_moving)
         self.assertEqual(moved, set())
-        self.assertTrue(team.services["dog3"].assembly.node.halt.word.is_on)
+        self.assertTrue(team.services["dog3"].assembly.node.halt.is_stopped)
         halts.release("ann")
         team.clock.advance(2.0)
         self.assertTrue([dog.name for dog in team.yard.world.dogs.values() if dog.is_moving])
@@ -119,37 +119,52 @@ class HaltTests(SynchronousTestCase):
         self.assertEqual(self.told(asked)["dog2"], UNHEARD)
         self.team.board.heal()
         self.team.clock.advance(15.0)
-        self.assertTrue(self.node("dog2").halt.word.is_on)
+        self.assertTrue(self.node("dog2").halt.is_stopped)
         self.assertEqual(self.moved_in(3.0), set())
 
-    def test_a_higher_word_is_outbid(self) -> None:
-        """A web node that does not know how far the count is says its word again with a higher one, and is obeyed."""
-        self.node("dog1").halt.take(Word(41, False, "bob"))
-        asked = self.halts.halt("ann")
-        self.team.clock.advance(0.2)
-        self.assertEqual(self.told(asked)["dog1"], "stands")
-        self.assertEqual({self.node(name).halt.word.count for name in ("vaio", "dog1", "dog2")}, {42})
+    def test_a_release_ends_the_stops_that_it_names(self) -> None:
+        """Two operators stop the team, and one lets go on what was shown before the second stop: the team stands."""
+        self.halts.halt("ann")
+        self.team.clock.advance(0.5)
+        shown = [stop["id"] for stop in self.team.state()["halt"]["stops"]]
+        self.halts.halt("bob")
+        self.halts.release("ann", shown)
+        self.team.clock.advance(1.0)
+        self.assertEqual([stop["by"] for stop in self.team.state()["halt"]["stops"]], ["bob"])
+        self.assertTrue(self.team.state()["halted"])
+        self.halts.release("ann")
+        self.team.clock.advance(1.0)
+        self.assertFalse(self.team.state()["halted"])
 
     def test_nobody_waits_for_who_is_silent(self) -> None:
-        """The word that has to be said again is said again at once, though another device does not answer at all."""
+        """Another device that does not answer delays nobody, and the page does not say that the team is stopped."""
         acting = self.until_executing()
         silent = "dog2" if acting == "dog1" else "dog1"
-        self.node(acting).halt.take(Word(41, False, "bob"))
         self.team.silence(silent)
         self.halts.halt("ann")
         self.team.clock.advance(BRAKING)
         self.assertNotIn(acting, self.moving())
-        self.assertTrue(self.node(acting).halt.word.is_on)
+        self.assertTrue(self.node(acting).halt.is_stopped)
+        self.team.clock.advance(3.0)
+        state = self.team.state()
+        self.assertEqual((state["halted"], [other["name"] for other in state["halt"]["others"]]), (False, [silent]))
 
-    def test_of_two_the_stop_wins(self) -> None:
-        """One releases and another halts with the same number: the team stands, whatever was heard first."""
-        for name, words in (("dog1", (True, False)), ("dog2", (False, True))):
-            for is_on in words:
-                self.node(name).halt.take(Word(7, is_on, "ann"))
-            self.assertTrue(self.node(name).halt.is_on)
+    def test_a_release_that_was_not_heard_shows(self) -> None:
+        """A robot that did not hear the release is named as one that still stands, and goes on when it hears it."""
+        self.halts.halt("ann")
+        self.team.clock.advance(1.0)
+        self.assertTrue(self.team.state()["halted"])
+        self.team.silence("dog2")
+        self.halts.release("ann")
+        self.team.clock.advance(2.0)
+        self.assertEqual(self.team.state()["halt"]["standing"], ["dog2"])
+        self.team.board.heal()
+        self.team.clock.advance(15.0)
+        self.assertFalse(self.node("dog2").halt.is_on)
+        self.assertEqual(self.team.state()["halt"]["stops"], [])
 
-    def test_a_record_that_is_no_word_is_nothing(self) -> None:
-        """What a peer writes there that is no word halts nobody and breaks nothing."""
+    def test_a_record_that_is_no_statement_is_nothing(self) -> None:
+        """What a peer writes there that is no statement halts nobody and breaks nothing."""
         for value in (b"", b"\xc1", b"\x93\x01\x02\x03", b"\x93\xff\xc3\xa1x", b"\x80"):
             self.node("vaio").entangled.put(HALT, SLOT, value, "team")
             self.team.clock.advance(0.5)

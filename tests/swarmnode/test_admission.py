@@ -28,7 +28,7 @@ from middleware.errors import BadSetting
 from middleware.settings import Settings
 from swarmnode.assembly import assembled
 from swarmnode.rehearsal import VirtualTeam
-from swarmnode.team import init, invite, join, members, promote, revoke, rotate
+from swarmnode.team import init, invitations, invite, join, members, promote, revoke, rotate
 from swarmnode.team.office import Desk
 from tests.swarmnode.shell import Shell
 from tests.swarmnode.team import KEY, World
@@ -257,6 +257,23 @@ class AdmissionTests(SynchronousTestCase):
         self.assertEqual(self.done(revoke.main, "dog9")["what"], "the member")
         self.assertEqual(self.names(), ["dog1", "vaio"])
         self.assertEqual([each["name"] for each in self.done(members.main)["revoked"]], ["dog9"])
+
+    def test_invitations_are_listed(self) -> None:
+        """Each code that can be used is listed with what is left of it; with ``--all`` the others, with who came."""
+        text = self.done(invite.main, "dog8", "--uses", "2", "--role", "viewer")["text"]
+        self.done(invite.main, "dog9")
+        name = self.joined(text)["name"]
+        told = self.done(invitations.main)["invitations"]
+        rows = [(row["name"], row["roles"], row["uses"], row["left"], row["state"], row["came"]) for row in told]
+        self.assertEqual(
+            sorted(rows),
+            [("dog8", ["viewer"], 2, 1, "open", [name]), ("dog9", ["device"], 1, 1, "open", [])],
+        )
+        self.done(revoke.main, "dog9", "--invitation")
+        self.assertEqual([row["name"] for row in self.done(invitations.main)["invitations"]], ["dog8"])
+        told = {row["name"]: row["state"] for row in self.done(invitations.main, "--all")["invitations"]}
+        self.assertEqual(told, {"dog8": "open", "dog9": "revoked"})
+        self.assertIn("dog8", self.run_verb(invitations.main)[1])
 
     def test_revoke_invitation(self) -> None:
         """With an invitation go all that came by it, and they are named."""

@@ -266,7 +266,7 @@ class GatewayTests(SynchronousTestCase):
         phone = Phone(self, self.gateways["vaio"])
         self.live(1.0)
         node = self.team.services["vaio"].assembly.node
-        node.halt.order(True, "test", node.entangled.overlay.contacts())
+        node.halt.stop("test", node.entangled.overlay.contacts())
         self.live(0.5)
         self.assertEqual(phone.said, "The team is stopped. Wait.")
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from swarmnode.invitation import Invitation, invitations, invited, url_of
+from swarmnode.invitation import Invitation, at_terminal, invitations, invited, url_of
 from swarmnode.web_code import main
 
 OWN = Invitation("vaio", "http://127.0.0.1:8080/", "quiet-otter", os.getpid())
@@ -33,6 +33,20 @@ class InvitationTests(SynchronousTestCase):
         self.assertEqual(invitations()[0].secure, "https://127.0.0.1:8443/")
         (note,) = (self.where / "swarm-node").iterdir()
         self.assertEqual(stat.S_IMODE(note.stat().st_mode), 0o600)
+
+    def test_show_the_code_at_a_terminal(self) -> None:
+        """Who started the node at a terminal is shown the code there; what is no terminal, or is closed, shows none."""
+        self.patch(sys.modules["middleware.entangled.control.place"], "MAX_PATH", 4096)
+        screen = io.StringIO()
+        invited("vaio", "0.0.0.0", lambda: 8080, "quiet-otter", terminal=screen)
+        self.assertIn("http://127.0.0.1:8080/#code=quiet-otter", screen.getvalue())
+        invited("vaio", "0.0.0.0", lambda: 8080, "", terminal=(silent := io.StringIO()))
+        self.assertEqual(silent.getvalue(), "")
+        closed = io.StringIO()
+        closed.close()
+        for stream in (None, io.StringIO(), closed):
+            self.patch(sys, "__stderr__", stream)
+            self.assertIsNone(at_terminal())
 
     def test_pass_over_what_is_no_note(self) -> None:
         """The note of a node that has ended, and what is no note, are passed over."""

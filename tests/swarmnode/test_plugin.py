@@ -166,13 +166,20 @@ class OptionsTests(SynchronousTestCase):
         self.assertEqual((settings.node.name, settings.web.port), ("b", 0))
         self.assertEqual(settings.node.known_nodes, (Address("10.0.0.1", 7000), Address("10.0.0.2", 7000)))
 
+    def key_file(self) -> str:
+        """A file that holds a team's secret."""
+        path = Path(self.mktemp())
+        path.touch(mode=0o600)
+        path.write_text("t\n", encoding="utf-8")
+        return str(path)
+
     def test_every_setting_of_a_flag_exists(self) -> None:
         """Each flag but the file's is a setting: all of them at once are accepted."""
         values = {
             "name": "a", "kind": "k", "host": "127.0.0.1", "port": "0", "known-nodes": "10.0.0.1:1",
-            "store": "s.sqlite", "membership": "m", "team-key": "t", "roles": "edge", "agent-module": "search",
-            "driver-kind": "sim", "web-host": "127.0.0.1", "web-port": "0", "web-tls": "auto", "web-tls-port": "0",
-            "web-yard": "10.0.0.1:1", "tunnels": "wss://a", "tunnel-port": "443", "lan": "false",
+            "store": "s.sqlite", "membership": "m", "team-key-file": self.key_file(), "roles": "edge",
+            "agent-module": "search", "driver-kind": "sim", "web-host": "127.0.0.1", "web-port": "0", "web-tls": "auto",
+            "web-tls-port": "0", "web-yard": "10.0.0.1:1", "tunnels": "wss://a", "tunnel-port": "443", "lan": "false",
         }  # fmt: skip
         self.assertEqual(set(values), {str(row[0]) for row in Options.optParameters} - {"config"})
         Options().parseOptions([word for name, value in values.items() for word in (f"--{name}", value)])

@@ -27,7 +27,9 @@ class Connection:
 
     def ask(self, path: str, method: str = "GET", **headers: str) -> Connection:
         """Send a request without a body; ``_`` in a header's name stands for ``-``."""
-        lines = "".join(f"{name.replace('_', '-')}: {value}\r\n" for name, value in {"Host": "vaio", **headers}.items())
+        lines = "".join(
+            f"{name.replace('_', '-')}: {value}\r\n" for name, value in {"Host": "localhost", **headers}.items()
+        )
         return self.send(f"{method} {path} HTTP/1.1\r\n{lines}\r\n".encode())
 
     def send(self, data: bytes) -> Connection:

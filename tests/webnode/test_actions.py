@@ -28,7 +28,7 @@ class ActionTests(SynchronousTestCase):
         tuning = MemoryTuning({"01": [Knob("description", "a dog", "A line", most=200.0)]})
         self.board = Board(self.desk, Guests(), chronicle=self.chronicle, halts=self.halts, tuning=tuning)
         state = state_of([{"uuid": "01", "name": "dog1", "joined": 1}], [], {}, node="vaio")
-        app = create_app(lambda: state, self.board, wall=lambda: 1e9)
+        app = create_app(lambda: {**state, "halted": self.halts.is_halted()}, self.board, wall=lambda: 1e9)
         app.logger.setLevel(logging.CRITICAL + 1)
         self.client: FlaskClient = app.test_client()
 

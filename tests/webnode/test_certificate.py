@@ -1,4 +1,4 @@
-"""Tests of ``webnode.certificate``: one authority for the team, which vouches for the local network alone."""
+"""Tests of ``webnode.certificate``: an authority for each web node, which vouches for the local network alone."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ class AuthorityTests(SynchronousTestCase):
     if MISSING:
         skip = SKIP
 
-    def test_be_the_same_at_every_node(self) -> None:
+    def test_be_the_same_after_each_start(self) -> None:
         """One secret gives one authority, byte for byte and for good; another secret another one, by another name."""
-        first, second, other = authority(SECRET), authority(SECRET), authority(bytes(32))
+        first, second, other = authority(SECRET, "vaio"), authority(SECRET, "vaio"), authority(bytes(32), "vaio")
         self.assertEqual(first.pem, second.pem)
-        self.assertTrue(first.fingerprint.startswith("A6:BA:20:80:5C:67"), first.fingerprint)
+        self.assertTrue(first.fingerprint.startswith("BC:95:A9:E3:43:30"), first.fingerprint)
         self.assertNotEqual(other.fingerprint, first.fingerprint)
         self.assertNotEqual(other.certificate.subject, first.certificate.subject)
 
     def test_vouch_for_the_local_network_alone(self) -> None:
         """What it signs is believed of private addresses and local names, and of no site of the internet."""
-        signer = authority(SECRET)
+        signer = authority(SECRET, "vaio")
         for name in ("192.168.0.7", "10.1.2.3", "127.0.0.1", "fd00::7", "vaio.local", "vaio.home.arpa", "localhost"):
             self.assertTrue(self.is_believed(signer, leaf(signer, "vaio", [name], NOW, random.Random(1)), name), name)
         for name in ("example.org", "local.example.org", "8.8.8.8", "2001:db8::7"):
@@ -67,7 +67,7 @@ class LeafTests(SynchronousTestCase):
         skip = SKIP
 
     def setUp(self) -> None:
-        self.signer = authority(SECRET)
+        self.signer = authority(SECRET, "vaio")
         self.names = ["192.168.0.7", "vaio.local"]
         self.leaf = leaf(self.signer, "vaio", self.names, NOW, random.Random(1))
 
@@ -90,8 +90,8 @@ class LeafTests(SynchronousTestCase):
         self.assertEqual(self.flaw(names=["::ffff:192.168.0.7", "VAIO.local.", "127.0.0.1", "localhost"]), "")
 
     def test_tell_a_foreign_one(self) -> None:
-        """One that another team's authority signed, or whose key is another one's, is not taken."""
-        self.assertIn("another team", self.leaf.flaw(authority(bytes(32)), self.names, NOW))
+        """One that another authority signed, or whose key is another one's, is not taken."""
+        self.assertIn("another authority", self.leaf.flaw(authority(bytes(32), "vaio"), self.names, NOW))
         other = leaf(self.signer, "vaio", self.names, NOW, random.Random(2))
         self.assertIn("key", Leaf(other.key, self.leaf.certificate).flaw(self.signer, self.names, NOW))
 

@@ -62,3 +62,16 @@ class DelaysTests(SynchronousTestCase):
         """Nobody waits longer than the longest pause because the clock was set back."""
         self.guesses("a", 10**6)
         self.assertLessEqual(self.delays.wait("a", 0.0), LONGEST_S)
+
+    def test_take_a_try_back(self) -> None:
+        """Of tries that were right nothing is left, and those that were wrong count; with other numbers, too."""
+        delays = Delays(free=3, longest_s=10.0, forgotten_s=100.0)
+        for _ in range(20):
+            delays.tried("everywhere", 0.0)
+            delays.undo("everywhere")
+        self.assertEqual(delays.wait("everywhere", 0.0), 0.0)
+        for _ in range(8):
+            delays.tried("everywhere", 0.0)
+        delays.undo("everywhere")
+        self.assertEqual((delays.wait("everywhere", 0.0), delays.wait("everywhere", 100.0)), (10.0, 0.0))
+        delays.undo("nobody")

@@ -69,6 +69,24 @@ class TeamFallbacksTests(FleetCase):
         self.assertFalse(first.lets_in("https://127.0.0.1:8081"))
         self.assertFalse(first.lets_in("http://192.168.0.9:8081"))
 
+    def test_vouch_in_an_open_team(self) -> None:
+        """Where everybody may do everything those count that serve the page, or did within the hour."""
+        swarm = self.swarm(3)
+        first, second = (TeamFallbacks(node, swarm.clock.seconds) for node in swarm.nodes[:2])
+        for place, web in enumerate((first, second)):
+            web.serves([f"http://127.0.0.1:808{place}"])
+        swarm.run(2)
+        dog = swarm.nodes[2]
+        keys = [node.entangled.identity.public for node in swarm.nodes[:2]]
+        self.assertEqual([web.may_vouch(key) for web in (first, second) for key in keys], [True] * 4)
+        self.assertFalse(first.may_vouch(dog.entangled.identity.public))
+        self.assertFalse(first.may_vouch(bytes(32)))
+        swarm.nodes[0].vanish()
+        swarm.run(3)
+        self.assertTrue(second.may_vouch(keys[0]))
+        swarm.run(REMEMBERED_S)
+        self.assertFalse(second.may_vouch(keys[0]))
+
     def test_let_in_the_page_of_the_dead(self) -> None:
         """A web node that dies is listed no more; its page, which still runs in a browser, is let in for an hour."""
         swarm, (first, second) = self.web_nodes()

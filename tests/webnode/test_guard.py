@@ -4,21 +4,27 @@ from __future__ import annotations
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from webnode.guard import HEADERS, headers, is_local_host, is_own_origin, refusal, token_of
+from webnode.guard import HEADERS, headers, is_local_name, is_own_host, is_own_origin, refusal, token_of
 
 
 class GuardTests(SynchronousTestCase):
     def test_know_local_names(self) -> None:
-        """Addresses, bare names, names of the local network and names of the settings are this machine's."""
+        """Addresses, bare names and names of the local network can be those of a machine there."""
         hosts = ["10.0.0.7:8080", "[::1]:8080", "[fe80::1]", "localhost:8080", "vaio", "vaio.local:80", "VAIO.LAN"]
         for host in hosts:
-            self.assertTrue(is_local_host(host), host)
-        self.assertTrue(is_local_host("robots.example.org:8080", {"robots.example.org"}))
+            self.assertTrue(is_local_name(host), host)
+
+    def test_know_own_names(self) -> None:
+        """This machine is meant by an address, by localhost and by its own names, and by no other name of the LAN."""
+        for host in ("10.0.0.7:8080", "[::1]:8080", "localhost:80", "a.localhost", "VAIO.local", "vaio.local."):
+            self.assertTrue(is_own_host(host, {"vaio.local"}), host)
+        for host in ("evil.local", "vaio", "evil.lan:8080", "vaio.local.evil.lan", "evil-vaio.local", "", "a b", "["):
+            self.assertFalse(is_own_host(host, {"vaio.local"}), host)
 
     def test_refuse_public_names(self) -> None:
         """A name that somebody outside could point at this machine is refused, and so is nonsense."""
         for host in ("evil.example", "evil.example:8080", "", "a b", "[", "local.evil.com", "1.2.3.4.evil.com"):
-            self.assertFalse(is_local_host(host), host)
+            self.assertFalse(is_local_name(host), host)
 
     def test_compare_origins(self) -> None:
         """Only the page's own origin counts; programs send none."""
@@ -46,7 +52,7 @@ class GuardTests(SynchronousTestCase):
         """Orders want the own page or one of the team, and a mark; looking wants only a name of this machine."""
 
         def refused(method: str, origin: str | None = None, is_marked: bool = True, host: str = "vaio") -> str:
-            no = refusal(method, host, origin, is_marked, (), lambda origin: origin == "http://other")
+            no = refusal(method, host, origin, is_marked, ("vaio",), lambda origin: origin == "http://other")
             return "" if no is None else no.field
 
         self.assertEqual(refused("GET", "http://evil", False), "")

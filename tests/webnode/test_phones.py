@@ -12,6 +12,7 @@ from twisted.internet.task import Clock
 from twisted.trial.unittest import SynchronousTestCase
 from twisted.web.resource import Resource
 
+from middleware.entangled.identity import Identity
 from swarmnode.gateway import sides
 from tests.webnode.browser import Connection, site_of
 from tests.webnode.picture import jpeg
@@ -22,8 +23,9 @@ from webnode.guard import MAX_BODY
 from webnode.limits import AddressLimits
 from webnode.routes.phones import MEASURES, ROUTES
 from webnode.server import Root
-from webnode.session import SignedSessions
+from webnode.session import NOBODY, SignedSessions
 from webnode.state import state_of
+from webnode.token import TokenKey
 
 SECRET = "0f" * 32
 JOIN: dict[str, Any] = {"secret": SECRET, "name": "anna", "width": 208, "height": 156}
@@ -31,7 +33,9 @@ JOIN: dict[str, Any] = {"secret": SECRET, "name": "anna", "width": 208, "height"
 
 class PhoneRouteTests(SynchronousTestCase):
     def setUp(self) -> None:
-        self.sessions = SignedSessions(b"the team's secret", "quiet-otter", "", random.Random(1), lambda *_: succeed(0))
+        self.sessions = SignedSessions(
+            TokenKey(Identity(bytes(32))), lambda _: True, "quiet-otter", "", random.Random(1), lambda *_: succeed(0)
+        )
         self.phones = MemoryPhones(most=2, check=sides)
         self.board = Board(MemoryDesk(), self.sessions, MemoryAudit(), phones=self.phones)
         state = state_of([], [], {}, node="vaio")
@@ -43,7 +47,7 @@ class PhoneRouteTests(SynchronousTestCase):
         self.token = self.token_of("phone")
 
     def token_of(self, role: Any) -> str:
-        return self.sessions.token("guest", role, 1000.0, 60.0).text
+        return self.sessions.token(NOBODY, "guest", role, 1000.0, 60.0).text
 
     def join(self, token: str = "", **changes: Any) -> Any:
         bearer = {"Authorization": f"Bearer {token or self.token}"}
@@ -57,7 +61,7 @@ class PhoneRouteTests(SynchronousTestCase):
     def send(self, path: str, body: bytes = b"", **headers: str) -> tuple[int, Any]:
         """Status and JSON of what is sent natively."""
         connection = Connection(self.site)
-        head = {"Host": "vaio", "Content-Length": str(len(body)), **headers}
+        head = {"Host": "localhost", "Content-Length": str(len(body)), **headers}
         lines = "".join(f"{name}: {value}\r\n" for name, value in head.items())
         data = connection.send(f"POST /api/v1/{path} HTTP/1.1\r\n{lines}\r\n".encode() + body).taken()
         status, told = int(data.split(b" ", 2)[1]), data.split(b"\r\n\r\n", 1)[1]

@@ -10,11 +10,13 @@ import msgpack
 from twisted.internet.defer import succeed
 from twisted.trial.unittest import SynchronousTestCase
 
+from middleware.entangled.identity import Identity
 from middleware.entangled.record import Record
 from swarmnode.rehearsal import VirtualTeam
 from webnode.board import Visitor
 from webnode.revocation import MOST, REMEMBERED, REVOKED, SLOT, MemoryRevocations, TeamRevocations, revoked_in
 from webnode.session import SignedSessions
+from webnode.token import TokenKey
 
 
 class TeamRevocationsTests(SynchronousTestCase):
@@ -29,24 +31,28 @@ class TeamRevocationsTests(SynchronousTestCase):
     def test_hold_at_every_web_node(self) -> None:
         """A token that is revoked at one web node lets in nobody at another, nor at one that starts when both died."""
 
-        def at(revoked: TeamRevocations) -> SignedSessions:
-            return SignedSessions(b"the team's secret", "quiet-otter", "", random.Random(1), check, revoked)
+        def at(revoked: TeamRevocations, key: TokenKey) -> SignedSessions:
+            return SignedSessions(key, lambda _: True, "quiet-otter", "", random.Random(1), check, revoked)
 
         check = lambda text, word: succeed(False)  # noqa: E731
-        vaio, pi, now = at(self.vaio), at(self.pi), self.team.clock.seconds()
+        keys = [TokenKey(Identity(name.ljust(32))) for name in (b"vaio", b"pi", b"nuc")]
+        vaio, pi, now = at(self.vaio, keys[0]), at(self.pi, keys[1]), self.team.clock.seconds()
         token = self.successResultOf(vaio.sign_in("quiet-otter", "10.0.0.9", now))
-        self.assertEqual(pi.visitor(token.ticket, now).role, "viewer")
+        uuids = [key.node_id.hex() for key in keys]
+        given = vaio.passes(vaio.visitor(token.text, now), uuids, now)
+        there = given[uuids[1]]
+        self.assertEqual(pi.visitor(there.ticket, now).role, "viewer")
         vaio.revoke(vaio.visitor(token.text, now).token_id, token.until)
         self.assertEqual(vaio.visitor(token.text, now), Visitor())
         self.team.clock.advance(0.5)
-        for text in (token.text, token.ticket):
+        for text in (there.text, there.ticket):
             self.assertEqual(pi.visitor(text, now), Visitor())
         self.team.kill("vaio")
         self.team.kill("pi")
         self.team.clock.advance(2.0)
-        late = at(self.known("nuc"))
+        late = at(self.known("nuc"), keys[2])
         self.team.clock.advance(1.0)
-        self.assertEqual(late.visitor(token.text, now), Visitor())
+        self.assertEqual(late.visitor(given[uuids[2]].text, now), Visitor())
 
     def test_stay_small(self) -> None:
         """However many sign out, the record fits a datagram and holds the newest, and old ones are forgotten."""

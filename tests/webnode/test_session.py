@@ -3,32 +3,43 @@
 from __future__ import annotations
 
 import random
-from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
 from twisted.internet.defer import Deferred, succeed
 from twisted.trial.unittest import SynchronousTestCase
 
+from middleware.entangled.identity import Identity
 from middleware.errors import BadSetting
 from middleware.settings import Settings
 from webnode.board import OpenSessions, Token, Visitor
+from webnode.code import draw_code
 from webnode.errors import Refusal
 from webnode.ground import Ground
 from webnode.password import hashed, is_password
-from webnode.session import AT_ONCE, MAX_SIGNED_S, SIGNED_S, WAITING, SignedSessions, made, sessions
+from webnode.session import AT_ONCE, MAX_SIGNED_S, PASS_S, SIGNED_S, WAITING, SignedSessions, sessions
+from webnode.token import TokenKey
 
 HASH = hashed("correct horse", bytes(16), 4)
-HOME = "127.0.0.1"
+HOME = "10.0.0.9"
+KEYS = {name: TokenKey(Identity(name.encode().ljust(32))) for name in ("vaio", "pi", "nuc", "eve")}
+
+
+def uuid(name: str) -> str:
+    """The id of a node as the page has it."""
+    return KEYS[name].node_id.hex()
 
 
 class SignedSessionsTests(SynchronousTestCase):
     def setUp(self) -> None:
+        self.gateways = {KEYS[name].public for name in ("vaio", "pi", "nuc")}
         self.sessions = self.node()
 
-    def node(self, secret: bytes = b"the team's secret", password: str = "", check: Any = None) -> SignedSessions:
+    def node(self, name: str = "vaio", password: str = "", check: Any = None) -> SignedSessions:
         there = check or (lambda text, word: succeed(is_password(text, word)))
-        return SignedSessions(secret, "quiet-otter", password, random.Random(1), there)
+        return SignedSessions(
+            KEYS[name], self.gateways.__contains__, "quiet-otter", password, random.Random(name), there
+        )
 
     def signed(self, proof: str = "quiet-otter", now: float = 0.0, source: str = HOME) -> Token:
         return self.successResultOf(self.sessions.sign_in(proof, source, now))
@@ -49,11 +60,52 @@ class SignedSessionsTests(SynchronousTestCase):
         for text in (token.text, token.ticket):
             self.assertEqual(self.sessions.visitor(text, SIGNED_S), Visitor())
 
-    def test_hold_at_every_web_node_of_the_team(self) -> None:
-        """Who signed in at one web node is known at another of the team, and at none of another team."""
+    def test_go_on_at_another_web_node(self) -> None:
+        """A pass is good for minutes at the web node that it names and at no other; renewed there it is the session."""
+        pi, nuc = self.node("pi"), self.node("nuc")
         token = self.signed()
-        self.assertEqual(self.node().visitor(token.text, 1.0).role, "operator")
-        self.assertEqual(self.node(b"another secret").visitor(token.text, 1.0), Visitor())
+        self.assertEqual(pi.visitor(token.text, 1.0), Visitor())
+        who = self.sessions.visitor(token.text, 1.0)
+        given = self.sessions.passes(who, [uuid("pi")], 1.0)[uuid("pi")]
+        self.assertEqual((given.role, given.until), ("operator", 1.0 + PASS_S))
+        self.assertEqual([each.visitor(given.text, 2.0).role for each in (self.sessions, nuc)], ["anyone"] * 2)
+        there = pi.visitor(given.text, 2.0)
+        self.assertEqual((there.name, there.role, there.token_id), (who.name, who.role, who.token_id))
+        self.assertEqual(pi.visitor(given.ticket, 2.0).role, "viewer")
+        renewed = pi.renewed(there, 2.0)
+        self.assertEqual(pi.visitor(renewed.text, SIGNED_S).limit, who.limit)
+        further = pi.passes(pi.visitor(renewed.text, 3.0), [uuid("vaio"), uuid("nuc")], 3.0)
+        self.assertEqual(self.sessions.visitor(further[uuid("vaio")].text, 4.0).token_id, who.token_id)
+        self.assertEqual(nuc.visitor(further[uuid("nuc")].text, 4.0).token_id, who.token_id)
+        refusal = self.assertRaises(Refusal, pi.passes, pi.visitor(given.ticket, 2.0), [uuid("nuc")], 2.0)
+        self.assertEqual(refusal.status, 401)
+
+    def test_believe_gateways_alone(self) -> None:
+        """A session ends while one that vouches for it is no gateway, and nobody signs in at a node that is none."""
+        pi, token = self.node("pi"), self.signed()
+        given = self.sessions.passes(self.sessions.visitor(token.text, 1.0), [uuid("pi")], 1.0)[uuid("pi")]
+        renewed = pi.renewed(pi.visitor(given.text, 1.0), 1.0)
+        invited = pi.token(pi.visitor(renewed.text, 1.0), "guest", "viewer", 1.0, 60.0)
+        guest = self.successResultOf(pi.sign_in(invited.text, HOME, 1.0))
+        self.gateways.discard(KEYS["vaio"].public)
+        for text in (given.text, given.ticket, renewed.text, invited.text, guest.text):
+            self.assertEqual(pi.visitor(text, 2.0), Visitor())
+        self.assertEqual(self.sessions.visitor(token.text, 2.0), Visitor())
+        refusal = self.refused("quiet-otter", 2.0)
+        self.assertEqual((refusal.field, refusal.status), ("node", 403))
+        self.gateways.add(KEYS["vaio"].public)
+        self.assertEqual(self.sessions.visitor(token.text, 3.0).role, "operator")
+
+    def test_end_what_was_made_of_it(self) -> None:
+        """With an invitation end the sessions that began by it, with a session the tickets that were derived of it."""
+        who = self.sessions.visitor(self.signed().text, 1.0)
+        invitation = self.sessions.token(who, "guest", "phone", 1.0, 600.0)
+        guest = self.sessions.visitor(self.signed(invitation.text, 2.0).text, 2.0)
+        derived = self.sessions.derived(guest, "phone/1", "phone", 2.0, 1e9)
+        self.assertEqual((derived.until, self.sessions.visitor(derived.ticket, 3.0).name), (601.0, "phone/1"))
+        self.sessions.revoke(self.sessions.visitor(invitation.text, 3.0).token_id)
+        self.assertEqual(self.sessions.visitor(derived.ticket, 3.0), Visitor())
+        self.assertEqual(self.refused(invitation.text, 3.0).status, 401)
 
     def test_refuse_what_is_not_the_code(self) -> None:
         """Anything else is refused with 401 and words that say where the code stands; no token is nobody."""
@@ -103,14 +155,14 @@ class SignedSessionsTests(SynchronousTestCase):
 
     def test_invite(self) -> None:
         """An invitation signs in by itself, in its role and for no longer; its ticket and an old one do not."""
-        invitation = self.sessions.token("guest", "viewer", 0.0, 100.0)
+        invitation = self.sessions.token(OPERATOR, "guest", "viewer", 0.0, 100.0)
         token = self.signed(invitation.text, 10.0)
         self.assertEqual((token.role, token.until), ("viewer", 100.0))
         self.assertNotEqual(token.text, invitation.text)
         self.assertEqual(self.sessions.visitor(token.text, 50.0).name, "guest")
         self.assertEqual(self.refused(invitation.ticket, 10.0).status, 401)
         self.assertEqual(self.refused(invitation.text, 100.0).status, 401)
-        long = self.sessions.token("guest", "viewer", 0.0, 10 * SIGNED_S)
+        long = self.sessions.token(OPERATOR, "guest", "viewer", 0.0, 10 * SIGNED_S)
         self.assertEqual(self.signed(long.text, 1.0).until, SIGNED_S + 1.0)
 
     def test_sign_out(self) -> None:
@@ -136,7 +188,7 @@ class SignedSessionsTests(SynchronousTestCase):
 
     def test_renew_no_further_than_invited(self) -> None:
         """A guest stays until the invitation ends; a ticket, which is seen by more, and nobody renew nothing."""
-        invitation = self.sessions.token("guest", "viewer", 0.0, SIGNED_S + 10.0)
+        invitation = self.sessions.token(OPERATOR, "guest", "viewer", 0.0, SIGNED_S + 10.0)
         token = self.signed(invitation.text, 1.0)
         self.assertEqual(token.until, SIGNED_S + 1.0)
         self.assertEqual(self.sessions.renewed(self.sessions.visitor(token.text, 9.0), 9.0).until, SIGNED_S + 9.0)
@@ -146,39 +198,38 @@ class SignedSessionsTests(SynchronousTestCase):
             self.assertEqual((refusal.field, refusal.status), ("Authorization", 401))
 
 
+OPERATOR = Visitor("operator", "operator")
+
+
+def made_of(ground: Ground) -> Any:
+    """The sessions of a web node that is a gateway."""
+    return sessions(ground, cast(Any, SimpleNamespace(may_vouch=lambda public: True)))
+
+
 class FactoryTests(SynchronousTestCase):
     def ground(self, **web: object) -> Ground:
         settings = Settings.from_mapping({"node": {"name": "vaio", "team_key": "x" * 20}, "web": web}, "vaio.toml")
         nothing = cast(Any, None)
-        node = cast(Any, SimpleNamespace(entangled=SimpleNamespace(watch=lambda *what, **how: None)))
+        identity = Identity(bytes(32))
+        node = cast(Any, SimpleNamespace(entangled=SimpleNamespace(watch=lambda *what, **how: None, identity=identity)))
         return Ground(settings, node, nothing, nothing, lambda: 0.0, random.Random(1))
 
     def test_have_the_code_of_the_settings(self) -> None:
         """The code is that of the settings; where there is none, one is made that cannot be misread."""
-        self.assertEqual(sessions(self.ground(code="quiet-otter")).code, "quiet-otter")
-        self.assertRegex(sessions(self.ground()).code, r"^[a-hj-km-np-z]{4}-[a-hj-km-np-z]{4}$")
-        self.assertNotEqual(made(random.Random(1)), made(random.Random(2)))
+        self.assertEqual(made_of(self.ground(code="quiet-otter")).code, "quiet-otter")
+        self.assertRegex(made_of(self.ground()).code, r"^[a-hj-km-np-z]{4}-[a-hj-km-np-z]{4}$")
+        self.assertNotEqual(draw_code(random.Random(1)), draw_code(random.Random(2)))
 
     def test_do_without_on_this_machine_alone(self) -> None:
         """Without signing in a page is served to this machine alone; open to a network it is refused in one line."""
-        self.assertIsInstance(sessions(self.ground(sign_in=False)), OpenSessions)
-        self.assertIsInstance(sessions(self.ground(sign_in=False, host="::1")), OpenSessions)
+        self.assertIsInstance(made_of(self.ground(sign_in=False)), OpenSessions)
+        self.assertIsInstance(made_of(self.ground(sign_in=False, host="::1")), OpenSessions)
         for host in ("0.0.0.0", "192.168.0.2", "::"):
-            error = self.assertRaises(BadSetting, sessions, self.ground(sign_in=False, host=host))
+            error = self.assertRaises(BadSetting, made_of, self.ground(sign_in=False, host=host))
             self.assertIn("vaio.toml: [web] sign_in", str(error))
 
     def test_refuse_a_password_that_is_no_hash(self) -> None:
         """A password that stands there as it is typed is refused, and not shown."""
-        error = self.assertRaises(BadSetting, sessions, self.ground(password="correct horse"))
+        error = self.assertRaises(BadSetting, made_of, self.ground(password="correct horse"))
         self.assertIn("swarm password", str(error))
         self.assertNotIn("horse", str(error))
-
-    def test_keep_teams_apart(self) -> None:
-        """Two web nodes of one team take each other's tokens; that of another team does not."""
-        first, second = (sessions(self.ground()) for _ in range(2))
-        ground = self.ground()
-        settings = Settings.from_mapping({"node": {"name": "vaio", "team_key": "y" * 20}, "web": {}}, "vaio.toml")
-        stranger = sessions(replace(ground, settings=settings))
-        token = first.token("operator", "operator", 0.0, 10.0)
-        self.assertEqual(second.visitor(token.text, 1.0).role, "operator")
-        self.assertEqual(stranger.visitor(token.text, 1.0), Visitor())

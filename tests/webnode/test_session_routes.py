@@ -8,19 +8,23 @@ from typing import Any
 from twisted.internet.defer import succeed
 from twisted.trial.unittest import SynchronousTestCase
 
+from middleware.entangled.identity import Identity
 from webnode.app import create_app
-from webnode.board import Board, MemoryAudit, MemoryInvites
+from webnode.board import Board, MemoryAudit, MemoryFallbacks, MemoryInvites, Page
 from webnode.desk import MemoryDesk
 from webnode.password import hashed, is_password
 from webnode.session import SignedSessions
 from webnode.state import state_of
+from webnode.token import MAX_TEXT, TokenKey
 
 
 class SessionRouteTests(SynchronousTestCase):
     def setUp(self) -> None:
         check: Any = lambda text, word: succeed(is_password(text, word))  # noqa: E731
         password = hashed("correct horse", bytes(16), 4)
-        sessions = SignedSessions(b"the team's secret", "quiet-otter", password, random.Random(1), check)
+        sessions = SignedSessions(
+            TokenKey(Identity(bytes(32))), lambda _: True, "quiet-otter", password, random.Random(1), check
+        )
         self.audit = MemoryAudit()
         state = state_of([], [], {}, node="vaio")
         self.board = Board(MemoryDesk(), sessions, self.audit)
@@ -61,6 +65,21 @@ class SessionRouteTests(SynchronousTestCase):
         headers = self.bearer(anew.get_json()["token"])
         self.assertEqual(self.client.get("/api/v1/session", headers=headers).get_json()["role"], "anyone")
 
+    def test_go_on_elsewhere(self) -> None:
+        """Who has signed in gets a token for each other web node, by its uuid, and for this one none; a ticket none."""
+        told = self.signed(code="quiet-otter")
+        other = "ab" * 20
+        self.board.fallbacks = MemoryFallbacks(
+            Page("here", "http://10.0.0.7:80", is_self=True), Page(other, "http://x")
+        )
+        given = self.client.get("/api/v1/session/passes", headers=self.bearer(told["token"])).get_json()
+        self.assertEqual(list(given), [other])
+        self.assertEqual((given[other]["role"], given[other]["until"]), ("operator", 1600.0))
+        here = self.client.get("/api/v1/session", headers=self.bearer(given[other]["token"])).get_json()
+        self.assertEqual(here["role"], "anyone")
+        for headers in ({}, self.bearer(told["ticket"])):
+            self.assertEqual(self.client.get("/api/v1/session/passes", headers=headers).status_code, 401)
+
     def test_be_nobody_without(self) -> None:
         """Whoever has not signed in is anyone, who may look at nothing and order nothing."""
         self.assertEqual(self.client.get("/api/v1/session").get_json(), {"name": "", "role": "anyone"})
@@ -76,7 +95,7 @@ class SessionRouteTests(SynchronousTestCase):
             ({"code": "s3cr3t-guess"}, 401),
             ({"password": "s3cr3t-guess"}, 401),
             ({"code": 7}, 400),
-            ({"code": "x" * 301}, 400),
+            ({"code": "x" * (MAX_TEXT + 1)}, 400),
         ):
             answer = self.client.post("/api/v1/session", json=body)
             self.assertEqual(answer.status_code, status, body)

@@ -200,7 +200,7 @@ class SurveyTests(FleetCase):
 
         def asked(board: Board, path: str) -> tuple[int, Any]:
             client = create_app(lambda: state, board).test_client()
-            answer = client.get(f"/api/v1/{path}?ticket=viewer", headers={"Host": "vaio"})
+            answer = client.get(f"/api/v1/{path}?ticket=viewer", headers={"Host": "localhost"})
             return answer.status_code, answer.get_json()
 
         board = Board(MemoryDesk(), Guests(), survey=survey)

@@ -21,6 +21,7 @@ from twisted.trial.unittest import SynchronousTestCase
 from twisted.web.resource import Resource
 from twisted.web.static import Data
 
+from middleware.entangled.data.memory import MemoryStore
 from tests.webnode.browser import Connection, site_of
 from webnode.channel import CLOSE_S, HEAD_S
 from webnode.errors import PortTaken
@@ -30,8 +31,9 @@ from webnode.live import SENT_AHEAD, SYSTEM_AHEAD, Viewer
 MISSING = [name for name in ("OpenSSL", "cryptography") if find_spec(name) is None]
 if not MISSING:
     from middleware.settings import Settings
-    from webnode.certificate import authority, read
+    from webnode.certificate import authority, leaf, read
     from webnode.ground import Ground
+    from webnode.keyfile import keep
     from webnode.tls import Certified, TlsDoor, door
 
 SKIP = f"TLS IS NOT TESTED: missing {', '.join(MISSING)} (pip install 'swarm-node[tls]')"
@@ -49,7 +51,7 @@ class CertifiedTests(SynchronousTestCase):
         folder = Path(self.mktemp())
         folder.mkdir()
         self.path = folder / "a.sqlite.tls"
-        self.signer = authority(b"1" * 32)
+        self.signer = authority(b"1" * 32, "a")
         self.names = ["192.168.0.7"]
         self.now = NOW
 
@@ -84,7 +86,7 @@ class CertifiedTests(SynchronousTestCase):
             self.names = ["192.168.0.8"]
 
         def sworn() -> None:
-            self.signer = authority(b"2" * 32)
+            self.signer = authority(b"2" * 32, "a")
 
         def aged() -> None:
             self.now += 340 * DAY
@@ -94,7 +96,7 @@ class CertifiedTests(SynchronousTestCase):
             (cut, "no certificate with its key"),
             (lambda: self.path.write_bytes(b""), "no certificate with its key"),
             (moved, "it lacks 192.168.0.8"),
-            (sworn, "another team"),
+            (sworn, "another authority"),
             (aged, "it runs out"),
         ]
         for seed, (fault, words) in enumerate(faults):
@@ -152,19 +154,29 @@ class DoorTests(SynchronousTestCase):
         self.folder = Path(self.mktemp()).resolve()
         self.folder.mkdir()
 
-    def door(self, team_key: str = "of a test", store: str = "a.sqlite") -> TlsDoor:
-        node = {"name": "a", "roles": ["web"], "store": store, "team_key": team_key}
+    def door(self, store: str = "a.sqlite", kept: MemoryStore | None = None, seed: int = 1) -> TlsDoor:
+        node = {"name": "a", "roles": ["web"], "store": store, "team_key": "of a test"}
         settings = Settings.from_mapping({"node": node, "web": {"tls": "auto"}}, str(self.folder / "a.toml"))
         anything: Any = None
-        return door(
-            Ground(settings, anything, anything, Clock(), lambda: NOW, random.Random(1)), lambda: ["192.168.0.7"]
-        )
+        web_node: Any = SimpleNamespace(store=MemoryStore() if kept is None else kept)
+        ground = Ground(settings, web_node, anything, Clock(), lambda: NOW, random.Random(seed))
+        return door(ground, lambda: ["192.168.0.7"])
 
-    def test_share_the_team_s_authority(self) -> None:
-        """Nodes of one team have one authority, of which nothing is kept; those of another have another."""
-        self.assertEqual(self.door(store="a.sqlite").signer.pem, self.door(store="b.sqlite").signer.pem)
-        self.assertNotEqual(self.door("of another team").signer.pem, self.door().signer.pem)
+    def test_have_an_authority_of_its_own(self) -> None:
+        """Each node has its own authority, also in one team, and the same one after each start."""
+        kept = MemoryStore()
+        first = self.door("a.sqlite", kept)
+        self.assertEqual(self.door("a.sqlite", kept, 2).signer.pem, first.signer.pem)
+        self.assertNotEqual(self.door("b.sqlite", seed=3).signer.pem, first.signer.pem)
         self.assertEqual(sorted(os.listdir(self.folder)), ["a.sqlite.tls", "b.sqlite.tls"])
+
+    def test_migrate(self) -> None:
+        """A certificate that an authority of an earlier version signed, out of the team's secret, is made anew."""
+        path = self.folder / "a.sqlite.tls"
+        old = leaf(authority(b"7" * 32, "a"), "a", ["192.168.0.7"], NOW, random.Random(1))
+        keep(path, old.pem_with_key)
+        made = self.door()
+        self.assertEqual(read(path.read_bytes()).flaw(made.signer, ["192.168.0.7"], NOW), "")
 
     def test_keep_nothing_in_memory(self) -> None:
         """A node that stores nothing leaves no file behind."""
@@ -199,7 +211,7 @@ class HandshakeTests(SynchronousTestCase):
         skip = SKIP
 
     def setUp(self) -> None:
-        self.signer = authority(b"1" * 32)
+        self.signer = authority(b"1" * 32, "a")
         self.reactor = MemoryReactorClock()
         certified = Certified(self.signer, "a", None, lambda: ["10.0.0.9"], lambda: NOW, random.Random(1))
         self.limits = AddressLimits()

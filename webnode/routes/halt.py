@@ -4,25 +4,34 @@ from __future__ import annotations
 
 from typing import Any
 
+from middleware.halt import NO_ROBOT, STANDS
+from middleware.stop_set import MAX_RELEASED
 from webnode.board import Halts
 from webnode.errors import Refusal
 from webnode.field import Json
-from webnode.route import API, Ask, Route
+from webnode.route import API, Ask, Field, Route
 
 
 def is_halted(ask: Ask) -> Json:
-    """Whether it is halted."""
-    return {"halted": _halts(ask).is_halted()}
+    """Whether all of it stands."""
+    _halts(ask)
+    return {"halted": bool(ask.state.get("halted"))}
 
 
 def halt(ask: Ask) -> Any:
     """Stop all of it."""
-    return _halts(ask).halt(_name(ask)).addCallback(lambda devices: {"halted": True, "devices": devices})
+    return _halts(ask).halt(_name(ask)).addCallback(_told, True)
 
 
 def release(ask: Ask) -> Any:
-    """Let it go on."""
-    return _halts(ask).release(_name(ask)).addCallback(lambda devices: {"halted": False, "devices": devices})
+    """End the stops that are named, or all that are known."""
+    return _halts(ask).release(_name(ask), ask.given.get("stops")).addCallback(_told, False)
+
+
+def _told(devices: dict[str, str], otherwise: bool) -> Any:
+    """What each device does; ``otherwise``: whether a team without robots counts as stopped."""
+    robots = [said for said in devices.values() if said != NO_ROBOT]
+    return {"halted": all(said == STANDS for said in robots) if robots else otherwise, "devices": devices}
 
 
 def _name(ask: Ask) -> str:
@@ -35,9 +44,19 @@ def _halts(ask: Ask) -> Halts:
     return ask.board.halts
 
 
-GIVES = "halted, devices (uuid to what it does, in words)"
+GIVES = "halted (every robot stands), devices (uuid to what it does, in words)"
+STOPS = Field(
+    "stops",
+    "list",
+    "The ids of the stops to end, as in `halt` of the state; all that are known where it is left out",
+    most=MAX_RELEASED,
+    default=None,
+    is_required=False,
+)
 ROUTES = (
-    Route("GET", f"{API}/halt", "Whether the team is stopped", "viewer", is_halted, gives="halted"),
+    Route(
+        "GET", f"{API}/halt", "Whether the team is stopped and every robot stands", "viewer", is_halted, gives="halted"
+    ),
     Route(
         "POST",
         f"{API}/halt",
@@ -46,5 +65,5 @@ ROUTES = (
         halt,
         gives=GIVES,
     ),
-    Route("DELETE", f"{API}/halt", "Let the team go on from where it was", "operator", release, gives=GIVES),
+    Route("DELETE", f"{API}/halt", "Let the team go on from where it was", "operator", release, (STOPS,), GIVES),
 )

@@ -69,7 +69,7 @@ def join(ask: Ask) -> Deferred[Json]:
     can = {key: given[key] for key in ("width", "height", "orientation", "position")}
 
     def joined(uuid: str) -> Json:
-        token = ask.board.sessions.token(f"{BOUND}{uuid}", "phone", ask.now, TICKET_S)
+        token = ask.board.sessions.derived(ask.who, f"{BOUND}{uuid}", "phone", ask.now, TICKET_S)
         return {"uuid": uuid, "ticket": token.ticket, "until": token.until, "fps": FPS}
 
     return ask.board.phones.join(bytes.fromhex(secret), name, can).addCallback(joined)

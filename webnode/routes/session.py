@@ -13,10 +13,11 @@ from webnode.errors import Refusal
 from webnode.fallback import is_loopback
 from webnode.field import Json
 from webnode.route import API, Ask, Content, Field, Route
-from webnode.session import SIGNED_S
+from webnode.session import MAX_SIGNED_S, SIGNED_S
+from webnode.token import MAX_TEXT
 
 INVITED_S = 86400.0
-MAX_INVITED_S = 366 * 86400.0
+MAX_INVITED_S = MAX_SIGNED_S
 
 
 def sign_in(ask: Ask) -> Deferred[Json]:
@@ -47,13 +48,19 @@ def renew(ask: Ask) -> Json:
     return _told(ask.board.sessions.renewed(ask.who, ask.now))
 
 
+def passes(ask: Ask) -> Json:
+    """What lets the page of who asks go on at the team's other web nodes."""
+    nodes = [page.node for page in ask.board.fallbacks.here() if not page.is_self]
+    return {node: _told(token) for node, token in ask.board.sessions.passes(ask.who, nodes, ask.now).items()}
+
+
 def invite(ask: Ask) -> Any:
     """A token for somebody else, and the link by which a person comes with it."""
     given, invites = ask.given, ask.board.invites
     urls = [] if invites is None else invites.urls()
     if given["page"] and given["page"] not in urls:
         raise Refusal("page", "this node does not serve it", f"choose one of {', '.join(urls) or 'none'}")
-    token = ask.board.sessions.token(given["name"], given["role"], ask.now, given["seconds"])
+    token = ask.board.sessions.token(ask.who, given["name"], given["role"], ask.now, given["seconds"])
     if invites is None or not urls:
         return _told(token)
     url = given["page"] or urls[0]
@@ -104,7 +111,7 @@ ROUTES = (
         "anyone",
         sign_in,
         (
-            Field("code", "text", "the code, or an invitation's token", is_required=False, default=""),
+            Field("code", "text", "the code, or an invitation's token", most=MAX_TEXT, is_required=False, default=""),
             Field("password", "text", "the password", is_required=False, default=""),
         ),
         gives="token, ticket, role, until (unix seconds)",
@@ -119,6 +126,15 @@ ROUTES = (
         "viewer",
         renew,
         gives="token, ticket, role, until (unix seconds)",
+    ),
+    Route(
+        "GET",
+        f"{API}/session/passes",
+        "Tokens for the same session at the team's other web nodes, by uuid: each good at that one, for minutes; "
+        "there PUT session makes a session of it",
+        "viewer",
+        passes,
+        gives="uuid: token, ticket, role, until (unix seconds)",
     ),
     Route("DELETE", f"{API}/session", "Sign out, at every web node of the team", "anyone", sign_out),
     Route(
@@ -149,7 +165,7 @@ ROUTES = (
     Route(
         "GET",
         f"{API}/ca.crt",
-        "The team's authority, which a browser has to trust to open the page over TLS without a warning",
+        "This node's authority, which a browser has to trust to open its page over TLS without a warning",
         "anyone",
         authority,
         gives="application/x-x509-ca-cert",

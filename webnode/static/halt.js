@@ -1,19 +1,29 @@
 // Stop: one button at the same place in every view, also before an open dialog, and a line that lets the team go on.
-import { attribute, element } from "./element.js";
+import { attribute, element, words } from "./element.js";
 import { wish } from "./desk.js";
 import { panel } from "./panel.js";
 
 const STANDS = "stands";
+const GOES_ON = "goes on";
 const MOST = 8;
-const IDLE = ["has no robot", "goes on", STANDS];
 
-// What came of it: how many stand, and by name whoever says something else.
-function outcome(devices, { halted, devices: told }) {
-  const name = (uuid) => devices.get(uuid)?.name ?? uuid.slice(0, 8);
-  const strange = Object.entries(told).filter(([, said]) => !IDLE.includes(said)).map(([uuid, said]) => ` ${name(uuid)} ${said}.`);
-  const odd = strange.length > MOST ? [...strange.slice(0, MOST), ` And so on: ${strange.length} in all.`] : strange;
-  const count = Object.values(told).filter((said) => said === STANDS).length;
-  return `${halted ? `Stopped: ${count} ${count === 1 ? "robot stands" : "robots stand"}.` : "The team goes on."}${odd.join("")}`;
+const some = (said) => said.slice(0, MOST).map((line) => ` ${line}.`).join("") + (said.length > MOST ? ` And so on: ${said.length} in all.` : "");
+
+// What came of it: how many stand, and by name each device that says something else than was wanted.
+function outcome(devices, told, wanted) {
+  const robots = Object.entries(told).filter(([, said]) => said !== "has no robot");
+  const odd = robots.filter(([, said]) => said !== wanted).map(([uuid, said]) => `${devices.get(uuid)?.name ?? uuid.slice(0, 8)} ${said}`);
+  const count = robots.length - odd.length;
+  if (wanted === GOES_ON) return `${odd.length ? "Not every robot" : "The team"} goes on.${some(odd)}`;
+  return `${odd.length ? "Stopping" : "Stopped"}: ${count} ${count === 1 ? "robot stands" : "robots stand"}.${some(odd)}`;
+}
+
+// What the line says: "stopped" only where every robot says that it stands.
+function state({ halted, halt }) {
+  if (halted) return ["The team is stopped.", " Whoever had a task keeps it. "];
+  const { ordered, standing = [], others = [] } = halt ?? {};
+  if (!ordered) return ["Not every robot goes on.", some(standing.map((name) => `${name} stands`))];
+  return ["Stopping.", ` ${standing.length} of ${standing.length + others.length} robots stand.${some(others.map(({ name, says }) => `${name} ${says}`))}`];
 }
 
 // Behind an open dialog nothing can be pressed: the button goes where it can.
@@ -25,18 +35,24 @@ function before(dialog, button, root) {
 export function make(root, { model }) {
   const stop = element("button", { class: "stop", title: "All robots stand at once" }, "Stop");
   const go = element("button", {}, "Let it go on");
-  const banner = element("p", { class: "halted" }, element("b", {}, "The team is stopped."), " Whoever had a task keeps it. ", go);
+  const parts = [element("b", {}), element("span", {})];
+  const banner = element("p", { class: "halted" }, ...parts, go);
   banner.hidden = true;
   root.classList.add("halt");
   root.append(stop, banner);
-  const done = (told) => outcome(model.devices, told);
-  stop.addEventListener("click", () => wish("Stopping", "halt", { done }));
-  go.addEventListener("click", () => wish("Letting it go on", "halt", { method: "DELETE", done }));
+  const done = (wanted) => ({ devices }) => outcome(model.devices, devices, wanted);
+  stop.addEventListener("click", () => wish("Stopping", "halt", { done: done(STANDS) }));
+  // A release ends the stops that are shown, and none that came meanwhile.
+  go.addEventListener("click", () => {
+    const body = model.halt ? { stops: model.halt.stops.map(({ id }) => id) } : undefined;
+    wish("Letting it go on", "halt", { method: "DELETE", body, done: done(GOES_ON) });
+  });
   const watch = new MutationObserver(() => before(document.querySelector("dialog[open]"), stop, root));
   watch.observe(document.body, { subtree: true, attributeFilter: ["open"] });
   return {
     update() {
-      banner.hidden = !model.halted;
+      banner.hidden = !(model.halted || model.halt?.stops.length);
+      state(model).forEach((said, n) => words(parts[n], said));
       attribute(document.body, "data-halted", model.halted);
     },
     close() {

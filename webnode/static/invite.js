@@ -15,7 +15,7 @@ const STEPS = {
   "iPhone, iPad (Safari)": [
     "Open the address of the certificate in Safari, and allow the download.",
     "Settings, Profile Downloaded, Install.",
-    "Settings, General, About, Certificate Trust Settings: switch on the team's name. Then scan the first code.",
+    "Settings, General, About, Certificate Trust Settings: switch on the node's name. Then scan the first code.",
   ],
 };
 
@@ -76,9 +76,9 @@ function built() {
   const [certificate, certificateRow] = copied("Certificate", "i-certificate", tell);
   const trust = element("section", { class: "trust" },
     element("h3", {}, "The phone warns of the connection"),
-    element("p", {}, "That is right: the team vouches for itself, and the phone does not know it yet. For one visit accept the warning: ",
+    element("p", {}, "That is right: the node vouches for itself, and the phone does not know it yet. For one visit accept the warning: ",
       element("b", {}, "Advanced, Proceed"), " (Chrome) or ", element("b", {}, "Show Details, visit this website"), " (Safari). ",
-      "To come again, and to go on when this node is lost, let the phone trust the team, once:"),
+      "To come again, let the phone trust this node, once; to go on when it is lost, let it trust the other web nodes as well:"),
     ...steps(), parts.authority, certificateRow, parts.mark);
   const choices = element("div", { class: "choices" },
     element("div", {}, element("label", { for: "i-kind" }, "To"), parts.kind),

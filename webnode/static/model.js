@@ -11,6 +11,7 @@ export const model = {
   events: [],
   pages: [],
   halted: false,
+  halt: null,
   link: "wait",
   now: 0,
 };
@@ -30,6 +31,7 @@ const TAKERS = {
     model.tasks = byKey(state.tasks, "id");
     model.groups = byKey(state.groups, "task");
     model.halted = state.halted ?? false;
+    model.halt = state.halt ?? null;
   },
   // Rows that are other or new, and the keys of those that are gone; the order is that of the node's lists.
   change({ without = {}, ...told }) {
@@ -44,6 +46,7 @@ const TAKERS = {
     if (told.groups) model.groups = inOrder(model.groups, (a, b) => places.indexOf(a.task) - places.indexOf(b.task));
     model.node = told.node ?? model.node;
     model.halted = told.halted ?? model.halted;
+    model.halt = told.halt ?? model.halt;
   },
   pages(pages) {
     model.pages = pages;

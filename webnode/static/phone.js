@@ -1,7 +1,7 @@
 // This phone: takes part in the team as a device, for as long as its visitor holds it and looks at the page.
 import { attribute, badge, drawn, element, state, words } from "./element.js";
 import { opened, why } from "./eye.js";
-import { ask, fly, where } from "./link.js";
+import { ask, base, fly, where } from "./link.js";
 
 const KEPT = "swarm.phone";
 const AGAIN = 300;
@@ -32,7 +32,7 @@ function keep(phone) {
 }
 
 // By a ticket, and bare of headers: so no browser asks another node first whether it may ask.
-const of = (path, query) => where(`${path}?${new URLSearchParams(query)}`);
+const of = (path, query, at) => where(`${path}?${new URLSearchParams(query)}`, at);
 
 const pause = (ms) => new Promise((done) => setTimeout(done, Math.max(0, ms)));
 const asName = (text) => text.normalize("NFKD").replace(/[^\w-]+/g, "-").replace(/^-+|-+$/g, "").slice(0, 40);
@@ -121,13 +121,16 @@ export function make(root, { model, go }) {
 
   const wake = async () => { lock = await navigator.wakeLock?.request("screen").catch(() => null); };
 
-  const goodbye = ({ uuid, ticket: proof }) => navigator.sendBeacon(of(`phones/${uuid}/leave`, { ticket: proof }));
+  const goodbye = ({ uuid, ticket: proof, at }) => navigator.sendBeacon(of(`phones/${uuid}/leave`, { ticket: proof }, at));
 
   async function join(mine) {
     const { secret } = phone;
+    const at = base();
     const told = await ask("POST", "phones", { secret, name: phone.name, width: canvas.width, height: canvas.height, ...eye.has });
-    if (run === mine) ticket = told;
-    else goodbye(told);
+    // A ticket is good at the node that gave it; while the page went on to another one it is not known which that was.
+    if (at !== base()) return;
+    if (run === mine) ticket = { ...told, at };
+    else goodbye({ ...told, at });
   }
 
   // One picture in flight, never a queue; a node that is lost is waited for, and another takes the phone as it is.
@@ -140,10 +143,11 @@ export function make(root, { model, go }) {
         const look = await eye.look();
         if (run !== mine) return;
         draw(look);
-        if (!ticket) await join(mine);
+        if (ticket?.at !== base()) await join(mine);
         if (run !== mine) return;
+        if (ticket?.at !== base()) continue;
         const query = { ticket: ticket.ticket, values: JSON.stringify(look.values) };
-        const answer = await fly(of(`phones/${ticket.uuid}/look`, query), { method: "POST", body: look.picture });
+        const answer = await fly(of(`phones/${ticket.uuid}/look`, query, ticket.at), { method: "POST", body: look.picture });
         const told = await answer.json();
         if (run !== mine) return;
         if (answer.ok) {

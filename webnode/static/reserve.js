@@ -1,4 +1,6 @@
 // The reserve: where else the team serves the page, and which of its nodes answers now.
+import { has, sort } from "./session.js";
+
 const VERSION = 1;
 const PATIENCE = 800;
 const LEAD = 150;
@@ -16,8 +18,11 @@ function kept() {
   }
 }
 
-export function remember(told) {
+// `passes` are the tokens for the other nodes, by uuid; the node that made them knows which are gateways of the team.
+export function remember(told, passes, here) {
   pages = told;
+  const more = told.filter((page) => passes[page.node]).map((page) => [page.url, passes[page.node]]);
+  sort([here, location.origin, ...told.map(({ url }) => url)], Object.fromEntries(more));
   try {
     localStorage.setItem(KEPT, JSON.stringify(told));
   } catch {
@@ -25,8 +30,10 @@ export function remember(told) {
   }
 }
 
-// No page over TLS goes on with one without, and a page of this machine is meant for this machine alone.
+// Where there is no token for nothing is asked.  No page over TLS goes on with one without, and a page of this machine is
+// meant for this machine alone.
 function reachable({ url }) {
+  if (!has(url)) return false;
   if (isSecure(location.origin) && !isSecure(url)) return false;
   return !isLoopback(url) || isLoopback(location.origin);
 }

@@ -1,6 +1,6 @@
 // Signing in and out: by the code that the node printed, which a link may carry, or by the password.
 import { element, words } from "./element.js";
-import { ask, get, leave } from "./link.js";
+import { base, get, leave, signed } from "./link.js";
 import { panel } from "./panel.js";
 import { forget, keep, token } from "./session.js";
 
@@ -17,9 +17,7 @@ function codeOfLink() {
   return code ? decodeURIComponent(code) : "";
 }
 
-async function signIn(code) {
-  keep(await ask("POST", "session", { code }));
-}
+const signIn = (code) => signed("POST", { code });
 
 // Resolves when the visitor is let in, as often as it has to; `onMe` gets { name, role } each time.
 export async function enter(onMe) {
@@ -35,7 +33,7 @@ async function check(trouble = "") {
   let me = await get("session").catch(() => null);
   while (!me || me.role === "anyone") {
     if (me) {
-      if (token()) forget();
+      if (token(base())) keep(base(), undefined);
       const { asked } = await import("./door.js");
       await asked(trouble, signIn);
     } else await new Promise((done) => setTimeout(done, 1000));
@@ -76,7 +74,7 @@ panel({
         link = model.link;
         const { name, role } = model.me;
         words(who, `Signed in as ${name && name !== role ? `${name}, ${role}` : role}.`);
-        out.hidden = !token();
+        out.hidden = !token(base());
       },
       close: () => clearInterval(timer),
     };

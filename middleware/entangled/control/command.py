@@ -8,13 +8,14 @@ from __future__ import annotations
 import argparse
 import json
 import socket
+import struct
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
 from middleware.entangled.control import word
-from middleware.entangled.control.place import NoControl, found
+from middleware.entangled.control.place import NoControl, check_socket, found, owner_of
 
 FAILED, WRONG = 1, 2
 FORMS = """fields:     7  1.5  true  null  "7"  words       JSON where it is JSON, else text
@@ -112,9 +113,11 @@ def request_of(wishes: argparse.Namespace) -> dict[str, Any]:
 
 def asked(path: Path, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
     """The lines that the node behind the socket at ``path`` answers; raises ``NoControl`` where it does not."""
+    check_socket(path)
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
         try:
             connection.connect(str(path))
+            check_peer(connection, path)
             connection.sendall(json.dumps(request).encode() + b"\n")
             with connection.makefile("rb") as lines:
                 for line in lines:
@@ -122,6 +125,17 @@ def asked(path: Path, request: dict[str, Any]) -> Iterator[dict[str, Any]]:
         except (OSError, ValueError) as error:
             why = getattr(error, "strerror", None) or error
             raise NoControl(f"the node behind {path} does not answer ({why}); start it, or remove that file") from error
+
+
+def check_peer(connection: socket.socket, path: Path) -> None:
+    """Raise ``NoControl`` where another user's process is at the other end, if the system tells."""
+    option = getattr(socket, "SO_PEERCRED", None)
+    if option is None:
+        return
+    credentials = struct.Struct("3i")
+    _, user, _ = credentials.unpack(connection.getsockopt(socket.SOL_SOCKET, option, credentials.size))
+    if user not in (owner_of(path.parent), 0):
+        raise NoControl(f"another user's process listens at {path}; remove it, and start the node anew")
 
 
 def main(group: str, words: Sequence[str], out: TextIO | None = None, ask: Ask = asked) -> int:

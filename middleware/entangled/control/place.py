@@ -1,4 +1,7 @@
-"""Place: where the control sockets of this machine's nodes lie, one file a node, for its owner's eyes only."""
+"""Place: where the control sockets of this machine's nodes lie, one file a node, for its owner's eyes only.
+
+In ``/tmp`` any user may make a folder, a link or a socket first.  So node and client check the owner of each.
+"""
 
 from __future__ import annotations
 
@@ -29,12 +32,10 @@ def made(name: str) -> Path:
     where = folder()
     try:
         where.mkdir(mode=0o700, parents=True, exist_ok=True)
-        state = where.lstat()
     except OSError as error:
         raise NoControl(f"cannot make {where} for the control socket: {error.strerror}") from error
-    # In /tmp anybody may have made it first.
-    if not stat.S_ISDIR(state.st_mode) or state.st_uid != os.getuid() or state.st_mode & 0o077:
-        raise NoControl(f"{where} is not yours alone; remove it, or set XDG_RUNTIME_DIR to a folder of your own")
+    if owner_of(where) != os.getuid():
+        raise _foreign(where)
     path = where / f"{name}{ENDING}"
     if len(os.fsencode(path)) > MAX_PATH:
         raise NoControl(f"{path} is longer than the {MAX_PATH} bytes of a socket's path; set a shorter XDG_RUNTIME_DIR")
@@ -43,6 +44,8 @@ def made(name: str) -> Path:
 
 def found(name: str | None) -> Path:
     """The socket of node ``name``, or of the only node here; raises ``NoControl``, which names those there are."""
+    if os.path.lexists(folder()):
+        owner_of(folder())
     names = sorted(path.name.removesuffix(ENDING) for path in folder().glob(f"*{ENDING}"))
     if name is None and len(names) == 1:
         name = names[0]
@@ -54,3 +57,37 @@ def found(name: str | None) -> Path:
     if name is None:
         raise NoControl(f"several nodes have run on this machine; say which: --node NAME, one of {there}")
     raise NoControl(f"no node {name!r} runs on this machine; there are {there}")
+
+
+def check_socket(path: Path) -> None:
+    """Raise ``NoControl`` where ``path`` is no socket, or one of another user than its folder's."""
+    owner = owner_of(path.parent)
+    try:
+        state = path.lstat()
+    except OSError as error:
+        why = error.strerror
+        raise NoControl(f"the node behind {path} does not answer ({why}); start it, or remove that file") from error
+    if not stat.S_ISSOCK(state.st_mode):
+        raise NoControl(f"{path} is no socket; remove it, and start the node anew")
+    if state.st_uid != owner:
+        raise _foreign(path)
+
+
+def owner_of(where: Path) -> int:
+    """The user of the folder ``where``, in which no other user can make anything; raises ``NoControl``.
+
+    That is this user, or for root the user of a service, where ``XDG_RUNTIME_DIR`` names its folder.
+    """
+    try:
+        state = where.lstat()
+    except OSError as error:
+        raise NoControl(f"cannot use {where} for the control socket: {error.strerror}") from error
+    is_served = os.getuid() == 0 and bool(os.environ.get("XDG_RUNTIME_DIR"))
+    is_trusted = state.st_uid == os.getuid() or is_served
+    if not stat.S_ISDIR(state.st_mode) or state.st_mode & 0o077 or not is_trusted:
+        raise _foreign(where)
+    return state.st_uid
+
+
+def _foreign(path: Path) -> NoControl:
+    return NoControl(f"{path} is not yours alone; remove it, or set XDG_RUNTIME_DIR to a folder of your own")

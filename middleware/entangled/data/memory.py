@@ -5,12 +5,16 @@ from __future__ import annotations
 import heapq
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 
 from twisted.internet.defer import Deferred, succeed
 
-from middleware.entangled.data.store import HOLD, MAX_BYTES, MAX_ROWS, Origin, Usage, weight
-from middleware.entangled.errors import Full
+from middleware.entangled.data.store import HOLD, MAX_BYTES, MAX_ROWS, OWNER_BYTES, OWNER_ROWS, Origin, Usage, weight
+from middleware.entangled.errors import OWNER_FULL, Full
 from middleware.entangled.record import Record, Slot
+
+MAX_LOOKED_AT = 1000
+"""Old tombstones that are looked at for those of one owner, the oldest first."""
 
 
 @dataclass(slots=True)
@@ -25,8 +29,9 @@ class _Held:
 class MemoryStore:
     """A ``Store`` that lives as long as the program.
 
-    ``max_rows`` slots and ``max_bytes`` at most.  A tombstone is let in above that, for a delete must never fail for
-    want of room, up to as many slots again, for nobody shall fill the memory with them.
+    ``max_rows`` slots and ``max_bytes`` at most, and of these one owner may have as much as it leaves free.  A
+    tombstone is let in above that, for a delete must never fail for want of room, up to as many slots again, for nobody
+    shall fill the memory with them.
     """
 
     origin: Origin = "new"
@@ -44,6 +49,7 @@ class MemoryStore:
         self._slots: dict[Slot, _Held] = {}
         self._by_key: dict[bytes, dict[Slot, _Held]] = {}
         self._by_owner: dict[bytes, dict[Slot, _Held]] = {}
+        self._bytes_of: dict[bytes, int] = {}
         # In the order in which they may be let go of.
         self._tombstones: dict[Slot, _Held] = {}
         self._made_room: list[Record] = []
@@ -116,6 +122,10 @@ class MemoryStore:
         slots = self._by_owner.get(owner, {})
         return [slots[slot].record for slot in sorted(slots)]
 
+    def owners(self) -> list[bytes]:
+        """Every owner that has a slot, in the order in which they came."""
+        return list(self._by_owner)
+
     def extend(self, owner: bytes, expires_at: float) -> int:
         """Let all leased records of ``owner`` live until ``expires_at`` at least; returns how many there are."""
         leased = 0
@@ -182,15 +192,37 @@ class MemoryStore:
         size = weight(record) - (0 if held is None else weight(held.record))
         if not rows and size <= 0:
             return
-        leaving: list[Slot] = []
-        candidates = self._dispensable(record.slot)
+        leaving: dict[Slot, None] = {}
+        own = (slot for slot in islice(self._dispensable(record.slot), MAX_LOOKED_AT) if slot.owner == record.owner)
+        while not self._is_within_part(record, rows, size):
+            slot = next(own, None)
+            if slot is None:
+                raise Full(
+                    f"store full for this owner, which has {len(self._by_owner[record.owner])} rows and"
+                    f" {self._bytes_of[record.owner]} bytes: the store holds {self.usage}, and one owner may have as"
+                    f" much as it leaves free; remove some, or allow the store more",
+                    OWNER_FULL,
+                )
+            leaving[slot] = None
+            rows, size = rows - 1, size - weight(self._slots[slot].record)
+        candidates = (slot for slot in self._dispensable(record.slot) if slot not in leaving)
         while not self._fits(record, rows, size):
             slot = next(candidates, None)
             if slot is None:
                 raise Full(f"store full: it holds {self.usage}, no room for {size} bytes; remove some, or allow more")
-            leaving.append(slot)
+            leaving[slot] = None
             rows, size = rows - 1, size - weight(self._slots[slot].record)
         self._made_room += [self._remove(slot) for slot in leaving]
+
+    def _is_within_part(self, record: Record, rows: int, size: int) -> bool:
+        """Whether its owner leaves as much free as it has, with ``rows`` and ``size`` more, or has but little."""
+        has_rows = len(self._by_owner.get(record.owner, ())) + rows
+        has_bytes = self._bytes_of.get(record.owner, 0) + size
+        free_rows = self._max_rows - len(self._slots) - rows
+        free_bytes = self._max_bytes - self._bytes - size
+        return has_rows <= max(OWNER_ROWS, free_rows) and (
+            record.is_tombstone or has_bytes <= max(OWNER_BYTES, free_bytes)
+        )
 
     def _dispensable(self, spared: Slot) -> Iterator[Slot]:
         """What may be let go of, in that order, but for ``spared``."""
@@ -212,12 +244,16 @@ class MemoryStore:
         self._by_key.setdefault(slot.key, {})[slot] = held
         self._by_owner.setdefault(slot.owner, {})[slot] = held
         self._sorted.pop(slot.key, None)
-        self._bytes += weight(record)
+        self._weigh(slot.owner, weight(record))
         self._sort_in(slot, held)
         self._queue(held)
 
+    def _weigh(self, owner: bytes, more: int) -> None:
+        self._bytes += more
+        self._bytes_of[owner] = self._bytes_of.get(owner, 0) + more
+
     def _replace(self, held: _Held, record: Record, expires_at: float) -> None:
-        self._bytes += weight(record) - weight(held.record)
+        self._weigh(record.owner, weight(record) - weight(held.record))
         held.record, held.expires_at = record, expires_at
         self._sort_in(record.slot, held)
         if expires_at < held.queued_at:
@@ -260,7 +296,9 @@ class MemoryStore:
             if not index[name]:
                 del index[name]
         self._sorted.pop(slot.key, None)
-        self._bytes -= weight(held.record)
+        self._weigh(slot.owner, -weight(held.record))
+        if slot.owner not in self._by_owner:
+            del self._bytes_of[slot.owner]
         self._tombstones.pop(slot, None)
         self._changed(slot, None)
         return held.record

@@ -10,6 +10,10 @@ Where there is no room for a record, room is made in this order, and no further 
 
 Nothing else is ever let go of for the sake of something: if that is not enough, the writer is told ``Full``, with
 figures, and nothing has changed but 1.
+
+One owner may have as much as it leaves free: a dynamic threshold, as in switches with a shared buffer (Choudhury and
+Hahne, 1998).  Alone it has up to half of the rows and bytes; k owners that write without end leave 1 in 2**k free to
+the others.  An owner that has more is refused, and only tombstones of its own make room for it.
 """
 
 from __future__ import annotations
@@ -28,6 +32,9 @@ MAX_BYTES = 8 * 2**20
 HOLD = 86_400.0
 """Seconds for which a tombstone stays even where room is short: the longest absence after which a deleted record does
 not come back with whoever was away.  More is safer; less gives room back earlier."""
+OWNER_ROWS = 250
+OWNER_BYTES = 65_536
+"""Rows and bytes that each owner may have as long as there is room at all, however much others have."""
 FIXED_BYTES = 17
 """Sequence (8), ttl (8) and lifetime (1) of a record."""
 
@@ -77,8 +84,8 @@ class Store(Protocol):
 
         The very record that is already held only stays longer.  ``now``: what has run out by then makes room first.
 
-        Raises ``Full`` where there is no room, ``Unwritable`` where it cannot be written.  It is safe, and may be
-        acknowledged, once ``written`` has fired.
+        Raises ``Full`` where there is no room, or its owner has all that one owner may have, ``Unwritable`` where it
+        cannot be written.  It is safe, and may be acknowledged, once ``written`` has fired.
         """
 
     def written(self) -> Deferred[None]:
@@ -95,6 +102,9 @@ class Store(Protocol):
 
     def owned(self, owner: bytes) -> list[Record]:
         """The records of ``owner``, tombstones included, in the order of their slots."""
+
+    def owners(self) -> list[bytes]:
+        """Every owner that has a slot, in the order in which they came."""
 
     def extend(self, owner: bytes, expires_at: float) -> int:
         """Let all leased records of ``owner`` live until ``expires_at`` at least; returns how many there are."""

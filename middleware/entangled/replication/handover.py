@@ -74,7 +74,7 @@ class Handover:
         self._catching_up = False
         self._stored_at: dict[Slot, float] = {}
         self._given: dict[bytes, bytes] = {}
-        self._overlap = Overlap(store, replica, overlay, endpoint, clock)
+        self._overlap = Overlap(replica, overlay, endpoint, clock)
         self._overlap.standing = self._standing_now
         endpoint.expose("settled", self._answer_settled, changes=True, idempotent=True)
 
@@ -209,6 +209,7 @@ class Handover:
         while wanted:
             answer = await self._overlay.ask(contact, "fetch", [list(slot) for slot in wanted[:PLACES]])
             page = answer if isinstance(answer, list) else []
+            await self._replica.certificates.learn(contact, (slot.owner for slot in wanted[: len(page)]))
             for slot, fields in zip(wanted, page, strict=False):
                 self._take(slot, fields)
             wanted = wanted[len(page) :] if page else []

@@ -10,7 +10,6 @@ from collections.abc import Callable
 
 from twisted.internet.interfaces import IReactorTime
 
-from middleware.entangled.data.store import Store
 from middleware.entangled.errors import Refused
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.overlay import Overlay
@@ -42,12 +41,9 @@ class Overlap:
     ``standing`` says that of this node.
     """
 
-    def __init__(
-        self, store: Store, replica: Replica, overlay: Overlay, endpoint: Endpoint, clock: IReactorTime
-    ) -> None:
+    def __init__(self, replica: Replica, overlay: Overlay, endpoint: Endpoint, clock: IReactorTime) -> None:
         self.asked_at: dict[bytes, float] = {}
         self.standing: Callable[[], int] = lambda: SURE
-        self._store = store
         self._replica = replica
         self._overlay = overlay
         self._clock = clock
@@ -62,12 +58,11 @@ class Overlap:
 
     def held(self, slot: Slot) -> Record | None:
         """What the slot holds here, for others to see."""
-        return None if slot in self._replica.keepsakes else self._store.slot(slot)
+        return self._replica.shown(slot)
 
     def records(self) -> list[Record]:
         """The team records that are held here, tombstones included."""
-        kept = self._replica.keepsakes
-        return [r for r in self._store.records() if r.lifetime == "team" and r.slot not in kept]
+        return self._replica.team_records()
 
     def both(self, peer: Contact) -> tuple[list[list[Record]], list[Record]]:
         """What is held here and should be at the peer as well: by parts, and what should not be here any more."""

@@ -17,12 +17,12 @@ from twisted.internet.interfaces import IReactorTime
 
 from middleware.entangled.background import Background, paced, until
 from middleware.entangled.data.store import Store
-from middleware.entangled.errors import Conflict, EntangledError, NoAnswer, NotAcknowledged, Refused
+from middleware.entangled.errors import OWNER_FULL, Conflict, EntangledError, Full, NoAnswer, NotAcknowledged, Refused
 from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.overlay import Overlay
 from middleware.entangled.record import TEAM_TTL, TOMBSTONE_TTL, Lifetime, Record, Slot
-from middleware.entangled.replication.replica import FORBIDDEN, HELD, Replica, pages_of
+from middleware.entangled.replication.replica import FORBIDDEN, HELD, NO_ROOM, Replica, pages_of
 from middleware.entangled.replication.shipper import Shipper
 from middleware.entangled.replication.watch import digest_of
 from middleware.entangled.wire.door import ROLE, meaning
@@ -48,6 +48,8 @@ LONG = 2**16
 SPARE_S = 0.5
 """Seconds after which the second wave is not held back any longer, whatever became of the first."""
 MAX_SEQUENCE = 2**62
+OWNERS_FAULT = (ROLE, OWNER_FULL)
+"""Codes of refusals that are due to the owner of the record, and no fault of the replica."""
 SEQUENCES = "sequences"
 BLOCK = 1024
 """Sequence numbers that are noted in the store at once, so that not every write has to note one."""
@@ -128,6 +130,12 @@ class Owner:
             self._let_go(slot)
             self._replica.answer_let_go(self._overlay.me(), [digest_of([record])])
 
+    def review(self) -> None:
+        """Look no more after what the role of this node does not allow any more."""
+        if self._replica.certificates.door.authority(self._identity.public).is_final:
+            for slot in [slot for slot in self._own if not self._replica.may_store(slot)]:
+                self._let_go(slot)
+
     def owns(self, slot: Slot) -> bool:
         """Whether this node looks after what is in ``slot``."""
         return slot in self._own
@@ -180,7 +188,7 @@ class Owner:
         """Store at every holder: how many took it, and the highest sequence that stood against it (0: none).
 
         Raises ``NotAcknowledged`` where too few took it and nothing stood against it, ``Refused`` where that is because
-        its owner's role may not write it.
+        its owner's role may not write it, or the owner has as much as one owner may have.
         """
         if concern != "one":
             await self._overlay.met()
@@ -209,7 +217,7 @@ class Owner:
                 verdict = await self._verdict(contact, record, left)
             except EntangledError as error:
                 release()
-                if isinstance(error, Refused) and error.code == ROLE:
+                if isinstance(error, Refused) and error.code in OWNERS_FAULT:
                     forbidden.append(error)
                 raise
             for pause in UNSURE_FOR if concern != "one" and contact.node_id in voters else ():
@@ -237,7 +245,8 @@ class Owner:
         votes = sum(1 for node_id, verdict in answers.items() if verdict in (0, HELD) and is_vote(node_id, verdict))
         if votes < needed and not newest:
             if forbidden:
-                self._let_go(record.slot)  # to say it again would change nothing
+                if forbidden[0].code == ROLE:
+                    self._let_go(record.slot)  # to say it again would change nothing
                 raise forbidden[0]
             raise NotAcknowledged(votes, needed)
         return held, newest
@@ -254,6 +263,9 @@ class Owner:
             return verdict
         if verdict == FORBIDDEN:
             raise Refused(f"{contact.address} does not take {record.name!r} from its owner: {meaning(ROLE)}", ROLE)
+        if verdict == NO_ROOM:
+            text = f"{contact.address} holds all that it may of the owner of {record.name!r}; remove some records"
+            raise Full(text, OWNER_FULL)
         raise Refused(f"{contact.address} does not take the record")
 
     def left(self, record: Record) -> float | None:

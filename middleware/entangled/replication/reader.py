@@ -12,13 +12,13 @@ from typing import Literal
 from twisted.internet.defer import Deferred
 
 from middleware.entangled.background import Background, until
-from middleware.entangled.errors import EntangledError, Unavailable
+from middleware.entangled.errors import EntangledError, Refused, Unavailable
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.lookup import Lookup
 from middleware.entangled.kademlia.overlay import ALPHA, K, Overlay, contacts_of
 from middleware.entangled.record import Record, Slot, unpacked
 from middleware.entangled.replication.cache import MAX_AGE
-from middleware.entangled.replication.owner import Owner
+from middleware.entangled.replication.owner import OWNERS_FAULT, Owner
 from middleware.entangled.replication.replica import CACHED, HELD, SURE, UNSURE, Replica
 from middleware.entangled.replication.watch import digest_of
 
@@ -89,7 +89,9 @@ class Reader:
         for _ in range(MAX_PAGES):
             if not (isinstance(page, list) and len(page) >= 2 and isinstance(page[0], list)):
                 break
-            records += [r for r in map(unpacked, page[0]) if r is not None and self.is_credible(r, key, contact)]
+            told = [record for record in map(unpacked, page[0]) if record is not None]
+            await self._replica.certificates.learn(contact, (record.owner for record in told))
+            records += [record for record in told if self.is_credible(record, key, contact)]
             # What it was worth at the end counts: it may have fallen behind in between.
             worth = page[2] if len(page) > 2 and page[2] in (SURE, CACHED) else UNSURE
             nearer = contacts_of(page[3]) if len(page) > 3 else []
@@ -158,8 +160,13 @@ class Reader:
             holding = has[slot]
 
             async def mend(contact: Contact, record: Record = record, holding: set[bytes] = holding) -> None:
-                if await self._owner.store_at(contact, record, self._owner.left(record)) != HELD:
-                    holding.add(contact.node_id)  # it took it, or has a newer one
+                try:
+                    if await self._owner.store_at(contact, record, self._owner.left(record)) == HELD:
+                        return
+                except Refused as error:
+                    if error.code not in OWNERS_FAULT:
+                        raise
+                holding.add(contact.node_id)  # it took it, has a newer one, or lets this owner have no more
 
             lacking = [mend(c) for c in targets if c.node_id not in holding]
             await until(lambda _, holding=holding: len(holding & voters) >= _majority(voters), lacking)  # type: ignore

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import wraps
 
 from twisted.internet.defer import Deferred
@@ -16,13 +16,15 @@ from twisted.internet.interfaces import IReactorTime
 
 from middleware.entangled.background import Background
 from middleware.entangled.data.store import Store
-from middleware.entangled.errors import Refused
+from middleware.entangled.errors import OWNER_FULL, Full, Refused
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.record import KEY_BYTES, Record, Signed, Slot, unpacked
 from middleware.entangled.replication.cache import PathCache
+from middleware.entangled.replication.certificates import Certificates
 from middleware.entangled.replication.keepsake import Keepsakes
 from middleware.entangled.replication.pusher import WATCH_TTL, Pusher
 from middleware.entangled.replication.watch import digest_of
+from middleware.entangled.wire.door import Authority
 from middleware.entangled.wire.endpoint import Endpoint
 
 PAGE_BYTES = 12_000
@@ -40,7 +42,10 @@ UNSURE, SURE, CACHED = 0, 1, 2
 HELD = -2
 """Answer to a STORE of a replica that is not sure: the record is held, and yet that is no vote."""
 FORBIDDEN = -3
-"""Answer to a STORE of what its owner may not write, by its role."""
+"""Answer to a STORE of what its owner may not write: by its role, or because no certificate of it holds."""
+NO_ROOM = -4
+"""Answer to a STORE of several records for one whose owner has all that one owner may have; one that comes alone is
+refused with the figures."""
 
 OnRecord = Callable[[Record], None]
 
@@ -48,9 +53,10 @@ OnRecord = Callable[[Record], None]
 class Replica:
     """The records of others, held for them; ``keepsakes`` are the node's own copies, which nobody else gets to see.
 
-    ``may_store`` says whether the owner of a slot may write there, by its role, ``is_sure`` whether this node has
-    caught up with the others, ``nearest`` whom it knows close to a key, ``belongs`` whether it is one of the closest
-    itself.
+    ``may_store`` says whether the owner of a slot may write there, by its certificate as it is at present, ``may_stay``
+    whether what is held there may be held on and shown; that is the same but for few slots.  ``is_sure`` says whether
+    this node has caught up with the others, ``nearest`` whom it knows close to a key, ``belongs`` whether it is one of
+    the closest itself.
 
     ``on_record`` is told of every record that was accepted, ``on_gone`` of every one that is let go of, ``on_silent``
     of every owner (its public key) whose lease ran out or that said goodbye, ``on_peer`` of every peer that stores,
@@ -65,7 +71,10 @@ class Replica:
         self.pusher = Pusher(endpoint, clock, chores)
         self.cache = PathCache()
         self._signed = Signed()
-        self.may_store: Callable[[Slot], bool] = lambda slot: True
+        self.certificates = Certificates(endpoint, clock)
+        self.may_store: Callable[[Slot], bool] = self.certificates.may_store
+        self.may_stay: Callable[[Slot], bool] = self.certificates.may_stay
+        self._authorities: dict[bytes, Authority] = {}
         self.is_sure: Callable[[], bool] = lambda: True
         self.nearest: Callable[[bytes], list[Contact]] = lambda key: []
         self.belongs: Callable[[bytes], bool] = lambda key: True
@@ -94,9 +103,19 @@ class Replica:
 
     def held(self, key: bytes) -> list[Record]:
         """What is held under ``key`` as a replica, tombstones included."""
-        records = self._store.get(key, tombstones=True)
         kept = self.keepsakes.under(key)
-        return [r for r in records if r.slot not in kept] if kept else records
+        return [r for r in self._store.get(key, tombstones=True) if r.slot not in kept and self.may_stay(r.slot)]
+
+    def shown(self, slot: Slot) -> Record | None:
+        """What the slot holds as a replica, for others to see."""
+        return None if slot in self.keepsakes or not self.may_stay(slot) else self._store.slot(slot)
+
+    def team_records(self) -> list[Record]:
+        """The team records that are held as a replica, tombstones included, for others to see."""
+        kept = self.keepsakes
+        return [
+            r for r in self._store.records() if r.lifetime == "team" and r.slot not in kept and self.may_stay(r.slot)
+        ]
 
     def holds(self, record: Record) -> bool:
         """Whether this very record is held as a replica."""
@@ -130,23 +149,39 @@ class Replica:
         expiry = self._store.expiry(record.slot)
         return record.ttl if expiry is None else expiry - self._clock.seconds()
 
+    def review(self) -> bool:
+        """Judge the held records of those owners whose authority has changed; whether that was any.
+
+        What an owner may not write is gone for those who watch.  It is dropped where that is final; where only a clock
+        or a certificate that is missing stands against it, it is not shown until it may be, or runs out.
+        """
+        before, door = self._authorities, self.certificates.door
+        self._authorities = {owner: door.authority(owner) for owner in self._store.owners()}
+        changed = [owner for owner, authority in self._authorities.items() if before.get(owner) != authority]
+        for owner in changed:
+            self._judge(owner, self._authorities[owner], before.get(owner))
+        return bool(changed)
+
     # -- what peers ask ---------------------------------------------------------------------------------------------
 
-    def answer_store(self, peer: Contact, packed: list[object], left: list[object] | None = None) -> list[int]:
+    def answer_store(
+        self, peer: Contact, packed: list[object], left: list[object] | None = None
+    ) -> list[int] | Deferred[list[int]]:
         """STORE: keep records; answers for each what ``store`` says, or -1 for a forged one.
 
         It is ``FORBIDDEN`` for one that its owner may not write.  ``left`` are the seconds that each is to be
-        kept, where it does not come from its owner.
+        kept, where it does not come from its owner.  The peer is asked for certificates that are not known here.
         """
         self.on_peer(peer)
         records = [record for record in map(unpacked, packed) if record is not None]
         lives = [None] * len(packed) if left is None else [_checked_life(life) for life in left]
         if len(records) < len(packed) or len(lives) != len(packed):
             raise Refused("not a record")
-        return [
-            self.store(record, life) if not (refusal := self._refusal(record, peer)) else refusal
-            for record, life in zip(records, lives, strict=True)
-        ]
+        owners = [record.owner for record in records]
+        if self.certificates.lacking(peer, owners):
+            learnt = Deferred.fromCoroutine(self.certificates.learn(peer, owners))
+            return learnt.addCallback(lambda _: self._stored(peer, records, lives))
+        return self._stored(peer, records, lives)
 
     def answer_find_value(
         self,
@@ -169,7 +204,7 @@ class Replica:
         is_nothing = not page and after is None
         cached = self.cache.get(key, self._clock.seconds()) if is_nothing and not wants_sure else None
         if cached:
-            return [[record.packed() for record in cached], None, CACHED]
+            return [[record.packed() for record in cached if self.may_store(record.slot)], None, CACHED]
         is_aside = not is_nothing and not wants_sure and not self.belongs(key)
         if not (is_nothing or is_aside):
             return [page, following, self._worth()]
@@ -245,15 +280,45 @@ class Replica:
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
-    def _once_written(self, answer: Callable[..., list[int]]) -> Callable[..., Deferred[list[int]]]:
+    def _once_written(
+        self, answer: Callable[..., list[int] | Deferred[list[int]]]
+    ) -> Callable[..., Deferred[list[int]]]:
         """``answer``, given only when what it took would survive the end of this process."""
+
+        def written(answers: list[int]) -> Deferred[list[int]]:
+            return self._store.written().addCallback(lambda _: answers)
 
         @wraps(answer)
         def acknowledged(*arguments: object) -> Deferred[list[int]]:
             answers = answer(*arguments)
-            return self._store.written().addCallback(lambda _: answers)
+            return answers.addCallback(written) if isinstance(answers, Deferred) else written(answers)
 
         return acknowledged
+
+    def _stored(self, peer: Contact, records: list[Record], lives: Sequence[float | None]) -> list[int]:
+        """Keep those of ``records`` that are lawful; one whose owner has too many does not keep the others out."""
+        verdicts = []
+        for record, life in zip(records, lives, strict=True):
+            try:
+                verdicts.append(self._refusal(record, peer) or self.store(record, life))
+            except Full as error:
+                if len(records) == 1 or error.code != OWNER_FULL:
+                    raise
+                verdicts.append(NO_ROOM)
+        return verdicts
+
+    def _judge(self, owner: bytes, authority: Authority, before: Authority | None) -> None:
+        """Let go of what ``owner`` may not write now, or show again what it may."""
+        out = []
+        for record in self._store.owned(owner):
+            if not self.may_stay(record.slot):
+                out.append(record)
+            elif before is not None and before.refusal and record.slot not in self.keepsakes:
+                self.on_record(record)
+                self.pusher.push(record.key, [record], [])
+        self._gone(out)
+        for record in out if authority.is_final else ():
+            self._store.discard(record.slot)
 
     def _leased(self, owner: bytes) -> list[Record]:
         """What is held of ``owner`` on lease."""

@@ -117,6 +117,13 @@ class Subscriber:
             watch.view.remove(self._own_id, record.slot)
             self._settle(watch)
 
+    def review(self) -> None:
+        """Forget the records that their owners may not write any more."""
+        for watch in list(self._watches):
+            if not all(self._replica.may_stay(record.slot) for record in watch.records):
+                watch.view.retain(self._replica.may_stay)
+                self._settle(watch)
+
     # -- inside -----------------------------------------------------------------------------------------------------
 
     def _settle(self, watch: Watch) -> None:
@@ -185,7 +192,9 @@ class Subscriber:
 
     def _answer_push(self, peer: Contact, key: bytes, number: int, packed: list[object], gone: list[object]) -> None:
         self._overlay.heard(peer)
-        records = [r for r in map(unpacked, packed) if r is not None and self._reader.is_credible(r, key, peer)]
+        told = [record for record in map(unpacked, packed) if record is not None]
+        is_lacking = bool(self._replica.certificates.lacking(peer, (record.owner for record in told)))
+        records = [record for record in told if self._reader.is_credible(record, key, peer)]
         slots = [slot for place in gone if (slot := _slot_of(key, place)) is not None]
         for watch in [w for w in self._watches if w.key == key and peer.node_id in w.asked]:
             last = watch.pushed.get(peer.node_id, 0)
@@ -196,7 +205,9 @@ class Subscriber:
                 for slot in slots:
                     watch.view.remove(peer.node_id, slot)
             self._settle(watch)
-            if number not in (last, last + 1):  # the last one may be here for the second time
+            # The last one may be here for the second time.  Of an owner that is unknown here, the certificate is asked
+            # for with the records.
+            if is_lacking or number not in (last, last + 1):
                 self._chores.fork(self._renew_at(watch, peer))
 
 

@@ -53,6 +53,11 @@ class View:
         """``replica`` no longer holds the record of ``slot``: its lease or its time is over there."""
         self._opinions.get(replica, {}).pop(slot, None)
 
+    def retain(self, is_lawful: Callable[[Slot], bool]) -> None:
+        """Forget the records in those slots of which ``is_lawful`` does not hold, whichever replica has them."""
+        for replica, held in self._opinions.items():
+            self._opinions[replica] = {slot: record for slot, record in held.items() if is_lawful(slot)}
+
     def forget(self, replica: bytes) -> None:
         """``replica`` is gone; what it said does not count any more."""
         self._opinions.pop(replica, None)

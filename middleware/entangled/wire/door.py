@@ -30,7 +30,7 @@ MAX_NOTED = 1024
 LINES = 20.0
 
 EXPIRED, EARLY, REVOKED, FOREIGN = "expired", "early", "revoked", "foreign"
-DOUBLED, SUPERSEDED, ROLE = "doubled", "superseded", "role"
+DOUBLED, SUPERSEDED, ROLE, UNLISTED = "doubled", "superseded", "role", "unlisted"
 
 _REFUSALS = {
     EXPIRED: "the certificate has expired, or one of the two clocks is wrong; look at both clocks (swarm doctor tells"
@@ -43,6 +43,8 @@ _REFUSALS = {
     " its own; if the files were stolen, have the operator revoke them (swarm revoke, swarm rotate)",
     SUPERSEDED: "a node with the same identity was started later; stop one of them, for each needs a membership or"
     " store of its own; if the files were stolen, have the operator revoke them (swarm revoke, swarm rotate)",
+    UNLISTED: "the membership list has no room for it, or its invitation or its gateway was used too often; have the"
+    " operator look at the list (swarm members) and revoke those who should not be there (swarm revoke)",
     ROLE: "its role does not allow that; ask the operator for another role",
 }
 
@@ -55,6 +57,22 @@ class Life(NamedTuple):
 
 
 UNCOUNTED = Life()
+
+
+class Authority(NamedTuple):
+    """Why the certificate of an owner of records does not hold at present (``refusal``); else its roles and its name.
+
+    ``FOREIGN`` stands for an owner whose certificate this node has not seen.
+    """
+
+    refusal: str = ""
+    roles: tuple[str, ...] = ()
+    name: str = ""
+
+    @property
+    def is_final(self) -> bool:
+        """Whether no clock and no certificate that is yet to come can make the records good that it does not cover."""
+        return self.refusal in ("", REVOKED, ROLE)
 
 
 class Door(Protocol):
@@ -85,10 +103,28 @@ class Door(Protocol):
         """The name of the refusal of a node with this key that shows this pass; empty where it is let in."""
 
     def may(self, public: bytes, method: str) -> bool:
-        """Whether a node that was let in may call ``method``."""
+        """Whether ``public`` is the key of a present member that may call ``method``; no, where it is not known."""
 
     def may_store(self, slot: Slot) -> bool:
-        """Whether the owner of ``slot`` may write there; of an owner that this node never met it says yes."""
+        """Whether the certificate of the owner of ``slot``, as it is at present, allows it to write there."""
+
+    def may_stay(self, slot: Slot) -> bool:
+        """Whether what is held in ``slot``, written when its owner was allowed to, may be held on and shown."""
+
+    def authority(self, owner: bytes) -> Authority:
+        """What ``may_store`` goes by for this owner; it changes when that does."""
+
+    def roles_of(self, public: bytes) -> frozenset[str] | None:
+        """Return the roles that the holder of that key has now, none for a stranger or a revoked or expired member.
+
+        None means that the team is open and restricts nobody.
+        """
+
+    def certificate(self, owner: bytes) -> bytes:
+        """The certificate of an owner by which other nodes can judge its records; empty where it is unknown."""
+
+    def learn(self, owner: bytes, certificate: bytes) -> bool:
+        """Take in the certificate of an owner that another node showed; whether it holds."""
 
 
 class OpenDoor:
@@ -110,6 +146,26 @@ class OpenDoor:
     def may_store(self, slot: Slot) -> bool:
         """Everybody may."""
         return True
+
+    def may_stay(self, slot: Slot) -> bool:
+        """Everything may."""
+        return True
+
+    def authority(self, owner: bytes) -> Authority:
+        """The same for everybody."""
+        return Authority()
+
+    def roles_of(self, public: bytes) -> frozenset[str] | None:
+        """Nobody is restricted."""
+        return None
+
+    def certificate(self, owner: bytes) -> bytes:
+        """Nobody has one."""
+        return b""
+
+    def learn(self, owner: bytes, certificate: bytes) -> bool:
+        """Nobody needs one."""
+        return False
 
 
 OPEN = OpenDoor()

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import random
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from twisted.internet.interfaces import IReactorTime
 
@@ -75,13 +75,11 @@ class Contest:
     async def begin(self) -> None:
         """Have a council, and let everybody bid."""
         try:
-            council = await next(iter(self.bidders.values())).deputy.council(self.task)
+            self.task = task = await next(iter(self.bidders.values())).deputy.pinned(self.task)
         except EntangledError as error:
             self.trouble = str(error)
             return
-        self.task = replace(self.task, council=council)
-        task = self.task
-        auction = Auction(task.task_id, 1, council, task.strategy, task.waiting_period, task.exclusive)
+        auction = Auction(task.task_id, 1, task.council, task.strategy, task.waiting_period, task.exclusive)
         for bidder in self.bidders.values():
             self._clock.callLater(self._rng.uniform(0.0, self._spread), self._bid, bidder, auction)
 

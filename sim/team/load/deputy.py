@@ -45,7 +45,8 @@ class Rooms:
     @cached_property
     def councils(self) -> Councils:
         """The councils of tasks, as ``SwarmNode.councils``; nobody writes down where one moves to."""
-        return Councils(self._node, self._node.store, self._clock, self._rng, self._born_at, lambda task: None)
+        seen = self._node.store, self._clock, self._rng, self._born_at
+        return Councils(self._node, *seen, moved=lambda task: None, may_sit=lambda public: True)
 
     @cached_property
     def dissemination(self) -> Dissemination:
@@ -91,9 +92,9 @@ class Deputy:
         """The claimant of the right to act on ``task``."""
         return self._rooms.councils.lessee(task, changed, 0)
 
-    async def council(self, task: Task) -> tuple[Contact, ...]:
-        """Who is to be the council of ``task``."""
-        return await self._rooms.councils.nearest(task)
+    async def pinned(self, task: Task) -> Task:
+        """A new ``task`` with its council."""
+        return await self._rooms.councils.pinned(task)
 
     def stop(self) -> None:
         """Its node is gone; a swarm node has stopped its rooms itself."""

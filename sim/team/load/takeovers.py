@@ -8,7 +8,7 @@ over then (invariant E3).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 from twisted.internet.defer import Deferred
 
@@ -114,12 +114,11 @@ class Takeovers:
     async def _stand(self, trial: Trial) -> None:
         """Let the first agent hold the lease and the others stand by, then set the moment of the first one's death."""
         try:
-            council = await trial.agents[0].council(trial.task)
+            trial.task = await trial.agents[0].pinned(trial.task)
         except EntangledError:
             self._end(trial)
             self.unheld += 1
             return
-        trial.task = replace(trial.task, council=council)
         for agent in trial.agents:
             trial.lessees.append(agent.lessee(trial.task, lambda: self._changed(trial)))
         for rank, lessee in enumerate(trial.lessees):

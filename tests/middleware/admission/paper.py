@@ -32,7 +32,7 @@ def granted(signer: Operator, name: str, *roles: str) -> bytes:
 
 def invited(signer: Operator, name: str = "dog", uses: int = 1, seed: int = 1) -> tuple[Code, bytes, Invite]:
     """A code, the statement that makes it good, and that as it is read."""
-    code, packed = signer.invite(name, ("device",), uses, NOW, LATER, random.Random(seed))
+    code, packed, _ = signer.invite(name, ("device",), uses, NOW, LATER, random.Random(seed))
     invite = opened(signer.public, packed)
     assert isinstance(invite, Invite)
     return code, packed, invite

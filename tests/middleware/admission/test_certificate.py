@@ -41,7 +41,7 @@ class CertificateTests(SynchronousTestCase):
         member = member_of(OPERATOR.public, DOG.public, admitted(OPERATOR, "dog"))
         _, _, invite = invited(OPERATOR)
         expected = Member(
-            DOG.public, "dog", ("device",), NOW, NOW + invite.life, invite.public, identity("vaio").public
+            DOG.public, "dog", ("device",), NOW, NOW + invite.life, invite.public, identity("vaio").public, uses=1
         )
         self.assertEqual(member, expected)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import random
+from dataclasses import replace
 
 import msgpack
 from hypothesis import given, settings
@@ -13,11 +14,13 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.admission import knock
 from middleware.admission.certificate import ROOM, is_proof
-from middleware.admission.knock import Welcome
+from middleware.admission.code import Code
+from middleware.admission.knock import Hint, Reply, Signer, Welcome
+from middleware.admission.terms import TermsContent, seal_terms
 from middleware.entangled.errors import Forged, Malformed
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address
-from tests.middleware.admission.paper import identity, invited, operator
+from tests.middleware.admission.paper import granted, identity, invited, operator
 
 OPERATOR = operator()
 CODE, _, INVITE = invited(OPERATOR)
@@ -25,7 +28,24 @@ DOG = identity("dog").public
 SECRET = bytes(range(32))
 EPHEMERAL = bindings.crypto_scalarmult_base(SECRET)
 CONTACTS = tuple(Contact(identity(str(n)).public, Address("2001:db8::" + "1234:" * 3 + str(n), 7000)) for n in range(8))
-WELCOME = Welcome(OPERATOR.public, "yard", b"p" * ROOM, ((2, b"s" * 32, 9), (1, b"t" * 32, 0)), CONTACTS, {"lan": True})
+WELCOME = Welcome(b"p" * ROOM, ((2, b"s" * 32, 9), (1, b"t" * 32, 0)), CONTACTS)
+CONTENT = TermsContent(OPERATOR.public, "yard", {"lan": True})
+HEARD = knock.Knock(DOG, EPHEMERAL, "dog", b"")
+
+
+def signer(name: str = "vaio", role: str = "bootstrap", code: Code = CODE) -> Signer:
+    """The node of that name, which answers by the terms of ``code``."""
+    return Signer(identity(name), granted(OPERATOR, name, role), seal_terms(code, CONTENT, random.Random(3)))
+
+
+def welcomed(by: Signer | None = None) -> bytes:
+    """A WELCOME, lawful unless another node signs."""
+    return knock.welcome(INVITE.public, HEARD, WELCOME, by or signer(), random.Random(2))
+
+
+def read(datagram: bytes, code: Code = CODE, secret: bytes = SECRET) -> Reply | Hint:
+    """The answer as the newcomer reads it."""
+    return knock.opened_welcome(datagram, code, DOG, secret)
 
 
 def knocked(wish: str = "dog") -> bytes:
@@ -52,28 +72,36 @@ class KnockTests(SynchronousTestCase):
 
     def test_welcome_is_read_as_it_was_given(self) -> None:
         """The newcomer reads what it is given; the fullest welcome loses contacts rather than outgrow its knock."""
-        given = knock.welcome(INVITE.public, EPHEMERAL, WELCOME, random.Random(2))
-        self.assertLessEqual(len(given), knock.KNOCK_BYTES)
-        found = knock.opened_welcome(given, CODE.key.public, SECRET)
-        assert isinstance(found, Welcome)
-        self.assertEqual((found.shown, found.secrets, found.settings), (b"p" * ROOM, WELCOME.secrets, {"lan": True}))
-        self.assertEqual(found.contacts, CONTACTS[: len(found.contacts)])
-        self.assertGreater(len(found.contacts), 3)
+        said = welcomed()
+        self.assertLessEqual(len(said), knock.KNOCK_BYTES)
+        found = read(said)
+        assert isinstance(found, Reply) and isinstance(found.said, Welcome)
+        self.assertEqual((found.said.shown, found.said.secrets), (b"p" * ROOM, WELCOME.secrets))
+        self.assertEqual(found.terms, CONTENT)
+        self.assertEqual(found.said.contacts, CONTACTS[: len(found.said.contacts)])
+        self.assertGreater(len(found.said.contacts), 1)
 
     def test_welcome_is_for_one(self) -> None:
-        """Another ephemeral key, or another code, opens nothing."""
-        given = knock.welcome(INVITE.public, EPHEMERAL, WELCOME, random.Random(2))
-        other = invited(OPERATOR, seed=2)[2].public
-        self.assertRaises(Forged, knock.opened_welcome, given, INVITE.public, b"x" * 32)
-        self.assertRaises(Forged, knock.opened_welcome, given, other, SECRET)
+        """Another ephemeral key, another code or another newcomer reads nothing."""
+        other = invited(OPERATOR, seed=2)[0]
+        self.assertRaises(Forged, read, welcomed(), CODE, b"x" * 32)
+        self.assertRaises(Forged, read, welcomed(), other)
+        self.assertRaises(Forged, knock.opened_welcome, welcomed(), CODE, identity("cat").public, SECRET)
+
+    def test_only_a_bootstrap_node_answers(self) -> None:
+        """The answer of a member without the role, and one by the terms of another code, are forged."""
+        self.assertRaises(Forged, read, welcomed(signer(role="device")))
+        self.assertRaises(Forged, read, welcomed(signer(code=invited(OPERATOR, seed=2)[0])))
+        self.assertRaises(Forged, read, welcomed(replace(signer(), identity=identity("eye"))))
 
     def test_refusals_have_names(self) -> None:
-        """A refusal comes through by its code; one that nobody knows, and the hint of a stranger, mean unknown."""
-        for code, read in (("used", "used"), ("silly", "unknown")):
-            said = knock.refusal(INVITE.public, EPHEMERAL, code, random.Random(2))
-            self.assertEqual(knock.opened_welcome(said, INVITE.public, SECRET), read)
-        hint = knock.unknown(knock.id_of(knocked()))
-        self.assertEqual((knock.opened_welcome(hint, INVITE.public, SECRET), len(hint)), ("unknown", 9))
+        """A refusal comes through by its code, an unknown one as unknown; a hint is no more than a hint."""
+        for code, meant in (("used", "used"), ("silly", "unknown")):
+            said = knock.refusal(INVITE.public, HEARD, code, signer(), random.Random(2))
+            self.assertEqual(read(said), Reply(CONTENT, meant))
+        name = knock.id_of(knocked())
+        for code, meant in (("", "unknown"), ("role", "role"), ("silly", "unknown")):
+            self.assertEqual(read(knock.hint(name, code)), Hint(meant))
 
     @given(st.integers(0, 1399), st.integers(1, 255), st.binary(max_size=1400))
     @settings(max_examples=200, deadline=None)
@@ -83,14 +111,16 @@ class KnockTests(SynchronousTestCase):
         said[place] ^= change
         self.assertRaises((Forged, Malformed), knock.opened_knock, bytes(said), INVITE.public)
         self.assertRaises((Forged, Malformed), knock.opened_knock, b"\x17" + junk, INVITE.public)
-        given = bytearray(knock.welcome(INVITE.public, EPHEMERAL, WELCOME, random.Random(2)))
+        given = bytearray(welcomed())
         given[1 + place % (len(given) - 1)] ^= change
-        self.assertRaises((Forged, Malformed), knock.opened_welcome, bytes(given), INVITE.public, SECRET)
+        self.assertRaises((Forged, Malformed), read, bytes(given))
 
     @given(st.recursive(st.integers(0, 99) | st.binary(max_size=70) | st.text(max_size=5), st.lists, max_leaves=20))
     @settings(max_examples=200, deadline=None)
-    def test_who_has_the_code_may_seal_anything(self, body: object) -> None:
-        """A welcome that opens and holds something else raises nothing but Malformed, or is a refusal."""
-        said = knock._answered(INVITE.public, EPHEMERAL, msgpack.packb(body), random.Random(2))
+    def test_a_bootstrap_node_may_sign_anything(self, body: object) -> None:
+        """An answer that is signed and holds something else raises nothing but Malformed, or is a refusal."""
+        whole = knock._signed(INVITE.public, HEARD, msgpack.packb(body), signer())
+        said = knock._answered(INVITE.public, EPHEMERAL, whole, random.Random(2))
         with contextlib.suppress(Malformed):
-            self.assertIsInstance(knock.opened_welcome(said, INVITE.public, SECRET), str)
+            found = read(said)
+            self.assertTrue(isinstance(found, Reply) and isinstance(found.said, str))

@@ -13,12 +13,12 @@ from twisted.logger import capturedLogs, formatEvent
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.admission import knock
-from middleware.admission.knock import Welcome
+from middleware.admission.knock import Reply, Welcome
 from middleware.admission.reception import HINTS, RATE, Reception
 from middleware.admission.roll import Roll
 from middleware.entangled.errors import Full, NoAnswer
 from middleware.entangled.network.network import Address
-from tests.middleware.admission.paper import NOW, granted, identity, invited, operator, roll
+from tests.middleware.admission.paper import LATER, NOW, granted, identity, invited, operator, roll
 
 OPERATOR = operator()
 CODE, PACKED, INVITE = invited(OPERATOR)
@@ -31,7 +31,8 @@ class ReceptionTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.now = 0.0
         self.sent: list[tuple[bytes, Address]] = []
-        self.roll: Roll = roll(OPERATOR, granted(OPERATOR, "vaio", "bootstrap"), PACKED)
+        terms = OPERATOR.invite("dog", ("device",), 1, NOW, LATER, random.Random(1)).terms
+        self.roll: Roll = roll(OPERATOR, granted(OPERATOR, "vaio", "bootstrap"), PACKED, terms)
         self.taken: Deferred[bool] = succeed(True)
         self.admit: Any = lambda packed: self.roll.add(packed, NOW)
         self.reception = Reception(
@@ -39,7 +40,7 @@ class ReceptionTests(SynchronousTestCase):
             identity("vaio"),
             lambda invite: self.taken,
             lambda packed: self.admit(packed),
-            lambda shown: Welcome(OPERATOR.public, "yard", shown, ((1, b"s" * 32, 0),)),
+            lambda shown: Welcome(shown, ((1, b"s" * 32, 0),)),
             lambda datagram, to: self.sent.append((datagram, to)),
             lambda: self.now,
             lambda: NOW,
@@ -52,8 +53,10 @@ class ReceptionTests(SynchronousTestCase):
         return knock.knock(CODE.key, identity(name).public, shared, "", random.Random(dice))
 
     def answer(self) -> Welcome | str:
-        """What the last answer says."""
-        return knock.opened_welcome(self.sent[-1][0], INVITE.public, SECRET)
+        """The content of the last signed answer."""
+        reply = knock.opened_welcome(self.sent[-1][0], CODE, DOG, SECRET)
+        assert isinstance(reply, Reply)
+        return reply.said
 
     def test_let_in(self) -> None:
         """A lawful knock is answered once, to where it came from, and never with more bytes than it has."""

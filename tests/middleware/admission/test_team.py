@@ -108,7 +108,7 @@ class JoiningTests(VillageCase):
         village.run(5.0)
         for house in village.houses[1:]:
             village.close(house, is_sudden=True)
-        _, packed = village.signer.invite("dog", ("device",), 2, village.wall(), 3600.0, village.dice)
+        _, packed, _ = village.signer.invite("dog", ("device",), 2, village.wall(), 3600.0, village.dice)
         told = village.tell(packed)
         village.run(20.0)
         text = str(self.failureResultOf(told, NotAcknowledged).value)
@@ -307,7 +307,10 @@ class StrangersTests(VillageCase):
     def test_expired_member(self) -> None:
         """When the time of a certificate is over its member is parted with, though a session is open."""
         village = self.village()
-        code, packed = village.signer.invite("dog", ("device",), 1, village.wall(), 3600.0, village.dice, life=30.0)
+        code, packed, terms = village.signer.invite(
+            "dog", ("device",), 1, village.wall(), 3600.0, village.dice, life=30.0
+        )
+        village.tell(terms)
         village.tell(packed)
         village.run(1.0)
         knocked = village.knock(code.text)

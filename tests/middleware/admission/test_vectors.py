@@ -13,7 +13,8 @@ from middleware.admission import knock
 from middleware.admission.certificate import chained, guest_pass, pass_of, proof
 from middleware.admission.code import Code
 from middleware.admission.roll import digest_of, packed_admission
-from middleware.admission.statement import Grant, Invite, Revoke, sealed_secret, signed
+from middleware.admission.statement import Grant, Invite, Revoke, Terms, sealed_secret, signed
+from middleware.admission.terms import TermsContent, seal_terms
 from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address
@@ -43,7 +44,9 @@ def made() -> dict[str, str]:
     ephemeral = b"e" * 32
     shared = bindings.crypto_scalarmult_base(ephemeral)
     contact = Contact(vaio.public, Address("10.0.0.1", 7000))
-    given = knock.Welcome(operator.public, "yard", chain, ((2, b"s" * 32, NOW + 60),), (contact,), {"lan": True})
+    sealed = seal_terms(code, TermsContent(operator.public, "yard", {"lan": True}), dice)
+    given = knock.Welcome(chain, ((2, b"s" * 32, NOW + 60),), (contact,))
+    signer, heard = knock.Signer(vaio, grant, sealed), knock.Knock(dog.public, shared, "rex", b"")
     found = {
         "grant": grant,
         "invitation": packed,
@@ -55,8 +58,9 @@ def made() -> dict[str, str]:
         "admission": packed_admission(dog.public, chain),
         "digest of the admission": digest_of(packed_admission(dog.public, chain)),
         "KNOCK": knock.knock(code.key, dog.public, shared, "rex", dice),
-        "WELCOME": knock.welcome(code.key.public, shared, given, dice),
-        "WELCOME that refuses": knock.refusal(code.key.public, shared, "used", dice),
+        "terms": signed(operator, Terms(code.key.public, sealed, NOW, NOW + 100)),
+        "WELCOME": knock.welcome(code.key.public, heard, given, signer, dice),
+        "WELCOME that refuses": knock.refusal(code.key.public, heard, "used", signer, dice),
     }
     return {"code": code.text, **{name: whole.hex() for name, whole in found.items()}}
 

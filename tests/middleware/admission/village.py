@@ -9,7 +9,7 @@ from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.admission.code import Code, read
-from middleware.admission.doorkeeper import Anything
+from middleware.admission.doorkeeper import Anything, Rules
 from middleware.admission.membership import Membership, MemoryMembership
 from middleware.admission.newcomer import Newcomer
 from middleware.admission.operator import Operator
@@ -48,6 +48,8 @@ class House:
 class Village(World):
     """A closed team; ``signer`` is its operator, whose words are told to the first house unless another is named."""
 
+    rules: Rules = Anything()
+
     def __init__(self, seed: int = 1, weather: Weather = CALM, bootstraps: int = 1) -> None:
         super().__init__(seed, weather)
         self.signer: Operator = operator(seed)
@@ -74,7 +76,7 @@ class Village(World):
     def open(self, house: House) -> None:
         """Begin a life of a node."""
         place = house.place
-        house.team = Team(house.kept, self.store(place), self.wall, self.rng(place), Anything())
+        house.team = Team(house.kept, self.store(place), self.wall, self.rng(place), self.rules)
         network = self.board.network(*self.address(place))
         house.node = EntangledNode(
             house.team.identity,
@@ -107,11 +109,12 @@ class Village(World):
 
     def invite(self, name: str = "dog", uses: int = 1, expires: float = 3600.0, house: int = 0) -> str:
         """A code that is good from now on."""
-        code, packed = self.signer.invite(name, ("device",), uses, self.wall(), expires, self.dice)
+        code, packed, terms = self.signer.invite(name, ("device",), uses, self.wall(), expires, self.dice)
         told: list[str] = []
-        self.tell(packed, house).addCallback(told.append)
+        for each in (terms, packed):
+            self.tell(each, house).addCallback(told.append)
         self.run(1.0)
-        assert told == ["invite"]
+        assert told == ["terms", "invite"]
         return code.text
 
     def knock(

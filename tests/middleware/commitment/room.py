@@ -8,6 +8,8 @@ from typing import Any
 from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
+from middleware.commitment.ballot import Ballot
+from middleware.commitment.charter import Charter, sign_change
 from middleware.commitment.lessee import Lessee
 from tests.invariants.team import Team
 
@@ -27,6 +29,17 @@ class RoomCase(SynchronousTestCase):
         room.add_task(T, [3, 4, 5])
         room.clock.advance(TTL + 0.1)
         return room
+
+    def chartered(self, *councils: Sequence[int], signers: int = 2) -> Charter:
+        """The proof that the council of the task became these, one after the other."""
+        charter, sitting = self.room.councils[T], [3, 4, 5]
+        for number, council in enumerate(councils, start=1):
+            members = tuple(self.room.contacts[place] for place in council)
+            ballot = Ballot(number, "agent")
+            signed = [(n, self.room.identities[place]) for n, place in enumerate(sitting[:signers])]
+            votes = [(n, 7, sign_change(each, T, number, ballot, members, 7)) for n, each in signed]
+            charter, sitting = charter.extended(members, ballot, tuple(votes)), list(council)
+        return charter
 
     def lessee(self, place: int) -> Lessee:
         """The claim of an agent."""

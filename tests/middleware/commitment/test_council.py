@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from middleware.commitment.ballot import LIFE, NoMajority, OpenClaim, Superseded
 from middleware.entangled.errors import Refused
 from tests.middleware.commitment.room import TTL, RoomCase, T
@@ -43,7 +45,7 @@ class CouncilTests(RoomCase):
         """A claimant with the old record is sent on by any member, of those that left too."""
         self.assertIsNone(self.change(1, 0, 1, 2))
         self.assertEqual(self.places(2), [0, 1, 2])
-        self.room.councils[T] = tuple(self.room.contacts[n] for n in (3, 4, 5)), 1
+        self.room.councils[T] = replace(self.room.councils[T], links=())
         self.lessee(0)
         self.assertEqual(self.places(0), [3, 4, 5])
         self.wanting(0, 0.3)
@@ -122,8 +124,9 @@ class CouncilTests(RoomCase):
     def test_learnt_from_the_record(self) -> None:
         """A newer configuration of the task's record is taken over, an older one is not."""
         council = self.lessee(0).council
-        for configuration, places in ((3, [0, 1, 2]), (2, [4, 5, 6])):
-            council.learn(configuration, [self.room.contacts[n] for n in places])
+        council.learn(self.chartered([4, 5, 6], [0, 1, 2]).packed)
+        for packed in (self.chartered([4, 5, 6]).packed, b"", b"?"):
+            council.learn(packed)
             self.assertEqual((council.configuration, self.places(0)), (3, [0, 1, 2]))
 
     def test_minority_of_the_old_council_decides_nothing(self) -> None:

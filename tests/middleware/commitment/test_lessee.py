@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from middleware.entangled.data.memory import MemoryStore
 from tests.invariants.radio import Air
 from tests.invariants.takeover import takeover, upkeep
@@ -214,7 +216,7 @@ class LesseeTests(RoomCase):
 
     def test_nobody_to_ask(self) -> None:
         """A council of nobody grants nothing, and is asked in peace."""
-        self.room.councils[T] = (), 1
+        self.room.councils[T] = replace(self.room.councils[T], first=())
         self.wanting(0, 2.0)
         self.assertEqual(self.holders(), [])
         self.lessee(0).release()

@@ -7,7 +7,7 @@ from twisted.internet.defer import Deferred
 from drivers.driver import Permit
 from drivers.errors import StaleCommand
 from drivers.gate import Gate
-from middleware.commitment.ballot import NoMajority, OpenClaim
+from middleware.commitment.ballot import NoMajority, OpenClaim, Superseded
 from middleware.commitment.lessee import CLOCK_MARGIN, RENEWALS
 from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.kademlia.distance import closest
@@ -196,7 +196,7 @@ class RuleTests(RoomCase):
         self.lessee(0).release()
         self.wanting(1)
         stale = self.lessee(0).council.close(1)
-        self.assertIsInstance(self.outcome(stale), NoMajority)
+        self.assertIsInstance(self.outcome(stale), Superseded)
         self.assertEqual(self.holders(), [1])
         self.assertIsNone(self.outcome(self.lessee(1).council.close(2)))
         self.assertEqual(self.holders(), [])
@@ -206,7 +206,7 @@ class RuleTests(RoomCase):
             for n, result in enumerate(results)
         ]
         for told in (records, records[::-1]):
-            self.assertEqual(outcome_of(told), results[0])
+            self.assertEqual(outcome_of(Task(T, "search", "Find it"), told), results[0])
 
     def test_rule_10_graceful_leave(self) -> None:
         """Stopped, given back, and in a fifth of a second the first that stands by acts, after the time to stop."""

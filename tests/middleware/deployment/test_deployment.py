@@ -10,7 +10,7 @@ import msgpack
 
 from middleware.consensus.strategy import strategy_for
 from middleware.deployed import BEHAVIOUR, STRATEGY
-from middleware.deployment.deployment import RETRY, Deployment
+from middleware.deployment.deployment import RETRY, Author, Deployment
 from middleware.deployment.manifest import (
     MAX_SOURCE,
     Manifest,
@@ -24,6 +24,7 @@ from middleware.entangled.record import Record, hashed_key
 from middleware.errors import UnknownStrategy
 from middleware.node import SwarmNode
 from middleware.settings import DeploymentSettings
+from swarmnode.sandbox import simulated
 from tests.fleet import FleetCase
 
 SOURCE = b"""
@@ -45,6 +46,7 @@ class DeploymentTests(FleetCase):
         self.world = self.swarm(3)
         self.operator, self.stranger, self.dog = self.world.nodes
         self.shelf = MemoryShelf()
+        self.author = Author("laptop", frozenset({"operator"}))
         self.deployment = self.allow()
 
     def allow(self, shelf: Shelf | None = None, node: SwarmNode | None = None, **more: object) -> Deployment:
@@ -53,7 +55,17 @@ class DeploymentTests(FleetCase):
         key = self.operator.entangled.identity.public.hex()
         allowed = replace(DeploymentSettings(True, (key,), ("best",)), **more)  # type: ignore[arg-type]
         shelf = self.shelf if shelf is None else shelf
-        made = Deployment(node.entangled, node.presence, node.wall, node.later, allowed, shelf)
+        made = Deployment(
+            node.entangled,
+            node.presence,
+            node.wall,
+            node.later,
+            allowed,
+            shelf,
+            lambda public: self.author,
+            simulated,
+            node.clock.seconds,
+        )
         made.open()
         made.follow()
         return made
@@ -93,7 +105,9 @@ class DeploymentTests(FleetCase):
         self.assertIn(CANARY, sys.modules)
         strategy = strategy_for("deployed:best", deployed=self.deployment.modules)
         self.assertEqual(strategy.name, "deployed:best")
-        self.assertEqual(self.dog.presence.device.deployed, {"best": f"1 {manifest.digest[:8]}"})
+        key = self.operator.entangled.identity.public.hex()
+        told = f"1 {manifest.digest[:8]} by laptop {key[:8]} runs, not confined"
+        self.assertEqual(self.dog.presence.device.deployed, {"best": told})
         error = self.assertRaises(UnknownStrategy, strategy_for, "deployed:other", deployed=self.deployment.modules)
         self.assertIn("there are deployed:best", str(error))
         self.assertRaises(UnknownStrategy, strategy_for, "deployed:best")

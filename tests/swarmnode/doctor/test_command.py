@@ -41,7 +41,7 @@ class CommandTests(SynchronousTestCase):
 
     def setUp(self) -> None:
         self.folder = Path(self.mktemp()).absolute()
-        (self.folder / FOLDER).mkdir(parents=True)
+        (self.folder / FOLDER).mkdir(mode=0o700, parents=True)
         self.patch(os, "environ", {**os.environ, "XDG_RUNTIME_DIR": str(self.folder)})
         self.settings = self.folder / "dog1.toml"
         self.settings.write_text('[node]\nname = "dog1"\nteam_key = "k"\n', encoding="utf-8")

@@ -1,0 +1,112 @@
+"""Pushed: observations, means and contexts as plain values, and behaviours as their own process serves them; pure."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Mapping
+from dataclasses import astuple
+from typing import Any
+
+from agents.context import Context
+from agents.means import Means
+from drivers.reading import Frame, Observation
+from middleware.deployed import Make
+
+OPTIONAL: Mapping[str, object] = {
+    "is_safe": True,
+    "progress": None,
+    "valid_for": 0.0,
+    "angle": None,
+    "value": (),
+    "choice": "",
+    "weight": 1.0,
+    "electorate": 0.0,
+}
+"""The optional attributes of a behaviour, each with its default (``agents.behaviour``)."""
+LOOK, SEARCH, HOLD, EXECUTE, EMBODY = "look", "search", "hold", "execute", "embody"
+
+
+class BehaviourKind:
+    """Behaviours, in their own process.  Each answer is the result, the cost, and the optional attributes."""
+
+    def make(self, make: Make, arguments: list[Any]) -> object:
+        """A behaviour for the parameters of a task, with its own random generator."""
+        parameters, seed = arguments
+        return _Embodied(make(parameters, random.Random(seed)))
+
+    def facts(self, thing: object) -> dict[str, Any]:
+        """Its cost and attributes before the first look."""
+        assert isinstance(thing, _Embodied)
+        return {"told": told(thing.behaviour)}
+
+    def call(self, thing: object, method: str, arguments: list[Any]) -> object:
+        """The result of one method, with the cost and attributes after it."""
+        assert isinstance(thing, _Embodied)
+        behaviour = thing.behaviour
+        result = None
+        if method == EMBODY:
+            thing.embody(arguments[0])
+        elif method == LOOK:
+            behaviour.look(observation_of(arguments[0]), arguments[1])
+        elif method == EXECUTE:
+            now, token, deadline, began, is_resumed, value, choice = arguments
+            context = Context(now, token, deadline, began, is_resumed, tuple(value), choice)
+            result = _plain_action(behaviour.execute(context))
+        else:
+            result = _plain_action({SEARCH: behaviour.search, HOLD: behaviour.hold}[method](arguments[0]))
+        return [result, told(behaviour)]
+
+
+class _Embodied:
+    """A behaviour, with what its body can do."""
+
+    def __init__(self, behaviour: Any) -> None:
+        self.behaviour = behaviour
+        self._means: Means | None = None
+
+    def embody(self, fields: dict[str, Any]) -> None:
+        """Tell it the means of its body; later calls update the same object."""
+        is_new = self._means is None
+        self._means = means = self._means or Means()
+        for name, value in fields.items():
+            setattr(means, name, _tuples(value))
+        if is_new and hasattr(self.behaviour, "embody"):
+            self.behaviour.embody(means)
+
+
+def told(thing: object) -> list[Any]:
+    """The cost and the optional attributes of a behaviour, in the order of ``OPTIONAL``."""
+    return [getattr(thing, "cost", None), *(getattr(thing, name, usual) for name, usual in OPTIONAL.items())]
+
+
+def plain_means(means: Means) -> dict[str, Any]:
+    """The means of a body as plain values."""
+    return {name: dict(value) if isinstance(value, Mapping) else value for name, value in vars(means).items()}
+
+
+def plain_observation(seen: Observation) -> list[Any]:
+    """An observation as plain values."""
+    samples = {key: list(values) for key, values in seen.samples.items()}
+    frame = None if seen.frame is None else list(astuple(seen.frame))
+    return [seen.t_host, seen.t_robot, dict(seen.values), samples, frame]
+
+
+def observation_of(fields: list[Any]) -> Observation:
+    """An observation out of plain values."""
+    t_host, t_robot, values, samples, frame = fields
+    held = {key: tuple(each) for key, each in samples.items()}
+    return Observation(t_host, t_robot, values, held, None if frame is None else Frame(*frame))
+
+
+def _tuples(value: object) -> object:
+    if isinstance(value, dict):
+        return {key: _tuples(each) for key, each in value.items()}
+    return tuple(value) if isinstance(value, list) else value
+
+
+def _plain_action(action: object) -> dict[str, float] | None:
+    if action is None:
+        return None
+    if not isinstance(action, Mapping):
+        raise TypeError(f"an action is a mapping, not {type(action).__name__}")
+    return {str(key): float(value) for key, value in action.items()}

@@ -1,0 +1,113 @@
+"""Host: the side of the module, in its own process: it loads one module and answers the node's questions.
+
+``confine`` is called with the module's kind and source before any of the source runs; it gives up the rights of the
+process and says which limits hold from then on.  Each kind of module is served by a ``Kind``.
+"""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Protocol
+
+from middleware.consensus.remote import answer as answer_of
+from middleware.consensus.strategy import reads_of
+from middleware.deployed import STRATEGY, Make
+from middleware.deployment import frame
+from middleware.deployment.frame import CALL, DROP, FIRST, LOAD, MAKE
+from middleware.deployment.manifest import Manifest
+from middleware.deployment.module import loaded
+from middleware.errors import Undeployable
+
+MAX_INSTANCES = 64
+MAX_REASON = 1000
+
+Confine = Callable[[str, bytes], Sequence[str]]
+
+
+class Kind(Protocol):
+    """How modules of one kind are made and asked, in plain values."""
+
+    def make(self, make: Make, arguments: list[Any]) -> object:
+        """One instance."""
+
+    def facts(self, thing: object) -> dict[str, Any]:
+        """The facts that the node needs about an instance."""
+
+    def call(self, thing: object, method: str, arguments: list[Any]) -> object:
+        """The answer of an instance."""
+
+
+class StrategyKind:
+    """Strategies."""
+
+    def make(self, make: Make, arguments: list[Any]) -> object:
+        """The strategy."""
+        return make()
+
+    def facts(self, thing: object) -> dict[str, Any]:
+        """The fields of a report that it reads, apart from the cost."""
+        return {"reads": list(reads_of(thing))}
+
+    def call(self, thing: object, method: str, arguments: list[Any]) -> object:
+        """Its answer."""
+        return answer_of(thing, method, arguments)
+
+
+class Host:
+    """One module, with several instances if it is a behaviour."""
+
+    def __init__(self, kinds: Mapping[str, Kind], confine: Confine) -> None:
+        self._kinds = kinds
+        self._confine = confine
+        self._kind: Kind | None = None
+        self._make: Make | None = None
+        self._things: dict[int, object] = {}
+
+    def answer(self, question: bytes) -> bytes:
+        """The answer to one question, with its length; whatever the module raises becomes a refusal."""
+        number = 0
+        try:
+            number, verb, arguments = frame.unpack_question(question)
+            verbs: dict[str, Callable[..., object]] = {
+                LOAD: self._load,
+                MAKE: self._create,
+                CALL: self._call,
+                DROP: self._drop,
+            }
+            packed = frame.pack([number, True, verbs[verb](*arguments)])
+            if len(packed) <= frame.MAX_ANSWER:
+                return packed
+            why = f"its answer has {len(packed)} bytes, more than {frame.MAX_ANSWER}"
+        except Undeployable as error:
+            why = error.problem
+        except frame.BadFrame as error:
+            why = f"its answer {error}"
+        except BaseException as error:  # a pushed module may raise anything
+            why = "".join(traceback.format_exception_only(error)).strip()
+        return frame.pack([number, False, why[:MAX_REASON].encode(errors="replace").decode()])
+
+    def _load(self, name: str, kind: str, version: int, digest: str, size: int, source: bytes) -> object:
+        limits = list(self._confine(kind, source))
+        self._kind = self._kinds[kind]
+        self._make = loaded(Manifest(name, kind, version, digest, size), source)
+        facts: dict[str, Any] = {"limits": limits}
+        if kind == STRATEGY:
+            thing = self._things[FIRST] = self._kind.make(self._make, [])
+            facts |= self._kind.facts(thing)
+        return facts
+
+    def _create(self, place: int, arguments: list[Any]) -> object:
+        assert self._kind is not None and self._make is not None
+        if len(self._things) >= MAX_INSTANCES:
+            raise Undeployable(str(place), f"there are {MAX_INSTANCES} of it already")
+        thing = self._things[place] = self._kind.make(self._make, arguments)
+        return self._kind.facts(thing)
+
+    def _call(self, place: int, method: str, arguments: list[Any]) -> object:
+        assert self._kind is not None
+        return self._kind.call(self._things[place], method, arguments)
+
+    def _drop(self, place: int) -> object:
+        self._things.pop(place, None)
+        return None

@@ -1,0 +1,135 @@
+"""Process: the channel to a module's process, over two pipes that never block the node."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import select
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from contextlib import suppress
+
+from middleware.deployment.channel import Gone
+from middleware.deployment.frame import MAX_ANSWER, MAX_QUESTION, BadFrame, Splitter
+
+PIPE_BYTES = 1024 * 1024
+"""Requested size of the pipe to the process, so that a picture fits into it."""
+READ_BYTES = 64 * 1024
+MAX_READ = 1024 * 1024
+"""Bytes that are read at a time at most."""
+ENVIRONMENT = {
+    # Sets have the same order on every machine; libraries start no threads.
+    "PYTHONHASHSEED": "0",
+    "OPENBLAS_NUM_THREADS": "1",
+    "OMP_NUM_THREADS": "1",
+}
+
+
+SANDBOX = "swarmnode.sandbox"
+"""The program that runs a module."""
+
+
+class ProcessChannel:
+    """A process that runs ``python -m program``, with none of this process's files, environment or folders."""
+
+    def __init__(self, program: str = SANDBOX) -> None:
+        self._folder = tempfile.mkdtemp(prefix="swarm-module-")
+        path = os.pathsep.join([*filter(None, sys.path), os.getcwd()])
+        try:
+            self._process: subprocess.Popen[bytes] | None = subprocess.Popen(
+                [sys.executable, "-s", "-P", "-m", program, str(os.getpid())],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                bufsize=0,
+                cwd=self._folder,
+                env={**ENVIRONMENT, "PYTHONPATH": path},
+                start_new_session=True,
+            )
+        except OSError:
+            shutil.rmtree(self._folder, ignore_errors=True)
+            raise
+        assert self._process.stdin is not None and self._process.stdout is not None
+        self._in, self._out = self._process.stdin.fileno(), self._process.stdout.fileno()
+        for pipe in (self._in, self._out):
+            os.set_blocking(pipe, False)
+        with suppress(OSError, AttributeError):  # not every system can
+            fcntl.fcntl(self._in, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
+        self._rest = b""
+        self._answers = Splitter(MAX_ANSWER)
+
+    @property
+    def is_behind(self) -> bool:
+        """Whether something is left to be sent."""
+        return bool(self._rest)
+
+    @property
+    def pid(self) -> int:
+        """The number of the process."""
+        return 0 if self._process is None else self._process.pid
+
+    def send(self, message: bytes) -> None:
+        """Send a message, or as much of it as the pipe takes."""
+        if len(self._rest) + len(message) > 2 * MAX_QUESTION:
+            raise Gone("it takes nothing in")
+        self._rest += message
+        self._flush()
+
+    def receive(self, within_s: float) -> list[bytes]:
+        """The received messages; if there is none yet, wait for one at most ``within_s`` seconds."""
+        end = time.monotonic() + within_s
+        found: list[bytes] = []
+        while True:
+            self._flush()
+            found += self._read()
+            left = end - time.monotonic()
+            if found or left <= 0.0:
+                return found
+            poll = select.poll()
+            poll.register(self._out, select.POLLIN)
+            if self._rest:
+                poll.register(self._in, select.POLLOUT)
+            poll.poll(left * 1000.0)
+
+    def end(self) -> None:
+        """Kill the process, with all that it may have started."""
+        process, self._process = self._process, None
+        if process is None:
+            return
+        process.kill()
+        for pipe in (process.stdin, process.stdout):
+            if pipe is not None:
+                pipe.close()
+        process.wait()
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+    def _flush(self) -> None:
+        if self._process is None:
+            raise Gone("its process has ended")
+        while self._rest:
+            try:
+                self._rest = self._rest[os.write(self._in, self._rest) :]
+            except BlockingIOError:
+                return
+            except OSError as error:
+                raise Gone("its process has died") from error
+
+    def _read(self) -> list[bytes]:
+        found: list[bytes] = []
+        for _ in range(MAX_READ // READ_BYTES):
+            try:
+                data = os.read(self._out, READ_BYTES)
+            except BlockingIOError:
+                return found
+            except OSError as error:
+                raise Gone("its process has died") from error
+            if not data:
+                raise Gone("its process has died")
+            try:
+                found += self._answers.feed(data)
+            except BadFrame as error:
+                raise Gone(f"its answer {error}") from error
+        return found

@@ -1,0 +1,80 @@
+"""Certificates: ask the node that hands over records for the certificates of their owners.
+
+A record is judged by its owner's certificate.  Most owners are known: from a session with them, or from the team's
+membership list.  Of the others, such as guests that only some members met, the node that shows their records shows the
+certificate as well.  A node that cannot is not asked again for ``UNASKED_S`` seconds, so junk costs little.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from twisted.internet.interfaces import IReactorTime
+
+from middleware.entangled.errors import EntangledError
+from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.record import Slot
+from middleware.entangled.wire.door import FOREIGN, OPEN, Door
+from middleware.entangled.wire.endpoint import Endpoint
+
+MAX_OWNERS = 12
+"""Owners in one request."""
+UNASKED_S = 2.0
+MAX_UNASKED = 1024
+"""Peers that are not asked for the present; the one of longest ago is asked again first."""
+OWNER_BYTES = 32
+
+
+class Certificates:
+    """The certificates of the owners of records, as the ``door`` of one node judges them."""
+
+    def __init__(self, endpoint: Endpoint, clock: IReactorTime) -> None:
+        self.door: Door = OPEN
+        self._endpoint = endpoint
+        self._clock = clock
+        self._unasked: dict[bytes, float] = {}
+        endpoint.expose("certificates", self._answer_certificates)
+
+    def may_store(self, slot: Slot) -> bool:
+        """Whether the owner of ``slot`` may write there at present."""
+        return self.door.may_store(slot)
+
+    def may_stay(self, slot: Slot) -> bool:
+        """Whether what is held in ``slot`` may be held on and shown."""
+        return self.door.may_stay(slot)
+
+    def lacking(self, contact: Contact, owners: Iterable[bytes]) -> list[bytes]:
+        """Those of ``owners`` whose certificates this node has not seen, and may ask ``contact`` for."""
+        lacking = [owner for owner in dict.fromkeys(owners) if self.door.authority(owner).refusal == FOREIGN]
+        return lacking if self._clock.seconds() >= self._unasked.get(contact.node_id, 0.0) else []
+
+    async def learn(self, contact: Contact, owners: Iterable[bytes]) -> None:
+        """Ask ``contact`` for the certificates of those of ``owners`` that lack one; raises nothing."""
+        lacking = self.lacking(contact, owners)
+        while lacking and await self._learn(contact, lacking[:MAX_OWNERS]):
+            lacking = lacking[MAX_OWNERS:]
+
+    # -- inside -----------------------------------------------------------------------------------------------------
+
+    async def _learn(self, contact: Contact, owners: list[bytes]) -> bool:
+        """Ask for those of ``owners``; whether ``contact`` could show a certificate that holds for each of them."""
+        try:
+            answer = await self._endpoint.ask(contact, "certificates", owners)
+        except EntangledError:
+            answer = None
+        shown = answer if isinstance(answer, list) and len(answer) == len(owners) else [None] * len(owners)
+        for owner, certificate in zip(owners, shown, strict=True):
+            if not (isinstance(certificate, bytes) and certificate and self.door.learn(owner, certificate)):
+                self._unasked.pop(contact.node_id, None)
+                self._unasked[contact.node_id] = self._clock.seconds() + UNASKED_S
+                if len(self._unasked) > MAX_UNASKED:
+                    del self._unasked[next(iter(self._unasked))]
+                return False
+        return True
+
+    def _answer_certificates(self, peer: Contact, owners: list[object]) -> list[bytes]:
+        """CERTIFICATES: of each owner its certificate, empty where this node has none."""
+        return [
+            self.door.certificate(owner) if isinstance(owner, bytes) and len(owner) == OWNER_BYTES else b""
+            for owner in owners[:MAX_OWNERS]
+        ]

@@ -1,0 +1,60 @@
+"""Loopback: the way to a behaviour of this process, through the same plain values as one in another process."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from agents.pushed import BehaviourKind
+from middleware.deployed import Make
+from middleware.deployment import frame
+
+
+class Loopback:
+    """A conversation that answers at once, or where ``is_held`` when ``let`` is called."""
+
+    def __init__(self, make: Make, parameters: Mapping[str, Any] | None = None) -> None:
+        self.fault = ""
+        self.facts: dict[str, Any] = {}
+        self.is_behind = False
+        self.is_held = False
+        self.is_closed = False
+        self.asked: list[str] = []
+        self._kind = BehaviourKind()
+        self._thing = self._kind.make(make, [dict(parameters or {}), 1])
+        self.facts = self._kind.facts(self._thing)
+        self._held: list[Callable[[], None]] = []
+
+    @classmethod
+    def of(cls, make: Make) -> Callable[..., Loopback]:
+        """What makes a conversation with one of these."""
+        return lambda parameters, rng: cls(make, parameters)
+
+    def ask(self, method: str, arguments: list[Any], take: Callable[[bool, Any], None]) -> bool:
+        """Ask the behaviour."""
+        if self.fault:
+            return False
+        self.asked.append(method)
+        number, _, carried = frame.unpack_question(frame.pack([1, method, arguments])[4:])
+        try:
+            content = self._kind.call(self._thing, method, carried)
+            answer = frame.unpack_answer(frame.pack([number, True, content])[4:])[1:]
+        except Exception as error:  # as the other process does
+            answer = False, f"{type(error).__name__}: {error}"
+        self._held.append(lambda: take(*answer))
+        if not self.is_held:
+            self.let()
+        return True
+
+    def let(self) -> None:
+        """Have what was held arrive."""
+        held, self._held = self._held, []
+        for each in held:
+            each()
+
+    def look(self) -> None:
+        """Nothing comes by itself."""
+
+    def close(self) -> None:
+        """Note it."""
+        self.is_closed = True

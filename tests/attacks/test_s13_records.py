@@ -1,0 +1,319 @@
+"""Attack S13: records of owners that no certificate covers: invented keys, revoked keys, and one owner that floods."""
+
+from __future__ import annotations
+
+import random
+from typing import Any
+
+import msgpack
+
+from middleware.entangled.identity import Identity
+from middleware.entangled.record import Record, hashed_key
+from middleware.entangled.replication.watch import Watch
+from middleware.entangled.space.tuplespace import TupleSpace
+from middleware.halt import HALT, SLOT
+from middleware.roles import DEVICE, OPERATOR, VIEWER
+from middleware.stop_set import Statement
+from middleware.tasks import TASKS
+from tests.attacks.siege import SOURCE, ClosedTeam, SiegeCase
+from tests.middleware.admission.village import House
+
+JUNK = 12_400
+PAGE = 60
+OTHER = hashed_key("whatever")
+STOP = bytes(range(16))
+
+
+def written(owner: Identity, key: bytes, name: str, value: bytes = b"\xc3", sequence: int = 1) -> Record:
+    """A team record with a good signature of its owner."""
+    return Record(key, name, owner.public, sequence, "team", 3600.0, value).signed(owner)
+
+
+class RecordCase(SiegeCase):
+    """A team of four that are in touch."""
+
+    def setUp(self) -> None:
+        """Everybody knows everybody."""
+        super().setUp()
+        self.team: ClosedTeam = self.siege()
+        for name in ("dog1", "dog2", "dog3"):
+            self.team.enlist(name, DEVICE)
+        self.team.run(10.0)
+
+    def forged(self, owner: Identity) -> list[Record]:
+        """The release of a stop, a task, and something else, as their owner would write them."""
+        release = msgpack.packb(Statement({}, (STOP,), "nobody").packed())
+        return [written(owner, HALT, SLOT, release), written(owner, TASKS, "t1"), written(owner, OTHER, "x")]
+
+    def holders(self, records: list[Record], among: list[House]) -> list[str]:
+        """Which of these houses have any of the records in their stores."""
+        return [h.name for h in among if any(h.node.store.slot(record.slot) is not None for record in records)]
+
+    def read(self, records: list[Record], house: House) -> list[Record]:
+        """Which of the records a house reads, by a majority."""
+        keys = dict.fromkeys(record.key for record in records)
+        found = [self.outcome(self.team, house.node.get(key)) for key in keys]
+        return [record for each in found for record in each if record in records]
+
+    def watch(self, records: list[Record], house: House) -> list[Watch]:
+        """The watches of a house on the keys of the records."""
+        keys = dict.fromkeys(record.key for record in records)
+        return [house.node.watch(key, lambda found: None, keep=True) for key in keys]
+
+    def works(self, house: House) -> None:
+        """A house writes a record and a tuple, and the operator invites somebody there."""
+        put = house.node.put(hashed_key("own"), "slot", b"\xc3")
+        self.assertGreaterEqual(self.outcome(self.team, put), 3)
+        space = TupleSpace(house.node, self.team.clock, random.Random(7), "yard")
+        self.addCleanup(space.stop)
+        self.assertIsNone(self.outcome(self.team, space.put(("ball", 1))))
+        self.assertEqual(self.outcome(self.team, space.get_if_exists(("ball", int))), ("ball", 1))
+        self.team.invite("pup")
+
+    def accomplice(self) -> House:
+        """A member whose node holds, hands over and shows whatever it likes."""
+        house = self.team.houses[-1]
+        house.node.replica.may_store = house.node.replica.may_stay = lambda slot: True
+        return house
+
+
+class InventedKeyTests(RecordCase):
+    """Records of an owner that is on no membership list."""
+
+    def setUp(self) -> None:
+        """A viewer with a good pass."""
+        super().setUp()
+        self.invented = Identity(b"invented".ljust(32))
+        self.records = self.forged(self.invented)
+
+    def test_brought_by_a_viewer(self) -> None:
+        """By no method that takes records a viewer brings in what it signed with an invented key."""
+        team = self.team
+        viewer, own = self.insider(team, "eye", VIEWER)
+        viewer.expose("watch", lambda peer, key, digest, ttl=8.0: [0, [[], None]], changes=True)
+        watches = [watch for house in team.houses for watch in self.watch(self.records, house)]
+        for house in team.houses:
+            node: Any = house.node
+            for watch in node._subscriber._watches:
+                watch.asked.add(own.node_id)
+            contact = team.contact(house)
+            for record in self.records:
+                packed = [record.packed()]
+                for method, arguments in (
+                    ("store", (packed,)),
+                    ("store", (packed, [600.0])),
+                    ("cache", (record.key, packed, 60.0)),
+                    ("push", (record.key, 1, packed, [])),
+                ):
+                    viewer.ask(contact, method, *arguments, changes=True).addErrback(lambda failure: None)
+        team.run(0.5)
+        self.assertEqual([record for watch in watches for record in watch.records], [])
+        team.run(3.0)
+        self.assertEqual(self.holders(self.records, team.houses), [])
+        cached = [h.node.replica.cache.get(r.key, 0.0) for h in team.houses for r in self.records]
+        self.assertEqual([copy for copy in cached if copy], [])
+        self.assertEqual(self.read(self.records, team.houses[0]), [])
+
+    def test_told_by_a_lying_replica(self) -> None:
+        """What a replica answers to a read, a watch or a fetch is not believed of an owner that nobody certified."""
+        team, house = self.team, self.team.houses[0]
+        liar, _ = self.insider(team, "eye", VIEWER)
+        by_key = {record.key: record for record in self.records}
+        liar.expose("find_value", lambda peer, key, *rest: [[by_key[key].packed()], None, 1])
+        liar.expose("watch", lambda peer, key, *rest: [1, [[by_key[key].packed()], None]], changes=True)
+        liar.expose("fetch", lambda peer, slots: [[by_key[slot[0]].packed(), 600.0] for slot in slots])
+        self.outcome(team, liar.ask(team.contact(house), "ping", bytes(8), changes=True))
+        contact = next(iter([c for c in house.node.overlay.contacts() if c.address == SOURCE]), None)
+        assert contact is not None
+        node: Any = house.node
+        for record in self.records:
+            reading = node._chores
+            answers: list[Any] = []
+
+            async def read(record: Record = record, answers: list[Any] = answers) -> None:
+                answers.append(await node._reader.pages(contact, record.key))
+
+            reading.fork(read())
+            [watch] = self.watch([record], house)
+            reading.fork(node._subscriber._renew_at(watch, contact))
+            reading.fork(node._handover._fetch(contact, [record.slot]))
+            team.run(1.0)
+            self.assertEqual([answer.records for answer in answers], [[]])
+            self.assertEqual(watch.records, [])
+        self.assertEqual(self.holders(self.records, [house]), [])
+
+    def test_handed_over_by_an_accomplice(self) -> None:
+        """A whole node that keeps such records hands them to nobody, and no read or watch of others shows them."""
+        team = self.team
+        accomplice = self.accomplice()
+        others = [house for house in team.houses if house is not accomplice]
+        watches = [watch for house in others for watch in self.watch(self.records, house)]
+        for record in self.records:
+            accomplice.node.replica.keep(record)
+        team.run(60.0)
+        self.assertEqual(self.holders(self.records, [accomplice]), [accomplice.name])
+        self.assertEqual(self.holders(self.records, others), [])
+        self.assertEqual([record for watch in watches for record in watch.records], [])
+        self.assertEqual([self.read(self.records, house) for house in others], [[], [], []])
+
+    def test_a_flood_of_junk(self) -> None:
+        """12,400 records under invented keys fill no store; afterwards records, tuples and invitations work."""
+        team = self.team
+        viewer, _ = self.insider(team, "eye", VIEWER)
+        junk = [written(self.invented, OTHER, f"{number}") for number in range(JUNK)]
+        for house in team.houses:
+            for begin in range(0, JUNK, PAGE):
+                page = [record.packed() for record in junk[begin : begin + PAGE]]
+                asked = viewer.ask(team.contact(house), "store", page, [600.0] * len(page), changes=True)
+                asked.addErrback(lambda failure: None)
+                team.run(0.05)
+        team.run(2.0)
+        self.assertEqual(self.holders(junk, team.houses), [])
+        self.works(team.houses[1])
+
+
+class RevokedKeyTests(RecordCase):
+    """Records of an operator that was revoked."""
+
+    def setUp(self) -> None:
+        """An operator that has ordered something."""
+        super().setUp()
+        self.boss = self.team.enlist("boss", OPERATOR)
+        self.team.enlist("dog4", DEVICE)
+        self.team.run(10.0)
+        self.others = [house for house in self.team.houses if house is not self.boss]
+        self.outcome(self.team, self.boss.node.put(TASKS, "before", b"\xc3"))
+        [self.before] = self.outcome(self.team, self.others[0].node.get(TASKS))
+        self.later = written(self.boss.kept.membership.identity, TASKS, "later", sequence=2**40)
+
+    def revoke(self) -> None:
+        """The operator of the team revokes it."""
+        self.team.tell(self.team.signer.revoke(self.boss.public, self.boss.name, self.team.wall()))
+        self.team.run(10.0)
+        self.team.close(self.boss, is_sudden=True)
+
+    def test_what_it_ordered_before(self) -> None:
+        """What a revoked operator ordered is gone from every store and every watch when the revocation arrives."""
+        watches = [watch for house in self.others for watch in self.watch([self.before], house)]
+        self.team.run(3.0)
+        self.assertEqual([watch.records for watch in watches], [[self.before]] * len(watches))
+        self.revoke()
+        self.assertEqual([watch.records for watch in watches], [[]] * len(watches))
+        self.assertEqual(self.holders([self.before], self.others), [])
+        self.assertEqual(self.read([self.before], self.others[0]), [])
+
+    def test_its_stop_stays(self) -> None:
+        """A stop that it ordered before stays in force, across restarts too, and it cannot lift it itself."""
+        stop = msgpack.packb(Statement({STOP: "boss"}).packed())
+        self.outcome(self.team, self.boss.node.put(HALT, SLOT, stop))
+        self.revoke()
+        sleeper = self.others[1]
+        self.team.close(sleeper)
+        self.team.open(sleeper)
+        self.team.run(5.0)
+        for house in self.others:
+            found = self.outcome(self.team, house.node.get(HALT))
+            self.assertEqual([record.value for record in found], [stop], house.name)
+        bad, _ = self.insider(self.team, "bad", DEVICE)
+        lifted = msgpack.packb(Statement({}, (STOP,), "boss").packed())
+        release = written(self.boss.kept.membership.identity, HALT, SLOT, lifted, sequence=2**40)
+        for house in self.others:
+            bad.ask(self.team.contact(house), "store", [release.packed()], [600.0], changes=True)
+        self.team.run(1.0)
+        for house in self.others:
+            self.assertNotEqual(house.node.store.slot(release.slot), release)
+
+    def test_what_it_signs_afterwards(self) -> None:
+        """What it signs afterwards is refused from the hands of a member, and of an accomplice's whole node."""
+        self.revoke()
+        bad, _ = self.insider(self.team, "bad", DEVICE)
+        for house in self.others:
+            asked = bad.ask(self.team.contact(house), "store", [self.later.packed()], [600.0], changes=True)
+            [verdict] = self.outcome(self.team, asked, 0.5)
+            self.assertLess(verdict, 0)
+        accomplice = self.accomplice()
+        accomplice.node.replica.keep(self.later)
+        honest = [house for house in self.others if house is not accomplice]
+        self.team.run(60.0)
+        self.assertEqual(self.holders([self.later], honest), [])
+        self.assertEqual(self.read([self.later], honest[0]), [])
+
+    def test_after_a_restart(self) -> None:
+        """A node that was off meanwhile neither shows nor keeps what its store has of it, once it hears."""
+        sleeper = self.others[1]
+        self.team.close(sleeper)
+        self.revoke()
+        self.assertEqual(self.holders([self.before], [sleeper]), [sleeper.name])
+        self.team.open(sleeper)
+        self.team.run(12.0)
+        self.assertEqual(self.holders([self.before], self.others), [])
+        self.team.close(sleeper)
+        sleeper.node.store.put(self.later, self.team.clock.seconds() + 600.0)
+        self.team.open(sleeper)
+        self.assertEqual(sleeper.node.replica.held(TASKS), [])
+        self.team.run(12.0)
+        self.assertEqual(self.holders([self.later], self.others), [])
+        self.assertEqual(self.read([self.later], sleeper), [])
+
+
+class FloodTests(RecordCase):
+    """A member that may write, and does nothing else."""
+
+    def test_it_fills_its_own_share_only(self) -> None:
+        """One device that floods every store fills its own share of it, and everybody else goes on."""
+        team = self.team
+        bad, own = self.insider(team, "bad", DEVICE)
+        names = [f"{number}" for number in range(JUNK)]
+        junk = [Record(OTHER, name, own.public, 1, "team", 3600.0, b"\xc3", bytes(64)).packed() for name in names]
+        refused = 0
+        for house in team.houses:
+            for begin in range(0, JUNK, PAGE):
+                asked = bad.ask(team.contact(house), "store", junk[begin : begin + PAGE], changes=True)
+                verdicts = self.outcome(team, asked, 0.05)
+                refused += not isinstance(verdicts, list) or any(verdicts)
+            usage = house.node.store.usage
+            self.assertLessEqual(usage.rows, usage.max_rows // 2)
+        self.assertGreater(refused, 0)
+        self.works(team.houses[1])
+        first = Record(OTHER, names[0], own.public, 2, "team", 3600.0, None, bytes(64))
+        asked = bad.ask(team.contact(team.houses[0]), "store", [first.packed()], changes=True)
+        self.assertEqual(self.outcome(team, asked), [0], "a full owner can still delete")
+
+    def test_it_blocks_no_reads(self) -> None:
+        """A member whose share is full at all replicas but one cannot make the reads of a key fail."""
+        team = self.team
+        bad, own = self.insider(team, "bad", OPERATOR)
+        for house in team.houses[1:]:
+            usage = house.node.store.usage
+            for number in range((usage.max_rows - usage.rows) // 2):
+                house.node.replica.keep(Record(OTHER, f"{number}", own.public, 1, "team", 3600.0, b"\xc3", bytes(64)))
+        record = written(own, TASKS, "t1")
+        asked = bad.ask(team.contact(team.houses[0]), "store", [record.packed()], changes=True)
+        self.assertEqual(self.outcome(team, asked), [0])
+        for house in team.houses:
+            found = self.outcome(team, house.node.get(TASKS), 5.0)
+            self.assertIsInstance(found, list)
+
+
+class GuestTests(RecordCase):
+    """What a guest of a gateway may write reaches those that never met it."""
+
+    def test_second_hand(self) -> None:
+        """A node that joined after the guest left has its record, believes it, and still does after a restart."""
+        team = self.team
+        guest = team.move_in(team.houses[0].team.guest(bytes(range(32)), "phone"))
+        team.run(5.0)
+        self.outcome(team, guest.node.put(OTHER, "note", b"\xc3"))
+        [record] = self.outcome(team, guest.node.get(OTHER))
+        team.run(5.0)
+        team.close(guest)
+        team.run(5.0)
+        late = team.enlist("late", DEVICE)
+        team.run(30.0)
+        self.assertEqual(late.node.replica.held(OTHER), [record])
+        self.assertEqual(self.read([record], late), [record])
+        for house in team.houses:
+            if house is not guest:
+                team.close(house)
+        team.open(late)
+        self.assertEqual(late.node.replica.held(OTHER), [record])

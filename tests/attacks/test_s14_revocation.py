@@ -1,0 +1,150 @@
+"""Attack S14: to outlive a revocation, to fill the membership list, and to be a member that nobody can revoke."""
+
+from __future__ import annotations
+
+import random
+
+from middleware.admission.certificate import chained, guest_pass, proof
+from middleware.admission.code import Code, read
+from middleware.admission.doorkeeper import MAX_VOUCHED
+from middleware.admission.roll import MAX_ENTRIES, RESERVED, Roll, invitation_id, packed_admission
+from middleware.admission.statement import Invite
+from middleware.entangled.errors import Full, NotAdmitted
+from middleware.entangled.identity import Identity
+from middleware.entangled.wire.door import REVOKED, UNLISTED
+from tests.attacks.siege import SOURCE, ClosedTeam, SiegeCase
+from tests.middleware.admission.paper import NOW, granted, identity, operator
+
+BOOT = identity("boot")
+
+
+class BackdatingTests(SiegeCase):
+    """A revoked bootstrap node and a used code."""
+
+    def setUp(self) -> None:
+        """Make a team with a bootstrap node that was revoked, and one member that this node let in before."""
+        super().setUp()
+        self.team: ClosedTeam = self.siege(bootstraps=2)
+        self.thief = self.team.houses[1]
+        self.code: Code = read(self.team.invite("dog", uses=5))
+        invite = self.team.houses[0].team.roll.invites()[0]
+        grant = self.team.houses[0].team.roll.granted(self.thief.public)
+        assert grant is not None
+        self.invite, self.grant = invite, grant[1]
+        known = self.team.houses[0].team.roll.invited(invitation_id(invite.public))
+        assert known is not None
+        self.packed = known[1]
+
+    def mint(self, seed: int, begin: int) -> tuple[Identity, bytes]:
+        """A member that the thief lets in by the code, with a certificate that begins whenever it likes."""
+        own = Identity(bytes([seed]) * 32)
+        came = (own.public, "", proof(self.code.key, own.public, ""))
+        thief = self.thief.kept.membership.identity
+        return own, chained(thief, self.grant, (self.packed, self.invite), came, f"dog{seed}", begin)
+
+    def enter(self, own: Identity, shown: bytes, port: int) -> object:
+        """The answer of the first node to a question of that member."""
+        secret = self.team.houses[0].kept.membership.secrets[0][1]
+        endpoint = self.attacker(self.team, own, secret, shown, SOURCE._replace(port=port))
+        contact = self.team.contact(self.team.houses[0])
+        return self.outcome(self.team, endpoint.ask(contact, "ping", bytes(8), changes=True), 4.0)
+
+    def test_backdated_members(self) -> None:
+        """Members that a revoked bootstrap node makes are refused, whatever their dates; a kept member stays."""
+        kept, shown = self.mint(1, int(self.team.wall()))
+        self.assertNotIsInstance(self.enter(kept, shown, 701), Exception)
+        revoke = self.team.signer.revoke(self.thief.public, "boot1", self.team.wall(), kept=[kept.public])
+        self.outcome(self.team, self.team.tell(revoke))
+        self.team.run(2.0)
+        for number in (2, 3, 4):
+            own, shown_too = self.mint(number, self.invite.not_before)
+            error = self.enter(own, shown_too, 700 + number)
+            self.assertIsInstance(error, NotAdmitted)
+            self.assertEqual(getattr(error, "code", ""), REVOKED)
+        self.assertIn("dog1", self.team.members())
+        self.assertNotIn("dog2", self.team.members())
+
+    def test_revoked_with_all(self) -> None:
+        """Without a list the members that a bootstrap node let in go with it."""
+        own, shown = self.mint(1, int(self.team.wall()))
+        self.enter(own, shown, 701)
+        self.assertIn("dog1", self.team.members())
+        self.outcome(self.team, self.team.tell(self.team.signer.revoke(self.thief.public, "boot1", self.team.wall())))
+        self.team.run(2.0)
+        self.assertNotIn("dog1", self.team.members())
+
+    def test_more_uses_than_the_code_has(self) -> None:
+        """A bootstrap node that lets in more by a code than it is good for finds no room on the list for them."""
+        results = [self.enter(*self.mint(number, int(self.team.wall())), 700 + number) for number in range(1, 9)]
+        codes = [getattr(each, "code", "") for each in results if isinstance(each, NotAdmitted)]
+        self.assertEqual(codes, [UNLISTED] * 3)
+
+
+class RoomTests(SiegeCase):
+    """The membership list, filled by those who may sign admissions."""
+
+    def test_room_for_the_operator(self) -> None:
+        """A list that a bootstrap node filled takes the operator's revocation, which makes room again."""
+        signer = operator(1)
+        roll = Roll(signer.public)
+        grant = granted(signer, "boot", "bootstrap")
+        roll.add(grant, NOW)
+        rng = random.Random(1)
+        with self.assertRaises(Full):
+            for code in range(MAX_ENTRIES):
+                invitation = signer.invite(f"p{code}", ("device",), 100, NOW, 3600.0, rng)
+                invite = roll.add(invitation.invite, NOW)
+                assert isinstance(invite, Invite)
+                for number in range(invite.uses):
+                    public = rng.randbytes(32)
+                    came = (public, "", proof(invitation.code.key, public, ""))
+                    shown = chained(BOOT, grant, (invitation.invite, invite), came, f"p{number}", NOW)
+                    roll.add(packed_admission(public, shown), NOW)
+        self.assertGreater(len(roll.admissions()), 400)
+        self.assertLessEqual(len(roll.admissions()), MAX_ENTRIES - RESERVED)
+        roll.add(signer.revoke(BOOT.public, "boot", NOW), NOW)
+        self.assertIsNotNone(roll.revoked(BOOT.public))
+        self.assertEqual(roll.admissions(), [])
+
+
+class UnlistedTests(SiegeCase):
+    """A member whose grant nobody was told of."""
+
+    def test_who_is_met_is_listed(self) -> None:
+        """A member that shows a grant which it kept to itself is on every list after its first session."""
+        team = self.siege()
+        team.enlist("cat")
+        hidden, own = self.insider(team, "ghost", "viewer")
+        self.assertNotIn("ghost", team.members())
+        self.outcome(team, hidden.ask(team.contact(team.houses[0]), "ping", bytes(8), changes=True))
+        team.run(6.0)
+        self.assertEqual([team.members(place) for place in (0, 1)], [["cat", "ghost", "vaio"]] * 2)
+        self.outcome(team, team.tell(team.signer.revoke(own.public, "ghost", team.wall())))
+        team.run(2.0)
+        error = self.outcome(team, hidden.ask(team.contact(team.houses[0]), "roll.secret", 1), 4.0)
+        self.assertIsInstance(error, NotAdmitted)
+
+    def test_any_key_can_be_revoked(self) -> None:
+        """A key that is on no list can be revoked, and its certificate is refused from then on."""
+        team = self.siege()
+        paper = team.paper("ghost", "viewer")
+        public = paper.identity.public
+        self.outcome(team, team.tell(team.signer.revoke(public, "ghost", team.wall())))
+        hidden = self.attacker(team, paper.identity, paper.secrets[0][1], paper.shown)
+        error = self.outcome(team, hidden.ask(team.contact(team.houses[0]), "ping", bytes(8), changes=True), 4.0)
+        self.assertEqual(getattr(error, "code", ""), REVOKED)
+
+
+class GuestTests(SiegeCase):
+    """A gateway that vouches for a crowd."""
+
+    def test_guests_of_one_gateway_are_few(self) -> None:
+        """A node lets in so many guests of one gateway at a time, and refuses the others by name."""
+        team = self.siege()
+        paper = team.paper("gate", "gateway")
+        refused = []
+        for number in range(MAX_VOUCHED + 3):
+            guest = Identity(number.to_bytes(32))
+            shown = guest_pass(paper.identity, paper.shown, guest.public, "phone", int(team.wall()))
+            refused.append(team.houses[0].team.door.judge(guest.public, shown))
+        self.assertEqual(refused, [""] * MAX_VOUCHED + [UNLISTED] * 3)

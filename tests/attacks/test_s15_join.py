@@ -1,0 +1,193 @@
+"""Attack S15: a member answers a newcomer in the operator's place, or with terms that the operator never gave."""
+
+from __future__ import annotations
+
+import random
+import tomllib
+from collections.abc import Callable
+from typing import Any
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from nacl import bindings
+from twisted.internet.defer import Deferred
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.admission import knock
+from middleware.admission.certificate import chained, proof
+from middleware.admission.code import Code, mark_of, read
+from middleware.admission.knock import Knock, Signer, Welcome
+from middleware.admission.membership import Membership
+from middleware.admission.newcomer import Newcomer
+from middleware.admission.operator import Operator
+from middleware.admission.statement import Invite, Terms, opened, signed
+from middleware.admission.terms import TermsContent, seal_terms
+from middleware.entangled.errors import Forged
+from middleware.entangled.identity import Identity
+from middleware.entangled.network.network import Address
+from swarmnode.team.init import SHARED, settings_text
+from tests.attacks.siege import ClosedTeam, SiegeCase
+
+DOOR = Address("10.6.6.6", 666)
+LINE = st.text(st.characters(exclude_categories=("C", "Z")), min_size=1, max_size=40)
+NEWCOMER = Identity(b"n" * 32)
+Answer = Callable[[bytes, Knock], bytes]
+
+
+class JoinTests(SiegeCase):
+    """A team with a code that is open, and a hostile member that knows all that a member knows."""
+
+    def setUp(self) -> None:
+        """Make the team, the code, and the member."""
+        super().setUp()
+        self.team: ClosedTeam = self.siege()
+        self.code: Code = read(self.team.invite("dog"))
+        self.invitation = self.code.key.public
+        self.eye = self.team.enlist("eye", "viewer")
+        self.rng = random.Random(7)
+        terms = self.eye.team.roll.terms_of(self.invitation)
+        assert terms is not None
+        self.terms = terms
+
+    def check_true_team(self, answer: Answer) -> None:
+        """Let the hostile member ``answer`` each KNOCK first, then a bootstrap node; the true team has to be joined."""
+        network = self.team.board.network(*DOOR)
+        answered: list[Knock] = []
+
+        def received(datagram: bytes, source: Address) -> None:
+            answered.append(knock.opened_knock(datagram, self.invitation))
+            network.send(answer(datagram, answered[-1]), source)
+
+        network.listen(received)
+        self.addCleanup(network.close)
+        newcomer = Newcomer(self.code, NEWCOMER.seed, self.network(), self.team.clock, random.Random(8))
+        joined: list[Membership] = []
+        failed: list[Exception] = []
+        work: Deferred[Any] = newcomer.join([DOOR, self.team.address_of(self.team.houses[0])], 12.0)
+        work.addCallbacks(joined.append, lambda failure: failed.append(failure.value))
+        self.team.run(13.0)
+        self.assertTrue(answered)
+        self.assertEqual(failed, [])
+        [membership] = joined
+        self.assertEqual((membership.operator, membership.team), (self.team.signer.public, self.team.signer.team))
+        self.assertEqual(dict(membership.settings), {})
+        self.assertEqual(membership.secrets[0][1], self.team.houses[0].kept.membership.secrets[0][1])
+
+    def network(self) -> Any:
+        """The newcomer's own port."""
+        return self.team.board.network("10.0.0.2", 9999)
+
+    def grant(self, identity: Identity, *roles: str) -> bytes:
+        """The true operator's grant for a key."""
+        return self.team.signer.grant(identity.public, "eye", roles, self.team.wall())
+
+    def forge(self, heard: Knock, operator: Operator, terms: bytes) -> bytes:
+        """Make a complete WELCOME by another operator: invitation, bootstrap node, pass and all."""
+        boot, now = Identity(b"b" * 32), int(self.team.wall())
+        grant = operator.grant(boot.public, "boot", ("bootstrap",), now)
+        invite = Invite(self.invitation, "dog", ("device",), 1, now, now + 3600, 3600)
+        came = (heard.public, heard.wish, heard.proof)
+        shown = chained(boot, grant, (signed(operator.identity, invite), invite), came, "dog", now)
+        given = Welcome(shown, ((1, b"x" * 32, 0),))
+        return knock.welcome(self.invitation, heard, given, Signer(boot, grant, terms), self.rng)
+
+    def test_another_operator(self) -> None:
+        """A member that answers for an operator of its own, with terms of its own making, is not believed."""
+        impostor = Operator("yard", b"i" * 32, {"presence_lease": 9.0})
+        false = Code(self.code.secret ^ 1, mark_of(impostor.public))
+        terms = seal_terms(false, TermsContent(impostor.public, "yard", impostor.settings), self.rng)
+        self.check_true_team(lambda datagram, heard: self.forge(heard, impostor, terms))
+
+    def test_another_operator_with_the_true_terms(self) -> None:
+        """The true terms name the true operator, so a bootstrap node of another one cannot answer with them."""
+        impostor = Operator("yard", b"i" * 32)
+        self.check_true_team(lambda datagram, heard: self.forge(heard, impostor, self.terms))
+
+    def test_an_operator_with_the_same_mark(self) -> None:
+        """Twenty bits of the operator's key are no proof: without the code's secret nobody seals terms for it."""
+        impostor = Operator("yard", b"i" * 32)
+        # A search for a key with the mark of the code takes a minute; instead the code has the mark of the key.
+        code = Code(self.code.secret, mark_of(impostor.public))
+        self.invitation = code.key.public
+        false = Code(self.code.secret ^ 1, code.mark)
+        terms = seal_terms(false, TermsContent(impostor.public, "yard"), self.rng)
+        ephemeral = bindings.crypto_scalarmult_base(b"e" * 32)
+        heard = Knock(NEWCOMER.public, ephemeral, "", proof(code.key, NEWCOMER.public, ""))
+        said = self.forge(heard, impostor, terms)
+        self.assertRaises(Forged, knock.opened_welcome, said, code, NEWCOMER.public, b"e" * 32)
+
+    def test_secrets_of_a_member(self) -> None:
+        """A member without the role bootstrap can give no secret and no pass in the true operator's name."""
+        identity = self.eye.team.identity
+        signer = Signer(identity, self.grant(identity, "viewer"), self.terms)
+        given = Welcome(self.eye.kept.membership.shown, ((9, b"x" * 32, 0),))
+        self.check_true_team(lambda datagram, heard: knock.welcome(self.invitation, heard, given, signer, self.rng))
+
+    def test_a_grant_of_another_node(self) -> None:
+        """The terms, a grant and the newcomer's own pass, which every member knows, do not let another key sign."""
+        boot = self.team.houses[0].team.identity
+        self.team.knock(self.code.text, seed=NEWCOMER.seed)
+        self.team.run(8.0)
+        admission = self.eye.team.roll.admitted(NEWCOMER.public)
+        assert admission is not None
+        signer = Signer(self.eye.team.identity, self.grant(boot, "bootstrap"), self.terms)
+        given = Welcome(admission.shown, ((9, b"x" * 32, 0),))
+        self.check_true_team(lambda datagram, heard: knock.welcome(self.invitation, heard, given, signer, self.rng))
+
+    def test_terms_of_another_invitation(self) -> None:
+        """Terms that the operator sealed for another code open with that code only."""
+        other = self.team.signer.invite("cat", ("device",), 1, self.team.wall(), 3600.0, random.Random(9))
+        statement = opened(self.team.signer.public, other.terms)
+        assert isinstance(statement, Terms)
+        boot = self.team.houses[0].team.identity
+        signer = Signer(boot, self.grant(boot, "bootstrap"), statement.sealed)
+        given = Welcome(self.team.houses[0].kept.membership.shown, ((9, b"x" * 32, 0),))
+        self.check_true_team(lambda datagram, heard: knock.welcome(self.invitation, heard, given, signer, self.rng))
+
+    def test_an_old_answer(self) -> None:
+        """The recorded answer to an earlier attempt, by the true bootstrap node, does not open for a later one."""
+        boot = self.team.houses[0].team.identity
+        signer = Signer(boot, self.grant(boot, "bootstrap"), self.terms)
+        old = Knock(NEWCOMER.public, bindings.crypto_scalarmult_base(b"o" * 32), "", b"")
+        given = Welcome(self.team.houses[0].kept.membership.shown, ((9, b"x" * 32, 0),))
+        recorded = knock.welcome(self.invitation, old, given, signer, self.rng)
+        self.check_true_team(lambda datagram, heard: recorded)
+
+    def test_a_forged_refusal(self) -> None:
+        """A refusal that a member without the role bootstrap signs does not end the attempt."""
+        identity = self.eye.team.identity
+        signer = Signer(identity, self.grant(identity, "viewer"), self.terms)
+        self.check_true_team(lambda datagram, heard: knock.refusal(self.invitation, heard, "used", signer, self.rng))
+
+    def test_a_hint(self) -> None:
+        """An unauthenticated hint that the code was used does not end the attempt."""
+        self.check_true_team(lambda datagram, heard: knock.hint(knock.id_of(datagram), "used"))
+
+    def test_an_invitation_without_terms(self) -> None:
+        """A newcomer with a code of an older version is let in by nobody, and is told to ask for another code."""
+        village = self.siege(seed=3)
+        old = village.signer.invite("dog", ("device",), 1, village.wall(), 3600.0, village.dice)
+        village.tell(old.invite)
+        village.run(1.0)
+        knocked = village.knock(old.code.text, timeout=5.0)
+        village.run(6.0)
+        self.assertEqual(self.failureResultOf(knocked).value.code, "old")
+
+
+class SettingsTests(SynchronousTestCase):
+    """The settings that a newcomer gets."""
+
+    @settings(max_examples=100, deadline=None, derandomize=True, database=None)
+    @given(LINE, LINE)
+    def test_no_text_becomes_structure(self, kind: str, membership: str) -> None:
+        """Text in a settings file for a newcomer is read back as that text; it opens no table and sets no other key."""
+        text = settings_text("dog", membership, ["edge"], None, (), {"kind": kind})
+        found = tomllib.loads(text)
+        self.assertEqual(set(found), {"node"})
+        self.assertEqual((found["node"]["kind"], found["node"]["membership"]), (kind, membership))
+        self.assertEqual(set(found["node"]), {"name", "membership", "store", "roles", "kind"})
+
+    def test_keys_that_may_be_given(self) -> None:
+        """No key that runs code, opens a page, grants a right or names a file can be given to newcomers."""
+        for key in ("name", "store", "membership", "team_key", "roles", "host", "known_nodes", "tunnels", "deployment"):
+            self.assertNotIn(key, SHARED)

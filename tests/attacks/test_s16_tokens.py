@@ -1,0 +1,364 @@
+"""Attack S16: members who want to be operators of the page: tokens, invitations, TLS, failover and guessing."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import os
+import random
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
+from typing import Any
+
+from itsdangerous import Signer
+from itsdangerous.encoding import base64_encode
+from twisted.internet.defer import Deferred
+from twisted.logger import capturedLogs, formatEvent
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.admission.membership import MemoryMembership
+from middleware.admission.operator import FIRST
+from swarmnode import invitation
+from swarmnode.rehearsal import VirtualTeam
+from webnode.app import create_app
+from webnode.board import Board, OpenSessions, Token, Visitor
+from webnode.desk import MemoryDesk
+from webnode.errors import Refusal
+from webnode.fallback import TeamFallbacks, fallbacks
+from webnode.ground import Ground
+from webnode.session import SignedSessions, sessions
+from webnode.state import state_of
+from webnode.token import Claim, TokenKey, packed
+
+CODE = "quiet-otter"
+HOME = "10.0.0.9"
+NOBODY = Visitor()
+IN_FORCE = 3.0
+
+
+class TokenTeam(VirtualTeam):
+    """Two web nodes with the role gateway (and a third one), and a viewer, eve, who runs whatever she likes."""
+
+    def __init__(self) -> None:
+        super().__init__(16, dogs=(), others=("pi", "nuc", "eve"))
+
+    def _membership(self, name: str) -> MemoryMembership:
+        if name not in self._memberships:
+            roles = ("viewer",) if name == "eve" else FIRST
+            made = self.operator.founded(name, roles, self.clock.seconds(), self._dice, self._secret)
+            self._memberships[name] = MemoryMembership(made)
+        return self._memberships[name]
+
+
+@dataclass
+class Web:
+    """The web node's part of a node."""
+
+    sessions: SignedSessions
+    fallbacks: TeamFallbacks
+    node: Any
+    ground: Ground
+
+
+class PageCase(SynchronousTestCase):
+    """A closed team of real nodes; each of ``webs`` serves a page."""
+
+    def setUp(self) -> None:
+        """Sign in as the operator at vaio."""
+        self.team = TokenTeam()
+        self.addCleanup(self.team.stop)
+        self.webs = {name: self.web(name, port) for port, name in enumerate(("vaio", "pi", "nuc", "eve"), 8080)}
+        self.vaio, self.pi, self.nuc, self.eve = self.webs.values()
+        self.run_for(IN_FORCE)
+        self.token = self.signed(self.vaio)
+
+    def web(self, name: str, port: int) -> Web:
+        """The page of a node, which tells the team where it is."""
+        service = self.team.services[name]
+        node, rng = service.assembly.node, random.Random(name)
+        settings = replace(service.settings, web=replace(service.settings.web, code=CODE))
+        ground = Ground(settings, node, self.team.desk, self.team.clock, self.now, rng)
+        followed = fallbacks(ground)
+        signed = sessions(ground, followed)
+        assert isinstance(followed, TeamFallbacks) and isinstance(signed, SignedSessions)
+        followed.serves([f"http://127.0.0.1:{port}"])
+        return Web(signed, followed, node, ground)
+
+    def now(self) -> float:
+        """The wall clock of all."""
+        return self.team.clock.seconds()
+
+    def run_for(self, seconds: float) -> None:
+        """Let time pass."""
+        self.team.clock.advance(seconds)
+
+    def signed(self, web: Web, proof: str = CODE, source: str = HOME) -> Token:
+        """A session at a web node."""
+        return self.successResultOf(web.sessions.sign_in(proof, source, self.now()))
+
+    def refused(self, web: Web, proof: str, source: str = HOME, later: float = 0.0) -> int:
+        """The status with which a sign-in is refused."""
+        failure = self.failureResultOf(web.sessions.sign_in(proof, source, self.now() + later), Refusal)
+        return int(failure.value.status)
+
+    def role(self, web: Web, token: str) -> str:
+        """What a token lets do at a web node."""
+        return web.sessions.visitor(token, self.now()).role
+
+    def passes(self, web: Web, token: str) -> dict[str, Token]:
+        """What the visitor with a token is given for the other web nodes, by the name of the node."""
+        who = web.sessions.visitor(token, self.now())
+        nodes = {each.node.uuid: name for name, each in self.webs.items()}
+        pages = [page.node for page in web.fallbacks.here() if not page.is_self]
+        return {nodes[uuid]: token for uuid, token in web.sessions.passes(who, pages, self.now()).items()}
+
+    def tell(self, packed: bytes) -> None:
+        """The operator of the team says something, and it is heard."""
+        self.successResultOf(Deferred.fromCoroutine(self.vaio.node.team.tell(packed)))
+        self.run_for(IN_FORCE)
+
+    def revoke(self, name: str) -> None:
+        """The operator revokes a member."""
+        web = self.webs[name]
+        self.tell(self.team.operator.revoke(web.node.entangled.identity.public, name, self.now()))
+
+    def rotate(self) -> None:
+        """The operator gives the others a new secret, at once."""
+        members = [self.webs[name].node.entangled.identity.public for name in ("vaio", "nuc")]
+        self.tell(self.team.operator.rotate(2, members, self.now(), 0.0, random.Random(2)))
+
+    def secrets(self) -> list[bytes]:
+        """Every secret of the team that anybody has."""
+        found = [secret for web in self.webs.values() for _, secret, _ in web.node.team.membership.secrets]
+        return list(dict.fromkeys(found))
+
+    def minted(self, claim: Claim, audience: Web) -> list[str]:
+        """An operator's tokens, made of all that eve has: her own key, and whatever the members have in common."""
+        own = TokenKey(self.eve.node.entangled.identity)
+        at = audience.node.entangled.identity.node_id
+        found = [own.token(claim), own.token(claim, at)]
+        # In the name of the web node, under every key that can be derived from what all members know.
+        for secret in self.secrets():
+            page = hashlib.blake2s(secret, person=b"page").hexdigest()
+            for known in (secret, hashlib.blake2s(page.encode()).digest(), hashlib.blake2s(secret).digest()):
+                found.append(old_token(known, claim.until, claim.limit))
+                signer = Signer(known, key_derivation="none")
+                found.append(signer.sign(base64_encode(packed(claim))).decode())
+        return found
+
+
+def old_token(secret: bytes, until: int, limit: int) -> str:
+    """An operator's token as the nodes of earlier versions derived it from the team's secret."""
+    key = hashlib.blake2s(hashlib.blake2b(secret, digest_size=32).digest(), person=b"swarmweb").digest()
+    payload = bytes((2, 1 << 1)) + until.to_bytes(5, "big") + limit.to_bytes(5, "big") + bytes(8) + b"eve"
+    mac = hashlib.blake2s(payload, key=key, digest_size=16, person=b"swarmweb").digest()
+    return base64.urlsafe_b64encode(payload + mac).decode().rstrip("=")
+
+
+class MintTests(PageCase):
+    """A viewer, who holds the team's secret as all members do."""
+
+    def claim(self, seconds: float = 365 * 86_400.0) -> Claim:
+        """An operator, for a year."""
+        end = int(self.now() + seconds)
+        return Claim("ab" * 8, "eve", "operator", end, limit=end)
+
+    def test_mint_a_token(self) -> None:
+        """No token that a viewer can make is one at any web node, neither as a session nor as an invitation."""
+        self.assertEqual(self.role(self.vaio, self.token.text), "operator")
+        for web in (self.vaio, self.pi, self.nuc):
+            for text in self.minted(self.claim(), web):
+                self.assertEqual(web.sessions.visitor(text, self.now()), NOBODY)
+                self.assertIn(self.refused(web, text, f"10.0.{len(text)}.1"), (401, 429))
+
+    def test_mint_after_revoke_and_rotate(self) -> None:
+        """Neither does she after she is revoked and the secret rotated, with the old secrets or the new one."""
+        self.revoke("eve")
+        self.rotate()
+        self.assertGreater(len(self.secrets()), 1)
+        for text in self.minted(self.claim(), self.vaio):
+            self.assertEqual(self.vaio.sessions.visitor(text, self.now()), NOBODY)
+
+    def test_serve_a_page_oneself(self) -> None:
+        """At her own web node nobody is let in, by code or token: the node has not the role gateway."""
+        self.assertEqual(self.refused(self.eve, CODE), 403)
+        self.assertEqual(self.role(self.eve, TokenKey(self.eve.node.entangled.identity).token(self.claim())), "anyone")
+
+    def test_invite_beyond_oneself(self) -> None:
+        """Whoever was invited until tomorrow invites nobody for longer."""
+        who = self.vaio.sessions.visitor(self.token.text, self.now())
+        invited = self.signed(self.vaio, self.vaio.sessions.token(who, "guest", "operator", self.now(), 3600.0).text)
+        guest = self.vaio.sessions.visitor(invited.text, self.now())
+        further = self.vaio.sessions.token(guest, "friend", "operator", self.now(), 365 * 86_400.0)
+        self.assertLessEqual(further.until, self.now() + 3600.0)
+
+
+class StandingTests(PageCase):
+    """Gateways that are gateways no more."""
+
+    def test_revoked_gateway(self) -> None:
+        """What a revoked gateway signed lets in nobody at once, without a restart, nor what was made of it since."""
+        signed = self.signed(self.pi)
+        given = self.passes(self.pi, signed.text)
+        self.assertEqual(self.role(self.vaio, given["vaio"].text), "operator")
+        who = self.vaio.sessions.visitor(given["vaio"].text, self.now())
+        renewed = self.vaio.sessions.renewed(who, self.now())
+        invited = self.vaio.sessions.token(who, "guest", "operator", self.now(), 60.0)
+        further = self.passes(self.vaio, renewed.text)["nuc"]
+        made = (given["vaio"], renewed, invited)
+        self.assertEqual([self.role(self.vaio, each.text) for each in made], ["operator"] * 3)
+        self.assertEqual(self.role(self.nuc, further.text), "operator")
+        self.revoke("pi")
+        for each in made:
+            for text in (each.text, each.ticket):
+                self.assertEqual(self.vaio.sessions.visitor(text, self.now()), NOBODY)
+        self.assertEqual(self.role(self.nuc, further.text), "anyone")
+        self.assertEqual(self.refused(self.vaio, invited.text), 401)
+        self.assertEqual(self.role(self.vaio, self.token.text), "operator")
+        self.assertNotIn("pi", self.passes(self.vaio, self.token.text))
+        self.assertFalse(self.vaio.fallbacks.lets_in("http://127.0.0.1:8081"))
+        self.rotate()
+        self.assertEqual(self.role(self.vaio, made[0].text), "anyone")
+
+    def test_revoked_gateway_serves_nobody(self) -> None:
+        """A gateway that hears that it is revoked, or is a viewer now, lets in nobody, signed in or not."""
+        for name, web in (("pi", self.pi), ("nuc", self.nuc)):
+            signed = self.signed(web)
+            self.assertEqual(self.role(web, signed.text), "operator")
+            if name == "pi":
+                self.revoke(name)
+                # It may be put out before it hears of it; it knows as soon as anybody tells it.
+                public = web.node.entangled.identity.public
+                web.node.team._gossip.add(self.team.operator.revoke(public, name, self.now()))
+            else:
+                public = web.node.entangled.identity.public
+                self.tell(self.team.operator.grant(public, name, ("viewer",), self.now()))
+            self.assertEqual((self.role(web, signed.text), self.role(web, signed.ticket)), ("anyone", "anyone"), name)
+            self.assertEqual(self.refused(web, CODE), 403)
+
+    def test_role_taken_away(self) -> None:
+        """The tokens of a gateway that is a viewer now are worth nothing elsewhere."""
+        given = self.passes(self.nuc, self.signed(self.nuc).text)["vaio"]
+        self.assertEqual(self.role(self.vaio, given.text), "operator")
+        public = self.nuc.node.entangled.identity.public
+        self.tell(self.team.operator.grant(public, "nuc", ("device", "viewer"), self.now()))
+        self.assertEqual(self.role(self.vaio, given.text), "anyone")
+
+
+class FailoverTests(PageCase):
+    """A viewer who advertises a page, and waits for the browser."""
+
+    def test_advertise_a_page(self) -> None:
+        """A viewer's page is on nobody's list, its origin may ask nothing, and no token is made for it."""
+        told = {page.node for page in self.pi.fallbacks.here()}
+        self.assertIn(self.vaio.node.uuid, told)
+        for web in (self.vaio, self.pi, self.nuc):
+            self.assertNotIn(self.eve.node.uuid, [page.node for page in web.fallbacks.here()])
+            self.assertFalse(web.fallbacks.lets_in("http://127.0.0.1:8083"))
+            self.assertNotIn("eve", self.passes(web, self.signed(web).text))
+        who = self.vaio.sessions.visitor(self.token.text, self.now())
+        self.assertEqual(self.vaio.sessions.passes(who, [], self.now()), {})
+
+    def test_use_a_token_elsewhere(self) -> None:
+        """What was made for one web node lets in nobody at another, so it is worth nothing to whoever sees it there."""
+        given = self.passes(self.vaio, self.token.text)
+        self.assertEqual(sorted(given), ["nuc", "pi"])
+        for name, token in given.items():
+            for web_name, web in self.webs.items():
+                wanted = ("operator", "viewer") if web_name == name else ("anyone", "anyone")
+                self.assertEqual((self.role(web, token.text), self.role(web, token.ticket)), wanted, (name, web_name))
+        for web in (self.pi, self.nuc):
+            self.assertEqual((self.role(web, self.token.text), self.role(web, self.token.ticket)), ("anyone",) * 2)
+
+    def test_wait_with_a_token(self) -> None:
+        """What takes a page to another web node lasts minutes, and is renewed there by the session alone."""
+        given = self.passes(self.vaio, self.token.text)["pi"]
+        self.assertLessEqual(given.until - self.now(), 900.0)
+        self.run_for(901.0)
+        self.assertEqual(self.role(self.pi, given.text), "anyone")
+
+    def test_sign_out_everywhere(self) -> None:
+        """Who signs out at one web node is signed out at those to which the page went, too."""
+        given = self.passes(self.vaio, self.token.text)["pi"]
+        moved = self.pi.sessions.renewed(self.pi.sessions.visitor(given.text, self.now()), self.now())
+        self.assertEqual(self.role(self.pi, moved.text), "operator")
+        who = self.vaio.sessions.visitor(self.token.text, self.now())
+        self.vaio.sessions.revoke(who.token_id, who.limit)
+        self.run_for(IN_FORCE)
+        self.assertEqual([self.role(self.pi, each.text) for each in (given, moved)], ["anyone"] * 2)
+
+
+class GuessTests(PageCase):
+    """Somebody who guesses the code from many addresses."""
+
+    def test_guess_from_many_addresses(self) -> None:
+        """Of ten thousand guesses, each from an address of its own, in an hour, few are looked at."""
+        looked = 0
+        for number in range(10_000):
+            source = f"10.{number // 250}.{number % 250}.1"
+            looked += self.refused(self.vaio, f"guess{number}", source, 0.36 * number) == 401
+        self.assertLess(looked, 250)
+
+    def test_lock_out_nobody(self) -> None:
+        """Meanwhile who is signed in goes on, an invitation signs in, and so do this machine and a known address."""
+        for number in range(1000):
+            self.refused(self.vaio, f"guess{number}", f"10.{number // 250}.{number % 250}.1")
+        now = self.now()
+        who = self.vaio.sessions.visitor(self.token.text, now)
+        self.assertEqual(self.vaio.sessions.renewed(who, now).role, "operator")
+        self.assertEqual(self.refused(self.vaio, CODE, "192.168.7.7"), 429)
+        self.assertEqual(self.signed(self.vaio, CODE, "127.0.0.1").role, "operator")
+        self.assertEqual(self.signed(self.vaio, CODE, HOME).role, "operator")
+        invited = self.vaio.sessions.token(who, "guest", "viewer", now, 60.0)
+        self.assertEqual(self.signed(self.vaio, invited.text, "192.168.7.8").role, "viewer")
+
+
+class LogTests(SynchronousTestCase):
+    """Somebody who reads the log."""
+
+    def test_read_the_log(self) -> None:
+        """The log says where the page is, and neither the code nor a link with it."""
+        self.patch(os, "environ", {**os.environ, "XDG_RUNTIME_DIR": self.mktemp()})
+        with capturedLogs() as said:
+            invitation.invited("s16", "127.0.0.1", lambda: 8080, CODE)
+        words = "\n".join(formatEvent(each) + str(each) for each in said)
+        self.assertIn("http://127.0.0.1:8080/", words)
+        self.assertNotIn(CODE, words)
+
+
+class RebindingTests(SynchronousTestCase):
+    """A site on the LAN that points its own name at the web node."""
+
+    def test_rebind_a_local_name(self) -> None:
+        """A name of the LAN that is not the node's own is refused; its own and those of the settings serve."""
+        board, state = Board(MemoryDesk(), OpenSessions()), state_of([], [], {}, node="vaio")
+        client = create_app(lambda: state, board, hosts=("vaio", "vaio.local", "robots.lan")).test_client()
+
+        def status(host: str) -> int:
+            return client.get("/api/v1/node", headers={"Host": host}).status_code
+
+        for host in ("evil.local", "evil.lan", "evil.local:8080", "evil.internal", "evil.home.arpa", "evil"):
+            self.assertEqual(status(host), 403, host)
+        for host in ("vaio.local:8080", "VAIO", "robots.lan", "localhost:8080", "127.0.0.1:8080", "[::1]:8080"):
+            self.assertEqual(status(host), 200, host)
+
+
+class TlsTests(PageCase):
+    """A member who wants to pass for the page before the phones that trust the team."""
+
+    if find_spec("OpenSSL") is None or find_spec("cryptography") is None:
+        skip = "TLS IS NOT TESTED: missing OpenSSL or cryptography (pip install 'swarm-node[tls]')"
+
+    def test_sign_a_leaf(self) -> None:
+        """No key that follows from the team's secrets is that of a web node's authority; each node has its own."""
+        from webnode.certificate import authority
+        from webnode.tls import door
+
+        signers = [door(web.ground, lambda: []).signer for web in (self.vaio, self.pi)]
+        self.assertNotEqual(signers[0].pem, signers[1].pem)
+        self.assertEqual(door(self.vaio.ground, lambda: []).signer.pem, signers[0].pem)
+        for secret in [*self.secrets(), hashlib.blake2s(b"").digest()]:
+            page = hashlib.blake2s(secret, person=b"page").hexdigest()
+            for known in (secret, hashlib.blake2s(page.encode()).digest()):
+                mine = authority(known, "").key.private_numbers()
+                self.assertNotIn(mine, [each.key.private_numbers() for each in signers])

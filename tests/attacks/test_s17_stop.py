@@ -1,0 +1,409 @@
+"""Attack S17: a member tries to release a stop, to disable later ones, or to have one forgotten."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Sequence
+from typing import Any
+
+import msgpack
+from twisted.internet.defer import Deferred, fail
+
+from middleware.entangled.errors import Refused, Unwritable
+from middleware.entangled.identity import Identity
+from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.record import Record, Slot
+from middleware.halt import HALT, METHOD, NO_ROBOT, SLOT, STANDS, UNSAVED, Halt, answer_halt
+from middleware.roles import DEVICE, GATEWAY, OPERATOR, ROLES, VIEWER, may_call
+from middleware.stop_set import ID_BYTES, MAX_NAMED, MAX_OF_SENDER, MAX_RELEASED, MAX_SENDERS
+from tests.attacks.siege import SOURCE, ClosedTeam, SiegeCase, Tape
+from tests.middleware.admission.village import House
+
+SEQUENCES, STEPS = 6, 25
+
+
+class HaltingTeam(ClosedTeam):
+    """A closed team each of whose nodes answers ``device.halt``; ``halts`` are those of the present lives, by name."""
+
+    def __init__(self, seed: int) -> None:
+        self.halts: dict[str, Halt] = {}
+        super().__init__(seed)
+
+    def open(self, house: House) -> None:
+        """Begin a life of a node, which stands until it has learnt of the stops."""
+        super().open(house)
+        node: Any = house.node
+        halt = answer_halt(node, self.rng(house.place), node._chores.later, lambda stops, words: None)
+
+        def obey() -> str:
+            if not halt.is_known:
+                halt.learn()
+            return STANDS if halt.is_on else NO_ROBOT
+
+        halt.watch(obey)
+        self.halts[house.name] = halt
+        halt.learn()
+        node._chores.every(0.5, halt.refresh)
+
+    def halt(self, house: House) -> Halt:
+        """What a node knows of the stops."""
+        return self.halts[house.name]
+
+    def is_on(self) -> dict[str, bool]:
+        """Which nodes stand."""
+        return {name: halt.is_on for name, halt in self.halts.items()}
+
+    def reopen(self, house: House) -> None:
+        """The next life of a node on the store of the last one."""
+        self.close(house, is_sudden=True)
+        self.open(house)
+
+
+class StopCase(SiegeCase):
+    """A team of an operator ``ann``, a second operator ``bob`` and two robots."""
+
+    def setUp(self) -> None:
+        """All have learnt that nothing is stopped."""
+        super().setUp()
+        self.team = HaltingTeam(1)
+        self.addCleanup(self.left, self.team)
+        self.addCleanup(self.team.stop)
+        self.ann = self.team.houses[0]
+        self.bob = self.team.enlist("bob", OPERATOR)
+        self.dogs = [self.team.enlist(name, DEVICE) for name in ("dog1", "dog2")]
+        self.team.run(5.0)
+        self.assertEqual(set(self.team.is_on().values()), {False})
+
+    def stop(self, house: House, others: Sequence[House] | None = None) -> dict[str, str]:
+        """An operator stops the team; what each of those that are told says, by name."""
+        return self.said(self.team.halt(house).stop(house.name, self.contacts(others)))
+
+    def release(self, house: House, stops: Sequence[bytes], others: Sequence[House] | None = None) -> dict[str, str]:
+        """An operator releases these stops."""
+        return self.said(self.team.halt(house).release(stops, house.name, self.contacts(others)))
+
+    def contacts(self, houses: Sequence[House] | None) -> list[Any]:
+        """How to ask these, or all."""
+        return [self.team.contact(house) for house in (self.team.houses if houses is None else houses)]
+
+    def said(self, asked: Deferred[dict[str, str]]) -> dict[str, str]:
+        """What each says, by name."""
+        told = self.outcome(self.team, asked)
+        names = {house.node.identity.node_id.hex(): house.name for house in self.team.houses}
+        return {names[uuid]: words for uuid, words in told.items()}
+
+    def stops(self, house: House) -> list[bytes]:
+        """The stops that a node obeys."""
+        return list(self.team.halt(house).stops)
+
+    def ask(self, bare: Any, house: House, *arguments: object) -> Any:
+        """What comes of one call by an attacker."""
+        return self.outcome(self.team, bare.ask(self.team.contact(house), METHOD, *arguments, changes=True), 0.2)
+
+    def record(self, own: Identity, fields: object, sequence: int = 1) -> Record:
+        """A record of a stop or release."""
+        return Record(HALT, SLOT, own.public, sequence, "team", 600.0, msgpack.packb(fields)).signed(own)
+
+    def store(self, bare: Any, record: Record) -> None:
+        """Have every node hold a record, where it takes it."""
+        for house in self.team.houses:
+            asked = bare.ask(self.team.contact(house), "store", [record.packed()], changes=True)
+            self.outcome(self.team, asked, 0.2)
+        self.team.run(3.0)
+
+
+class DisablingTests(StopCase):
+    """What could make a later stop impossible."""
+
+    def test_no_number_disables_a_stop(self) -> None:
+        """An operator's key that sends the greatest numbers, in calls and records, prevents no later stop."""
+        bare, own = self.insider(self.team, "thief", OPERATOR)
+        for number in (2**53, 2**63, 2**64 - 1):
+            for house in self.team.houses:
+                self.assertIsInstance(self.ask(bare, house, number, False, "thief"), Refused)
+            self.store(bare, self.record(own, [number, False, "thief"], min(number, 2**62)))
+        self.stop(self.ann)
+        self.team.run(5.0)
+        self.assertEqual(set(self.team.is_on().values()), {True})
+
+    def test_releases_in_advance_disable_no_stop(self) -> None:
+        """Releases of invented ids, as many as fit into the table and more, end no stop and prevent none."""
+        bare, own = self.insider(self.team, "thief", OPERATOR)
+        self.stop(self.bob)
+        dice = random.Random(1)
+        for _ in range(3):
+            ids = [dice.randbytes(ID_BYTES) for _ in range(MAX_RELEASED)]
+            for house in self.team.houses:
+                self.ask(bare, house, [], ids, "thief")
+            self.store(bare, self.record(own, [[], ids[:40], "thief"]))
+        self.stop(self.ann)
+        self.assertEqual({len(self.stops(house)) for house in self.team.houses}, {2})
+        self.release(self.ann, [stop for stop in self.stops(self.ann) if stop in self.team.halt(self.bob).stops][:1])
+        self.assertEqual(set(self.team.is_on().values()), {True})
+
+    def test_thousands_of_stops_displace_none(self) -> None:
+        """An operator's key that sends thousands of stops fills its own places; others' stops need their release."""
+        [stop] = self.only_stop(self.ann)
+        _, own = self.insider(self.team, "thief", OPERATOR)
+        dice = random.Random(1)
+        dog = self.dogs[0]
+        for _ in range(300):
+            ids = [dice.randbytes(ID_BYTES) for _ in range(MAX_NAMED)]
+            self.team.halt(dog).answer(Contact(own.public, SOURCE), [[each, "thief"] for each in ids], [], "thief")
+        self.assertLessEqual(len(self.stops(dog)), MAX_OF_SENDER + 1)
+        self.assertIn(stop, self.stops(dog))
+        self.release(self.bob, [each for each in self.stops(dog) if each != stop], [dog])
+        self.assertEqual(self.stops(dog), [stop])
+        self.assertTrue(self.team.halt(dog).is_on)
+        self.release(self.bob, [stop], [dog])
+        self.assertFalse(self.team.halt(dog).is_on)
+
+    def only_stop(self, house: House) -> list[bytes]:
+        """The stop that an operator has just made."""
+        self.stop(house)
+        return self.stops(house)
+
+
+class RightsTests(StopCase):
+    """Who may stop, and who may release."""
+
+    def test_only_who_may_order(self) -> None:
+        """By call and by record, no role but operator and gateway stops the team or releases a stop."""
+        self.stop(self.ann)
+        [stop] = self.stops(self.dogs[0])
+        for number, role in enumerate(ROLES):
+            if may_call((role,), METHOD):
+                continue
+            bare, own = self.insider(self.team, role, role, at=SOURCE._replace(port=600 + number))
+            for house in self.team.houses:
+                self.assertIsInstance(self.ask(bare, house, [], [stop], role), Refused, role)
+                self.assertIsInstance(self.ask(bare, house, [[b"x" * 16, role]], [], role), Refused, role)
+            self.store(bare, self.record(own, [[[b"y" * 16, role]], [stop], role]))
+            self.assertEqual([self.stops(house) for house in self.team.houses], [[stop]] * 4, role)
+        self.assertEqual({role for role in ROLES if may_call((role,), METHOD)}, {OPERATOR, GATEWAY})
+
+    def test_invented_keys_release_nothing(self) -> None:
+        """A viewer signs a release with a key that it invented: replicas may take it, and no node goes on."""
+        self.stop(self.ann)
+        [stop] = self.stops(self.dogs[0])
+        bare, _ = self.insider(self.team, "eye", VIEWER)
+        self.store(bare, self.record(Identity(bytes(31) + b"i"), [[], [stop], "operator"]))
+        self.assertEqual(set(self.team.is_on().values()), {True})
+
+    def test_a_revoked_operator_releases_nothing(self) -> None:
+        """The record of a release that an operator signs after it was revoked is not obeyed, whoever hands it on."""
+        self.stop(self.ann)
+        [stop] = self.stops(self.dogs[0])
+        own = self.bob.kept.membership.identity
+        self.team.tell(self.team.signer.revoke(self.bob.public, "bob", self.team.wall()))
+        self.team.run(10.0)
+        self.team.close(self.bob, is_sudden=True)
+        del self.team.halts["bob"]
+        bare, _ = self.insider(self.team, "dog3", DEVICE)
+        self.store(bare, self.record(own, [[], [stop], "bob"], 2**40))
+        self.assertEqual(set(self.team.is_on().values()), {True})
+
+    def test_junk_changes_nothing(self) -> None:
+        """Calls and records of the wrong shape are refused or ignored, and break no node."""
+        self.stop(self.ann)
+        [stop] = self.stops(self.dogs[0])
+        bare, own = self.insider(self.team, "thief", OPERATOR)
+        junk: list[list[object]] = [
+            [[], [stop + b"x"], "x"],
+            [[], [stop[:-1]], "x"],
+            [[], ["a" * 16], "x"],
+            [[], [[stop]], "x"],
+            [[], [b"x" * 16] * (MAX_RELEASED + 1), "x"],
+            [[[b"x" * 16, 7]], [], "x"],
+            [[[b"x" * 16]], [], "x"],
+            [[[b"x" * 16, "x"]] * (MAX_NAMED + 1), [], "x"],
+            [[], [], "x" * 65],
+            [{}, {}, {}],
+            [-1, True, "x"],
+        ]
+        for sequence, fields in enumerate(junk, 1):
+            self.assertIsInstance(self.ask(bare, self.dogs[0], *fields), Refused, fields)
+            self.store(bare, self.record(own, fields, sequence))
+            self.assertEqual(self.stops(self.dogs[0]), [stop], fields)
+        for value in (b"", b"\xc1", b"\x93", b"\xff" * 2000):
+            record = Record(HALT, SLOT, own.public, 99, "team", 600.0, value).signed(own)
+            self.store(bare, record)
+        self.assertEqual([self.stops(house) for house in self.team.houses], [[stop]] * 4)
+
+
+class ReplayTests(StopCase):
+    """What was true once."""
+
+    def test_a_replayed_release_ends_no_later_stop(self) -> None:
+        """Every datagram of a release is played again after the next stop, and the released record is stored again."""
+        self.stop(self.ann)
+        first = self.stops(self.dogs[0])
+        tape = Tape()
+        for house in self.team.houses:
+            tape.tap(house.node._network)  # type: ignore[arg-type]
+        self.release(self.bob, first)
+        old = [record for record in self.ann.node.store.get(HALT) if record.name == SLOT]
+        self.assertEqual(set(self.team.is_on().values()), {False})
+        self.stop(self.ann)
+        heard, tape.heard = tape.heard, []
+        for network, datagram, source in heard:
+            assert network.receiver is not None
+            network.receiver(datagram, source)
+        self.team.run(3.0)
+        bare, _ = self.insider(self.team, "thief", OPERATOR)
+        for record in old:
+            self.store(bare, record)
+        self.assertEqual(set(self.team.is_on().values()), {True})
+
+    def test_a_released_stop_does_not_come_back(self) -> None:
+        """The record of a released stop, stored again by a replica that was away, stops nothing."""
+        self.stop(self.ann)
+        stop = self.stops(self.dogs[0])
+        [old] = [record for record in self.dogs[0].node.store.get(HALT) if record.owner == self.ann.public]
+        self.release(self.bob, stop)
+        bare, _ = self.insider(self.team, "dog3", DEVICE)
+        for house in self.team.houses:
+            house.node.store.discard(Slot(HALT, self.ann.public, SLOT))
+        self.store(bare, old)
+        self.assertEqual(set(self.team.is_on().values()), {False})
+
+
+class LossTests(StopCase):
+    """A stop that was acknowledged is in force until its release."""
+
+    def test_a_restart_of_all_releases_nothing(self) -> None:
+        """All nodes end at once without a word and come back: all stand at once, before they have asked anybody."""
+        self.assertEqual(self.stop(self.ann)["dog1"], STANDS)
+        for house in self.team.houses:
+            self.team.close(house, is_sudden=True)
+        for house in self.team.houses:
+            self.team.open(house)
+        self.assertTrue(all(self.team.halt(house).is_stopped for house in self.team.houses))
+        self.team.run(20.0)
+        self.assertTrue(all(self.team.halt(house).is_stopped for house in self.team.houses))
+        self.release(self.bob, self.stops(self.dogs[1]))
+        self.assertEqual(set(self.team.is_on().values()), {False})
+
+    def test_a_stop_outlives_its_author(self) -> None:
+        """Its author is revoked and its record is gone: all stand, newcomers too, until its id is released."""
+        self.stop(self.bob)
+        stop = self.stops(self.dogs[0])
+        self.team.tell(self.team.signer.revoke(self.bob.public, "bob", self.team.wall()))
+        self.team.run(10.0)
+        self.team.close(self.bob, is_sudden=True)
+        del self.team.halts["bob"]
+        for house in self.team.houses:
+            self.lose(house, Slot(HALT, self.bob.public, SLOT))
+        self.team.run(60.0)
+        self.assertEqual([self.stops(house) for house in self.team.houses if house is not self.bob], [stop] * 3)
+        late = self.team.enlist("dog3", DEVICE)
+        self.team.run(5.0)
+        self.assertEqual(self.stops(late), stop)
+        answer = self.outcome(
+            self.team, self.ann.node.call(self.team.contact(late), METHOD, [], [], "ann", changes=True), 0.5
+        )
+        self.assertEqual([named for named, _ in answer[1]], stop)
+        self.release(self.ann, stop)
+        self.assertEqual(set(self.team.is_on().values()), {False})
+
+    def lose(self, house: House, slot: Slot) -> None:
+        """Let a replica drop a record, as it does when its time is over."""
+        record = house.node.store.slot(slot)
+        if record is not None and house.node.store.discard(slot):
+            house.node.replica._gone([record])
+
+    def test_a_stop_that_is_not_saved_says_so(self) -> None:
+        """A node whose disk takes nothing stands, and does not acknowledge the stop as one that would outlast it."""
+        store: Any = self.dogs[0].node.store
+        self.patch(store, "written", lambda: fail(Unwritable("the disk is full")))
+        self.assertEqual(self.stop(self.ann)["dog1"], STANDS + UNSAVED)
+        self.assertTrue(self.team.halt(self.dogs[0]).is_on)
+
+    def test_a_damaged_note_stands(self) -> None:
+        """A node that cannot read what it noted of the stops stands until that is released by its id."""
+        self.dogs[0].node.store.note("halt/stops", b"\xc1junk")
+        self.team.reopen(self.dogs[0])
+        self.team.run(3.0)
+        self.assertEqual(self.team.is_on(), {"vaio": False, "bob": False, "dog1": True, "dog2": False})
+        self.release(self.ann, self.stops(self.dogs[0]))
+        self.assertEqual(set(self.team.is_on().values()), {False})
+
+    def test_a_stop_of_an_earlier_version_stands(self) -> None:
+        """A stop of an earlier version has to be released by its id; a release of an earlier version ends none."""
+        own = self.bob.kept.membership.identity
+        bare, _ = self.insider(self.team, "dog3", DEVICE)
+        self.store(bare, self.record(own, [7, True, "bob"]))
+        [stop] = self.stops(self.dogs[0])
+        self.store(bare, self.record(own, [8, False, "bob"], 2))
+        self.assertEqual(set(self.team.is_on().values()), {True})
+        self.release(self.ann, [stop])
+        self.assertEqual(set(self.team.is_on().values()), {False})
+
+    def test_more_senders_than_places(self) -> None:
+        """More operators stop than there are places: each further one stops as well, and all has to be released."""
+        dog, dice = self.team.halt(self.dogs[0]), random.Random(1)
+        for number in range(MAX_SENDERS + 40):
+            peer = Contact(number.to_bytes(32, "big"), SOURCE)
+            dog.answer(peer, [[dice.randbytes(ID_BYTES), "x"]], [], "x")
+        self.assertLessEqual(len(dog.stops), MAX_SENDERS + MAX_OF_SENDER)
+        self.release(self.ann, list(dog.stops)[1:], [self.dogs[0]])
+        self.assertTrue(dog.is_on)
+        self.release(self.ann, list(dog.stops), [self.dogs[0]])
+        self.assertFalse(dog.is_on)
+
+
+class SequenceTests(StopCase):
+    """Random sequences over whole nodes."""
+
+    def test_stop_holds_on_whole_nodes(self) -> None:
+        """Stops, releases, partitions, restarts, a viewer's messages: a stop is kept until a release names it."""
+        bare, own = self.insider(self.team, "eye", VIEWER)
+        for seed in range(SEQUENCES):
+            dice = random.Random(seed)
+            for number in range(STEPS):
+                self.step(dice, bare, own, number)
+            self.team.board.heal()
+            self.team.run(20.0)
+            self.release(self.ann, sorted({stop for house in self.team.houses for stop in self.stops(house)}))
+            self.team.run(20.0)
+            self.assertEqual(set(self.team.is_on().values()), {False}, seed)
+
+    def step(self, dice: random.Random, bare: Any, own: Identity, number: int) -> None:
+        """One thing that happens, and what must hold after it."""
+        house = dice.choice((self.ann, self.bob))
+        known = self.stops(house)
+        match dice.randrange(6):
+            case 0 | 1:
+                asked = self.team.halt(house).stop(house.name, self.contacts(None))
+                [stop] = set(self.stops(house)) - set(known)
+                told = self.said(asked)
+                for dog in self.dogs:
+                    if told.get(dog.name) == STANDS:
+                        self.assertIn(stop, self.stops(dog))
+            case 2:
+                named = dice.sample(known, dice.randrange(len(known) + 1))
+                before = {dog.name: set(self.stops(dog)) for dog in self.dogs}
+                self.release(house, named)
+                for dog in self.dogs:
+                    self.assertLessEqual(before[dog.name] - set(self.stops(dog)), set(named) | self.released(dog))
+            case 3:
+                near = [self.team.address_of(each) for each in self.team.houses if dice.random() < 0.5]
+                self.team.board.partition(near) if dice.random() < 0.6 else self.team.board.heal()
+            case 4:
+                dog = dice.choice(self.dogs)
+                before_restart = self.stops(dog)
+                self.team.reopen(dog)
+                self.assertEqual(self.stops(dog), before_restart)
+            case 5:
+                for dog in self.dogs:
+                    self.ask(bare, dog, [], self.stops(dog), "eye")
+                record = self.record(own, [[], self.stops(self.dogs[0]), "eye"], number + 1)
+                bare.ask(self.team.contact(self.dogs[0]), "store", [record.packed()], changes=True).addErrback(str)
+        held = {dog.name: set(self.stops(dog)) for dog in self.dogs}
+        self.team.run(dice.random() * 5.0)
+        for dog in self.dogs:
+            self.assertLessEqual(held[dog.name] - set(self.stops(dog)), self.released(dog))
+
+    def released(self, dog: House) -> set[bytes]:
+        """What an operator released, of what a robot knew."""
+        return {stop for house in (self.ann, self.bob) for stop in self.team.halt(house)._ordered}

@@ -1,0 +1,335 @@
+"""Attack S18: one member tries to break, end, move or block a lease that it does not hold, or to pass as another."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from twisted.internet.defer import Deferred
+
+from middleware import roles
+from middleware.admission.team import Team
+from middleware.commitment.ballot import GRANTED, MOVED, OVER, Reply
+from middleware.commitment.lessee import Lessee
+from middleware.entangled.errors import Refused
+from middleware.entangled.identity import Identity
+from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.record import Record
+from middleware.group import Group
+from middleware.node import SwarmNode
+from middleware.presence import DEVICES, Device, devices_of
+from middleware.tasks import COMPLETED, RESULT, TASKS, Result, Task, group_key, tasks_of
+from tests.attacks.siege import SOURCE, ClosedTeam, SiegeCase
+from tests.middleware.admission.village import House
+
+TASK = Task("t1", "search", "Find it")
+HUGE = 2**62 - 2
+DEVICE_NAME = "dog1"
+
+
+class LeaseTeam(ClosedTeam):
+    """A closed team of swarm nodes: a gateway and devices."""
+
+    def __init__(self, seed: int = 1, bootstraps: int = 1) -> None:
+        self.nodes: list[SwarmNode] = []
+        super().__init__(seed, bootstraps=bootstraps)
+        for number in range(1, 5):
+            self.enlist(f"dog{number}", "device")
+        self.run(TASK.lease_ttl)
+
+    def open(self, house: House) -> None:
+        """Begin a life of a swarm node."""
+        place = house.place
+        house.team = Team(house.kept, self.store(place), self.wall, self.rng(place), roles)
+        name = house.team.door.me.name
+        node = SwarmNode(
+            Device("", name, capabilities={"camera": {"width": 208}}),
+            house.team.identity,
+            house.team.secret,
+            [self.address(0)] if place else [],
+            self.board.network(*self.address(place)),
+            self.store(place),
+            self.clock,
+            self.rng(place),
+            self.wall,
+            door=house.team.door,
+        )
+        house.team.attach(node.entangled, self.clock)
+        node.team = house.team
+        house.node = node.entangled
+        self.nodes.append(node)
+        node.startService()
+
+    def close(self, house: House, is_sudden: bool = False) -> None:
+        """End a life of a swarm node."""
+        self.nodes[house.place].stopService()
+
+
+class LeaseCase(SiegeCase):
+    """A team with a task, and a member with the role of a device that obeys no rule."""
+
+    def setUp(self) -> None:
+        """Pin the council of a task."""
+        super().setUp()
+        self.team = team = LeaseTeam()
+        self.addCleanup(self.left, team)
+        self.addCleanup(team.stop)
+        self.task: Task = self.outcome(team, Deferred.fromCoroutine(team.nodes[0].submit(TASK)), 1.0)
+        self.lessees: list[Lessee] = []
+        self.bad, self.own = self.insider(team, "bad", "device")
+
+    def lessee(self, place: int) -> Lessee:
+        """The claim of an honest node, given back when the test ends."""
+        lessee = self.team.nodes[place].lessee(self.task, lambda: None, 0)
+        self.lessees.append(lessee)
+        self.addCleanup(self.team.run, 2.0)
+        self.addCleanup(lessee.release)
+        return lessee
+
+    def held_by(self, place: int, within: float = 1.0) -> Lessee:
+        """The claim of an honest node that wins."""
+        lessee = self.lessee(place)
+        lessee.want()
+        self.team.run(within)
+        self.assert_won(lessee)
+        return lessee
+
+    def assert_won(self, lessee: Lessee) -> None:
+        """It holds the lease, under a token that leaves room for many more."""
+        self.assertIsNotNone(lessee.lease, "an honest node does not win the lease")
+        self.assertLess(lessee.token, 2**40)
+
+    def attack(self, method: str, *arguments: object) -> list[Any]:
+        """Ask every node the same question, with bare hands; their answers, or errors."""
+        found = []
+        for house in self.team.houses:
+            asked = self.bad.ask(self.team.contact(house), method, *arguments, changes=True)
+            found.append(self.outcome(self.team, asked, 0.3))
+        return found
+
+    def store(self, *records: Record) -> list[Any]:
+        """Bring records to every node."""
+        return self.attack("store", [record.packed() for record in records])
+
+    def members(self) -> list[int]:
+        """The places of the council's members."""
+        known = [house.public for house in self.team.houses]
+        return [known.index(member.public) for member in self.task.council]
+
+    def outsiders(self) -> list[int]:
+        """The places of the others."""
+        return [place for place in range(len(self.team.houses)) if place not in self.members()]
+
+
+class ReconfigurationTests(LeaseCase):
+    """A council that nobody elected."""
+
+    def test_forged_council(self) -> None:
+        """A council that one device invents is installed nowhere, and no second node wins the lease through it."""
+        holder = self.held_by(self.members()[0])
+        others = [self.team.contact(self.team.houses[place]) for place in self.outsiders()]
+        own = Contact(self.own.public, SOURCE)
+        packed = [contact.packed() for contact in (*others, own)][:3]
+        self.attack("lease.install", TASK.task_id, 2, packed, 0, 0, 1.5)
+        self.attack("lease.install", TASK.task_id, b"", False, 1.5)
+        second = self.lessee(self.outsiders()[0])
+        second.want()
+        self.team.run(1.0)
+        self.assertIsNotNone(holder.lease)
+        self.assertIsNone(second.lease)
+        self.assertEqual((second.council.configuration, second.council.members), (1, self.task.council))
+
+    def test_member_that_lies_about_the_council(self) -> None:
+        """A member that says that the council is another one leads no claimant to it."""
+        holder = self.held_by(self.members()[0])
+        liar, accomplices = self.members()[1], self.outsiders()
+        forged = tuple(self.team.contact(self.team.houses[place]) for place in accomplices)
+        acceptor: Any = self.team.nodes[liar].councils.desk._acceptor
+        reply = Reply(MOVED, configuration=9, members=forged)
+        for name in ("prepare", "propose"):
+            setattr(acceptor, name, lambda *_, **__: reply)
+        second = self.lessee(accomplices[0])
+        second.want()
+        self.team.run(3.0)
+        self.assertIsNotNone(holder.lease)
+        self.assertIsNone(second.lease)
+        self.assertEqual(second.council.members, self.task.council)
+
+    def test_council_of_the_device_alone(self) -> None:
+        """Members of a council accept no next one in which a device, with keys that it made up, is a majority."""
+        own = Contact(self.own.public, SOURCE).packed()
+        invented = [Contact(Identity(bytes([n]) * 32).public, SOURCE).packed() for n in range(2)]
+        viewer = Contact(self.insider(self.team, "eye", "viewer", at=SOURCE._replace(port=7))[1].public, SOURCE)
+        honest = [self.team.contact(house).packed() for house in self.team.houses]
+        for council in ([own], [own, honest[0]], [own, *invented], [*honest[:2], viewer.packed()]):
+            self.attack("lease.prepare", TASK.task_id, 1, 2**20, 1.5)
+            answers = self.attack("lease.change", TASK.task_id, 1, 2**20, council, 0, False)
+            self.assertTrue(all(isinstance(answer, Refused) for answer in answers))
+        self.held_by(self.outsiders()[0])
+
+    def test_certified_council(self) -> None:
+        """With the signatures of the old council a new one is installed, and it goes on above the old tokens."""
+        holder = self.held_by(self.members()[0])
+        token = holder.token
+        contacts = [self.team.contact(house) for house in self.team.houses]
+        following = [self.task.council[0], *(contacts[place] for place in self.outsiders())]
+        self.assertIsNone(self.outcome(self.team, holder.move(following), 2.0))
+        self.assertEqual((holder.council.configuration, list(holder.council.members)), (2, following))
+        self.assert_won(holder)
+        self.assertGreater(holder.token, token)
+        links = [holder.council.charter.links[0]] if holder.council.charter is not None else []
+        self.assertEqual([len(link.votes) for link in links], [2])
+
+
+class ClosingTests(LeaseCase):
+    """The end of a task that another device holds."""
+
+    def test_device_closes(self) -> None:
+        """A device that holds nothing ends no task: not as an operator, not under the token, not under a higher one."""
+        holder = self.held_by(self.members()[0])
+        for token in (0, holder.token, holder.token + 1, HUGE):
+            self.attack("lease.close", TASK.task_id, 1, token)
+        self.attack("lease.cancel", TASK.task_id, 1)
+        self.team.run(2 * TASK.lease_ttl)
+        self.assertIsNotNone(holder.lease)
+        self.assertFalse(holder.is_over)
+
+    def test_device_closes_before_anybody_acts(self) -> None:
+        """A task that nobody holds yet is not ended by a device either."""
+        for token in (0, 1, HUGE):
+            self.attack("lease.close", TASK.task_id, 1, token)
+        self.attack("lease.cancel", TASK.task_id, 1)
+        self.held_by(2)
+
+    def test_operator_closes(self) -> None:
+        """The gateway, which may order, ends the task that another holds."""
+        holder = self.held_by(self.members()[0])
+        council = self.team.nodes[0].councils.of(self.task)
+        self.assertIsNone(self.outcome(self.team, council.close(), 4.0))
+        self.assertTrue(holder.is_over)
+
+    def test_member_that_says_it_is_over(self) -> None:
+        """One member that lies about the end keeps no healthy claimant from the lease."""
+        liar = self.members()[1]
+        acceptor: Any = self.team.nodes[liar].councils.desk._acceptor
+        for name in ("prepare", "propose"):
+            setattr(acceptor, name, lambda *_, **__: Reply(OVER))
+        self.held_by(self.outsiders()[0], 2.0)
+
+
+class NumberTests(LeaseCase):
+    """Numbers after which there are no higher ones."""
+
+    def test_highest_ballot(self) -> None:
+        """After a device has asked under the highest ballots there are, others still win."""
+        for counter in (HUGE, HUGE - 1, 2**61, 2**52, 2**40):
+            self.attack("lease.prepare", TASK.task_id, 1, counter, 1.5)
+        self.held_by(self.outsiders()[0], 3.0)
+
+    def test_highest_token(self) -> None:
+        """After a device has proposed the highest tokens there are, others still win when its lease has run out."""
+        for number in range(1, 4):
+            self.attack("lease.prepare", TASK.task_id, 1, number * 2**20, 0.1)
+            for token in (HUGE + 1, HUGE, 2**61, 2**53, 2**40):
+                self.attack("lease.propose", TASK.task_id, 1, number * 2**20, token, 0.1)
+            self.team.run(1.0)
+        self.held_by(self.outsiders()[0], 3.0)
+
+    def test_false_news(self) -> None:
+        """A device that tells claimants of the highest token blocks none of them."""
+        place = self.outsiders()[0]
+        lessee = self.lessee(place)
+        lessee.stand_by(1)
+        self.attack("lease.freed", TASK.task_id, HUGE, 0.0)
+        lessee.release()
+        self.team.run(1.0)
+        lessee.want()
+        self.team.run(1.0)
+        self.assert_won(lessee)
+
+    def test_member_that_lies_about_numbers(self) -> None:
+        """One member that answers with the highest numbers there are blocks no claimant."""
+        acceptor: Any = self.team.nodes[self.members()[1]].councils.desk._acceptor
+        genuine = acceptor.prepare
+
+        def lie(*arguments: Any) -> Reply:
+            reply: Reply = genuine(*arguments)
+            return reply._replace(kind=GRANTED, token=HUGE, ballot=reply.ballot._replace(counter=HUGE))
+
+        acceptor.prepare = lie
+        self.held_by(self.outsiders()[0], 3.0)
+
+
+class TaskTests(LeaseCase):
+    """Records of tasks that a device may not write."""
+
+    def record(self, key: bytes, name: str, value: bytes, owner: Identity | None = None) -> Record:
+        """A team record of the device."""
+        own = owner or self.own
+        return Record(key, name, own.public, 2**40, "team", 600.0, value).signed(own)
+
+    def seen(self) -> dict[str, Task]:
+        """The tasks as every node of the team reads them."""
+        all_seen = [tasks_of(self.outcome(self.team, node.entangled.get(TASKS), 1.0)) for node in self.team.nodes]
+        self.assertTrue(all(seen == all_seen[0] for seen in all_seen))
+        return all_seen[0]
+
+    def test_task_made_or_altered(self) -> None:
+        """A device makes no task and changes none, its council included."""
+        before = self.seen()
+        other = replace(self.task, generation=9, priority=9, council=self.task.council[:1], charter=b"")
+        self.store(
+            self.record(TASKS, "t1", other.packed()), self.record(TASKS, "t2", replace(other, task_id="t2").packed())
+        )
+        self.assertEqual(self.seen(), before)
+
+    def test_task_concluded(self) -> None:
+        """What a device writes about the end of a task that it does not hold is no end for any node."""
+        heard: dict[int, Result | None] = {}
+
+        def follow(place: int) -> Group:
+            node = self.team.nodes[place]
+            return node.group(self.task, lambda members, outcome: heard.update({place: outcome}))
+
+        groups = [follow(place) for place in range(len(self.team.nodes))]
+        holder = self.held_by(self.members()[0])
+        forged = Result(COMPLETED, "dog1", 1.0, holder.token + 1).packed()
+        key = group_key(TASK.task_id)
+        self.store(self.record(key, RESULT, forged), self.record(key, "done", forged))
+        self.team.run(2.0)
+        for group in groups:
+            group.leave()
+        self.assertEqual(set(heard.values()) - {None}, set())
+        self.assertIsNotNone(holder.lease)
+
+
+class NameTests(LeaseCase):
+    """The name of another device."""
+
+    def test_name_of_another(self) -> None:
+        """A device that announces itself under another's name, in the slot or in the value, is not shown under it."""
+        device = Device(self.own.node_id.hex(), DEVICE_NAME, capabilities={"camera": {"width": 208}}, joined=9)
+        for slot in (DEVICE_NAME, "bad"):
+            self.store(Record(DEVICES, slot, self.own.public, 1, "leased", 60.0, device.packed()).signed(self.own))
+        right = replace(device, name="bad")
+        listing = self.outcome(self.team, self.team.nodes[0].list_devices(), 2.0)
+        self.assertEqual(self.names(listing.records), ["dog1", "dog2", "dog3", "dog4", "vaio"])
+        self.store(Record(DEVICES, "bad", self.own.public, 2, "leased", 60.0, right.packed()).signed(self.own))
+        listing = self.outcome(self.team, self.team.nodes[0].list_devices(), 2.0)
+        self.assertEqual(self.names(listing.records), ["bad", "dog1", "dog2", "dog3", "dog4", "vaio"])
+
+    def test_two_members_of_one_name(self) -> None:
+        """Of two members to whom the operator gave one name each is shown with the beginning of its id."""
+        self.team.enlist("dog2", "device")
+        self.team.run(2.0)
+        listing = self.outcome(self.team, self.team.nodes[0].list_devices(), 2.0)
+        twins = [name for name in self.names(listing.records) if name.startswith("dog2")]
+        self.assertEqual(twins, sorted(f"dog2-{node.uuid[:6]}" for node in self.twins()))
+
+    def twins(self) -> list[SwarmNode]:
+        """The nodes of that name."""
+        return [node for node in self.team.nodes if node.presence.device.name == "dog2"]
+
+    def names(self, records: list[Record]) -> list[str]:
+        """The names under which devices are shown."""
+        return sorted(device.name for device, _ in devices_of(records))

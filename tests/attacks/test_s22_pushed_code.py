@@ -1,0 +1,214 @@
+"""Attack S22: an author that is not, or is no longer, an operator of the team has code run on a node."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.admission.membership import MemoryMembership
+from middleware.deployment.shelf import MemoryShelf
+from middleware.entangled.control.place import made
+from middleware.node import SwarmNode
+from middleware.tasks import Task
+from swarmnode.deploy import main
+from swarmnode.rehearsal import VirtualTeam
+from tests.swarmnode.shell import Shell
+
+CANARY = "swarm_canary"
+SOURCE = f"""
+import sys
+from middleware.consensus.nearest import Nearest
+sys.modules["{CANARY}"] = sys
+
+
+class Strategy(Nearest):
+    pass
+"""
+WALK = """
+class Behaviour:
+    cost = 1.0
+    def __init__(self, parameters, rng): self.left = parameters["steps"]
+    def look(self, seen, now): self.progress = 1.0 / (1.0 + self.left)
+    def search(self, now): return {}
+    def hold(self, now): return {}
+    def execute(self, context):
+        self.left -= 1
+        return {"base.vx": 0.05, "base.vy": 0.0, "base.wz": 0.3} if self.left > 0 else None
+"""
+IN_FORCE = 10.0
+
+
+class PushedCodeTests(SynchronousTestCase):
+    """A closed team: the laptop is its first node, ``author`` pushes, and the dog lists the author's key."""
+
+    def setUp(self) -> None:
+        """The team runs; nothing was pushed."""
+        self.folder = Path(tempfile.mkdtemp())
+        self.addCleanup(shutil.rmtree, self.folder)
+        self.patch(os, "environ", {**os.environ, "XDG_RUNTIME_DIR": str(self.folder)})
+        self.addCleanup(sys.modules.pop, CANARY, None)
+        made("author").touch()
+        self.team = VirtualTeam(11, dogs=())
+        self.team._names += ("author", "second")
+        self.addCleanup(self.team.stop)
+        self.shelf = MemoryShelf()
+
+    def join(self, name: str, *roles: str) -> SwarmNode:
+        """A member that the operator gave these roles."""
+        membership = self.team.operator.founded(
+            name, roles, self.team.clock.seconds(), self.team._dice, self.team._secret
+        )
+        self.team._memberships[name] = MemoryMembership(membership)
+        self.team.add(name)
+        self.team.clock.advance(1.0)
+        return self.team.services[name].assembly.node
+
+    def allow(self, *authors: SwarmNode) -> SwarmNode:
+        """Start the dog, which lists the keys of these authors."""
+        keys = [author.entangled.identity.public.hex() for author in authors]
+        allowed = {"allow": True, "operators": keys, "modules": ["best"]}
+        self.team.add("dog1", {"deployment": allowed}, self.shelf)
+        self.team.clock.advance(1.0)
+        return self.team.services["dog1"].assembly.node
+
+    def push(self, author: SwarmNode, source: str = SOURCE, kind: str = "strategy") -> int:
+        """Push a module at the author's node; returns the exit code."""
+        path = self.folder / "best.py"
+        path.write_text(source)
+        shell = Shell(self.team, author)
+        code, _ = shell.run(main, ["push", str(path), "--name", "best", "--kind", kind])
+        self.team.clock.advance(2.0)
+        return int(code)
+
+    def revoke(self, node: SwarmNode, name: str) -> None:
+        """The operator revokes a member at the laptop."""
+        packed = self.team.operator.revoke(node.entangled.identity.public, name, self.team.clock.seconds())
+        team = self.team.services["vaio"].assembly.node.team
+        assert team is not None
+        told = self.team_told(team.tell(packed))
+        self.assertEqual(told, "revoke")
+        self.team.clock.advance(IN_FORCE)
+
+    def submit(self, steps: int) -> None:
+        """A task for the pushed behaviour, which ends after so many steps."""
+        task = Task("t1", "deployed:best", "Walk", parameters={"steps": steps}, requirements={"base2d": {}})
+        task = replace(task, created=self.team.clock.seconds())
+        self.team_told(self.team.services["vaio"].assembly.node.submit(task))
+
+    def pose(self) -> tuple[float, ...]:
+        """Where the dog is."""
+        (robot,) = [each for each in self.team.truth()["dogs"] if each["name"] == "dog1"]
+        return tuple(round(robot[key], 4) for key in ("x", "y", "heading"))
+
+    def team_told(self, work: object) -> object:
+        """The kind of a statement."""
+        from twisted.internet.defer import Deferred
+
+        done = Deferred.fromCoroutine(work)  # type: ignore[arg-type,var-annotated]
+        self.team.clock.advance(1.0)
+        return self.successResultOf(done)
+
+    def shown(self) -> str:
+        """The state of the module on the dog, as the page shows it."""
+        (device,) = [each for each in self.team.state()["devices"] if each["name"] == "dog1"]
+        return str(device["deployed"].get("best", ""))
+
+    def assert_nothing_runs(self, dog: SwarmNode) -> None:
+        """Neither has the module run, nor may a task have it."""
+        self.assertEqual((dict(dog.deployed), CANARY in sys.modules), ({}, False))
+
+    def test_gateway_does_not_push(self) -> None:
+        """A gateway writes the records of operators for the people behind it, and has no code run, even if listed."""
+        author = self.join("author", "gateway")
+        dog = self.allow(author)
+        self.assertNotEqual(self.push(author), 0)
+        self.assert_nothing_runs(dog)
+        self.assertEqual(self.shown(), "")
+
+    def test_device_and_viewer_do_not_push(self) -> None:
+        """Neither does a device or a viewer whose key a node lists by mistake."""
+        authors = [self.join("author", "device"), self.join("second", "viewer")]
+        dog = self.allow(*authors)
+        for author in authors:
+            self.push(author)
+            self.assert_nothing_runs(dog)
+
+    def test_revoked_operator_stops_running(self) -> None:
+        """The module of an operator that is revoked runs no longer, and no task gets it."""
+        author = self.join("author", "operator")
+        dog = self.allow(author)
+        self.assertEqual(self.push(author), 0)
+        self.assertEqual(list(dog.deployed), [("strategy", "best")])
+        sys.modules.pop(CANARY)
+        self.revoke(author, "author")
+        self.assert_nothing_runs(dog)
+        self.assertIn("refused", self.shown())
+
+    def test_revoked_operator_is_not_loaded_again(self) -> None:
+        """Nor does the next life of a node load it from its own file."""
+        author = self.join("author", "operator")
+        dog = self.allow(author)
+        self.push(author)
+        self.assertEqual(len(self.shelf.contents), 1)
+        sys.modules.pop(CANARY)
+        self.revoke(author, "author")
+        self.team.services["dog1"].leave(1.0)
+        self.team.clock.advance(5.0)
+        dog = self.team.services["dog1"].assembly.node
+        self.assert_nothing_runs(dog)
+
+    def test_another_operator_follows_a_revoked_one(self) -> None:
+        """A module of a revoked operator, with any version, does not block the next operator."""
+        author, second = self.join("author", "operator"), self.join("second", "operator")
+        dog = self.allow(author, second)
+        self.push(author)
+        self.revoke(author, "author")
+        made("author").unlink()
+        made("second").touch()
+        self.assertEqual(self.push(second, SOURCE + "# two\n"), 0)
+        self.assertEqual(list(dog.deployed), [("strategy", "best")])
+
+    def test_behaviour_does_its_task(self) -> None:
+        """A behaviour of an operator moves the robot, and ends the task."""
+        author = self.join("author", "operator")
+        self.allow(author)
+        self.push(author, WALK, "behaviour")
+        before = self.pose()
+        self.submit(60)
+        self.team.clock.advance(15.0)
+        self.assertNotEqual(self.pose(), before)
+        self.assertEqual([task["status"] for task in self.team.state()["tasks"]], ["COMPLETED"])
+
+    def test_robot_stands_when_its_author_is_revoked(self) -> None:
+        """A robot that a behaviour moves stands when the author of the behaviour is revoked."""
+        author = self.join("author", "operator")
+        dog = self.allow(author)
+        self.push(author, WALK, "behaviour")
+        self.submit(10**6)
+        self.team.clock.advance(10.0)
+        before = self.pose()
+        self.team.clock.advance(2.0)
+        self.assertNotEqual(self.pose(), before)
+        self.revoke(author, "author")
+        before = self.pose()
+        self.team.clock.advance(5.0)
+        self.assertEqual((self.pose(), dict(dog.deployed)), (before, {}))
+
+    def test_author_and_digest_are_shown(self) -> None:
+        """The page shows name and key of the author and the digest, of a running and of a refused module."""
+        author = self.join("author", "operator")
+        dog = self.allow(author)
+        self.push(author)
+        record = dog.presence.device.deployed["best"]
+        key = author.entangled.identity.public.hex()
+        for part in ("author", key[:8], record.split()[1][:8]):
+            self.assertIn(part, self.shown())
+        self.push(author, SOURCE + "1 / 0\n")
+        self.assertIn("refused", self.shown())
+        self.assertEqual(self.shown().count(key[:8]), 2)

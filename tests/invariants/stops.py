@@ -1,0 +1,508 @@
+"""Random sequences of stops, releases, partitions, restarts and hostile messages over the halts of a small team.
+
+The halts are the real ones; the network below them delivers late, twice or not at all, disks lose what was not written,
+and replicas forget records and offer old ones.  Checked after each step: once a robot's node has acknowledged a stop of
+an honest operator, the robot stands until a release by a member that may order, naming that very stop, has reached it.
+Checked at the end, with the network healed: an operator can release all of it.
+
+``python -m tests.invariants.stops --sequences 10000 --seed 1`` runs so many, and prints what happened in them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import random
+import sys
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import msgpack
+from twisted.internet.defer import Deferred, fail, succeed
+from twisted.internet.task import Clock
+from twisted.python.failure import Failure
+
+from middleware import roles
+from middleware.entangled.data.memory import MemoryStore
+from middleware.entangled.errors import EntangledError, NoAnswer, Refused, Unavailable
+from middleware.entangled.identity import Identity
+from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.network.network import Address
+from middleware.entangled.record import Record, Slot
+from middleware.halt import HALT, METHOD, NOTE, SLOT, STANDS, UNSAVED, Halt, answer_halt
+from middleware.stop_set import ID_BYTES, MAX_NAMED, MAX_RELEASED, statement_of
+
+STEPS = 60
+TEAM = {
+    "ann": roles.OPERATOR,
+    "bob": roles.OPERATOR,
+    "web": roles.GATEWAY,
+    "dog1": roles.DEVICE,
+    "dog2": roles.DEVICE,
+    "dog3": roles.DEVICE,
+    "eye": roles.VIEWER,
+    "boot": roles.BOOTSTRAP,
+    "thief": roles.OPERATOR,
+}
+HONEST = ("ann", "bob", "web")
+ROBOTS = ("dog1", "dog2", "dog3")
+NODES = (*HONEST, *ROBOTS)
+OUTSIDE = "invented"
+"""Signs records with a key that is no member's."""
+
+
+class Violation(AssertionError):
+    """A robot that acknowledged a stop may move, or a team cannot be released."""
+
+
+class Disk(MemoryStore):
+    """A store whose notes survive a crash only once they are written."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.safe: bytes | None = None
+        self.waiting: list[tuple[bytes | None, Deferred[None]]] = []
+
+    def written(self) -> Deferred[None]:
+        """Fire when the disk says so."""
+        done: Deferred[None] = Deferred()
+        self.waiting.append((self.noted(NOTE), done))
+        return done
+
+    def commit(self) -> None:
+        """Write what is owed."""
+        self.safe = self.noted(NOTE)
+        waiting, self.waiting = self.waiting, []
+        for _, done in waiting:
+            done.callback(None)
+
+    def crash(self) -> None:
+        """Lose what was not written."""
+        self.waiting.clear()
+        self._notes.pop(NOTE, None)
+        if self.safe is not None:
+            self.note(NOTE, self.safe)
+
+
+@dataclass
+class Life:
+    """One life of a node, as its halt sees the library."""
+
+    net: Net
+    name: str
+    halt: Halt = field(init=False)
+    is_over: bool = False
+    changed: Callable[[list[Record]], None] | None = None
+    answer: Callable[..., Any] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.identity = self.net.identities[self.name]
+        self.store = self.net.disks[self.name]
+        self.endpoint = self.replica = self.door = self
+        self.records: list[Record] = []
+        self.halt = answer_halt(self, self.net.dice, self.later, lambda stops, words: None)  # type: ignore[arg-type]
+        if self.name in ROBOTS:
+            self.halt.watch(self.obey)
+
+    def obey(self) -> str:
+        """As an agent does."""
+        if not self.halt.is_known:
+            self.halt.learn()
+        return STANDS if self.halt.is_on else "goes on"
+
+    def expose(self, name: str, answer: Callable[..., Any], changes: bool, idempotent: bool) -> None:
+        """Take the answers to calls."""
+        self.answer = answer
+
+    def later(self, seconds: float, call: Callable[[], None]) -> None:
+        """A timer that ends with this life."""
+        self.net.clock.callLater(seconds, lambda: None if self.is_over else call())
+
+    def may(self, public: bytes, method: str) -> bool:
+        """Whether a present member may call that."""
+        return self.net.may(public)
+
+    def may_store(self, slot: Slot) -> bool:
+        """Whether the owner may write there at present."""
+        return self.net.may(slot.owner)
+
+    def may_stay(self, slot: Slot) -> bool:
+        """As the most lenient of replicas: what was written stays, whoever wrote it."""
+        return True
+
+    def call(self, contact: Contact, method: str, *arguments: object, changes: bool = False) -> Deferred[Any]:
+        """Ask another node."""
+        return self.net.send(self.name, self.net.names[contact.public], arguments)
+
+    def put(self, key: bytes, name: str, value: bytes, lifetime: str) -> Deferred[int]:
+        """Store a record; it spreads when the network lets it."""
+        self.net.write(self.name, value)
+        return succeed(1)
+
+    def get(self, key: bytes) -> Deferred[list[Record]]:
+        """A majority read."""
+        near = [other for other in NODES if self.net.reaches(self.name, other)]
+        if len(near) <= len(NODES) // 2:
+            return fail(Unavailable(len(near), len(NODES) // 2 + 1))
+        records = self.net.newest(near)
+        self.net.reached(self.name, records)
+        return succeed(records)
+
+    def watch(self, key: bytes, changed: Callable[[list[Record]], None], keep: bool) -> Life:
+        """Follow the records that this node holds; the life is its own watch."""
+        self.changed = changed
+        self.look()
+        return self
+
+    def look(self) -> None:
+        """Tell the watch what the replica of this node holds."""
+        records = self.net.newest([self.name])
+        if self.changed is not None and records != self.records:
+            self.records = records
+            self.net.reached(self.name, records)
+            self.changed(records)
+
+
+class Net:
+    """A team, what is under way in it, and what each robot owes to whom."""
+
+    def __init__(self, seed: int, counts: Counter[str]) -> None:
+        self.dice = random.Random(seed)
+        self.counts = counts
+        self.clock = Clock()
+        self.identities = {name: Identity(self.dice.randbytes(32)) for name in (*TEAM, OUTSIDE)}
+        self.names = {self.identities[name].public: name for name in TEAM}
+        self.revoked: set[str] = set()
+        self.disks = {name: Disk() for name in NODES}
+        self.replicas: dict[str, dict[bytes, Record]] = {name: {} for name in NODES}
+        self.old: list[Record] = []
+        self.sent: list[tuple[str, str, tuple[Any, ...]]] = []
+        self.sides = dict.fromkeys(TEAM, 0)
+        self.lives: dict[str, Life] = {}
+        self.owed: dict[str, set[bytes]] = {name: set() for name in ROBOTS}
+        self.tracked: set[bytes] = set()
+        for name in NODES:
+            self.begin(name)
+
+    # -- what the lives ask -----------------------------------------------------------------------------------------
+
+    def may(self, public: bytes) -> bool:
+        """Whether the holder of this key is a member that may order now."""
+        name = self.names.get(public, "")
+        return name in TEAM and name not in self.revoked and roles.may_call((TEAM[name],), METHOD)
+
+    def reaches(self, one: str, other: str) -> bool:
+        """Whether two nodes hear each other."""
+        return self.sides[one] == self.sides[other] and other in self.lives
+
+    def newest(self, names: list[str]) -> list[Record]:
+        """The newest record of each owner, as these nodes hold them."""
+        best: dict[bytes, Record] = {}
+        for name in names:
+            for owner, record in self.replicas[name].items():
+                if record.beats(best.get(owner)):
+                    best[owner] = record
+        return [best[owner] for owner in sorted(best)]
+
+    def write(self, name: str, value: bytes) -> None:
+        """A new record of an owner, at its own replica where it is a node."""
+        own = self.identities[name].public
+        known = [r.sequence for r in (*self.old, *self.newest(list(NODES))) if r.owner == own]
+        record = Record(HALT, SLOT, own, max(known, default=0) + 1, "team", 600.0, value, self.dice.randbytes(64))
+        self.old.append(record)
+        self.hold(name if name in NODES else self.dice.choice(NODES), record)
+
+    def hold(self, name: str, record: Record) -> None:
+        """Have a replica take a record, where it beats what it holds and its owner may write it."""
+        owner = self.names.get(record.owner)
+        if owner is not None and not self.may(record.owner):
+            return
+        if record.beats(self.replicas[name].get(record.owner)):
+            self.replicas[name][record.owner] = record
+            if name in self.lives:
+                self.lives[name].look()
+
+    def reached(self, name: str, records: list[Record]) -> None:
+        """Take note of what the records of members that may order release at a robot."""
+        for record in records:
+            if name in ROBOTS and self.may(record.owner) and _is_msgpack(record.value):
+                self.released(name, msgpack.unpackb(record.value or b""))
+
+    def released(self, name: str, fields: object) -> None:
+        """What these fields release is owed no more."""
+        statement = statement_of(fields)
+        if statement is not None:
+            self.owed[name] -= set(statement.released)
+
+    def send(self, sender: str, to: str, arguments: tuple[Any, ...]) -> Deferred[Any]:
+        """One call; it may be lost, and so may its answer."""
+        self.sent.append((sender, to, arguments))
+        if not self.reaches(sender, to) or self.dice.random() < 0.1:
+            return fail(NoAnswer("lost"))
+        answered = self.deliver(sender, to, arguments)
+        return fail(NoAnswer("lost")) if self.dice.random() < 0.1 else answered
+
+    def deliver(self, sender: str, to: str, arguments: tuple[Any, ...]) -> Deferred[Any]:
+        """What the endpoint of ``to`` does with a call: the role decides, then the types, then the method."""
+        if not self.may(self.identities[sender].public):
+            self.counts["refused"] += 1
+            return fail(Refused("role"))
+        if [type(each) for each in arguments] != [list, list, str]:
+            self.counts["refused"] += 1
+            return fail(Refused("not the arguments"))
+        life = self.lives[to]
+        peer = Contact(self.identities[sender].public, Address("10.0.0.1", 1))
+        if to in ROBOTS:
+            self.released(to, list(arguments))
+        try:
+            answered: Deferred[Any] = life.answer(peer, *arguments)
+        except Refused:
+            self.counts["refused"] += 1
+            return fail(Failure())
+
+        def acknowledged(answer: list[Any]) -> list[Any]:
+            said, obeyed = answer
+            if to in ROBOTS and life is self.lives.get(to) and not said.endswith(UNSAVED):
+                ids = {stop for stop, _ in obeyed} & self.tracked
+                # A release may have come between the order and the end of the write.
+                fresh = {stop for stop, _ in arguments[0]} & ids & set(life.halt.stops)
+                self.owed[to] |= fresh
+                self.counts["acknowledged"] += len(fresh)
+            return answer
+
+        return answered.addCallback(acknowledged)
+
+    # -- what happens -----------------------------------------------------------------------------------------------
+
+    def begin(self, name: str) -> None:
+        """The first or next life of a node."""
+        life = self.lives[name] = Life(self, name)
+        life.halt.learn() if name in ROBOTS else life.halt.follow()
+
+    def contacts(self) -> list[Contact]:
+        """Every node."""
+        return [Contact(self.identities[name].public, Address("10.0.0.1", 1)) for name in NODES]
+
+    def stop(self) -> None:
+        """An honest operator stops the team."""
+        name = self.orderer()
+        if name:
+            before = set(self.lives[name].halt.stops)
+            asked = self.lives[name].halt.stop
+            # The id is known before the first answer comes.
+            state = self.dice.getstate()
+            self.tracked.add(self.dice.randbytes(ID_BYTES))
+            self.dice.setstate(state)
+            asked(name, self.contacts()).addErrback(_expected)
+            self.counts["stops"] += bool(set(self.lives[name].halt.stops) - before)
+
+    def release(self) -> None:
+        """An honest operator releases all that it knows, or some of it."""
+        name = self.orderer()
+        if name:
+            known = list(self.lives[name].halt.stops)
+            named = known if self.dice.random() < 0.6 else self.dice.sample(known, len(known) // 2)
+            self.lives[name].halt.release(named, name, self.contacts()).addErrback(_expected)
+            self.counts["releases"] += 1
+
+    def orderer(self) -> str:
+        """An honest operator that is up and not revoked."""
+        up = [name for name in HONEST if name in self.lives and name not in self.revoked]
+        return self.dice.choice(up) if up else ""
+
+    def partition(self) -> None:
+        """The network falls into two, or is whole again."""
+        is_whole = self.dice.random() < 0.5
+        self.sides = {name: 0 if is_whole else self.dice.randrange(2) for name in TEAM}
+        self.counts["partitions"] += 1
+
+    def restart(self) -> None:
+        """A node, or all of them, end without a word and come back."""
+        for name in NODES if self.dice.random() < 0.1 else [self.dice.choice(NODES)]:
+            life = self.lives.pop(name, None)
+            if life is None:
+                continue
+            life.is_over = True
+            self.disks[name].crash()
+            self.counts["restarts"] += 1
+            if self.dice.random() < 0.3:
+                self.replicas[name].clear()
+            self.clock.callLater(self.dice.random() * 20.0, self.come_back, name)
+
+    def come_back(self, name: str) -> None:
+        """Begin a life where there is none."""
+        if name not in self.lives:
+            self.begin(name)
+
+    def forget(self) -> None:
+        """A replica drops a record, as when its time is over."""
+        name = self.dice.choice(NODES)
+        if self.replicas[name]:
+            del self.replicas[name][self.dice.choice(list(self.replicas[name]))]
+            if name in self.lives:
+                self.lives[name].look()
+            self.counts["records lost"] += 1
+
+    def gossip(self) -> None:
+        """Two replicas compare."""
+        for _ in range(6):
+            one, other = self.dice.sample(NODES, 2)
+            if one in self.lives and self.reaches(one, other):
+                for record in self.newest([one, other]):
+                    self.hold(one, record)
+                    self.hold(other, record)
+
+    def repeat(self) -> None:
+        """The network delivers an earlier call of a present member again, or a replica offers an earlier record."""
+        self.counts["repeated"] += 1
+        if self.sent and self.dice.random() < 0.6:
+            sender, to, arguments = self.dice.choice(self.sent)
+            if to in self.lives:
+                self.deliver(sender, to, arguments).addErrback(_expected)
+        elif self.old:
+            self.hold(self.dice.choice(NODES), self.dice.choice(self.old))
+
+    def revoke(self) -> None:
+        """An operator is revoked; one honest one remains."""
+        name = self.dice.choice(("bob", "web", "thief"))
+        if name not in self.revoked and self.dice.random() < 0.3:
+            self.revoked.add(name)
+            public = self.identities[name].public
+            for replica in NODES:
+                self.replicas[replica].pop(public, None)
+                if replica in self.lives:
+                    self.lives[replica].look()
+            self.counts["revoked"] += 1
+
+    def attack(self) -> None:
+        """A member that must not order, an invented key, or an operator's stolen key sends something hostile."""
+        self.counts["hostile"] += 1
+        sender = self.dice.choice(("eye", "boot", "dog1", "thief", OUTSIDE))
+        known = list(self.tracked)
+        if sender == "thief" and self.dice.random() < 0.9:
+            known = []  # it may release the stops that it knows; its inventions are the attack
+        arguments = self.dice.choice(
+            [
+                lambda: (2 ** self.dice.choice((31, 53, 63)), self.dice.random() < 0.5, sender),
+                lambda: (
+                    [],
+                    [self.dice.randbytes(ID_BYTES) for _ in range(self.dice.choice((1, MAX_RELEASED)))],
+                    sender,
+                ),
+                lambda: ([[self.dice.randbytes(ID_BYTES), sender] for _ in range(MAX_NAMED)], [], sender),
+                lambda: ([], known[:MAX_RELEASED], sender),
+                lambda: ([[stop, sender] for stop in known[:MAX_NAMED]], [], sender),
+                lambda: ([[b"", 0]], [2**53, [], {}], "x" * 100),
+                lambda: ([], [b"x" * 16] * (MAX_RELEASED + 1), sender),
+            ]
+        )()
+        if self.dice.random() < 0.5 or sender == OUTSIDE:
+            self.write(sender, self.dice.choice((msgpack.packb(list(arguments)), b"\xc1", self.dice.randbytes(20))))
+        else:
+            to = self.dice.choice(NODES)
+            if to in self.lives:
+                self.deliver(sender, to, arguments).addErrback(_expected)
+
+    # -- what must hold ---------------------------------------------------------------------------------------------
+
+    def check(self, what: str) -> None:
+        """No robot that owes a stop may move."""
+        for name in ROBOTS:
+            life = self.lives.get(name)
+            if life is not None and self.owed[name] and not life.halt.is_on:
+                raise Violation(f"after {what} {name} may move, though {len(self.owed[name])} stops are not released")
+
+    def step(self) -> None:
+        """One thing that happens."""
+        events = (
+            (self.stop, 4),
+            (self.release, 3),
+            (self.partition, 2),
+            (self.restart, 3),
+            (self.forget, 2),
+            (self.gossip, 6),
+            (self.repeat, 3),
+            (self.attack, 5),
+            (self.revoke, 1),
+        )
+        [event] = self.dice.choices([each for each, _ in events], [weight for _, weight in events])
+        event()
+        self.check(event.__name__)
+        for name in NODES:
+            if self.dice.random() < 0.4:
+                self.disks[name].commit()
+        self.tick(self.dice.random() * 5.0)
+        self.check("a while")
+
+    def tick(self, seconds: float) -> None:
+        """Let time pass, in which agents look."""
+        self.clock.advance(seconds)
+        for name in ROBOTS:
+            if name in self.lives and self.lives[name].halt.is_on:
+                self.lives[name].halt.refresh()
+
+    def end(self) -> None:
+        """All are back, nobody is hostile any more: an operator releases what the devices name."""
+        self.sides = dict.fromkeys(TEAM, 0)
+        self.revoked.add("thief")
+        gone = self.identities[OUTSIDE].public, *(self.identities[name].public for name in self.revoked)
+        for _ in range(12):
+            self.tick(30.0)
+            for name in NODES:
+                self.disks[name].commit()
+                for owner in gone:
+                    self.replicas[name].pop(owner, None)
+            for _ in range(8):
+                self.gossip()
+            operator = self.orderer()
+            named = {stop for name in NODES if name in self.lives for stop in self.lives[name].halt.stops}
+            if operator and named:
+                self.lives[operator].halt.release(sorted(named), operator, self.contacts()).addErrback(_expected)
+            self.check("the end")
+        standing = [name for name in ROBOTS if self.lives[name].halt.is_on]
+        if standing:
+            raise Violation(f"no release lets {', '.join(standing)} go on")
+
+
+def run(seed: int, counts: Counter[str]) -> None:
+    """One sequence; raises ``Violation``."""
+    net = Net(seed, counts)
+    counts["sequences"] += 1
+    for _ in range(STEPS):
+        net.step()
+    net.end()
+
+
+def _expected(failure: Failure) -> None:
+    failure.trap(EntangledError)
+
+
+def _is_msgpack(value: bytes | None) -> bool:
+    try:
+        msgpack.unpackb(value or b"")
+    except Exception:  # the decoder raises many kinds on crafted bytes
+        return False
+    return True
+
+
+def main() -> int:
+    """Run what the arguments say; 1 where a sequence failed."""
+    parser = argparse.ArgumentParser(prog="python -m tests.invariants.stops", description=__doc__)
+    parser.add_argument("--sequences", type=int, default=10_000, help="how many to run (default 10000)")
+    parser.add_argument("--seed", type=int, default=1, help="the seed of the first; the others follow (default 1)")
+    wanted = parser.parse_args()
+    counts: Counter[str] = Counter()
+    failed = 0
+    for seed in range(wanted.seed, wanted.seed + wanted.sequences):
+        try:
+            run(seed, counts)
+        except Violation as violation:
+            failed += 1
+            sys.stdout.write(f"seed {seed}: {violation}\n")
+    sys.stdout.write(", ".join(f"{count} {name}" for name, count in counts.items()) + f", {failed} failed\n")
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

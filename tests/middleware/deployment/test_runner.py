@@ -1,0 +1,197 @@
+"""Tests of ``middleware.deployment.runner``: a module's process as its node sees it, on a turned clock."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from typing import Any
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.consensus.guard import STRIKES, Lost, NoOpinion
+from middleware.consensus.strategy import Report
+from middleware.deployed import BEHAVIOUR, STRATEGY
+from middleware.deployment import frame
+from middleware.deployment.channel import Gone
+from middleware.deployment.manifest import pushed
+from middleware.deployment.runner import MAX_PENDING, PATIENCE_S, START_S, TRANSITIONS, PushedStrategy, Runner, State
+from middleware.errors import UnknownTask
+from swarmnode.sandbox import simulated
+
+NEAREST = b"from middleware.consensus.nearest import Nearest as Strategy\n"
+ONE = [0, "find", []]
+
+
+class Scripted:
+    """A process that answers what the test says."""
+
+    is_behind = False
+
+    def __init__(self, answer: Callable[[int, str], bytes]) -> None:
+        self.is_ended = False
+        self.asked: list[str] = []
+        self._answer = answer
+        self._splitter = frame.Splitter(frame.MAX_QUESTION)
+        self._ready: list[bytes] = []
+
+    def send(self, message: bytes) -> None:
+        """Answer at once."""
+        for question in self._splitter.feed(message):
+            number, verb, _ = frame.unpack_question(question)
+            self.asked.append(verb)
+            self._ready += frame.Splitter(frame.MAX_ANSWER).feed(self._answer(number, verb))
+
+    def receive(self, within_s: float) -> list[bytes]:
+        """What is ready."""
+        ready, self._ready = self._ready, []
+        return ready
+
+    def end(self) -> None:
+        """Note it."""
+        self.is_ended = True
+
+
+def well(number: int, content: Any) -> bytes:
+    """A good answer."""
+    return frame.pack([number, True, content])
+
+
+class RunnerTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.now = 0.0
+        self.objection = ""
+        self.processes: list[Scripted] = []
+        self.flushed = False
+
+    def runner(self, answer: Callable[[int, str], bytes], kind: str = STRATEGY) -> Runner:
+        """A module whose processes answer so; it is started."""
+
+        def spawn() -> Scripted:
+            self.processes.append(Scripted(answer))
+            return self.processes[-1]
+
+        runner = Runner(pushed("best", kind, NEAREST, None), NEAREST, spawn, lambda: self.now, lambda: self.objection)
+        runner.start()
+        runner.look()
+        return runner
+
+    def good(self, number: int, verb: str) -> bytes:
+        """Loads, and finds the same each time."""
+        return well(number, {"limits": ["seccomp"], "reads": ["load"], "told": []} if verb != "call" else 7)
+
+    def test_every_state_is_in_the_table(self) -> None:
+        """Each state has its transitions, and nothing leads out of the last one."""
+        self.assertEqual(set(TRANSITIONS), set(State))
+        self.assertEqual(TRANSITIONS[State.OUT], frozenset())
+
+    def test_ready_and_asked(self) -> None:
+        """Once it has loaded it tells its limits and what it reads, and is asked."""
+        runner = self.runner(self.good)
+        self.assertEqual((runner.state, runner.limits, runner.reads), (State.READY, ("seccomp",), ("load",)))
+        self.assertEqual(runner.wait_for("call", ONE), 7)
+        self.assertEqual(PushedStrategy(runner).name, "deployed:best")
+
+    def test_may_not_run(self) -> None:
+        """Where there is an objection no process is started, also not after a loss."""
+        self.objection = "is revoked"
+        runner = self.runner(self.good)
+        self.assertEqual((runner.state, runner.why, self.processes), (State.OUT, "is revoked", []))
+        self.objection = ""
+        lost = self.runner(lambda number, verb: self.good(number, verb) if verb == "load" else b"")
+        self.assertRaises(Lost, lost.wait_for, "call", ONE)
+        self.objection = "is revoked"
+        self.assertRaises(NoOpinion, lost.wait_for, "call", ONE)
+        self.assertEqual((lost.state, len(self.processes)), (State.OUT, 1))
+
+    def test_silence_costs_the_process(self) -> None:
+        """A process that gives no answer is ended; the third one is the last."""
+        runner = self.runner(lambda number, verb: self.good(number, verb) if verb == "load" else b"")
+        for _ in range(STRIKES):
+            self.assertRaises(Lost, runner.wait_for, "call", ONE)
+        self.assertIs(runner.state, State.OUT)
+        self.assertRaises(NoOpinion, runner.wait_for, "call", ONE)
+        self.assertEqual([each.is_ended for each in self.processes], [True] * STRIKES)
+
+    def test_never_loaded(self) -> None:
+        """A process that is not ready in time is ended."""
+        runner = self.runner(lambda number, verb: b"")
+        self.assertRaises(NoOpinion, runner.wait_for, "call", ONE)
+        self.now = START_S + 1.0
+        runner.look()
+        self.assertEqual((runner.state, self.processes[0].is_ended), (State.LOST, True))
+
+    def test_hostile_answers(self) -> None:
+        """Whatever comes back instead of an answer ends the process, and raises nothing else."""
+        for nonsense in (
+            frame.pack(7),
+            frame.pack([1]),
+            frame.pack([99, True, None]),
+            frame.pack(["1", True, None]),
+            frame.pack([2, 1, None]),
+            b"\0\0\0\1\xc1",
+            b"\0\0\0\0",
+        ):
+
+            def answer(number: int, verb: str, nonsense: bytes = nonsense) -> bytes:
+                return self.good(number, verb) if verb == "load" else nonsense
+
+            runner = self.runner(answer)
+            self.assertRaises(NoOpinion, runner.wait_for, "call", ONE)
+            self.assertIs(runner.state, State.LOST)
+
+    def test_hostile_facts(self) -> None:
+        """Whatever it says of itself when it has loaded, it is used or refused, and never raises."""
+        for facts in (None, 7, {}, {"limits": 7, "reads": 7}, {"limits": [None] * 99, "reads": [[], {}, 1]}):
+            runner = self.runner(lambda number, verb, facts=facts: well(number, facts))  # type: ignore[misc]
+            self.assertIs(runner.state, State.READY if isinstance(facts, dict) else State.OUT)
+            self.assertLessEqual(len(runner.limits), 16)
+
+    def test_instances(self) -> None:
+        """A behaviour's instance is made, asked and dropped; it ends with the process, which is told by its name."""
+        runner = self.runner(self.good, BEHAVIOUR)
+        instance = runner.create({"turns": 1}, random.Random(1))
+        answers: list[tuple[bool, Any]] = []
+        self.assertTrue(instance.ask("look", [], lambda is_well, content: answers.append((is_well, content))))
+        instance.look()
+        self.assertEqual(answers, [(True, 7)])
+        instance.close()
+        self.assertEqual(self.processes[0].asked, ["load", "make", "call", "drop"])
+        other = runner.create({}, random.Random(1))
+        runner.stop("is revoked")
+        other.look()
+        self.assertEqual((other.fault, runner.instances), ("is revoked", set()))
+        self.assertFalse(other.ask("look", [], lambda is_well, content: None))
+        self.assertRaises(UnknownTask, runner.create, {}, random.Random(1))
+
+    def test_late_behaviour_is_ended(self) -> None:
+        """A behaviour that does not answer in time is ended, and each that waits is told."""
+        runner = self.runner(lambda number, verb: b"" if verb == "call" else self.good(number, verb), BEHAVIOUR)
+        instance = runner.create({}, random.Random(1))
+        answers: list[bool] = []
+        instance.ask("look", [], lambda is_well, content: answers.append(is_well))
+        self.now = PATIENCE_S
+        instance.look()
+        self.assertEqual(answers, [])
+        self.now = PATIENCE_S + 0.01
+        instance.look()
+        self.assertEqual((answers, runner.state, bool(instance.fault)), ([False], State.LOST, True))
+
+    def test_questions_are_bounded(self) -> None:
+        """So many wait at most."""
+        runner = self.runner(lambda number, verb: b"" if verb == "call" else self.good(number, verb), BEHAVIOUR)
+        for _ in range(MAX_PENDING):
+            runner.ask("call", [], lambda is_well, content: None)
+        self.assertRaises(Gone, runner.ask, "call", [], lambda is_well, content: None)
+
+    def test_twin(self) -> None:
+        """The twin in memory loads, decides and refuses as a process does."""
+        runner = Runner(pushed("best", STRATEGY, NEAREST, None), NEAREST, simulated, lambda: 0.0)
+        runner.start()
+        runner.look()
+        found = PushedStrategy(runner).find([Report("a", 2.0), Report("b", 1.0)])
+        self.assertEqual((found.assigned_agent, runner.limits), ("b", ("simulated",)))
+        wrong = Runner(pushed("best", STRATEGY, b"1 / 0", None), b"1 / 0", simulated, lambda: 0.0)
+        wrong.start()
+        wrong.look()
+        self.assertEqual(wrong.state, State.OUT)
+        self.assertIn("ZeroDivisionError", wrong.why)

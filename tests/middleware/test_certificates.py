@@ -1,0 +1,135 @@
+"""Tests of ``middleware.entangled.replication.certificates``: whose certificates are asked for, and of which peers."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from twisted.internet.defer import Deferred, fail, succeed
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.entangled.clock import HeapClock
+from middleware.entangled.errors import NoAnswer
+from middleware.entangled.identity import Identity
+from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.network.network import Address
+from middleware.entangled.replication.certificates import MAX_OWNERS, MAX_UNASKED, UNASKED_S, Certificates
+from middleware.entangled.wire.door import FOREIGN, Authority, OpenDoor
+
+
+class KnownDoor(OpenDoor):
+    """Knows the owners whose certificates it learned; a certificate that holds is the owner's key itself."""
+
+    def __init__(self) -> None:
+        self.known: set[bytes] = set()
+
+    def authority(self, owner: bytes) -> Authority:
+        """By what was learned."""
+        return Authority("" if owner in self.known else FOREIGN)
+
+    def certificate(self, owner: bytes) -> bytes:
+        """Of those that are known."""
+        return owner if owner in self.known else b""
+
+    def learn(self, owner: bytes, certificate: bytes) -> bool:
+        """Where it is the right one."""
+        if owner == certificate:
+            self.known.add(owner)
+        return owner == certificate
+
+
+class Endpoint:
+    """Answers as the test says."""
+
+    def __init__(self) -> None:
+        self.asked: list[list[bytes]] = []
+        self.answer: Any = lambda owners: succeed(owners)
+        self.exposed: Any = None
+
+    def expose(self, name: str, answer: Any) -> None:
+        """Keep it for the test."""
+        self.exposed = answer
+
+    def ask(self, contact: Contact, method: str, owners: list[bytes]) -> Deferred[Any]:
+        """Note the question."""
+        self.asked.append(owners)
+        answered: Deferred[Any] = self.answer(owners)
+        return answered
+
+
+def made() -> Any:
+    """An endpoint, as far as it is needed."""
+    return Endpoint()
+
+
+def contact(number: int) -> Contact:
+    """Some peer."""
+    return Contact(Identity(number.to_bytes(32)).public, Address("10.0.0.1", 1000 + number % 60_000))
+
+
+def owners(count: int) -> list[bytes]:
+    """Some keys."""
+    return [number.to_bytes(32) for number in range(count)]
+
+
+class CertificateTests(SynchronousTestCase):
+    """One node's certificates."""
+
+    def setUp(self) -> None:
+        """A door that knows nobody."""
+        self.clock = HeapClock()
+        self.endpoint = made()
+        self.certificates = Certificates(self.endpoint, self.clock)
+        self.door = self.certificates.door = KnownDoor()
+
+    def learn(self, which: list[bytes], peer: int = 1) -> None:
+        """Ask a peer."""
+        self.successResultOf(Deferred.fromCoroutine(self.certificates.learn(contact(peer), which)))
+
+    def test_asked_once_for_each(self) -> None:
+        """Only unknown owners are asked for, each once, a few in one question."""
+        self.door.known.update(owners(3))
+        self.learn(owners(20) * 2)
+        self.assertEqual(self.endpoint.asked, [owners(20)[3 : 3 + MAX_OWNERS], owners(20)[3 + MAX_OWNERS :]])
+        self.learn(owners(20))
+        self.assertEqual(len(self.endpoint.asked), 2)
+
+    def test_a_peer_that_cannot_show_one(self) -> None:
+        """After junk, silence or nothing a peer is left alone for a while; another one is asked all the same."""
+        junk: list[Any] = [
+            lambda asked: fail(NoAnswer("silent")),
+            lambda asked: succeed(None),
+            lambda asked: succeed([b""]),
+            lambda asked: succeed([b"junk"] * len(asked)),
+            lambda asked: succeed([7] * len(asked)),
+        ]
+        for peer, answer in enumerate(junk, start=1):
+            self.endpoint.answer = answer
+            before = len(self.endpoint.asked)
+            self.learn(owners(2), peer)
+            self.learn(owners(2), peer)
+            self.assertEqual(len(self.endpoint.asked) - before, 1)
+            self.assertEqual(self.certificates.lacking(contact(peer), owners(2)), [])
+        self.endpoint.answer = lambda asked: succeed(asked)
+        self.clock.advance(UNASKED_S)
+        self.learn(owners(2), 1)
+        self.assertEqual(self.door.known, set(owners(2)))
+
+    def test_only_those_that_were_asked_for(self) -> None:
+        """What a peer shows counts for the owner that was asked for, and the ones before a bad one are kept."""
+        self.endpoint.answer = lambda asked: succeed([asked[0], b"", *asked[2:]])
+        self.learn(owners(3))
+        self.assertEqual(self.door.known, {owners(3)[0]})
+
+    def test_bounded(self) -> None:
+        """However many peers show junk, no more than so many are remembered."""
+        self.endpoint.answer = lambda asked: succeed(None)
+        for peer in range(MAX_UNASKED + 10):
+            self.learn(owners(1), peer)
+        self.assertEqual(len(self.certificates._unasked), MAX_UNASKED)
+
+    def test_answer(self) -> None:
+        """A node shows the certificates that it knows, of a few owners, and nothing for what is no key."""
+        self.door.known.update(owners(2))
+        answer = self.endpoint.exposed(contact(1), [*owners(3), b"short", 7])
+        self.assertEqual(answer, [*owners(2), b"", b"", b""])
+        self.assertEqual(len(self.endpoint.exposed(contact(1), owners(100))), MAX_OWNERS)

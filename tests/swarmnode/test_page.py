@@ -1,0 +1,28 @@
+"""Tests of ``swarmnode.page``: the names by which a browser may open a page."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.settings import Settings
+
+MISSING = [name for name in ("flask",) if find_spec(name) is None]
+if not MISSING:
+    from swarmnode.page import hosts_of
+
+
+class HostsTests(SynchronousTestCase):
+    if MISSING:
+        skip = f"THE PAGE IS NOT TESTED: missing {', '.join(MISSING)}"
+
+    def test_name_the_machine(self) -> None:
+        """The machine's name and the node's, bare and on the LAN, and those of the settings; no other."""
+        web = {"names": ["robots.lan", "page.example.org"]}
+        settings = Settings.from_mapping({"node": {"name": "Dog1", "team_key": "t"}, "web": web}, "")
+        found = hosts_of(settings, "Vaio.corp.example")
+        for name in ("vaio.corp.example", "vaio", "vaio.local", "vaio.lan", "dog1", "dog1.local", *web["names"]):
+            self.assertIn(name, found)
+        for name in ("evil.local", ".local", "corp.example", "vaio.example"):
+            self.assertNotIn(name, found)

@@ -1,0 +1,47 @@
+"""Tests of ``swarmnode.sandbox``: which libraries are there when the rights are given up."""
+
+from __future__ import annotations
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from swarmnode.sandbox import kinds, wanted
+
+SOURCE = b"""
+from __future__ import annotations
+import math, numpy as np, os
+import subprocess
+import agents.means
+from collections.abc import Sequence
+from middleware.consensus.nearest import Nearest
+from swarmnode.plugin import Options
+def late():
+    import statistics
+text = "import json"
+"""
+
+
+class SandboxTests(SynchronousTestCase):
+    def test_only_listed_libraries_are_imported(self) -> None:
+        """Of what a source names at the beginning of a line the listed libraries are imported, and nothing else."""
+        self.assertEqual(
+            wanted(SOURCE),
+            [
+                *("agents.means", "collections.abc", "math", "middleware.consensus.nearest", "numpy", "numpy.fft"),
+                *("numpy.random", "statistics"),
+            ],
+        )
+
+    def test_any_bytes(self) -> None:
+        """Bytes that are no Python name nothing, and cost no more than their length."""
+        for source in (
+            b"",
+            b"\xff" * 1000,
+            b"import " * 30_000,
+            b"from " + b"." * 100_000,
+            b"import a" + b", a" * 90_000,
+        ):
+            self.assertEqual(wanted(source), [])
+
+    def test_every_kind_is_served(self) -> None:
+        """Each kind that can be pushed has a side in the process."""
+        self.assertEqual(sorted(kinds()), ["behaviour", "strategy"])

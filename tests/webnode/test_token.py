@@ -1,0 +1,106 @@
+"""Tests of ``webnode.token``: tokens that one web node signs and the one that they are for reads."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import replace
+from typing import Any
+
+import msgpack
+from hypothesis import given
+from hypothesis import strategies as st
+from itsdangerous.encoding import base64_encode
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.entangled.identity import Identity
+from webnode.token import DOMAIN, MAX_NAME, MAX_TEXT, MAX_VOUCHERS, Claim, TokenKey, packed
+
+VAIO, PI, EVE = (TokenKey(Identity(bytes([n]) * 32)) for n in (1, 2, 3))
+CLAIM = Claim("ab" * 8, "operator", "operator", 2_000_000_000, limit=2_000_100_000)
+
+
+class TokenTests(SynchronousTestCase):
+    def test_read_what_was_signed(self) -> None:
+        """What a node signs for itself it reads again, with itself for a voucher; no other node does."""
+        for claim in (CLAIM, CLAIM.ticket, replace(CLAIM, role="phone", name="Z\N{SNOWMAN}", parents=("cd" * 8,))):
+            text = VAIO.token(claim)
+            self.assertRegex(text, r"^[\w.-]+$")
+            self.assertEqual(VAIO.claim(text), replace(claim, vouchers=(VAIO.public,)))
+            self.assertIsNone(PI.claim(text))
+
+    def test_read_what_is_for_it(self) -> None:
+        """What a node signs for another one that one reads alone; who vouched before still does."""
+        claim = replace(CLAIM, vouchers=(EVE.public,))
+        text = VAIO.token(claim, PI.node_id)
+        self.assertEqual(PI.claim(text), replace(claim, vouchers=(EVE.public, VAIO.public)))
+        self.assertEqual([key.claim(text) for key in (VAIO, EVE)], [None, None])
+        self.assertEqual(VAIO.token(CLAIM, VAIO.node_id), VAIO.token(CLAIM))
+
+    def test_a_ticket_lets_less(self) -> None:
+        """An operator's ticket is a viewer's, a phone's the phone's, and it says that it is one."""
+        roles: dict[Any, str] = {"operator": "viewer", "viewer": "viewer", "phone": "phone"}
+        for role, less in roles.items():
+            ticket = replace(CLAIM, role=role).ticket
+            self.assertEqual((ticket.role, ticket.is_ticket), (less, True))
+
+    def test_fit_into_its_places(self) -> None:
+        """An invitation is short enough for a code that a camera reads; the longest is read, and a long name is cut."""
+        self.assertLess(len(VAIO.token(replace(CLAIM, name="guest"))), 140)
+        others = tuple(bytes([n]) * 32 for n in range(MAX_VOUCHERS))
+        longest = replace(CLAIM, name="\N{SNOWMAN}" * 99, parents=("cd" * 8,) * 3, vouchers=others)
+        text = VAIO.token(longest, PI.node_id)
+        self.assertLessEqual(len(text), MAX_TEXT)
+        read = PI.claim(text)
+        assert read is not None
+        self.assertEqual((len(read.name), len(read.vouchers)), (MAX_NAME, MAX_VOUCHERS + 1))
+
+    def test_refuse_each_change(self) -> None:
+        """A token that was changed anywhere, cut or grown is none."""
+        for text in (VAIO.token(CLAIM), VAIO.token(CLAIM, PI.node_id)):
+            reader = VAIO if VAIO.claim(text) else PI
+            for at in range(len(text) - 2):  # of the last letter not every bit counts
+                changed = text[:at] + ("A" if text[at] != "A" else "B") + text[at + 1 :]
+                self.assertIsNone(reader.claim(changed), at)
+            for other in (text[:-4], text + "AAAA", f"A.{text}", text.replace(".", ".."), text * 5):
+                self.assertIsNone(reader.claim(other))
+
+    def test_refuse_what_is_signed_for_something_else(self) -> None:
+        """A signature of the same key over the same bytes, made for another purpose, is none here."""
+        identity = Identity(bytes([1]) * 32)
+        value = base64_encode(packed(CLAIM))
+
+        def is_token(domain: bytes) -> bool:
+            return VAIO.claim((value + b"." + base64_encode(identity.sign(domain + value))).decode()) is not None
+
+        found = [is_token(domain) for domain in (DOMAIN, b"", b"swarm-record-1", b"swarm-page-2 ")]
+        self.assertEqual(found, [True, False, False, False])
+
+    def test_refuse_unlawful_content(self) -> None:
+        """Whoever signs nonsense with a key of its own is refused without more ado."""
+        identity = Identity(bytes([3]) * 32)
+        lawful: list[Any] = msgpack.unpackb(packed(CLAIM, PI.node_id))
+        contents: list[Any] = [7, [], {}, None, lawful[:-1], [*lawful, 1]]
+        value: Any
+        for at in range(len(lawful)):
+            for value in (None, -1, 2**63, "x", b"x", [1], [b"x"], {}, 1.5, True):
+                if value != lawful[at] and not (at in (2, 3) and value in (True,)) and not (at == 5 and value == "x"):
+                    contents.append([*lawful[:at], value, *lawful[at + 1 :]])
+        contents.append([*lawful[:6], [bytes(8)] * 9, [], PI.node_id])
+        contents.append([*lawful[:6], [], [bytes(32)] * 9, PI.node_id])
+        for content in contents:
+            value = base64_encode(identity.public) + b"." + base64_encode(msgpack.packb(content))
+            text = (value + b"." + base64_encode(identity.sign(DOMAIN + value))).decode()
+            self.assertIsNone(PI.claim(text), content)
+
+    @given(st.text(max_size=700))
+    def test_bear_any_text(self, text: str) -> None:
+        """Whatever is shown, nothing is raised."""
+        for each in (text, f"{text}.{text}", f"{base64_encode(EVE.public).decode()}.{text}.{text}"):
+            self.assertIsNone(VAIO.claim(each))
+
+    def test_bear_keys_of_any_length(self) -> None:
+        """A key that is none is no reason to fail."""
+        dice = random.Random(1)
+        for length in (0, 1, 31, 33, 64, 200):
+            key = base64_encode(dice.randbytes(length)).decode()
+            self.assertIsNone(PI.claim(f"{key}.AAAA.{'A' * 86}"))
