@@ -54,8 +54,8 @@ def find_target(jpeg: bytes, size: Size, lens: tuple[float, float | None] = VIEW
 
     ``lens`` is what the picture shows across and up, in radians; up None: its pixels are square.
     """
-    size = size_of(jpeg)
-    picture = None if size is None else cv2.imdecode(np.frombuffer(jpeg, np.uint8), _reduction(max(size)))
+    sides = size_of(jpeg)
+    picture = None if sides is None else cv2.imdecode(np.frombuffer(jpeg, np.uint8), _reduction(max(sides)))
     if picture is None:
         return None
     colours = cv2.cvtColor(picture, cv2.COLOR_BGR2YCrCb)
@@ -82,12 +82,10 @@ def find_target(jpeg: bytes, size: Size, lens: tuple[float, float | None] = VIEW
 
 
 def _reduction(side: int) -> int:
-    """How to decode a picture of so many pixels a side: of a large one every second, fourth or eighth is enough."""
+    """How to decode a picture of so many pixels a side: of a large one every second or fourth is enough."""
     if side <= ENOUGH:
         return cv2.IMREAD_COLOR
-    if side <= 2 * ENOUGH:
-        return cv2.IMREAD_REDUCED_COLOR_2
-    return cv2.IMREAD_REDUCED_COLOR_4 if side <= 4 * ENOUGH else cv2.IMREAD_REDUCED_COLOR_8
+    return cv2.IMREAD_REDUCED_COLOR_2 if side <= 2 * ENOUGH else cv2.IMREAD_REDUCED_COLOR_4
 
 
 def _extent(redness: npt.NDArray[np.float32]) -> tuple[float, float]:

@@ -100,7 +100,13 @@ class Door(Protocol):
         """Eight bytes by which strangers tell this team from others; zero where it does not say."""
 
     def judge(self, public: bytes, shown: bytes) -> str:
-        """The name of the refusal of a node with this key that shows this pass; empty where it is let in."""
+        """The name of the refusal of a node with this key that shows this pass; empty where it would be let in.
+
+        Changes nothing: what it judges may be a recording.
+        """
+
+    def admit(self, public: bytes, shown: bytes) -> str:
+        """As ``judge``, of a node that has confirmed its session, so it may be remembered."""
 
     def may(self, public: bytes, method: str) -> bool:
         """Whether ``public`` is the key of a present member that may call ``method``; no, where it is not known."""
@@ -137,6 +143,10 @@ class OpenDoor:
 
     def judge(self, public: bytes, shown: bytes) -> str:
         """Nobody is refused."""
+        return ""
+
+    def admit(self, public: bytes, shown: bytes) -> str:
+        """Nobody is refused, or remembered."""
         return ""
 
     def may(self, public: bytes, method: str) -> bool:

@@ -405,8 +405,9 @@ class Endpoint:
             session.contact = Contact(session.contact.public, source)
             self._peers.moved(session)
         if not session.is_confirmed:
-            code = self._lives.judge(session.contact.public, session.life)
-            if code:  # two of them knocked at once
+            code = self._judged(session.contact.public, session.shown, session.life, self.door.admit)
+            session.shown = b""
+            if code:  # two of them knocked at once, or there is no room to remember it
                 self._refuse(session, code)
                 return
             self._half_open.confirm(session)
@@ -506,7 +507,7 @@ class Endpoint:
     def _admitted(self, acceptance: Acceptance, source: Address, now: float) -> bytes:
         """The RESP for who proved its key by an INIT; nothing where that is a recording, or its message malformed."""
         contact, hello = self._peers.contact(acceptance.public, source), self._peers.hello
-        code = self._judged(contact.public, acceptance.shown, acceptance.life)
+        code = self._judged(contact.public, acceptance.shown, acceptance.life, self.door.judge)
         if code:  # that is all that comes of it: it may be a recording, with a pass that was succeeded since
             self.counters["refused"] += 1
             self._say_refusing(contact, code)
@@ -528,9 +529,9 @@ class Endpoint:
             return b""  # the method stopped us
         index = self._peers.new_index()
         response, keys = acceptance.accept(index, answer, source, hello)
-        self._half_open.add(
-            Session(contact, index, acceptance.remote_index, keys, now, is_confirmed=False, life=acceptance.life), now
-        )
+        session = Session(contact, index, acceptance.remote_index, keys, now, is_confirmed=False, life=acceptance.life)
+        session.shown = acceptance.shown
+        self._half_open.add(session, now)
         return response
 
     def _on_resp(self, datagram: bytes, source: Address) -> None:
@@ -558,7 +559,7 @@ class Endpoint:
         session = Session(
             contact, index, reply.remote_index, reply.keys, self._clock.seconds(), is_confirmed=True, life=reply.life
         )
-        code = self._judged(contact.public, reply.shown, reply.life)
+        code = self._judged(contact.public, reply.shown, reply.life, self.door.admit)
         if code:
             self._refuse(session, code)
             return
@@ -579,10 +580,10 @@ class Endpoint:
 
     # -- who is let in ----------------------------------------------------------------------------------------------
 
-    def _judged(self, public: bytes, shown: bytes, life: Life) -> str:
+    def _judged(self, public: bytes, shown: bytes, life: Life, judge: Callable[[bytes, bytes], str]) -> str:
         if len(shown) > self.door.room:
             return FOREIGN
-        return self._lives.judge(public, life) or self.door.judge(public, shown)
+        return self._lives.judge(public, life) or judge(public, shown)
 
     def _refuse(self, session: Session, code: str) -> None:
         """Tell a peer on ``session`` that it is not let in, and have nothing more to do with it."""

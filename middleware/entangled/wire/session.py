@@ -278,13 +278,15 @@ class Session:
     ``local_index`` is the number under which we find the session, ``remote_index`` the one under which the peer does.
     ``contact`` is the peer with the address from which its newest datagram came.  ``is_confirmed`` says that the peer
     has shown to hold the keys at that address; until then nothing may be sent.  Moments are seconds of the endpoint's
-    clock.  ``life`` is the one that the peer lives in it; with ``is_over`` a later one has taken its place.
+    clock.  ``life`` is the one that the peer lives in it; with ``is_over`` a later one has taken its place.  ``shown``
+    is the pass in its INIT, until the session is confirmed.
     """
 
     __slots__ = (
         "contact",
         "life",
         "is_over",
+        "shown",
         "local_index",
         "remote_index",
         "is_confirmed",
@@ -310,6 +312,7 @@ class Session:
         self.contact = contact
         self.life = life
         self.is_over = False
+        self.shown = b""
         self.local_index = local_index
         self.remote_index = remote_index
         self.is_confirmed = is_confirmed
