@@ -21,8 +21,7 @@ KEY = b"sec-websocket-key"
 _GUID = b"258EAFA5-E914-47DA-95CA-C5AB0DC85B11"
 
 MAX_FRAMES = 2048
-"""Frames in one read of at most 64 KiB; more of them are a flood of nearly empty ones, which costs far more to take than
-to send."""
+"""Frames in one read of at most 64 KiB; more are a flood of nearly empty ones, which cost more to take than to send."""
 
 Nonce = Callable[[int], bytes]
 """So many bytes that nobody foresees (``os.urandom``)."""

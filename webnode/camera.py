@@ -85,7 +85,7 @@ class Camera:
         request.notifyFinish().addErrback(lambda _: self._forget(entry))
 
     def on_frame(self, seq: int, jpeg: bytes, age: float) -> None:
-        """Take the next picture, taken ``age`` seconds ago; a late one, and what no browser should decode, is dropped."""
+        """Take the next picture, taken ``age`` seconds ago; a late or far too large one, or no JPEG, is dropped."""
         if self._ended or len(jpeg) > MAX_FRAME or size_of(jpeg) is None:
             return
         now = self._clock.seconds()

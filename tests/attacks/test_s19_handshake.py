@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from functools import partial
 from typing import Any
 
 from twisted.internet.defer import Deferred
@@ -81,9 +82,14 @@ class RecordedQuestionTests(SiegeCase):
         network, endpoint = network_of(self.house), self.house.node.endpoint
         _ = self.house.node.seat
         self.streams = Streams(endpoint, self.team.clock)
+
+        def answer(name: str, *arguments: object) -> bytes:
+            self.ran.append(name)
+            return LARGE
+
         for name in METHODS:
             if name not in endpoint._answerer.methods:
-                endpoint.expose(name, lambda peer, *arguments, name=name: [self.ran.append(name), LARGE])
+                endpoint.expose(name, partial(answer, name))
         send = network.send
 
         def count(datagram: bytes, to: Address) -> None:
@@ -212,7 +218,7 @@ class TimestampTests(SiegeCase):
         self.assertTrue(self.house.node.endpoint.is_met(self.team.contact(dog)))
 
     def test_one_of_an_earlier_life(self) -> None:
-        """After its sender was restarted a recording opens no session, and the sender is let in though it counts anew."""
+        """After its sender was restarted a recording opens no session, and its sender is let in."""
         dog = self.team.houses[1]
         recording = self.open_again(dog)
         self.team.close(dog, is_sudden=True)
