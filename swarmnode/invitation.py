@@ -12,12 +12,11 @@ import sys
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import TextIO
 
 from twisted.logger import Logger
 
-from middleware.entangled.control.place import NoControl, folder, made
+from middleware.entangled.control.place import NoControl, files, made
 
 ENDING = ".page"
 ANY = ("0.0.0.0", "::")
@@ -87,10 +86,10 @@ def at_terminal() -> TextIO | None:
         return None
 
 
-def invitations(where: Path | None = None) -> list[Invitation]:
-    """The pages of this machine whose nodes run, by name."""
+def invitations() -> list[Invitation]:
+    """The pages of this machine whose nodes run, by name; raises ``NoControl`` where another user made the folder."""
     found = []
-    for path in sorted((where or folder()).glob(f"*{ENDING}")):
+    for path in files(ENDING):
         try:
             invitation = Invitation(**json.loads(path.read_text(encoding="utf-8")))
             os.kill(invitation.pid, 0)

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from typing import TextIO
 
+from middleware.entangled.control.place import NoControl
 from middleware.entangled.control.word import printable
 from swarmnode.invitation import Invitation, invitations
 
@@ -29,7 +30,11 @@ def main(
     """Run the command; returns 0, or 2 where there is no page."""
     out = out or sys.stdout
     wishes = parser().parse_args(words)
-    here = known()
+    try:
+        here = known()
+    except NoControl as problem:
+        sys.stderr.write(printable(f"swarm web: {problem}") + "\n")
+        return 2
     found = [each for each in here if wishes.node in (None, each.name)]
     if not found:
         there = f"there are those of {', '.join(each.name for each in here)}" if here else "start a node with the role"

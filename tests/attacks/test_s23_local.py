@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import os
 import shutil
 import socket
@@ -15,6 +16,7 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.control.command import asked, check_peer
 from middleware.entangled.control.place import NoControl, check_socket, folder, found, made
+from swarmnode.invitation import invitations
 from swarmnode.plugin import Options
 
 SECRET = "the secret of a classroom"
@@ -51,6 +53,14 @@ class ControlSocketTests(SynchronousTestCase):
         self.be_another()
         for use in (found, made):
             self.assertIn("not yours alone", str(self.assertRaises(NoControl, use, "vaio")))
+
+    def test_page_of_another(self) -> None:
+        """Nobody is led to a page that another user's note names."""
+        note = {"name": "vaio", "url": "http://127.0.0.1:1/", "code": "loud-otter", "pid": os.getpid()}
+        made("vaio").with_suffix(".page").write_text(json.dumps(note))
+        self.assertEqual([each.name for each in invitations()], ["vaio"])
+        self.be_another()
+        self.assertRaises(NoControl, invitations)
 
     def test_folder_that_others_write(self) -> None:
         """A folder in which others can make a socket is refused."""

@@ -16,7 +16,6 @@ from agents.catalogue import DEMO, TASKS
 from middleware.deployment.shelf import MemoryShelf
 from middleware.entangled.control.place import made
 from middleware.entangled.identity import node_id
-from middleware.presence import DEVICES
 from middleware.verdict import Verdict, verdict_of, verdicts_key
 from swarmnode.deploy import main
 from swarmnode.rehearsal import VirtualTeam
@@ -217,23 +216,12 @@ class DeployTests(SynchronousTestCase):
         self.assertEqual(self.swarm("status").count("farthest"), 1)
 
     def test_devices_cannot_move_the_cursor(self) -> None:
-        """Names of devices, and what they say that they run, reach the terminal without their control characters."""
+        """What devices say that they run reaches the terminal without its control characters."""
         self.let_in()
         self.push()
         self.team.services["dog1"].assembly.node.presence.change(deployed={"farthest": "1\x1b[2J\nx"})
-        for name, other in (("dog2", "dog2\x1b[2J"), ("vaio", "va\nio")):
-            node = self.team.services[name].assembly.node
-            node.presence.change(name=other)
-            node.entangled.remove(DEVICES, name)
         self.team.clock.advance(1.0)
-        status = self.swarm("status")
-        self.assertIn(" pushed by va io\n", status)
-        self.assertIn("\n  dog1      1 [2J x\n", status)
-        self.assertIn("\n  dog2 [2J  -\n", status)
-        keys = self.swarm("keys")
-        self.assertIn("\ndog2 [2J  ", keys)
-        self.assertTrue(keys.startswith("va io     "))
-        self.assertTrue(keys.replace("\n", "").isprintable())
+        self.assertIn("\n  dog1  1 [2J x\n", self.swarm("status"))
 
     def test_keys_and_json(self) -> None:
         """``keys`` tells each device's public key, of which its uuid is the hash; ``--json`` is one line of JSON."""

@@ -50,14 +50,14 @@ class InvitationTests(SynchronousTestCase):
 
     def test_pass_over_what_is_no_note(self) -> None:
         """The note of a node that has ended, and what is no note, are passed over."""
-        self.where.mkdir()
+        (self.where / "swarm-node").mkdir(mode=0o700, parents=True)
         for name, words in (
             ("a", "{}"),
             ("b", "no JSON"),
             ("c", '{"name": "c", "url": "", "code": "", "pid": 4194305}'),
         ):
-            (self.where / f"{name}.page").write_text(words)
-        self.assertEqual(invitations(self.where), [])
+            (self.where / "swarm-node" / f"{name}.page").write_text(words)
+        self.assertEqual(invitations(), [])
 
     def test_name_an_address_for_this_machine(self) -> None:
         """An address that stands for all of the machine's is told as one that a browser there can open."""

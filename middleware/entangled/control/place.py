@@ -42,11 +42,16 @@ def made(name: str) -> Path:
     return path
 
 
-def found(name: str | None) -> Path:
-    """The socket of node ``name``, or of the only node here; raises ``NoControl``, which names those there are."""
+def files(ending: str) -> list[Path]:
+    """The files of the nodes of this machine with that ending, by name; raises ``NoControl`` for a foreign folder."""
     if os.path.lexists(folder()):
         owner_of(folder())
-    names = sorted(path.name.removesuffix(ENDING) for path in folder().glob(f"*{ENDING}"))
+    return sorted(folder().glob(f"*{ending}"))
+
+
+def found(name: str | None) -> Path:
+    """The socket of node ``name``, or of the only node here; raises ``NoControl``, which names those there are."""
+    names = [path.name.removesuffix(ENDING) for path in files(ENDING)]
     if name is None and len(names) == 1:
         name = names[0]
     if name in names:
