@@ -104,7 +104,7 @@ class SearchAndApproach:
             self._forget()
 
     def _saw(self, now: float, pose: Pose, sighting: Sighting | None) -> None:
-        """Take in what is in the picture that came at ``now``, when the robot stood at ``pose``."""
+        """Add a sighting in the picture that came at ``now``, when the robot stood at ``pose``."""
         if sighting is None:
             return
         self._seen_at = self._looked_at = now
