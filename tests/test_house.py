@@ -30,8 +30,8 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "sim": ("sim", "drivers", "middleware.faults.stream"),
     "sim.namespaces": ("sim", "middleware"),
     "sim.team": ("sim.team", "middleware", *(f"drivers.{name}" for name in ("driver", "errors", "gate", "link"))),
-    "webnode": ("webnode", "middleware"),
-    "agents": ("agents", "middleware", "drivers.driver", "drivers.reading", "drivers.errors"),
+    "webnode": ("webnode", "middleware", "standards"),
+    "agents": ("agents", "middleware", "drivers.driver", "drivers.reading", "drivers.errors", "standards"),
     "swarmnode": ROOMS,
 }
 
@@ -59,7 +59,7 @@ PURE = (
     "drivers.aibo.sense",
     "drivers.errors",
     "drivers.gate",
-    "drivers.jpeg",
+    "standards.jpeg",
     "drivers.reading",
     "drivers.rosbridge.websocket",
     "middleware.admission.certificate",
