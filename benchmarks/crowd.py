@@ -76,9 +76,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _alone(bodies: int, controller: str, seconds: float) -> dict[str, float]:
     """The crowd alone: the mean of a step and of its parts, searches for neighbours and all."""
-    from sim.crowd.controller import CONTROLLERS, Senses
-    from sim.crowd.crowd import Crowd
-    from sim.crowd.ground import roomy
+    from sim.robots.crowd.controller import CONTROLLERS, Senses
+    from sim.robots.crowd.crowd import Crowd
+    from sim.robots.crowd.ground import roomy
 
     class Timed(Crowd):
         rays = 0.0
@@ -111,7 +111,7 @@ def _alone(bodies: int, controller: str, seconds: float) -> dict[str, float]:
 
 def _attached(agents: int) -> dict[str, float]:
     """Agents with nodes and drivers, attached to a crowd of 1,000 and without a task, with cameras and without."""
-    from sim.crowd.ground import roomy
+    from sim.robots.crowd.ground import roomy
     from swarmnode.crowd import CAMERA_FPS, CrowdTeam
 
     began = time.process_time()
@@ -142,7 +142,7 @@ def _attached(agents: int) -> dict[str, float]:
 
 def _tasked(sizes: Sequence[int]) -> list[dict[str, float]]:
     """What so many agents send from the assignment of one task on, beside what they send without."""
-    from sim.crowd.ground import roomy
+    from sim.robots.crowd.ground import roomy
     from swarmnode.crowd import CrowdTeam
 
     rows = []

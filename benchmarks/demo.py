@@ -152,7 +152,7 @@ def _name_of(pid: int) -> str:
     except OSError:
         return "ended"
     configuration = next((Path(word).stem for word in words if word.endswith(".toml")), "")
-    return configuration or next((word for word in words if word in ("sim.server", "sim.demo")), words[0])
+    return configuration or next((word for word in words if word in ("sim.robots.server", "sim.demo")), words[0])
 
 
 def memory(pid: int) -> tuple[float, float]:

@@ -52,11 +52,11 @@ def _play(ports: list[dict[str, int]]) -> int:
 
     from twisted.internet import reactor as running
 
-    from sim.dog import LIMITS
-    from sim.emulator.aibo import AiboEmulator
-    from sim.emulator.aibo_server import AiboServer
-    from sim.scene import loaded
-    from sim.yard import Yard
+    from sim.robots.dog import LIMITS
+    from sim.robots.emulator.aibo import AiboEmulator
+    from sim.robots.emulator.aibo_server import AiboServer
+    from sim.robots.scene import loaded
+    from sim.robots.yard import Yard
 
     reactor: Any = running
     yard = Yard(reactor, Random(1), loaded("three-dogs"))

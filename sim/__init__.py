@@ -1,1 +1,1 @@
-"""The yard in place of robots: world, cameras, sensors, and the server that robots' drivers talk to."""
+"""Simulation: ``robots`` stands in for robots, ``team`` for whole teams of nodes, ``namespaces`` for the internet."""

@@ -14,7 +14,7 @@ OURS = ("agents", "drivers", "middleware", "sim", "standards", "swarmnode", "web
 # A verb whose module is not here is not offered.
 WORKS: dict[str, tuple[str, str]] = {
     "demo": ("sim.demo.demonstration", "three robots, a red target and the page, on this machine"),
-    "yard": ("sim.server", "the yard alone, and the robots that it plays"),
+    "yard": ("sim.robots.server", "the yard alone, and the robots that it plays"),
     "trials": ("swarmnode.rehearsal", "both experiments, many times"),
     "crowd": ("swarmnode.crowd", "a yard for many: agents by the hundred among robots by the thousand"),
     "chaos": ("swarmnode.faults", "let a device of a team fail, to see another take over"),

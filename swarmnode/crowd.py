@@ -19,11 +19,11 @@ from middleware.entangled.network.switchboard import Switchboard, Weather
 from middleware.entangled.replication.watch import Watch
 from middleware.settings import Settings
 from middleware.tasks import Task, outcome_of
-from sim.crowd.command import main as run_crowd
-from sim.crowd.controller import Controller, wander
-from sim.crowd.ground import Ground
-from sim.crowd.search import Word
-from sim.crowd.yard import CrowdYard
+from sim.robots.crowd.command import main as run_crowd
+from sim.robots.crowd.controller import Controller, wander
+from sim.robots.crowd.ground import Ground
+from sim.robots.crowd.search import Word
+from sim.robots.crowd.yard import CrowdYard
 from swarmnode.rehearsal import LAN
 from swarmnode.seams import Seams
 from swarmnode.service import NodeService

@@ -21,9 +21,9 @@ from middleware.entangled.network.network import Address
 from middleware.entangled.network.switchboard import Switchboard, Weather
 from middleware.settings import Settings
 from sim.demo.trials import main as run_trials
-from sim.scene import loaded
+from sim.robots.scene import loaded
+from sim.robots.yard import Yard
 from sim.team.machine import Machine, MachineConnector, MachineNetwork
-from sim.yard import Yard
 from swarmnode.sandbox import simulated
 from swarmnode.seams import Seams
 from swarmnode.service import NodeService

@@ -34,13 +34,13 @@ from middleware.entangled.space import shelf, template
 from middleware.entangled.wire import rebuff
 from middleware.faults import kinds, takeover
 from middleware.settings import Settings
-from sim import dog, scene, sensor, world
-from sim.crowd import crowd, ray
 from sim.demo.cast import CASTS
 from sim.demo.configuration import DOGS
-from sim.emulator import aibo, rosbridge
-from sim.robots import Robots
-from sim.yard import Yard
+from sim.robots import dog, scene, sensor, world
+from sim.robots.crowd import crowd, ray
+from sim.robots.emulator import aibo, rosbridge
+from sim.robots.table import Robots
+from sim.robots.yard import Yard
 from standards.head import MAX_HEAD
 from swarmnode import gateway
 from swarmnode.driver import pilot

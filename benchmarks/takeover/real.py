@@ -51,7 +51,7 @@ class Team:
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
         self._token = ""
         key = random.Random(seed).randbytes(32).hex()
-        yard = on_leash(["-m", "sim.server", "--host", "0.0.0.0", "--port", str(YARD_PORT), "--seed", str(seed)])
+        yard = on_leash(["-m", "sim.robots.server", "--host", "0.0.0.0", "--port", str(YARD_PORT), "--seed", str(seed)])
         self._start("yard", yard)
         twistd = str(Path(sys.executable).parent / "twistd")
         for name in self._names:

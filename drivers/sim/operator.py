@@ -107,7 +107,7 @@ class YardOperator:
         return self._order("scatter", seed)
 
     def unplug(self, name: str) -> Deferred[bool]:
-        """Break what leads to the robot ``name``, where that is no simulated dog's own link (``sim.robots``)."""
+        """Break what leads to the robot ``name``, where that is no simulated dog's own link (``sim.robots.table``)."""
         return self._order("unplug", name)
 
     def plug(self, name: str) -> Deferred[bool]:

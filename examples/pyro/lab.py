@@ -17,11 +17,11 @@ from drivers.pyro.brain import Brain, Engine
 from drivers.pyro.robot import PyroRobot
 from drivers.reading import Value
 from drivers.registry import driver_for, kinds
-from sim.camera import Camera
-from sim.emulator.aibo import AiboEmulator
-from sim.scene import loaded
-from sim.sensor import Sensors
-from sim.world import SUBSTEP, World
+from sim.robots.camera import Camera
+from sim.robots.emulator.aibo import AiboEmulator
+from sim.robots.scene import loaded
+from sim.robots.sensor import Sensors
+from sim.robots.world import SUBSTEP, World
 
 STEPS = 2
 

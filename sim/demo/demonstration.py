@@ -71,7 +71,7 @@ class Demonstration:
             path = self._plan.run_dir / "robots.toml"
             path.write_text(self._plan.played, encoding="utf-8")
             yard += ["--robots", str(path)]
-        self._team.add(YARD, ["-m", "sim.server", *yard], self._plan.place(YARD).enter)
+        self._team.add(YARD, ["-m", "sim.robots.server", *yard], self._plan.place(YARD).enter)
         self._team.start()
         _, trouble = founder.communicate()
         if founder.returncode != 0:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from sim.demo.story import present
-from sim.scene import FOOTPRINT
+from sim.robots.scene import FOOTPRINT
 
 MOVED_M = 0.10
 """The dog is killed when it has come this much nearer to the target, or half its way where that is less."""

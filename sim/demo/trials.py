@@ -134,7 +134,7 @@ def _notice(outcome: Outcome, state: dict[str, Any], truth: dict[str, Any], now:
 def _painter(team: Team, folder: Path | None, experiment: int, seed: int) -> Draw:
     if folder is None:
         return lambda phase, caption: None
-    from sim.picture import overhead
+    from sim.robots.picture import overhead
 
     drawn: set[str] = set()
 

@@ -17,11 +17,11 @@ from agents.search import SearchAndApproach
 from drivers.bittle.gait import GAITS, Velocity, chosen
 from drivers.reading import Action, Description, Frame, Observation, Value
 from drivers.registry import describe
-from sim.camera import Camera
-from sim.dog import Motion
-from sim.scene import loaded
-from sim.sensor import Sensors
-from sim.world import SUBSTEP, World
+from sim.robots.camera import Camera
+from sim.robots.dog import Motion
+from sim.robots.scene import loaded
+from sim.robots.sensor import Sensors
+from sim.robots.world import SUBSTEP, World
 
 STEPS = 6
 TICK = STEPS * SUBSTEP

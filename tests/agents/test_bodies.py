@@ -16,7 +16,7 @@ from agents.vision import Sighting
 from drivers.bittle.gait import Velocity
 from drivers.reading import Action, Observation, Value
 from middleware.tasks import refusals
-from sim.sensor import NOSE
+from sim.robots.sensor import NOSE
 from tests.agents.roamer import Roamer, described, quantised
 
 KINDS = ("sim", "aibo", "create2", "bittle", "rosbridge")

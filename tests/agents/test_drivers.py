@@ -18,14 +18,14 @@ from drivers.driver import Driver, Permit
 from drivers.link import MemoryConnector
 from drivers.reading import Frame, Observation, Value
 from drivers.registry import driver_for
-from sim.camera import Camera
-from sim.emulator.aibo import AiboEmulator
-from sim.emulator.bittle import Bittle
-from sim.emulator.create2 import Create2
-from sim.emulator.rosbridge import RosbridgeRobot
-from sim.scene import FOOTPRINT, loaded
-from sim.sensor import Sensors
-from sim.world import SUBSTEP, World
+from sim.robots.camera import Camera
+from sim.robots.emulator.aibo import AiboEmulator
+from sim.robots.emulator.bittle import Bittle
+from sim.robots.emulator.create2 import Create2
+from sim.robots.emulator.rosbridge import RosbridgeRobot
+from sim.robots.scene import FOOTPRINT, loaded
+from sim.robots.sensor import Sensors
+from sim.robots.world import SUBSTEP, World
 from tests.agents.roamer import filming
 
 STEPS = 2

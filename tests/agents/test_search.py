@@ -12,10 +12,10 @@ from agents.context import Context
 from agents.means import STOP_AT
 from agents.search import HIDDEN, MEMORY, SearchAndApproach
 from drivers.reading import Action, Frame, Observation
-from sim.camera import Camera
-from sim.scene import FOOTPRINT, loaded
-from sim.sensor import NOSE, Sensors
-from sim.world import SUBSTEP, World
+from sim.robots.camera import Camera
+from sim.robots.scene import FOOTPRINT, loaded
+from sim.robots.sensor import NOSE, Sensors
+from sim.robots.world import SUBSTEP, World
 
 TICK = 8 * SUBSTEP
 

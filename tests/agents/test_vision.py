@@ -10,10 +10,10 @@ import numpy as np
 from twisted.trial.unittest import SynchronousTestCase
 
 from agents.vision import Sighting, Size, find_target
-from sim.camera import Camera
-from sim.scene import loaded
-from sim.sensor import NOSE
-from sim.world import World
+from sim.robots.camera import Camera
+from sim.robots.scene import loaded
+from sim.robots.sensor import NOSE
+from sim.robots.world import World
 
 SIZE = Size(0.08, 0.22)
 

@@ -33,8 +33,8 @@ from drivers.reading import Frame, Observation
 from drivers.registry import describe, driver_for
 from drivers.rosbridge import codec
 from middleware.tasks import Task
-from sim.emulator.body import MemoryBody
-from sim.emulator.mjpeg import MjpegCamera
+from sim.robots.emulator.body import MemoryBody
+from sim.robots.emulator.mjpeg import MjpegCamera
 from standards.jpeg import MAX_DECODED, MAX_SIDE, size_of
 from swarmnode.gateway import sides
 from webnode.camera import Camera as WebCamera

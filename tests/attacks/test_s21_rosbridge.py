@@ -14,8 +14,8 @@ from drivers.link import MemoryConnector
 from drivers.rosbridge.codec import MOST_DIGITS, MOST_VALUES, Answered, Status, decoded
 from drivers.rosbridge.driver import RosbridgeDriver
 from drivers.rosbridge.websocket import MAX_MESSAGE
-from sim.emulator.body import MemoryBody
-from sim.emulator.rosbridge import RosbridgeRobot
+from sim.robots.emulator.body import MemoryBody
+from sim.robots.emulator.rosbridge import RosbridgeRobot
 from standards import websocket
 from standards.websocket import CONTINUATION, MAX_FRAMES, PING, PONG, TEXT, End, framed
 

@@ -9,7 +9,7 @@ from twisted.internet.task import Clock
 
 from drivers.conformance import Conformance
 from drivers.driver import Driver, Permit
-from sim.emulator.body import MemoryBody
+from sim.robots.emulator.body import MemoryBody
 
 if TYPE_CHECKING:
     from twisted.trial.unittest import SynchronousTestCase as _Case

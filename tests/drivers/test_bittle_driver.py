@@ -1,4 +1,4 @@
-"""Tests of ``drivers.bittle.driver`` against ``sim.emulator.bittle``, on a cable and over Wi-Fi, through memory."""
+"""Tests of ``drivers.bittle.driver`` against ``sim.robots.emulator.bittle``, on a cable and over Wi-Fi."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from drivers.link import MemoryConnector
 from drivers.reading import Value
 from drivers.registry import driver_for
 from middleware.faults.stream import StreamFaults
-from sim.emulator.bittle import BEHAVIOUR_S, NEVER, Bittle
-from sim.emulator.body import MemoryBody
+from sim.robots.emulator.bittle import BEHAVIOUR_S, NEVER, Bittle
+from sim.robots.emulator.body import MemoryBody
 from tests.drivers.contract import DriverContract
 
 STEP = 0.005

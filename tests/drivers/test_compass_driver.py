@@ -1,4 +1,4 @@
-"""Tests of ``drivers.compass`` against ``sim.emulator.nmea``, joined through memory."""
+"""Tests of ``drivers.compass`` against ``sim.robots.emulator.nmea``, joined through memory."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from drivers.driver import Driver
 from drivers.errors import LinkLost, NotEnabled, Unsupported, UsageError
 from drivers.link import MemoryConnector
 from drivers.registry import describe, driver_for
-from sim.dog import Dog
-from sim.emulator.body import MemoryBody
-from sim.emulator.nmea import NmeaCompass
-from sim.scene import Kennel
+from sim.robots.dog import Dog
+from sim.robots.emulator.body import MemoryBody
+from sim.robots.emulator.nmea import NmeaCompass
+from sim.robots.scene import Kennel
 from tests.drivers.contract import SensingContract
 
 
@@ -68,7 +68,7 @@ class CompassDriverTests(SensingContract, SynchronousTestCase):
         driver = self.make_driver()
         driver.connect()
         for degrees in (0.0, 45.0, 90.0, 179.9, -179.9, -90.0, -0.04):
-            # What a dog of the yard calls its heading is what its compass tells (sim.sensor).
+            # What a dog of the yard calls its heading is what its compass tells (sim.robots.sensor).
             dog = Dog(Kennel("dog1", 0.0, 0.0, math.radians(degrees), 1), 1)
             self.body.values[HEADING] = dog.heading
             self.pass_time(0.2)

@@ -1,4 +1,4 @@
-"""Tests of ``drivers.create2.driver`` against ``sim.emulator.create2``, joined through memory."""
+"""Tests of ``drivers.create2.driver`` against ``sim.robots.emulator.create2``, joined through memory."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from drivers.link import MemoryConnector
 from drivers.reading import Value
 from drivers.registry import driver_for
 from middleware.faults.stream import StreamFaults
-from sim.emulator.body import MemoryBody
-from sim.emulator.create2 import Create2
+from sim.robots.emulator.body import MemoryBody
+from sim.robots.emulator.create2 import Create2
 from tests.drivers.contract import BodyContract
 
 STEP = 0.005

@@ -38,11 +38,11 @@ from drivers.link import MemoryConnector, MemoryLink
 from drivers.reading import Action, Description
 from drivers.registry import driver_for
 from drivers.rosbridge.driver import ASK_S, RosbridgeDriver
-from sim.emulator.aibo import AiboEmulator
-from sim.emulator.bittle import Bittle
-from sim.emulator.body import MemoryBody
-from sim.emulator.create2 import Create2
-from sim.emulator.rosbridge import RosbridgeRobot
+from sim.robots.emulator.aibo import AiboEmulator
+from sim.robots.emulator.bittle import Bittle
+from sim.robots.emulator.body import MemoryBody
+from sim.robots.emulator.create2 import Create2
+from sim.robots.emulator.rosbridge import RosbridgeRobot
 from standards.websocket import masked
 
 STEP = 0.005

@@ -16,11 +16,11 @@ from twisted.trial.unittest import SynchronousTestCase
 from drivers.driver import Driver, Permit
 from drivers.link import MemoryConnector
 from drivers.registry import driver_for
-from sim.emulator.aibo import AiboEmulator
-from sim.emulator.bittle import Bittle
-from sim.emulator.body import MemoryBody
-from sim.emulator.create2 import Create2
-from sim.emulator.rosbridge import RosbridgeRobot
+from sim.robots.emulator.aibo import AiboEmulator
+from sim.robots.emulator.bittle import Bittle
+from sim.robots.emulator.body import MemoryBody
+from sim.robots.emulator.create2 import Create2
+from sim.robots.emulator.rosbridge import RosbridgeRobot
 from swarmnode.driver.witness import Ear
 
 STEP = 0.005

@@ -25,9 +25,9 @@ from drivers.pyro.robot import TTL_S, PyroRobot
 from drivers.pyro.sensorvalue import Geometry, SensorValue
 from drivers.reading import Frame, Value
 from drivers.registry import describe
-from sim.emulator.aibo import AiboEmulator
-from sim.emulator.body import MemoryBody
-from sim.emulator.create2 import Create2
+from sim.robots.emulator.aibo import AiboEmulator
+from sim.robots.emulator.body import MemoryBody
+from sim.robots.emulator.create2 import Create2
 
 STEP_S = 0.004
 

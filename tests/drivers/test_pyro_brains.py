@@ -14,7 +14,7 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from drivers.pyro.brain import Engine
 from drivers.pyro.robot import PyroRobot
-from sim.scene import FOOTPRINT
+from sim.robots.scene import FOOTPRINT
 
 EXAMPLES = Path(__file__).parents[2] / "examples" / "pyro"
 STEP_S = 0.008

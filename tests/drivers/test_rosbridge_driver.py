@@ -14,8 +14,8 @@ from drivers.link import Link, MemoryConnector
 from drivers.registry import describe, driver_for
 from drivers.rosbridge.driver import CALL_S, SOURCE_S, RosbridgeDriver
 from drivers.rosbridge.link import SILENCE_S
-from sim.emulator.body import MemoryBody
-from sim.emulator.rosbridge import RosbridgeRobot
+from sim.robots.emulator.body import MemoryBody
+from sim.robots.emulator.rosbridge import RosbridgeRobot
 from tests.drivers.contract import BodyContract
 
 STEP = 0.005

@@ -15,8 +15,8 @@ from drivers.link import Link, MemoryConnector, Receiver
 from drivers.sim.codec import Motors, Sensors, encoded
 from drivers.sim.driver import SimDriver
 from drivers.sim.operator import YardOperator
-from sim.scene import loaded
-from sim.yard import Yard
+from sim.robots.scene import loaded
+from sim.robots.yard import Yard
 from tests.drivers.contract import DriverContract
 
 

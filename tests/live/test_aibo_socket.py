@@ -14,9 +14,9 @@ from drivers.aibo.driver import AiboDriver
 from drivers.driver import Permit
 from drivers.registry import driver_for
 from sim.demo.port import free
-from sim.emulator.aibo import EMULATED, AiboEmulator
-from sim.emulator.aibo_server import AiboServer
-from sim.emulator.body import MemoryBody
+from sim.robots.emulator.aibo import EMULATED, AiboEmulator
+from sim.robots.emulator.aibo_server import AiboServer
+from sim.robots.emulator.body import MemoryBody
 from tests.webnode.picture import jpeg
 
 

@@ -14,9 +14,9 @@ from twisted.trial.unittest import TestCase
 
 from drivers.link import TcpLinkFactory
 from drivers.registry import driver_for
-from sim.emulator.body import MemoryBody
-from sim.emulator.nmea import NmeaCompass
-from sim.emulator.pty import PtyPort
+from sim.robots.emulator.body import MemoryBody
+from sim.robots.emulator.nmea import NmeaCompass
+from sim.robots.emulator.pty import PtyPort
 
 reactor: Any = running
 

@@ -28,13 +28,13 @@ from drivers.deadman.keeper import Keeper
 from drivers.deadman.process import now
 from drivers.deadman.switch import LastWord
 from drivers.link import TcpLinkFactory
-from sim.emulator.aibo import AiboEmulator
-from sim.emulator.aibo_server import AiboServer
-from sim.emulator.bittle import Bittle
-from sim.emulator.body import MemoryBody
-from sim.emulator.create2 import Create2
-from sim.emulator.pty import PtyPort
-from sim.emulator.rosbridge import RosbridgeRobot
+from sim.robots.emulator.aibo import AiboEmulator
+from sim.robots.emulator.aibo_server import AiboServer
+from sim.robots.emulator.bittle import Bittle
+from sim.robots.emulator.body import MemoryBody
+from sim.robots.emulator.create2 import Create2
+from sim.robots.emulator.pty import PtyPort
+from sim.robots.emulator.rosbridge import RosbridgeRobot
 from tests.live.test_aibo_socket import free_ports
 
 if not Path("/proc/self/stat").exists():

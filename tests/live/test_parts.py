@@ -17,11 +17,11 @@ from drivers.link import TcpLinkFactory
 from drivers.reading import Observation
 from drivers.registry import driver_for
 from middleware.settings import Settings
-from sim.emulator.body import MemoryBody
-from sim.emulator.create2 import Create2
-from sim.emulator.mjpeg import MjpegCamera
-from sim.emulator.nmea import NmeaCompass
-from sim.emulator.pty import PtyPort
+from sim.robots.emulator.body import MemoryBody
+from sim.robots.emulator.create2 import Create2
+from sim.robots.emulator.mjpeg import MjpegCamera
+from sim.robots.emulator.nmea import NmeaCompass
+from sim.robots.emulator.pty import PtyPort
 from tests.drivers.test_camera_driver import jpeg
 
 reactor: Any = running

@@ -18,8 +18,8 @@ from twisted.trial.unittest import SynchronousTestCase, TestCase
 
 from drivers.pyro.robot import PyroRobot
 from drivers.registry import driver_for
-from sim.emulator.aibo import AiboEmulator
-from sim.emulator.body import MemoryBody
+from sim.robots.emulator.aibo import AiboEmulator
+from sim.robots.emulator.body import MemoryBody
 
 ROOT = Path(__file__).parents[2]
 reactor: Any = running

@@ -19,8 +19,8 @@ from twisted.trial.unittest import TestCase
 from drivers.driver import Permit
 from drivers.link import TcpConnector, TcpLinkFactory
 from drivers.rosbridge.driver import RosbridgeDriver
-from sim.emulator.body import MemoryBody
-from sim.emulator.rosbridge import RosbridgeRobot
+from sim.robots.emulator.body import MemoryBody
+from sim.robots.emulator.rosbridge import RosbridgeRobot
 
 reactor: Any = running
 MISSING = "NOTHING IS HELD AGAINST THE ROSBRIDGE OF OTHERS: install the extra ros"

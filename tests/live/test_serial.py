@@ -19,10 +19,10 @@ from drivers.driver import Driver, Permit
 from drivers.link import TcpLinkFactory
 from drivers.registry import driver_for
 from drivers.serial import SerialConnector
-from sim.emulator.bittle import Bittle
-from sim.emulator.body import MemoryBody
-from sim.emulator.create2 import Create2
-from sim.emulator.pty import PtyPort
+from sim.robots.emulator.bittle import Bittle
+from sim.robots.emulator.body import MemoryBody
+from sim.robots.emulator.create2 import Create2
+from sim.robots.emulator.pty import PtyPort
 
 try:
     import serial  # noqa: F401

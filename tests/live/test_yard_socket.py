@@ -27,7 +27,7 @@ ROOT = Path(sim.__file__).parents[1]
 def spawned(*arguments: str) -> subprocess.Popen[str]:
     """A yard process; its first line says where it listens."""
     return subprocess.Popen(
-        [sys.executable, "-m", "sim.server", *arguments],
+        [sys.executable, "-m", "sim.robots.server", *arguments],
         cwd=ROOT, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
     )  # fmt: skip
 

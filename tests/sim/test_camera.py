@@ -1,4 +1,4 @@
-"""Tests of ``sim.camera`` and ``sim.mesh``."""
+"""Tests of ``sim.robots.camera`` and ``sim.robots.mesh``."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 from twisted.trial.unittest import SynchronousTestCase
 
-from sim.camera import Camera
-from sim.lens import FOCAL_X, HEIGHT, WIDTH, Image
-from sim.scene import loaded
-from sim.sensor import NOSE
-from sim.world import World
+from sim.robots.camera import Camera
+from sim.robots.lens import FOCAL_X, HEIGHT, WIDTH, Image
+from sim.robots.scene import loaded
+from sim.robots.sensor import NOSE
+from sim.robots.world import World
 
 
 def red(image: Image) -> Image:

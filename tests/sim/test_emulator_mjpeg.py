@@ -1,4 +1,4 @@
-"""Tests of ``sim.emulator.mjpeg``: what a client of any kind finds there."""
+"""Tests of ``sim.robots.emulator.mjpeg``: what a client of any kind finds there."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from twisted.internet.task import Clock
 from twisted.trial.unittest import SynchronousTestCase
 
 from drivers.camera.codec import StreamReader, request
-from sim.emulator.body import MemoryBody
-from sim.emulator.mjpeg import MjpegCamera
+from sim.robots.emulator.body import MemoryBody
+from sim.robots.emulator.mjpeg import MjpegCamera
 
 
 class Wire:

@@ -1,4 +1,4 @@
-"""Tests of ``sim.picture``."""
+"""Tests of ``sim.robots.picture``."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 from twisted.trial.unittest import SynchronousTestCase
 
-from sim.picture import overhead, overhead_image
-from sim.scene import loaded
-from sim.world import World
+from sim.robots.picture import overhead, overhead_image
+from sim.robots.scene import loaded
+from sim.robots.world import World
 
 
 class PictureTests(SynchronousTestCase):

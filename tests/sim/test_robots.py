@@ -1,4 +1,4 @@
-"""Tests of ``sim.robots`` and ``sim.emulator.dog``: dogs of the yard that are reached as other robots are."""
+"""Tests of ``sim.robots.table`` and ``emulator.dog``: dogs of the yard that are reached as other robots are."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from drivers.aibo.driver import AiboDriver
 from drivers.driver import Permit
 from drivers.errors import UsageError
 from drivers.registry import describe
-from sim.dog import LIMITS
-from sim.emulator.aibo import AiboEmulator
-from sim.emulator.bittle import Bittle
-from sim.emulator.body import MemoryBody
-from sim.emulator.dog import DogBody
-from sim.emulator.pty import PtyPort
-from sim.robots import Robots
-from sim.scene import loaded
-from sim.world import TICK
-from sim.yard import Yard
+from sim.robots.dog import LIMITS
+from sim.robots.emulator.aibo import AiboEmulator
+from sim.robots.emulator.bittle import Bittle
+from sim.robots.emulator.body import MemoryBody
+from sim.robots.emulator.dog import DogBody
+from sim.robots.emulator.pty import PtyPort
+from sim.robots.scene import loaded
+from sim.robots.table import Robots
+from sim.robots.world import TICK
+from sim.robots.yard import Yard
 from standards.jpeg import size_of
 
 

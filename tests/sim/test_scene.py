@@ -1,4 +1,4 @@
-"""Tests of ``sim.scene``."""
+"""Tests of ``sim.robots.scene``."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from sim.scene import SceneError, loaded, parsed, scene_names
+from sim.robots.scene import SceneError, loaded, parsed, scene_names
 
 
 class SceneTests(SynchronousTestCase):

@@ -1,4 +1,4 @@
-"""Tests of ``sim.sensor``."""
+"""Tests of ``sim.robots.sensor``."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from random import Random
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from sim.scene import loaded
-from sim.sensor import NOSE, Sensors
-from sim.world import SUBSTEP, World
+from sim.robots.scene import loaded
+from sim.robots.sensor import NOSE, Sensors
+from sim.robots.world import SUBSTEP, World
 
 
 class SensorsTests(SynchronousTestCase):

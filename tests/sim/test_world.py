@@ -1,4 +1,4 @@
-"""Tests of ``sim.world`` and ``sim.dog``."""
+"""Tests of ``sim.robots.world`` and ``sim.robots.dog``."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from random import Random
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from sim.scene import FOOTPRINT, loaded
-from sim.world import SUBSTEP, NotPossible, World
+from sim.robots.scene import FOOTPRINT, loaded
+from sim.robots.world import SUBSTEP, NotPossible, World
 
 
 def make_world(seed: int = 1) -> World:

@@ -1,4 +1,4 @@
-"""Tests of ``sim.yard`` and ``sim.session`` by the bytes that clients exchange with it."""
+"""Tests of ``sim.robots.yard`` and ``sim.robots.session`` by the bytes that clients exchange with it."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from drivers.sim.codec import (
     Truth,
     encoded,
 )
-from sim.reception import SILENT_S
-from sim.scene import loaded
-from sim.session import Beat, Session
-from sim.world import TICK
-from sim.yard import Yard
+from sim.robots.reception import SILENT_S
+from sim.robots.scene import loaded
+from sim.robots.session import Beat, Session
+from sim.robots.world import TICK
+from sim.robots.yard import Yard
 
 
 class Client:

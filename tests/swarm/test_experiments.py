@@ -15,7 +15,7 @@ from drivers.link import MemoryLink
 from middleware.tasks import Task
 from sim.demo.experiment import TOUCH_M
 from sim.demo.trials import trial
-from sim.scene import FOOTPRINT
+from sim.robots.scene import FOOTPRINT
 from swarmnode.rehearsal import LAN, VirtualTeam
 
 LOOK_S = 0.05

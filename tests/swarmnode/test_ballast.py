@@ -52,7 +52,7 @@ class BallastTests(SynchronousTestCase):
     def test_load_nothing_for_commands(self) -> None:
         """The demonstration, the yard and the other commands have none, by either name."""
         nowhere = ("--host", "203.0.113.1")
-        for words in (("-m", "sim.demo", "--help"), ("-m", "sim.server", *nowhere)):
+        for words in (("-m", "sim.demo", "--help"), ("-m", "sim.robots.server", *nowhere)):
             told = self.said(*words)
             self.assertNotIn(LOADED, told)
             self.assertNotIn("Traceback", told)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from sim.crowd.ground import Ground
-from sim.crowd.search import search
+from sim.robots.crowd.ground import Ground
+from sim.robots.crowd.search import search
 from swarmnode.crowd import DESK, CrowdTeam
 from tests.replay import replayed
 
 RUN = """
-from sim.crowd.ground import Ground
-from sim.crowd.search import search
+from sim.robots.crowd.ground import Ground
+from sim.robots.crowd.search import search
 from swarmnode.crowd import CrowdTeam
 print(search(CrowdTeam(4, 3, Ground(30, 5.0, 5.0)), 4, 6.0, lambda: 0.0).digest)
 """

@@ -16,8 +16,8 @@ from agents.catalogue import DEMO, TASKS
 from drivers.registry import describe
 from middleware.presence import Device
 from middleware.settings import Settings
-from sim.emulator.aibo import AiboEmulator
-from sim.emulator.body import MemoryBody
+from sim.robots.emulator.aibo import AiboEmulator
+from sim.robots.emulator.body import MemoryBody
 from swarmnode.service import NodeService
 from tests.swarmnode.team import World
 from webnode.ledger import state_from

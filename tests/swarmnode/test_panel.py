@@ -17,7 +17,7 @@ from drivers.reading import Action, Observation
 from middleware.entangled.record import Record
 from middleware.panel import SEATS
 from middleware.tasks import Task, member_of
-from sim.crowd.ground import Ground
+from sim.robots.crowd.ground import Ground
 from swarmnode.crowd import DESK, CrowdTeam
 
 AGENTS = 24

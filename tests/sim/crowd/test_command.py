@@ -1,4 +1,4 @@
-"""Tests of ``sim.crowd.command``, ``search`` and ``picture``, with a team whose agents are made up."""
+"""Tests of ``sim.robots.crowd.command``, ``search`` and ``picture``, with a team whose agents are made up."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from typing import Any
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.clock import HeapClock
-from sim.crowd.command import MakeTeam, main
-from sim.crowd.controller import Controller, stand
-from sim.crowd.crowd import Crowd
-from sim.crowd.ground import Ground, roomy
-from sim.crowd.picture import INK, OTHER, drawn
-from sim.crowd.search import Word, search, table
-from sim.crowd.yard import CrowdYard
+from sim.robots.crowd.command import MakeTeam, main
+from sim.robots.crowd.controller import Controller, stand
+from sim.robots.crowd.crowd import Crowd
+from sim.robots.crowd.ground import Ground, roomy
+from sim.robots.crowd.picture import INK, OTHER, drawn
+from sim.robots.crowd.search import Word, search, table
+from sim.robots.crowd.yard import CrowdYard
 
 
 class PlayedTeam:

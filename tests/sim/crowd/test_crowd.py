@@ -1,4 +1,4 @@
-"""Tests of ``sim.crowd.crowd`` and ``sim.crowd.ground``: bodies that push each other, the same for the same seed."""
+"""Tests of ``sim.robots.crowd.crowd`` and ``ground``: bodies that push each other, the same for the same seed."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from random import Random
 import numpy as np
 from twisted.trial.unittest import SynchronousTestCase
 
-from sim.crowd.controller import CONTROLLERS, Senses
-from sim.crowd.crowd import RAYS, Crowd
-from sim.crowd.ground import CELL, MAX_BODIES, Ground, roomy
-from sim.scene import FOOTPRINT, Kennel, Scene, SceneError
-from sim.world import SUBSTEP, TICK, NotPossible, World
+from sim.robots.crowd.controller import CONTROLLERS, Senses
+from sim.robots.crowd.crowd import RAYS, Crowd
+from sim.robots.crowd.ground import CELL, MAX_BODIES, Ground, roomy
+from sim.robots.scene import FOOTPRINT, Kennel, Scene, SceneError
+from sim.robots.world import SUBSTEP, TICK, NotPossible, World
 from tests.replay import replayed
 
 RUN = """
-from sim.crowd.controller import CONTROLLERS, Senses
-from sim.crowd.crowd import Crowd
-from sim.crowd.ground import roomy
+from sim.robots.crowd.controller import CONTROLLERS, Senses
+from sim.robots.crowd.crowd import Crowd
+from sim.robots.crowd.ground import roomy
 crowd = Crowd(7, roomy(400, 0.2))
 for turn in range(150):
     crowd.wish[:] = CONTROLLERS["wander"](Senses(crowd))

@@ -1,4 +1,4 @@
-"""Tests of ``sim.crowd.ray``: all rays at once say what the yard's own say one by one."""
+"""Tests of ``sim.robots.crowd.ray``: all rays at once say what the yard's own say one by one."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from random import Random
 import numpy as np
 from twisted.trial.unittest import SynchronousTestCase
 
-from sim.crowd.crowd import RAYS, REACH, Crowd
-from sim.crowd.ground import Ground
-from sim.crowd.ray import Rays
-from sim.scene import FOOTPRINT, Kennel, Scene
-from sim.world import World
+from sim.robots.crowd.crowd import RAYS, REACH, Crowd
+from sim.robots.crowd.ground import Ground
+from sim.robots.crowd.ray import Rays
+from sim.robots.scene import FOOTPRINT, Kennel, Scene
+from sim.robots.world import World
 
 
 def twin(crowd: Crowd) -> World:

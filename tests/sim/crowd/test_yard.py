@@ -1,4 +1,4 @@
-"""Tests of ``sim.crowd.yard``, ``feeling``, ``eye`` and ``body``: to a driver a robot of a crowd is as a dog."""
+"""Tests of ``sim.robots.crowd.yard``, ``feeling``, ``eye`` and ``body``: to a driver a robot of a crowd is as a dog."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from drivers.errors import DriverError, UsageError
 from drivers.reading import Observation
 from drivers.sim.driver import SimDriver
 from middleware.entangled.clock import HeapClock
-from sim.crowd.body import CrowdBody
-from sim.crowd.controller import stand
-from sim.crowd.ground import Ground
-from sim.crowd.yard import SPARE, CrowdYard
-from sim.scene import FOOTPRINT, SceneError, loaded
-from sim.sensor import NOSE
-from sim.world import TICK
-from sim.yard import Yard
+from sim.robots.crowd.body import CrowdBody
+from sim.robots.crowd.controller import stand
+from sim.robots.crowd.ground import Ground
+from sim.robots.crowd.yard import SPARE, CrowdYard
+from sim.robots.scene import FOOTPRINT, SceneError, loaded
+from sim.robots.sensor import NOSE
+from sim.robots.world import TICK
+from sim.robots.yard import Yard
 
 
 class DrivenTests(SynchronousTestCase):

@@ -14,8 +14,8 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from drivers.driver import Permit
 from drivers.registry import driver_for, kinds
-from sim.emulator.aibo import AiboEmulator
-from sim.emulator.body import MemoryBody
+from sim.robots.emulator.aibo import AiboEmulator
+from sim.robots.emulator.body import MemoryBody
 from swarmnode.driver.command import main
 from swarmnode.driver.pilot import Pilot
 from tests.swarmnode.driver.ground import MemoryGround

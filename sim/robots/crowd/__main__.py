@@ -1,0 +1,8 @@
+"""``python -m sim.robots.crowd``: the yard for many alone, without agents."""
+
+import sys
+
+from sim.robots.crowd.command import main
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,97 @@
+"""Eye: what a robot of a crowd sees, painted far to near: walls, the red target, and the others as grey drums."""
+
+from __future__ import annotations
+
+import math
+from random import Random
+
+import cv2
+import numpy as np
+
+from sim.robots.crowd.crowd import Crowd
+from sim.robots.crowd.ground import Floats
+from sim.robots.lens import (
+    EYE,
+    FOCAL_X,
+    FOCAL_Y,
+    HEIGHT,
+    NEAR_PLANE,
+    WIDTH,
+    Image,
+    Room,
+    View,
+    draw_cylinder,
+    encoded,
+)
+from sim.robots.mesh import Colour
+from sim.robots.scene import FOOTPRINT
+
+CLEAR = 4.0
+"""Metres within which the others are drawn; farther ones only where they may hide the target."""
+FARTHEST = 12.0
+WEDGE, SIDE = 0.6, 0.35
+"""How far aside something may be to be in the picture: this share of how far ahead it is, and so many metres."""
+_SEAMS = np.array([1.0, 0.55, -0.35, -1.0])
+_GREYS: tuple[Colour, ...] = ((118, 114, 108), (172, 168, 162), (138, 134, 128))
+_STEEPEST = 1.4
+_MIDDLE = WIDTH / 2 - 0.5, HEIGHT / 2 - 0.5
+
+
+class Eyes:
+    """The cameras of the robots of ``crowd``; ``rng`` are the dice of their noise."""
+
+    def __init__(self, rng: Random, crowd: Crowd) -> None:
+        self._crowd = crowd
+        self._room = Room(rng, crowd.ground.width, crowd.ground.height, crowd.ground.wall_height)
+
+    def jpeg(self, body: int, is_halved: bool = False) -> bytes:
+        """What the robot of that number sees as a JPEG, 208x160 or half of that each way."""
+        return encoded(self.image(body), is_halved)
+
+    def image(self, body: int) -> Image:
+        """The same as blue, green and red bytes."""
+        crowd = self._crowd
+        view = View(float(crowd.x[body]), float(crowd.y[body]), float(crowd.heading[body]))
+        image = self._room.floor()
+        self._room.draw_walls(image, view)
+        target, target_at, far = crowd.target, math.inf, CLEAR
+        if target is not None:
+            ahead, left, _ = view.seen_one(target.x, target.y, EYE)
+            target_at = math.hypot(ahead, left)
+            if ahead > 0.0 and abs(left) < WEDGE * ahead + SIDE:
+                far = min(max(CLEAR, target_at), FARTHEST)
+        others, drums = self._drums(body, view, far)
+        behind = int((others > target_at).sum())
+        _draw(image, drums[:behind])
+        if target is not None:
+            draw_cylinder(image, view, target.x, target.y, target.radius, target.height)
+        _draw(image, drums[behind:])
+        return self._room.noisy(image)
+
+    def _drums(self, body: int, view: View, far: float) -> tuple[Floats, list[list[int]]]:
+        """How far the others in view are, the farthest first, and the columns and the lowest row of their strips.
+
+        They are as high as the lens, so that nobody looks onto their tops.
+        """
+        crowd = self._crowd
+        dx, dy = crowd.x - view.x, crowd.y - view.y
+        ahead, left = view.cos * dx + view.sin * dy, view.cos * dy - view.sin * dx
+        is_seen = (ahead > 0.0) & (ahead < far) & (np.abs(left) < WEDGE * ahead + SIDE)
+        is_seen[body] = False
+        seen = np.flatnonzero(is_seen)
+        ahead, left = ahead[seen], left[seen]
+        distance = np.hypot(ahead, left)
+        order = np.argsort(-distance, kind="stable")
+        ahead, left, distance = ahead[order], left[order], np.maximum(distance[order], 1e-6)
+        bearing, half = np.arctan2(left, ahead), np.arcsin(np.minimum(FOOTPRINT / distance, 0.999))
+        edges = np.clip(bearing[:, None] + half[:, None] * _SEAMS, -_STEEPEST, _STEEPEST)
+        front = np.maximum((distance - FOOTPRINT) * np.cos(bearing), NEAR_PLANE)
+        columns, lowest = _MIDDLE[0] - FOCAL_X * np.tan(edges), _MIDDLE[1] + FOCAL_Y * EYE / front
+        strips: list[list[int]] = np.concatenate((columns, lowest[:, None]), axis=1).round().astype(np.int32).tolist()
+        return distance, strips
+
+
+def _draw(image: Image, drums: list[list[int]]) -> None:
+    for *columns, lowest in drums:
+        for left, right, colour in zip(columns, columns[1:], _GREYS, strict=False):
+            cv2.rectangle(image, (left, HEIGHT // 2), (right, lowest), colour, cv2.FILLED)

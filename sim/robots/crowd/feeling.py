@@ -1,0 +1,98 @@
+"""Feeling: what those robots of a crowd that have a driver feel, under the keys of a dog of the yard, as arrays.
+
+The same noise, drift and battery as ``sim.robots.sensor`` gives one dog; one sample a step where that takes four.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from random import Random
+
+import numpy as np
+
+from drivers.reading import Value
+from sim.robots.crowd.crowd import REACH, Crowd
+from sim.robots.crowd.ground import Floats
+from sim.robots.sensor import BATTERY_S, CHEST, CHEST_PITCH, CHEST_REACH, FAR, FLOOR, GRAVITY, NEAR, NOSE, SAMPLED
+from sim.robots.world import SUBSTEP, TICK
+
+_KEYS = (
+    *("base.vx", "base.vy", "base.wz", "odom.x", "odom.y", "odom.yaw", "compass.heading"),
+    *SAMPLED,
+    "power.level",
+)
+_STEADY = 0.05 * math.sqrt(SUBSTEP / TICK)
+"""How much a stride differs from the next; where one is counted that the yard counts as four, by as much less."""
+
+
+class Feelings:
+    """What the first robots of ``crowd``, named ``names``, feel; ``sample`` once each step."""
+
+    def __init__(self, seed: int, crowd: Crowd, names: Sequence[str]) -> None:
+        self._crowd = crowd
+        self._dice = np.random.default_rng(seed)
+        count = len(names)
+        self._odometry = np.zeros((3, count))
+        self._stride_error, self._turn_error = 1.0 + self._dice.normal(0.0, 0.01, (2, count))
+        self._power = np.ones(count)
+        self._deviation = np.array([Random(f"compass of {name}").gauss(0.0, math.radians(2.0)) for name in names])
+        self._rows: list[list[float]] = [[math.nan] * len(_KEYS)] * count
+        self._moving: list[bool] = [False] * count
+
+    def sample(self) -> None:
+        """Feel once, ``TICK`` after the time before."""
+        crowd, first = self._crowd, slice(0, len(self._power))
+        heading, wz = crowd.heading[first], crowd.wz[first]
+        cos, sin = np.cos(heading), np.sin(heading)
+        vx = cos * crowd.vx[first] + sin * crowd.vy[first]
+        vy = cos * crowd.vy[first] - sin * crowd.vx[first]
+        moving = (crowd.wish[first] != 0.0).any(axis=1) | (np.hypot(vx, vy) > 0.005) | (np.abs(wz) > 0.02)
+        noise = self._dice.normal(size=(8, len(vx)))
+        self._reckon(moving, vx, vy, wz, noise[:2])
+        self._power = np.maximum(0.0, self._power - TICK / BATTERY_S * np.where(moving, 1.0, 0.5))
+        ahead = crowd.ranges[first, 0]
+        ahead = np.where(ahead < REACH, ahead - NOSE, math.nan)
+        slant = np.where(ahead < CHEST_REACH, ahead / math.cos(CHEST_PITCH), FLOOR)
+        shake = np.where(moving, 0.25, 0.04)
+        x, y, yaw = self._odometry
+        columns = (
+            *(vx, vy, wz, x, y, _turned(yaw), _turned(heading + self._deviation)),
+            *(_ranged(gap, limits, n) for gap, limits, n in ((ahead, NEAR, noise[2]), (ahead, FAR, noise[3]))),
+            _ranged(slant, CHEST, noise[4]),
+            cos * crowd.ax[first] + sin * crowd.ay[first] + shake * noise[5],
+            cos * crowd.ay[first] - sin * crowd.ax[first] + shake * noise[6],
+            GRAVITY + shake * noise[7],
+            self._power,
+        )
+        self._rows = np.stack(columns, axis=1).tolist()
+        self._moving = moving.tolist()
+
+    def values(self, body: int) -> dict[str, Value]:
+        """The newest of each value of the robot of that number, NaN for nothing in range."""
+        return {**dict(zip(_KEYS, self._rows[body], strict=True)), "base.moving": self._moving[body]}
+
+    def _reckon(self, moving: Floats, vx: Floats, vy: Floats, wz: Floats, noise: Floats) -> None:
+        x, y, yaw = self._odometry
+        slip = self._stride_error * (1.0 + _STEADY * noise[0]) * moving * TICK
+        cos, sin = np.cos(yaw), np.sin(yaw)
+        x += (vx * cos - vy * sin) * slip
+        y += (vx * sin + vy * cos) * slip
+        yaw += wz * self._turn_error * (1.0 + _STEADY * noise[1]) * moving * TICK
+
+
+def sampled(values: dict[str, Value]) -> dict[str, tuple[float, ...]]:
+    """The samples since the frame before: there is one of each."""
+    return {key: (float(values[key]),) for key in SAMPLED}
+
+
+def _turned(angle: Floats) -> Floats:
+    """The same directions within -pi and pi."""
+    turned: Floats = np.remainder(angle + math.pi, math.tau) - math.pi
+    return turned
+
+
+def _ranged(gap: Floats, limits: tuple[float, float], noise: Floats) -> Floats:
+    """What an infrared ranger says: noise grows with distance, too near reads as the shortest, too far as NaN."""
+    measured = gap + noise * (0.001 + 0.004 * gap)
+    return np.where(measured > limits[1], math.nan, np.maximum(measured, limits[0]))

@@ -1,0 +1,92 @@
+"""Rays: how far it is from every robot to whatever stands around it, all rays of all robots at once."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from sim.robots.crowd.ground import Floats
+from sim.robots.crowd.neighbour import Neighbours, Places
+from sim.robots.scene import FOOTPRINT
+
+SKIN = 0.3
+Disc = tuple[float, float, float]
+"""Something round that stands still: x, y and radius in metres."""
+
+
+class Rays:
+    """``count`` rays of ``reach`` metres from the middle of each robot, evenly around it; ray 0 looks ahead.
+
+    A disc is asked which of the rays meet it, and not each ray what it meets: so the work grows with what is there, and
+    not with the number of rays.
+    """
+
+    def __init__(self, width: float, height: float, count: int, reach: float, radius: float = FOOTPRINT) -> None:
+        self._width = width
+        self._height = height
+        self._count = count
+        self._reach = reach
+        self._radius = radius
+        self._between = math.tau / count
+        self._neighbours = Neighbours(reach + radius, SKIN)
+
+    def cast(self, x: Floats, y: Floats, heading: Floats, discs: Sequence[Disc] = ()) -> Floats:
+        """Metres along each ray, a row for each robot, counter-clockwise; ``reach`` where nothing is met."""
+        ranges = np.full((len(x), self._count), self._reach)
+        self._meet_walls(ranges, x, y, heading)
+        one, other = self._neighbours.pairs(x, y)
+        dx, dy = x[other] - x[one], y[other] - y[one]
+        square = dx * dx + dy * dy
+        is_near = np.flatnonzero(square < (self._reach + self._radius) ** 2)
+        one, other = one[is_near], other[is_near]
+        distance, towards = np.sqrt(square[is_near]), np.arctan2(dy[is_near], dx[is_near])
+        # What one sees of the other, the other sees of the one in the opposite direction.
+        self._meet(
+            ranges,
+            np.concatenate((one, other)),
+            np.concatenate((towards - heading[one], towards + math.pi - heading[other])),
+            np.concatenate((distance, distance)),
+            self._radius,
+        )
+        for disc_x, disc_y, radius in discs:
+            dx, dy = disc_x - x, disc_y - y
+            square = dx * dx + dy * dy
+            seers = np.flatnonzero(square < (self._reach + radius) ** 2)
+            towards = np.arctan2(dy[seers], dx[seers]) - heading[seers]
+            self._meet(ranges, seers, towards, np.sqrt(square[seers]), radius)
+        return ranges
+
+    def _meet(self, ranges: Floats, seers: Places, bearing: Floats, distance: Floats, radius: float) -> None:
+        """Shorten the rays of ``seers`` that meet a disc each, ``bearing`` radians from ahead and ``distance`` away."""
+        half = np.arcsin(np.minimum(radius / distance, 1.0)) / self._between
+        middle = bearing / self._between
+        first = np.ceil(middle - half)
+        count = np.floor(middle + half) - first + 1.0
+        flat = ranges.reshape(-1)
+        nth = 0
+        met = np.flatnonzero(count > 0)
+        while len(met):
+            ray = first[met] + nth
+            off = (ray - middle[met]) * self._between
+            far = distance[met]
+            beside = far * np.sin(off)
+            along = far * np.cos(off) - np.sqrt(np.maximum(radius * radius - beside * beside, 0.0))
+            # A robot that is met by the same ray as another is no nearer for having been looked at later.
+            np.minimum.at(flat, seers[met] * self._count + ray.astype(np.int64) % self._count, along)
+            nth += 1
+            met = met[count[met] > nth]
+
+    def _meet_walls(self, ranges: Floats, x: Floats, y: Floats, heading: Floats) -> None:
+        gap = np.minimum(np.minimum(x, self._width - x), np.minimum(y, self._height - y))
+        close = np.flatnonzero(gap < self._reach)
+        if not len(close):
+            return
+        x, y = x[close, None], y[close, None]
+        angle = heading[close, None] + np.arange(self._count) * self._between
+        cos, sin = np.cos(angle), np.sin(angle)
+        with np.errstate(divide="ignore"):  # who looks along a wall never meets it
+            across = np.where(cos > 0.0, self._width - x, x) / np.abs(cos)
+            up = np.where(sin > 0.0, self._height - y, y) / np.abs(sin)
+        ranges[close] = np.minimum(ranges[close], np.minimum(across, up))

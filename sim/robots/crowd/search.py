@@ -1,0 +1,184 @@
+"""Search: the thesis' experiment by the hundred: agents among many others search a red target, one walks up to it.
+
+The team is handed in by the front door; what is judged here is what stands in the yard and what the agents say.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+
+from sim.robots.crowd.yard import CrowdYard
+
+LOOK_S = 0.5
+"""Virtual seconds between two looks at the team."""
+SLICES = 10
+PLACING_S = 5.0
+"""Seconds after the task's assignment at which the target is placed, while they search."""
+SLACK = 0.1
+"""By this share somebody else may be nearer than the one that was chosen: the reports are measurements."""
+
+
+@dataclass(frozen=True)
+class Word:
+    """What one agent says: how far the target is (None: it knows of none), and who is to go, by name."""
+
+    cost: float | None
+    assigned: str
+
+
+class Team(Protocol):
+    """Agents with bodies in a crowd, on one turned clock."""
+
+    clock: Any
+    board: Any
+    yard: CrowdYard
+
+    def assign(self) -> None:
+        """Assign the task to whoever can do it."""
+
+    def words(self) -> Mapping[str, Word]:
+        """What each agent that takes part says, by its name."""
+
+    def done_by(self) -> str | None:
+        """Who ended the task, None while it is open."""
+
+    def stop(self) -> None:
+        """End everything."""
+
+
+@dataclass
+class Outcome:
+    """What came of it, and what it cost; times in virtual seconds since the task was assigned, cost in CPU seconds.
+
+    ``found`` counts the agents that knew the target when they agreed, or at the end; ``right`` says whether nobody of
+    those was much nearer than the one that was chosen.  ``cost`` has parts: ``moving`` all robots with their rays and
+    controllers, ``telling`` the drivers what is felt and seen, and ``agents``: nodes, drivers and agents.  ``trail`` is
+    where the one came along that goes now.
+    """
+
+    seed: int
+    agents: int
+    bodies: int
+    seconds: float = 0.0
+    engaged: float | None = None
+    first: float | None = None
+    found: int = 0
+    agree: float | None = None
+    by: str = ""
+    right: bool | None = None
+    reach: float | None = None
+    datagrams: int = 0
+    cost: dict[str, float] = field(default_factory=dict)
+    digest: str = ""
+    trail: list[tuple[float, float]] = field(default_factory=list)
+
+
+def search(
+    team: Team,
+    seed: int,
+    limit: float,
+    stopwatch: Callable[[], float],
+    show: Callable[[Outcome], None] = lambda outcome: None,
+    is_over: Callable[[], bool] = lambda: False,
+) -> Outcome:
+    """Let ``team`` search until somebody stands at the target, at most ``limit`` virtual seconds.
+
+    ``show`` is called at each look; once ``is_over`` the search ends with what is known by then.
+    """
+    yard = team.yard
+    outcome = Outcome(seed, len(yard.names), yard.crowd.ground.bodies)
+    began, sent = team.clock.seconds(), team.board.counters["sent"]
+    before = stopwatch(), yard.moving, yard.telling
+    team.assign()
+    while outcome.seconds < limit and outcome.reach is None and not is_over():
+        for _ in range(SLICES):
+            if not is_over():  # half a second of a large team may take a minute
+                team.clock.advance(LOOK_S / SLICES)
+        outcome.seconds = round(team.clock.seconds() - began, 3)
+        outcome.datagrams = team.board.counters["sent"] - sent
+        if yard.crowd.target is None and outcome.seconds >= PLACING_S:
+            yard.crowd.place_target_at_random()
+        _notice(outcome, team)
+        show(outcome)
+    spent, moving, telling = stopwatch() - before[0], yard.moving - before[1], yard.telling - before[2]
+    outcome.cost = {"moving": moving, "telling": telling, "agents": spent - moving - telling}
+    outcome.digest = f"{team.board.digest()[:16]}-{yard.crowd.digest()[:16]}"
+    return outcome
+
+
+def _notice(outcome: Outcome, team: Team) -> None:
+    words, now = team.words(), outcome.seconds
+    if outcome.engaged is None and len(words) == outcome.agents:
+        outcome.engaged = now
+    finders = [name for name, word in words.items() if word.cost is not None]
+    if outcome.first is None and finders:
+        outcome.first = now
+    named = {word.assigned for word in words.values()}
+    if outcome.agree is None:
+        outcome.found = len(finders)
+        if len(words) == outcome.agents and len(named) == 1 and "" not in named:
+            outcome.agree, outcome.right = now, _is_nearest(team.yard, next(iter(named)), finders)
+    before = outcome.by
+    if outcome.agree is not None and len(named) == 1 and "" not in named:
+        outcome.by = named.pop()
+    done = team.done_by()
+    if done is not None:
+        outcome.reach, outcome.by = now, done
+    if outcome.by != before:
+        outcome.trail.clear()  # it is another that goes now
+    if outcome.by:
+        body = team.yard.names.index(outcome.by)
+        outcome.trail.append((float(team.yard.crowd.x[body]), float(team.yard.crowd.y[body])))
+
+
+def _is_nearest(yard: CrowdYard, chosen: str, finders: list[str]) -> bool:
+    crowd, target = yard.crowd, yard.crowd.target
+    if target is None:
+        return False
+    gaps = np.hypot(crowd.x - target.x, crowd.y - target.y)
+    least = min((float(gaps[yard.names.index(name)]) for name in finders), default=math.inf)
+    return bool(gaps[yard.names.index(chosen)] <= least * (1.0 + SLACK) + SLACK)
+
+
+def table(outcome: Outcome) -> str:
+    """What came of it, line by line."""
+
+    def at(moment: float | None) -> str:
+        return "-" if moment is None else f"{moment:.1f} s"
+
+    seconds = max(outcome.seconds, 1e-9)
+    yard = outcome.cost["moving"] + outcome.cost["telling"]
+    whole = yard + outcome.cost["agents"]
+    rows = [
+        ("robots, agents among them", f"{outcome.bodies:,}, {outcome.agents:,}"),
+        ("all agents take part", at(outcome.engaged)),
+        ("the first has found the target", at(outcome.first)),
+        ("all name the same agent", f"{at(outcome.agree)}, {outcome.found} had found it"),
+        ("it was the nearest of those", {True: "yes", False: "NO", None: "-"}[outcome.right]),
+        ("the target is reached", f"{at(outcome.reach)} by {outcome.by or 'nobody'}"),
+        ("datagrams for each agent and second", f"{outcome.datagrams / seconds / max(1, outcome.agents):.1f}"),
+        ("the yard alone", f"{1e3 * yard / seconds:8.1f} ms a second: {seconds / max(yard, 1e-9):.1f} x real time"),
+        ("  rays, moves and controllers", f"{1e3 * outcome.cost['moving'] / seconds:8.1f} ms"),
+        ("  sensor frames and pictures", f"{1e3 * outcome.cost['telling'] / seconds:8.1f} ms"),
+        ("nodes, drivers and agents", f"{1e3 * outcome.cost['agents'] / seconds:8.1f} ms"),
+        ("all together", f"{1e3 * whole / seconds:8.1f} ms a second: {seconds / max(whole, 1e-9):.2f} x real time"),
+        ("hash", outcome.digest),
+    ]
+    return "\n".join(f"{name:38}{value}" for name, value in rows)
+
+
+def kinds(team: Team, outcome: Outcome) -> dict[int, str]:
+    """What each robot of an agent is, for the picture."""
+    words, names = team.words(), team.yard.names
+    found = {name for name, word in words.items() if word.cost is not None}
+    every = {
+        body: "agents that have found it" if name in found else "agents that search" for body, name in enumerate(names)
+    }
+    if outcome.by:
+        every[names.index(outcome.by)] = "the one that goes"
+    return every

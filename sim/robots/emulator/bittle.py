@@ -1,0 +1,322 @@
+"""Bittle: the robot's side of OpenCat, on a cable or behind its web server, over a body that the yard moves."""
+
+from __future__ import annotations
+
+import math
+import random
+import re
+from collections import deque
+from collections.abc import Callable, Mapping
+from typing import Any
+from urllib.parse import parse_qs, unquote_to_bytes, urlsplit
+
+from twisted.internet.interfaces import IReactorTime
+
+from drivers.bittle.codec import END_BYTES, END_TEXT
+from drivers.bittle.gait import GAITS, Velocity
+from drivers.bittle.option import BEHAVIOURS, POSTURES
+from drivers.link import Link
+from drivers.reading import Value
+from middleware.faults.stream import StreamFaults
+from sim.robots.emulator.body import Body
+from sim.robots.emulator.outlet import Outlet
+
+VERSIONS = {"biboard": "B10_250712", "nyboard": "N_250224"}
+UNFINISHED_S = 0.01
+"""A command without its end is taken after so long a silence."""
+BOOT_S = 1.5
+POSTURE_S, BEHAVIOUR_S = 0.1, 1.0
+NYBOARD_S = 0.04
+"""The web server of a NyBoard returns what was said within so long."""
+MAX_REQUEST = 4096
+MAX_TASKS = 50
+"""So many tasks are remembered; asking for an older one is an error, as on the board."""
+FAR_DEGREES = 270
+"""No joint is asked to turn farther; the firmware clips what it is told."""
+NEVER = frozenset("csa!")
+"""Tokens that change the robot for good, which a driver never sends."""
+
+
+class Bittle:
+    """One dog; ``accept`` is its serial port, ``accept_http`` its web server.
+
+    ``faults`` spoils what it says; ``resets`` says whether opening the port starts the board anew, as most do.
+    ``heard`` are the commands that it took, in their order.
+    """
+
+    def __init__(
+        self,
+        body: Body,
+        clock: IReactorTime,
+        rng: random.Random,
+        faults: StreamFaults | None = None,
+        board: str = "biboard",
+        resets: bool = False,
+        gaits: Mapping[str, Velocity] = GAITS,
+    ) -> None:
+        self.faults = StreamFaults() if faults is None else faults
+        self.board = board
+        self.heard: list[bytes] = []
+        self.joints = [0] * 16
+        self.tasks: dict[str, list[str]] = {}
+        self.begun = 0
+        self.said: list[str] = []
+        self.is_limp = True
+        self.clock = clock
+        self._body = body
+        self._rng = rng
+        self._resets = resets
+        self._gaits = gaits
+        self._outlet = Outlet(clock, rng, self.faults)
+        self._rest = bytearray()
+        self._unfinished: Any = None
+        self._boot: Any = None
+        self._busy: Any = None
+        self._queue: deque[tuple[bytes, Callable[[str], None]]] = deque()
+
+    def accept(self, link: Link) -> Bittle:
+        """Plug a cable in."""
+        self._outlet.link = link
+        if self._resets:
+            self.reboot()
+        return self
+
+    def accept_http(self, link: Link) -> BittlePage:
+        """Take a connection to its web server."""
+        return BittlePage(self, link, self._rng)
+
+    def received(self, data: bytes) -> None:
+        """Hear what comes over the cable."""
+        if self._boot is not None:
+            return
+        self._rest += data
+        self._cancel("_unfinished")
+        while self._rest:
+            end = END_BYTES if 65 <= self._rest[0] <= 90 else END_TEXT
+            at = self._rest.find(end)
+            if at < 0:
+                self._unfinished = self.clock.callLater(UNFINISHED_S, self._on_unfinished)
+                return
+            command = bytes(self._rest[:at])
+            del self._rest[: at + 1]
+            self.execute(command, self._say)
+
+    def link_down(self) -> None:
+        """The cable is out; a gait goes on."""
+        self._outlet.link = None
+
+    def reboot(self) -> None:
+        """Start anew: it lies down at once, is deaf for a while, and greets."""
+        self.stop()
+        self._rest.clear()
+        self._queue.clear()
+        self._boot = self.clock.callLater(BOOT_S, self._on_booted)
+
+    def stop(self) -> None:
+        """End; nothing is left on the clock."""
+        self._body.halt()
+        self.is_limp = True
+        for name in ("_unfinished", "_boot", "_busy"):
+            self._cancel(name)
+
+    def execute(self, command: bytes, say: Callable[[str], None]) -> None:
+        """Do a command, after those before it; ``say`` gets each line of the answer."""
+        if self._boot is not None:
+            return
+        self._queue.append((command, say))
+        if self._busy is None:
+            self._next()
+
+    # -- inside -----------------------------------------------------------------------------------------------------
+
+    def _cancel(self, name: str) -> None:
+        timer = getattr(self, name)
+        setattr(self, name, None)
+        if timer is not None and timer.active():
+            timer.cancel()
+
+    def _on_unfinished(self) -> None:
+        self._unfinished = None
+        command = bytes(self._rest)
+        self._rest.clear()
+        self.execute(command, self._say)
+
+    def _on_booted(self) -> None:
+        self._boot = None
+        for line in ("k", "* Start *", "Bittle", f"Software version: {VERSIONS[self.board]}"):
+            self._say(line)
+
+    def _say(self, line: str) -> None:
+        self._outlet.send(line.encode() + b"\r\n")
+
+    def _next(self) -> None:
+        while self._queue and self._busy is None:
+            command, say = self._queue.popleft()
+            if command:
+                self.heard.append(command)
+                self._do(chr(command[0]), command[1:], say)
+
+    def _later(self, seconds: float, say: Callable[[str], None], *lines: str) -> None:
+        def done() -> None:
+            self._busy = None
+            for line in lines:
+                say(line)
+            self._next()
+
+        self._busy = self.clock.callLater(seconds, done)
+
+    def _do(self, token: str, argument: bytes, say: Callable[[str], None]) -> None:
+        answer: list[str] = []
+        if token == "k":
+            self._do_skill(argument.decode("latin-1").strip(), say)
+            return
+        if token == "d":
+            self._body.halt()
+            self.is_limp = True
+            self._later(POSTURE_S, say, "g", "d")
+            return
+        if token in "im":
+            numbers = [int(one) for one in re.findall(rb"-?\d+", argument)]
+            for joint, angle in zip(numbers[::2], numbers[1::2], strict=False):
+                if 0 <= joint < 16:
+                    self.joints[joint] = min(max(angle, -FAR_DEGREES), FAR_DEGREES)
+        elif token in "IM":
+            for joint, angle in zip(argument[::2], argument[1::2], strict=False):
+                if joint < 16:
+                    self.joints[joint] = angle - 256 if angle > 127 else angle
+        elif token == "L" and len(argument) == 16:
+            self.joints = [angle - 256 if angle > 127 else angle for angle in argument]
+        elif token == "j":
+            answer = self._told_joints()
+        elif (token == "g" and argument == b"p") or (token == "v" and self.board == "nyboard"):
+            answer = [self._told_attitude()]
+        elif token == "P" and self.board == "biboard":
+            level = float(self._body.sense().get("power.level", 1.0))
+            answer = [f"Voltage: {6.8 + 1.6 * level:.2f} V"]
+        elif token == "X" and argument[:1] == b"U":
+            distance = float(self._body.sense().get("range.near", math.nan))
+            answer = ["=", f"{min(200, distance * 100):.0f}" if math.isfinite(distance) else "0"]
+        elif token == "?":
+            answer = ["Bittle", f"Software version: {VERSIONS[self.board]}"]
+        for line in (*answer, token):
+            say(line)
+
+    def _do_skill(self, name: str, say: Callable[[str], None]) -> None:
+        velocity = self._gaits.get(name)
+        if velocity is not None:
+            self.is_limp = False
+            self._body.drive(velocity.vx, 0.0, velocity.wz)
+            say(name)
+            say("k")
+        elif name in POSTURES:
+            self.is_limp = False
+            self._body.halt()
+            self._later(POSTURE_S, say, name, "k")
+        elif name in BEHAVIOURS:
+            self.is_limp = False
+            self._body.halt()
+            self._later(BEHAVIOUR_S, say, name, "k")
+        else:
+            say(f"?{name}?")
+            say("k")
+
+    def _told_joints(self) -> list[str]:
+        numbers = "\t".join(str(one) for one in range(16))
+        angles = "".join(f"{angle},\t" for angle in self.joints)
+        return ["=", numbers, angles] if self.board == "biboard" else [f"={numbers}", angles]
+
+    def _told_attitude(self) -> str:
+        sensed = self._body.sense()
+
+        def degrees(key: str) -> float:
+            value: Value = sensed.get(key, 0.0)
+            return math.degrees(float(value))
+
+        roll, pitch, yaw = degrees("imu.roll"), degrees("imu.pitch"), degrees("odom.yaw")
+        if self.board == "nyboard":
+            return f"{pitch:.5f}\t{roll:.5f}\t0.00000\t0.00000\t9.80000"
+        return f"ICM:{0.0:6.1f}{0.0:6.1f}{9.8:6.1f}{yaw:6.1f}{pitch:6.1f}{roll:6.1f}"
+
+
+class BittlePage:
+    """One connection to the web server of a dog."""
+
+    def __init__(self, robot: Bittle, link: Link, rng: random.Random) -> None:
+        self._robot = robot
+        self._link = link
+        self._rng = rng
+        self._data = b""
+
+    def received(self, data: bytes) -> None:
+        """Hear a request."""
+        self._data += data
+        if b"\r\n\r\n" not in self._data:
+            if len(self._data) > MAX_REQUEST:
+                self._link.close()
+            return
+        words, self._data = self._data.split(b" ", 2), b""
+        try:
+            where = urlsplit(words[1].decode("latin-1"))
+        except (IndexError, ValueError):
+            self._respond("400 Bad Request", "")
+            return
+        raw = where.query.partition("=")[2].partition("&")[0]
+        if self._robot.board == "nyboard" and where.path == "/action":
+            self._act(unquote_to_bytes(raw))
+        elif self._robot.board == "biboard" and where.path == "/cmd" and raw:
+            self._begin(unquote_to_bytes(raw))
+        elif self._robot.board == "biboard" and where.path == "/status":
+            self._tell(parse_qs(where.query).get("taskId", [""])[0])
+        else:
+            self._respond(
+                "400 Bad Request" if where.path == "/cmd" and self._robot.board == "biboard" else "404 Not Found", ""
+            )
+
+    def link_down(self) -> None:
+        """The client has gone."""
+
+    def _act(self, command: bytes) -> None:
+        # What comes later waits in the dongle for the next request.
+        said = self._robot.said
+        self._robot.execute(command.removesuffix(END_BYTES), said.append)
+        self._robot.clock.callLater(NYBOARD_S, self._tell_all)
+
+    def _tell_all(self) -> None:
+        said = self._robot.said
+        text = "\r\n".join([*said, ""])
+        said.clear()
+        self._respond("200 OK", text)
+
+    def _begin(self, command: bytes) -> None:
+        tasks = self._robot.tasks
+        number = str(1000 + self._robot.begun)
+        self._robot.begun += 1
+        lines: list[str] = []
+        tasks[number] = lines
+        if len(tasks) > MAX_TASKS:
+            del tasks[next(iter(tasks))]
+        token = chr(command[0])
+
+        def say(line: str) -> None:
+            lines.append(line)
+            if line.lower() == token.lower():
+                lines.append("")
+
+        self._robot.execute(command.removesuffix(END_BYTES), say)
+        self._respond("200 OK", f"TASK_ID:{number}")
+
+    def _tell(self, number: str) -> None:
+        lines = self._robot.tasks.get(number)
+        if lines is None:
+            self._respond("200 OK", "error\nERROR: Task not found")
+        elif lines and not lines[-1]:
+            self._respond("200 OK", "completed\n" + "\r\n".join(lines[:-1]))
+        else:
+            self._respond("200 OK", "running\n")
+
+    def _respond(self, status: str, text: str) -> None:
+        head = (
+            f"HTTP/1.1 {status}\r\nContent-Type: text/plain\r\nContent-Length: {len(text)}\r\nConnection: close\r\n\r\n"
+        )
+        for piece in self._robot.faults.wire((head + text).encode(), self._rng):
+            self._link.send(piece)

@@ -1,0 +1,232 @@
+"""Create2: the robot's side of the Open Interface, over a body that the yard moves."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Mapping
+from typing import Any
+
+from twisted.internet.interfaces import IReactorTime
+
+from drivers.create2 import codec
+from drivers.link import Link
+from drivers.reading import Value
+from middleware.faults.stream import StreamFaults
+from sim.robots.emulator.body import Body
+from sim.robots.emulator.outlet import Outlet
+
+MM_PER_COUNT = math.pi * 72.0 / 508.8
+WHEEL_BASE = 235.0
+CAPACITY = 2696
+BOOT_S = 1.0
+BOOT_TEXT = b"bl-start\r\nSTR730\r\nbootloader id: #x47175347 6C7C0BFF\r\nr3_robot/tags/release-3.5.4\r\n"
+LIGHT_REACH = 0.35
+"""Metres within which the light bumpers see a wall."""
+DOCKING_SPEED = 0.1
+OFF, PASSIVE, SAFE, FULL = range(4)
+
+
+class Create2:
+    """One robot; ``accept`` is its serial port.  Without a cable it goes on as it was, as the real one does.
+
+    ``faults`` spoils what it says; ``reboot`` is a power cut; ``left`` and ``right`` are its wheel counters, in counts.
+    """
+
+    def __init__(self, body: Body, clock: IReactorTime, rng: random.Random, faults: StreamFaults | None = None) -> None:
+        self.faults = StreamFaults() if faults is None else faults
+        self.mode = OFF
+        self.left = self.right = 0.0
+        self.played: list[int] = []
+        self._body = body
+        self._clock = clock
+        self._outlet = Outlet(clock, rng, self.faults)
+        self._reader = codec.CommandReader()
+        self._ids: tuple[int, ...] = ()
+        self._streams = False
+        self._is_docking = False
+        self._songs: set[int] = set()
+        self._wheels = (0, 0)
+        self._place = self._pose()
+        self._boot: Any = None
+        self._tick: Any = clock.callLater(codec.FRAME_S, self._on_tick)
+
+    def accept(self, link: Link) -> Create2:
+        """Plug a cable in."""
+        self._outlet.link = link
+        return self
+
+    def received(self, data: bytes) -> None:
+        """Hear what comes over the cable."""
+        if self._boot is None:
+            for command in self._reader.read(data):
+                self._on_command(command)
+
+    def link_down(self) -> None:
+        """The cable is out."""
+        self._outlet.link = None
+
+    def reboot(self) -> None:
+        """Cut its power for a moment: it stands, says its boot text, is off, and has forgotten its stream."""
+        self._rest()
+        self.mode, self._ids, self._streams = OFF, (), False
+        self.left = self.right = 0.0
+        self._reader = codec.CommandReader()
+        if self._boot is not None:
+            self._boot.cancel()
+        self._boot = self._clock.callLater(BOOT_S, self._on_booted)
+
+    def stop(self) -> None:
+        """End; nothing is left on the clock."""
+        self._rest()
+        for timer in (self._tick, self._boot):
+            if timer is not None and timer.active():
+                timer.cancel()
+
+    # -- inside -----------------------------------------------------------------------------------------------------
+
+    def _on_booted(self) -> None:
+        self._boot = None
+        self._outlet.send(BOOT_TEXT)
+
+    def _on_command(self, command: codec.Command) -> None:
+        if command.opcode == codec.RESET:
+            self.reboot()
+        elif command.opcode == codec.START:
+            self._rest()
+            self.mode = PASSIVE
+        elif self.mode != OFF:
+            self._on_interface(command)
+
+    def _on_interface(self, command: codec.Command) -> None:
+        match command.opcode:
+            case 130 | codec.SAFE:
+                self._rest()
+                self.mode = SAFE
+                self._guard(self._body.sense())
+            case codec.FULL:
+                self._rest()
+                self.mode = FULL
+            case codec.STOP:
+                self._rest()
+                self.mode, self._streams = OFF, False
+            case codec.DOCK:
+                self._rest()
+                self.mode, self._is_docking = PASSIVE, True
+                self._body.drive(DOCKING_SPEED, 0.0, 0.0)
+            case 133 | 134 | codec.CLEAN | 136:
+                self._rest()
+                self.mode = PASSIVE
+            case codec.STREAM:
+                self._ids = tuple(one for one in command.data[1:] if one in codec.PACKETS)
+                self._streams = bool(self._ids)
+            case codec.PAUSE:
+                self._streams = bool(command.data[0]) and bool(self._ids)
+            case codec.SENSORS:
+                self._answer(command.data)
+            case codec.QUERY:
+                self._answer(command.data[1:])
+            case codec.SONG:
+                self._songs.add(command.data[0])
+            case _ if self.mode in (SAFE, FULL):
+                self._on_actuators(command)
+
+    def _on_actuators(self, command: codec.Command) -> None:
+        if command.opcode == codec.DIRECT:
+            self._turn(*command.words)
+        elif command.opcode == codec.DRIVE:
+            velocity, radius = command.words
+            if radius in (codec.STRAIGHT, 0x7FFF):
+                self._turn(velocity, velocity)
+            elif radius in (1, -1):
+                self._turn(velocity * radius, -velocity * radius)
+            elif radius:
+                bend = WHEEL_BASE / 2.0 / radius
+                self._turn(round(velocity * (1.0 + bend)), round(velocity * (1.0 - bend)))
+        elif command.opcode == codec.PLAY and command.data[0] in self._songs:
+            self.played.append(command.data[0])
+
+    def _turn(self, right: int, left: int) -> None:
+        top = codec.TOP_SPEED
+        right, left = (min(max(wheel, -top), top) for wheel in (right, left))
+        self._wheels = (right, left)
+        self._body.drive((right + left) / 2000.0, 0.0, (right - left) / WHEEL_BASE)
+        self._guard(self._body.sense())
+
+    def _rest(self) -> None:
+        self._wheels = (0, 0)
+        self._is_docking = False
+        self._body.halt()
+
+    def _answer(self, ids: bytes) -> None:
+        known = [one for one in ids if one in codec.PACKETS or one in codec.GROUPS]
+        packets = self._packets(self._body.sense())
+        self._outlet.send(b"".join(codec.packed(one, packets) for one in known))
+
+    def _on_tick(self) -> None:
+        self._tick = self._clock.callLater(codec.FRAME_S, self._on_tick)
+        self._roll()
+        sensed = self._body.sense()
+        self._guard(sensed)
+        if self._is_docking and sensed.get("power.charging", False):
+            self._rest()
+        if self._streams and self._boot is None:
+            self._outlet.send(codec.stream_frame(self._ids, self._packets(sensed)))
+
+    def _guard(self, sensed: Mapping[str, Value]) -> None:
+        """Leave safe mode where a real one does: a ledge ahead, a wheel in the air, a charger."""
+        if self.mode != SAFE:
+            return
+        ahead = sum(self._wheels) > 0
+        ledge = any(sensed.get(f"cliff.{name}", False) for name in ("left", "front_left", "front_right", "right"))
+        drop = any(sensed.get(f"wheeldrop.{name}", False) for name in ("left", "right"))
+        if drop or (ledge and ahead) or sensed.get("power.charging", False):
+            self._rest()
+            self.mode = PASSIVE
+
+    def _pose(self) -> tuple[float, float, float]:
+        sensed = self._body.sense()
+        x, y, yaw = (float(sensed.get(key, 0.0)) for key in ("odom.x", "odom.y", "odom.yaw"))
+        return x, y, yaw
+
+    def _roll(self) -> None:
+        """Count what the wheels have turned since the tick before."""
+        (old_x, old_y, old_yaw), self._place = self._place, self._pose()
+        x, y, yaw = self._place
+        turn = math.remainder(yaw - old_yaw, math.tau)
+        middle = old_yaw + turn / 2.0
+        ahead = 1000.0 * ((x - old_x) * math.cos(middle) + (y - old_y) * math.sin(middle))
+        self.left += (ahead - turn * WHEEL_BASE / 2.0) / MM_PER_COUNT
+        self.right += (ahead + turn * WHEEL_BASE / 2.0) / MM_PER_COUNT
+
+    def _packets(self, sensed: Mapping[str, Value]) -> dict[str, int]:
+        def flag(key: str) -> int:
+            return int(bool(sensed.get(key, False)))
+
+        charging = flag("power.charging")
+        packets = {
+            "bumps": flag("bump.right")
+            | flag("bump.left") << 1
+            | flag("wheeldrop.right") << 2
+            | flag("wheeldrop.left") << 3,
+            "charging_state": 2 * charging,
+            "charger": 2 * charging,
+            "voltage": 15200,
+            "current": 600 if charging else -300,
+            "temperature": 25,
+            "charge": round(CAPACITY * float(sensed.get("power.level", 1.0))),
+            "capacity": CAPACITY,
+            "mode": self.mode,
+            "left_encoder": math.floor(self.left) & 0xFFFF,
+            "right_encoder": math.floor(self.right) & 0xFFFF,
+            "right_velocity": self._wheels[0],
+            "left_velocity": self._wheels[1],
+        }
+        for name in ("left", "front_left", "front_right", "right"):
+            packets[f"cliff_{name}"] = flag(f"cliff.{name}")
+            packets[f"cliff_{name}_signal"] = 0 if flag(f"cliff.{name}") else 2500
+        distance = float(sensed.get("range.near", math.nan))
+        if distance < LIGHT_REACH:
+            strength = round(4095 * (1.0 - max(distance, 0.0) / LIGHT_REACH))
+            packets |= {"light_center_left": strength, "light_center_right": strength, "light_bumper": 0b001100}
+        return packets

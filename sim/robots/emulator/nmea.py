@@ -1,0 +1,78 @@
+"""NmeaCompass: a digital compass that tells a body's heading by NMEA 0183, to a cable or to any number of clients."""
+
+from __future__ import annotations
+
+import math
+import random
+
+from twisted.internet.interfaces import IReactorTime
+
+from drivers.compass.codec import eastward, sentence
+from drivers.link import Link
+from middleware.faults.stream import StreamFaults
+from sim.robots.emulator.body import Body
+from sim.robots.emulator.broadcast import Broadcast
+from sim.robots.emulator.outlet import Outlet
+
+
+class NmeaCompass(Broadcast["_Client"]):
+    """One compass; ``accept`` takes a cable or a client.  North is along the yard's y axis.
+
+    ``kinds`` are the sentences that it sends each time.  Its needle is off by ``deviation``, and the place's magnetic
+    north by ``variation``, degrees to the east; ``HDG`` tells both, ``HDM`` the needle without its deviation.  A body
+    without ``compass.heading`` has an empty field.  ``faults`` spoils what it says.
+    """
+
+    def __init__(
+        self,
+        clock: IReactorTime,
+        body: Body,
+        rate: float = 10.0,
+        rng: random.Random | None = None,
+        faults: StreamFaults | None = None,
+    ) -> None:
+        super().__init__(clock, body, rate, rng, faults)
+        self.kinds: tuple[str, ...] = ("HDG",)
+        self.deviation = 0.0
+        self.variation = 0.0
+
+    def accept(self, link: Link) -> _Client:
+        """Take a client."""
+        outlet = Outlet(self._clock, self._rng, self.faults)
+        outlet.link = link
+        client = _Client(self, link, outlet)
+        self.clients.append(client)
+        return client
+
+    def _tell(self) -> None:
+        heading = self._body.sense().get("compass.heading")
+        true = math.nan if heading is None else 90.0 - math.degrees(float(heading))
+        said = b"".join(self._sentence(kind, true) for kind in self.kinds)
+        for client in self.clients:
+            if not client.link.is_busy:
+                client.outlet.send(said)
+
+    def _sentence(self, kind: str, true: float) -> bytes:
+        off = {"HDG": self.variation + self.deviation, "HDM": self.variation}.get(kind, 0.0)
+        # Rounded first: 359.96 is 0.0, and not 360.0.
+        degrees = "" if math.isnan(true) else f"{round(true - off, 1) % 360.0:.1f}"
+        if kind == "HDG":
+            return sentence("HCHDG", degrees, *eastward(self.deviation), *eastward(self.variation))
+        return sentence(f"HC{kind}", degrees, kind[2])
+
+
+class _Client:
+    """Who listens."""
+
+    def __init__(self, compass: NmeaCompass, link: Link, outlet: Outlet) -> None:
+        self.link = link
+        self.outlet = outlet
+        self._compass = compass
+
+    def received(self, data: bytes) -> None:
+        """Hear nothing: a compass takes no commands."""
+
+    def link_down(self) -> None:
+        """The client has gone."""
+        self.outlet.link = None
+        self._compass.leave(self)

@@ -1,0 +1,331 @@
+"""A ROS robot's side of the wire: a rosbridge server with a base, a scanner, a battery and a camera behind it."""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+from collections.abc import Iterator, Mapping
+from random import Random
+from typing import Any
+
+from twisted.internet.interfaces import IReactorTime
+
+from drivers.link import Link, Receiver
+from drivers.reading import Value
+from drivers.rosbridge.websocket import WebSocket
+from middleware.faults.stream import StreamFaults
+from sim.robots.emulator.body import Body
+
+BASE_STOPS_S = 0.5
+"""A base that hears no velocity for so long stands still, as those of most robots do."""
+TICK_S = 0.02
+TYPE_SERVICE = "/rosapi/topic_type"
+BEAMS = 24
+RANGE_MIN, RANGE_MAX = 0.05, 3.5
+ASIDE = {"left": math.pi / 2, "right": -math.pi / 2, "back": math.pi}
+"""Where a body's ranger of that name looks; the others look ahead."""
+DOWN = "chest"
+"""A body's ranger that looks at the floor: what it sees stands in nobody's way."""
+TOPICS: Mapping[str, tuple[str, float]] = {
+    "/odom": ("nav_msgs/Odometry", 25.0),
+    "/scan": ("sensor_msgs/LaserScan", 5.0),
+    "/imu": ("sensor_msgs/Imu", 25.0),
+    "/battery_state": ("sensor_msgs/BatteryState", 1.0),
+    "/camera/image_raw/compressed": ("sensor_msgs/CompressedImage", 12.5),
+}
+"""What the robot publishes: its type, and how often a second."""
+
+
+class RosbridgeRobot:
+    """One robot; ``accept`` is what a listening port or a ``MemoryConnector`` calls.
+
+    ``velocity_type`` is what its base listens to on ``/cmd_vel``; any other is silently ignored, as ROS does.
+    ``has_rosapi`` says whether somebody may ask for that, ``rosapi_s`` how long that takes; ``ignored`` counts what
+    the base did not understand.
+    """
+
+    def __init__(
+        self,
+        clock: IReactorTime,
+        body: Body,
+        rng: Random,
+        faults: StreamFaults | None = None,
+        velocity_type: str = "geometry_msgs/msg/Twist",
+        has_rosapi: bool = True,
+    ) -> None:
+        self.faults = faults or StreamFaults()
+        self.velocity_type = velocity_type
+        self.has_rosapi = has_rosapi
+        self.rosapi_s = 0.0
+        self.has_motor_power = True
+        self.ignored = 0
+        self.heard: list[dict[str, Any]] = []
+        self._clock = clock
+        self._body = body
+        self._rng = rng
+        self._clients: list[_Client] = []
+        self._ticks = 0
+        self._booted_at = clock.seconds()
+        self._pending: Any = None
+        self._stop: Any = None
+
+    def start(self) -> None:
+        """Begin to publish."""
+        self._pending = self._clock.callLater(TICK_S, self._on_tick)
+
+    def stop(self) -> None:
+        """End for good."""
+        self._hang_up()
+        if self._pending is not None:
+            self._pending.cancel()
+            self._pending = None
+
+    def reboot(self) -> None:
+        """Lose all connections, the motion, and the clock, which begins again at 0."""
+        self._hang_up()
+        self._booted_at = self._clock.seconds()
+        self._ticks = 0
+
+    def accept(self, link: Link) -> Receiver:
+        """Take a client; a rosbridge serves many."""
+        client = _Client(self, link)
+        self._clients.append(client)
+        return client
+
+    # -- for its clients --------------------------------------------------------------------------------------------
+
+    def send(self, link: Link, data: bytes) -> None:
+        """Let some bytes leave as the wire has them."""
+        for piece in self.faults.wire(data, self._rng):
+            if self.faults.delay > 0:
+                self._clock.callLater(self.faults.delay, link.send, piece)
+            else:
+                link.send(piece)
+
+    def call(self, client: _Client, name: str, arguments: Any, number: object) -> None:
+        """Answer a call, as late as this service does."""
+
+        def answer() -> None:
+            is_done, values = self.service(name, arguments)
+            said = {"op": "service_response", "service": name, "values": values, "result": is_done}
+            client.say(said if number is None else {**said, "id": number})
+
+        if name == TYPE_SERVICE and self.rosapi_s > 0:
+            self._clock.callLater(self.rosapi_s, answer)
+        else:
+            answer()
+
+    def forget(self, client: _Client) -> None:
+        """A client has gone; the base learns nothing of that."""
+        if client in self._clients:
+            self._clients.remove(client)
+
+    def command(self, topic: str, kind: str, message: Mapping[str, Any]) -> None:
+        """Somebody has published a message of this type."""
+        if topic != "/cmd_vel" or kind.replace("/msg/", "/") != self.velocity_type.replace("/msg/", "/"):
+            self.ignored += 1
+            return
+        twist = message.get("twist", {}) if kind.endswith("TwistStamped") else message
+        try:
+            linear, angular = twist["linear"], twist["angular"]
+            vx, vy, wz = float(linear["x"]), float(linear.get("y", 0.0)), float(angular["z"])
+        except (KeyError, TypeError, ValueError, AttributeError):
+            self.ignored += 1
+            return
+        if self._stop is not None:
+            self._stop.cancel()
+            self._stop = None
+        if not self.has_motor_power or not all(map(math.isfinite, (vx, vy, wz))):
+            self._body.halt()
+            return
+        self._body.drive(vx, vy, wz)
+        if vx or vy or wz:
+            self._stop = self._clock.callLater(BASE_STOPS_S, self._on_no_command)
+
+    def service(self, name: str, arguments: Any) -> tuple[bool, Any]:
+        """Whether a service answers, and what."""
+        if name == TYPE_SERVICE and self.has_rosapi:
+            topic = str(arguments.get("topic")) if isinstance(arguments, dict) else ""
+            if topic == "/cmd_vel":
+                return True, {"type": self.velocity_type}
+            return True, {"type": TOPICS[topic][0].replace("/", "/msg/") if topic in TOPICS else ""}
+        if name == "/motor_power":
+            self.has_motor_power = bool(isinstance(arguments, dict) and arguments.get("data"))
+            if not self.has_motor_power:
+                self._body.halt()
+            return True, {"success": True, "message": ""}
+        if name == "/dock":
+            return True, {"success": True, "message": "docked"}
+        return False, f"Service {name} does not exist"
+
+    # -- inside -----------------------------------------------------------------------------------------------------
+
+    def _hang_up(self) -> None:
+        if self._stop is not None:
+            self._stop.cancel()
+            self._stop = None
+        self._body.halt()
+        for client in list(self._clients):
+            client.link.close()
+
+    def _on_no_command(self) -> None:
+        self._stop = None
+        self._body.halt()
+
+    def _on_tick(self) -> None:
+        self._pending = self._clock.callLater(TICK_S, self._on_tick)
+        self._ticks += 1
+        for topic, (_, rate) in TOPICS.items():
+            every = round(1 / rate / TICK_S)
+            if self._ticks % every == 0 or (self._ticks == 1 and rate <= 1):
+                wanting = [client for client in self._clients if client.wants(topic, self._clock.seconds())]
+                if wanting and (message := self._message(topic)) is not None:
+                    for client in wanting:
+                        client.say({"op": "publish", "topic": topic, "msg": message})
+
+    def _message(self, topic: str) -> dict[str, Any] | None:
+        seen = self._body.sense()
+        nanos = round((self._clock.seconds() - self._booted_at) * 1e9)
+        header = {"stamp": {"sec": nanos // 10**9, "nanosec": nanos % 10**9}, "frame_id": topic[1:5]}
+        match topic:
+            case "/odom":
+                return {"header": header, "child_frame_id": "base_footprint", **_odometry(seen)}
+            case "/scan":
+                return {"header": header, **_scan(seen)}
+            case "/imu":
+                pull = {axis: _real(seen.get(f"imu.a{axis}"), 9.8 if axis == "z" else 0.0) for axis in "xyz"}
+                turn = {"x": 0.0, "y": 0.0, "z": _real(seen.get("base.wz"))}
+                attitude = _quaternion(_real(seen.get("odom.yaw")))
+                return {"header": header, "orientation": attitude, "orientation_covariance": [0.0] * 9} | {
+                    "angular_velocity": turn,
+                    "linear_acceleration": pull,
+                }
+            case "/battery_state":
+                level = _real(seen.get("power.level"), 1.0)
+                volts = _real(seen.get("power.volts"), 11.0 + 1.6 * level)
+                # The current is not measured: NaN, which goes over this wire as null.
+                return {"header": header, "voltage": volts, "current": None, "percentage": level} | {
+                    "power_supply_status": 1 if seen.get("power.charging") else 2,
+                    "present": True,
+                }
+        jpeg = self._body.picture()
+        if jpeg is None:
+            return None
+        return {"header": header, "format": "bgr8; jpeg compressed bgr8", "data": base64.b64encode(jpeg).decode()}
+
+
+class _Client:
+    """One connection."""
+
+    def __init__(self, robot: RosbridgeRobot, link: Link) -> None:
+        self.link = link
+        self._robot = robot
+        self._socket = WebSocket(lambda size: bytes(size), is_client=False)
+        self._topics: dict[str, dict[str, tuple[float, float]]] = {}
+        self._types: dict[str, str] = {}
+
+    def wants(self, topic: str, now: float) -> bool:
+        """Whether a message on ``topic`` is due for it."""
+        due = False
+        for sid, (period, next_at) in self._topics.get(topic, {}).items():
+            if now >= next_at - 1e-6:
+                self._topics[topic][sid] = (period, now + period)
+                due = True
+        return due
+
+    def say(self, message: Mapping[str, Any]) -> None:
+        """Send one message."""
+        self._robot.send(self.link, self._socket.text(json.dumps(message).encode()))
+
+    def received(self, data: bytes) -> None:
+        """Take bytes from the client."""
+        if self._robot.faults.half_open:
+            return
+        messages, reply = self._socket.received(data)
+        if reply:
+            self._robot.send(self.link, reply)
+        for message in messages:
+            for answer in self._answers(message):
+                self.say(answer)
+        if self._socket.fault:
+            self.link.close()
+
+    def link_down(self) -> None:
+        """Learn that the client is gone."""
+        self._robot.forget(self)
+
+    def _answers(self, payload: bytes) -> Iterator[dict[str, Any]]:
+        try:
+            said = json.loads(payload)
+            op = said["op"]
+        except (ValueError, KeyError, TypeError, RecursionError):
+            yield {"op": "status", "level": "error", "msg": f"Unable to deserialize message: {payload[:60]!r}"}
+            return
+        self._robot.heard.append(said)
+        del self._robot.heard[:-1000]
+        topic, sid = str(said.get("topic", "")), str(said.get("id", ""))
+        match op:
+            case "advertise":
+                self._types[topic] = str(said.get("type", ""))
+            case "unadvertise":
+                self._types.pop(topic, None)
+            case "publish":
+                message = said.get("msg")
+                self._robot.command(topic, self._types.get(topic, ""), message if isinstance(message, dict) else {})
+            case "subscribe":
+                period = _real(said.get("throttle_rate")) / 1000
+                self._topics.setdefault(topic, {})[sid] = (period, 0.0)
+            case "unsubscribe":
+                if sid:
+                    self._topics.get(topic, {}).pop(sid, None)
+                else:
+                    self._topics.pop(topic, None)
+            case "call_service":
+                self._robot.call(self, str(said.get("service", "")), said.get("args"), said.get("id"))
+            case "set_level" | "status" | "auth":
+                pass
+            case _:
+                yield {"op": "status", "level": "error", "msg": f"Unknown operation: {str(op)[:40]}.  Ignoring it."}
+
+
+def _odometry(seen: Mapping[str, Value]) -> dict[str, Any]:
+    place = {"x": _real(seen.get("odom.x")), "y": _real(seen.get("odom.y")), "z": 0.0}
+    linear = {"x": _real(seen.get("base.vx")), "y": _real(seen.get("base.vy")), "z": 0.0}
+    turn = {"x": 0.0, "y": 0.0, "z": _real(seen.get("base.wz"))}
+    pose = {"position": place, "orientation": _quaternion(_real(seen.get("odom.yaw")))}
+    unknown = [0.0] * 36
+    return {
+        "pose": {"pose": pose, "covariance": unknown},
+        "twist": {"twist": {"linear": linear, "angular": turn}, "covariance": unknown},
+    }
+
+
+def _scan(seen: Mapping[str, Value]) -> dict[str, Any]:
+    beams = [math.inf] * BEAMS
+    step = math.tau / BEAMS
+    for key, value in seen.items():
+        name = key.removeprefix("range.")
+        if name in (key, DOWN) or math.isnan(far := _real(value, math.nan)):
+            continue
+        place = round(ASIDE.get(name, 0.0) / step) % BEAMS
+        beams[place] = min(beams[place], far)
+    return {
+        "angle_min": 0.0,
+        "angle_max": step * (BEAMS - 1),
+        "angle_increment": step,
+        "time_increment": 0.0,
+        "scan_time": 0.2,
+        "range_min": RANGE_MIN,
+        "range_max": RANGE_MAX,
+        "ranges": [far if RANGE_MIN <= far <= RANGE_MAX else None for far in beams],
+        "intensities": [],
+    }
+
+
+def _quaternion(yaw: float) -> dict[str, float]:
+    return {"x": 0.0, "y": 0.0, "z": math.sin(yaw / 2), "w": math.cos(yaw / 2)}
+
+
+def _real(value: object, default: float = 0.0) -> float:
+    return float(value) if isinstance(value, (int, float)) and not isinstance(value, bool) else default

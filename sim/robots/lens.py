@@ -1,0 +1,200 @@
+"""Lens: what a camera on a robot's nose makes of a place, and what all such cameras paint with.
+
+208x160 pixels, 56.9 by 45.2 degrees as on the ERS-7.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from random import Random
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.robots.mesh import Colour, Points
+from sim.robots.sensor import NOSE
+
+WIDTH, HEIGHT = 208, 160
+FOCAL_X = WIDTH / 2 / math.tan(math.radians(56.9) / 2)
+FOCAL_Y = HEIGHT / 2 / math.tan(math.radians(45.2) / 2)
+EYE = 0.19
+"""Metres of the lens above the floor."""
+QUALITY = 80
+NEAR_PLANE = 0.02
+SKIRTING_M = 0.03
+
+Image = NDArray[np.uint8]
+
+_WALLS: tuple[Colour, ...] = ((182, 176, 166), (170, 164, 154), (188, 182, 172), (164, 158, 149))
+_SKIRTING: Colour = (112, 106, 98)
+_BEYOND: Colour = (214, 208, 202)
+_SHADOW: Colour = (84, 104, 92)
+
+SEAMS = (1.0, 0.9, 0.72, 0.45, 0.1, -0.3, -0.62, -0.86, -1.0)
+"""Where the strips of the round target meet, as shares of its half width, from left to right."""
+REDS: tuple[Colour, ...] = (
+    (28, 18, 158),
+    (32, 22, 176),
+    (38, 28, 194),
+    (48, 38, 212),
+    (46, 36, 208),
+    (40, 30, 200),
+    (34, 24, 184),
+    (29, 19, 164),
+)
+_RING = [(math.cos(turn * math.tau / 14), math.sin(turn * math.tau / 14)) for turn in range(14)]
+SUB_BITS = 4
+_NOISE_SHEETS = 8
+_SCALE = (-FOCAL_X * (1 << SUB_BITS), -FOCAL_Y * (1 << SUB_BITS))
+_MIDDLE = ((WIDTH / 2 - 0.5) * (1 << SUB_BITS), (HEIGHT / 2 - 0.5) * (1 << SUB_BITS))
+
+# One thread draws a frame in well under a millisecond; a pool of threads would only contend for the cores.
+cv2.setNumThreads(1)
+
+
+class View:
+    """What the lens on the nose of a robot at this place sees, in its own frame: forward, left, up."""
+
+    def __init__(self, x: float, y: float, heading: float) -> None:
+        self.cos, self.sin = math.cos(heading), math.sin(heading)
+        self.x, self.y = x + NOSE * self.cos, y + NOSE * self.sin
+        self._turn = np.array([(self.cos, -self.sin, 0.0), (self.sin, self.cos, 0.0), (0.0, 0.0, 1.0)])
+
+    def seen_one(self, x: float, y: float, z: float) -> list[float]:
+        """One point of the yard, from the lens."""
+        x, y = x - self.x, y - self.y
+        return [self.cos * x + self.sin * y, self.cos * y - self.sin * x, z - EYE]
+
+    def seen(self, points: Points) -> Points:
+        """Points of the yard, from the lens."""
+        moved: Points = (points - (self.x, self.y, EYE)) @ self._turn
+        return moved
+
+
+def pixels(seen: Points) -> NDArray[np.int32]:
+    """Where points before the near plane fall on the picture, in sixteenths of a pixel."""
+    places = np.empty((len(seen), 2))
+    np.divide(seen[:, 1:], seen[:, :1], out=places)
+    places *= _SCALE
+    places += _MIDDLE
+    return places.astype(np.int32)
+
+
+def filled(image: Image, seen: list[list[float]], colour: Colour) -> None:
+    """Fill a convex polygon of a few corners, clipped at the near plane; for so few, plain numbers beat arrays."""
+    if all(corner[0] < NEAR_PLANE for corner in seen):
+        return
+    if any(corner[0] < NEAR_PLANE for corner in seen):
+        seen = _clipped(seen)
+    (scale_x, scale_y), (middle_x, middle_y) = _SCALE, _MIDDLE
+    places = [(int(middle_x + scale_x * y / x), int(middle_y + scale_y * z / x)) for x, y, z in seen]
+    cv2.fillConvexPoly(image, np.array(places, np.int32), colour, cv2.LINE_AA, SUB_BITS)
+
+
+def _clipped(seen: list[list[float]]) -> list[list[float]]:
+    """What of a convex polygon lies beyond the near plane (Sutherland and Hodgman's rule for one plane)."""
+    kept = []
+    for one, other in zip(seen, seen[1:] + seen[:1], strict=True):
+        if one[0] >= NEAR_PLANE:
+            kept.append(one)
+        if (one[0] >= NEAR_PLANE) != (other[0] >= NEAR_PLANE):
+            share = (NEAR_PLANE - one[0]) / (other[0] - one[0])
+            kept.append([NEAR_PLANE, *(a + share * (b - a) for a, b in zip(one[1:], other[1:], strict=True))])
+    return kept
+
+
+def draw_shadow(image: Image, view: View, x: float, y: float, radius: float) -> None:
+    """Darken the floor under something round."""
+    ring = [view.seen_one(x + radius * cos, y + radius * sin, 0.0) for cos, sin in _RING]
+    filled(image, ring, _SHADOW)
+
+
+def draw_cylinder(
+    image: Image,
+    view: View,
+    x: float,
+    y: float,
+    radius: float,
+    height: float,
+    seams: Sequence[float] = SEAMS,
+    colours: Sequence[Colour] = REDS,
+) -> None:
+    """Draw an upright cylinder, at least as high as the lens, as strips between its two tangents.
+
+    The strips meet at ``seams``, shares of its half width, and have ``colours``, one less than seams.
+    """
+    ahead, left, _ = view.seen_one(x, y, 0.0)
+    distance, bearing = math.hypot(ahead, left), math.atan2(left, ahead)
+    half = math.asin(min(0.999, radius / max(distance, 1e-6)))
+    if abs(bearing) - half > math.radians(35.0):
+        return
+    draw_shadow(image, view, x, y, radius * 1.25)
+    edges = []
+    for share in seams:
+        off = half * share
+        edge = max(-1.4, min(1.4, bearing + off))
+        # The foot and the top are round: the middle of the cylinder is nearer than its tangents.
+        sagitta = math.sqrt(max(0.0, radius**2 - (distance * math.sin(off)) ** 2))
+        along = distance * math.cos(off) - sagitta
+        edges.append((max(along * math.cos(edge), NEAR_PLANE), along * math.sin(edge)))
+    for (ahead_1, left_1), (ahead_2, left_2), colour in zip(edges, edges[1:], colours, strict=False):
+        low, high = -EYE, height - EYE
+        strip = [[ahead_1, left_1, low], [ahead_2, left_2, low], [ahead_2, left_2, high], [ahead_1, left_1, high]]
+        filled(image, strip, colour)
+
+
+class Room:
+    """An empty room of ``width`` by ``depth`` metres, and the noise of a camera's chip, whose dice are ``rng``."""
+
+    def __init__(self, rng: Random, width: float, depth: float, wall_height: float) -> None:
+        self._rng = rng
+        dice = np.random.default_rng(rng.getrandbits(64))
+        self._noise = [
+            np.clip(dice.normal(8.0, 3.0, (HEIGHT, WIDTH, 3)), 0, 16).astype(np.uint8) for _ in range(_NOISE_SHEETS)
+        ]
+        self._backdrop = _backdrop()
+        corners = [(0.0, 0.0), (width, 0.0), (width, depth), (0.0, depth)]
+        self._quads = np.array(
+            [
+                corner
+                for (x1, y1), (x2, y2) in zip(corners, corners[1:] + corners[:1], strict=True)
+                for high in (wall_height, SKIRTING_M)
+                for corner in ((x1, y1, 0.0), (x2, y2, 0.0), (x2, y2, high), (x1, y1, high))
+            ]
+        )
+
+    def floor(self) -> Image:
+        """A new picture with the floor and the sky, and no walls yet."""
+        return self._backdrop.copy()
+
+    def draw_walls(self, image: Image, view: View) -> None:
+        """Draw the four walls."""
+        rows = view.seen(self._quads).tolist()
+        for number in range(0, len(rows), 8):
+            filled(image, rows[number : number + 4], _WALLS[number // 8])
+            filled(image, rows[number + 4 : number + 8], _SKIRTING)
+
+    def noisy(self, image: Image) -> Image:
+        """The picture as the chip delivers it."""
+        return np.asarray(cv2.add(image, self._noise[self._rng.randrange(_NOISE_SHEETS)]), dtype=np.uint8)
+
+
+def encoded(image: Image, is_halved: bool = False) -> bytes:
+    """The picture as a JPEG, with half the width and height if asked for."""
+    if is_halved:
+        image = np.asarray(cv2.resize(image, (WIDTH // 2, HEIGHT // 2), interpolation=cv2.INTER_AREA), np.uint8)
+    done, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    if not done:
+        raise RuntimeError("the picture cannot be encoded")
+    return data.tobytes()
+
+
+def _backdrop() -> Image:
+    """The room beyond the walls above the horizon, the floor below it, lighter towards the lens."""
+    image = np.empty((HEIGHT, WIDTH, 3), np.uint8)
+    image[:] = _BEYOND
+    ramp = np.linspace(0.0, 1.0, HEIGHT - HEIGHT // 2)[:, None]
+    image[HEIGHT // 2 :] = ((1 - ramp) * (104, 130, 116) + ramp * (126, 156, 140)).astype(np.uint8)[:, None, :]
+    return image

@@ -1,0 +1,204 @@
+"""Picture: the yard from above as a PNG, in the manner of the thesis' Figures 5.3 to 5.7."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sim.robots.mesh import Colour
+
+WIDTH, HEIGHT = 640, 520
+_FINE = 3
+"""Everything is drawn so many times larger and then shrunk: smooth edges without a vector library."""
+_MARGIN = 26
+_CAPTION = 40
+_FLOOR: Colour = (146, 172, 158)
+_JOINT: Colour = (134, 160, 146)
+_PAPER: Colour = (246, 245, 243)
+_WALL: Colour = (96, 92, 88)
+_EDGE: Colour = (70, 66, 62)
+_BODY: Colour = (240, 240, 238)
+_LEG: Colour = (176, 172, 168)
+_EAR: Colour = (60, 56, 54)
+_YELLOW: Colour = (20, 200, 250)
+_RED: Colour = (40, 34, 208)
+_INK: Colour = (48, 44, 42)
+_TRAILS: tuple[Colour, ...] = ((176, 110, 40), (60, 120, 40), (150, 50, 140), (40, 90, 170), (90, 90, 90))
+_FONT = cv2.FONT_HERSHEY_SIMPLEX
+
+Image = NDArray[np.uint8]
+Trail = Sequence[tuple[float, float]]
+
+
+def overhead(
+    snapshot: Mapping[str, Any],
+    width: int = WIDTH,
+    height: int = HEIGHT,
+    trails: Mapping[str, Trail] | None = None,
+    caption: str = "",
+) -> bytes:
+    """A PNG of ``width`` by ``height`` pixels of the yard's ``snapshot``, with the ways the dogs came and a caption."""
+    done, data = cv2.imencode(".png", overhead_image(snapshot, width, height, trails, caption))
+    if not done:
+        raise RuntimeError("the picture cannot be encoded")
+    return data.tobytes()
+
+
+def overhead_image(
+    snapshot: Mapping[str, Any],
+    width: int = WIDTH,
+    height: int = HEIGHT,
+    trails: Mapping[str, Trail] | None = None,
+    caption: str = "",
+) -> Image:
+    """The same as blue, green and red bytes."""
+    sheet = _Sheet(snapshot["walls"], width, height, caption)
+    sheet.draw_yard()
+    for number, dog in enumerate(snapshot["dogs"]):
+        sheet.draw_trail((trails or {}).get(dog["name"], ()), _TRAILS[number % len(_TRAILS)])
+    if snapshot["target"] is not None:
+        sheet.draw_target(snapshot["target"])
+    for dog in snapshot["dogs"]:
+        sheet.draw_dog(dog)
+    image = sheet.shrunk()
+    for dog in snapshot["dogs"]:
+        _draw_name(image, sheet, dog)
+    if caption:
+        _draw_caption(image, caption)
+    return image
+
+
+class _Sheet:
+    """A large drawing in metres: x to the right, y up."""
+
+    def __init__(self, walls: Sequence[float], width: int, height: int, caption: str) -> None:
+        self.room = (float(walls[0]), float(walls[1]))
+        below = _CAPTION if caption else 0
+        self.scale = min((width - 2 * _MARGIN) / self.room[0], (height - below - 2 * _MARGIN) / self.room[1])
+        self.left = (width - self.scale * self.room[0]) / 2
+        self.bottom = (height - below + self.scale * self.room[1]) / 2
+        self._size = (width, height)
+        self.image: Image = np.full((height * _FINE, width * _FINE, 3), _PAPER, np.uint8)
+
+    def place(self, x: float, y: float) -> tuple[float, float]:
+        """Where a point of the yard falls, in pixels of the finished picture."""
+        return self.left + self.scale * x, self.bottom - self.scale * y
+
+    def shrunk(self) -> Image:
+        """The finished picture."""
+        return np.asarray(cv2.resize(self.image, self._size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+    def draw_yard(self) -> None:
+        width, height = self.room
+        thick = 0.05
+        shade = [(0.03, -0.08), (width + 0.08, -0.08), (width + 0.08, height - 0.03), (0.03, height - 0.03)]
+        self._polygon(shade, (222, 220, 216))
+        outer = [(-thick, -thick), (width + thick, -thick), (width + thick, height + thick), (-thick, height + thick)]
+        self._polygon(outer, _WALL)
+        self._polygon([(0, 0), (width, 0), (width, height), (0, height)], _FLOOR)
+        for x in np.arange(0.3, width - 0.01, 0.3):
+            self._line([(x, 0), (x, height)], _JOINT, 0.006)
+        for y in np.arange(0.3, height - 0.01, 0.3):
+            self._line([(0, y), (width, y)], _JOINT, 0.006)
+        self._line([(0, 0), (width, 0), (width, height), (0, height), (0, 0)], _EDGE, 0.012)
+
+    def draw_trail(self, trail: Trail, colour: Colour) -> None:
+        if len(trail) > 1:
+            self._line(list(trail), colour, 0.014)
+            self._disc(*trail[0], 0.018, colour)
+
+    def draw_target(self, target: Mapping[str, float]) -> None:
+        x, y, radius = target["x"], target["y"], target["radius"]
+        self._disc(x + 0.02, y - 0.025, radius * 1.08, (118, 142, 130))
+        self._disc(x, y, radius, (30, 24, 150))
+        self._disc(x, y, radius * 0.90, _RED)
+        self._disc(x - radius * 0.3, y + radius * 0.3, radius * 0.26, (120, 112, 240))
+
+    def draw_dog(self, dog: Mapping[str, Any]) -> None:
+        """Draw a dog from above: legs, trunk, tail, ears, and a head with its yellow stripes."""
+        x, y, heading = dog["x"], dog["y"], dog["heading"]
+        cos, sin = math.cos(heading), math.sin(heading)
+
+        def at(points: Sequence[tuple[float, float]], lift: float = 0.0) -> list[tuple[float, float]]:
+            return [(x + cos * a - sin * b + lift, y + sin * a + cos * b - lift) for a, b in points]
+
+        self._polygon(at(_rounded(-0.13, 0.15, -0.085, 0.085, 0.06), 0.02), (118, 142, 130))
+        for a in (-0.085, 0.065):
+            for b in (-0.085, 0.085):
+                self._outlined(at(_rounded(a - 0.03, a + 0.035, b - 0.022, b + 0.022, 0.02)), _LEG)
+        self._line(at([(-0.11, 0.0), (-0.165, 0.0)]), _EAR, 0.02)
+        self._outlined(at(_rounded(-0.12, 0.09, -0.068, 0.068, 0.045)), _BODY)
+        self._polygon(at(_rounded(-0.085, 0.02, -0.026, 0.026, 0.02)), (206, 204, 200))
+        for b in (-0.062, 0.062):
+            self._outlined(at(_rounded(0.055, 0.105, b - 0.016, b + 0.016, 0.014)), _EAR)
+        self._outlined(at(_rounded(0.15, 0.195, -0.028, 0.028, 0.02)), _EAR)
+        self._outlined(at(_rounded(0.03, 0.16, -0.056, 0.056, 0.03)), _BODY)
+        stripes = int(dog["stripes"])
+        for number in range(stripes):
+            middle = 0.095 + 0.036 * (number - (stripes - 1) / 2)
+            band = [
+                (middle - 0.010, -0.050),
+                (middle + 0.010, -0.050),
+                (middle + 0.010, 0.050),
+                (middle - 0.010, 0.050),
+            ]
+            self._polygon(at(band), _YELLOW)
+
+    def _outlined(self, points: Sequence[tuple[float, float]], colour: Colour) -> None:
+        self._polygon(points, colour)
+        self._line([*points, points[0]], _EDGE, 0.006)
+
+    def _polygon(self, points: Sequence[tuple[float, float]], colour: Colour) -> None:
+        cv2.fillPoly(self.image, [self._fine(points)], colour, cv2.LINE_AA, 4)
+
+    def _line(self, points: Sequence[tuple[float, float]], colour: Colour, thickness: float) -> None:
+        wide = max(1, round(thickness * self.scale * _FINE))
+        cv2.polylines(self.image, [self._fine(points)], False, colour, wide, cv2.LINE_AA, 4)
+
+    def _disc(self, x: float, y: float, radius: float, colour: Colour) -> None:
+        column, row = self._fine([(x, y)])[0]
+        size = round(radius * self.scale * _FINE * 16)
+        cv2.circle(self.image, (int(column), int(row)), size, colour, -1, cv2.LINE_AA, 4)
+
+    def _fine(self, points: Sequence[tuple[float, float]]) -> NDArray[np.int32]:
+        return (np.array([self.place(x, y) for x, y in points]) * (_FINE * 16)).round().astype(np.int32)
+
+
+def _rounded(x1: float, x2: float, y1: float, y2: float, radius: float) -> list[tuple[float, float]]:
+    """A rectangle with round corners."""
+    points = []
+    for number, (x, y) in enumerate(
+        ((x2 - radius, y2 - radius), (x1 + radius, y2 - radius), (x1 + radius, y1 + radius), (x2 - radius, y1 + radius))
+    ):
+        for step in range(7):
+            turn = (number + step / 6) * math.pi / 2
+            points.append((x + radius * math.cos(turn), y + radius * math.sin(turn)))
+    return points
+
+
+def _draw_name(image: Image, sheet: _Sheet, dog: Mapping[str, Any]) -> None:
+    """Write the name beside the dog, on the side that has room."""
+    name, size = str(dog["name"]), 0.45
+    (wide, high), _ = cv2.getTextSize(name, _FONT, size, 1)
+    x, y = sheet.place(dog["x"], dog["y"])
+    above = y - 0.21 * sheet.scale
+    base = above if above - high > sheet.place(0.0, sheet.room[1])[1] + 2 else y + 0.21 * sheet.scale + high
+    left, right = sheet.place(0.0, 0.0)[0] + 3, sheet.place(sheet.room[0], 0.0)[0] - wide - 3
+    spot = (round(min(max(x - wide / 2, left), right)), round(base))
+    cv2.putText(image, name, spot, _FONT, size, _FLOOR, 4, cv2.LINE_AA)
+    cv2.putText(image, name, spot, _FONT, size, _INK, 1, cv2.LINE_AA)
+
+
+def _draw_caption(image: Image, caption: str) -> None:
+    """Write the caption below, in the middle, as large as fits."""
+    width, size = image.shape[1], 0.55
+    (wide, _), _ = cv2.getTextSize(caption, _FONT, size, 1)
+    if wide > width - 20:
+        size *= (width - 20) / wide
+        (wide, _), _ = cv2.getTextSize(caption, _FONT, size, 1)
+    cv2.putText(image, caption, ((width - wide) // 2, image.shape[0] - 18), _FONT, size, _INK, 1, cv2.LINE_AA)

@@ -1,0 +1,108 @@
+"""Sensor: what one dog feels, from the world alone: rangers, accelerometer, odometry, power.
+
+Geometry and ranges are those of the ERS-7 in the stance of its stock walk (body 0.105 m above the floor, neck drawn
+back so that the nose stays inside the footprint).  The compass is no part of an ERS-7: it rides on the back.
+"""
+
+from __future__ import annotations
+
+import math
+from random import Random
+
+from sim.robots.dog import Dog
+from sim.robots.world import SUBSTEP, World
+
+NOSE = 0.105
+"""Where the rangers and the camera sit, metres before the middle of the dog."""
+NEAR = (0.05, 0.5)
+FAR = (0.2, 1.5)
+CHEST = (0.1, 0.9)
+CHEST_HEIGHT = 0.102
+CHEST_PITCH = math.radians(30.0)
+GRAVITY = 9.80665
+BATTERY_S = 90 * 60.0
+SAMPLED = ("range.near", "range.far", "range.chest", "imu.ax", "imu.ay", "imu.az")
+
+FLOOR = CHEST_HEIGHT / math.sin(CHEST_PITCH)
+CHEST_REACH = CHEST_HEIGHT / math.tan(CHEST_PITCH)
+
+
+class Sensors:
+    """The senses of ``dog``; ``sample`` once each substep, ``values`` once each sensor frame."""
+
+    def __init__(self, rng: Random, world: World, dog: Dog) -> None:
+        self._rng = rng
+        self._world = world
+        self._dog = dog
+        self._samples: dict[str, list[float]] = {key: [] for key in SAMPLED}
+        self._newest = dict.fromkeys(SAMPLED, math.nan)
+        self._odometry = [0.0, 0.0, 0.0]
+        # Each dog's legs are a little longer or shorter than the table says: dead reckoning drifts steadily.
+        self._stride_error = 1.0 + rng.gauss(0.0, 0.01)
+        self._turn_error = 1.0 + rng.gauss(0.0, 0.01)
+        self._power = 1.0
+        # Iron in the legs turns the needle, each dog's a little and always alike.
+        self._deviation = Random(f"compass of {dog.name}").gauss(0.0, math.radians(2.0))
+
+    def sample(self) -> None:
+        """Take one sample of everything, 8 ms after the one before."""
+        dog, gauss = self._dog, self._rng.gauss
+        moving = dog.is_moving
+        ahead = self._world.distance_ahead(dog, NOSE, FAR[1] * 1.1)
+        chest = self._world.distance_ahead(dog, NOSE, CHEST_REACH)
+        slant = FLOOR if chest is None else chest / math.cos(CHEST_PITCH)
+        shake = 0.25 if moving else 0.04
+        for key, value in (
+            ("range.near", self._ranged(ahead, NEAR)),
+            ("range.far", self._ranged(ahead, FAR)),
+            ("range.chest", self._ranged(slant, CHEST)),
+            ("imu.ax", dog.felt[0] + gauss(0.0, shake)),
+            ("imu.ay", dog.felt[1] + gauss(0.0, shake)),
+            ("imu.az", GRAVITY + gauss(0.0, shake)),
+        ):
+            self._samples[key].append(value)
+            self._newest[key] = value
+        self._reckon(moving)
+        self._power = max(0.0, self._power - SUBSTEP / BATTERY_S * (1.0 if moving else 0.5))
+
+    def values(self) -> dict[str, float | bool]:
+        """The newest of each value under the flat keys of the driver contract, NaN for nothing in range."""
+        vx, vy, wz = self._dog.motion
+        x, y, yaw = self._odometry
+        return {
+            "base.vx": vx,
+            "base.vy": vy,
+            "base.wz": wz,
+            "base.moving": self._dog.is_moving,
+            "odom.x": x,
+            "odom.y": y,
+            "odom.yaw": math.remainder(yaw, math.tau),
+            "compass.heading": math.remainder(self._dog.heading + self._deviation, math.tau),
+            **self._newest,
+            "power.level": self._power,
+        }
+
+    def taken_samples(self) -> dict[str, tuple[float, ...]]:
+        """The samples since this was last asked, oldest first."""
+        taken = {key: tuple(samples) for key, samples in self._samples.items()}
+        for samples in self._samples.values():
+            samples.clear()
+        return taken
+
+    def _ranged(self, distance: float | None, limits: tuple[float, float]) -> float:
+        """What an infrared ranger says: noise grows with distance, too near reads as the shortest, too far as NaN."""
+        noise = self._rng.gauss(0.0, 1.0)
+        if distance is None:
+            return math.nan
+        measured = distance + noise * (0.001 + 0.004 * distance)
+        return math.nan if measured > limits[1] else max(measured, limits[0])
+
+    def _reckon(self, moving: bool) -> None:
+        if not moving:
+            return
+        vx, vy, wz = self._dog.motion
+        slip = self._stride_error * (1.0 + self._rng.gauss(0.0, 0.05))
+        yaw = self._odometry[2]
+        self._odometry[0] += (vx * math.cos(yaw) - vy * math.sin(yaw)) * slip * SUBSTEP
+        self._odometry[1] += (vx * math.sin(yaw) + vy * math.cos(yaw)) * slip * SUBSTEP
+        self._odometry[2] = yaw + wz * self._turn_error * (1.0 + self._rng.gauss(0.0, 0.05)) * SUBSTEP

@@ -1,0 +1,236 @@
+"""World: the walled yard as physics, stepped 8 ms at a time and the same for the same seed.
+
+It knows no sensor, no picture and no connection.  Metres, radians, seconds; x to the right, y up.
+"""
+
+from __future__ import annotations
+
+import math
+from contextlib import suppress
+from dataclasses import dataclass
+from random import Random
+
+import pymunk
+
+from sim.robots.dog import DOG, REST, TARGET, WALL, Dog, Motion
+from sim.robots.scene import FOOTPRINT, Scene
+
+SUBSTEP = 0.008
+"""Seconds of one ``step``; the ERS-7 samples its sensors as often."""
+SUBSTEPS = 4
+TICK = SUBSTEPS * SUBSTEP
+"""Seconds by which a yard goes on at a time: one sensor frame of the ERS-7."""
+WALL_THICKNESS = 0.04
+TRIES = 2000
+LATEST = 3600.0
+"""Seconds within which a target can be placed later."""
+
+
+class NotPossible(ValueError):
+    """The operator asked for something that the yard cannot hold; the message says why and what would be possible."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """The upright red cylinder."""
+
+    x: float
+    y: float
+    radius: float
+    height: float
+
+
+class World:
+    """The arena of ``scene``: dogs that push each other and bump into walls, and at most one fixed target."""
+
+    def __init__(self, rng: Random, scene: Scene) -> None:
+        self.scene = scene
+        self.target: Target | None = None
+        self.collisions = 0
+        self._rng = rng
+        self._steps = 0
+        self._placing_at = math.inf
+        self._space = pymunk.Space()
+        # The library's default slop is meant for pixels: in metres, bodies would sink 10 cm into each other.
+        self._space.collision_slop = 0.001
+        self._target_shape: pymunk.Shape | None = None
+        self._build_walls()
+        self.dogs: dict[str, Dog] = {}
+        for number, kennel in enumerate(scene.kennels, 1):
+            dog = self.dogs[kennel.name] = Dog(kennel, number)
+            self._space.add(dog.body, dog.shape)
+        for other in (DOG, TARGET, WALL):
+            self._space.on_collision(DOG, other, begin=self._on_collision)
+
+    @property
+    def t(self) -> float:
+        """Seconds of simulated time since the start."""
+        return self._steps * SUBSTEP
+
+    @property
+    def walls(self) -> list[tuple[float, float, float, float]]:
+        """The inner faces of the walls as x1, y1, x2, y2, counter-clockwise from the lower one."""
+        width, height = self.scene.width, self.scene.height
+        corners = [(0.0, 0.0), (width, 0.0), (width, height), (0.0, height)]
+        return [(*corners[i], *corners[(i + 1) % 4]) for i in range(4)]
+
+    def step(self) -> None:
+        """Let ``SUBSTEP`` seconds pass."""
+        if self.t >= self._placing_at:
+            self._placing_at = math.inf
+            with suppress(NotPossible):  # no place is free: nobody waits for an answer any more
+                self.place_target_at_random()
+        for dog in self.dogs.values():
+            dog.strive(SUBSTEP)
+        self._space.step(SUBSTEP)
+        for dog in self.dogs.values():
+            dog.feel(SUBSTEP)
+        self._steps += 1
+
+    def drive(self, name: str, vx: float, vy: float, wz: float) -> None:
+        """Let the dog ``name`` walk with this velocity in its own frame until told otherwise."""
+        self.dogs[name].drive(Motion(vx, vy, wz))
+
+    def halt(self, name: str) -> None:
+        """Let the dog ``name`` stand still, as fast as its legs can brake."""
+        self.dogs[name].command = REST
+
+    def distance_ahead(self, dog: Dog, forward: float, reach: float) -> float | None:
+        """Metres to what stands ahead of the point ``forward`` metres before the middle, None beyond ``reach``."""
+        cos, sin = math.cos(dog.body.angle), math.sin(dog.body.angle)
+        x, y = dog.x + forward * cos, dog.y + forward * sin
+        hit = self._space.segment_query_first((x, y), (x + reach * cos, y + reach * sin), 0.0, dog.shape.filter)
+        return None if hit is None else hit.alpha * reach
+
+    def place_target(self, x: float, y: float) -> None:
+        """Put the target here, in place of an older one; raises ``NotPossible`` where a dog or a wall is."""
+        radius = self.scene.target_radius
+        self._check_inside("the target", x, y, radius)
+        for dog in self.dogs.values():
+            if math.hypot(dog.x - x, dog.y - y) < FOOTPRINT + radius:
+                raise NotPossible(f"{dog.name} stands at ({x:.2f}, {y:.2f}); choose a free place")
+        self.clear_target()
+        self.target = Target(x, y, radius, self.scene.target_height)
+        shape = pymunk.Circle(self._space.static_body, radius, (x, y))
+        shape.friction = 0.3
+        shape.collision_type = TARGET
+        self._target_shape = shape
+        self._space.add(shape)
+
+    def place_target_at_random(self, clearance: float = 0.75, from_walls: float = 0.25, apart: float = 0.25) -> None:
+        """Put the target at a free place, ``clearance`` from every dog, so that one dog is clearly the nearest.
+
+        The distances to the dogs differ pairwise by ``apart`` metres.  Where no place has both, the one that comes
+        nearest to both is taken; raises ``NotPossible`` in a yard with no free place at all.
+        """
+        best, best_fit = None, -math.inf
+        for _ in range(TRIES):
+            x = self._rng.uniform(from_walls, self.scene.width - from_walls)
+            y = self._rng.uniform(from_walls, self.scene.height - from_walls)
+            distances = sorted(math.hypot(dog.x - x, dog.y - y) for dog in self.dogs.values())
+            if distances and distances[0] < FOOTPRINT + 2 * self.scene.target_radius:
+                continue
+            gap = min((b - a for a, b in zip(distances, distances[1:], strict=False)), default=apart)
+            room = distances[0] if distances else clearance
+            fit = min(gap / apart, 1.0) + min(room / clearance, 1.0)
+            if fit > best_fit:
+                best, best_fit = (x, y), fit
+        if best is None:
+            raise NotPossible("no place is free; move the dogs apart")
+        self.place_target(*best)
+
+    def place_target_later(self, seconds: float) -> None:
+        """Put the target at a free place in ``seconds``, unless it is placed or taken away before."""
+        if not 0.0 <= seconds <= LATEST:
+            raise NotPossible(f"the target is placed within {LATEST:g} s, not in {seconds:g}")
+        self._placing_at = self.t + seconds
+
+    def clear_target(self) -> None:
+        """Take the target away, if there is one."""
+        self._placing_at = math.inf
+        if self._target_shape is not None:
+            self._space.remove(self._target_shape)
+        self.target = self._target_shape = None
+
+    def move_dog(self, name: str, x: float, y: float, heading: float) -> None:
+        """Lift a dog and set it down; raises ``NotPossible`` for an unknown dog or a taken place."""
+        dog = self.dogs.get(name)
+        if dog is None:
+            raise NotPossible(f"no dog is named {name!r}; here are {', '.join(self.dogs)}")
+        self._check_inside(name, x, y, FOOTPRINT)
+        if not math.isfinite(heading):
+            raise NotPossible("a heading must be a finite number of radians")
+        for other in self.dogs.values():
+            if other is not dog and math.hypot(other.x - x, other.y - y) < 2 * FOOTPRINT:
+                raise NotPossible(f"{other.name} stands at ({x:.2f}, {y:.2f}); choose a free place")
+        if (
+            self.target is not None
+            and math.hypot(self.target.x - x, self.target.y - y) < FOOTPRINT + self.target.radius
+        ):
+            raise NotPossible(f"the target stands at ({x:.2f}, {y:.2f}); choose a free place")
+        self._put(dog, x, y, heading)
+
+    def scatter(self, seed: int, clearance: float = 0.45, from_walls: float = 0.3) -> None:
+        """Set all dogs down at rest at random free places; the same ``seed`` gives the same places."""
+        rng = Random(seed)
+        taken = [] if self.target is None else [(self.target.x, self.target.y)]
+        places = []
+        for _ in self.dogs:
+            for _ in range(TRIES):
+                x = rng.uniform(from_walls, self.scene.width - from_walls)
+                y = rng.uniform(from_walls, self.scene.height - from_walls)
+                if all(math.hypot(x - a, y - b) >= clearance for a, b in taken):
+                    break
+            else:
+                raise NotPossible(f"the yard is too small to keep {len(self.dogs)} dogs {clearance} m apart")
+            taken.append((x, y))
+            places.append((x, y, rng.uniform(-math.pi, math.pi)))
+        for dog, place in zip(self.dogs.values(), places, strict=True):
+            self._put(dog, *place)
+
+    def snapshot(self) -> dict[str, object]:
+        """The truth about the yard as plain data, for the map and the referee."""
+        target = self.target
+        return {
+            "t": self.t,
+            "walls": [self.scene.width, self.scene.height],
+            "dogs": [
+                {
+                    "name": dog.name,
+                    "x": dog.x,
+                    "y": dog.y,
+                    "heading": dog.heading,
+                    "moving": dog.is_moving,
+                    "stripes": dog.stripes,
+                }
+                for dog in self.dogs.values()
+            ],
+            "target": None if target is None else {"x": target.x, "y": target.y, "radius": target.radius},
+            "collisions": self.collisions,
+        }
+
+    def _put(self, dog: Dog, x: float, y: float, heading: float) -> None:
+        dog.put(x, y, heading)
+        self._space.reindex_shapes_for_body(dog.body)
+
+    def _check_inside(self, what: str, x: float, y: float, radius: float) -> None:
+        inside = radius <= x <= self.scene.width - radius and radius <= y <= self.scene.height - radius
+        if not inside:
+            raise NotPossible(
+                f"{what} does not fit at ({x:.2f}, {y:.2f}); "
+                f"x must be {radius:g} to {self.scene.width - radius:g}, y {radius:g} to {self.scene.height - radius:g}"
+            )
+
+    def _build_walls(self) -> None:
+        half = WALL_THICKNESS / 2
+        for x1, y1, x2, y2 in self.walls:
+            # A wall has thickness so that nothing tunnels; it lies outside, so that its inner face is the boundary.
+            length = math.hypot(x2 - x1, y2 - y1)
+            out_x, out_y = half * (y2 - y1) / length, -half * (x2 - x1) / length
+            wall = pymunk.Segment(self._space.static_body, (x1 + out_x, y1 + out_y), (x2 + out_x, y2 + out_y), half)
+            wall.friction = 0.3
+            wall.collision_type = WALL
+            self._space.add(wall)
+
+    def _on_collision(self, _arbiter: pymunk.Arbiter, _space: pymunk.Space, _data: object) -> None:
+        self.collisions += 1

@@ -1,0 +1,122 @@
+"""Yard: the world, its sensors and cameras tied to connections, paced by the clock it is given."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from functools import partial
+from random import Random
+from typing import Any
+
+from twisted.internet.interfaces import IReactorTime
+
+from drivers.sim.codec import VERSION, Done, Message, Order, Overlook, Truth
+from sim.robots.camera import Camera
+from sim.robots.emulator.dog import DogBody
+from sim.robots.paced import PacedYard
+from sim.robots.scene import Scene
+from sim.robots.sensor import Sensors as Senses
+from sim.robots.session import Beat, Session
+from sim.robots.world import SUBSTEPS, TICK, NotPossible, World
+
+MAX_SESSIONS = 64
+MAX_RATE = 1.0 / TICK
+
+
+class Yard(PacedYard):
+    """The yard of a ``scene``.
+
+    The truth is in ``world``; whoever referees may look there, or ask as an operator over a link.
+    """
+
+    def __init__(self, clock: IReactorTime, rng: Random, scene: Scene) -> None:
+        self.world = World(Random(rng.getrandbits(64)), scene)
+        self._camera = Camera(Random(rng.getrandbits(64)), self.world)
+        self._senses = {
+            name: Senses(Random(rng.getrandbits(64)), self.world, dog) for name, dog in self.world.dogs.items()
+        }
+        super().__init__(clock, self.world.dogs, self.world, MAX_SESSIONS, self._on_operator)
+        self._orders: dict[str, tuple[Callable[..., None], tuple[type, ...]]] = {
+            "place_target": (self.world.place_target, (float, float)),
+            "place_target_at_random": (self.world.place_target_at_random, ()),
+            "place_target_later": (self.world.place_target_later, (float,)),
+            "clear_target": (self.world.clear_target, ()),
+            "move_dog": (self.world.move_dog, (str, float, float, float)),
+            "scatter": (self.world.scatter, (int,)),
+        }
+
+    def truth(self) -> dict[str, object]:
+        """The whole yard as seen from above, and of each dog what its gate has let through and refused."""
+        snapshot = self.world.snapshot()
+        gates = self._reception.gates.values()
+        counts = [{"token": g.token or 0, "accepted": g.accepted, "refused": sum(g.refused.values())} for g in gates]
+        dogs: Any = snapshot["dogs"]
+        return {**snapshot, "dogs": [{**dog, **count} for dog, count in zip(dogs, counts, strict=True)]}
+
+    def lend(self, name: str, limits: Mapping[str, tuple[float, float]]) -> DogBody:
+        """Hand a dog over to an emulator, which moves it within ``limits`` from now on; no driver may hold it here.
+
+        Raises ``UsageError`` where there is no such dog.
+        """
+        self._reception.lend(name)
+        dog = self.world.dogs[name]
+        dog.limits = limits
+        return DogBody(self.world, dog, self._senses[name], self._camera)
+
+    def learn(self, verb: str, work: Callable[..., None], kinds: tuple[type, ...]) -> None:
+        """Have operators order ``verb`` as well, with arguments of ``kinds``."""
+        self._orders[verb] = (work, kinds)
+
+    def _play(self, late: float) -> int:
+        due = 1 + max(0, math.floor(late / TICK + 1e-6))
+        for left in range(due - 1, -1, -1):
+            # A late yard drops pictures, never physics.
+            self._tick(with_pictures=left == 0)
+        return due
+
+    def _tick(self, with_pictures: bool) -> None:
+        for _ in range(SUBSTEPS):
+            self._reception.expire(self.world.t)
+            self.world.step()
+            for senses in self._senses.values():
+                senses.sample()
+        self._report(with_pictures)
+        self._reception.drop_silent()
+
+    def _report(self, with_pictures: bool) -> None:
+        t = self.world.t
+        for name, senses in self._senses.items():
+            values, samples = senses.values(), senses.taken_samples()
+            picture = partial(self._camera.jpeg, self.world.dogs[name]) if with_pictures else None
+            self._reception.tell(name, t, values, samples, picture)
+        sessions = self._reception.sessions
+        watchers = [one for one in sessions if one.is_operator and one.truths.is_due(t) and not one.link.is_busy]
+        if watchers:
+            truth = Truth(self.truth())
+            for session in watchers:
+                session.send(truth)
+
+    def _on_operator(self, session: Session, message: Message) -> None:
+        match message:
+            case Overlook():
+                session.is_operator = message.version == VERSION
+                session.truths = Beat(min(max(message.rate, 0.1), MAX_RATE))
+            case Order() if session.is_operator:
+                session.send(Done(message.number, self._carried_out(message)))
+            case _:
+                pass
+
+    def _carried_out(self, order: Order) -> str:
+        """Do what the operator orders; the problem in words, or an empty text."""
+        if order.verb not in self._orders:
+            return f"the yard knows no order {order.verb!r}; it knows {', '.join(self._orders)}"[:200]
+        work, kinds = self._orders[order.verb]
+        if len(order.arguments) != len(kinds) or not all(
+            type(value) is kind for value, kind in zip(order.arguments, kinds, strict=True)
+        ):
+            return f"{order.verb} takes {', '.join(kind.__name__ for kind in kinds) or 'nothing'}"
+        try:
+            work(*order.arguments)
+        except NotPossible as error:
+            return str(error)[:200]
+        return ""
