@@ -7,15 +7,14 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 from twisted.internet.defer import Deferred
 
 from agents.catalogue import DEMO, task_named
-from middleware.entangled.clock import HeapClock
-from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.network.network import Address
-from middleware.entangled.network.switchboard import Switchboard, Weather
+from middleware.entangled.network.switchboard import Weather
 from middleware.entangled.replication.watch import Watch
 from middleware.settings import Settings
 from middleware.tasks import Task, outcome_of
@@ -24,6 +23,7 @@ from sim.robots.crowd.controller import Controller, wander
 from sim.robots.crowd.ground import Ground
 from sim.robots.crowd.search import Word
 from sim.robots.crowd.yard import CrowdYard
+from sim.team.world import World
 from swarmnode.rehearsal import LAN
 from swarmnode.seams import Seams
 from swarmnode.service import NodeService
@@ -39,7 +39,7 @@ PORT = 7000
 TASK = "search"
 
 
-class CrowdTeam:
+class CrowdTeam(World):
     """``agents`` in the first bodies of a crowd on ``ground``, and a desk; a seed replays them exactly.
 
     What runs is what runs on a robot: the real node, agent, driver and detection; the team is an open one.
@@ -55,13 +55,11 @@ class CrowdTeam:
         weather: Weather = LAN,
         camera_fps: float = CAMERA_FPS,
     ) -> None:
-        self.clock = HeapClock()
-        self.board = Switchboard(self.clock, random.Random(f"{seed}/board"), weather)
+        super().__init__(seed, weather)
         yard_dice = random.Random(f"{seed}/yard")
         self.yard = CrowdYard(self.clock, yard_dice, ground, agents, controller, stopwatch)
         self.yard.start()
         self.services: dict[str, NodeService] = {}
-        self._seed = seed
         self._fps = camera_fps
         self._group: Watch | None = None
         self._task: Task | None = None
@@ -69,6 +67,10 @@ class CrowdTeam:
             self._add(name)
             self.clock.advance(JOINING)
         self.clock.advance(SETTLING)
+
+    def address(self, place: int) -> Address:
+        """Where the node of this place listens, each on a machine of its own."""
+        return Address(f"10.{place >> 16}.{place >> 8 & 255}.{place & 255}", PORT)
 
     def assign(self) -> None:
         """Have whoever can do it search the red target."""
@@ -107,28 +109,23 @@ class CrowdTeam:
         number = len(self.services)
         node: dict[str, Any] = {"name": name, "port": PORT, "team_key": TEAM_KEY}
         mapping: dict[str, Any] = {"node": node}
-        dice = random.Random(f"{self._seed}/{name}")
+        dice = random.Random(f"{self.seed}/{name}")
         if number:
             # Each joins by somebody who is there: a hundred at one door would only show what that door bears.
-            node["known_nodes"] = [str(_address(dice.randrange(number)))]
+            node["known_nodes"] = [str(self.address(dice.randrange(number)))]
             mapping["agent"] = {"module": "search"}
             mapping["driver"] = {"kind": "sim", "options": {"robot": name, "camera_fps": self._fps}}
         connector = self.yard.connector()
         seams = Seams(
             self.clock,
-            lambda: self.board.network(*_address(number)),
-            MemoryStore(),
+            partial(self.network, number),
+            self.store(number),
             dice,
             self.clock.seconds,
             connector,
         )
-        self.services[name] = NodeService(Settings.from_mapping(mapping, f"seed {self._seed}"), seams)
+        self.services[name] = NodeService(Settings.from_mapping(mapping, f"seed {self.seed}"), seams)
         self.services[name].startService()
-
-
-def _address(number: int) -> Address:
-    """Where the node of that number listens, each a machine of its own."""
-    return Address(f"10.{number >> 16}.{number >> 8 & 255}.{number & 255}", PORT)
 
 
 def main(arguments: list[str]) -> int:

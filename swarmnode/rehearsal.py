@@ -15,15 +15,15 @@ from drivers.sim.operator import YardOperator
 from middleware.admission.membership import MemoryMembership
 from middleware.admission.operator import FIRST, drawn
 from middleware.admission.statement import SECRET_BYTES
-from middleware.entangled.clock import HeapClock
 from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.network.network import Address
-from middleware.entangled.network.switchboard import Switchboard, Weather
+from middleware.entangled.network.switchboard import Weather
 from middleware.settings import Settings
 from sim.demo.trials import main as run_trials
 from sim.robots.scene import loaded
 from sim.robots.yard import Yard
 from sim.team.machine import Machine, MachineConnector, MachineNetwork
+from sim.team.world import World
 from swarmnode.sandbox import simulated
 from swarmnode.seams import Seams
 from swarmnode.service import NodeService
@@ -39,7 +39,7 @@ RESTARTED = 15.0
 """Seconds after which a node that was killed by a fault is there again, as in a demonstration."""
 
 
-class VirtualTeam:
+class VirtualTeam(World):
     """A laptop and its dogs; a seed replays them exactly.
 
     What runs is what runs on a robot: the real node, agent, driver, yard and detection.  ``dogs`` are those that are
@@ -62,8 +62,7 @@ class VirtualTeam:
         others: tuple[str, ...] = (),
         faults: bool = False,
     ) -> None:
-        self.clock = HeapClock()
-        self.board = Switchboard(self.clock, random.Random(f"{seed}/board"), weather)
+        super().__init__(seed, weather)
         self.yard = Yard(self.clock, random.Random(f"{seed}/yard"), loaded("three-dogs"))
         self.yard.start()
         self.services: dict[str, NodeService] = {}
@@ -74,7 +73,6 @@ class VirtualTeam:
         self._secret = self._dice.randbytes(SECRET_BYTES)
         self._memberships: dict[str, MemoryMembership] = {}
         self._names = (self.BOOTSTRAP, *self.DOGS, *others)
-        self._seed = seed
         self._fps = camera_fps
         self._faults = faults
         for name in (self.BOOTSTRAP, *others, *dogs):
@@ -91,10 +89,10 @@ class VirtualTeam:
 
         ``shelf`` is where it keeps deployed modules.
         """
-        port = self.address(name).port
+        port = self.address_of(name).port
         mapping: dict[str, Any] = {"node": {"name": name, "port": port}}
         if name != self.BOOTSTRAP:
-            mapping["node"]["known_nodes"] = [str(self.address(self.BOOTSTRAP))]
+            mapping["node"]["known_nodes"] = [str(self.address_of(self.BOOTSTRAP))]
         if name in self.DOGS:
             mapping["agent"] = {"module": "search"}
             mapping["driver"] = {"kind": "sim", "options": {"robot": name, "camera_fps": self._fps}}
@@ -105,9 +103,9 @@ class VirtualTeam:
         connector = self.connectors[name] = self.yard.connector()
         seams = Seams(
             machine,
-            lambda: MachineNetwork(machine, self.board.network(*self.address(name))),
+            lambda: MachineNetwork(machine, self.board.network(*self.address_of(name))),
             MemoryStore(),
-            random.Random(f"{self._seed}/{name}"),
+            random.Random(f"{self.seed}/{name}"),
             self.clock.seconds,
             MachineConnector(machine, connector),
             shelf,
@@ -115,7 +113,7 @@ class VirtualTeam:
             membership=self._membership(name),
             spawn=simulated,
         )
-        self.services[name] = NodeService(Settings.from_mapping(mapping, f"seed {self._seed}"), seams)
+        self.services[name] = NodeService(Settings.from_mapping(mapping, f"seed {self.seed}"), seams)
         self.services[name].startService()
 
     def _membership(self, name: str) -> MemoryMembership:
@@ -126,9 +124,13 @@ class VirtualTeam:
             self._memberships[name] = MemoryMembership(membership)
         return self._memberships[name]
 
-    def address(self, name: str) -> Address:
+    def address(self, place: int) -> Address:
+        """Where the node of this place listens."""
+        return Address("127.0.0.1", 7000 + place)
+
+    def address_of(self, name: str) -> Address:
         """Where the node ``name`` listens."""
-        return Address("127.0.0.1", 7000 + self._names.index(name))
+        return self.address(self._names.index(name))
 
     def run_demo(self) -> str:
         """Press the Run Demo button; returns the task's id."""
@@ -162,7 +164,7 @@ class VirtualTeam:
         """Let nothing pass between a node and the others; ``one_way``: it still hears them."""
         for other in self._names:
             if other != name:
-                self.board.cut(self.address(name), self.address(other), one_way)
+                self.board.cut(self.address_of(name), self.address_of(other), one_way)
 
     def unplug(self, name: str) -> None:
         """Let nothing pass between the node of a dog and its body, though no connection is closed."""
