@@ -9,6 +9,7 @@ from random import Random
 from typing import Any
 
 from twisted.internet.task import Clock
+from twisted.internet.testing import MemoryReactorClock
 from twisted.trial.unittest import SynchronousTestCase
 
 from drivers.aibo.driver import AiboDriver
@@ -26,15 +27,6 @@ from sim.robots.table import Robots
 from sim.robots.world import TICK
 from sim.robots.yard import Yard
 from standards.jpeg import size_of
-
-
-class FakeReactor(Clock):
-    """A clock on which ports can be read and written, though nobody does."""
-
-    def _ignore(self, port: object) -> None:
-        pass
-
-    addReader = removeReader = addWriter = removeWriter = _ignore  # noqa: N815 (Twisted's)
 
 
 class YardCase(SynchronousTestCase):
@@ -166,14 +158,14 @@ class RobotsTests(YardCase):
         path = folder / "ttyUSB0"
         table = {"dog1": {"kind": "create2", "options": {"port": str(path)}}}
         path.write_text("a device, or somebody's notes")
-        robots = Robots(FakeReactor(), Random(1), self.yard, table)
+        robots = Robots(MemoryReactorClock(), Random(1), self.yard, table)
         with self.assertRaisesRegex(UsageError, r"\[dog1\] .*ttyUSB0 is there already"):
             robots.start()
         robots.stop()
         self.assertEqual(path.read_text(), "a device, or somebody's notes")
         path.unlink()
         path.symlink_to("/dev/pts/99999")
-        port = PtyPort(FakeReactor(), Bittle(MemoryBody(), self.clock, Random(1)).accept, str(path))
+        port = PtyPort(MemoryReactorClock(), Bittle(MemoryBody(), self.clock, Random(1)).accept, str(path))
         self.assertNotEqual(str(path.readlink()), "/dev/pts/99999")
         # Another one that took the path over keeps it.
         path.unlink()
@@ -185,7 +177,7 @@ class RobotsTests(YardCase):
         """A robot that cannot be served is named with what is wrong, and nothing of it stays open."""
         before = len(os.listdir("/dev/fd"))
         table = {"dog2": {"kind": "create2", "options": {"port": "/nowhere/at/all"}}}
-        robots = Robots(FakeReactor(), Random(1), self.yard, table)
+        robots = Robots(MemoryReactorClock(), Random(1), self.yard, table)
         with self.assertRaisesRegex(UsageError, r"\[dog2\] it cannot be served: .*/nowhere/at/all"):
             robots.start()
         robots.stop()
