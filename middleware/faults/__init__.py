@@ -1,4 +1,4 @@
-"""Fault injection: make a node, its process, its network or its robot fail on purpose, and time the recovery.
+"""Fault injection: make a node, its process, its network or its robot fail, and measure the time of the takeover.
 
 ``kinds``: the faults of a running node with their bounds.  ``network``, ``stream``, ``battery`` and ``process``: where
 a fault takes effect (datagrams, the bytes of a robot's link, observations, the operating system).  ``injector``: the

@@ -12,7 +12,7 @@ LEVEL = "power.level"
 class LowBattery:
     """Forward everything to ``driver``, but report at most ``level`` (0 to 1) as its charge; None: the real charge.
 
-    A robot with a low level still moves when it is told to: its agent has to give up the task.
+    The robot still obeys commands; its agent has to give up the task.
     """
 
     def __init__(self, driver: Any) -> None:
@@ -23,7 +23,7 @@ class LowBattery:
         return getattr(self._driver, name)
 
     def observe(self) -> Any:
-        """Return the newest observation with the limited level; None where there is none."""
+        """Return the newest observation with the limited level; None before the first."""
         return self._limit(self._driver.observe())
 
     def subscribe(self, seen: Callable[[Any], None]) -> Callable[[], None]:

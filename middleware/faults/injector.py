@@ -36,7 +36,7 @@ get lost, it may have to send its answer several times."""
 
 
 class State(Enum):
-    """How far an ordered fault is."""
+    """The state of an ordered fault."""
 
     ORDERED = "ordered"
     ACTIVE = "active"
@@ -134,7 +134,7 @@ class FaultInjector:
     def expose(self, node: SwarmNode, make_task: MakeTask) -> None:
         """Let other nodes order faults of ``node``, list them, and publish a predefined task for a scenario.
 
-        ``make_task`` raises ``UnknownTask`` where it knows no task of that name.
+        ``make_task`` raises ``UnknownTask`` for a name that it does not know.
         """
 
         def cause(peer: Contact, kind: object, seconds: object, amount: object) -> float:

@@ -15,15 +15,15 @@ CAUSE, ASKED, ASSIGN = "device.fault", "device.faults", "device.assign"
 """Methods of a node that allows faults: inject one; list its kinds and the active ones; publish a predefined task."""
 MIN_S, MAX_S, USUAL_S = 0.1, 600.0, 15.0
 MOST_AHEAD_S = 2.0
-"""What a device says at most of how long it has until it suffers."""
+"""The longest delay between the answer of a device and its fault."""
 
 
 @dataclass(frozen=True)
 class Kind:
-    """One sort of fault.
+    """The properties of one kind of fault.
 
-    ``is_lost``: who acts under it must be replaced.  ``amount`` is what is usual where a fault of this kind has an
-    amount (``unit`` says so), ``least`` and ``most`` bound it; ``means`` says what the amount is.
+    ``is_lost``: a device that executes a task has to be replaced.  A kind with a ``unit`` has an amount: ``amount`` is
+    its default, ``least`` and ``most`` are its bounds, and ``means`` is its meaning in words.
     """
 
     about: str
@@ -49,7 +49,7 @@ KINDS: Mapping[str, Kind] = {
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault that somebody wants: ``kind`` is one of ``KINDS``, for ``seconds``."""
+    """A fault of a ``kind`` out of ``KINDS`` that lasts for ``seconds``."""
 
     kind: str
     seconds: float = USUAL_S
@@ -57,7 +57,7 @@ class Fault:
 
 
 def parse_fault(kind: object, seconds: object = None, amount: object = None) -> Fault:
-    """The fault that foreign words mean; None stands for what is usual.  Raises ``BadFault``."""
+    """Check the fields of a fault that come from outside; None means the default.  Raises ``BadFault``."""
     if not isinstance(kind, str) or kind not in KINDS:
         raise BadFault("kind", f"there is no fault {str(kind)[:40]!r}", f"choose one of {', '.join(KINDS)}")
     rule = KINDS[kind]
@@ -71,7 +71,7 @@ def parse_fault(kind: object, seconds: object = None, amount: object = None) -> 
 
 
 def begins_in(answer: object) -> float:
-    """Seconds until a fault begins, as the device answers that is asked for it; 0 where it says nothing lawful."""
+    """Return the seconds until a fault begins from a device's answer to the order; 0 for an invalid answer."""
     return float(answer) if is_number(answer) and 0.0 < answer <= MOST_AHEAD_S else 0.0  # type: ignore[operator,arg-type]
 
 

@@ -1,7 +1,7 @@
-"""A network whose one node can be cut off, made deaf or mute, or given bad weather while it runs.
+"""Faults of one node's datagrams: loss, delay, duplicates, and silence in one direction or both.
 
-It goes around any other ``Network``: what the switchboard does between nodes in one process, this does at the port of
-a real one.  As it was made it changes nothing.
+``FaultyNetwork`` wraps any other ``Network``.  It does at the port of a real node the same as the switchboard does
+between simulated ones.  Initially it changes nothing.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from middleware.entangled.network.switchboard import CALM
 
 
 class FaultyNetwork:
-    """``network``, as it is for a node that fails.
+    """``network`` with faults.
 
-    ``weather`` is met by each datagram that goes out and by each that comes in, so a question and its answer meet it
-    twice.  ``is_deaf``: nothing comes in; ``is_mute``: nothing goes out.  ``eaten`` counts the datagrams that were
-    silenced, lost and duplicated.
+    ``weather`` applies to each datagram sent and to each one received, so to a request and its response twice.
+    ``is_deaf``: nothing is received; ``is_mute``: nothing is sent.  ``eaten`` counts the datagrams that were silenced,
+    lost and duplicated.
     """
 
     def __init__(self, network: Network, clock: IReactorTime, rng: random.Random) -> None:

@@ -1,4 +1,4 @@
-"""Faults of a byte stream, such as the link of an emulated robot, by switches that tests and people set."""
+"""Faults of a byte stream, such as the link of an emulated robot, set by tests or by hand."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from dataclasses import dataclass
 
 @dataclass
 class StreamFaults:
-    """The switches; ``wire`` says what of some bytes leaves the robot, and when.
+    """The faults of one stream.
 
-    ``drop`` and ``garbage`` are the shares of writes that are lost and spoilt, ``delay`` the seconds that all of them
-    take longer; while ``half_open``, the robot hears and says nothing at all, though its link stays up; ``split`` cuts
-    each write at random places, as a network may.
+    ``drop`` and ``garbage`` are the shares of writes that are lost and corrupted, ``delay`` is in seconds.
+    ``half_open``: the robot receives and sends nothing, but its link stays open.  ``split``: each write is cut at
+    random places, as a network may do.
     """
 
     drop: float = 0.0
@@ -23,7 +23,7 @@ class StreamFaults:
     split: bool = False
 
     def wire(self, data: bytes, rng: random.Random) -> Iterator[bytes]:
-        """The pieces of ``data`` that leave, in their order; none where it is lost."""
+        """Yield the pieces of ``data`` that are sent, in order; none if it is lost."""
         if self.half_open or rng.random() < self.drop:
             return
         if data and rng.random() < self.garbage:

@@ -1,4 +1,4 @@
-"""A clock that runs from a fault until another device goes on with the task.  Pure."""
+"""Measure the time from a fault until another device continues the task.  Pure."""
 
 from __future__ import annotations
 
@@ -8,22 +8,23 @@ from dataclasses import dataclass
 from middleware.presence import EXECUTING, Device
 
 TARGET_S = 2.0
-"""Seconds within which another shall have taken over."""
+"""Seconds within which another device should take over."""
 WATCHED_S = 5.0
-"""Seconds after the end of a fault for which one still looks whether another takes over."""
+"""Seconds after the end of a fault in which a takeover still counts."""
 
 
 def acting(devices: Iterable[Device]) -> dict[str, str]:
-    """Who acts: uuid to task."""
+    """Return the devices that execute a task: uuid to task."""
     return {device.uuid: device.task for device in devices if device.status == EXECUTING and device.task}
 
 
 @dataclass
 class Takeover:
-    """The clock of one fault of the device ``lost``.
+    """The takeover after one fault of the device ``lost``.
 
-    ``task`` is what it was at, empty where it did not act: then there is nothing to take over.  ``began`` and ``until``
-    are seconds of whoever looks; ``seconds`` and ``to`` (a uuid) are None and empty until another acts on the task.
+    ``task`` is the task that the device executed, empty if it executed none: then there is nothing to take over.
+    ``began`` and ``until`` are on the observer's clock; ``seconds`` and ``to`` (a uuid) are None and empty until
+    another device executes the task.
     """
 
     lost: str
@@ -34,7 +35,7 @@ class Takeover:
     to: str = ""
 
     def look(self, acts: Mapping[str, str], now: float) -> bool:
-        """Take in who acts (uuid to task) at the moment ``now``; True where that is what stops the clock."""
+        """Note the executing devices (uuid to task) at ``now``; True if the takeover is seen with this call."""
         if not self.is_open(now):
             return False
         others = sorted(uuid for uuid, task in acts.items() if task == self.task and uuid != self.lost)
@@ -43,5 +44,5 @@ class Takeover:
         return bool(others)
 
     def is_open(self, now: float) -> bool:
-        """Whether the clock runs: somebody may still take over."""
+        """Whether a takeover can still be seen."""
         return bool(self.task) and self.seconds is None and now < self.until + WATCHED_S

@@ -35,7 +35,6 @@ from sim.team.scenario import Scenario
 KEY = b"t" * 32
 PORT = 7000
 CAPABILITIES = {"camera": {"width": 208}}
-MOST_PLACES = 1 << 22
 
 Node = EntangledNode | SwarmNode
 Watcher = Callable[[int, Node], object]
