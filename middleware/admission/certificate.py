@@ -74,8 +74,10 @@ class Member:
 
     @property
     def unrenewed(self) -> Member:
-        """The member by its certificate before any renewal; of who came by a code that has ended, as far as is known
-        from the renewal alone."""
+        """The member by its certificate before any renewal.
+
+        The renewal of a member that came by a code does not say when that certificate ended: it counts as over.
+        """
         if not self.renewer:
             return self
         end = self.since if self.invitation else self.since + self.life

@@ -15,6 +15,8 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
+import msgpack
+
 from middleware.admission.certificate import (
     ADMISSION,
     BOOTSTRAP,
@@ -125,6 +127,11 @@ def invitation_id(public: bytes) -> bytes:
     return hashlib.blake2s(public, digest_size=ID, person=b"invite").digest()
 
 
+def packed_admission(public: bytes, shown: bytes) -> bytes:
+    """An admission or a renewal as it travels; it needs no signature of its own."""
+    return bytes(msgpack.packb([ADMISSION, public, shown]))
+
+
 class Roll:
     """What a node knows of the team of the operator with the public key ``operator``; plain logic, no clock.
 
@@ -215,9 +222,9 @@ class Roll:
         held = None if key is None else self._held[key]
         found = (held.entry, held.packed) if held is not None and isinstance(held.entry, Grant) else None
         renewal = self.renewal(public)
-        if renewal is not None and renewal.grant is not None:
-            if found is None or found[0].not_before < renewal.grant[0].not_before:
-                return renewal.grant
+        other = None if renewal is None else renewal.grant
+        if found is None or (other is not None and found[0].not_before < other[0].not_before):
+            return other
         return found
 
     def invited(self, name: bytes) -> tuple[Invite, bytes] | None:
@@ -315,7 +322,7 @@ class Roll:
         return None if renewal is None else self.known_as(renewal.member, now)
 
     def best_pass(self, member: Member, shown: bytes, now: float) -> bytes:
-        """The pass to show for ``member``, which the pass ``shown`` says: the one by which it is a member for longest."""
+        """The pass to show for ``member``, which the pass ``shown`` says: that of the latest end."""
         known, renewal, grant = self.known_as(member, now), self.renewal(member.public), self.granted(member.public)
         if known.renewer:
             is_held = renewal is not None and renewal.member.not_after == known.not_after
@@ -351,9 +358,9 @@ class Roll:
             end = other.not_after
             if renewal is not None and renewal.member.renewer != other.public:
                 end = max(end, renewal.member.not_after)
-            if BOOTSTRAP in other.roles and other.life >= YEAR and self.revoked(other.public) is None:
-                if now < end - 2 * STEP:
-                    return False
+            may_renew = BOOTSTRAP in other.roles and other.life >= YEAR and self.revoked(other.public) is None
+            if may_renew and now < end - 2 * STEP:
+                return False
         return True
 
     # -- inside -----------------------------------------------------------------------------------------------------
@@ -389,11 +396,12 @@ class Roll:
         raise Full(f"the roll of the team holds {len(self)} statements, {self._bytes} bytes; it has no room for more")
 
     def _drop_ended(self, now: float) -> None:
-        """Let go of certificates that have ended and are remembered so that the operator can renew them."""
+        """Let go of admissions and renewals that have ended and are remembered so that the operator can renew them.
+
+        Grants stay: with one that ended its key would fall back to what was said of it before.
+        """
         for key, held in list(self._held.items()):
-            entry = held.entry
-            end = entry.member.not_after if isinstance(entry, Admission | Renewal) else now + 1
-            if (entry.not_after if isinstance(entry, Grant) else end) <= now:
+            if isinstance(held.entry, Admission | Renewal) and held.entry.member.not_after <= now:
                 self._let_go(key)
 
     def _counts(self, renewal: Member, now: float) -> bool:
@@ -422,9 +430,9 @@ class Roll:
         grant, admission = self.granted(member.public), self.admitted(member.public)
         if grant is not None and grant[0].not_before > member.since:
             return True  # the operator said something else since
-        if admission is not None and admission.member.invitation == member.invitation:
-            if not _is_same_admission(member, admission.member):
-                return True
+        is_by_one_code = admission is not None and admission.member.invitation == member.invitation
+        if admission is not None and is_by_one_code and not _is_same_admission(member, admission.member):
+            return True
         return member.renewer != member.public and not self._counts(member, now)
 
     def _drop_void(self, keys: Iterable[bytes], now: float) -> None:

@@ -72,8 +72,8 @@ class Grant:
 
     @property
     def until(self) -> int:
-        """Until when it is worth being remembered."""
-        return remembered_until(self.not_after, self.life)
+        """Until when it is worth being remembered: as long as what was said before of that key could last."""
+        return max(self.not_after, self.not_before + MAX_LIFE)
 
     @property
     def life(self) -> int:
