@@ -107,8 +107,8 @@ class Reception:
     async def _decide(self, heard: Knock, invite: Invite, packed: bytes) -> bytes | str:
         """The pass of who knocked, or the code of the refusal."""
         now = int(self._wall())
-        me = self._roll.granted(self._identity.public)
-        if me is None or BOOTSTRAP not in me[0].roles:
+        me, own = self._roll.granted(self._identity.public), self._roll.member(self._identity.public, now)
+        if me is None or own is None or BOOTSTRAP not in me[0].roles or self._roll.refusal(own, now):
             return "role"
         if self._roll.terms_of(invite.public) is None:
             return "old"

@@ -17,6 +17,7 @@ from middleware.admission.certificate import BOOTSTRAP, Member, member_of, renew
 from middleware.admission.roll import STEP, Roll, packed_admission
 from middleware.entangled.errors import Full, RemoteError
 from middleware.entangled.identity import Identity
+from middleware.entangled.wire.door import Noted
 
 SCANNED_S = 600.0
 """Seconds between two looks at the list, on average.  Less renews sooner whoever is present for a short while only."""
@@ -48,6 +49,7 @@ class Renewer:
         self._add = add
         self._rng = rng
         self._next_at = 0.0
+        self._noted = Noted()
 
     def is_time(self, now: float) -> bool:
         """Whether to look over the list; the next time is drawn, so that several nodes do so one after the other."""
@@ -85,7 +87,8 @@ class Renewer:
             member_of(self._roll.operator, member.public, after)
             self._add(packed_admission(member.public, after))
         except (RemoteError, Full) as error:
-            self._log.warn("{name} cannot be renewed: {error}", name=member.name, error=error)
+            if self._noted.is_new(now, member.public):
+                self._log.warn("{name} cannot be renewed: {error}", name=member.name, error=error)
             return False
         return True
 

@@ -412,7 +412,7 @@ class Roll:
         end, grant = self.revoked(renewal.renewer), self.granted(renewal.renewer)
         if end is not None and renewal_id(renewal.public, renewal.not_after) not in end.kept:
             return False
-        if grant is not None and (BOOTSTRAP not in grant[0].roles or grant[0].life < YEAR):
+        if grant is not None and BOOTSTRAP not in grant[0].roles:
             return False
         if renewal.renewer == renewal.public and not self.is_last_bootstrap(renewal.public, renewal.not_before, now):
             return False

@@ -128,6 +128,15 @@ class RevokedBootstrapTests(RenewalCase):
         self.assertEqual((isinstance(error, NotAdmitted), getattr(error, "code", "")), (True, EXPIRED))
         self.assertEqual(self.said(self.renew(old, by=0)), "")
 
+    def test_without_the_role(self) -> None:
+        """A bootstrap node from which the operator took that role renews nobody, by its earlier grant either."""
+        old = self.word()
+        self.team.days = 300
+        grant = self.team.signer.grant(self.keys[1].public, "boot1", ("device",), self.team.wall())
+        self.tell(grant)
+        self.team.days = 370
+        self.assertEqual({self.said(self.renew(old, ago * DAY)) for ago in (0, 80, 360)}, {EXPIRED})
+
     def test_laundered_admission(self) -> None:
         """Whom a bootstrap node let in, and the operator did not keep, goes with it, though another node renewed it."""
         code = read(self.team.invite("pup"))
