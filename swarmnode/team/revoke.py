@@ -44,8 +44,7 @@ def main(words: Sequence[str] | None = None, desk: Desk | None = None) -> int:
 
 def _admitted_by(found: Known, public: bytes, now: float) -> list[Member]:
     """Return the present members that the bootstrap node ``public`` let in."""
-    admissions = [each.member for each in found.roll.admissions()]
-    return [each for each in admissions if each.admitter == public and not found.roll.refusal(each, now)]
+    return [each for each in found.members(now) if each.admitter == public]
 
 
 def _renewed_by(found: Known, public: bytes, now: float) -> list[tuple[bytes, int]]:
