@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from middleware.admission.certificate import member_of
+from twisted.internet.defer import Deferred, succeed
+
+from middleware.admission.certificate import Member, member_of
 from middleware.admission.membership import Membership, unpacked
+from middleware.admission.renewal import BATCH
 from middleware.admission.statement import YEAR
 from middleware.entangled.errors import NotAdmitted
 from tests.middleware.admission.village import House, Village, VillageCase
@@ -103,6 +106,55 @@ class YearAndAHalfTests(YearsCase):
         years.live(500)
         self.assertEqual(years.members(2), ["cat", "dog", "pig", "vaio"])
         years.open(years.houses[1])
+
+
+class LargeTeamTests(YearsCase):
+    """A team in which a bootstrap node does not see everybody."""
+
+    def test_not_in_sight(self) -> None:
+        """A member that is no contact of the bootstrap node is looked up in a large team, and has to answer."""
+        years = self.years(bootstraps=1)
+        vaio, dog, cat = years.houses[:3]
+        years.close(cat, is_sudden=True)
+        overlay = vaio.node.overlay
+        self.patch(overlay, "contact", lambda node_id: None)
+        answers: list[bool] = []
+        for house in (dog, cat):
+            member = vaio.team.door.member(house.public)
+            assert member is not None
+            self.assertEqual([vaio.team._may_be_here(member), self.is_large_and_may(vaio, member)], [False, True])
+            Deferred.fromCoroutine(vaio.team._is_here(member)).addCallback(answers.append)
+            years.run(20.0)
+        self.assertEqual(answers, [True, False])
+        years.open(cat)
+
+    def is_large_and_may(self, house: House, member: Member) -> bool:
+        """Whether a member that is not in sight may be there for a house in a large team."""
+        overlay = house.node.overlay
+        overlay.is_large = True
+        found = house.team._may_be_here(member)
+        overlay.is_large = False
+        return found
+
+
+class BatchTests(YearsCase):
+    """Many members of one day."""
+
+    def test_a_few_at_once(self) -> None:
+        """A bootstrap node signs a few renewals at a time, and goes on until all are renewed."""
+        years = self.years(bootstraps=1)
+        for number in range(BATCH + 3):
+            years.tell(years.signer.grant(bytes([number]) * 32, f"p{number}", ("device",), years.wall()))
+        team = years.houses[0].team
+        self.patch(team, "_may_be_here", lambda member: True)
+        self.patch(team, "_is_here", lambda member: succeed(True))
+        years.days += 300
+        years.run(6.0)
+        before = len([each for each in team.members() if each.renewer])
+        self.assertEqual(before, BATCH)
+        years.days += 1
+        years.run(6.0)
+        self.assertEqual({bool(each.renewer) for each in team.members()}, {True})
 
 
 class SleeperTests(YearsCase):
