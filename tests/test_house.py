@@ -26,8 +26,8 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "drivers": ("drivers", "standards"),
     "sim": ("sim", "drivers"),
     "sim.team": ("sim.team", "middleware"),
-    "webnode": ("webnode", "middleware"),
-    "agents": ("agents", "middleware", "drivers.driver", "drivers.reading", "drivers.errors"),
+    "webnode": ("webnode", "middleware", "standards"),
+    "agents": ("agents", "middleware", "drivers.driver", "drivers.reading", "drivers.errors", "standards"),
     "swarmnode": ROOMS,
 }
 
@@ -55,7 +55,7 @@ PURE = (
     "drivers.aibo.sense",
     "drivers.errors",
     "drivers.gate",
-    "drivers.jpeg",
+    "standards.jpeg",
     "drivers.reading",
     "drivers.rosbridge.websocket",
     "middleware.admission.certificate",

@@ -150,12 +150,13 @@ def grant_of(operator: bytes, shown: bytes) -> tuple[Grant, bytes] | None:
     return (_grant(operator, word[0]), word[0]) if len(word) == 1 else None
 
 
-def entry_of(public: bytes, shown: bytes) -> bytes | None:
-    """Return the entry of the membership list that a good pass of ``public`` has in it; None for that of a guest."""
+def entries_of(public: bytes, shown: bytes) -> list[bytes]:
+    """Return the entries of the membership list that a good pass of ``public`` has in it; none for that of a guest."""
     kind, *rest = unpacked(shown)
     if kind == 0:
-        return bytes(rest[0])
-    return bytes(msgpack.packb([ADMISSION, public, shown])) if kind in (1, 3) else None
+        return [bytes(rest[0])]
+    grants = [bytes(rest[0][0])] if kind == 3 and len(rest[0]) == 1 else []
+    return [*grants, bytes(msgpack.packb([ADMISSION, public, shown]))] if kind in (1, 3) else []
 
 
 def guest_pass(gateway: Identity, own: bytes, public: bytes, name: str, now: int, life: int = GUEST_LIFE) -> bytes:

@@ -11,7 +11,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Collection
 from typing import Protocol
 
-from middleware.admission.certificate import ROOM, Member, entry_of, member_by, member_of, pass_of
+from middleware.admission.certificate import ROOM, Member, entries_of, member_by, member_of, pass_of
 from middleware.admission.membership import Membership
 from middleware.admission.roll import Roll
 from middleware.entangled.data.store import Store
@@ -113,7 +113,14 @@ class Doorkeeper:
         except RemoteError:
             return FOREIGN
         now = self._wall()
-        refusal = self._roll.refusal(self._roll.known_as(member, now), now) or self._list(public, shown, member)
+        return self._roll.refusal(self._roll.known_as(member, now), now) or self._count_guest(member)
+
+    def admit(self, public: bytes, shown: bytes) -> str:
+        """Judge a node that has confirmed its session, and remember it where it is let in."""
+        refusal = self.judge(public, shown)
+        if not refusal:
+            member = self._read(public, shown)
+            refusal = self._list(public, shown, member)
         if not refusal:
             self._met[public] = member
             self._met.move_to_end(public)
@@ -139,20 +146,21 @@ class Doorkeeper:
         Returns the refusal of one for whom the list has no room: who is not on it is no member.  A guest is not listed;
         its voucher is.  A renewal that the list does not have is listed, too.
         """
-        if member.voucher is not None:
-            return self._count_guest(member)
-        entry, is_off_roll = entry_of(public, shown), self.is_off_roll(public)
-        is_news = is_off_roll or (bool(member.renewer) and not self._roll.has(entry))
-        if entry is not None and public != self._me.public and is_news:
+        entries = entries_of(public, shown) if member.voucher is None else []
+        is_off_roll = self.is_off_roll(public)
+        if public != self._me.public and (is_off_roll or member.renewer):
             try:
-                self.list_entry(entry)
+                for entry in entries:
+                    if not self._roll.has(entry):
+                        self.list_entry(entry)
             except (Full, RemoteError):
                 return UNLISTED if is_off_roll else ""
         return ""
 
     def _count_guest(self, member: Member) -> str:
         """Return a refusal where the voucher of a guest vouches for too many others at present."""
-        assert member.voucher is not None
+        if member.voucher is None:
+            return ""
         now, voucher = self._wall(), member.voucher.public
         others = sum(
             each.voucher is not None
@@ -205,7 +213,7 @@ class Doorkeeper:
 
     def learn(self, owner: bytes, certificate: bytes) -> bool:
         """Take in the pass of an owner that another node showed; whether it holds."""
-        return not self.judge(owner, certificate)
+        return not self.admit(owner, certificate)
 
     def member(self, public: bytes) -> Member | None:
         """What is known of the holder of ``public``, met or only heard of."""

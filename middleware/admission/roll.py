@@ -168,9 +168,9 @@ class Roll:
         keys = self._held if wanted is None else wanted
         return [self._held[key].packed for key in keys if key in self._held]
 
-    def has(self, packed: bytes | None) -> bool:
+    def has(self, packed: bytes) -> bool:
         """Whether this entry is held."""
-        return packed is not None and digest_of(packed) in self._held
+        return digest_of(packed) in self._held
 
     def add(self, packed: object, now: float) -> Entry | None:
         """Take an entry in; returns it where it is new and holds, else None.

@@ -12,7 +12,7 @@ from twisted.internet.interfaces import IReactorTime
 from twisted.logger import Logger
 
 from middleware.admission import knock
-from middleware.admission.certificate import Member, entry_of, guest_pass
+from middleware.admission.certificate import Member, entries_of, guest_pass
 from middleware.admission.doorkeeper import Doorkeeper, Rules, begun
 from middleware.admission.errors import WHY, BadKeyFile
 from middleware.admission.gossip import COMPARED, Gossip
@@ -176,8 +176,7 @@ class Team:
         except Exception:  # a rotten file may hold anything
             noted = []
         shown, public = self.membership.shown, self.identity.public
-        own = entry_of(public, shown)  # of a guest nothing is kept
-        for packed in [*(noted if isinstance(noted, list) else []), *([] if own is None else [own])]:
+        for packed in [*(noted if isinstance(noted, list) else []), *entries_of(public, shown)]:
             try:
                 self.roll.add(packed, self._wall())
             except (RemoteError, Full):

@@ -66,7 +66,7 @@ class RenewalCase(SiegeCase):
 
     def said(self, shown: bytes, own: Identity = DOG) -> str:
         """How the honest nodes judge a pass: their refusal; empty where the key is let in."""
-        answers = {self.team.houses[place].team.door.judge(own.public, shown) for place in (0, 2)}
+        answers = {self.team.houses[place].team.door.admit(own.public, shown) for place in (0, 2)}
         self.assertEqual(len(answers), 1, answers)
         return answers.pop()
 
@@ -127,6 +127,14 @@ class RevokedBootstrapTests(RenewalCase):
         error = self.enter(self.renew(old, 80 * DAY))
         self.assertEqual((isinstance(error, NotAdmitted), getattr(error, "code", "")), (True, EXPIRED))
         self.assertEqual(self.said(self.renew(old, by=0)), "")
+
+    def test_behind_a_void_renewal(self) -> None:
+        """A member that shows a void renewal of a grant that still holds is let in by the grant, and is on the list."""
+        ghost = identity("ghost")
+        old = pass_of(self.team.signer.grant(ghost.public, "ghost", ("viewer",), self.team.wall()))
+        self.tell(self.team.signer.revoke(self.keys[1].public, "boot1", self.team.wall()))
+        self.assertEqual(self.said(self.renew(old, own=ghost), ghost), "")
+        self.assertEqual([("ghost" in self.team.members(place)) for place in (0, 2)], [True, True])
 
     def test_without_the_role(self) -> None:
         """A bootstrap node from which the operator took that role renews nobody, by its earlier grant either."""

@@ -50,7 +50,7 @@ BITING_ELSEWHERE = {
 }
 """The same of the quickest bugs that other workloads look for."""
 ALL = tuple(WORKLOADS)
-SHRUNK = 12
+SHRUNK = 16
 """The seed of a schedule that a bug fails."""
 DIGEST = "from tests.middleware.test_invariants import digests; print(digests())"
 

@@ -60,7 +60,13 @@ def constant(path: Path, name: str) -> float:
 
 
 def _number(path: Path, node: ast.AST) -> float:
-    signs = {ast.Mult: operator.mul, ast.Add: operator.add, ast.Sub: operator.sub, ast.Pow: operator.pow}
+    signs = {
+        ast.Mult: operator.mul,
+        ast.Add: operator.add,
+        ast.Sub: operator.sub,
+        ast.Pow: operator.pow,
+        ast.FloorDiv: operator.floordiv,
+    }
     if isinstance(node, ast.Constant):
         assert isinstance(node.value, int | float)
         return float(node.value)
