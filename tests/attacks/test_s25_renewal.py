@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import msgpack
+from twisted.internet.defer import Deferred
 
 from middleware.admission.certificate import ROOM, Member, chained, member_of, pass_of, proof, renewed
 from middleware.admission.code import read
+from middleware.admission.membership import Membership
 from middleware.admission.roll import invitation_id, packed_admission
 from middleware.admission.statement import YEAR, Invite
 from middleware.entangled.errors import NotAdmitted
@@ -259,6 +261,48 @@ class WideningTests(RenewalCase):
         self.assertEqual(self.said(self.renew(old, 290 * DAY)), "")
         member = self.judge.team.door.member(DOG.public)
         self.assertEqual(None if member is None else member.not_after, self.read(good).not_after)
+
+    def end(self, own: Identity = DOG) -> int:
+        """When the certificate of a key ends, by the list of a plain member."""
+        member = self.judge.team.roll.member(own.public, self.team.wall())
+        assert member is not None
+        return member.not_after
+
+    def test_in_the_place_of_a_good_one(self) -> None:
+        """A renewal of an earlier word, which lasts longer, does not keep out one of the present word."""
+        old = self.word(life=3 * YEAR)
+        self.team.days = 1
+        new = self.word()
+        self.tell(msgpack.unpackb(new)[1])
+        self.team.days = 300
+        self.said(self.renew(old))
+        good = self.renew(new, by=0)
+        self.assertEqual((self.said(good), self.end()), ("", self.read(good).not_after))
+
+    def test_another_origin(self) -> None:
+        """A renewal that gives a member by a code another name or admitting node keeps out no good one, and is none."""
+        dog = self.team.move_in(self.successResultOf(self.knocked("pup", 2)))
+        shown, own = dog.kept.membership.shown, dog.kept.membership.identity
+        self.team.days = 300
+        fields = msgpack.unpackb(shown)
+        fields[4] = "pup-9"
+        other = msgpack.packb(fields)
+        member = self.read(shown, own)
+        bad = renewed(self.keys[1], self.thief, member, other, int(self.team.wall()) + 99)
+        self.assertEqual((member.name, self.read(bad, own).name), ("pup-1", "pup-9"))
+        for place in (0, 2):
+            self.assertIsNone(
+                self.team.houses[place].team.roll.add(packed_admission(own.public, bad), self.team.wall())
+            )
+        good = self.renew(shown, own=own, by=0)
+        self.assertEqual((self.said(good, own), self.end(own)), ("", self.read(good, own).not_after))
+        self.assertIn("pup-1", self.team.members(2))
+
+    def knocked(self, name: str, uses: int) -> Deferred[Membership]:
+        """A newcomer that was let in by a code for several."""
+        knocked = self.team.knock(self.team.invite(name, uses))
+        self.team.run(2.0)
+        return knocked
 
     def test_ahead_of_time(self) -> None:
         """A renewal that begins in the future does not count before that, and lasts no longer than others."""
