@@ -14,14 +14,14 @@ from types import FrameType
 from twisted.logger import globalLogBeginner
 
 from middleware.errors import SwarmError
-from sim.team.command import World, run
+from sim.team.command import Environment, run
 from sim.team.scale.command import scale
 
 WRONG = 2
 SPARING = 200_000, 20, 20
 """Objects made between two looks for garbage, and how often older ones are looked at; of Python's own 700, 10, 10 a
 large team makes one look after the other at what is none."""
-Verb = Callable[[Sequence[str], World], int]
+Verb = Callable[[Sequence[str], Environment], int]
 VERBS: Mapping[str, tuple[Verb, str]] = {
     "run": (run, "play a scenario with whole nodes, to its verdict"),
     "scale": (scale, "measure teams of many sizes, and draw the curves"),
@@ -56,7 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     ending = Ending()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, ending.wish)
-    world = World(
+    world = Environment(
         *(sys.stdout, sys.stderr, time.monotonic, time.process_time),
         read=lambda path: Path(path).read_text(encoding="ascii"),
         columns=shutil.get_terminal_size().columns if sys.stderr.isatty() else 0,

@@ -27,7 +27,7 @@ MISSED, ENDED = 1, 130
 
 
 @dataclass
-class World:
+class Environment:
     """What a command needs of the machine; tests have another one.
 
     ``wall`` and ``cpu`` give seconds; ``columns`` is how wide the terminal is, 0 where there is none; ``is_stopped``
@@ -44,7 +44,7 @@ class World:
     grown: Callable[[], None] = field(default=lambda: None)
 
 
-def run(arguments: Sequence[str], world: World, kinds: Kinds = KINDS) -> int:
+def run(arguments: Sequence[str], world: Environment, kinds: Kinds = KINDS) -> int:
     """Run what the arguments say; 1 where a target or an invariant is missed.  Raises ``BadSetting``."""
     wanted = _parsed(arguments)
     changes = {} if wanted.nodes is None else {"nodes": wanted.nodes}

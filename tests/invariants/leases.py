@@ -19,7 +19,7 @@ from middleware.entangled.kademlia.contact import Contact
 from sim.team.event import Awaited
 from sim.team.faults.timeline import TimedFault, Timeline
 from sim.team.leases.radio import CALM, Air
-from sim.team.leases.team import Team
+from sim.team.leases.team import LeaseTeam
 from sim.team.shrink import WHOLE, Trim
 
 TTL = 1.5
@@ -54,7 +54,7 @@ def draw_faults(dice: random.Random, n: int, agents: Sequence[int], has_stores: 
     return faults
 
 
-class Leases(Team):
+class Leases(LeaseTeam):
     """The run of ``seed``: everything follows from it."""
 
     def __init__(self, seed: int, trim: Trim = WHOLE, ttl: float = TTL) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.errors import BadSetting
-from sim.team.command import World
+from sim.team.command import Environment
 from sim.team.figure import Figure
 from sim.team.scale import theory
 from sim.team.scale.command import scale
@@ -23,10 +23,10 @@ from sim.team.scale.record import Record
 from sim.team.scale.survey import Ended, Sized, SurveySettings, Watcher, surveyed
 
 
-def world() -> World:
+def world() -> Environment:
     """A machine with room for everything."""
     ticks = itertools.count()
-    return World(
+    return Environment(
         io.StringIO(), io.StringIO(), lambda: next(ticks), lambda: 0.0, read=lambda path: "MemAvailable: 99999999 kB"
     )
 

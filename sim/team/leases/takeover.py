@@ -12,19 +12,19 @@ import random
 import sys
 
 from sim.team.leases.radio import Air
-from sim.team.leases.team import Team
+from sim.team.leases.team import LeaseTeam
 
 TASK = "t0"
 DELAY, JITTER, DRIFT = 0.02, 0.01, 0.01
 NEVER = 1e12
 
 
-def standing(seed: int, loss: float, ttl: float, stand_bys: int = 2) -> Team:
+def standing(seed: int, loss: float, ttl: float, stand_bys: int = 2) -> LeaseTeam:
     """A team of three council members and of agents, the first of which holds the lease."""
     dice = random.Random(f"takeover/{seed}")
     agents = 1 + stand_bys
     rates = [1.0 + dice.uniform(-DRIFT, DRIFT) for _ in range(agents + 3)]
-    team = Team(f"takeover/{seed}", rates, agents, ttl, tick=NEVER)
+    team = LeaseTeam(f"takeover/{seed}", rates, agents, ttl, tick=NEVER)
     team.radio.air = Air(DELAY, JITTER, loss)
     team.add_task(TASK, range(agents, agents + 3))
     team.clock.advance(ttl + 0.1)
@@ -37,7 +37,7 @@ def standing(seed: int, loss: float, ttl: float, stand_bys: int = 2) -> Team:
     return team
 
 
-def holder_of(team: Team) -> int | None:
+def holder_of(team: LeaseTeam) -> int | None:
     """Who holds the lease, by its own clock, among those that live."""
     for place in team.agents:
         if team.bidders[place].machine.is_alive and team.bidders[place].lessee(TASK).lease is not None:

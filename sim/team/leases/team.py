@@ -1,6 +1,6 @@
 """Places with machines, acceptors, agents and devices on a simulated link, for schedules and trials of leases.
 
-``Bidder`` is one life of a place, ``Team`` all places, ``Referee`` what is written down of them (E1 to E9).
+``Bidder`` is one life of a place, ``LeaseTeam`` all places, ``Referee`` what is written down of them (E1 to E9).
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ WIRE = 0.001
 class Bidder:
     """One life of a place: its acceptor, its claims, its robot."""
 
-    def __init__(self, world: Team, place: int, machine: Machine, store: Store, rng: random.Random) -> None:
+    def __init__(self, world: LeaseTeam, place: int, machine: Machine, store: Store, rng: random.Random) -> None:
         self.world = world
         self.place = place
         self.machine = machine
@@ -211,7 +211,7 @@ class Bidder:
 class Referee:
     """The history of a team, and of each task its device's gate, what that accepted, and who won."""
 
-    def __init__(self, world: Team) -> None:
+    def __init__(self, world: LeaseTeam) -> None:
         self.history = History(world.clock.seconds)
         self.gates: dict[str, Gate] = {}
         self.accepted: dict[str, list[tuple[float, int, int]]] = {}
@@ -293,7 +293,7 @@ class Referee:
                     self.history.note(Reached, *mine, is_reached)
 
 
-class Team:
+class LeaseTeam:
     """Places whose clocks run at ``rates``; the first ``agents`` of them have agents.  ``seed`` names its dice.
 
     ``stop_time`` is how long a robot takes to come to rest, ``drift`` the largest error of a clock.

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 
 from middleware.errors import BadSetting
-from sim.team.command import ENDED, MISSED, World
+from sim.team.command import ENDED, MISSED, Environment
 from sim.team.figure import Figure, table
 from sim.team.memory import check
 from sim.team.scale.apart import apart
@@ -35,7 +35,7 @@ def surveyed_apart(nodes: int, settings: SurveySettings, watcher: Watcher) -> Si
     return apart(partial(surveyed, nodes, settings, watcher), Ended, is_stopped=watcher.is_stopped)
 
 
-def scale(arguments: Sequence[str], world: World, measure: Measure = surveyed_apart) -> int:
+def scale(arguments: Sequence[str], world: Environment, measure: Measure = surveyed_apart) -> int:
     """Measure the sizes that are not measured yet, print and draw all; 1 where a target is missed.
 
     Raises ``BadSetting``.
@@ -98,7 +98,7 @@ def _draw(out: Path, sizes: Mapping[int, Sized], settings: SurveySettings) -> No
     (out / "table.md").write_text(f"# Scale: the figures\n\n{page(CURVES, points(sizes))}", encoding="utf-8")
 
 
-def _say(world: World, line: str) -> None:
+def _say(world: Environment, line: str) -> None:
     world.err.write(f"{line}\n")
     world.err.flush()
 

@@ -11,7 +11,7 @@ from twisted.trial.unittest import SynchronousTestCase
 from middleware.commitment.ballot import Ballot
 from middleware.commitment.charter import Charter, sign_change
 from middleware.commitment.lessee import Lessee
-from sim.team.leases.team import Team
+from sim.team.leases.team import LeaseTeam
 
 TTL = 1.5
 T = "t0"
@@ -23,9 +23,9 @@ class RoomCase(SynchronousTestCase):
     def setUp(self) -> None:
         self.room = self.made()
 
-    def made(self, stop_time: float = 0.0, rates: Sequence[float] = (1.0,) * 7, seed: str = "room") -> Team:
+    def made(self, stop_time: float = 0.0, rates: Sequence[float] = (1.0,) * 7, seed: str = "room") -> LeaseTeam:
         """A team whose council may grant."""
-        room = Team(seed, rates, 3, TTL, stop_time)
+        room = LeaseTeam(seed, rates, 3, TTL, stop_time)
         room.add_task(T, [3, 4, 5])
         room.clock.advance(TTL + 0.1)
         return room

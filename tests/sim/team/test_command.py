@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.errors import BadSetting
-from sim.team.command import ENDED, KINDS, MISSED, World, run
+from sim.team.command import ENDED, KINDS, MISSED, Environment, run
 
 SCENARIO = """
 about = "a small team"
@@ -58,7 +58,7 @@ class CommandTests(SynchronousTestCase):
                 raise FileNotFoundError(path)
             return "VmRSS: 2048 kB"
 
-        world = World(self.out, self.err, self.seconds, self.seconds, read, columns, is_stopped)
+        world = Environment(self.out, self.err, self.seconds, self.seconds, read, columns, is_stopped)
         return run(["--scenario", str(self.path), *words], world, KINDS)
 
     def test_report_is_for_people_and_programs(self) -> None:
