@@ -92,12 +92,12 @@ class Keeper:
 
     def rest(self) -> None:
         """Learn that a halt has just been sent, so that nothing is in force once it has left."""
-        if self._end is not None:
+        if self._end is not None and self._closed is None:
             self._settle_soon()
 
     def leave(self) -> None:
         """Learn that the link is gone."""
-        if self._word is not None:
+        if self._word is not None and self._closed is None:
             self._is_leaving = True
             self._settle_soon()
 

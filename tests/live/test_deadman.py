@@ -284,6 +284,17 @@ class KeeperTests(TestCase):
         self.keeper.leave()
         await until(lambda: self.wire.heard() is None, 1.0)
 
+    def test_leaves_no_timer_once_closed(self) -> Deferred[None]:
+        """A link that is lost after the keeper was closed starts nothing: the reactor would find it unclean."""
+        return Deferred.fromCoroutine(self._close())
+
+    async def _close(self) -> None:
+        self.keeper.guard(LastWord(b"halt", self.wire))
+        self.keeper.until(1.0)
+        await self.keeper.close()
+        self.keeper.rest()
+        self.keeper.leave()
+
     def test_finishes_a_halt_that_left_in_part(self) -> Deferred[None]:
         """A halt of which the link took a part is finished before it is said anew."""
         return Deferred.fromCoroutine(self._part())

@@ -47,7 +47,7 @@ class Waits(Protocol):
 class Taker:
     """The takes of one node in one space; ``held`` are the tuples it holds, ``gone`` those it knows to be taken.
 
-    ``on_free`` is called when this node gives up a tuple that it held, ``put_back`` with a tuple that was confirmed to
+    ``on_free`` is called when this node gives up a tuple that it held or failed to claim, ``put_back`` with a tuple that was confirmed to
     a call for which nobody waits any more.
     """
 
@@ -221,7 +221,6 @@ class Taker:
 
     def _missed(self, place: Place, outcome: Outcome) -> None:
         now = self._clock.seconds()
-        self.held.discard(place)
         if outcome.result is Result.DECIDED and outcome.value is not None:
             self._over(place, outcome.value)
             self._keeper.doubt(place, outcome.value)
@@ -231,6 +230,8 @@ class Taker:
             self._not_before[place] = now + self._rng.uniform(*CONTEST_RETRY)
         else:
             self._not_before[place] = now + self._rng.uniform(*SILENT_RETRY)
+        # Another call of this node may sleep because this one held the tuple: nothing else would wake it.
+        self._free(place)
 
     def _over(self, place: Place, winner: bytes) -> None:
         self.held.discard(place)

@@ -371,6 +371,16 @@ class ClaimTests(SpaceCase):
         claim.release()
         self.assertEqual(self.done(fleet, waiting, 1.0), ("job", 1))
 
+    def test_get_behind_another_call_of_the_same_node(self) -> None:
+        """A get that finds the tuple held by another call of its node goes on when that call does not win it."""
+        fleet, (a, b, c) = self.spaces(3)
+        b.read(("bell", int)).addErrback(lambda failure: failure.trap(NotRunning))  # keeps the shelf of b open
+        self.done(fleet, a.put(("job", 1)), 1.0)
+        self._claimed(fleet, c, lease=4.0)
+        at_once, waiting = b.get_if_exists(("job", ANY)), b.get(("job", ANY))
+        self.assertIsNone(self.done(fleet, at_once, 3.0))
+        self.assertEqual(self.done(fleet, waiting, 5.0), ("job", 1))
+
     def test_renew(self) -> None:
         """A claim that is renewed outlasts its first lease; one that is over cannot be renewed."""
         fleet, (a, b, c) = self.spaces(3)
