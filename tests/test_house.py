@@ -14,18 +14,19 @@ from pathlib import Path
 from twisted.trial.unittest import SynchronousTestCase
 
 ROOT = Path(__file__).resolve().parent.parent
-BELOW = ("agents", "drivers", "middleware", "sim", "standards", "webnode")
+BELOW = ("agents", "drivers", "middleware", "sim", "standards", "validation", "webnode")
 ROOMS = (*BELOW, "swarmnode")
 
 # From the most special name to the room: what a module may import of the house.  The longest name that fits holds.
 MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "standards": ("standards",),
-    "middleware": ("middleware",),
+    "validation": ("validation",),
+    "middleware": ("middleware", "validation"),
     "middleware.entangled": ("middleware.entangled", "standards"),
     "middleware.admission": ("middleware.admission", "middleware.entangled"),
-    "drivers": ("drivers", "standards"),
-    "sim": ("sim", "drivers"),
-    "sim.team": ("sim.team", "middleware"),
+    "drivers": ("drivers", "standards", "validation"),
+    "sim": ("sim", "drivers", "validation"),
+    "sim.team": ("sim.team", "middleware", "validation"),
     "webnode": ("webnode", "middleware"),
     "agents": ("agents", "middleware", "drivers.driver", "drivers.reading", "drivers.errors"),
     "swarmnode": ROOMS,
@@ -174,6 +175,7 @@ PURE = (
     "sim.team.scenario",
     "sim.team.session",
     "standards",
+    "validation",
     "swarmnode.doctor.diagnosis",
     "swarmnode.doctor.facts",
     "swarmnode.doctor.finding",
@@ -209,7 +211,7 @@ EDGES = (
     "middleware.entangled.data.writer",
 )
 WORLD = ("time", "socket", "threading", "asyncio", "selectors", "subprocess", "secrets", "twisted.internet.reactor")
-GUARDED = ("standards", "middleware", "agents", "drivers")
+GUARDED = ("standards", "validation", "middleware", "agents", "drivers")
 
 ON_DEMAND = (
     *("middleware.deployment", "middleware.explanation", "middleware.verdict"),
@@ -267,7 +269,7 @@ def _allowed(module: str) -> tuple[str, ...]:
         kinds = sorted({name.split(".")[1] for name in FILES if re.fullmatch(r"drivers\.\w+\.maker", name)})
         own = parts[1] if len(parts) > 2 or module in (f"drivers.{kind}" for kind in kinds) else ""
         contract = tuple(name for name in FILES if name.startswith("drivers.") and name.split(".")[1] not in kinds)
-        contract += ("standards",)
+        contract += ("standards", "validation")
         allowed = (*contract, f"drivers.{own}") if own else contract
     return allowed
 
