@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import MISSING, Field, dataclass, fields
-from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import MISSING, dataclass, fields
+from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 from msgspec import Meta, MsgspecError, convert
 
@@ -62,6 +62,20 @@ def check_printable(value: Any) -> Any:
 
 
 LINE = Then(check_printable)
+
+
+def one_of(words: Sequence[str]) -> Then:
+    """Allow one of ``words``."""
+    return Then(lambda word: word, raw=Literal[tuple(words)])
+
+
+def some_of(words: Sequence[str]) -> Then:
+    """Allow a list of some of ``words``, at least one; they are put into the order of ``words``."""
+    word: Any = Literal[tuple(words)]
+    raw = Annotated[tuple[word, ...], Meta(min_length=1)]
+    return Then(lambda given: tuple(word for word in words if word in given), raw)
+
+
 UNIQUE = Then(lambda items: tuple(dict.fromkeys(items)))
 """Leaves repeated entries of a list out."""
 
@@ -73,41 +87,55 @@ def convert_table(table: object, cls: type[T]) -> T:
     known = {field.name: field for field in fields(cls)}  # type: ignore[arg-type]
     for key in table:
         if key not in known:
-            raise Invalid(str(key), "is unknown", f"{nearest_of(str(key), known)}known are {', '.join(known)}")
+            raise Invalid(
+                str(key), "is unknown", f"the nearest is {nearest_of(str(key), known)}; known are {', '.join(known)}"
+            )
     hints = get_type_hints(cls, include_extras=True)
-    values = {key: _convert(value, hints[key], known[key], False) for key, value in table.items()}
+    values = {key: convert_value(value, hints[key], key, known[key].default) for key, value in table.items()}
     for key, field in known.items():
         if key not in values and field.default is MISSING and field.default_factory is MISSING:
-            raise Invalid(key, f"is missing, and must be {_expected_by(hints[key])}", _remedy_for(hints[key], None))
+            raise Invalid(key, f"is missing, and must be {_expected_by(hints[key])}", _remedy_for(hints[key]))
     return cls(**values)
 
 
 def convert_field(value: object, cls: type[Any], key: str, is_text: bool = False) -> Any:
-    """Convert ``value`` to the type of one field of the dataclass ``cls``; raises ``Invalid``.
+    """Convert ``value`` to the type of one field of the dataclass ``cls``; as ``convert_value``."""
+    default = next(field.default for field in fields(cls) if field.name == key)
+    return convert_value(value, get_type_hints(cls, include_extras=True)[key], key, default, is_text)
+
+
+def convert_value(value: object, hint: Any, key: str = "", default: object = None, is_text: bool = False) -> Any:
+    """Convert ``value`` to the type ``hint``; raises ``Invalid``, with ``key``, and ``default`` as the example.
 
     ``is_text``: it is a word of a command line, where lists are separated by commas.
     """
-    field = next(field for field in fields(cls) if field.name == key)
-    return _convert(value, get_type_hints(cls, include_extras=True)[key], field, is_text)
-
-
-def _convert(value: object, hint: Any, field: Field[Any], is_text: bool) -> Any:
     extra = getattr(hint, "__metadata__", ())
-    steps = [each for each in extra if isinstance(each, Then)]
-    raw = next((step.raw for step in steps if step.raw is not None), hint)
+    raw = raw_of(hint)
     try:
         if is_text and get_origin(_base_of(raw)) is tuple:
             value = [word.strip() for word in str(value).split(",") if word.strip()]
         result = convert(value, raw, strict=not is_text)
-        for step in steps:
-            result = step.apply(result)
+        for step in extra:
+            result = step.apply(result) if isinstance(step, Then) else result
         return result
     except (MsgspecError, ValueError) as error:
-        expected, remedy = _expected_by(hint), _remedy_for(hint, field.default)
+        expected = _expected_by(hint)
         if any(isinstance(each, Secret) for each in extra):
-            raise Invalid(field.name, f"must be {expected} (its value is not shown)", remedy) from None
-        problem = _problem_of(error, value)
-        raise Invalid(field.name, f"{problem}, but must be {expected}", remedy) from None
+            raise Invalid(key, f"must be {expected} (its value is not shown)", _remedy_for(hint)) from None
+        place, wrong = _innermost(value, error)
+        problem = str(error)
+        if isinstance(error, MsgspecError) or not problem:
+            unknown = re.match(r"Object .* field `.*?`", problem)
+            problem = f"has {unknown[0][7:]}" if unknown else f"is {show_value(wrong)}"
+        raise Invalid(
+            key, f"{place} {problem}, but must be {expected}".strip(), _remedy_for(hint, default, wrong)
+        ) from None
+
+
+def raw_of(hint: Any) -> Any:
+    """The type of a value before its last steps."""
+    steps = [each for each in getattr(hint, "__metadata__", ()) if isinstance(each, Then)]
+    return next((step.raw for step in steps if step.raw is not None), hint)
 
 
 def show_value(value: object) -> str:
@@ -117,32 +145,26 @@ def show_value(value: object) -> str:
 
 
 def nearest_of(word: str, known: Iterable[str]) -> str:
-    """The beginning of a remedy that names the nearest known word; empty where none is near."""
+    """The known word that is most like ``word``."""
     from difflib import get_close_matches  # only a mistake needs it
 
-    near = get_close_matches(word[:64], list(known), n=1, cutoff=0.5)
-    return f"the nearest is {near[0]}; " if near else ""
+    return get_close_matches(word[:64], list(known), n=1, cutoff=0.0)[0]
 
 
 def _base_of(hint: Any) -> Any:
     return get_args(hint)[0] if hasattr(hint, "__metadata__") else hint
 
 
-def _problem_of(error: Exception, value: object) -> str:
-    """What is wrong with ``value``: the innermost entry at the path that ``msgspec`` names, such as ``$[1].kind``."""
-    text = str(error)
-    if not isinstance(error, MsgspecError):
-        return text or f"is {show_value(value)}"
-    path = re.search(r" - at `(?:key in `)?\$([^`]*)`", text)
+def _innermost(value: object, error: Exception) -> tuple[str, object]:
+    """The place and value of the entry that ``msgspec`` complains of, by a path such as ``$[1].kind``."""
+    path = re.search(r" - at `(?:key in `)?\$([^`]*)`", str(error))
     place = ""
     for name, number in re.findall(r"\.(\w+)|\[(\d+)\]", path[1] if path else ""):
         if isinstance(value, Mapping) and name in value:
             value, place = value[name], f"{place}.{name}"
         elif number and isinstance(value, list | tuple):
             value, place = value[int(number)], f"{place}[{number}]"
-    unknown = re.match(r"Object .* field `.*?`", text)
-    problem = unknown[0].lower().replace("object", "a table") if unknown else f"is {show_value(value)}"
-    return f"{place.lstrip('.')} {problem}".strip()
+    return place, value
 
 
 def _expected_by(hint: Any) -> str:
@@ -152,6 +174,8 @@ def _expected_by(hint: Any) -> str:
     for meta in metas:
         if meta.description:
             return meta.description
+    if raw_of(hint) is not hint:
+        return _expected_by(raw_of(hint))
     base, unit = _base_of(hint), "".join(f" {each.name}" for each in extra if isinstance(each, Unit))
     if get_origin(base) is Literal:
         return f"one of {', '.join(map(json.dumps, get_args(base)))}"
@@ -171,10 +195,21 @@ def _expected_by(hint: Any) -> str:
     return name + "".join([*limits, unit, *lengths])
 
 
-def _remedy_for(hint: Any, default: object) -> str:
+def _remedy_for(hint: Any, default: object = None, wrong: object = None) -> str:
+    words = _words_of(hint)
+    if words and isinstance(wrong, str):
+        return f'the nearest is "{nearest_of(wrong, words)}"'
     for meta in getattr(hint, "__metadata__", ()):
         if isinstance(meta, Meta) and meta.examples:
             default = meta.examples[0]
     # TOML writes texts, numbers, truth values and lists as JSON does.
     has_example = isinstance(default, bool | int | float | str | list | tuple) and default not in ("", ())
     return f"write, for example, {json.dumps(default)}" if has_example else "write such a value, or leave it out"
+
+
+def _words_of(hint: Any) -> list[str]:
+    """The words that a type allows by itself, or as entries of its list."""
+    base = _base_of(raw_of(hint))
+    if get_origin(base) is tuple:
+        base = _base_of(get_args(base)[0])
+    return [word for word in get_args(base) if isinstance(word, str)] if get_origin(base) is Literal else []

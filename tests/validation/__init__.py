@@ -1,1 +1,1 @@
-"""Tests of what others have standardised."""
+"""Tests of the conversion of settings and options."""
