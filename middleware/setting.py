@@ -63,7 +63,7 @@ class Part(Struct, forbid_unknown_fields=True):
     """One entry of ``[[driver.parts]]``."""
 
     kind: Annotated[str, Meta(pattern=r"^[A-Za-z_][A-Za-z0-9_]*([.:][A-Za-z_][A-Za-z0-9_]*)*$(?!\n)")]
-    options: dict[str, object] = {}
+    options: dict[str, Any] = {}
 
 
 # Patterns end with $(?!\n): $ alone also matches before a last line break, and JSON schemas do not know \Z.
@@ -117,7 +117,7 @@ Position = Annotated[
     Meta(description="{ x = 0.0, y = 0.0, heading = 0.0 } or { lat = 0.0, lon = 0.0, accuracy = 0.0 }"),
     Then(_check_position, raw=dict[str, Annotated[float, FINITE]]),
 ]
-Options = Annotated[Mapping[str, object], Then(dict, raw=dict[str, object])]
+Options = Annotated[Mapping[str, object], Then(dict, raw=dict[str, Any])]
 Parts = Annotated[
     tuple[tuple[str, Mapping[str, object]], ...],
     Meta(description='at most 8 tables, such as { kind = "camera", options = {} }'),

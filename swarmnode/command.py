@@ -31,6 +31,7 @@ WORKS: dict[str, tuple[str, str]] = {
     "why": ("swarmnode.why", "who was chosen for a task, and why"),
     "doctor": ("swarmnode.doctor.command", "what keeps a node from its team, and what to do"),
     "links": ("swarmnode.links", "how a node reaches each of its peers, and how well"),
+    "schema": ("swarmnode.schema", "the JSON schema of a settings file, for editors"),
     "service": ("swarmnode.systemd.command", "a node as a service of systemd: install, show, restart, remove"),
     "web": ("swarmnode.web_code", "where the page is, and the code to sign in with"),
     "password": ("swarmnode.password", "the hash of a password, for the settings of the page"),
