@@ -11,6 +11,7 @@ from twisted.internet.interfaces import IReactorTime
 from twisted.internet.task import deferLater
 from twisted.logger import Logger
 
+from agents.detection import run_in_thread
 from agents.engagement import Deed
 from agents.means import Means
 from drivers.driver import Driver
@@ -37,7 +38,7 @@ class Body:
         missing: Callable[[str], None],
     ) -> None:
         self.driver = driver
-        self.means = Means(driver.description)
+        self.means = Means(driver.description, run_in_thread(clock))
         self.is_awake = False
         self._clock = clock
         self._seen = seen

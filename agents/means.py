@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
+from agents.detection import Run, run_now
 from drivers.reading import Action, Description, Value
 
 STAND = {"base.vx": 0.0, "base.vy": 0.0, "base.wz": 0.0}
@@ -52,10 +53,11 @@ class Means:
 
     ``walk`` (m/s) and ``turn`` (rad/s) are the highest speeds for what it senses, ``lens`` is what the camera sees
     across and up in radians (up None: as across, for the picture's pixels are square), ``ahead`` and ``radius`` are in
-    metres.
+    metres.  ``run`` is where its pictures are decoded.
     """
 
-    def __init__(self, description: Description | None = None) -> None:
+    def __init__(self, description: Description | None = None, run: Run = run_now) -> None:
+        self.run = run
         if description is None:
             description = Description("", "", {"ranger": {"max": 1.5}}, USUAL, 0.12)
         self._keys = description.limits

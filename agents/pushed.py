@@ -80,8 +80,9 @@ def told(thing: object) -> list[Any]:
 
 
 def plain_means(means: Means) -> dict[str, Any]:
-    """The means of a body as plain values."""
-    return {name: dict(value) if isinstance(value, Mapping) else value for name, value in vars(means).items()}
+    """The means of a body as plain values; without ``run``, because that process decodes its pictures itself."""
+    fields = {name: value for name, value in vars(means).items() if name != "run"}
+    return {name: dict(value) if isinstance(value, Mapping) else value for name, value in fields.items()}
 
 
 def plain_observation(seen: Observation) -> list[Any]:

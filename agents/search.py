@@ -11,9 +11,11 @@ import math
 import random
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 
 from agents.circling import Circling
 from agents.context import Context
+from agents.detection import Detector
 from agents.detour import Detour
 from agents.exploration import TURN_GAIN, Exploration, Pose, clipped
 from agents.formation import Post
@@ -60,6 +62,7 @@ class SearchAndApproach:
         self._distances: list[float] = []
         self._done_for = 0
         self._means = Means()
+        self._detector = Detector()
         self._circling = Circling(self._means)
         self._detour = Detour(self._means)
         self._is_lit = self._is_bumped = self._was_bumped = self._has_arrived = False
@@ -72,6 +75,7 @@ class SearchAndApproach:
     def embody(self, means: Means) -> None:
         """Look and walk as this body can."""
         self._means = self._exploration.means = self._circling.means = self._detour.means = means
+        self._detector.run = means.run
 
     # -- observing --------------------------------------------------------------------------------------------------
 
@@ -90,7 +94,8 @@ class SearchAndApproach:
         self._exploration.saw(self._pose, math.remainder(yaw - before[2], math.tau), self._ahead)
         if seen.frame is not None and seen.frame.seq != self._frame:
             self._frame = seen.frame.seq
-            self._saw(find_target(seen.frame.data, self._size, self._means.lens), now)
+            find = partial(find_target, seen.frame.data, self._size, self._means.lens)
+            self._detector.detect(find, partial(self._saw, now, self._pose))
         if self._circling.is_walking or self._detour.is_on(now):
             self._looked_at = now  # it looks elsewhere, and the target stays where it is
         elif self.cost is not None and self._is_hidden and now - self._seen_at <= HIDDEN - MEMORY:
@@ -98,12 +103,13 @@ class SearchAndApproach:
         if now - self._looked_at > MEMORY:
             self._forget()
 
-    def _saw(self, sighting: Sighting | None, now: float) -> None:
+    def _saw(self, now: float, pose: Pose, sighting: Sighting | None) -> None:
+        """Add a sighting in the picture that came at ``now``, when the robot stood at ``pose``."""
         if sighting is None:
             return
         self._seen_at = self._looked_at = now
         # Where it stands in the robot's own odometry: between pictures the body turns and walks, the target does not.
-        x, y, yaw = self._pose
+        x, y, yaw = pose
         if sighting.is_filling and self._target is not None and not self._means.ranges:
             # It is nearer than the picture can tell: what was known before, and the way since, say how near.
             sighting = replace(sighting, distance=min(sighting.distance, self._distance))

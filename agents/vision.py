@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from agents.means import VIEW
+from standards.jpeg import size_of
 
 cv2.setNumThreads(1)
 
@@ -22,6 +23,8 @@ GREY = 128.0
 BLUR = 2
 MIN_AREA = 14
 SAME_SHAPE = 0.2
+ENOUGH = 1024
+"""Pixels a side that show the target well enough."""
 
 
 @dataclass(frozen=True)
@@ -47,12 +50,12 @@ class Sighting:
 
 
 def find_target(jpeg: bytes, size: Size, lens: tuple[float, float | None] = VIEW) -> Sighting | None:
-    """The largest red blob of a JPEG picture, or None; bytes that are no picture count as nothing seen.
+    """The largest red blob of a JPEG picture, or None; no whole JPEG, or one beyond the limits, shows nothing.
 
     ``lens`` is what the picture shows across and up, in radians; up None: its pixels are square.
     """
-    # OpenCV raises where there is no byte at all, and gives None for all other bytes that are no picture.
-    picture = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR) if jpeg else None
+    sides = size_of(jpeg)
+    picture = None if sides is None else cv2.imdecode(np.frombuffer(jpeg, np.uint8), _reduction(max(sides)))
     if picture is None:
         return None
     colours = cv2.cvtColor(picture, cv2.COLOR_BGR2YCrCb)
@@ -76,6 +79,13 @@ def find_target(jpeg: bytes, size: Size, lens: tuple[float, float | None] = VIEW
     distance = by_width if is_whole else min(by_width, by_height)
     is_filling = left == 0 and width == columns
     return Sighting(bearing, distance / max(math.cos(bearing), 0.5), is_whole, is_filling)
+
+
+def _reduction(side: int) -> int:
+    """How to decode a picture of so many pixels a side: of a large one every second or fourth is enough."""
+    if side <= ENOUGH:
+        return cv2.IMREAD_COLOR
+    return cv2.IMREAD_REDUCED_COLOR_2 if side <= 2 * ENOUGH else cv2.IMREAD_REDUCED_COLOR_4
 
 
 def _extent(redness: npt.NDArray[np.float32]) -> tuple[float, float]:

@@ -64,7 +64,7 @@ class Streams:
         self._clock = clock
         self._viewers: dict[str, dict[bytes, tuple[Contact, float]]] = {}
         self._looks: dict[tuple[bytes, str], _Look] = {}
-        endpoint.expose("stream.open", self._answer_open)
+        endpoint.expose("stream.open", self._answer_open, changes=True, idempotent=True)
         endpoint.expose("stream.part", self._answer_part)
 
     # -- publisher --------------------------------------------------------------------------------------------------
@@ -166,7 +166,7 @@ class _Look:
     def renew(self) -> None:
         """Ask the publisher to go on."""
         self._timer = self._streams._clock.callLater(RENEW, self.renew)
-        opened = self._streams._endpoint.ask(self._publisher, "stream.open", self._channel)
+        opened = self._streams._endpoint.ask(self._publisher, "stream.open", self._channel, changes=True)
         opened.addErrback(lambda failure: failure.trap(EntangledError))
 
     def end(self) -> None:

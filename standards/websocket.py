@@ -20,6 +20,9 @@ NORMAL, BAD = 1000, 1002
 KEY = b"sec-websocket-key"
 _GUID = b"258EAFA5-E914-47DA-95CA-C5AB0DC85B11"
 
+MAX_FRAMES = 2048
+"""Frames in one read of at most 64 KiB; more are a flood of nearly empty ones, which cost more to take than to send."""
+
 Nonce = Callable[[int], bytes]
 """So many bytes that nobody foresees (``os.urandom``)."""
 
@@ -44,6 +47,7 @@ class End(ABC):
         self._key = base64.b64encode(nonce(16)) if is_client else b""
         self._buffer = bytearray()
         self._begun: bytearray | None = None
+        self._left = MAX_FRAMES
         self._reply: list[bytes] = []
 
     def received(self, data: bytes) -> tuple[list[bytes], bytes]:
@@ -51,6 +55,7 @@ class End(ABC):
         if self.fault:
             return [], b""
         self._buffer += data
+        self._left = MAX_FRAMES
         if not self.is_open:
             self._greet()
         messages = list(self._messages()) if self.is_open else []
@@ -157,6 +162,8 @@ class End(ABC):
             size = int.from_bytes(have[2:start], "big")
         if size > self._longest:
             why = self._too_long
+        if not self._left:
+            why = f"more than {MAX_FRAMES} frames at once"
         if why:
             self._fail(why)
             return None
@@ -167,6 +174,7 @@ class End(ABC):
         payload = bytes(have[start : start + size])
         del have[: start + size]
         self.frames += 1
+        self._left -= 1
         return is_last, opcode, masked(payload, mask) if is_masked else payload
 
     def _fail(self, why: str) -> None:

@@ -17,7 +17,6 @@ from twisted.internet.defer import Deferred, DeferredList, fail, maybeDeferred, 
 from twisted.internet.interfaces import IDelayedCall
 from twisted.logger import Logger
 
-from drivers.jpeg import size_of
 from drivers.phone.driver import SIGHT, PhoneDriver
 from drivers.phone.option import FPS, MOST_SIDE
 from middleware.admission.certificate import GATEWAY
@@ -35,6 +34,7 @@ from middleware.settings import (
     Settings,
     WebSettings,
 )
+from standards.jpeg import size_of
 from swarmnode.assembly import FAULTS, assembled
 from swarmnode.seams import Seams
 from webnode.board import Phones, Wanted

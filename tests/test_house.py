@@ -27,8 +27,8 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "drivers": ("drivers", "standards", "validation"),
     "sim": ("sim", "drivers", "validation"),
     "sim.team": ("sim.team", "middleware", "validation"),
-    "webnode": ("webnode", "middleware"),
-    "agents": ("agents", "middleware", "drivers.driver", "drivers.reading", "drivers.errors"),
+    "webnode": ("webnode", "middleware", "standards"),
+    "agents": ("agents", "middleware", "drivers.driver", "drivers.reading", "drivers.errors", "standards"),
     "swarmnode": ROOMS,
 }
 
@@ -56,7 +56,7 @@ PURE = (
     "drivers.aibo.sense",
     "drivers.errors",
     "drivers.gate",
-    "drivers.jpeg",
+    "standards.jpeg",
     "drivers.reading",
     "drivers.rosbridge.websocket",
     "middleware.admission.certificate",

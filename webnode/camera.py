@@ -8,6 +8,7 @@ from typing import Protocol
 from twisted.internet.interfaces import IDelayedCall, IReactorTime
 from twisted.web.http import Request
 
+from standards.jpeg import size_of
 from webnode.errors import Refusal
 
 POLL_S = 5.0
@@ -84,8 +85,8 @@ class Camera:
         request.notifyFinish().addErrback(lambda _: self._forget(entry))
 
     def on_frame(self, seq: int, jpeg: bytes, age: float) -> None:
-        """Take the next picture, taken ``age`` seconds ago; no JPEG, a far too large or a late one is dropped."""
-        if self._ended or not jpeg.startswith(b"\xff\xd8") or len(jpeg) > MAX_FRAME:
+        """Take the next picture, taken ``age`` seconds ago; a late or far too large one, or no JPEG, is dropped."""
+        if self._ended or len(jpeg) > MAX_FRAME or size_of(jpeg) is None:
             return
         now = self._clock.seconds()
         self._newest, self._came_at = (seq, jpeg, now - age), now

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 from drivers.aibo.cursor import Cursor, Short, string
 from drivers.errors import BadFrame
+from standards.jpeg import size_of
 
 REQUEST = b"connection request"
 COLOUR, SINGLE = 0, 1
@@ -159,8 +160,8 @@ def _block(cursor: Cursor) -> Block:
         if size > MAX_JPEG:
             raise BadFrame(f"a JPEG of {size} bytes")
         data = cursor.take(size)
-        if not (data.startswith(b"\xff\xd8") and data.endswith(b"\xff\xd9")):
-            raise BadFrame("a JPEG without its beginning or its end")
+        if size_of(data) is None:
+            raise BadFrame("a JPEG that is cut off, or too large to be decoded")
     elif form == "RawImage":
         if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
             raise BadFrame(f"a channel of {width} x {height} pixels")

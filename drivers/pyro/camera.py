@@ -8,6 +8,7 @@ from typing import Any
 from drivers.errors import BadFrame, UsageError
 from drivers.pyro.device import Device
 from drivers.reading import Frame, Value
+from standards.jpeg import size_of
 
 Blob = tuple[int, int, int, int, int]
 """Left, top, right and bottom in pixels from the upper left corner, and the area; all 0: none."""
@@ -125,7 +126,7 @@ def _decoded(data: bytes) -> Any:
         import numpy as np
     except ImportError as error:
         raise UsageError("pictures need OpenCV: pip install 'swarm-node[vision]'") from error
-    picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
+    picture = None if size_of(data) is None else cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     if picture is None:
         raise BadFrame(f"{len(data)} bytes are no picture")
     return np.ascontiguousarray(picture[:, :, ::-1])

@@ -14,13 +14,17 @@ from dataclasses import dataclass
 from typing import Any
 
 from drivers.errors import BadFrame
-from drivers.jpeg import size_of
 from drivers.reading import Value
+from standards.jpeg import size_of
 
 FAR_M, FAST, PULL = 1e6, 100.0, 1000.0
 """Beyond so many m, m/s or rad/s, and m/s2 a reading is absurd."""
 MOST_READINGS = 20_000
 """Of a scan."""
+MOST_VALUES = 2**16
+"""In a message: a scan with its intensities has 40,000."""
+MOST_DIGITS = 400
+"""Characters of a number: the largest float in full has 309."""
 CHARGING = 1
 """``power_supply_status`` of sensor_msgs/BatteryState."""
 
@@ -76,8 +80,11 @@ def twist_stamped(vx: float, vy: float, wz: float, frame: str = "base_link") -> 
 
 def decoded(data: bytes) -> Message:
     """One message; raises ``BadFrame``."""
+    # Counted beforehand: to make so many objects takes up to a hundred times the memory of their text.
+    if sum(map(data.count, (b",", b"[", b"{"))) >= MOST_VALUES:
+        raise BadFrame(f"{len(data)} bytes of JSON have more than {MOST_VALUES} values")
     try:
-        said = json.loads(data)
+        said = _DECODER.decode(str(data, "utf-8"))
     except (ValueError, RecursionError) as error:
         raise BadFrame(f"{len(data)} bytes are no JSON: {type(error).__name__}") from error
     if not isinstance(said, dict):
@@ -90,10 +97,16 @@ def decoded(data: bytes) -> Message:
             is_done = rest.get("result") is not False
             if isinstance(values, dict):
                 return Answered(number, values, is_done)
-            return Answered(number, {"error": str(values or "no reason given")[:200]}, is_done)
+            return Answered(number, {"error": brief(values or "no reason given", 200)}, is_done)
         case {"op": "status", "level": str(level), **rest}:
-            return Status(level, str(rest.get("msg", ""))[:300])
-    raise BadFrame(f"operation {str(said.get('op'))[:40]!r} with wrong fields, or none that is known")
+            return Status(level, brief(rest.get("msg", ""), 300))
+    raise BadFrame(f"operation {brief(said.get('op'), 40)!r} with wrong fields, or none that is known")
+
+
+def brief(value: object, most: int) -> str:
+    """The beginning of a value as text; of a list or an object its type only, which may be large and deeply nested."""
+    is_plain = value is None or isinstance(value, (str, int, float))
+    return str(value)[:most] if is_plain else f"a {type(value).__name__}"
 
 
 def odometry(message: Mapping[str, Any]) -> dict[str, Value]:
@@ -180,7 +193,7 @@ def picture(message: Mapping[str, Any]) -> tuple[bytes, int, int]:
         raise BadFrame("a picture is no base64") from error
     size = size_of(data)
     if size is None:
-        raise BadFrame(f"a picture is no whole JPEG, but {str(message.get('format'))[:40]!r}")
+        raise BadFrame(f"a picture is no whole JPEG, but {brief(message.get('format'), 40)!r}")
     return data, *size
 
 
@@ -206,6 +219,23 @@ def angles(quaternion: Mapping[str, Any]) -> tuple[float, float, float]:
     return roll, pitch, math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
+def _whole(text: str) -> int:
+    return int(_short(text))
+
+
+def _fraction(text: str) -> float:
+    return float(_short(text))
+
+
+def _short(text: str) -> str:
+    if len(text) > MOST_DIGITS:
+        raise ValueError(f"a number of {len(text)} characters")
+    return text
+
+
+_DECODER = json.JSONDecoder(parse_int=_whole, parse_float=_fraction)
+
+
 def _at(message: Mapping[str, Any], *path: str) -> Mapping[str, Any]:
     found: Any = message
     for name in path:
@@ -218,7 +248,7 @@ def _at(message: Mapping[str, Any], *path: str) -> Mapping[str, Any]:
 def _number(message: Mapping[str, Any], name: str, most: float) -> float:
     value: Any = message.get(name)
     if not _is_number(value) or not -most <= value <= most:
-        raise BadFrame(f"{name} is {str(value)[:40]}")
+        raise BadFrame(f"{name} is {brief(value, 40)}")
     return float(value)
 
 

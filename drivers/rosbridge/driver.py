@@ -115,7 +115,7 @@ class RosbridgeDriver(BaseDriver):
             if values.get("success") is True:
                 self._has_motors = on
             else:
-                self._warn(f"{self._options.motor_service} refused: {str(values.get('message'))[:200]}")
+                self._warn(f"{self._options.motor_service} refused: {codec.brief(values.get('message'), 200)}")
 
         if self._options.motor_service:
             self._call(self._options.motor_service, data=on).addCallbacks(switched, self._on_call_failed)
@@ -266,7 +266,7 @@ class RosbridgeDriver(BaseDriver):
         if is_done:
             answered.callback(values)
         else:
-            answered.errback(RobotError(str(values.get("error", values))[:300]))
+            answered.errback(RobotError(codec.brief(values.get("error", values), 300)))
 
     # -- which type the velocity has --------------------------------------------------------------------------------
 
@@ -277,7 +277,7 @@ class RosbridgeDriver(BaseDriver):
             self._settling = self._clock.callLater(ASK_S, self._on_no_type)
 
     def _on_type(self, values: Mapping[str, Any]) -> None:
-        topic, found = self._options.velocity_topic, str(values.get("type", ""))[:100]
+        topic, found = self._options.velocity_topic, codec.brief(values.get("type", ""), 100)
         known = {"Twist": False, "TwistStamped": True}.get(found.rpartition("/")[2])
         if self._is_stamped is not None:
             if known is not None and known is not self._is_stamped:

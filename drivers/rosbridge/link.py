@@ -118,8 +118,8 @@ class Bridge:
         if socket.frames > frames or (socket.is_open and not self._is_up):
             # Bytes alone are no sign of life: they may belong to a frame whose length was spoilt.
             self._heard_at = self._clock.seconds()
-        if reply and link is not None:
-            link.send(reply)
+        if reply and link is not None and not link.is_busy:
+            link.send(reply)  # else it would pile up here: the other end sends pings, and takes no answers
         if socket.is_open and not self._is_up and not socket.fault:
             self._rise()
         for message in messages:

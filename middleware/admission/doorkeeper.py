@@ -115,7 +115,14 @@ class Doorkeeper:
             member = self._roll.known_as(self._read(public, shown))
         except RemoteError:
             return FOREIGN
-        refusal = self._roll.refusal(member, self._wall()) or self._list(public, shown, member)
+        return self._roll.refusal(member, self._wall()) or self._count_guest(member)
+
+    def admit(self, public: bytes, shown: bytes) -> str:
+        """Judge a node that has confirmed its session, and remember it where it is let in."""
+        refusal = self.judge(public, shown)
+        if not refusal:
+            member = self._roll.known_as(self._read(public, shown))
+            refusal = self._list(public, shown, member)
         if not refusal:
             self._met[public] = member
             self._met.move_to_end(public)
@@ -141,9 +148,7 @@ class Doorkeeper:
         Returns the refusal of one for whom the list has no room: who is not on it is no member.  A guest is not listed;
         its voucher is.
         """
-        if member.voucher is not None:
-            return self._count_guest(member)
-        entry = entry_of(public, shown)
+        entry = entry_of(public, shown) if member.voucher is None else None
         if entry is not None and public != self._me.public and self.is_off_roll(public):
             try:
                 self.list_entry(entry)
@@ -153,7 +158,8 @@ class Doorkeeper:
 
     def _count_guest(self, member: Member) -> str:
         """Return a refusal where the voucher of a guest vouches for too many others at present."""
-        assert member.voucher is not None
+        if member.voucher is None:
+            return ""
         now, voucher = self._wall(), member.voucher.public
         others = sum(
             each.voucher is not None
@@ -202,7 +208,7 @@ class Doorkeeper:
 
     def learn(self, owner: bytes, certificate: bytes) -> bool:
         """Take in the pass of an owner that another node showed; whether it holds."""
-        return not self.judge(owner, certificate)
+        return not self.admit(owner, certificate)
 
     def member(self, public: bytes) -> Member | None:
         """What is known of the holder of ``public``, met or only heard of."""

@@ -90,7 +90,7 @@ class Acceptor:
         promised = max(entry.promised, ballot)
         is_new = (entry.promised, entry.ballot, entry.token, entry.ttl) != (promised, ballot, token, ttl)
         entry.promised, entry.ballot = promised, ballot
-        entry.token, entry.ttl = token, ttl
+        entry.token, entry.grantee, entry.ttl = token, ballot.agent, ttl
         entry.until, entry.touched_at = now + ttl, now
         if is_new:
             self._ledger.keep(task_id)
@@ -132,13 +132,14 @@ class Acceptor:
     def close(self, task_id: str, agent: str, configuration: int, token: int, now: float) -> Reply:
         """Grant no more leases on a task that has ended; ``remaining`` is how long another may still act on it.
 
-        An agent names the token that it was granted here, and is refused where it was not; token 0 is an operator's.
+        An agent names the token that it was granted here, even if it has given the lease back since; any other one is
+        refused.  Token 0 is an operator's.
         Where the council is another one by now, or may be, that one has to be asked as well.
         """
         entry = self._ledger.get(task_id) or self._ledger.add(task_id, FIRST, now)
         if entry is None:
             return Reply(QUIET, remaining=ROOM)
-        if token and (entry.token, entry.ballot.agent) != (token, agent):
+        if token and (entry.token, entry.grantee) != (token, agent):
             return self._reply(OUTBID if token < entry.token else BEHIND, entry, now)
         if not entry.is_over:
             entry.is_over, entry.touched_at = True, now
@@ -170,7 +171,8 @@ class Acceptor:
         if ballot < entry.promised or ballot <= entry.spent or not entry.ceiling.admits(now, ballot.counter, token):
             return self._reply(OUTBID, entry, now)
         entry.promised = entry.sealed = ballot
-        entry.members, entry.token, entry.touched_at = members, max(entry.token, token), now
+        entry.members, entry.touched_at = members, now
+        entry.hear_token(token)
         self._ledger.keep(task_id)
         return self._reply(GRANTED, entry, now)
 
@@ -196,7 +198,8 @@ class Acceptor:
         if configuration > entry.configuration:
             entry.configuration, entry.members, entry.sealed = configuration, members, NONE
             entry.ballot, entry.until = ballot, now if ballot == NONE else now + ttl
-            entry.token, entry.touched_at, entry.charter = max(entry.token, token), now, charter
+            entry.touched_at, entry.charter = now, charter
+            entry.hear_token(token, ballot.agent)
             entry.ceiling = Ceiling(now, entry.promised, entry.token)
             self._ledger.keep(task_id)
         return self._reply(GRANTED if configuration == entry.configuration else MOVED, entry, now)

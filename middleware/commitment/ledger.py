@@ -30,7 +30,8 @@ class Entry:
 
     ``promised`` is the highest ballot answered, ``ballot`` that of the lease, which runs ``ttl`` seconds ``until`` then
     (its ``agent`` holds it); ``spent`` is the highest ballot whose lease was given back, by an agent whose robot comes
-    to rest until ``until``.  ``token`` never falls.
+    to rest until ``until``.  ``token`` never falls; ``grantee`` is the agent to which this member granted it, empty where
+    it only heard of it.
     ``sealed`` is the ballot under which ``members`` were accepted as the next council; where it is none they are the
     present one, as far as known, and ``charter`` is the proof of that.  ``ceiling`` bounds the numbers that are taken.
     """
@@ -39,6 +40,7 @@ class Entry:
     promised: Ballot = NONE
     ballot: Ballot = NONE
     token: int = 0
+    grantee: str = ""
     ttl: float = 0.0
     spent: Ballot = NONE
     sealed: Ballot = NONE
@@ -55,11 +57,16 @@ class Entry:
         """Whether whoever held the lease acts no more: what may still move is its robot, until it is at rest."""
         return self.ballot <= self.spent
 
+    def hear_token(self, token: int, agent: str = "") -> None:
+        """Take note of a token that others granted, to ``agent`` where that is known; tokens never fall."""
+        if token > self.token:
+            self.token, self.grantee = token, agent
+
     def packed(self) -> list[object]:
         """The entry as it stands in a note; moments mean nothing to a later life and stay behind."""
         ballots = [*self.promised, *self.ballot, *self.spent, *self.sealed]
         members = [member.packed() for member in self.members]
-        return [self.configuration, ballots, self.token, self.ttl, members, self.is_over, self.charter]
+        return [self.configuration, ballots, self.token, self.ttl, members, self.is_over, self.charter, self.grantee]
 
 
 class Ledger:
@@ -158,16 +165,17 @@ class Ledger:
 
 def entry_of(row: object) -> Entry | None:
     """The entry that ``packed`` made, or None where the row cannot be one; never raises."""
-    if not isinstance(row, list) or not 6 <= len(row) <= 7:
+    if not isinstance(row, list) or not 6 <= len(row) <= 8:
         return None
     configuration, ballots, token, ttl, packed, is_over = row[:6]
     charter = row[6] if len(row) > 6 else b""  # the version before kept none
     if not isinstance(ballots, list) or len(ballots) != 8:
         return None
+    grantee = row[7] if len(row) > 7 else ballots[3]  # the versions before knew that of a lease not given back
     members = members_of(packed)
     lawful = (
         all(map(is_number, (configuration, token, *ballots[::2])))
-        and all(isinstance(agent, str) for agent in ballots[1::2])
+        and all(isinstance(agent, str) for agent in (*ballots[1::2], grantee))
         and isinstance(ttl, float)
         and isinstance(is_over, bool)
         and isinstance(charter, bytes)
@@ -176,7 +184,7 @@ def entry_of(row: object) -> Entry | None:
     if not lawful or members is None:
         return None
     promised, ballot, spent, sealed = (Ballot(ballots[n], ballots[n + 1]) for n in range(0, 8, 2))
-    return Entry(configuration, promised, ballot, token, ttl, spent, sealed, members, is_over, charter)
+    return Entry(configuration, promised, ballot, token, grantee, ttl, spent, sealed, members, is_over, charter)
 
 
 def _unpacked(noted: bytes | None) -> object:

@@ -26,8 +26,8 @@ CAMERA_S = 1.0 / 30.0
 DEAD_MAN_S = 3.0
 NATIVE = (208, 160)
 """The camera's own size; it sends half of it each way unless it is asked for more."""
-DARK = b"\xff\xd8" + bytes(64) + b"\xff\xd9"
-"""What a body without a picture shows: bytes that begin and end as a JPEG does."""
+DARK = b"\xff\xd8\xff\xc0\x00\x0b\x08\x00\x50\x00\x68\x01\x01\x11\x00" + bytes(64) + b"\xff\xd9"
+"""What a body without a picture shows: a JPEG of 104 x 80 pixels, as far as its header goes."""
 EMULATED = {**PORTS, "gains": 10032}
 
 

@@ -146,5 +146,5 @@ class GuestTests(SiegeCase):
         for number in range(MAX_VOUCHED + 3):
             guest = Identity(number.to_bytes(32))
             shown = guest_pass(paper.identity, paper.shown, guest.public, "phone", int(team.wall()))
-            refused.append(team.houses[0].team.door.judge(guest.public, shown))
+            refused.append(team.houses[0].team.door.admit(guest.public, shown))
         self.assertEqual(refused, [""] * MAX_VOUCHED + [UNLISTED] * 3)

@@ -36,9 +36,10 @@ from drivers.aibo.cursor import string
 from drivers.aibo.menu import Item, Load, MenuReader, Refresh
 from drivers.aibo.picture import Block, Closing, Picture, PictureReader, Posture
 from drivers.errors import BadFrame
+from tests.webnode.picture import jpeg
 
 FELT: dict[str, float | bool | str] = {"range.near": 0.25, "imu.ax": 0.5, "imu.az": 9.75, "power.level": 0.5}
-JPEG = b"\xff\xd8" + bytes(2543) + b"\xff\xd9"
+JPEG = jpeg(104, 80)[:-2] + bytes(2524) + b"\xff\xd9"
 HEADER = picture.header(0, 1, 104, 80, 121465, 3185)
 COLOUR = HEADER + picture.block(Block(104, 80, "JPEGColor", JPEG))
 BARE = picture.header(0, 0, 104, 80, 7, 8) + b"".join(

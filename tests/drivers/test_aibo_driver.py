@@ -17,6 +17,7 @@ from sim.emulator.aibo import AiboEmulator
 from sim.emulator.body import MemoryBody
 from swarmnode.driver.witness import Ear
 from tests.drivers.contract import BodyContract
+from tests.webnode.picture import jpeg
 
 STEP_S = 0.004
 
@@ -398,7 +399,7 @@ class AiboCameraTests(_Case):
     def pictures(self, transport: str, is_raw: bool = False, fps: float = 30.0) -> tuple[AiboDriver, AiboEmulator]:
         """A dog that films, and its driver, 2 s after the driver began."""
         clock = Clock()
-        body = MemoryBody(jpeg=b"\xff\xd8dog\xff\xd9")
+        body = MemoryBody(jpeg=jpeg())
         dog = AiboEmulator(clock, body, random.Random(1), is_raw=is_raw)
         dog.start()
         options = {"host": "10.0.0.1", "camera_transport": transport, "camera_fps": fps}
@@ -425,7 +426,7 @@ class AiboCameraTests(_Case):
             self.near(driver.diagnostics()["pictures"], 59, 3)
             newest = driver.observe()
             assert newest is not None and newest.frame is not None
-            self.assertEqual((newest.frame.data, newest.frame.encoding), (b"\xff\xd8dog\xff\xd9", "jpeg"))
+            self.assertEqual((newest.frame.data, newest.frame.encoding), (jpeg(), "jpeg"))
             self.assertEqual((newest.frame.width, newest.frame.height), (104, 80))
         self.assertEqual(self.ways.opened[0].sent, 1)
 

@@ -17,6 +17,7 @@ from sim.demo.port import free
 from sim.emulator.aibo import EMULATED, AiboEmulator
 from sim.emulator.aibo_server import AiboServer
 from sim.emulator.body import MemoryBody
+from tests.webnode.picture import jpeg
 
 
 def free_ports() -> dict[str, int]:
@@ -39,7 +40,7 @@ class AiboSocketTests(TestCase):
 
     async def _drive(self, transport: str) -> None:
         clock = IReactorTime(reactor)
-        body = MemoryBody(jpeg=b"\xff\xd8dog\xff\xd9")
+        body = MemoryBody(jpeg=jpeg())
         ports = free_ports()
         dog = AiboEmulator(clock, body, random.Random(1), ports=ports)
         server = AiboServer(reactor, dog)

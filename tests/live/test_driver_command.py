@@ -25,9 +25,10 @@ from sim.emulator.aibo import AiboEmulator
 from sim.emulator.aibo_server import AiboServer
 from sim.emulator.body import MemoryBody
 from tests.live.test_aibo_socket import free_ports
+from tests.webnode.picture import jpeg
 
 ROOT = Path(__file__).resolve().parents[2]
-JPEG = b"\xff\xd8dog\xff\xd9"
+JPEG = jpeg()
 COMMAND = [sys.executable, "-c", "import sys; from swarmnode.command import main; sys.exit(main())", "driver"]
 
 

@@ -17,6 +17,7 @@ from twisted.web.client import Agent, HTTPConnectionPool, readBody
 from twisted.web.http_headers import Headers
 from twisted.web.static import Data
 
+from tests.webnode.picture import jpeg
 from webnode.board import Board, OpenSessions
 from webnode.camera import MemoryFrames
 from webnode.desk import MemoryDesk
@@ -112,8 +113,8 @@ class WebServiceTests(TestCase):
         asked = self.asked("/shot/01?after=")
         while "01" not in self.frames.watched:
             await deferLater(reactor, 0.01)
-        self.frames.show("01", 1, b"\xff\xd8.")
-        self.assertEqual(await readBody(await asked), b"\xff\xd8.")
+        self.frames.show("01", 1, jpeg())
+        self.assertEqual(await readBody(await asked), jpeg())
         self.assertEqual(json.loads(await self.body("/api/v1/demo", b"POST")), {"id": "demo-1"})
 
     async def test_push_changes(self) -> None:

@@ -24,6 +24,7 @@ from middleware.entangled.wire.message import (
     part_count,
     receipt_of,
 )
+from middleware.entangled.wire.peer import SESSION_END_S
 from middleware.entangled.wire.session import INIT, INIT_LEAST, MAX_PLAIN
 from tests.middleware.test_endpoint import DELAY, EndpointCase
 
@@ -120,6 +121,7 @@ class ParcelTests(ParcelCase):
         self.assertEqual((self.b._courier._assemblies, dict(self.b._courier._bytes_in)), ({}, {}))
         self.assertEqual(dict(self.a._courier._bytes_out), {})
         self.assertEqual(self.b.counters["abandoned"], 1)
+        self.clock.advance(SESSION_END_S)
         self.assertEqual(self.clock.getDelayedCalls(), [])
 
     def test_a_short_break_is_survived(self) -> None:

@@ -98,7 +98,7 @@ class PassTests(ClosedCase):
 
     def test_resp_is_never_longer_than_its_init(self) -> None:
         """However long the answer is, the RESP with its pass is no longer than the INIT, and that is one datagram."""
-        self.b.expose("zeros", lambda peer, padding, count: bytes(count))
+        self.b.expose("zeros", lambda peer, padding, count: bytes(count), early=True)
         sizes = ((0, 0), (0, ANSWER_ROOM - 20), (0, ANSWER_ROOM + 10), (500, 600), (800, 0), (2000, 2000))
         for seed, (asked, answered) in enumerate(sizes, start=11):
             asker, to_asker = self.endpoint(seed)
@@ -127,7 +127,7 @@ class PassTests(ClosedCase):
     def test_refused_by_the_responder(self) -> None:
         """Who shows no lawful pass is told why, nothing that it asked runs, and no session is left on either side."""
         self.at_b.refused[self.to_a.public] = EXPIRED
-        self.b.expose("look", lambda peer: self.runs.append(peer))
+        self.b.expose("look", lambda peer: self.runs.append(peer), early=True)
         text = self.refused(self.a.ask(self.to_b, "look"), EXPIRED, 2 * DELAY)
         self.assertIn(meaning(EXPIRED), text)
         self.assertEqual((self.runs, self.a._sessions, self.b._sessions), ([], {}, {}))

@@ -18,7 +18,7 @@ from middleware.entangled.network.switchboard import Switchboard, SwitchboardNet
 from middleware.entangled.wire import method, peer
 from middleware.entangled.wire.endpoint import Endpoint
 from middleware.entangled.wire.message import MAX_MESSAGE
-from middleware.entangled.wire.peer import IN_TOUCH
+from middleware.entangled.wire.peer import IN_TOUCH, SESSION_END_S
 from middleware.entangled.wire.session import DATA, INIT, INIT_LEAST, MAX_PLAIN, RESP, Invitation
 
 TEAM = b"k" * 32
@@ -72,7 +72,7 @@ class EndpointCase(SynchronousTestCase):
 
     def equip(self, endpoint: Endpoint) -> None:
         """Give an endpoint the methods."""
-        endpoint.expose("echo", lambda peer, value: value)
+        endpoint.expose("echo", lambda peer, value: value, early=True)
         endpoint.expose("add", self.add, changes=True)
         endpoint.expose("refuse", self.refuse)
         endpoint.expose("whole", self.whole)
@@ -213,6 +213,8 @@ class AskTests(EndpointCase):
         self.failed(self.a.ask(self.to_b, "echo", 1), NoAnswer, 1.0)
         self.failed(self.a.ask(self.to_b, "echo", 1, timeout=0.1), NoAnswer, 0.11)
         self.assertIn("no key", self.failed(self.a.ask(Contact(b"\xff" * 32, self.to_b.address), "echo", 1), NoAnswer))
+        self.a.stop()
+        self.b.stop()
         self.assertEqual(self.clock.getDelayedCalls(), [])
 
     def test_cancelled_question_is_forgotten(self) -> None:
@@ -397,13 +399,44 @@ class WeatherTests(EndpointCase):
         self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 3), 2 * DELAY), 3)
         self.assertTrue(self.a.is_met(self.to_b))
 
-    def test_a_small_network_keeps_its_sessions(self) -> None:
-        """Where nobody lets go of sessions, a question after a long silence needs no handshake."""
+    def test_keys_of_an_idle_session_are_forgotten(self) -> None:
+        """Nothing is sent for an idle session; at its end both sides forget its keys, and a question opens another."""
         self.got(self.a.ask(self.to_b, "echo", 1))
-        self.clock.advance(10 * IN_TOUCH)
+        sent = self.board.counters["sent"]
+        self.clock.advance(SESSION_END_S - 4.0)
         self.assertTrue(self.a.is_met(self.to_b))
+        self.clock.advance(2.0)
+        self.assertEqual([len(end._sessions) for end in (self.a, self.b)], [0, 0])
+        self.assertEqual(self.clock.getDelayedCalls(), [])
+        self.assertEqual(self.board.counters["sent"], sent)
+        self.assertFalse(self.a.is_met(self.to_b))
         self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 2), 2 * DELAY), 2)
-        self.assertEqual(len(self.kept(self.to_b, INIT)), 1)
+        self.assertEqual(len(self.kept(self.to_b, INIT)), 2)
+
+    def test_used_session_is_renewed(self) -> None:
+        """A session in use is succeeded every 120 s by one handshake; each answer still takes one round trip."""
+        for seconds in range(600):
+            asker, to = (self.a, self.to_b) if seconds % 2 else (self.b, self.to_a)
+            asker.tell(to, "echo", seconds)
+            asked = self.a.ask(self.to_b, "echo", seconds)
+            self.clock.advance(2 * DELAY)
+            self.assertEqual(self.successResultOf(asked), seconds)
+            self.clock.advance(1.0 - 2 * DELAY)
+            for end in (self.a, self.b):
+                self.assertLessEqual(len(end._sessions), peer.MAX_SESSIONS)
+                ages = [self.clock.seconds() - session.opened_at for session in end._sessions.values()]
+                self.assertLessEqual(max(ages), SESSION_END_S + 1.0)
+        inits = [len(self.kept(to, INIT)) for to in (self.to_a, self.to_b)]
+        self.assertIn(sum(inits), (5, 6, 7))
+
+    def test_session_that_cannot_be_renewed_is_dropped(self) -> None:
+        """Where the peer is silent nothing is sent any more under keys that have come to their end."""
+        self.got(self.a.ask(self.to_b, "echo", 1))
+        self.board.cut(self.to_a.address, self.to_b.address)
+        for _ in range(200):
+            self.a.tell(self.to_b, "echo", 1)
+            self.clock.advance(1.0)
+        self.assertEqual(self.a._sessions, {})
 
     def test_worn_session_is_renewed(self) -> None:
         """After its number of datagrams a session gets a successor, and after twice as many nothing is sent on it."""
@@ -413,7 +446,8 @@ class WeatherTests(EndpointCase):
             self.assertEqual(self.got(self.a.ask(self.to_b, "add", number, changes=True)), number)
             worn = max([worn, *(session.sent for session in self.a._sessions.values())])
         self.assertEqual(self.runs, list(range(100)))
-        self.assertIn(len(self.kept(self.to_b, INIT)), (4, 5, 6))
+        handshakes = len(self.kept(self.to_a, INIT)) + len(self.kept(self.to_b, INIT))
+        self.assertIn(handshakes, range(4, 11))
         self.assertLessEqual(worn, 41)
 
     def test_worn_session_without_successor_is_dropped(self) -> None:
@@ -433,7 +467,7 @@ class AttackTests(EndpointCase):
         """Hand a datagram to ``b``; how many datagrams ``b`` sent because of it."""
         before = self.board.counters["sent"]
         self.taps[self.to_b.address].receiver(datagram, source)
-        self.clock.advance(1)
+        self.clock.advance(2 * DELAY)
         return self.board.counters["sent"] - before
 
     def test_wrong_team_is_not_answered(self) -> None:

@@ -84,7 +84,7 @@ def exchange() -> dict[str, Any]:
         ends[name] = end, Contact(identity.public, network.address)
         ends[name][0].start()
     (alice, _), (bob, to_bob) = ends["alice"], ends["bob"]
-    bob.expose("echo", lambda peer, value: value)
+    bob.expose("echo", lambda peer, value: value, early=True)
     bob.expose("add", lambda peer, one, two: one + two, changes=True)
     Session.seal = noted  # type: ignore[method-assign, assignment]
     try:

@@ -14,7 +14,6 @@ from twisted.trial.unittest import SynchronousTestCase
 from drivers.aibo.driver import AiboDriver
 from drivers.driver import Permit
 from drivers.errors import UsageError
-from drivers.jpeg import size_of
 from drivers.registry import describe
 from sim.dog import LIMITS
 from sim.emulator.aibo import AiboEmulator
@@ -26,6 +25,7 @@ from sim.robots import Robots
 from sim.scene import loaded
 from sim.world import TICK
 from sim.yard import Yard
+from standards.jpeg import size_of
 
 
 class FakeReactor(Clock):

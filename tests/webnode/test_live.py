@@ -11,6 +11,7 @@ from twisted.trial.unittest import SynchronousTestCase
 from twisted.web.resource import Resource
 
 from tests.webnode.browser import Connection, site_of
+from tests.webnode.picture import jpeg
 from webnode.board import Entry, MemoryChronicle, OpenSessions, Page, Visitor
 from webnode.camera import MemoryFrames, OnFrame
 from webnode.errors import Refusal
@@ -19,7 +20,7 @@ from webnode.live import LEAD_S, MAX_VIEWERS, MAX_WAITING, Events, Shots
 
 MORE = "x" * 999
 """What makes a state longer than a few changes."""
-JPEG = b"\xff\xd8 a picture"
+JPEG = jpeg()
 
 
 def events_in(data: bytes) -> list[tuple[str, Any]]:
@@ -316,7 +317,7 @@ class ShotsTests(SynchronousTestCase):
         """Who is behind gets the newest picture at once, never those between, and how old it is."""
         self.asked()
         for seq in (1, 2, 3):
-            self.frames.show("ab", seq, JPEG + b"%d" % seq, 0.5)
+            self.frames.show("ab", seq, JPEG, 0.5)
         self.clock.advance(0.25)
         data = self.asked("1").taken()
         self.assertIn(b"X-Seq: 3", data)
@@ -386,10 +387,12 @@ class ShotsTests(SynchronousTestCase):
         self.assertEqual((page.taken(), self.shots.watched), (b"", []))
 
     def test_drop_what_is_no_picture(self) -> None:
-        """Bytes that are no JPEG, or far too many, go to nobody."""
+        """Bytes that are no whole JPEG, far too many, or a claim of far too many pixels, go to nobody."""
         page = self.asked()
         self.frames.show("ab", 1, b"<script>")
-        self.frames.show("ab", 2, b"\xff\xd8" + bytes(2_000_000))
+        self.frames.show("ab", 2, JPEG[:-2] + bytes(2_000_000) + JPEG[-2:])
+        self.frames.show("ab", 3, JPEG[:-1])
+        self.frames.show("ab", 4, jpeg(65500, 65500))
         self.assertEqual(page.taken(), b"")
 
     def test_tell_of_no_camera(self) -> None:

@@ -76,8 +76,8 @@ class Membership:
         self._is_entered = False
         self.detour = Detour(overlay, endpoint, clock, rng, chores, self._enter)
         endpoint.expose("ping", self._answer_ping, changes=True, idempotent=True)
-        endpoint.expose("members", self._answer_members)
-        endpoint.expose("known", self._answer_known)
+        endpoint.expose("members", self._answer_members, early=True)
+        endpoint.expose("known", self._answer_known, early=True)
 
     def start(self) -> None:
         """Keep the contacts fresh from now on."""

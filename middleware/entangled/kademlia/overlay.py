@@ -103,7 +103,7 @@ class Overlay:
         self._checked_at: dict[bytes, float] = {}
         self.lookups: deque[Looked] = deque(maxlen=LOOKUPS_KEPT)
         endpoint.on_contact = self.proved
-        endpoint.expose("find_node", self._answer_find_node)
+        endpoint.expose("find_node", self._answer_find_node, early=True)
 
     @cached_property
     def _dice(self) -> random.Random:

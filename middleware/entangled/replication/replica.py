@@ -88,7 +88,7 @@ class Replica:
         self.on_goodbye: Callable[[Contact], None] = lambda contact: None
         self._chores = chores
         endpoint.expose("store", self._once_written(self.answer_store), changes=True, idempotent=True)
-        endpoint.expose("find_value", self.answer_find_value)
+        endpoint.expose("find_value", self.answer_find_value, early=True)
         endpoint.expose("cache", self.answer_cache, changes=True, idempotent=True)
         endpoint.expose("watch", self.answer_watch, changes=True, idempotent=True)
         endpoint.expose("alive", self.answer_alive, changes=True, idempotent=True)

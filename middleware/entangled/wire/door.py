@@ -6,6 +6,10 @@ the names of the refusals, with what to do about each.
 
 A store that was copied makes two nodes with one identity.  So each life of an identity has a number that grows from
 start to start, and eight random bytes: of two lives the later one holds, and the other one is told.
+
+Each INIT has a timestamp that grows within a life.  So a recorded INIT is older than the newest one of its sender, or
+equal to it, and is refused (after WireGuard, Donenfeld 2017, section 5.1; the life number takes the place of its wall
+clock, which a robot may not have).
 """
 
 from __future__ import annotations
@@ -96,7 +100,13 @@ class Door(Protocol):
         """Eight bytes by which strangers tell this team from others; zero where it does not say."""
 
     def judge(self, public: bytes, shown: bytes) -> str:
-        """The name of the refusal of a node with this key that shows this pass; empty where it is let in."""
+        """The name of the refusal of a node with this key that shows this pass; empty where it would be let in.
+
+        Changes nothing: what it judges may be a recording.
+        """
+
+    def admit(self, public: bytes, shown: bytes) -> str:
+        """As ``judge``, of a node that has confirmed its session, so it may be remembered."""
 
     def may(self, public: bytes, method: str) -> bool:
         """Whether ``public`` is the key of a present member that may call ``method``; no, where it is not known."""
@@ -133,6 +143,10 @@ class OpenDoor:
 
     def judge(self, public: bytes, shown: bytes) -> str:
         """Nobody is refused."""
+        return ""
+
+    def admit(self, public: bytes, shown: bytes) -> str:
+        """Nobody is refused, or remembered."""
         return ""
 
     def may(self, public: bytes, method: str) -> bool:
@@ -219,6 +233,33 @@ class Lives:
     def forget(self, public: bytes) -> None:
         """Forget what is known of an identity."""
         self._known.pop(public, None)
+
+
+class Stamps:
+    """The newest INIT of each identity that was let in; bounded, and empty after a restart."""
+
+    def __init__(self) -> None:
+        self._newest: dict[bytes, tuple[Life, int]] = {}
+
+    def __len__(self) -> int:
+        return len(self._newest)
+
+    def take(self, public: bytes, life: Life, stamp: int) -> bool:
+        """Whether an INIT is newer than every one before it of its sender; it is the newest one then.
+
+        An INIT may be noted before its session is confirmed: a recording is never newer than what its sender sends
+        next.  Without a life or a timestamp it counts as new.
+        """
+        if not life.number or not stamp:
+            return True
+        last, newest = self._newest.get(public, (UNCOUNTED, 0))
+        if life.number < last.number or (life == last and stamp <= newest):
+            return False
+        self._newest.pop(public, None)
+        self._newest[public] = (life, stamp)
+        if len(self._newest) > MAX_LIVES:
+            del self._newest[next(iter(self._newest))]
+        return True
 
 
 class Noted:

@@ -34,6 +34,7 @@ from middleware.entangled.wire.door import (
     Life,
     Lives,
     Noted,
+    Stamps,
     checked_secrets,
     is_refusal,
     meaning,
@@ -124,6 +125,7 @@ class Endpoint:
         self._own = Credentials.of(identity, team_key)
         self._codes = ErrorCodes()
         self._lives = Lives()
+        self._stamps = Stamps()
         self._noted = Noted()
         self._peers = Peers([self._own], clock, rng, network, self.counters, door)
         self._courier = Courier(
@@ -216,20 +218,31 @@ class Endpoint:
         if self.is_running:
             self._network.send(datagram, to)
 
-    def expose(self, name: str, answer: Callable[..., object], changes: bool = False, idempotent: bool = False) -> None:
+    def expose(
+        self,
+        name: str,
+        answer: Callable[..., object],
+        changes: bool = False,
+        idempotent: bool = False,
+        early: bool = False,
+    ) -> None:
         """Let peers call ``answer(peer, *arguments)`` under ``name``.
 
         It returns something that msgpack can hold (``MAX_MESSAGE`` at most), a Deferred or a coroutine of it, or raises
         ``Refused`` or an exception that both sides named by ``expose_error``: the asker gets it with its text.
         Arguments that do not fit the function's parameters and plain annotations are refused before it runs; other
-        exceptions are logged, and the asker gets ``Refused("internal error")``.  With ``changes`` it runs only in an
-        established session, and at most once for each question; a repeated one is given the answer of the first.  Say
-        ``idempotent`` as well where a second run does no harm: then nothing need be kept of the first.
+        exceptions are logged, and the asker gets ``Refused("internal error")``.  It runs only in an established
+        session, and with ``changes`` at most once for each question; a repeated one is given the answer of the first.
+        Say ``idempotent`` as well where a second run does no harm: then nothing need be kept of the first.
+
+        With ``early`` it may also run for a question that came with an INIT, which saves a round trip.  Anybody may
+        send a recorded INIT from a forged address, so an early method only reads, sends nothing, and returns its
+        result, not a Deferred; ``ValueError`` where it ``changes`` something.
 
         When the asker gives up or its time is over, a Deferred or coroutine is cancelled.  A function with a
         keyword-only parameter ``deadline`` gets that moment, in seconds of this node's clock (infinite where none).
         """
-        self._answerer.methods[name] = Method(name, answer, changes, idempotent)
+        self._answerer.methods[name] = Method(name, answer, changes, idempotent, early)
 
     def expose_error(self, kind: type[Exception], code: str) -> None:
         """Let exceptions of ``kind`` cross the wire, both ways, under ``code``, made again from their text alone.
@@ -249,7 +262,7 @@ class Endpoint:
     def send_inside(self, session: Session, plain: bytes, to: Address | None = None) -> None:
         """Seal ``plain`` for the peer of a session and send it where the peer is, or ``to`` another address of it."""
         if self.is_running:
-            self._network.send(session.seal(plain), to or session.contact.address)
+            self._network.send(self._sealed(session, plain), to or session.contact.address)
 
     @property
     def peers(self) -> Peers:
@@ -392,8 +405,9 @@ class Endpoint:
             session.contact = Contact(session.contact.public, source)
             self._peers.moved(session)
         if not session.is_confirmed:
-            code = self._lives.judge(session.contact.public, session.life)
-            if code:  # two of them knocked at once
+            code = self._judged(session.contact.public, session.shown, session.life, self.door.admit)
+            session.shown = b""
+            if code:  # two of them knocked at once, or there is no room to remember it
                 self._refuse(session, code)
                 return
             self._half_open.confirm(session)
@@ -491,15 +505,18 @@ class Endpoint:
             self._network.send(response, source)
 
     def _admitted(self, acceptance: Acceptance, source: Address, now: float) -> bytes:
-        """The RESP for who proved its key by an INIT; nothing where what rides in the INIT is malformed."""
+        """The RESP for who proved its key by an INIT; nothing where that is a recording, or its message malformed."""
         contact, hello = self._peers.contact(acceptance.public, source), self._peers.hello
-        code = self._judged(contact.public, acceptance.shown, acceptance.life)
+        code = self._judged(contact.public, acceptance.shown, acceptance.life, self.door.judge)
         if code:  # that is all that comes of it: it may be a recording, with a pass that was succeeded since
             self.counters["refused"] += 1
             self._say_refusing(contact, code)
             if code not in (DOUBLED, SUPERSEDED):  # who plays a recording shall not make people look for a copy
                 self._met("we", contact, code)
             return acceptance.refuse(code, source, hello.life)
+        if not self._stamps.take(contact.public, acceptance.life, acceptance.stamp):
+            self.counters["replayed"] += 1
+            return b""
         try:
             rider = decoded(acceptance.rider) if acceptance.rider else None
         except Malformed:
@@ -512,9 +529,9 @@ class Endpoint:
             return b""  # the method stopped us
         index = self._peers.new_index()
         response, keys = acceptance.accept(index, answer, source, hello)
-        self._half_open.add(
-            Session(contact, index, acceptance.remote_index, keys, now, is_confirmed=False, life=acceptance.life), now
-        )
+        session = Session(contact, index, acceptance.remote_index, keys, now, is_confirmed=False, life=acceptance.life)
+        session.shown = acceptance.shown
+        self._half_open.add(session, now)
         return response
 
     def _on_resp(self, datagram: bytes, source: Address) -> None:
@@ -542,7 +559,7 @@ class Endpoint:
         session = Session(
             contact, index, reply.remote_index, reply.keys, self._clock.seconds(), is_confirmed=True, life=reply.life
         )
-        code = self._judged(contact.public, reply.shown, reply.life)
+        code = self._judged(contact.public, reply.shown, reply.life, self.door.admit)
         if code:
             self._refuse(session, code)
             return
@@ -563,10 +580,10 @@ class Endpoint:
 
     # -- who is let in ----------------------------------------------------------------------------------------------
 
-    def _judged(self, public: bytes, shown: bytes, life: Life) -> str:
+    def _judged(self, public: bytes, shown: bytes, life: Life, judge: Callable[[bytes, bytes], str]) -> str:
         if len(shown) > self.door.room:
             return FOREIGN
-        return self._lives.judge(public, life) or self.door.judge(public, shown)
+        return self._lives.judge(public, life) or judge(public, shown)
 
     def _refuse(self, session: Session, code: str) -> None:
         """Tell a peer on ``session`` that it is not let in, and have nothing more to do with it."""
@@ -640,7 +657,11 @@ class Endpoint:
 
     def _send(self, session: Session, message: bytes) -> None:
         if self.is_running:
-            self._network.send(session.seal(message), session.contact.address)
+            self._network.send(self._sealed(session, message), session.contact.address)
+
+    def _sealed(self, session: Session, message: bytes) -> bytes:
+        self._peers.renew(session)
+        return session.seal(message)
 
     def _send_to(self, public: bytes, message: bytes) -> None:
         """Send on the newest session with a peer; where there is none the message is lost, as datagrams may be."""

@@ -64,8 +64,9 @@ _FORMS: WeakKeyDictionary[Callable[..., object], _Form] = WeakKeyDictionary()
 class Method:
     """An exposed function.
 
-    ``changes`` says that it may run only in an established session, and once for each question; ``is_idempotent`` that
-    a second run does no harm, so that nobody need remember the first one.
+    ``changes`` says that it runs once for each question; ``is_idempotent`` that a second run does no harm, so that
+    nobody need remember the first one.  ``is_early`` says that it only reads and answers at once, so that it may run
+    before its peer has confirmed the session; every other method runs in an established session only.
 
     A function with a keyword-only parameter ``deadline`` gets there the moment, on the clock of the node, after which
     nobody waits for its answer.
@@ -75,7 +76,12 @@ class Method:
     answer: Callable[..., object]
     changes: bool = False
     is_idempotent: bool = False
+    is_early: bool = False
     _known: _Form | None = field(default=None, init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        if self.is_early and self.changes:
+            raise ValueError(f"{self.name}: a method that changes something cannot be early")
 
     @property
     def _form(self) -> _Form:

@@ -42,8 +42,13 @@ LIVELY_S = 3.0
 IN_TOUCH = 105.0
 """Seconds of silence up to which the other side of a session surely has its end yet, in a wide network: less than those
 after which it lets go of it, by more than can lie between what either of us heard last."""
-SESSION_LIFE_S = 3600.0
-SESSION_END_S = SESSION_LIFE_S + 600.0
+SESSION_LIFE_S = 120.0
+"""Age from which a session is succeeded by another one, when something is sent on it."""
+SECOND_S = 30.0
+"""Seconds by which the one of two peers that has the higher key leaves that to the other one."""
+SESSION_END_S = 180.0
+"""Age at which the keys of a session are forgotten."""
+SWEEP_S = 1.0
 # Far below what ChaCha20-Poly1305 allows under one key (2**62 datagrams of this size).
 SESSION_DATAGRAMS = 2**32
 
@@ -187,6 +192,8 @@ class Peers:
         self.is_wide = False
         self._peers: dict[bytes, Peer] = {}
         self._openings: dict[int, Opening] = {}
+        self._stamp = 0
+        self._sweeper: IDelayedCall | None = None
         self._by_mac: dict[bytes, Opening] = {}
 
     def known(self, public: bytes) -> Peer | None:
@@ -255,22 +262,31 @@ class Peers:
         return wait if likely is None else min(wait, max(likely, within / self.loss.tries))
 
     def usable(self, peer: Peer) -> Session | None:
-        """The session to send on; an old or worn one calls for its successor.
+        """The session to send on.
 
-        A very old one is dropped, and one that the other side may have let go of, unless something waits for it.
+        A worn one is dropped, and one that the other side may have let go of, unless something waits for it.
         """
         session = peer.session
         if session is None:
             return None
-        age = self._clock.seconds() - session.opened_at
-        is_lost = peer.is_idle and not self.is_in_touch(peer)
-        if is_lost or age > SESSION_END_S or session.sent > 2 * SESSION_DATAGRAMS:
+        if (peer.is_idle and not self.is_in_touch(peer)) or session.sent > 2 * SESSION_DATAGRAMS:
             self._end(peer.sessions)
             peer.sessions = ()
             return None
-        if age > SESSION_LIFE_S or session.sent > SESSION_DATAGRAMS:
-            self.open(peer, session.contact.address)
         return session
+
+    def renew(self, session: Session) -> None:
+        """Open a successor of a session on which something is about to be sent, if it is old or worn.
+
+        Of two peers the one with the lower key does so first, so that there are not two successors.
+        """
+        public = session.contact.public
+        life = SESSION_LIFE_S if self.ring[0].public < public else SESSION_LIFE_S + SECOND_S
+        if self._clock.seconds() - session.opened_at < life and session.sent < SESSION_DATAGRAMS:
+            return
+        peer = self._peers.get(public)
+        if peer is not None and session in (peer.session, peer.direct_session):
+            self.open(peer, session.contact.address)
 
     def is_in_touch(self, peer: Peer) -> bool:
         """Whether there is a session of which the other side, if it lives, surely has its end yet.
@@ -295,8 +311,21 @@ class Peers:
             peer.sessions = peer.sessions[1:]
         if peer.opening is not None and peer.opening.knocks and not is_carried:
             self.close(peer.opening)  # the peer, which was told to knock too, came first
+        if self._sweeper is None:
+            self._sweep()
         self.on_established(session)
         return peer
+
+    def _sweep(self) -> None:
+        """Forget the sessions that have come to their end, and look again when the next one does."""
+        self._sweeper, now = None, self._clock.seconds()
+        while self.sessions:  # in the order in which they were opened
+            oldest = next(iter(self.sessions.values()))
+            left = oldest.opened_at + SESSION_END_S - now
+            if left > 0:
+                self._sweeper = self._clock.callLater(max(left, SWEEP_S), self._sweep)
+                return
+            self.drop(oldest)
 
     def confirmed(self, session: Session) -> None:
         """Learn how far away a peer is that opened a session, and has just confirmed it: one round trip after our RESP.
@@ -387,6 +416,8 @@ class Peers:
         for opening in self._openings.values():
             cancel(opening.timer)
             cancel(opening.helper)
+        cancel(self._sweeper)
+        self._sweeper = None
         self._openings.clear()
         self._by_mac.clear()
         self._peers.clear()
@@ -416,8 +447,11 @@ class Peers:
             return False
         own, hello = peer.own or self.ring[0], self.hello
         rider = rider if len(rider) <= hello.rider_room else b""
-        invitation = Invitation(own, exchange_key(peer.public), self._rng.randbytes(32), self.new_index(), rider, hello)
-        opening = Opening(invitation, peer, address, self._clock.seconds(), {address: b""}, within)
+        now = self._clock.seconds()
+        self._stamp = max(self._stamp + 1, int(now * 1e6))
+        secret, index = self._rng.randbytes(32), self.new_index()
+        invitation = Invitation(own, exchange_key(peer.public), secret, index, rider, hello, self._stamp)
+        opening = Opening(invitation, peer, address, now, {address: b""}, within)
         self._openings[invitation.local_index] = self._by_mac[invitation.mac] = peer.opening = opening
         opening.is_wanted = is_wanted
         if is_wanted:

@@ -45,9 +45,10 @@ INDEX_BYTES = 4
 MAC = 16
 ANSWER_ROOM = 512
 _LIFE = 8 + NONCE
+STAMP = 8
 _ASKED = INDEX_BYTES + KEY + _LIFE  # before the pass of an INIT
 _GIVEN = INDEX_BYTES + _LIFE + ADDRESS  # before that of a RESP
-_PAYLOAD = _ASKED + 2 + 2
+_PAYLOAD = _ASKED + 2 + 2 + STAMP
 _INIT_BARE = 1 + FIRST_OVERHEAD + _PAYLOAD + 2 * MAC
 _RESP_BARE = 1 + INDEX_BYTES + SECOND_OVERHEAD + _GIVEN + 2
 RESP_LEAST = _RESP_BARE
@@ -133,7 +134,10 @@ class Reply(NamedTuple):
 
 
 class Invitation:
-    """The initiator's half of a handshake; ``mac`` is the first of the two hashes in its INIT."""
+    """The initiator's half of a handshake; ``mac`` is the first of the two hashes in its INIT.
+
+    ``stamp`` is the timestamp of the INIT: higher than that of every INIT before it of this life.
+    """
 
     def __init__(
         self,
@@ -143,12 +147,14 @@ class Invitation:
         local_index: int,
         rider: bytes,
         hello: Hello = OF_OPEN_TEAM,
+        stamp: int = 0,
     ) -> None:
         self.own = own
         self._noise = Initiator(own.static, remote_static, ephemeral_secret, PROLOGUE, own.psk)
         self.local_index = local_index
         index = local_index.to_bytes(INDEX_BYTES, "little")
         payload = index + own.public + _packed_life(hello.life) + _counted(hello.shown) + _counted(rider)
+        payload += stamp.to_bytes(STAMP, "little")
         payload = payload.ljust(_PAYLOAD + hello.init_least - _INIT_BARE, b"\0")
         bare = bytes([INIT]) + self._noise.write(payload)
         self.mac = _hashed(own.mac_key, bare)
@@ -181,7 +187,7 @@ class Acceptance:
     """The responder's half: reads an INIT, then makes its RESP.
 
     ``public`` is the initiator's Ed25519 key, proved; ``life`` and ``shown`` what it says of itself, ``rider`` its
-    message.  Raises ``Forged`` where anything is not as it must be.
+    message, ``stamp`` its timestamp.  Raises ``Forged`` where anything is not as it must be.
     """
 
     def __init__(self, own: Credentials, datagram: bytes, ephemeral_secret: bytes) -> None:
@@ -197,7 +203,8 @@ class Acceptance:
         if not proved:
             raise Forged("an INIT whose key is not its sender's")
         self.shown, rest = _taken(payload, _ASKED)
-        self.rider, _ = _taken(rest, 0)
+        self.rider, rest = _taken(rest, 0)
+        self.stamp = int.from_bytes(rest[:STAMP], "little")
         self._room = len(datagram) - _RESP_BARE
 
     def answer_room(self, hello: Hello) -> int:
@@ -271,13 +278,15 @@ class Session:
     ``local_index`` is the number under which we find the session, ``remote_index`` the one under which the peer does.
     ``contact`` is the peer with the address from which its newest datagram came.  ``is_confirmed`` says that the peer
     has shown to hold the keys at that address; until then nothing may be sent.  Moments are seconds of the endpoint's
-    clock.  ``life`` is the one that the peer lives in it; with ``is_over`` a later one has taken its place.
+    clock.  ``life`` is the one that the peer lives in it; with ``is_over`` a later one has taken its place.  ``shown``
+    is the pass in its INIT, until the session is confirmed.
     """
 
     __slots__ = (
         "contact",
         "life",
         "is_over",
+        "shown",
         "local_index",
         "remote_index",
         "is_confirmed",
@@ -303,6 +312,7 @@ class Session:
         self.contact = contact
         self.life = life
         self.is_over = False
+        self.shown = b""
         self.local_index = local_index
         self.remote_index = remote_index
         self.is_confirmed = is_confirmed

@@ -22,6 +22,7 @@ from middleware.commitment.ballot import (
     Reply,
 )
 from middleware.commitment.ledger import Ledger
+from middleware.entangled.data.memory import MemoryStore
 from tests.middleware.commitment.test_ballot import MEMBERS
 
 TTL = 2.0
@@ -215,6 +216,24 @@ class AcceptorTests(SynchronousTestCase):
         ):
             self.assertEqual(reply.kind, QUIET)
             self.assertGreater(reply.remaining, 0.0)
+
+    def test_close_after_release(self) -> None:
+        """An agent that gave its lease back may end the task under its token, also after a restart; nobody else."""
+        store = MemoryStore()
+        self.acceptor = Acceptor(Ledger(store))
+        self.propose(1, "a", 3, 0.0)
+        self.acceptor.release("t", ballot(1, "a"), 0.5)
+        self.propose(2, "b", 4, 0.5)
+        self.acceptor.release("t", ballot(2, "b"), 1.0)
+        self.acceptor = Acceptor(Ledger(store))
+        self.assertEqual([self.acceptor.close("t", "a", 1, token, 1.0).kind for token in (3, 4)], [OUTBID, BEHIND])
+        self.assertEqual(self.acceptor.close("t", "b", 1, 4, 1.0).kind, OVER)
+
+    def test_close_under_a_token_of_others(self) -> None:
+        """A member that only heard of a token signs no end under it."""
+        self.propose(1, "a", 3, 0.0)
+        self.acceptor.change("t", 1, ballot(2, "b"), tuple(MEMBERS), 5, 3.0)
+        self.assertEqual([self.acceptor.close("t", agent, 1, 5, 3.0).kind for agent in ("a", "b")], [BEHIND] * 2)
 
     def test_close(self) -> None:
         """After the end nothing is granted or renewed; who ends it learns how long another may still act."""

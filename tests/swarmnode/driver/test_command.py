@@ -19,8 +19,9 @@ from sim.emulator.body import MemoryBody
 from swarmnode.driver.command import main
 from swarmnode.driver.pilot import Pilot
 from tests.swarmnode.driver.ground import MemoryGround
+from tests.webnode.picture import jpeg
 
-JPEG = b"\xff\xd8dog\xff\xd9"
+JPEG = jpeg()
 ROBOT = "--kind aibo --option host=dog1"
 BLIND = f"{ROBOT} --option camera=false"
 

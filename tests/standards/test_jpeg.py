@@ -1,4 +1,4 @@
-"""Tests of ``drivers.jpeg``."""
+"""Tests of ``standards.jpeg``."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 
-from drivers.jpeg import size_of
+from standards.jpeg import size_of
 from tests.webnode.picture import jpeg
 
 

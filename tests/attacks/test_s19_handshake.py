@@ -1,0 +1,309 @@
+"""Attack S19: to have a node answer, act or remember because of a recorded handshake and the question in it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from functools import partial
+from typing import Any
+
+from twisted.internet.defer import Deferred
+
+from middleware.entangled.identity import Identity, exchange_key
+from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.network.network import Address
+from middleware.entangled.record import hashed_key
+from middleware.entangled.wire import peer
+from middleware.entangled.wire.door import MAX_LIVES, Life, Stamps
+from middleware.entangled.wire.endpoint import Endpoint
+from middleware.entangled.wire.message import Question, encoded
+from middleware.entangled.wire.session import INIT, RESPONSES_S, Credentials, Hello, Invitation
+from middleware.roles import METHODS
+from middleware.streams import PART_BYTES, Streams
+from tests.attacks.siege import ClosedTeam, SiegeCase, Tape, network_of
+from tests.fuzz.ground import state_of
+from tests.middleware.admission.village import House
+from tests.middleware.test_endpoint import DELAY, EndpointCase
+
+VICTIM = Address("10.7.7.7", 77)
+KEY = hashed_key("tasks")
+LARGE = b"x" * 4000
+ARGUMENTS: dict[str, tuple[object, ...]] = {
+    "ping": (bytes(8),),
+    "find_node": (bytes(20),),
+    "members": (b"",),
+    "store": ([],),
+    "find_value": (KEY,),
+    "cache": (KEY, [], 60.0),
+    "watch": (KEY, bytes(8)),
+    "push": (KEY, 1, [], []),
+    "alive": (1.0, bytes(8)),
+    "missing": ([],),
+    "let_go": ([],),
+    "digests": (0, 2),
+    "places": (0, []),
+    "lacking": ([],),
+    "fetch": ([],),
+    "decree.claim": (KEY, [], bytes(8), 1, bytes(20), 1.0),
+    "decree.confirm": (KEY, [], bytes(8), 1, bytes(20), bytes(20)),
+    "decree.release": (KEY, [], bytes(8), 1, bytes(20)),
+    "roll.tell": ([],),
+    "roll.compare": (bytes(16),),
+    "roll.fetch": ([],),
+    "roll.secret": (1,),
+    "reach.introduce": (bytes(20), [], 0),
+    "reach.meet": (Identity(b"v" * 32).public, [], 0),
+    "reach.seen": (VICTIM.host, VICTIM.port),
+    "stream.open": ("camera",),
+    "stream.part": ("camera", 1, 0, 1, b"x", 0),
+}
+"""What the methods of a node take; the others get nothing."""
+
+
+class RecordedQuestionTests(SiegeCase):
+    """A node of a closed team that has a camera and every method, and forgot its sessions by a restart."""
+
+    def setUp(self) -> None:
+        """Count what the node sends to whom, and note each method that runs without a session."""
+        super().setUp()
+        self.team: ClosedTeam = self.siege()
+        for name in ("cat", "pig", "cow", "hen", "fox", "owl"):
+            self.team.enlist(name, "device", "operator", "gateway")
+        self.house = self.team.houses[0]
+        self.member = self.team.paper("dog", "device", "operator", "gateway")
+        self.sent: Counter[Address] = Counter()
+        self.ran: list[str] = []
+        self.numbers = 0
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin another life of the node, which remembers no handshake."""
+        self.team.close(self.house, is_sudden=True)
+        self.team.open(self.house)
+        network, endpoint = network_of(self.house), self.house.node.endpoint
+        _ = self.house.node.seat
+        self.streams = Streams(endpoint, self.team.clock)
+
+        def answer(name: str, *arguments: object) -> bytes:
+            self.ran.append(name)
+            return LARGE
+
+        for name in METHODS:
+            if name not in endpoint._answerer.methods:
+                endpoint.expose(name, partial(answer, name))
+        send = network.send
+
+        def count(datagram: bytes, to: Address) -> None:
+            self.sent[to] += len(datagram)
+            if to != VICTIM:  # nothing is there; what is under way would count as state
+                send(datagram, to)
+
+        port: Any = network
+        port.send = count
+        for method in endpoint._answerer.methods.values():
+            _ = method._form  # else it is found out at the first call
+        self.team.run(20.0)
+
+    def recording(self, method: str) -> bytes:
+        """An INIT of a member in which a question rides, as it was recorded."""
+        self.numbers += 1
+        question = encoded(Question(self.numbers, method, ARGUMENTS.get(method, ())))
+        own = Credentials.of(self.member.identity, self.house.team.secret)
+        hello = Hello(Life(1, b"the life"), self.member.shown, 640)
+        secret = self.numbers.to_bytes(32, "little")
+        remote = exchange_key(self.house.public)
+        return Invitation(own, remote, secret, self.numbers, question, hello, self.numbers).datagram()
+
+    def state(self) -> str:
+        """The hash of what the node remembers, but for the half-open sessions, which are bounded and end soon."""
+        endpoint = self.house.node.endpoint
+        half = endpoint._half_open
+        for session in list(half._unconfirmed.values()):
+            half.forget(session)
+        half.clear()
+        stamps, endpoint._stamps = endpoint._stamps, Stamps()
+        timers = sorted(call.getTime() for call in self.team.clock.getDelayedCalls())
+        found = state_of([self.house.node, self.house.node.store, self.house.team.roll, self.streams, timers])
+        endpoint._stamps = stamps
+        return found
+
+    def play(self, datagram: bytes) -> None:
+        """Send a recording to the node from the address of a victim."""
+        receiver = network_of(self.house).receiver
+        assert receiver is not None
+        receiver(datagram, VICTIM)
+
+    def show(self, seconds: float) -> None:
+        """Let time pass, in which the camera takes ten pictures a second."""
+        for number in range(int(10 * seconds)):
+            self.streams.offer("camera", number, bytes(20 * PART_BYTES))
+            self.team.run(0.1)
+
+    def test_every_method(self) -> None:
+        """A recorded INIT with a question for any method brings back no more bytes than it has, and changes nothing."""
+        methods = self.house.node.endpoint._answerer.methods
+        self.assertLessEqual(set(METHODS), set(methods))
+        answered = []
+        for name in methods:
+            recording = self.recording(name)
+            before = self.state()
+            self.sent.clear()
+            self.play(recording)
+            answered += [name] * bool(self.sent[VICTIM])
+            changed = [name] * (self.state() != before)
+            self.show(3.0)
+            self.assertLessEqual(self.sent[VICTIM], len(recording), name)
+            self.assertEqual(changed, [])
+        self.assertEqual(answered, list(methods))  # each was let in, and got its RESP
+        self.assertEqual(self.ran, [])
+
+    def test_pictures_for_a_victim(self) -> None:
+        """A recorded INIT that asks for pictures, sent again after the restart, has none sent to a forged address."""
+        recording = self.recording("stream.open")
+        for _ in range(5):
+            self.sent.clear()
+            self.play(recording)
+            self.show(5.0)
+            self.assertLessEqual(self.sent[VICTIM], len(recording))
+            self.restart()
+
+    def test_a_member_gets_its_pictures(self) -> None:
+        """A member that confirms its session does get them."""
+        viewer, _ = self.insider(self.team, "eye", "viewer")
+        shown: list[int] = []
+        watching = Streams(viewer, self.team.clock)
+        stop = watching.look(self.team.contact(self.house), "camera", lambda number, frame, age: shown.append(number))
+        self.show(3.0)
+        stop()
+        self.assertGreater(len(shown), 20)
+
+
+class TimestampTests(SiegeCase):
+    """A recorded INIT, sent again when its RESP is not remembered any more."""
+
+    def setUp(self) -> None:
+        """Record what comes to the first node."""
+        super().setUp()
+        self.team = self.siege()
+        self.house = self.team.houses[0]
+        self.team.enlist("dog", "device")
+        self.tape = Tape()
+        self.tape.tap(network_of(self.house))
+
+    def open_again(self, house: House) -> bytes:
+        """Have a node open another session with the first one; its INIT."""
+        house.node.endpoint.reopen(self.team.contact(self.house))
+        self.team.run(1.0)
+        return [datagram for _, datagram, _ in self.tape.heard if datagram[0] == INIT][-1]
+
+    def played(self, recording: bytes) -> tuple[int, int]:
+        """How many bytes a recording brings back, and how many sessions it opens."""
+        network: Any = network_of(self.house)
+        endpoint = self.house.node.endpoint
+        sent, sessions = [0], len(endpoint._sessions)
+        send, network.send = network.send, lambda datagram, to: sent.append(len(datagram))
+        network.receiver(recording, VICTIM)
+        network.send = send
+        return sum(sent), len(endpoint._sessions) - sessions
+
+    def test_an_older_one_is_dropped(self) -> None:
+        """The newest INIT of a member and all before it are dropped without an answer; a newer one is answered."""
+        dog = self.team.houses[1]
+        recordings = [self.open_again(dog) for _ in range(3)]
+        self.assertEqual(len(set(recordings)), 3)
+        self.team.run(RESPONSES_S + 1.0)
+        for recording in recordings:
+            self.assertEqual(self.played(recording), (0, 0))
+        self.assertEqual(self.house.node.endpoint.counters["replayed"], 3)
+        self.open_again(dog)
+        self.assertTrue(self.house.node.endpoint.is_met(self.team.contact(dog)))
+
+    def test_one_of_an_earlier_life(self) -> None:
+        """After its sender was restarted a recording opens no session, and its sender is let in."""
+        dog = self.team.houses[1]
+        recording = self.open_again(dog)
+        self.team.close(dog, is_sudden=True)
+        self.team.open(dog)
+        self.team.run(5.0)
+        self.assertTrue(self.house.node.endpoint.is_met(self.team.contact(dog)))
+        self.team.run(RESPONSES_S + 1.0)
+        self.assertEqual(self.played(recording)[1], 0)
+        self.open_again(dog)
+        self.assertEqual(self.house.node.endpoint.counters["replayed"], 0)
+
+    def test_bounded(self) -> None:
+        """The newest INITs of so many members are remembered, and of an unproved later life no older one counts."""
+        stamps, first, later = Stamps(), Life(1, b"1" * 8), Life(2, b"2" * 8)
+        answers = [stamps.take(b"a", life, stamp) for life, stamp in ((first, 5), (first, 5), (first, 4), (first, 6))]
+        self.assertEqual(answers, [True, False, False, True])
+        answers = [stamps.take(b"a", life, stamp) for life, stamp in ((later, 1), (first, 9), (later, 1), (later, 2))]
+        self.assertEqual(answers, [True, False, False, True])
+        self.assertEqual([stamps.take(b"b", Life(), 5), stamps.take(b"b", first, 0), len(stamps)], [True, True, 1])
+        for number in range(MAX_LIVES + 5):
+            stamps.take(number.to_bytes(4, "big"), first, 1)
+        self.assertEqual(len(stamps), MAX_LIVES)
+
+
+class RoundTripTests(EndpointCase):
+    """What it costs that a change waits for the session."""
+
+    def asked(self, method: str, *arguments: object, changes: bool) -> float:
+        """The round trips that the first question to a peer takes."""
+        identity = Identity(self.rng.randbytes(32))
+        asker = Endpoint(identity, b"k" * 32, self.board.network("127.0.0.1", 0), self.clock, self.rng)
+        asker.start()
+        self.addCleanup(asker.stop)
+        answered: list[object] = []
+        asker.ask(self.to_b, method, *arguments, changes=changes).addCallback(answered.append)
+        trips = 0.0
+        while not answered:
+            self.clock.advance(DELAY)
+            trips += 0.5
+        return trips
+
+    def test_one_more_for_changes_and_large_answers(self) -> None:
+        """A first question for a small read takes one round trip, any other one takes two."""
+        self.b.expose("zeros", lambda peer, count: bytes(count), early=True)
+        self.b.expose("late", lambda peer: 1)
+        self.assertEqual(self.asked("echo", 1, changes=False), 1.0)
+        self.assertEqual(self.asked("add", 1, changes=True), 2.0)
+        self.assertEqual(self.asked("add", 2, changes=False), 2.0)
+        self.assertEqual(self.asked("late", changes=False), 2.0)
+        self.assertEqual(self.asked("zeros", 1000, changes=False), 2.0)
+
+    def test_early_and_changing(self) -> None:
+        """A method that changes something cannot be exposed as early."""
+        self.assertRaises(ValueError, self.b.expose, "bad", lambda peer: 1, changes=True, early=True)
+
+    def test_early_and_slow(self) -> None:
+        """An early method that takes its time is cancelled, and runs again in the session."""
+        cancelled: list[object] = []
+        waiting: list[Deferred[int]] = []
+
+        def slow(peer: Contact) -> Deferred[int]:
+            waiting.append(Deferred(cancelled.append))
+            return waiting[-1]
+
+        self.b.expose("slow", slow, early=True)
+        asked = self.a.ask(self.to_b, "slow")
+        self.clock.advance(3 * DELAY)
+        self.assertEqual((len(cancelled), len(waiting)), (1, 2))
+        waiting[1].callback(5)
+        self.assertEqual(self.got(asked), 5)
+
+
+class KeyLifeTests(SiegeCase):
+    """A member whose keys are stolen from memory."""
+
+    def test_keys_are_replaced(self) -> None:
+        """Sessions in use have new keys every two minutes, and no node holds keys that are older than three."""
+        team = self.siege()
+        for name in ("dog", "cat"):
+            team.enlist(name)
+        seen: set[bytes] = set()
+        for _ in range(60):
+            team.run(10.0)
+            for house in team.houses:
+                for session in house.node.endpoint._sessions.values():
+                    seen.add(bytes(session._sending))
+                    self.assertLess(team.clock.seconds() - session.opened_at, peer.SESSION_END_S + 2.0)
+        self.assertGreaterEqual(len(seen), 2 * 3 * 4)

@@ -1,0 +1,287 @@
+"""Attack S20: to have a node spend seconds and gigabytes on a picture of a few hundred bytes."""
+
+from __future__ import annotations
+
+import base64
+import random
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from twisted.internet import reactor
+from twisted.internet.defer import Deferred
+from twisted.internet.interfaces import IReactorThreads
+from twisted.internet.task import Clock
+from twisted.python.failure import Failure
+from twisted.trial.unittest import SynchronousTestCase, TestCase
+from zope.interface import directlyProvides
+
+from agents.behaviour import behaviour_for
+from agents.body import Body
+from agents.detection import Detector, run_in_thread
+from agents.vision import ENOUGH, Size, find_target
+from drivers.aibo import picture
+from drivers.aibo.picture import Block, PictureReader
+from drivers.camera.shots import FolderShots
+from drivers.errors import BadFrame, LinkLost
+from drivers.link import MemoryConnector
+from drivers.pyro.camera import Camera as PyroCamera
+from drivers.reading import Frame, Observation
+from drivers.registry import describe, driver_for
+from drivers.rosbridge import codec
+from middleware.tasks import Task
+from sim.emulator.body import MemoryBody
+from sim.emulator.mjpeg import MjpegCamera
+from standards.jpeg import MAX_DECODED, MAX_SIDE, size_of
+from swarmnode.gateway import sides
+from webnode.camera import Camera as WebCamera
+from webnode.camera import MemoryFrames
+from webnode.errors import Refusal
+
+SIZE = Size(0.05, 0.2)
+START_OF_SCAN, END = b"\xff\xda", b"\xff\xd9"
+
+
+def encoded(width: int, height: int, *options: int) -> bytes:
+    """A picture with a red target in it, made by a real encoder."""
+    pixels = np.full((height, width, 3), 128, np.uint8)
+    pixels[height // 4 : 3 * height // 4, 2 * width // 5 : 3 * width // 5] = (0, 0, 255)
+    return bytes(cv2.imencode(".jpg", pixels, list(options))[1].tobytes())
+
+
+def claiming(width: int, height: int, kind: bytes = b"\xff\xc0") -> bytes:
+    """A small picture, the header of which claims another size, and maybe another kind of coding."""
+    data = bytearray(encoded(8, 8))
+    start = data.index(b"\xff\xc0")
+    data[start : start + 2] = kind
+    data[start + 5 : start + 9] = height.to_bytes(2, "big") + width.to_bytes(2, "big")
+    return bytes(data)
+
+
+def of_scans(width: int, height: int, count: int) -> bytes:
+    """A progressive picture, the last scan of which comes again and again."""
+    data = encoded(width, height, cv2.IMWRITE_JPEG_PROGRESSIVE, 1)
+    last = data[data.rindex(START_OF_SCAN) : -len(END)]
+    return data[: -len(END)] + (count - data.count(START_OF_SCAN)) * last + END
+
+
+BOMBS = {
+    "629 bytes of 4 gigapixels": claiming(65500, 65500),
+    "one side too long": claiming(MAX_SIDE + 1, 8),
+    "the other side too long": claiming(8, MAX_SIDE + 1),
+    "the height comes later": claiming(4000, 0),
+    "3000 scans": of_scans(1000, 1000, 3000),
+    "arithmetic coding": claiming(4000, 4000, b"\xff\xc9"),
+    "lossless": claiming(4000, 4000, b"\xff\xc3"),
+    "a PNG": bytes(cv2.imencode(".png", np.zeros((9000, 9000), np.uint8))[1].tobytes()),
+    "a PNG with the ends of a JPEG": b"\xff\xd8"
+    + bytes(cv2.imencode(".png", np.zeros((8, 8), np.uint8))[1].tobytes())
+    + END,
+    "a BMP": b"BM" + bytes(24) + (2**30).to_bytes(4, "little") * 2 + bytes(600),
+}
+
+
+class BombCase(SynchronousTestCase):
+    """Counts how often the decoder runs, and on how many bytes."""
+
+    def setUp(self) -> None:
+        """Wrap the decoder."""
+        self.decoded: list[tuple[int, ...]] = []
+        decode = cv2.imdecode
+
+        def counted(data: Any, flags: int) -> Any:
+            pixels = decode(data, flags)
+            assert pixels is not None
+            self.decoded.append(pixels.shape[:2])
+            return pixels
+
+        self.patch(cv2, "imdecode", counted)
+
+
+class HeaderTests(BombCase):
+    """What is read before a decoder runs."""
+
+    def test_no_bomb_is_decoded(self) -> None:
+        """Detection and student programs decode none of the bombs; each is at most half a megabyte."""
+        pyro = PyroCamera(8, 8)
+        pyro.addFilter(lambda camera: len(camera.data))
+        for number, (name, bomb) in enumerate(BOMBS.items(), start=1):
+            self.assertLess(len(bomb), 2**19, name)
+            self.assertIsNone(size_of(bomb), name)
+            self.assertIsNone(find_target(bomb, SIZE), name)
+            pyro.see(Frame(number, 8, 8, bomb, 0.0))
+            self.assertEqual((pyro.pictures, pyro.bad_pictures), (0, number), name)
+        self.assertEqual(self.decoded, [])
+
+    def streamed(self, jpeg: bytes) -> object:
+        """What a driver shows of a camera on the network that sends nothing else."""
+        clock = Clock()
+        camera = MjpegCamera(clock, MemoryBody(jpeg=jpeg), 30.0)
+        camera.start()
+        table = {"url": "http://10.0.0.7:81/stream", "fps": 30}
+        driver = driver_for("camera", table, "cam", clock, MemoryConnector(clock, camera.accept))
+        driver.connect().addErrback(lambda failure: failure.trap(LinkLost))
+        clock.pump([0.01] * 30)
+        seen = driver.observe()
+        driver.disconnect()
+        camera.stop()
+        return seen and seen.frame
+
+    def from_folder(self, jpeg: bytes) -> object:
+        """What is shown of a folder that has nothing else."""
+        folder = Path(self.mktemp())
+        folder.mkdir()
+        (folder / "1.jpg").write_bytes(jpeg)
+        shots = FolderShots(str(folder))
+        shots.open()
+        try:
+            return shots.shoot()
+        except BadFrame:
+            return None
+
+    def on_page(self, jpeg: bytes) -> object:
+        """What a web node keeps for browsers."""
+        clock, frames = Clock(), MemoryFrames()
+        camera = WebCamera(clock, lambda on_frame: frames.watch("dog", on_frame), lambda: None)
+        frames.show("dog", 1, jpeg)
+        kept = camera._newest
+        camera.close()
+        return kept
+
+    def test_no_bomb_is_taken(self) -> None:
+        """A camera, a robot, a phone and a page take none of them, so that none is shown or sent on."""
+        for name, bomb in BOMBS.items():
+            text = base64.b64encode(bomb).decode()
+            self.assertRaises(BadFrame, codec.picture, {"format": "jpeg", "data": text})
+            self.assertRaises(Refusal, sides, bomb)
+            self.assertIsNone(self.streamed(bomb), name)
+            self.assertIsNone(self.from_folder(bomb), name)
+            self.assertIsNone(self.on_page(bomb), name)
+            reader = PictureReader()
+            packet = picture.header(0, 1, 208, 160, 1, 1) + picture.block(Block(208, 160, "JPEGColor", bomb))
+            self.assertEqual((list(reader.read(packet)), reader.bad_frames > 0), ([], True), name)
+        good = encoded(208, 156)
+        for taken in (self.streamed(good), self.from_folder(good), self.on_page(good)):
+            self.assertIsNotNone(taken)
+
+    def test_real_pictures_are_decoded(self) -> None:
+        """Pictures of cameras are searched, baseline and progressive; of large ones every second or fourth pixel."""
+        for width, height in ((208, 156), (1920, 1080), (MAX_SIDE, MAX_SIDE)):
+            for is_progressive in (0, 1) if width < MAX_SIDE else (0,):
+                seen = find_target(encoded(width, height, cv2.IMWRITE_JPEG_PROGRESSIVE, is_progressive), SIZE)
+                assert seen is not None
+                self.assertLess(abs(seen.bearing), 0.02)
+                self.assertLessEqual(max(self.decoded[-1]), ENOUGH)
+        self.assertEqual(len(self.decoded), 5)
+
+    def test_most_that_is_decoded(self) -> None:
+        """The limit counts the pixels of all scans."""
+        most = MAX_DECODED // 1024**2
+        self.assertEqual(size_of(of_scans(1024, 1024, most)), (1024, 1024))
+        self.assertIsNone(size_of(of_scans(1024, 1024, most + 1)))
+
+
+class PooledClock(Clock):
+    """A clock with a thread pool whose threads run when the test says so."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        directlyProvides(self, IReactorThreads)
+        self.jobs: list[Callable[[], None]] = []
+
+    def getThreadPool(self) -> PooledClock:  # noqa: N802 (Twisted's)
+        """Itself."""
+        return self
+
+    def callInThreadWithCallback(self, done: Callable[[bool, object], None], function: Callable[[], object]) -> None:  # noqa: N802 (Twisted's)
+        """Keep it."""
+
+        def job() -> None:
+            try:
+                result = function()
+            except Exception:
+                done(False, Failure())
+            else:
+                done(True, result)
+
+        self.jobs.append(job)
+
+    def callFromThread(self, function: Callable[..., object], *arguments: object) -> None:  # noqa: N802 (Twisted's)
+        """Call it at once: there is one thread."""
+        function(*arguments)
+
+    def work(self) -> int:
+        """Run what was kept; how many that were."""
+        jobs, self.jobs = self.jobs, []
+        for job in jobs:
+            job()
+        return len(jobs)
+
+
+class StillDriver:
+    """As much of a driver as a body asks for before it moves."""
+
+    description = describe("camera", {"url": "http://10.0.0.7/"})
+
+
+class QueueTests(BombCase):
+    """Where pictures are decoded, and how many wait."""
+
+    def test_reactor_decodes_nothing(self) -> None:
+        """An agent that is shown 100 pictures has two decoded, the first and the newest, both in the thread pool."""
+        for kind in ("find-target", "watch-target"):
+            with self.subTest(kind=kind):
+                clock = PooledClock()
+                driver: Any = StillDriver()
+                body = Body(driver, clock, lambda seen: None, lambda why: None)
+                behaviour = behaviour_for(Task("t", kind, "t"), random.Random(1), means=body.means)
+                values = {"odom.x": 0.0, "odom.y": 0.0, "odom.yaw": 0.0}
+                self.decoded.clear()
+                for number in range(1, 101):
+                    frame = Frame(number, 208, 156 + number, encoded(208, 156 + number), 0.0)
+                    now = number / 1000
+                    behaviour.look(Observation(now, now, values, frame=frame), now)
+                self.assertEqual((self.decoded, len(clock.jobs), behaviour.cost), ([], 1, None))
+                self.assertEqual([clock.work(), clock.work(), clock.work()], [1, 1, 0])
+                self.assertEqual(self.decoded, [(157, 208), (256, 208)])
+                for number in range(101, 111):
+                    frame, now = Frame(number, 208, 156, encoded(208, 156), 0.0), number / 1000
+                    behaviour.look(Observation(now, now, values, frame=frame), now)
+                    clock.work()
+                self.assertIsNotNone(behaviour.cost)
+
+    def test_queue_of_one(self) -> None:
+        """While one picture is searched the next ones replace each other; a failure does not stop the detector."""
+        clock, found = PooledClock(), list[object]()
+        detector = Detector(run_in_thread(clock))
+        for number in range(50):
+            detector.detect(lambda number=number: 1 / number, found.append)  # type: ignore[misc]
+        self.assertEqual((len(clock.jobs), detector.dropped), (1, 48))
+        self.assertEqual([clock.work(), clock.work(), clock.work()], [1, 1, 0])
+        self.assertEqual((found, len(self.flushLoggedErrors(ZeroDivisionError))), ([1 / 49], 1))
+
+
+class ThreadTests(TestCase):
+    """With the real reactor."""
+
+    async def test_not_in_the_thread_of_the_reactor(self) -> None:
+        """Where the clock is a reactor, pictures are searched in another thread, and what is found comes back to it."""
+        threads: list[int] = []
+        done: Deferred[None] = Deferred()
+
+        def find() -> Any:
+            threads.append(threading.get_ident())
+            return find_target(encoded(208, 156), SIZE)
+
+        def found(sighting: object) -> None:
+            threads.append(threading.get_ident())
+            self.assertIsNotNone(sighting)
+            done.callback(None)
+
+        Detector(run_in_thread(reactor)).detect(find, found)
+        await done
+        self.assertNotEqual(threads[0], threading.get_ident())
+        self.assertEqual(threads[1], threading.get_ident())

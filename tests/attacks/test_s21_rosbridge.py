@@ -1,0 +1,234 @@
+"""Attack S21: a rosbridge, or who answers in its place, that has its driver spend memory and time."""
+
+from __future__ import annotations
+
+import tracemalloc
+from random import Random
+from typing import Any
+
+from twisted.internet.task import Clock
+from twisted.trial.unittest import SynchronousTestCase
+
+from drivers.errors import BadFrame, RobotError
+from drivers.link import MemoryConnector
+from drivers.rosbridge.codec import MOST_DIGITS, MOST_VALUES, Answered, Status, decoded
+from drivers.rosbridge.driver import RosbridgeDriver
+from drivers.rosbridge.websocket import MAX_MESSAGE
+from sim.emulator.body import MemoryBody
+from sim.emulator.rosbridge import RosbridgeRobot
+from standards import websocket
+from standards.websocket import CONTINUATION, MAX_FRAMES, PING, PONG, TEXT, End, framed
+
+READ = 65536
+"""Bytes that a reactor reads at once."""
+ROOM = 24 * 2**20
+"""Bytes that a message may cost beside itself."""
+
+
+def published(inner: bytes) -> bytes:
+    """A message of odometry with something in it."""
+    return b'{"op":"publish","topic":"/odom","msg":{"pose":' + inner + b"}}"
+
+
+def filled(one: bytes, size: int = MAX_MESSAGE - 100) -> bytes:
+    """A message with as many values of a kind as fit."""
+    return published(b"[" + one + (b"," + one) * ((size - len(one)) // (len(one) + 1)) + b"]")
+
+
+MANY = {
+    "numbers": filled(b"1"),
+    "floats": filled(b".1".rjust(3, b"0")),
+    "lists": filled(b"[]"),
+    "lists of lists": filled(b"[[0]]"),
+    "objects": filled(b"{}"),
+    "objects of objects": filled(b'{"":{}}'),
+    "names": published(b"{" + b",".join(b'"%x":0' % number for number in range(400_000)) + b"}"),
+}
+LONG = {
+    "a number of a megabyte": published(b"1" * 10**6),
+    "a fraction of a megabyte": published(b"1." + b"1" * 10**6),
+    "an exponent of a megabyte": published(b"1e" + b"1" * 10**6),
+    "a negative one": published(b"-" + b"1" * 10**6),
+    "many numbers of 4000 digits": filled(b"1" * 4000),
+    "as an id": b'{"op":"service_response","id":' + b"1" * 10**6 + b',"values":{}}',
+}
+DEEP = {
+    "lists": published(b"[" * 30_000 + b"]" * 30_000),
+    "objects": published(b'{"":' * 30_000 + b"0" + b"}" * 30_000),
+    "not closed": b"[" * 10**6,
+}
+
+
+class MessageTests(SynchronousTestCase):
+    """What one message costs."""
+
+    def peak(self, data: bytes) -> tuple[bool, int]:
+        """Whether a message is taken, and the most memory that this needed."""
+        tracemalloc.start()
+        try:
+            decoded(data)
+        except BadFrame:
+            return False, tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+        return True, 0
+
+    def test_many_values(self) -> None:
+        """Messages of 4 MB with up to two million values are refused before they become objects."""
+        for name, data in MANY.items():
+            self.assertLessEqual(len(data), MAX_MESSAGE)
+            is_taken, peak = self.peak(data)
+            self.assertFalse(is_taken, name)
+            self.assertLess(peak, 10_000, name)
+
+    def test_long_numbers(self) -> None:
+        """Numbers with up to a megabyte of digits are refused, and no such number is computed."""
+        for name, data in LONG.items():
+            is_taken, peak = self.peak(data)
+            self.assertFalse(is_taken, name)
+            self.assertLess(peak, 3 * len(data) + 10_000, name)
+
+    def test_deep_nesting(self) -> None:
+        """Nesting deeper than the interpreter follows is refused as no message."""
+        for name, data in DEEP.items():
+            self.assertFalse(self.peak(data)[0], name)
+
+    def test_nesting_is_not_printed(self) -> None:
+        """A deep or large value in the place of a text or a number is named by its type only."""
+        for depth in range(50, 1000):
+            deep = b"[" * depth + b"]" * depth
+            for data in (b'{"op":' + deep + b"}", b'{"op":"service_response","id":"1","values":' + deep + b"}"):
+                try:
+                    said = decoded(data)
+                except BadFrame as error:
+                    self.assertLess(len(str(error)), 100)
+                else:
+                    assert isinstance(said, Answered)
+                    self.assertEqual(said.values, {"error": "a list"})
+        status = decoded(b'{"op":"status","level":"error","msg":[[[1]]]}')
+        self.assertEqual(status, Status("error", "a list"))
+
+    def test_most_that_is_taken(self) -> None:
+        """The most that is taken costs a bounded amount of memory; the largest scans and numbers are taken."""
+        worst = published(b"[" + b",".join([b'{"":0}'] * (MOST_VALUES // 2 - 5)) + b"]")
+        tracemalloc.start()
+        try:
+            message = decoded(worst)
+            self.assertLess(tracemalloc.get_traced_memory()[1], ROOM)
+        finally:
+            tracemalloc.stop()
+        del message
+        ranges = b",".join([b"1.2345678901234567"] * 20_000)
+        scan = b'{"op":"publish","topic":"/scan","msg":{"ranges":[%b],"intensities":[%b]}}' % (ranges, ranges)
+        self.assertTrue(self.peak(scan)[0])
+        self.assertTrue(self.peak(published(b"1" * MOST_DIGITS))[0])
+        self.assertTrue(self.peak(published(b"%.6f" % 1.7e308))[0])
+
+
+class FloodTests(SynchronousTestCase):
+    """A driver of a robot whose rosbridge sends what it likes."""
+
+    def setUp(self) -> None:
+        """Connect a driver to an emulated robot, and count the frames that are made."""
+        self.clock = Clock()
+        self.robot = RosbridgeRobot(self.clock, MemoryBody(values={"power.level": 0.8}), Random(1))
+        self.robot.start()
+        self.connector = MemoryConnector(self.clock, self.robot.accept)
+        self.driver = RosbridgeDriver({}, self.connector, self.clock, "turtle", Random(2).randbytes)
+        self.driver.connect()
+        self.pass_time(0.5)
+        self.assertEqual(self.driver.state, "ready")
+        self.taken = 0
+        take, make = End._frame, websocket.framed
+
+        def counted(end: End) -> Any:
+            frame = take(end)
+            self.taken += frame is not None and end._is_client
+            return frame
+
+        self.patch(End, "_frame", counted)
+        self.pongs: list[int] = []
+
+        def noted(opcode: int, payload: bytes, mask: bytes | None) -> bytes:
+            if opcode == PONG and mask is not None:
+                self.pongs.append(len(payload))
+            return make(opcode, payload, mask)
+
+        self.patch(websocket, "framed", noted)
+        self.addCleanup(self.end)
+
+    def end(self) -> None:
+        """Leave nothing on the clock."""
+        self.driver.disconnect()
+        self.robot.stop()
+        self.pass_time(0.1)
+
+    def pass_time(self, seconds: float) -> None:
+        """Turn the clock."""
+        self.clock.pump([0.005] * round(seconds / 0.005))
+
+    @property
+    def link(self) -> Any:
+        """The driver's end of the newest connection."""
+        return self.connector.links[-1]
+
+    def hear(self, data: bytes) -> None:
+        """Let the driver read this, as a reactor would."""
+        for start in range(0, len(data), READ):
+            if self.link.receiver is not None:
+                self.link.receiver.received(data[start : start + READ])
+
+    def test_flood_of_empty_frames(self) -> None:
+        """Of a megabyte of empty frames of any kind some thousand are taken; the link is closed, and called later."""
+        for opcode in (PING, PONG, CONTINUATION, TEXT):
+            with self.subTest(opcode=opcode):
+                self.taken = 0
+                data = framed(opcode, b"", None)
+                self.hear(data * (2**20 // len(data)))
+                self.assertLessEqual(self.taken, MAX_FRAMES)
+                self.assertLessEqual(len(self.pongs), MAX_FRAMES)
+                self.assertNotEqual(self.driver.state, "ready")
+                self.pass_time(8.0)
+                self.assertEqual(self.driver.state, "ready")
+
+    def test_flood_comes_again(self) -> None:
+        """A rosbridge that floods each connection is called at most once in some seconds, so it costs little in all."""
+        flood = framed(PING, b"", None) * (READ // 2)
+        self.taken = 0
+        for _ in range(6000):
+            if self.driver.state == "ready":
+                self.hear(flood)
+            self.pass_time(0.005)
+        self.assertLess(self.taken, 60 * MAX_FRAMES)
+
+    def test_pongs_do_not_pile_up(self) -> None:
+        """Where the other end takes nothing, its pings are not answered."""
+        sent: list[bytes] = []
+        self.patch(self.link, "send", sent.append)
+        self.link.is_busy = True
+        self.hear(framed(PING, bytes(125), None) * 300)
+        self.assertEqual(sent, [])
+        self.link.is_busy = False
+        self.hear(framed(PING, bytes(125), None) * 3)
+        self.assertEqual(len(sent), 1)
+
+    def test_driver_survives(self) -> None:
+        """None of the messages takes the connection down or raises; the driver goes on with the next good one."""
+        before = self.driver.diagnostics()["bad_frames"]
+        hostile = [*MANY.values(), *LONG.values(), *DEEP.values()]
+        for data in hostile:
+            self.hear(framed(TEXT, data, None))
+        self.assertEqual(self.driver.diagnostics()["bad_frames"] - before, len(hostile))
+        self.pass_time(0.5)
+        self.assertEqual(self.driver.state, "ready")
+
+    def test_answers_to_calls(self) -> None:
+        """A failed call whose reason is deeply nested fails with a short text."""
+        errors: list[object] = []
+        asked = self.driver._call("/dance")
+        asked.addErrback(lambda failure: errors.append(failure.check(RobotError) and failure.getErrorMessage()))
+        number = next(reversed(self.driver._calls))
+        deep = b"[" * 500 + b"]" * 500
+        answer = b'{"op":"service_response","id":"%b","result":false,"values":{"error":%b}}'
+        self.hear(framed(TEXT, answer % (number.encode(), deep), None))
+        self.assertEqual(errors, ["a list"])
