@@ -220,6 +220,7 @@ ON_DEMAND = (
 HEAVY = (
     *("flask", "jinja2", "segno", "prometheus_client", "OpenSSL", "cryptography"),
     *("cv2", "numpy", "pymunk", "serial", "playwright", "roslibpy", "autobahn"),
+    *("wsproto", "h11"),
 )
 
 
