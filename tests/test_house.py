@@ -27,7 +27,7 @@ MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "drivers": ("drivers", "standards", "validation"),
     "sim": ("sim", "drivers", "validation"),
     "sim.team": ("sim.team", "middleware", "validation"),
-    "webnode": ("webnode", "middleware", "standards"),
+    "webnode": ("webnode", "middleware", "standards", "validation"),
     "agents": ("agents", "middleware", "drivers.driver", "drivers.reading", "drivers.errors", "standards"),
     "swarmnode": ROOMS,
 }

@@ -94,7 +94,7 @@ def convert_table(table: object, cls: type[T]) -> T:
     values = {key: convert_value(value, hints[key], key, known[key].default) for key, value in table.items()}
     for key, field in known.items():
         if key not in values and field.default is MISSING and field.default_factory is MISSING:
-            raise Invalid(key, f"is missing, and must be {_expected_by(hints[key])}", _remedy_for(hints[key]))
+            raise Invalid(key, "is missing", _remedy_for(hints[key]))
     return cls(**values)
 
 
@@ -119,17 +119,14 @@ def convert_value(value: object, hint: Any, key: str = "", default: object = Non
             result = step.apply(result) if isinstance(step, Then) else result
         return result
     except (MsgspecError, ValueError) as error:
-        expected = _expected_by(hint)
         if any(isinstance(each, Secret) for each in extra):
-            raise Invalid(key, f"must be {expected} (its value is not shown)", _remedy_for(hint)) from None
+            raise Invalid(key, "is not allowed (its value is not shown)", _remedy_for(hint)) from None
         place, wrong = _innermost(value, error)
         problem = str(error)
         if isinstance(error, MsgspecError) or not problem:
             unknown = re.match(r"Object .* field `.*?`", problem)
             problem = f"has {unknown[0][7:]}" if unknown else f"is {show_value(wrong)}"
-        raise Invalid(
-            key, f"{place} {problem}, but must be {expected}".strip(), _remedy_for(hint, default, wrong)
-        ) from None
+        raise Invalid(key, f"{place} {problem}".strip(), _remedy_for(hint, default, wrong)) from None
 
 
 def raw_of(hint: Any) -> Any:
@@ -179,9 +176,12 @@ def _expected_by(hint: Any) -> str:
     base, unit = _base_of(hint), "".join(f" {each.name}" for each in extra if isinstance(each, Unit))
     if get_origin(base) is Literal:
         return f"one of {', '.join(map(json.dumps, get_args(base)))}"
-    if get_origin(base) is tuple:
-        most = next((f" of at most {meta.max_length} entries" for meta in metas if meta.max_length), "")
-        return f"a list{most}, each {_expected_by(get_args(base)[0])}"
+    if get_origin(base) in (list, tuple):
+        most = next(
+            (f" of {meta.min_length or 0} to {meta.max_length} entries" for meta in metas if meta.max_length), ""
+        )
+        entry = get_args(base)[0]
+        return f"a list{most}" if entry is Any else f"a list{most}, each {_expected_by(entry)}"
     name = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}.get(base, "a table")
     bounds = {"ge": "from", "gt": "above", "le": "to", "lt": "below", "pattern": "that matches"}
     limits = [
@@ -198,13 +198,13 @@ def _expected_by(hint: Any) -> str:
 def _remedy_for(hint: Any, default: object = None, wrong: object = None) -> str:
     words = _words_of(hint)
     if words and isinstance(wrong, str):
-        return f'the nearest is "{nearest_of(wrong, words)}"'
+        return f'write {_expected_by(hint)}; the nearest is "{nearest_of(wrong, words)}"'
     for meta in getattr(hint, "__metadata__", ()):
         if isinstance(meta, Meta) and meta.examples:
             default = meta.examples[0]
-    # TOML writes texts, numbers, truth values and lists as JSON does.
-    has_example = isinstance(default, bool | int | float | str | list | tuple) and default not in ("", ())
-    return f"write, for example, {json.dumps(default)}" if has_example else "write such a value, or leave it out"
+    # TOML writes texts, numbers and lists as JSON does.
+    has_example = isinstance(default, int | float | str | list | tuple) and default not in (True, False, "", ())
+    return f"write {_expected_by(hint)}{f', such as {json.dumps(default)}' if has_example else ''}"
 
 
 def _words_of(hint: Any) -> list[str]:

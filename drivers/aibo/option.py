@@ -62,8 +62,8 @@ def checked(table: Mapping[str, object]) -> Options:
     """The options in ``table``; raises ``UsageError`` that names the key and what to write instead."""
     options = convert_options("aibo", table, Options)
     if options.camera_transport == "udp" and not _is_address(options.host):
-        problem = f'is {options.host!r}, but must be a numeric address where camera_transport is "udp"'
-        raise fault_of("aibo", "host", problem, 'write one such as host = "192.168.0.51"')
+        problem = f'is {options.host!r}, which camera_transport = "udp" does not allow'
+        raise fault_of("aibo", "host", problem, 'write a numeric address, such as "192.168.0.51"')
     return options
 
 

@@ -60,7 +60,7 @@ class RefusalTests(SynchronousTestCase):
     def test_refuse_wrong_type(self) -> None:
         """A value of the wrong type is refused with file, key and what to write."""
         path = self.file('[node]\nname = "a"\nteam_key = "t"\nport = "high"\n')
-        self.assert_says(self.refusal("--config", path), path, "[node] port", "write, for example, 8484")
+        self.assert_says(self.refusal("--config", path), path, "[node] port", "such as 8484")
 
     def test_refuse_missing_file(self) -> None:
         """A settings file that is not there is named."""
