@@ -30,8 +30,8 @@ class Entry:
 
     ``promised`` is the highest ballot answered, ``ballot`` that of the lease, which runs ``ttl`` seconds ``until`` then
     (its ``agent`` holds it); ``spent`` is the highest ballot whose lease was given back, by an agent whose robot comes
-    to rest until ``until``.  ``token`` never falls; ``grantee`` is the agent to which this member granted it, empty where
-    it only heard of it.
+    to rest until ``until``.  ``token`` never falls; ``grantee`` is the agent to which this member granted it, empty
+    where it only heard of it.
     ``sealed`` is the ballot under which ``members`` were accepted as the next council; where it is none they are the
     present one, as far as known, and ``charter`` is the proof of that.  ``ceiling`` bounds the numbers that are taken.
     """
