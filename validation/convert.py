@@ -185,7 +185,7 @@ def _expected_by(hint: Any) -> str:
     name = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}.get(base, "a table")
     bounds = {"ge": "from", "gt": "above", "le": "to", "lt": "below", "pattern": "that matches"}
     limits = [
-        f" {word} {limit:g}" if isinstance(limit, int | float) and limit < 1e6 else f" {word} {limit}"
+        f" {word} {limit:.15g}" if isinstance(limit, float) else f" {word} {limit}"
         for meta in metas
         if meta is not FINITE
         for bound, word in bounds.items()

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta
 
-from validation.convert import Invalid, Unit, convert_value, nearest_of
+from validation.convert import Invalid, Secret, Unit, convert_value, nearest_of
 from webnode.board import Board, Role, Visitor
 from webnode.errors import Refusal
 from webnode.field import Json, text
@@ -170,8 +170,10 @@ def hint_of(field: Field) -> Any:
     """The type of a field with its bounds, by which it is converted and documented."""
     least, most = field.least, field.most
     match field.kind:
-        case "text":
-            return Annotated[str, Meta(min_length=int(1 if least is None else least), max_length=_longest(field))]
+        case "text":  # perhaps a password, so no error repeats it
+            return Annotated[
+                str, Meta(min_length=int(1 if least is None else least), max_length=_longest(field)), Secret()
+            ]
         case "number" | "whole":
             low, high = -MAX_NUMBER if least is None else least, MAX_NUMBER if most is None else most
             if field.kind == "whole":
