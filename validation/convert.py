@@ -114,7 +114,9 @@ def convert_value(value: object, hint: Any, key: str = "", default: object = Non
     try:
         if is_text and get_origin(_base_of(raw)) is tuple:
             value = [word.strip() for word in str(value).split(",") if word.strip()]
-        result = convert(value, raw, strict=not is_text)
+        if is_text and raw is bool:
+            value = {"true": True, "false": False}.get(str(value), value)
+        result = convert(value, raw, strict=not is_text or raw is bool)
         for step in extra:
             result = step.apply(result) if isinstance(step, Then) else result
         return result

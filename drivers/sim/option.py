@@ -8,7 +8,7 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from drivers.option import Fps, Host, Port, convert_options
+from drivers.option import Fps, Port, convert_options
 from drivers.reading import Description
 
 DEFAULT_PORT = 7400
@@ -19,7 +19,7 @@ class Options:
     """Where the yard is, which of its robots is meant, and how many pictures a second are wanted (0: no camera)."""
 
     robot: Annotated[str, Meta(min_length=1, max_length=32, examples=["dog1"])]
-    host: Host = "127.0.0.1"
+    host: Annotated[str, Meta(min_length=1)] = "127.0.0.1"
     port: Port = DEFAULT_PORT
     camera_fps: Fps = 15.0
     camera: bool = True

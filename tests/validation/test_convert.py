@@ -34,6 +34,7 @@ class _Table:
     word: Annotated[bytes, Meta(description="a loud word"), Then(_shout, raw=str)] = b""
     key: Annotated[str, Meta(min_length=8), Secret()] = field(default="", repr=False)
     x: Annotated[float, FINITE] = 0.0
+    on: bool = False
 
 
 class ConvertTests(SynchronousTestCase):
@@ -94,4 +95,7 @@ class ConvertTests(SynchronousTestCase):
         """Words stand for numbers, truth and lists separated by commas."""
         self.assertEqual(convert_field("8080", _Table, "port", is_text=True), 8080)
         self.assertEqual(convert_field("1, 2,", _Table, "sizes", is_text=True), (1, 2))
+        self.assertIs(convert_field("true", _Table, "on", is_text=True), True)
+        for word in ("1", "yes", "True", ""):
+            self.assertRaises(Invalid, convert_field, word, _Table, "on", is_text=True)
         self.assertRaises(Invalid, convert_field, "many", _Table, "port", is_text=True)
