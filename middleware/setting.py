@@ -1,4 +1,4 @@
-"""Setting: the types of a node's settings, each with the constraints that a settings file is held to."""
+"""Setting: the types of a node's settings, each with its constraints."""
 
 from __future__ import annotations
 

@@ -56,7 +56,7 @@ class End(ABC):
         self._reply: list[bytes] = []
 
     def opening(self) -> bytes:
-        """What a client sends first; nothing of a server."""
+        """Return the request of a client; a server sends nothing first."""
         return b"" if self._request is None else self._send(self._request)
 
     def received(self, data: bytes) -> tuple[list[bytes], bytes]:
@@ -79,11 +79,11 @@ class End(ABC):
         return messages, reply
 
     def framed(self, payload: bytes) -> bytes:
-        """A binary message as one frame; empty once the connection closes."""
+        """Return a binary message as one frame, or nothing once the connection closes."""
         return self._send(BytesMessage(payload))
 
     def text(self, payload: bytes) -> bytes:
-        """A text in UTF-8 as one frame; empty once the connection closes."""
+        """Return a text in UTF-8 as one frame, or nothing once the connection closes."""
         return self._send(TextMessage(payload.decode()))
 
     def ping(self) -> bytes:
@@ -91,18 +91,18 @@ class End(ABC):
         return self._send(Ping())
 
     def closing(self, code: int = NORMAL) -> bytes:
-        """The frame that closes the connection; empty where it was sent already."""
+        """Return the frame that closes the connection, or nothing if it was sent already."""
         return self._send(CloseConnection(code))
 
     # -- for subclasses ---------------------------------------------------------------------------------------------
 
     @abstractmethod
     def _answer(self, request: Request) -> AcceptConnection | RejectConnection:
-        """What a server says to a request."""
+        """Return the server's answer to a request."""
 
     @abstractmethod
     def _fault_of(self, answer: AcceptConnection | RejectConnection | Exception) -> str:
-        """What is wrong with what a server answers; empty where the frames may begin."""
+        """Return the fault of a server's answer, or an empty text if frames may follow."""
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
@@ -113,7 +113,7 @@ class End(ABC):
             return b""  # it is not open yet, or is closing
 
     def _is_taken(self, event: Event) -> bool:
-        """Take an event; False where it ends the connection."""
+        """Take an event; return False if it ends the connection."""
         self._left -= 1
         if self._left < 0:
             self._fail(f"more than {MAX_FRAMES} frames at once")
@@ -156,7 +156,7 @@ class End(ABC):
         self._reply.append(self.closing(code))
 
     def _refuse(self, error: Exception) -> None:
-        """End what is no WebSocket; a server says so in HTTP."""
+        """End a connection that is no WebSocket; a server answers in HTTP."""
         if self.is_open:
             self._fail(str(error))
         elif self._request is not None:

@@ -16,7 +16,7 @@ from validation.convert import raw_of
 
 
 def json_schema() -> dict[str, Any]:
-    """The schema; where a setting has a step after its conversion, the program refuses more than the schema does."""
+    """Return the schema; the program refuses more values for settings that have a step after the conversion."""
     tables = {name: _struct_of(name, cls) for name, cls in TABLES.items()}
     optional: list[tuple[str, Any, Any]] = [
         (name, table, msgspec.field(default_factory=dict)) for name, table in tables.items() if name != "node"

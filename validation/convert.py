@@ -1,4 +1,4 @@
-"""Convert: what TOML or a command line gave, to the type that the field of a dataclass declares.
+"""Convert: values of TOML or a command line, to the type that the field of a dataclass declares.
 
 ``msgspec`` checks types and constraints (``Annotated[int, Meta(ge=0, le=65535)]``); this module turns its errors into
 ``Invalid``, with the key, the problem and the remedy.  Dataclasses and not ``msgspec.Struct``, because a dataclass can
@@ -167,7 +167,7 @@ def _innermost(value: object, error: Exception) -> tuple[str, object]:
 
 
 def _expected_by(hint: Any) -> str:
-    """What a type allows, for people."""
+    """Describe the values that a type allows, for errors."""
     extra = getattr(hint, "__metadata__", ())
     metas = [each for each in extra if isinstance(each, Meta)]
     for meta in metas:

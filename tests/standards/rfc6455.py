@@ -12,7 +12,7 @@ MASK = bytes.fromhex("37fa213d")
 
 
 def answer_to(request: bytes) -> bytes:
-    """What a server says to a client's request."""
+    """Return the answer of a server to a client's request."""
     found = re.search(rb"Sec-WebSocket-Key: (\S+)", request, re.IGNORECASE)
     assert found
     key = hashlib.sha1(found[1] + b"258EAFA5-E914-47DA-95CA-C5AB0DC85B11", usedforsecurity=False).digest()

@@ -1,4 +1,4 @@
-"""Tests of ``standards.websocket``: what it adds to ``wsproto``."""
+"""Tests of ``standards.websocket``: the limits around ``wsproto``."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def client() -> Plain:
 
 class GreetingTests(SynchronousTestCase):
     def test_refused_greetings(self) -> None:
-        """What is refused opens nothing, and nothing is heard after it; a server answers in HTTP all the same."""
+        """A refused greeting opens no connection and no frame is read after it; a server answers in HTTP."""
         for old, new in ((b"101 Switching", b"200 OK"), (b"Accept: ", b"Accept: x"), (b"e: websocket", b"e: h2c")):
             one = Plain()
             answer = answer_to(one.opening())
