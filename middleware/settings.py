@@ -9,15 +9,17 @@ from __future__ import annotations
 import hashlib
 import os
 import tomllib
-from collections.abc import Iterable, Mapping
-from dataclasses import MISSING, dataclass, field, fields, replace
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import Annotated, Any, Literal
+
+from msgspec import Meta
 
 from middleware import setting
 from middleware.entangled.data.store import MAX_BYTES, MAX_ROWS, Durable
-from middleware.entangled.network.network import Address
 from middleware.entangled.network.url import Url
 from middleware.errors import BadSetting
+from validation.convert import Invalid, Secret, Unit, convert_field, convert_table, nearest_of, some_of
 
 IN_MEMORY = ":memory:"
 ROLES = ("edge", "bootstrap", "web")
@@ -29,88 +31,84 @@ NODE_PORT = 8484
 class NodeSettings:
     """``[node]``: the node itself and its way into the network."""
 
-    name: str = field(metadata=setting.pattern(r"[A-Za-z0-9_-]{1,40}", 'such as "dog1"'))
+    name: setting.Name
     """What people call the device; 1 to 40 letters, digits, ``_`` or ``-``.  Required."""
 
-    kind: str = field(default="generic", metadata=setting.text(40))
+    kind: setting.Word = "generic"
     """What sort of device it is, for people and for matching; at most 40 characters."""
 
-    description: str = field(default="", metadata=setting.text(200))
+    description: setting.Sentence = ""
     """A line about the device, shown on the page; at most 200 characters."""
 
-    laptop: str = field(default="", metadata=setting.text(40))
+    laptop: setting.Word = ""
     """What people call the computer that the node runs on, such as ``dog1_laptop``, shown on the page; at most 40
     characters.  One node and its computer belong to one device (thesis, Table 5.1)."""
 
-    host: str = field(default="127.0.0.1", metadata=setting.numeric_host(is_told=True))
+    host: setting.ReachableHost = "127.0.0.1"
     """The numeric address to listen at; the others are told it too.  ``*`` is every interface, of IPv4 and IPv6.  The
     default hears this machine alone."""
 
-    port: int = field(default=NODE_PORT, metadata=setting.port())
+    port: setting.Port = NODE_PORT
     """The UDP port; 0 takes any free one.  Where none is set and the usual one is in use, as by another node of this
     machine, the next free one is taken.  Nodes that others name in ``known_nodes`` had better set theirs."""
 
-    known_nodes: tuple[Address, ...] = field(default=(), metadata=setting.addresses())
+    known_nodes: setting.Addresses = ()
     """Nodes to enter the network through, as ``"host:port"``.  Any one that answers is enough; more survive more
     losses.  None: this node finds its team on the LAN, or is the first of its network."""
 
-    lan: bool = field(default=True, metadata=setting.truth())
+    lan: bool = True
     """Whether the node looks for its team on its LAN, by multicast, and is found there.  False: only ``known_nodes``
     and who comes by itself.  Nothing is sent where ``host`` is an address of this machine alone."""
 
-    store: str = field(default=IN_MEMORY, metadata=setting.text(4000, least=1))
+    store: setting.File = IN_MEMORY
     """The data store's file, relative to the folder of the settings file; ``:memory:`` forgets all when the node ends,
     and so gives the node a new identity each time."""
 
-    store_rows: int = field(default=MAX_ROWS, metadata=setting.whole(100, 1_000_000))
+    store_rows: Annotated[int, Meta(ge=100, le=1_000_000)] = MAX_ROWS
     """Records that the node holds.  More serves a larger network; fewer spare memory: 1.2 KiB each, and their bytes."""
 
-    store_bytes: int = field(default=MAX_BYTES, metadata=setting.whole(100_000, 2**31))
+    store_bytes: Annotated[int, Meta(ge=100_000, le=2**31)] = MAX_BYTES
     """Bytes that the records may have together.  More holds more large values; fewer spare memory and card.  What has
     run out and old tombstones make room; then the writer is refused, with figures."""
 
-    durable: Durable = field(default="power", metadata=setting.one_of(("power", "crash")))
+    durable: Durable = "power"
     """What a stored record has outlived before its writer is told: the loss of ``power``, or only a ``crash`` of the
     node.  ``crash`` waits for no disk, and may lose the last moments with the power; the file stays whole."""
 
-    membership: str = field(default="", metadata=setting.text(4000))
+    membership: setting.MaybeFile = ""
     """The file by which this node is a member of a closed team, relative to the folder of the settings file; ``swarm
     init`` makes the first one of a team, ``swarm join CODE`` that of a newcomer.  One node a file.  Empty: the team is
     an open one, and ``team_key`` is needed."""
 
-    team_key: str = field(default="", metadata=setting.secret(1000), repr=False)
+    team_key: Annotated[str, Meta(min_length=1, max_length=1000), Secret()] = field(default="", repr=False)
     """Instead of a membership, for a classroom: what all nodes of an open team know.  **Whoever knows it is a member,
     may do everything, and can be put out by another key for all the others only.**  Any long text will do; it is
     hashed."""
 
-    roles: tuple[str, ...] = field(default=("edge",), metadata=setting.some_of(ROLES))
+    roles: Annotated[tuple[str, ...], some_of(ROLES)] = ("edge",)
     """What the node does: ``edge`` carries a device, ``bootstrap`` lets others in, ``web`` serves the page."""
 
-    capabilities: Mapping[str, Mapping[str, float | str]] = field(
-        default_factory=dict, metadata=setting.table_of_tables()
-    )
+    capabilities: setting.Capabilities = field(default_factory=dict)
     """What the device can do beyond what its driver says: a table of properties (numbers or text) for each
     capability.  A capability that the driver names, too, is merged, and what stands here wins."""
 
-    presence_lease: float = field(default=1.0, metadata=setting.seconds(0.1, 60.0))
+    presence_lease: Annotated[float, Meta(ge=0.1, le=60.0), Unit("seconds")] = 1.0
     """Seconds for which the others believe in the device without a sign of it.  Less notices a loss sooner, and takes
     a slow radio for a loss; more costs fewer datagrams (three are sent to each holder in that time)."""
 
-    position: Mapping[str, float] = field(
-        default_factory=dict, metadata=setting.numbers(("x", "y", "heading"), ("lat", "lon", "accuracy"))
-    )
+    position: setting.Position = field(default_factory=dict)
     """Where the device stands, for the page's map: ``x`` and ``y`` in metres and ``heading`` in radians, or ``lat`` and
     ``lon`` in degrees and ``accuracy`` in metres.  A device that moves and knows where it is says so itself."""
 
-    tunnels: tuple[str, ...] = field(default=("auto",), metadata=setting.tunnels(8))
+    tunnels: setting.Tunnels = ("auto",)
     """Tunnels over TLS by which to enter where no known node answers by UDP, as ``"wss://host:port"``; ``auto`` stands
     for port 443 of each known node that is not this machine.  Empty: none, and where UDP is blocked the node stays
     outside."""
 
-    tunnel_port: int = field(default=0, metadata=setting.port())
+    tunnel_port: setting.Port = 0
     """The TCP port at which this node lets those in to whom UDP is blocked, best 443; 0: it does not."""
 
-    tunnel_tls: bool = field(default=True, metadata=setting.truth())
+    tunnel_tls: bool = True
     """False: the port speaks no TLS, and only to this machine: for a reverse proxy that has a certificate."""
 
     @property
@@ -131,10 +129,10 @@ class NodeSettings:
 class AgentSettings:
     """``[agent]``: the mind of the device."""
 
-    module: str = field(default="", metadata=setting.pattern(r"([A-Za-z_]\w*([.:][A-Za-z_]\w*)*)?", 'such as "search"'))
+    module: setting.Module = ""
     """The agent's module, by its name or its dotted path; none where empty."""
 
-    name: str = field(default="", metadata=setting.text(40))
+    name: setting.Word = ""
     """What people call the agent, such as ``dog1_agent``, shown on the page and in the log; at most 40 characters."""
 
 
@@ -142,15 +140,13 @@ class AgentSettings:
 class DriverSettings:
     """``[driver]``: the body of the device."""
 
-    kind: str = field(default="", metadata=setting.pattern(r"([A-Za-z_]\w*([.:][A-Za-z_]\w*)*)?", 'such as "sim"'))
+    kind: setting.Module = ""
     """The sort of robot, by its name, or the place of its driver as ``module:Class``; none where empty."""
 
-    options: Mapping[str, object] = field(default_factory=dict, metadata=setting.table())
+    options: setting.Options = field(default_factory=dict)
     """Handed on to the driver as they stand; it checks them."""
 
-    parts: tuple[tuple[str, Mapping[str, object]], ...] = field(
-        default=(), metadata=setting.kinds_with_options(8, "camera")
-    )
+    parts: setting.Parts = ()
     """What rides on the robot and only senses, as a camera board or a compass: a table ``[[driver.parts]]`` with
     ``kind`` and ``options`` for each, at most 8.  What the robot itself can do stays the robot's."""
 
@@ -159,35 +155,33 @@ class DriverSettings:
 class WebSettings:
     """``[web]``: the page; read where the node has the role ``web``."""
 
-    host: str = field(default="127.0.0.1", metadata=setting.numeric_host())
+    host: setting.Host = "127.0.0.1"
     """The numeric address to serve at.  The default serves this machine alone; ``0.0.0.0`` also phones and tablets."""
 
-    port: int = field(default=8080, metadata=setting.port())
+    port: setting.Port = 8080
     """The TCP port of the page; 0 takes any free one."""
 
-    yard: Address | None = field(default=None, metadata=setting.address())
+    yard: setting.MaybeAddress = None
     """Where the simulated yard takes its operator's commands, as ``"host:port"``; none where empty."""
 
-    tls: str = field(default="", metadata=setting.one_of(("", "auto")))
+    tls: Literal["", "auto"] = ""
     """``auto``: the page is also served over TLS, with a certificate that the node makes (extra ``tls``; 13 MiB more).
     Empty: not, and a phone gives such a page no camera."""
 
-    tls_port: int = field(default=8443, metadata=setting.port())
+    tls_port: setting.Port = 8443
     """The TCP port of the page over TLS; 0 takes any free one."""
 
-    code: str = field(default="", repr=False, metadata=setting.pattern(r"([a-z0-9-]{6,40})?", 'such as "quiet-otter"'))
+    code: setting.SignInCode = field(default="", repr=False)
     """What operators sign in with; 6 to 40 small letters, digits and ``-``.  Empty: one is made at each start."""
 
-    password: str = field(default="", metadata=setting.hidden(200), repr=False)
+    password: Annotated[str, Meta(max_length=200), Secret()] = field(default="", repr=False)
     """The hash of a password to sign in with, as ``swarm password`` prints it.  Empty: the code alone lets in."""
 
-    names: tuple[str, ...] = field(
-        default=(), metadata=setting.patterns(r"[a-z0-9]([a-z0-9.-]{0,98}[a-z0-9])?", 8, '"robots.lan"')
-    )
+    names: setting.HostNames = ()
     """Further names of this machine by which the page may be opened, at most 8.  Its addresses, its host name (also
     with ``.local`` and ``.lan``) and the node's name always may."""
 
-    sign_in: bool = field(default=True, metadata=setting.truth())
+    sign_in: bool = True
     """False: whoever can open the page is an operator; only where ``host`` is an address of this machine alone."""
 
 
@@ -195,7 +189,7 @@ class WebSettings:
 class FaultSettings:
     """``[faults]``: whether operators may make this node fail, to see the team go on; for demonstrations and tests."""
 
-    allow: bool = field(default=False, metadata=setting.truth())
+    allow: bool = False
     """False: nobody can, whoever asks."""
 
 
@@ -203,20 +197,16 @@ class FaultSettings:
 class DeploymentSettings:
     """``[deployment]``: whether code that operators push into the running team may run on this node."""
 
-    allow: bool = field(default=False, metadata=setting.truth())
+    allow: bool = False
     """**The author of a behaviour decides where this robot goes.**  The signature says from whom a module comes, not
     that it is harmless.  It runs in a process of its own without rights, as far as the system allows
     (``docs/deployment.md``).  False: nothing is ever fetched, loaded or run."""
 
-    operators: tuple[str, ...] = field(
-        default=(), metadata=setting.patterns(r"[0-9a-f]{64}", 8, '"5f0c...", as `swarm deploy keys` shows them')
-    )
+    operators: setting.PublicKeys = ()
     """Public keys of the nodes that may push, each 64 hexadecimal digits; in a closed team they need the role operator
     as well.  Empty: none may."""
 
-    modules: tuple[str, ...] = field(
-        default=(), metadata=setting.patterns(r"[a-z][a-z0-9_-]{0,31}", 8, '"nearest-left"')
-    )
+    modules: setting.ModuleNames = ()
     """Names of the modules that may run here, at most 8.  Any other is refused, whoever pushes it."""
 
 
@@ -273,18 +263,18 @@ class Settings:
             if name in TABLES:
                 continue
             if isinstance(value, Mapping):
-                remedy = f"the nearest table is [{_nearest(name, TABLES)}]"
+                remedy = f"the nearest table is [{nearest_of(name, TABLES)}]"
                 raise BadSetting(origin, f"[{name}]", "is not a table that a node has", remedy)
-            key = _nearest(name, [key for _, key in _keys()])
+            key = nearest_of(name, [key for _, key in _keys()])
             tables = " or ".join(f"[{table}]" for table, known in _keys() if known == key)
             remedy = f"write it below {tables}" if key == name else f"the nearest setting is {key}, below {tables}"
             raise BadSetting(origin, name, "stands outside of any table", remedy)
         made: dict[str, Any] = {}
         for name, kind in TABLES.items():
-            table = mapping.get(name, {})
-            if not isinstance(table, Mapping):
-                raise BadSetting(origin, f"[{name}]", f"must be a table, is {setting.shown(table)}", f"write [{name}]")
-            made[name] = _checked(table, name, kind, origin)
+            try:
+                made[name] = convert_table(mapping.get(name, {}), kind)
+            except Invalid as error:
+                raise BadSetting(origin, f"[{name}] {error.key}".strip(), error.problem, error.remedy) from None
         node, folder = made["node"], os.path.dirname(origin)
         if node.store != IN_MEMORY:
             node = replace(node, store=os.path.join(folder, node.store))
@@ -306,13 +296,15 @@ class Settings:
         for flag, value in flags.items():
             shown = "--" + flag.replace("_", "-")
             if flag not in known:
-                remedy = "the nearest is --" + _nearest(flag, known).replace("_", "-")
+                remedy = "the nearest is --" + nearest_of(flag, known).replace("_", "-")
                 raise BadSetting(COMMAND_LINE, shown, "is not a setting", remedy)
             if value is not None:
                 table, key = known[flag]
-                rule = next(f for f in fields(TABLES[table]) if f.name == key).metadata
-                value = rule["read"](value) if isinstance(value, str) else value
-                changed.setdefault(table, {})[key] = _ruled(rule, value, COMMAND_LINE, shown)
+                try:
+                    new = convert_field(value, TABLES[table], key, is_text=isinstance(value, str))
+                except Invalid as error:
+                    raise BadSetting(COMMAND_LINE, shown, error.problem, error.remedy) from None
+                changed.setdefault(table, {})[key] = new
         given = self.given | {(table, key) for table, keys in changed.items() for key in keys}
         tables = {table: replace(getattr(self, table), **keys) for table, keys in changed.items()}
         return replace(self, **tables, given=given)
@@ -322,30 +314,5 @@ def _is_here(host: str) -> bool:
     return host.startswith("127.") or host in ("::1", "localhost")
 
 
-def _checked(table: Mapping[str, object], name: str, kind: type[Any], origin: str) -> Any:
-    known = {f.name: f for f in fields(kind)}
-    for key in table:
-        if key not in known:
-            nearest = _nearest(key, known)
-            raise BadSetting(origin, f"[{name}] {key}", "is not a setting", f"the nearest is {nearest}")
-    for key, wanted in known.items():
-        if key not in table and wanted.default is MISSING and wanted.default_factory is MISSING:
-            raise BadSetting(origin, f"[{name}] {key}", "is missing", f'write {key} = "..." below [{name}]')
-    return kind(**{key: _ruled(known[key].metadata, value, origin, f"[{name}] {key}") for key, value in table.items()})
-
-
-def _ruled(rule: Mapping[str, Any], value: object, origin: str, key: str) -> Any:
-    try:
-        return rule["check"](value)
-    except setting.Wrong as wrong:
-        raise BadSetting(origin, key, wrong.problem, wrong.remedy) from None
-
-
 def _keys() -> list[tuple[str, str]]:
     return [(table, f.name) for table, kind in TABLES.items() for f in fields(kind)]
-
-
-def _nearest(name: str, known: Iterable[str]) -> str:
-    from difflib import get_close_matches  # only a mistake needs it
-
-    return get_close_matches(name, known, n=1, cutoff=0.0)[0]

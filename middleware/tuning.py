@@ -8,13 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, fields, replace
-from difflib import get_close_matches
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import msgpack
 
-from middleware import setting
 from middleware.entangled.data.store import Store
 from middleware.entangled.errors import Refused
 from middleware.entangled.kademlia.contact import Contact
@@ -22,6 +21,7 @@ from middleware.node import SwarmNode
 from middleware.presence import Capabilities
 from middleware.settings import NodeSettings, Settings
 from middleware.value import MAX_VALUE
+from validation.convert import Invalid, convert_field, nearest_of
 
 SETTINGS, TUNE = "device.settings", "device.tune"
 WRONG = "setting"
@@ -31,7 +31,7 @@ NOTE = "tuning"
 
 @dataclass(frozen=True)
 class Knob:
-    """One setting: ``rule`` checks what it is to be (``middleware.setting``), ``turn`` makes it so.
+    """One setting: ``check`` returns what it is to be, or raises ``Invalid``; ``turn`` makes it so.
 
     ``least`` and ``most`` bound a number, or the characters of a text; both are for people.
     """
@@ -40,7 +40,7 @@ class Knob:
     about: str
     read: Callable[[], Any]
     turn: Callable[[Any], None]
-    rule: setting.Rule
+    check: Callable[[Any], Any]
     unit: str = ""
     least: float | None = None
     most: float | None = None
@@ -58,8 +58,8 @@ class Tuning:
         """Have one more knob, and turn it to where it was left in an earlier life."""
         self._knobs[knob.key] = knob
         if knob.key in self._kept:
-            with suppress(setting.Wrong):  # it was lawful when it was kept; the file's value holds
-                knob.turn(knob.rule["check"](self._kept[knob.key]))
+            with suppress(Invalid):  # it was lawful when it was kept; the file's value holds
+                knob.turn(knob.check(self._kept[knob.key]))
 
     def told(self) -> list[list[object]]:
         """Each knob as ``[key, value, about, unit, least, most]``."""
@@ -72,7 +72,7 @@ class Tuning:
         for key, value in checked.items():
             try:
                 self._knobs[key].turn(value)
-            except setting.Wrong as wrong:
+            except Invalid as wrong:
                 for other, old in before.items():
                     self._knobs[other].turn(old)
                 raise _refused(key, wrong) from None
@@ -82,12 +82,11 @@ class Tuning:
 
     def _checked(self, key: object, value: object) -> Any:
         if not isinstance(key, str) or key not in self._knobs:
-            near = get_close_matches(str(key)[:64], list(self._knobs), n=1, cutoff=0.0)
-            wrong = setting.Wrong("cannot be changed on this device", f"the nearest is {near[0]}" if near else "let be")
-            raise _refused(key, wrong)
+            remedy = f"the nearest is {nearest_of(str(key), self._knobs)}" if self._knobs else "let be"
+            raise _refused(key, Invalid("", "cannot be changed on this device", remedy))
         try:
-            return self._knobs[key].rule["check"](value)
-        except setting.Wrong as wrong:
+            return self._knobs[key].check(value)
+        except Invalid as wrong:
             raise _refused(key, wrong) from None
 
     def answer_settings(self, peer: Contact) -> list[list[object]]:
@@ -102,7 +101,10 @@ class Tuning:
 def answer_tuning(node: SwarmNode, settings: Settings, body: Capabilities | None = None) -> Tuning:
     """Have ``node`` tell and change what of ``settings`` can be changed; ``body`` is what its robot can do."""
     tuning = Tuning(node.store)
-    rules = {each.name: each.metadata for each in fields(NodeSettings)}
+
+    def check(key: str) -> Callable[[Any], Any]:
+        return partial(convert_field, cls=NodeSettings, key=key)
+
     extra = dict(settings.node.capabilities)
 
     def describe(text: str) -> None:
@@ -112,27 +114,27 @@ def answer_tuning(node: SwarmNode, settings: Settings, body: Capabilities | None
         nonlocal extra
         device = replace(node.presence.device, capabilities={**(body or {}), **capabilities})
         if len(device.packed()) > MAX_VALUE:
-            raise setting.Wrong(f"makes the device's record larger than {MAX_VALUE} bytes", "leave some out")
+            raise Invalid("capabilities", f"makes the device's record larger than {MAX_VALUE} bytes", "leave some out")
         extra = dict(capabilities)
         node.presence.change(capabilities=device.capabilities)
 
     about = "A line about the device"
     tuning.add(
-        Knob("description", about, lambda: node.presence.device.description, describe, rules["description"], most=200)
+        Knob("description", about, lambda: node.presence.device.description, describe, check("description"), most=200)
     )
     about = "How long the others believe in the device without a sign of it"
     lease = node.entangled
     tuning.add(
-        Knob("presence_lease", about, lambda: lease.lease, lease.set_lease, rules["presence_lease"], "s", 0.1, 60.0)
+        Knob("presence_lease", about, lambda: lease.lease, lease.set_lease, check("presence_lease"), "s", 0.1, 60.0)
     )
     about = "What the device can do beyond what its driver says"
-    tuning.add(Knob("capabilities", about, lambda: extra, enable, rules["capabilities"]))
+    tuning.add(Knob("capabilities", about, lambda: extra, enable, check("capabilities")))
     node.entangled.endpoint.expose(SETTINGS, tuning.answer_settings, changes=True, idempotent=True)
     node.entangled.endpoint.expose(TUNE, tuning.answer_tune, changes=True, idempotent=True)
     return tuning
 
 
-def _refused(key: object, wrong: setting.Wrong) -> Refused:
+def _refused(key: object, wrong: Invalid) -> Refused:
     return Refused(f"{str(key)[:64]}: {wrong.problem}; {wrong.remedy}", WRONG)
 
 

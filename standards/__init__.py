@@ -1,5 +1,5 @@
-"""Standards: what the world outside has written down and more than one room speaks, as bytes in and bytes out.
+"""Standards: formats of others that several packages use, as bytes in and bytes out.
 
-``head`` is the head of HTTP, ``websocket`` the greeting and the frames of RFC 6455.  This room knows no robot and no
-node, and imports nothing of the house.
+``head`` is the head of HTTP, ``websocket`` one end of a WebSocket with limits, ``jpeg`` the size of a picture.  This
+package knows no robot and no node, and imports nothing of the project.
 """

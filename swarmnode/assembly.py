@@ -13,8 +13,8 @@ from twisted.logger import Logger
 from agents.registry import agent_named
 from drivers.driver import MAX_FPS, Driver, Filming
 from drivers.errors import DriverError
+from drivers.option import Fps
 from drivers.registry import describe, driver_for
-from middleware import setting
 from middleware.entangled.data.store import Store
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.identity import Identity
@@ -27,6 +27,7 @@ from middleware.settings import Settings
 from middleware.survey import answer_survey
 from middleware.tuning import Knob, answer_tuning
 from swarmnode.seams import Seams
+from validation.convert import convert_value
 from webnode.errors import WebError
 
 if TYPE_CHECKING:
@@ -194,9 +195,9 @@ def _closed_team(seams: Seams) -> Team | None:
 
 
 def _camera_knob(driver: Filming) -> Knob:
-    about, rule = "Pictures that the camera takes", setting.number(0.0, MAX_FPS)
+    about, check = "Pictures that the camera takes", partial(convert_value, hint=Fps)
     read = partial(getattr, driver, "camera_fps")
-    return Knob("camera_fps", about, read, driver.set_camera_fps, rule, "per second", 0.0, MAX_FPS)
+    return Knob("camera_fps", about, read, driver.set_camera_fps, check, "per second", 0.0, MAX_FPS)
 
 
 def _deployable(node: SwarmNode, settings: Settings, seams: Seams) -> None:

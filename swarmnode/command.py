@@ -10,7 +10,7 @@ from importlib.util import find_spec
 from middleware.errors import MissingExtra
 from swarmnode.ballast import drop_tls
 
-OURS = ("agents", "drivers", "middleware", "sim", "standards", "swarmnode", "webnode")
+OURS = ("agents", "drivers", "middleware", "sim", "standards", "swarmnode", "validation", "webnode")
 # A verb whose module is not here is not offered.
 WORKS: dict[str, tuple[str, str]] = {
     "demo": ("sim.demo.demonstration", "three robots, a red target and the page, on this machine"),
@@ -32,6 +32,7 @@ WORKS: dict[str, tuple[str, str]] = {
     "why": ("swarmnode.why", "who was chosen for a task, and why"),
     "doctor": ("swarmnode.doctor.command", "what keeps a node from its team, and what to do"),
     "links": ("swarmnode.links", "how a node reaches each of its peers, and how well"),
+    "schema": ("swarmnode.schema", "the JSON schema of a settings file, for editors"),
     "service": ("swarmnode.systemd.command", "a node as a service of systemd: install, show, restart, remove"),
     "web": ("swarmnode.web_code", "where the page is, and the code to sign in with"),
     "password": ("swarmnode.password", "the hash of a password, for the settings of the page"),

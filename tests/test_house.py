@@ -14,7 +14,7 @@ from pathlib import Path
 from twisted.trial.unittest import SynchronousTestCase
 
 ROOT = Path(__file__).resolve().parent.parent
-BELOW = ("agents", "drivers", "middleware", "sim", "standards", "webnode")
+BELOW = ("agents", "drivers", "middleware", "sim", "standards", "validation", "webnode")
 ROOMS = (*BELOW, "swarmnode")
 
 FAULTS_USE = tuple(f"middleware.{name}" for name in ("errors", "node", "presence", "tasks", "value"))
@@ -22,16 +22,22 @@ FAULTS_USE = tuple(f"middleware.{name}" for name in ("errors", "node", "presence
 # From the most special name to the room: what a module may import of the house.  The longest name that fits holds.
 MAY_IMPORT: dict[str, tuple[str, ...]] = {
     "standards": ("standards",),
-    "middleware": ("middleware",),
+    "validation": ("validation",),
+    "middleware": ("middleware", "validation"),
     "middleware.entangled": ("middleware.entangled", "standards"),
-    "middleware.faults": ("middleware.faults", "middleware.entangled", *FAULTS_USE),
+    "middleware.faults": ("middleware.faults", "middleware.entangled", "validation", *FAULTS_USE),
     "middleware.admission": ("middleware.admission", "middleware.entangled"),
-    "drivers": ("drivers", "standards"),
-    "sim": ("sim", "drivers"),
-    "sim.robots": ("sim.robots", "drivers", "middleware.faults.stream"),
+    "drivers": ("drivers", "standards", "validation"),
+    "sim": ("sim", "drivers", "validation"),
+    "sim.robots": ("sim.robots", "drivers", "middleware.faults.stream", "validation"),
     "sim.namespaces": ("sim", "middleware"),
-    "sim.team": ("sim.team", "middleware", *(f"drivers.{name}" for name in ("driver", "errors", "gate", "link"))),
-    "webnode": ("webnode", "middleware", "standards"),
+    "sim.team": (
+        "sim.team",
+        "middleware",
+        "validation",
+        *(f"drivers.{name}" for name in ("driver", "errors", "gate", "link")),
+    ),
+    "webnode": ("webnode", "middleware", "standards", "validation"),
     "agents": ("agents", "middleware", "drivers.driver", "drivers.reading", "drivers.errors", "standards"),
     "swarmnode": ROOMS,
 }
@@ -182,6 +188,7 @@ PURE = (
     "sim.team.scenario",
     "sim.team.session",
     "standards",
+    "validation",
     "swarmnode.doctor.diagnosis",
     "swarmnode.doctor.facts",
     "swarmnode.doctor.finding",
@@ -218,7 +225,7 @@ EDGES = (
     "middleware.faults.process",
 )
 WORLD = ("time", "socket", "threading", "asyncio", "selectors", "subprocess", "secrets", "twisted.internet.reactor")
-GUARDED = ("standards", "middleware", "agents", "drivers")
+GUARDED = ("standards", "validation", "middleware", "agents", "drivers")
 
 ON_DEMAND = (
     *("middleware.deployment", "middleware.explanation", "middleware.verdict"),
@@ -227,6 +234,7 @@ ON_DEMAND = (
 HEAVY = (
     *("flask", "jinja2", "segno", "prometheus_client", "OpenSSL", "cryptography"),
     *("cv2", "numpy", "pymunk", "serial", "playwright", "roslibpy", "autobahn"),
+    *("wsproto", "h11"),
 )
 
 
@@ -276,7 +284,7 @@ def _allowed(module: str) -> tuple[str, ...]:
         kinds = sorted({name.split(".")[1] for name in FILES if re.fullmatch(r"drivers\.\w+\.maker", name)})
         own = parts[1] if len(parts) > 2 or module in (f"drivers.{kind}" for kind in kinds) else ""
         contract = tuple(name for name in FILES if name.startswith("drivers.") and name.split(".")[1] not in kinds)
-        contract += ("standards",)
+        contract += ("standards", "validation")
         allowed = (*contract, f"drivers.{own}") if own else contract
     return allowed
 

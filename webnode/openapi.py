@@ -6,19 +6,12 @@ import re
 from collections.abc import Sequence
 from typing import Any
 
+import msgspec
+
 from webnode.guard import MAX_BODY
-from webnode.route import API, MAX_ENTRIES, MAX_NUMBER, MAX_TEXT, Field, Route
+from webnode.route import API, Field, Route, hint_of
 
 VERSION = "1"
-KINDS: dict[str, dict[str, Any]] = {
-    "text": {"type": "string"},
-    "number": {"type": "number"},
-    "whole": {"type": "integer"},
-    "flag": {"type": "boolean"},
-    "choice": {"type": "string"},
-    "table": {"type": "object"},
-    "list": {"type": "array"},
-}
 ERROR = {
     "type": "object",
     "required": ["error"],
@@ -99,21 +92,8 @@ def _answer(route: Route) -> dict[str, Any]:
 
 
 def _schema(field: Field) -> dict[str, Any]:
-    schema: dict[str, Any] = {
-        **KINDS[field.kind],
-        "description": field.about + (f" ({field.unit})" if field.unit else ""),
-    }
-    match field.kind:
-        case "text":
-            schema |= {"minLength": int(1 if field.least is None else field.least)}
-            schema |= {"maxLength": int(MAX_TEXT if field.most is None else field.most)}
-        case "number" | "whole":
-            schema |= {"minimum": -MAX_NUMBER if field.least is None else field.least}
-            schema |= {"maximum": MAX_NUMBER if field.most is None else field.most}
-        case "choice":
-            schema |= {"enum": list(field.choices)}
-        case "list":
-            schema |= {"minItems": int(field.least or 0), "maxItems": int(field.most or MAX_ENTRIES)}
+    schema = msgspec.json.schema(hint_of(field))
+    schema["description"] = field.about + (f" ({field.unit})" if field.unit else "")
     if not field.is_required and field.default is not None:
         schema["default"] = field.default
         if field.kind == "text" and field.default == "":

@@ -6,12 +6,13 @@ refuses it in words that name the field.  An answer gets an ``Ask`` and knows ne
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
-from difflib import get_close_matches
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
+from msgspec import Meta
+
+from validation.convert import Invalid, Secret, Unit, convert_value, nearest_of
 from webnode.board import Board, Role, Visitor
 from webnode.errors import Refusal
 from webnode.field import Json, text
@@ -134,7 +135,7 @@ def checked(route: Route, path: Mapping[str, str], query: Mapping[str, str], bod
             value = place[field.name]
             given[field.name] = _value(field, value if field.where == "body" else _read(field, value))
         elif field.is_required:
-            raise Refusal(field.name, "it is missing or empty", _wanted(field))
+            raise Refusal(field.name, "it is missing", f"give {field.about}")
         else:
             given[field.name] = field.default
     return given
@@ -150,9 +151,9 @@ def device(ask: Ask) -> State:
     return dict(found[0])
 
 
-def _nearest(name: object, known: Iterable[str]) -> str:
-    near = get_close_matches(str(name)[:64], sorted(known), n=1, cutoff=0.0)
-    return f"leave it out; the nearest is {near[0]}" if near else "leave it out; this route takes no fields"
+def _nearest(name: object, known: Collection[str]) -> str:
+    near = f"the nearest is {nearest_of(str(name), known)}" if known else "this route takes no fields"
+    return f"leave it out; {near}"
 
 
 def _read(field: Field, word: str) -> object:
@@ -165,72 +166,36 @@ def _read(field: Field, word: str) -> object:
     return {"true": True, "false": False}.get(word, word) if field.kind == "flag" else word
 
 
-def _value(field: Field, value: object) -> Any:
+def hint_of(field: Field) -> Any:
+    """The type of a field with its bounds, by which it is converted and documented."""
+    least, most = field.least, field.most
     match field.kind:
-        case "text":
-            return _text(field, value)
+        case "text":  # perhaps a password, so no error repeats it
+            return Annotated[
+                str, Meta(min_length=int(1 if least is None else least), max_length=_longest(field)), Secret()
+            ]
         case "number" | "whole":
-            return _number(field, value)
-        case "flag" if isinstance(value, bool):
-            return value
-        case "choice" if isinstance(value, str) and value in field.choices:
-            return value
-        case "table" if isinstance(value, Mapping):
-            return dict(value)
-        case "list" if isinstance(value, list):
-            if not (field.least or 0) <= len(value) <= (field.most or MAX_ENTRIES):
-                raise Refusal(field.name, f"it has {len(value)} entries", _wanted(field))
-            return value
-    problem = "it is none of the choices" if field.kind == "choice" else f"it is no {_WORDS[field.kind]}"
-    raise Refusal(field.name, problem, _wanted(field))
-
-
-def _text(field: Field, value: object) -> str:
-    least, most = _lengths(field)
-    if not isinstance(value, str):
-        raise Refusal(field.name, "it is missing or empty", _wanted(field))
-    if len(value) > most:
-        raise Refusal(field.name, f"it has {len(value)} characters", f"give at most {most}")
-    cleaned = text(value, limit=most)
-    if len(cleaned) < least:
-        raise Refusal(field.name, "it is missing or empty" if not cleaned else "it is too short", _wanted(field))
-    return cleaned
-
-
-def _number(field: Field, value: object) -> float | int:
-    if isinstance(value, bool) or not isinstance(value, int | float) or abs(value) > MAX_NUMBER or math.isnan(value):
-        raise Refusal(field.name, "it is missing or no number", _wanted(field))
-    if field.kind == "whole" and value != int(value):
-        raise Refusal(field.name, f"{value:g} is no whole number", _wanted(field))
-    least = -MAX_NUMBER if field.least is None else field.least
-    if not least <= value <= (MAX_NUMBER if field.most is None else field.most):
-        raise Refusal(field.name, f"{value:g} is out of range", _wanted(field))
-    return int(value) if field.kind == "whole" else float(value)
-
-
-_WORDS = {"flag": "true or false", "table": "table", "list": "list", "choice": "choice"}
-
-
-def _lengths(field: Field) -> tuple[int, int]:
-    return 1 if field.least is None else int(field.least), MAX_TEXT if field.most is None else int(field.most)
-
-
-def _wanted(field: Field) -> str:
-    """What to give instead."""
-    unit = f" {field.unit}" if field.unit else ""
-    match field.kind:
-        case "text":
-            least, most = _lengths(field)
-            return f"give a text of {least} to {most} characters"
+            low, high = -MAX_NUMBER if least is None else least, MAX_NUMBER if most is None else most
+            if field.kind == "whole":
+                return Annotated[int, Meta(ge=int(low), le=int(high))]
+            return Annotated[float, Meta(ge=low, le=high), *([Unit(field.unit)] if field.unit else [])]
         case "choice":
-            return f"give one of {', '.join(field.choices)}"
-        case "flag":
-            return "give true or false"
-        case "table":
-            return 'give an object such as {"key": "value"}'
+            return Literal[field.choices]
         case "list":
-            return f"give a list of {field.least or 0:g} to {field.most or MAX_ENTRIES:g} entries"
-    kind = "whole" if field.kind == "whole" else "finite"
-    bounds = [f"at least {field.least:g}"] if field.least is not None else []
-    bounds += [f"at most {field.most:g}"] if field.most is not None else []
-    return f"give a {kind} number{unit}" + (f", {' and '.join(bounds)}" if bounds else "")
+            return Annotated[list[Any], Meta(min_length=int(least or 0), max_length=int(most or MAX_ENTRIES))]
+    return {"flag": bool, "table": dict[str, Any]}[field.kind]
+
+
+def _longest(field: Field) -> int:
+    return MAX_TEXT if field.most is None else int(field.most)
+
+
+def _value(field: Field, value: object) -> Any:
+    hint = hint_of(field)
+    if field.kind == "whole" and isinstance(value, float) and value.is_integer():
+        value = int(value)
+    try:
+        converted = convert_value(value, hint, field.name)
+        return convert_value(text(converted, limit=_longest(field)), hint) if field.kind == "text" else converted
+    except Invalid as error:
+        raise Refusal(field.name, f"it {error.problem}", error.remedy) from None

@@ -124,7 +124,7 @@ class BittleDriver(BaseDriver):
     # -- to the robot -----------------------------------------------------------------------------------------------
 
     def _open(self) -> None:
-        where, number = self._options.port, self._options.baud
+        where, number = self._options.port, int(self._options.baud)
         if self._options.host:
             where, number = self._options.host, self._options.http_port
         self._line = self._connector.call(where, number, self)

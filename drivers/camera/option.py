@@ -4,14 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Annotated
 from urllib.parse import unquote, urlsplit
+
+from msgspec import Meta
 
 from drivers.driver import MAX_FPS
 from drivers.errors import UsageError
+from drivers.option import convert_options
 from drivers.reading import Description
+from validation.convert import LINE, Unit
 
 LEAST_SIDE, MOST_SIDE = 16, 1920
 """Pixels of a side of a picture."""
+Side = Annotated[int, Meta(ge=LEAST_SIDE, le=MOST_SIDE), Unit("pixels")]
 DEVICE = "/dev/video"
 
 
@@ -41,15 +47,19 @@ class Options:
     middle of the robot that carries it, in metres.
     """
 
-    source: int | str = 0
+    source: Annotated[
+        Annotated[int, Meta(ge=0, le=63)] | Annotated[str, Meta(min_length=1)],
+        Meta(description='a number from 0 to 63 ("/dev/video0" is 0), a video file, or a folder of JPEGs'),
+        LINE,
+    ] = 0
     url: str = ""
-    width: int = 320
-    height: int = 240
-    fps: float = 10.0
-    lens: float = 60.0
-    quality: int = 80
-    radius: float = 0.15
-    ahead: float = 0.1
+    width: Side = 320
+    height: Side = 240
+    fps: Annotated[float, Meta(ge=0.1, le=MAX_FPS), Unit("pictures a second")] = 10.0
+    lens: Annotated[float, Meta(ge=5, le=180), Unit("degrees across the picture")] = 60.0
+    quality: Annotated[int, Meta(ge=10, le=95)] = 80
+    radius: Annotated[float, Meta(ge=0.01, le=5), Unit("metres")] = 0.15
+    ahead: Annotated[float, Meta(ge=-5, le=5), Unit("metres before the middle of the robot")] = 0.1
 
     @property
     def is_device(self) -> bool:
@@ -57,38 +67,13 @@ class Options:
         return not self.url and (isinstance(self.source, int) or self.source.startswith(DEVICE))
 
 
-_NUMBERS: Mapping[str, tuple[type, float, float, str]] = {
-    "width": (int, LEAST_SIDE, MOST_SIDE, "pixels"),
-    "height": (int, LEAST_SIDE, MOST_SIDE, "pixels"),
-    "fps": (float, 0.1, MAX_FPS, "pictures a second"),
-    "lens": (float, 5, 180, "degrees across the picture"),
-    "quality": (int, 10, 95, "as of a JPEG"),
-    "radius": (float, 0.01, 5, "metres"),
-    "ahead": (float, -5, 5, "metres before the middle of the robot"),
-}
-
-
 def checked(table: Mapping[str, object]) -> Options:
     """The options in ``table``; raises ``UsageError`` that names the key and what to write instead."""
     if "url" in table and "source" in table:
         raise UsageError('driver "camera": options source and url exclude each other; leave one out')
-    for key, value in table.items():
-        if key == "url":
-            place_of(value)
-        elif key == "source":
-            is_number = type(value) is int and 0 <= value <= 63
-            if not is_number and not (isinstance(value, str) and value and value.isprintable()):
-                remedy = 'a number from 0 to 63 ("/dev/video0" is 0), a video file, or a folder of JPEGs'
-                raise _fault(key, value, remedy)
-        elif key not in _NUMBERS:
-            raise UsageError(f'driver "camera": unknown option {key!r}; known are source, url, {", ".join(_NUMBERS)}')
-        else:
-            kind, low, high, unit = _NUMBERS[key]
-            fits = type(value) is int or (kind is float and type(value) is float)
-            if not fits or not low <= float(str(value)) <= high:
-                default = getattr(Options(), key)
-                raise _fault(key, value, f"{unit} from {low:g} to {high:g}, as in {key} = {default:g}")
-    return Options(**table)  # type: ignore[arg-type]
+    if "url" in table:
+        place_of(table["url"])
+    return convert_options("camera", table, Options)
 
 
 def place_of(url: object) -> Place:
@@ -118,7 +103,3 @@ def described(options: Options) -> Description:
     model = "a camera" if options.is_device else "pictures in place of a camera"
     model = "a camera on the network" if options.url else model
     return Description("camera", model, {"camera": camera}, {}, options.radius, {"camera": options.fps})
-
-
-def _fault(key: str, value: object, remedy: str) -> UsageError:
-    return UsageError(f'driver "camera": option {key} is {value!r}, but must be {remedy}')

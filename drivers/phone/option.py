@@ -4,14 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Annotated
 
-from drivers.errors import UsageError
+from msgspec import Meta
+
+from drivers.option import convert_options
 from drivers.reading import Description
+from validation.convert import Unit
 
 LENS_DEG = 65.0
 """Across the longer side of the picture.  No browser tells it; those of phones are from 60 to 75."""
 LEAST_SIDE, MOST_SIDE = 16, 640
 """Pixels of a side of a picture."""
+Side = Annotated[int, Meta(ge=LEAST_SIDE, le=MOST_SIDE), Unit("pixels")]
 FPS = 10.0
 """Pictures a second that a phone is asked for while it has a task."""
 
@@ -20,24 +25,15 @@ FPS = 10.0
 class Options:
     """The pictures' size in pixels, and whether the phone tells how it is held and where it is."""
 
-    width: int = 208
-    height: int = 156
+    width: Side = 208
+    height: Side = 156
     orientation: bool = False
     position: bool = False
 
 
 def checked(table: Mapping[str, object]) -> Options:
     """The options in ``table``; raises ``UsageError`` that names the key and what to write instead."""
-    known = ("width", "height", "orientation", "position")
-    for key, value in table.items():
-        if key not in known:
-            raise UsageError(f'driver "phone": unknown option {key!r}; known are {", ".join(known)}')
-        if key in ("width", "height"):
-            if type(value) is not int or not LEAST_SIDE <= value <= MOST_SIDE:
-                raise _fault(key, value, f"pixels from {LEAST_SIDE} to {MOST_SIDE}, as in {key} = 208")
-        elif not isinstance(value, bool):
-            raise _fault(key, value, "true or false")
-    return Options(**table)  # type: ignore[arg-type]
+    return convert_options("phone", table, Options)
 
 
 def described(options: Options) -> Description:
@@ -50,7 +46,3 @@ def described(options: Options) -> Description:
     if options.position:
         capabilities["position"] = {}
     return Description("phone", "a phone's browser", capabilities, {}, 0.08, {"camera": FPS})
-
-
-def _fault(key: str, value: object, remedy: str) -> UsageError:
-    return UsageError(f'driver "phone": option {key} is {value!r}, but must be {remedy}')

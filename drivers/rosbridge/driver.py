@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -22,7 +21,6 @@ from drivers.rosbridge import codec
 from drivers.rosbridge.codec import Answered, Published, Status, decoded, encoded
 from drivers.rosbridge.link import Bridge
 from drivers.rosbridge.option import RATES, TYPES, Options, checked, described, sectors
-from standards.websocket import Nonce
 
 REPEAT_S = 0.1
 """A velocity is said so often while it is in force: most bases stop by themselves when they hear none."""
@@ -50,12 +48,11 @@ class RosbridgeDriver(BaseDriver):
         connector: Connector,
         clock: IReactorTime,
         name: str = "the ROS robot",
-        nonce: Nonce = os.urandom,
         dead_man: DeadMan | None = None,
     ) -> None:
         self._options = options if isinstance(options, Options) else checked(options)
         super().__init__(described(self._options), name, clock, dead_man)
-        self._bridge = Bridge(self, connector, clock, nonce, self._options.host, self._options.port, self._options.path)
+        self._bridge = Bridge(self, connector, clock, self._options.host, self._options.port, self._options.path)
         self._sources = {topic: source for source, topic in self._options.topics.items()}
         self._sectors = sectors()
         self._told: dict[str, tuple[float, dict[str, Value]]] = {}

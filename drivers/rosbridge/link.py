@@ -11,7 +11,6 @@ from twisted.logger import Logger
 from drivers.base import heard_at
 from drivers.link import Connector, Line, Link
 from drivers.rosbridge.websocket import WebSocket
-from standards.websocket import Nonce
 
 PING_S = 1.0
 SILENCE_S = 3.0
@@ -39,14 +38,13 @@ class Bridge:
     log = Logger()
 
     def __init__(
-        self, owner: Owner, connector: Connector, clock: IReactorTime, nonce: Nonce, host: str, port: int, path: str
+        self, owner: Owner, connector: Connector, clock: IReactorTime, host: str, port: int, path: str
     ) -> None:
         self.bytes = 0
         self.faults = 0
         self._owner = owner
         self._connector = connector
         self._clock = clock
-        self._nonce = nonce
         self._host, self._port, self._path = host, port, path
         self._line: Line | None = None
         self._link: Link | None = None
@@ -133,7 +131,7 @@ class Bridge:
     # -- inside -----------------------------------------------------------------------------------------------------
 
     def _fresh(self) -> WebSocket:
-        return WebSocket(self._nonce, f"{self._host}:{self._port}", self._path)
+        return WebSocket(f"{self._host}:{self._port}", self._path)
 
     def _greet(self, link: Link) -> None:
         self._is_held = False

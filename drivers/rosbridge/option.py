@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Literal
 
-from drivers.driver import MAX_FPS
+from msgspec import Meta
+
 from drivers.errors import UsageError
+from drivers.option import Fps, Port, convert_options
 from drivers.reading import Description
+from validation.convert import LINE, Then, Unit
 
 DEFAULT_PORT = 9090
-VELOCITY_TYPES = ("auto", "twist", "twist_stamped")
+VelocityType = Literal["auto", "twist", "twist_stamped"]
+Topic = Annotated[str, Meta(max_length=200, pattern=r"^/[\x00-\x7f]*$(?!\n)", examples=["/cmd_vel"])]
+AnyTopic = Annotated[
+    str, Meta(max_length=200, pattern=r"^(/[\x00-\x7f]*)?$(?!\n)", description="a topic, or empty", examples=["/scan"])
+]
+Pixels = Annotated[int, Meta(ge=16, le=4096), Unit("pixels")]
 SECTORS: Mapping[str, tuple[float, float]] = {
     "front": (0.0, 40.0),
     "front_left": (45.0, 40.0),
@@ -34,6 +42,19 @@ RATES = {"odometry": 20.0, "scan": 10.0, "imu": 20.0, "battery": 1.0}
 """How often each is asked for, a second at most."""
 
 
+def _check_skills(services: Mapping[str, str]) -> Mapping[str, str]:
+    for name in services:
+        if not name.isidentifier():
+            raise ValueError(f"has {name!r}, which is no name of a skill")
+    return services
+
+
+def _check_full(value: float) -> float:
+    if value not in (1, 100):
+        raise ValueError
+    return value
+
+
 @dataclass(frozen=True)
 class Options:
     """The robot; an empty topic means that it has none.
@@ -44,31 +65,35 @@ class Options:
     ``services`` maps skills to services without arguments (std_srvs/Trigger).
     """
 
-    host: str = "127.0.0.1"
-    port: int = DEFAULT_PORT
-    path: str = "/"
-    ros: int = 2
-    model: str = "ROS robot"
-    velocity_topic: str = "/cmd_vel"
-    velocity_type: str = "auto"
-    odometry_topic: str = "/odom"
-    scan_topic: str = "/scan"
-    imu_topic: str = ""
-    battery_topic: str = "/battery_state"
-    image_topic: str = ""
-    camera_fps: float = 10.0
-    camera_width: int = 640
-    camera_height: int = 480
-    camera_lens: float = 62.0
-    max_vx: float = 0.22
-    max_vy: float = 0.0
-    max_wz: float = 2.84
-    max_range: float = 3.5
-    radius: float = 0.11
-    scan_turn: float = 0.0
-    battery_full: float = 1.0
-    motor_service: str = ""
-    services: Mapping[str, str] = field(default_factory=dict)
+    host: Annotated[str, Meta(min_length=1, max_length=253), LINE] = "127.0.0.1"
+    port: Port = DEFAULT_PORT
+    path: Annotated[str, Meta(max_length=200, pattern=r"^/[!-~]*$(?!\n)")] = "/"
+    ros: Literal[1, 2] = 2
+    model: Annotated[str, Meta(min_length=1, max_length=60), LINE] = "ROS robot"
+    velocity_topic: Topic = "/cmd_vel"
+    velocity_type: VelocityType = "auto"
+    odometry_topic: AnyTopic = "/odom"
+    scan_topic: AnyTopic = "/scan"
+    imu_topic: AnyTopic = ""
+    battery_topic: AnyTopic = "/battery_state"
+    image_topic: AnyTopic = ""
+    camera_fps: Fps = 10.0
+    camera_width: Pixels = 640
+    camera_height: Pixels = 480
+    camera_lens: Annotated[float, Meta(ge=5, le=180), Unit("degrees across the picture")] = 62.0
+    max_vx: Annotated[float, Meta(ge=0.01, le=5), Unit("m/s")] = 0.22
+    max_vy: Annotated[float, Meta(ge=0, le=5), Unit("m/s (0: it cannot go sideways)")] = 0.0
+    max_wz: Annotated[float, Meta(ge=0.01, le=20), Unit("rad/s")] = 2.84
+    max_range: Annotated[float, Meta(ge=0.1, le=200), Unit("metres")] = 3.5
+    radius: Annotated[float, Meta(ge=0.01, le=5), Unit("metres")] = 0.11
+    scan_turn: Annotated[float, Meta(ge=-360, le=360), Unit("degrees to the left")] = 0.0
+    battery_full: Annotated[float, Meta(description="1 or 100, what a full battery reports"), Then(_check_full)] = 1.0
+    motor_service: AnyTopic = ""
+    services: Annotated[
+        Mapping[str, str],
+        Meta(description='a table of skills to services, such as {dock = "/dock"}'),
+        Then(_check_skills, raw=dict[str, Topic]),
+    ] = field(default_factory=dict)
 
     @property
     def topics(self) -> dict[str, str]:
@@ -80,73 +105,9 @@ class Options:
         return name if self.ros == 1 else name.replace("/", "/msg/")
 
 
-_Rule = tuple[Callable[[Any], bool], str]
-
-
-def _text(least: int, most: int) -> Callable[[Any], bool]:
-    return lambda value: isinstance(value, str) and least <= len(value) <= most and value.isprintable()
-
-
-def _topic(is_needed: bool) -> Callable[[Any], bool]:
-    def fits(value: Any) -> bool:
-        if value == "":
-            return not is_needed
-        return isinstance(value, str) and len(value) <= 200 and value.startswith("/") and value.isascii()
-
-    return fits
-
-
-def _whole(low: int, high: int) -> Callable[[Any], bool]:
-    return lambda value: type(value) is int and low <= value <= high
-
-
-def _real(low: float, high: float) -> Callable[[Any], bool]:
-    def fits(value: Any) -> bool:
-        return isinstance(value, (int, float)) and not isinstance(value, bool) and low <= value <= high
-
-    return fits
-
-
-def _services(value: Any) -> bool:
-    return isinstance(value, Mapping) and all(
-        isinstance(name, str) and name.isidentifier() and _topic(True)(service) for name, service in value.items()
-    )
-
-
-_RULES: Mapping[str, _Rule] = {
-    "host": (_text(1, 253), 'the address of the robot, as in host = "192.168.1.20"'),
-    "port": (_whole(1, 65535), f"a number from 1 to 65535, as in port = {DEFAULT_PORT}"),
-    "path": (lambda v: _topic(True)(v) and " " not in v and v.isprintable(), 'a path, as in path = "/"'),
-    "ros": (_whole(1, 2), "1 or 2, the version of ROS on the robot"),
-    "model": (_text(1, 60), 'a name, as in model = "TurtleBot 3 Burger"'),
-    "velocity_topic": (_topic(True), 'a topic, as in velocity_topic = "/cmd_vel"'),
-    "velocity_type": (lambda v: v in VELOCITY_TYPES, f"one of {', '.join(VELOCITY_TYPES)}"),
-    **{f"{name}_topic": (_topic(False), f'a topic, or "" where there is no {name}') for name in TYPES},
-    "camera_fps": (_real(0, MAX_FPS), f"pictures a second from 0 to {MAX_FPS:g}, as in camera_fps = 10"),
-    "camera_width": (_whole(16, 4096), "pixels from 16 to 4096, as in camera_width = 640"),
-    "camera_height": (_whole(16, 4096), "pixels from 16 to 4096, as in camera_height = 480"),
-    "camera_lens": (_real(5, 180), "degrees across the picture from 5 to 180, as in camera_lens = 62"),
-    "max_vx": (_real(0.01, 5), "m/s from 0.01 to 5, as in max_vx = 0.22"),
-    "max_vy": (_real(0, 5), "m/s from 0 (it cannot go sideways) to 5, as in max_vy = 0"),
-    "max_wz": (_real(0.01, 20), "rad/s from 0.01 to 20, as in max_wz = 2.84"),
-    "max_range": (_real(0.1, 200), "metres from 0.1 to 200, as in max_range = 3.5"),
-    "radius": (_real(0.01, 5), "metres from 0.01 to 5, as in radius = 0.11"),
-    "scan_turn": (_real(-360, 360), "degrees from -360 to 360, left positive, as in scan_turn = 90"),
-    "battery_full": (lambda v: not isinstance(v, bool) and v in (1, 100), "1 or 100, what a full battery reports"),
-    "motor_service": (_topic(False), 'a service, as in motor_service = "/motor_power", or ""'),
-    "services": (_services, 'a table of skills to services, as in services = {dock = "/dock"}'),
-}
-
-
 def checked(table: Mapping[str, object]) -> Options:
     """The options in ``table``; raises ``UsageError`` that names the key and what to write instead."""
-    for key, value in table.items():
-        if key not in _RULES:
-            raise UsageError(f'driver "rosbridge": unknown option {key!r}; known are {", ".join(_RULES)}')
-        fits, remedy = _RULES[key]
-        if not fits(value):
-            raise UsageError(f'driver "rosbridge": option {key} is {value!r}, but must be {remedy}')
-    options = Options(**table)  # type: ignore[arg-type]
+    options = convert_options("rosbridge", table, Options)
     if not any(topic for name, topic in options.topics.items() if name in ("odometry", "scan", "imu")):
         raise UsageError('driver "rosbridge": give odometry_topic, scan_topic or imu_topic, or nobody sees it is alive')
     return options

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Annotated
 
-from drivers.driver import MAX_FPS
-from drivers.errors import UsageError
+from msgspec import Meta
+
+from drivers.option import Fps, Port, convert_options
 from drivers.reading import Description
 
 DEFAULT_PORT = 7400
@@ -16,10 +18,10 @@ DEFAULT_PORT = 7400
 class Options:
     """Where the yard is, which of its robots is meant, and how many pictures a second are wanted (0: no camera)."""
 
-    robot: str
-    host: str = "127.0.0.1"
-    port: int = DEFAULT_PORT
-    camera_fps: float = 15.0
+    robot: Annotated[str, Meta(min_length=1, max_length=32, examples=["dog1"])]
+    host: Annotated[str, Meta(min_length=1)] = "127.0.0.1"
+    port: Port = DEFAULT_PORT
+    camera_fps: Fps = 15.0
     camera: bool = True
 
     @property
@@ -30,26 +32,7 @@ class Options:
 
 def checked(table: Mapping[str, object]) -> Options:
     """The options in ``table``; raises ``UsageError`` that names the key and what to write instead."""
-    known = ("robot", "host", "port", "camera_fps", "camera")
-    for key in table:
-        if key not in known:
-            raise UsageError(f'driver "sim": unknown option {key!r}; known are {", ".join(known)}')
-    robot = table.get("robot")
-    if not isinstance(robot, str) or not 1 <= len(robot) <= 32:
-        raise _fault("robot", robot, 'the name of a robot of the yard, as in robot = "dog1"')
-    host = table.get("host", "127.0.0.1")
-    if not isinstance(host, str) or not host:
-        raise _fault("host", host, 'the address of the yard, as in host = "127.0.0.1"')
-    port = table.get("port", DEFAULT_PORT)
-    if type(port) is not int or not 1 <= port <= 65535:
-        raise _fault("port", port, f"a number from 1 to 65535, as in port = {DEFAULT_PORT}")
-    fps = table.get("camera_fps", 15.0)
-    if not isinstance(fps, (int, float)) or isinstance(fps, bool) or not 0 <= fps <= MAX_FPS:
-        raise _fault("camera_fps", fps, f"pictures a second from 0 to {MAX_FPS:g}, as in camera_fps = 15")
-    camera = table.get("camera", True)
-    if not isinstance(camera, bool):
-        raise _fault("camera", camera, "true or false")
-    return Options(robot, host, port, float(fps), camera)
+    return convert_options("sim", table, Options)
 
 
 def described(options: Options) -> Description:
@@ -74,7 +57,3 @@ def described(options: Options) -> Description:
         radius=0.12,
         rates=rates,
     )
-
-
-def _fault(key: str, value: object, remedy: str) -> UsageError:
-    return UsageError(f'driver "sim": option {key} is {value!r}, but must be {remedy}')

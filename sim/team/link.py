@@ -9,10 +9,13 @@ from __future__ import annotations
 import math
 import random
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import Annotated
 
-from middleware import setting
+from msgspec import Meta
+
 from middleware.entangled.network.network import Address
+from validation.convert import Unit, one_of
 
 KINDS = ("none", "lan", "wifi", "internet")
 MEAN_RTT = 0.156
@@ -30,30 +33,30 @@ LOST: tuple[float, ...] = ()
 class LinkSettings:
     """``[link]``: what lies between the nodes."""
 
-    kind: str = field(default="lan", metadata=setting.one_of(KINDS))
+    kind: Annotated[str, one_of(KINDS)] = "lan"
     """``none``: no delay.  ``lan``: 0.2 to 0.6 ms.  ``wifi``: 1 ms and up, 5 ms on average.  ``internet``: by where
     nodes are, 156 ms there and back on average."""
 
-    loss: float = field(default=0.0, metadata=setting.number(0.0, 0.9))
+    loss: Annotated[float, Meta(ge=0.0, le=0.9)] = 0.0
     """Share of the datagrams that is lost, each way."""
 
-    burst: float = field(default=0.0, metadata=setting.seconds(0.0, 10.0))
+    burst: Annotated[float, Meta(ge=0.0, le=10.0), Unit("seconds")] = 0.0
     """Mean seconds for which a sender loses everything, so that the share is as ``loss`` says (Gilbert-Elliott); 0:
     each datagram by itself."""
 
-    asymmetry: float = field(default=0.0, metadata=setting.number(0.0, 1.0))
+    asymmetry: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0
     """Of two directions one loses this share more than ``loss`` says, and the other as much less."""
 
-    duplicate: float = field(default=0.0, metadata=setting.number(0.0, 0.9))
+    duplicate: Annotated[float, Meta(ge=0.0, le=0.9)] = 0.0
     """Share of the datagrams that arrives twice."""
 
-    reorder: float = field(default=0.0, metadata=setting.number(0.0, 0.9))
+    reorder: Annotated[float, Meta(ge=0.0, le=0.9)] = 0.0
     """Share of the datagrams that takes as long again, and a millisecond, so that others overtake it."""
 
-    bandwidth: float = field(default=0.0, metadata=setting.number(0.0, 1e9))
+    bandwidth: Annotated[float, Meta(ge=0.0, le=1e9)] = 0.0
     """Bytes a second that a node can send; 0: as many as it likes."""
 
-    queue: float = field(default=0.5, metadata=setting.seconds(0.001, 60.0))
+    queue: Annotated[float, Meta(ge=0.001, le=60.0), Unit("seconds")] = 0.5
     """Seconds for which a datagram waits for its turn to be sent; what would have to wait longer is lost."""
 
 

@@ -8,17 +8,19 @@ from __future__ import annotations
 import re
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, fields
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
-from middleware import setting
+from msgspec import Meta
+
 from middleware.errors import BadSetting
 from sim.team.faults.settings import Fault, fault_problem
 from sim.team.figure import Bound, bound_of
 from sim.team.link import LinkSettings
 from sim.team.session import KINDS, Session
+from validation.convert import LINE, Invalid, Unit, convert_field, convert_table, one_of, some_of
 
 FOLDER = Path(__file__).resolve().parent.parent / "scenarios"
 NODE_KINDS = ("entangled", "swarm")
@@ -35,22 +37,22 @@ Settings = Mapping[str, type[Any]]
 class Join:
     """``[join]``: how the team comes together."""
 
-    how: str = field(default="one by one", metadata=setting.one_of(WAYS))
+    how: Annotated[str, one_of(WAYS)] = "one by one"
     """``one by one``, ``pause`` seconds apart; in ``batches`` of ``size``; all ``at once`` when the first is there."""
 
-    pause: float = field(default=0.05, metadata=setting.seconds(0.0, 3600.0))
+    pause: Annotated[float, Meta(ge=0.0, le=3600.0), Unit("seconds")] = 0.05
     """Seconds between two nodes, or two batches."""
 
-    size: int = field(default=50, metadata=setting.whole(1, MOST_NODES))
+    size: Annotated[int, Meta(ge=1, le=MOST_NODES)] = 50
     """Nodes of one batch."""
 
-    known: int = field(default=2, metadata=setting.whole(1, 20))
+    known: Annotated[int, Meta(ge=1, le=20)] = 2
     """How many nodes a newcomer knows, of those that are in; the first nodes know only the first one."""
 
-    within: float = field(default=120.0, metadata=setting.seconds(1.0, 86_400.0))
+    within: Annotated[float, Meta(ge=1.0, le=86_400.0), Unit("seconds")] = 120.0
     """Seconds after the last one came, in which all must be in; who is not is a violation."""
 
-    settle: float = field(default=10.0, metadata=setting.seconds(0.0, 86_400.0))
+    settle: Annotated[float, Meta(ge=0.0, le=86_400.0), Unit("seconds")] = 10.0
     """Seconds of quiet, once all are in, before anything is measured."""
 
 
@@ -58,19 +60,19 @@ class Join:
 class Sessions:
     """``[sessions]``: how long nodes stay.  Without a median nobody leaves."""
 
-    kind: str = field(default="exponential", metadata=setting.one_of(KINDS))
+    kind: Annotated[str, one_of(KINDS)] = "exponential"
     """How the durations are distributed."""
 
-    median: float = field(default=0.0, metadata=setting.seconds(0.0, 1e7))
+    median: Annotated[float, Meta(ge=0.0, le=1e7), Unit("seconds")] = 0.0
     """Seconds that half of the sessions outlast."""
 
-    away: float = field(default=10.0, metadata=setting.seconds(0.1, 1e7))
+    away: Annotated[float, Meta(ge=0.1, le=1e7), Unit("seconds")] = 10.0
     """Median seconds until the next session at that place, of the same distribution."""
 
-    goodbye: float = field(default=0.0, metadata=setting.number(0.0, 1.0))
+    goodbye: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0
     """Share of the sessions that end with a word to the others; the rest ends as a loss of power does."""
 
-    same: bool = field(default=True, metadata=setting.truth())
+    same: bool = True
     """Whether the same node comes back, from its disk; else a newcomer takes its place."""
 
     @property
@@ -88,10 +90,10 @@ class Sessions:
 class Clocks:
     """``[clocks]``: how wrong the nodes' clocks are."""
 
-    drift: float = field(default=0.0, metadata=setting.number(0.0, 0.2))
+    drift: Annotated[float, Meta(ge=0.0, le=0.2)] = 0.0
     """Largest error of a rate: with 0.01 each clock runs between 0.99 and 1.01 times as fast as the world's."""
 
-    wall: float = field(default=0.0, metadata=setting.seconds(0.0, 1e7))
+    wall: Annotated[float, Meta(ge=0.0, le=1e7), Unit("seconds")] = 0.0
     """Seconds by which wall clocks are wrong at most, when the team begins."""
 
 
@@ -99,10 +101,10 @@ class Clocks:
 class Nats:
     """``[nat]``: who sits behind a router that translates addresses."""
 
-    share: float = field(default=0.0, metadata=setting.number(0.0, 0.9))
+    share: Annotated[float, Meta(ge=0.0, le=0.9)] = 0.0
     """Share of the nodes, each behind a router of its own; the first ones never are."""
 
-    kinds: tuple[str, ...] = field(default=("port",), metadata=setting.some_of(NAT_KINDS))
+    kinds: Annotated[tuple[str, ...], some_of(NAT_KINDS)] = ("port",)
     """The sorts of routers, in turn (``network.nat``)."""
 
 
@@ -110,31 +112,31 @@ class Nats:
 class Scenario:
     """What happens to a team."""
 
-    about: str = field(default="", metadata=setting.text(200))
+    about: Annotated[str, Meta(max_length=200), LINE] = ""
     """A line for people."""
 
-    nodes: int = field(default=10, metadata=setting.whole(1, MOST_NODES))
+    nodes: Annotated[int, Meta(ge=1, le=MOST_NODES)] = 10
     """Places in the team; ``--nodes`` takes its place."""
 
-    kind: str = field(default="entangled", metadata=setting.one_of(NODE_KINDS))
+    kind: Annotated[str, one_of(NODE_KINDS)] = "entangled"
     """What nodes are: peers of the network alone (``entangled``), or the whole node of a device (``swarm``)."""
 
-    seconds: float = field(default=30.0, metadata=setting.seconds(0.0, 1e7))
+    seconds: Annotated[float, Meta(ge=0.0, le=1e7), Unit("seconds")] = 30.0
     """How long it lasts, from the moment when the team stands."""
 
-    lead: float = field(default=0.0, metadata=setting.seconds(0.0, 1e7))
+    lead: Annotated[float, Meta(ge=0.0, le=1e7), Unit("seconds")] = 0.0
     """Seconds of it that pass before the workloads begin to act."""
 
-    repair: float = field(default=0.0, metadata=setting.seconds(0.0, 1e6))
+    repair: Annotated[float, Meta(ge=0.0, le=1e6), Unit("seconds")] = 0.0
     """Seconds that the team is given after that, with all faults taken back, before it is asked what it knows."""
 
-    step: float = field(default=0.5, metadata=setting.seconds(0.01, 60.0))
+    step: Annotated[float, Meta(ge=0.01, le=60.0), Unit("seconds")] = 0.5
     """Seconds between two steps of the workloads."""
 
-    lease: float = field(default=1.0, metadata=setting.seconds(0.1, 60.0))
+    lease: Annotated[float, Meta(ge=0.1, le=60.0), Unit("seconds")] = 1.0
     """Seconds for which what a node owns on lease outlives its last sign of life."""
 
-    disks: bool = field(default=False, metadata=setting.truth())
+    disks: bool = False
     """Whether nodes keep what they hold on disks that take a moment, can be full, and lose the last moment with the
     power; without, what a node held is all there in its next life."""
 
@@ -241,12 +243,12 @@ class _Reader:
         self, content: dict[str, Any], name: str, settings: Settings, changes: Mapping[str, object]
     ) -> Scenario:
         """The scenario, each value by itself as it should be."""
-        own = [f.name for f in fields(Scenario) if f.metadata]
+        own = [f.name for f in fields(Scenario) if f.name not in (*TABLES, "faults", "loads", "targets", "name")]
         known = [*own, *TABLES, "fault", "load", "targets"]
         self._known(content, "", known)
-        parts: dict[str, Any] = {key: self._value(Scenario, key, content[key], "") for key in own if key in content}
+        parts: dict[str, Any] = {key: self._value(key, content[key]) for key in own if key in content}
         for key, value in changes.items():
-            parts[key] = self._value(Scenario, key, value, "", f"--{key}")
+            parts[key] = self._value(key, value, f"--{key}")
         for key, sort in TABLES.items():
             parts[key] = self._table(sort, content.get(key, {}), key)
         faults = content.get("fault", [])
@@ -296,21 +298,16 @@ class _Reader:
     # -- inside -----------------------------------------------------------------------------------------------------
 
     def _table(self, sort: type[T], content: object, where: str) -> T:
-        assert is_dataclass(sort)
-        if not isinstance(content, dict):
-            raise self.bad("", where, "must be a table", f"write [{where}], and its keys below")
-        self._known(content, where, [f.name for f in fields(sort)])
-        for f in fields(sort):
-            if f.name not in content and f.default is MISSING and f.default_factory is MISSING:
-                raise self.bad(where, f.name, "is missing", f"write {f.name} = ...")
-        return sort(**{key: self._value(sort, key, value, where) for key, value in content.items()})
-
-    def _value(self, sort: type[Any], key: str, value: object, where: str, shown: str = "") -> object:
-        rule = next(f for f in fields(sort) if f.name == key).metadata
         try:
-            return rule["check"](value)
-        except setting.Wrong as error:
-            raise self.bad(where, key, error.problem, error.remedy, shown) from error
+            return convert_table(content, sort)
+        except Invalid as error:
+            raise self.bad(*((where, error.key) if error.key else ("", where)), error.problem, error.remedy) from error
+
+    def _value(self, key: str, value: object, shown: str = "") -> object:
+        try:
+            return convert_field(value, Scenario, key)
+        except Invalid as error:
+            raise self.bad("", key, error.problem, error.remedy, shown) from error
 
     def _known(self, content: Mapping[str, object], where: str, known: list[str]) -> None:
         for key in content:

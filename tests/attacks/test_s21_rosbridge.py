@@ -8,6 +8,7 @@ from typing import Any
 
 from twisted.internet.task import Clock
 from twisted.trial.unittest import SynchronousTestCase
+from wsproto.events import Event, Pong
 
 from drivers.errors import BadFrame, RobotError
 from drivers.link import MemoryConnector
@@ -16,8 +17,8 @@ from drivers.rosbridge.driver import RosbridgeDriver
 from drivers.rosbridge.websocket import MAX_MESSAGE
 from sim.robots.emulator.body import MemoryBody
 from sim.robots.emulator.rosbridge import RosbridgeRobot
-from standards import websocket
-from standards.websocket import CONTINUATION, MAX_FRAMES, PING, PONG, TEXT, End, framed
+from standards.websocket import MAX_FRAMES, End
+from tests.standards.rfc6455 import CONTINUATION, PING, PONG, TEXT, framed
 
 READ = 65536
 """Bytes that a reactor reads at once."""
@@ -134,27 +135,27 @@ class FloodTests(SynchronousTestCase):
         self.robot = RosbridgeRobot(self.clock, MemoryBody(values={"power.level": 0.8}), Random(1))
         self.robot.start()
         self.connector = MemoryConnector(self.clock, self.robot.accept)
-        self.driver = RosbridgeDriver({}, self.connector, self.clock, "turtle", Random(2).randbytes)
+        self.driver = RosbridgeDriver({}, self.connector, self.clock, "turtle")
         self.driver.connect()
         self.pass_time(0.5)
         self.assertEqual(self.driver.state, "ready")
         self.taken = 0
-        take, make = End._frame, websocket.framed
+        take, send = End._is_taken, End._send
 
-        def counted(end: End) -> Any:
-            frame = take(end)
-            self.taken += frame is not None and end._is_client
-            return frame
+        def counted(end: End, event: Event) -> bool:
+            is_taken = take(end, event)
+            self.taken += is_taken and end._request is not None
+            return is_taken
 
-        self.patch(End, "_frame", counted)
+        self.patch(End, "_is_taken", counted)
         self.pongs: list[int] = []
 
-        def noted(opcode: int, payload: bytes, mask: bytes | None) -> bytes:
-            if opcode == PONG and mask is not None:
-                self.pongs.append(len(payload))
-            return make(opcode, payload, mask)
+        def noted(end: End, event: Event) -> bytes:
+            if isinstance(event, Pong) and end._request is not None:
+                self.pongs.append(len(event.payload))
+            return send(end, event)
 
-        self.patch(websocket, "framed", noted)
+        self.patch(End, "_send", noted)
         self.addCleanup(self.end)
 
     def end(self) -> None:

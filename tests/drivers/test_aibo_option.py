@@ -98,7 +98,7 @@ class RecipeTests(SynchronousTestCase):
         self.assertEqual(recipe.sized(208)[:2], ["!set vision.rawcam.y_skip=1", "!set vision.rawcam.uv_skip=2"])
         camera = describe("aibo", {"host": "d", "camera_width": 208}).capabilities["camera"]
         self.assertEqual((camera["width"], camera["height"]), (208, 160))
-        with self.assertRaisesRegex(UsageError, "camera_width is 416, but must be 104 or 208"):
+        with self.assertRaisesRegex(UsageError, "camera_width is 416; write one of 104, 208"):
             checked({"host": "d", "camera_width": 416})
 
     def test_waits_between_pictures(self) -> None:

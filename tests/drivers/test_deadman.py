@@ -43,7 +43,7 @@ from sim.robots.emulator.bittle import Bittle
 from sim.robots.emulator.body import MemoryBody
 from sim.robots.emulator.create2 import Create2
 from sim.robots.emulator.rosbridge import RosbridgeRobot
-from standards.websocket import masked
+from tests.standards.rfc6455 import masked
 
 STEP = 0.005
 
@@ -374,7 +374,7 @@ class LastWordTests(SynchronousTestCase):
         """A driver of that robot."""
         robot.start()
         connector = MemoryConnector(self.clock, robot.accept)
-        return RosbridgeDriver({}, connector, self.clock, "robot", Random(2).randbytes, self.switch)
+        return RosbridgeDriver({}, connector, self.clock, "robot", self.switch)
 
     def published(self, word: LastWord) -> dict[str, Any]:
         """The message of such a frame."""

@@ -58,7 +58,7 @@ class RosbridgeDriverTests(BodyContract, SynchronousTestCase):
 
     def make_driver(self, **options: object) -> RosbridgeDriver:
         """A driver of the robot."""
-        driver = RosbridgeDriver(options, self.connector, self.clock, "turtle", Random(2).randbytes)
+        driver = RosbridgeDriver(options, self.connector, self.clock, "turtle")
         self.drivers.append(driver)
         return driver
 

@@ -96,4 +96,4 @@ class SimulationTests(SynchronousTestCase):
         process = self.begun(1)
         out, err = process.communicate(timeout=100)
         self.assertEqual((process.returncode, out), (2, ""))
-        self.assertEqual(err, f"sim run: {self.scenario}:2: nodes: must be 1..100000, is -3; write a whole number\n")
+        self.assertTrue(err.startswith(f"sim run: {self.scenario}:2: nodes: is -3; write "), err)

@@ -10,8 +10,8 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.network.network import Address
 from middleware.errors import BadSetting, MissingExtra
-from middleware.setting import shown
 from middleware.settings import Settings
+from validation.convert import show_value
 
 WHOLE = """
 [node]
@@ -126,14 +126,13 @@ class SettingsTest(SynchronousTestCase):
 
     def test_examples_of_errors(self) -> None:
         """An error is one line: file, table and key, what is wrong, and what to do."""
-        self.assertEqual(
-            self.refusal("node", "port", "x"),
-            'dog1.toml: [node] port: must be 0..65535, is "x"; write a number, 0 for any free port',
-        )
-        self.assertEqual(
-            self.refusal("node", "roles", ["edge", "wep"]),
-            'dog1.toml: [node] roles: "wep" is none of edge, bootstrap, web; the nearest is "web"',
-        )
+        problem, _, remedy = self.refusal("node", "port", "x").rpartition("; ")
+        self.assertIn('is "x"', problem)
+        self.assertIn("65535", remedy)
+        self.assertIn("8484", remedy)
+        problem, _, remedy = self.refusal("node", "roles", ["edge", "wep"]).rpartition("; ")
+        self.assertIn('[1] is "wep"', problem)
+        self.assertIn('nearest is "web"', remedy)
 
     def test_secret_is_not_in_the_error(self) -> None:
         """An error about the team's key does not show it."""
@@ -285,8 +284,11 @@ class FlagsTest(SynchronousTestCase):
         """An unknown flag names the nearest one, a bad value its flag; the file is not blamed."""
         for flags, line in (
             ({"prot": 1}, "command line: --prot: is not a setting; the nearest is --port"),
-            ({"web_port": "many"}, 'command line: --web-port: must be 0..65535, is "many"; write a number, 0 for any'),
-            ({"presence_lease": "long"}, "command line: --presence-lease: must be 0.1..60.0 seconds"),
+            ({"web_port": "many"}, 'command line: --web-port: is "many"; write a number from 0 to 65535'),
+            (
+                {"presence_lease": "long"},
+                'command line: --presence-lease: is "long"; write a number from 0.1 to 60 seconds',
+            ),
         ):
             error = self.assertRaises(BadSetting, settings().with_flags, **flags)
             self.assertTrue(str(error).startswith(line), str(error))
@@ -295,8 +297,8 @@ class FlagsTest(SynchronousTestCase):
 class WordingTest(SynchronousTestCase):
     def test_long_values_are_cut(self) -> None:
         """A value in an error never makes the line endless, nor more than one."""
-        self.assertEqual(len(shown("x" * 10_000)), 60)
-        self.assertNotIn("\n", shown("a\nb"))
+        self.assertEqual(len(show_value("x" * 10_000)), 60)
+        self.assertNotIn("\n", show_value("a\nb"))
 
     def test_missing_extra(self) -> None:
         """A missing library is named by what to install."""

@@ -34,7 +34,8 @@ URL = Url("wss", HOST, 443)
 PLAIN = Url("ws", HOST, 443)
 Heard = list[tuple[bytes, Address]]
 GREETING = (
-    b"GET /swarm HTTP/1.1\r\nUpgrade: websocket\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n"
+    b"GET /swarm HTTP/1.1\r\nHost: a\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
+    b"Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n"
     b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Protocol: swarm-tunnel-1\r\nX-Forwarded-For: 9.9.9.%d\r\n\r\n"
 )
 
@@ -385,7 +386,7 @@ class BurdenTests(TunnelCase):
         server, _ = self.made(is_plain=True)
         page = self.dribble(b"GET / HTTP/1.1\r\nHost: a\r\n\r\n")
         self.clock.advance(0.1)
-        self.assertTrue(page.is_lost and page.heard.startswith(b"HTTP/1.1 404"))
+        self.assertTrue(page.is_lost and page.heard.startswith(b"HTTP/1.1 400"))
 
     def test_bear_one_address(self) -> None:
         """Of one address so many connections are borne and no more; others are served all the same."""

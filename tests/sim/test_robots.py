@@ -138,7 +138,7 @@ class RobotsTests(YardCase):
             ({"dog9": aibo}, "no robot is named 'dog9'.*it has dog1, dog2, dog3"),
             ({"dog1": {"kind": "phone"}}, "no robot of kind 'phone'.*it has aibo"),
             ({"dog1": {**aibo, "dialect": "T9"}}, "dialect is 'T9', but must be one of T4, T2"),
-            ({"dog1": {"kind": "aibo", "options": {"port": 1}}}, "unknown option 'port'"),
+            ({"dog1": {"kind": "aibo", "options": {"port": 1}}}, "option port is unknown"),
             ({"dog1": {"kind": "aibo", "options": 7}}, r"\[dog1\] options must be a table"),
             ({"dog1": {**aibo, "parts": 7}}, r"\[dog1\] parts must be tables"),
             ({"dog1": {**aibo, "parts": [{"options": {}}]}}, r"\[dog1\] parts must be tables"),

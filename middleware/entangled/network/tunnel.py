@@ -252,7 +252,7 @@ class TunnelNetwork:
             where = Address(proxy.host, proxy.port)
         if url.is_tls:
             layers.append(Tls(self._client_context, url.host))
-        socket = WebSocket(self._rng.randbytes, url, bundle.token)
+        socket = WebSocket(url, bundle.token)
         link = self._kept(Link(self, self._clock, bundle.address, url.host, layers, socket), bundle)
         self._carrier.dial(where, link, lambda why: link.end(why, is_rude=True))
 
@@ -277,7 +277,7 @@ class TunnelNetwork:
         address = Address(VIRTUAL + self._rng.randbytes(6).hex(), 1)
         layers = [] if self._is_plain else [Tls(self._server_context, is_server=True)]
         bundle = Bundle(address, self._carrier.strain, self._clock.seconds())
-        return self._kept(Link(self, self._clock, address, place, layers, WebSocket(self._rng.randbytes)), bundle)
+        return self._kept(Link(self, self._clock, address, place, layers, WebSocket()), bundle)
 
     def _kept(self, link: Link, bundle: Bundle) -> Link:
         self._bundles[link.address] = bundle

@@ -221,7 +221,7 @@ class _Client:
     def __init__(self, robot: RosbridgeRobot, link: Link) -> None:
         self.link = link
         self._robot = robot
-        self._socket = WebSocket(lambda size: bytes(size), is_client=False)
+        self._socket = WebSocket()
         self._topics: dict[str, dict[str, tuple[float, float]]] = {}
         self._types: dict[str, str] = {}
 

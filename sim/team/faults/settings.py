@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import Annotated
 
-from middleware import setting
+from msgspec import Meta
+
+from validation.convert import UNIQUE, Unit, one_of
 
 _WHOM = ("count", "share", "places")
 TAKES: dict[str, tuple[str, ...]] = {
@@ -39,7 +42,7 @@ class Fault:
     names them by their number, from 0 on.
     """
 
-    kind: str = field(metadata=setting.one_of(KINDS))
+    kind: Annotated[str, one_of(KINDS)]
     """``crash``: the power fails.  ``leave``: with a goodbye.  ``freeze``: as after SIGSTOP.  ``cut``: away from all
     others, among themselves connected; ``deaf``: only nothing comes in; ``mute``: only nothing gets out; ``clog``: each
     of them alone.  ``pairs``: that ``share`` of all pairs of nodes is cut.  ``step``: wall clocks are set ``amount``
@@ -47,25 +50,25 @@ class Fault:
     newcomers.  ``weather``: the share ``amount`` of all datagrams is lost besides.  ``rebind``: routers forget their
     mappings."""
 
-    at: float = field(metadata=setting.seconds(0.0, 1e7))
+    at: Annotated[float, Meta(ge=0.0, le=1e7), Unit("seconds")]
     """When, in seconds after the team stands."""
 
-    lasts: float = field(default=0.0, metadata=setting.seconds(0.0, 1e7))
+    lasts: Annotated[float, Meta(ge=0.0, le=1e7), Unit("seconds")] = 0.0
     """For how long; after that it is taken back: who crashed or left starts again from its disk.  0: for good."""
 
-    count: int = field(default=0, metadata=setting.whole(0, 100_000))
+    count: Annotated[int, Meta(ge=0, le=100_000)] = 0
     """How many."""
 
-    share: float = field(default=0.0, metadata=setting.number(0.0, 1.0))
+    share: Annotated[float, Meta(ge=0.0, le=1.0)] = 0.0
     """Which share of them."""
 
-    places: tuple[int, ...] = field(default=(), metadata={"check": lambda value: _places(value)})
+    places: Annotated[tuple[Annotated[int, Meta(ge=0)], ...], UNIQUE] = ()
     """Who, by number."""
 
-    amount: float = field(default=0.0, metadata=setting.number(-1e7, 1e7))
+    amount: Annotated[float, Meta(ge=-1e7, le=1e7)] = 0.0
     """How much."""
 
-    over: float = field(default=0.0, metadata=setting.seconds(0.0, 1e6))
+    over: Annotated[float, Meta(ge=0.0, le=1e6), Unit("seconds")] = 0.0
     """Seconds over which it spreads, one after the other; 0: all at once."""
 
     def __str__(self) -> str:
@@ -107,9 +110,3 @@ def fault_problem(fault: Fault, nodes: int, seconds: float) -> Problem | None:
     if kind == "weather" and not 0 < fault.amount < 1:
         return "amount", "must be the share that is lost", "write amount = 0.1"
     return None
-
-
-def _places(value: object) -> tuple[int, ...]:
-    if not isinstance(value, list) or not all(type(place) is int and place >= 0 for place in value):
-        raise setting.Wrong(f"must be a list of whole numbers, is {setting.shown(value)}", "write places = [0, 3]")
-    return tuple(dict.fromkeys(value))

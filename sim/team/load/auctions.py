@@ -6,11 +6,12 @@ The seconds count from the end of the waiting period, which begins with the firs
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import Annotated
 
+from msgspec import Meta
 from twisted.internet.defer import Deferred
 
-from middleware.setting import seconds, whole
 from middleware.tasks import Task
 from sim.team.figure import Figure, mean, share, spread
 from sim.team.load.contest import Contest
@@ -18,22 +19,23 @@ from sim.team.load.deputies import deputies_of
 from sim.team.load.deputy import Deputy
 from sim.team.load.residents import Residents
 from sim.team.team import Team
+from validation.convert import Unit
 
 
 @dataclass(frozen=True)
 class AuctionSettings:
     """``[load.auctions]``: one task after the other, for all."""
 
-    count: int = field(default=3, metadata=whole(1, 10_000))
+    count: Annotated[int, Meta(ge=1, le=10_000)] = 3
     """Auctions in all."""
 
-    every: float = field(default=10.0, metadata=seconds(2.0, 3600.0))
+    every: Annotated[float, Meta(ge=2.0, le=3600.0), Unit("seconds")] = 10.0
     """Seconds from one to the next."""
 
-    waiting: float = field(default=0.5, metadata=seconds(0.0, 60.0))
+    waiting: Annotated[float, Meta(ge=0.0, le=60.0), Unit("seconds")] = 0.5
     """Seconds that the agents wait for each other's bids after the first one."""
 
-    spread: float = field(default=0.1, metadata=seconds(0.0, 60.0))
+    spread: Annotated[float, Meta(ge=0.0, le=60.0), Unit("seconds")] = 0.1
     """Seconds within which all of them bid."""
 
 

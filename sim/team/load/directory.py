@@ -7,25 +7,28 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import Annotated
+
+from msgspec import Meta
 
 from middleware.entangled.record import Record
 from middleware.node import SwarmNode
 from middleware.presence import device_of, devices_of
-from middleware.setting import seconds, whole
 from sim.team.figure import Figure, mean, share, spread
 from sim.team.load.residents import Residents
 from sim.team.team import Team
+from validation.convert import Unit
 
 
 @dataclass(frozen=True)
 class DirectorySettings:
     """``[load.directory]``: who lists the devices; of nodes of kind ``swarm`` only."""
 
-    readers: int = field(default=3, metadata=whole(0, 10_000))
+    readers: Annotated[int, Meta(ge=0, le=10_000)] = 3
     """Nodes that list all devices, one after the other."""
 
-    every: float = field(default=5.0, metadata=seconds(0.5, 3600.0))
+    every: Annotated[float, Meta(ge=0.5, le=3600.0), Unit("seconds")] = 5.0
     """Seconds that each of them is given."""
 
 

@@ -14,8 +14,10 @@ live, in their order (invariant D6).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import Annotated
 
+from msgspec import Meta
 from twisted.python.failure import Failure
 
 from middleware.entangled.errors import EntangledError
@@ -23,11 +25,11 @@ from middleware.entangled.identity import ID_BYTES
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.overlay import K
 from middleware.entangled.node import EntangledNode
-from middleware.setting import number, seconds, whole
 from sim.team.figure import Figure, at_most, mean, share, spread
 from sim.team.load.pace import Pace
 from sim.team.load.residents import Residents
 from sim.team.team import Team
+from validation.convert import Unit
 
 LISTED = 20
 """Violations that are told one by one."""
@@ -37,13 +39,13 @@ LISTED = 20
 class LookupSettings:
     """``[load.lookups]``: how often somebody looks for somebody."""
 
-    rate: float = field(default=10.0, metadata=number(0.0, 10_000.0))
+    rate: Annotated[float, Meta(ge=0.0, le=10_000.0)] = 10.0
     """Lookups a second, of all nodes together."""
 
-    limit: float = field(default=4.0, metadata=seconds(0.1, 60.0))
+    limit: Annotated[float, Meta(ge=0.1, le=60.0), Unit("seconds")] = 4.0
     """Seconds after which a lookup is late, and has failed."""
 
-    exact: int = field(default=100, metadata=whole(0, 100_000))
+    exact: Annotated[int, Meta(ge=0, le=100_000)] = 100
     """Random keys that are looked up in quiet at the end, where the answer has to be exact."""
 
 

@@ -6,10 +6,12 @@ Nothing is measured here but how much is answered: whether it is right, fresh an
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import Annotated
+
+from msgspec import Meta
 
 from middleware.entangled.record import hashed_key
-from middleware.setting import number, whole
 from sim.team.clients import READ, REMOVE, WRITE, Clients
 from sim.team.figure import Figure, share
 from sim.team.load.pace import Pace
@@ -27,10 +29,10 @@ MOST_READERS = 32
 class RecordSettings:
     """``[load.records]``: how much is written and read."""
 
-    keys: int = field(default=4, metadata=whole(1, 10_000))
+    keys: Annotated[int, Meta(ge=1, le=10_000)] = 4
     """Keys that all write under, each in a slot of its own."""
 
-    rate: float = field(default=4.0, metadata=number(0.001, 10_000.0))
+    rate: Annotated[float, Meta(ge=0.001, le=10_000.0)] = 4.0
     """Writes, removals and reads in a second, in all."""
 
 

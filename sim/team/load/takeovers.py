@@ -8,13 +8,14 @@ over then (invariant E3).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import Annotated
 
+from msgspec import Meta
 from twisted.internet.defer import Deferred
 
 from middleware.commitment.lessee import Lessee
 from middleware.entangled.errors import EntangledError
-from middleware.setting import number, seconds, whole
 from middleware.tasks import Task
 from sim.team.figure import Figure, at_most, share, spread
 from sim.team.load.deputies import deputies_of
@@ -22,6 +23,7 @@ from sim.team.load.deputy import Deputy
 from sim.team.load.pace import Pace
 from sim.team.load.residents import Residents
 from sim.team.team import Team
+from validation.convert import Unit
 
 AGENTS = 3
 PATIENCE = 30.0
@@ -32,16 +34,16 @@ PATIENCE = 30.0
 class TakeoverSettings:
     """``[load.takeovers]``: who dies, and how often."""
 
-    count: int = field(default=200, metadata=whole(1, 1_000_000))
+    count: Annotated[int, Meta(ge=1, le=1_000_000)] = 200
     """Trials in all."""
 
-    rate: float = field(default=0.1, metadata=number(0.0001, 1000.0))
+    rate: Annotated[float, Meta(ge=0.0001, le=1000.0)] = 0.1
     """Trials that begin in a second."""
 
-    ttl: float = field(default=1.5, metadata=seconds(0.1, 60.0))
+    ttl: Annotated[float, Meta(ge=0.1, le=60.0), Unit("seconds")] = 1.5
     """Seconds for which a lease runs."""
 
-    away: float = field(default=10.0, metadata=seconds(0.1, 3600.0))
+    away: Annotated[float, Meta(ge=0.1, le=3600.0), Unit("seconds")] = 10.0
     """Seconds after which who died is back, from its disk."""
 
 

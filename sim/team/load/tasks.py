@@ -6,11 +6,12 @@ Every one goes the whole way: council, bids, announcement, claim.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import Annotated
 
+from msgspec import Meta
 from twisted.internet.defer import Deferred
 
-from middleware.setting import seconds, whole
 from middleware.tasks import Task
 from sim.team.figure import Figure, at_most, share, spread
 from sim.team.load.contest import Contest
@@ -18,25 +19,26 @@ from sim.team.load.deputies import deputies_of
 from sim.team.load.lookups import LISTED
 from sim.team.load.residents import Residents
 from sim.team.team import Team
+from validation.convert import Unit
 
 
 @dataclass(frozen=True)
 class TaskSettings:
     """``[load.tasks]``: how many at once."""
 
-    count: int = field(default=1000, metadata=whole(1, 100_000))
+    count: Annotated[int, Meta(ge=1, le=100_000)] = 1000
     """Tasks that are published at the same moment."""
 
-    bidders: int = field(default=8, metadata=whole(1, 10_000))
+    bidders: Annotated[int, Meta(ge=1, le=10_000)] = 8
     """Agents that bid for each of them."""
 
-    waiting: float = field(default=0.5, metadata=seconds(0.0, 60.0))
+    waiting: Annotated[float, Meta(ge=0.0, le=60.0), Unit("seconds")] = 0.5
     """Seconds that they wait for each other's bids after the first one."""
 
-    ttl: float = field(default=1.5, metadata=seconds(0.1, 60.0))
+    ttl: Annotated[float, Meta(ge=0.1, le=60.0), Unit("seconds")] = 1.5
     """Seconds for which a lease runs."""
 
-    after: float = field(default=2.0, metadata=seconds(0.0, 3600.0))
+    after: Annotated[float, Meta(ge=0.0, le=3600.0), Unit("seconds")] = 2.0
     """Seconds after the first step at which they are published."""
 
 

@@ -9,9 +9,11 @@ from __future__ import annotations
 import resource
 import sys
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import Annotated
 
-from middleware.setting import whole
+from msgspec import Meta
+
 from sim.team.figure import Figure, mean, percentile
 from sim.team.team import Team
 
@@ -22,7 +24,7 @@ PAGE = resource.getpagesize()
 class TrafficSettings:
     """``[load.traffic]``: who is counted."""
 
-    sample: int = field(default=200, metadata=whole(1, 100_000))
+    sample: Annotated[int, Meta(ge=1, le=100_000)] = 200
     """Nodes whose contacts are counted at the end; the bytes of all are."""
 
 

@@ -11,8 +11,10 @@ closest of them) that it finds is what lookups of KAD in the field had 18 % of (
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import Annotated
 
+from msgspec import Meta
 from twisted.python.failure import Failure
 
 from middleware.entangled.errors import EntangledError
@@ -23,12 +25,12 @@ from middleware.entangled.kademlia.overlay import K
 from middleware.entangled.node import EntangledNode
 from middleware.entangled.record import Record, Slot, hashed_key
 from middleware.entangled.replication.owner import Stored
-from middleware.setting import number, one_of, seconds, whole
 from sim.team.figure import Figure, at_most, mean, share, spread
 from sim.team.load.lookups import LISTED
 from sim.team.load.pace import Pace
 from sim.team.load.residents import Residents
 from sim.team.team import Team
+from validation.convert import Unit, one_of
 
 QUORUM, NONE = "quorum", "none"
 AGAIN = 2.0
@@ -40,22 +42,22 @@ NAME = "value"
 class ValueSettings:
     """``[load.values]``: what is stored, and who dies for it."""
 
-    count: int = field(default=1000, metadata=whole(1, 1_000_000))
+    count: Annotated[int, Meta(ge=1, le=1_000_000)] = 1000
     """Values in all."""
 
-    rate: float = field(default=1.0, metadata=number(0.001, 10_000.0))
+    rate: Annotated[float, Meta(ge=0.001, le=10_000.0)] = 1.0
     """Values that are stored in a second."""
 
-    deaths: str = field(default=NONE, metadata=one_of((NONE, QUORUM)))
+    deaths: Annotated[str, one_of((NONE, QUORUM))] = NONE
     """``quorum``: at once one less than acknowledged it; ``none``: only whom the scenario lets die."""
 
-    age: float = field(default=5.0, metadata=seconds(0.0, 86_400.0))
+    age: Annotated[float, Meta(ge=0.0, le=86_400.0), Unit("seconds")] = 5.0
     """Seconds after these deaths in which a value is read; without deaths it is read at the end."""
 
-    away: float = field(default=30.0, metadata=seconds(1.0, 86_400.0))
+    away: Annotated[float, Meta(ge=1.0, le=86_400.0), Unit("seconds")] = 30.0
     """Seconds after which a newcomer takes the place of each that died."""
 
-    patience: float = field(default=90.0, metadata=seconds(0.0, 3600.0))
+    patience: Annotated[float, Meta(ge=0.0, le=3600.0), Unit("seconds")] = 90.0
     """Seconds for which reading is tried before a value counts as lost.  Members that died count in majorities for
     half a minute at least, so what many of them held may be unavailable for as long."""
 

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Annotated
 
+from msgspec import Meta
 from twisted.python.failure import Failure
 
 from middleware.entangled.errors import EntangledError, NotAcknowledged
 from middleware.entangled.node import EntangledNode
 from middleware.entangled.record import Record, hashed_key
-from middleware.setting import number, seconds, whole
 from sim.team.figure import Figure, share, spread
 from sim.team.load.pace import Pace
 from sim.team.load.residents import Residents
 from sim.team.team import Team
+from validation.convert import Unit
 
 NAME = "watched"
 
@@ -23,16 +25,16 @@ NAME = "watched"
 class WatchSettings:
     """``[load.watches]``: who follows what."""
 
-    keys: int = field(default=10, metadata=whole(1, 100_000))
+    keys: Annotated[int, Meta(ge=1, le=100_000)] = 10
     """Keys that are followed."""
 
-    watchers: int = field(default=10, metadata=whole(1, 10_000))
+    watchers: Annotated[int, Meta(ge=1, le=10_000)] = 10
     """Nodes that follow each of them; who dies is followed by another."""
 
-    rate: float = field(default=1.0, metadata=number(0.001, 10_000.0))
+    rate: Annotated[float, Meta(ge=0.001, le=10_000.0)] = 1.0
     """Changes a second, of all keys together."""
 
-    limit: float = field(default=10.0, metadata=seconds(0.1, 600.0))
+    limit: Annotated[float, Meta(ge=0.1, le=600.0), Unit("seconds")] = 10.0
     """Seconds after which a change that was not heard of counts as unheard."""
 
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import random
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import Annotated
 
+from msgspec import Meta
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware import setting
 from middleware.errors import BadSetting
 from sim.team.command import KINDS
 from sim.team.scenario import FOLDER, Scenario, loaded, names, scenario_of
@@ -16,7 +17,7 @@ from sim.team.scenario import FOLDER, Scenario, loaded, names, scenario_of
 
 @dataclass(frozen=True)
 class _Load:
-    rate: float = field(default=1.0, metadata=setting.number(0.0, 100.0))
+    rate: Annotated[float, Meta(ge=0.0, le=100.0)] = 1.0
 
 
 SETTINGS = {"lookups": _Load}

@@ -167,7 +167,7 @@ class DriverCommandTests(SynchronousTestCase):
             (["drive"], "name the robot by --kind"),
             (["probe", "--kind", "aibo", "--config", "x.toml"], "not by both"),
             (["probe", "--kind", "warp"], "known are aibo"),
-            (["probe", "--kind", "aibo"], "option host is None"),
+            (["probe", "--kind", "aibo"], "option host is missing"),
             (["probe", "--kind", "aibo", "--option", "host"], "KEY=VALUE"),
             (["probe", "--option", "host=x"], "--option says nothing without --kind"),
             (["monitor", "--config", "/no/such/file.toml"], "cannot be read"),

@@ -1,0 +1,42 @@
+"""Schema: ``swarm schema``, the JSON schema of a settings file, for editors that check TOML by one."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import MISSING, fields
+from typing import Any, TextIO, get_type_hints
+
+import msgspec
+
+from middleware.settings import TABLES
+from validation.convert import raw_of
+
+
+def json_schema() -> dict[str, Any]:
+    """Return the schema; the program refuses more values for settings that have a step after the conversion."""
+    tables = {name: _struct_of(name, cls) for name, cls in TABLES.items()}
+    optional: list[tuple[str, Any, Any]] = [
+        (name, table, msgspec.field(default_factory=dict)) for name, table in tables.items() if name != "node"
+    ]
+    whole = msgspec.defstruct("Settings", [("node", tables["node"]), *optional], forbid_unknown_fields=True)
+    return msgspec.json.schema(whole)
+
+
+def _struct_of(name: str, cls: type[Any]) -> type[Any]:
+    hints = get_type_hints(cls, include_extras=True)
+    known: list[tuple[Any, ...]] = []
+    for each in fields(cls):
+        default = each.default if each.default is not MISSING else None
+        is_needed = each.default is MISSING is each.default_factory
+        known.append((each.name, raw_of(hints[each.name]), *(() if is_needed else (default,))))
+    return msgspec.defstruct(name, known, forbid_unknown_fields=True)
+
+
+def main(words: Sequence[str] | None = None, out: TextIO | None = None) -> int:
+    """Run the command; returns 0."""
+    argparse.ArgumentParser(prog="swarm schema", description=__doc__.partition(": ")[2]).parse_args(words)
+    (out or sys.stdout).write(json.dumps(json_schema(), indent=2) + "\n")
+    return 0

@@ -1,0 +1,217 @@
+"""Convert: values of TOML or a command line, to the type that the field of a dataclass declares.
+
+``msgspec`` checks types and constraints (``Annotated[int, Meta(ge=0, le=65535)]``); this module turns its errors into
+``Invalid``, with the key, the problem and the remedy.  Dataclasses and not ``msgspec.Struct``, because a dataclass can
+leave a secret out of its ``repr``.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import MISSING, dataclass, fields
+from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+
+from msgspec import Meta, MsgspecError, convert
+
+T = TypeVar("T")
+MAX_SHOWN = 60
+FINITE = Meta(ge=-1.7e308, le=1.7e308)
+"""Any number but NaN and the infinities."""
+
+
+class Invalid(Exception):
+    """A value that its field does not allow."""
+
+    def __init__(self, key: str, problem: str, remedy: str) -> None:
+        super().__init__(key, problem, remedy)
+        self.key = key
+        self.problem = problem
+        self.remedy = remedy
+
+
+@dataclass(frozen=True)
+class Then:
+    """A step after the conversion: return the value to use, or raise ``ValueError``.
+
+    ``raw`` is the type of the value before this step, where the field has another one.
+    """
+
+    apply: Callable[[Any], Any]
+    raw: Any = None
+
+
+@dataclass(frozen=True)
+class Unit:
+    """The unit of a number, for errors."""
+
+    name: str
+
+
+@dataclass(frozen=True)
+class Secret:
+    """Marks a value that no error shows."""
+
+
+def check_printable(value: Any) -> Any:
+    """Return ``value`` if it is no text, or all its characters are printable."""
+    if isinstance(value, str) and not value.isprintable():
+        raise ValueError("has a line break or another character that cannot be printed")
+    return value
+
+
+LINE = Then(check_printable)
+
+
+def one_of(words: Sequence[str]) -> Then:
+    """Allow one of ``words``."""
+    return Then(lambda word: word, raw=Literal[tuple(words)])
+
+
+def some_of(words: Sequence[str]) -> Then:
+    """Allow a list of some of ``words``, at least one; they are put into the order of ``words``."""
+    word: Any = Literal[tuple(words)]
+    raw = Annotated[tuple[word, ...], Meta(min_length=1)]
+    return Then(lambda given: tuple(word for word in words if word in given), raw)
+
+
+UNIQUE = Then(lambda items: tuple(dict.fromkeys(items)))
+"""Leaves repeated entries of a list out."""
+
+
+def convert_table(table: object, cls: type[T]) -> T:
+    """Convert a table to the dataclass ``cls``; raises ``Invalid``, with an empty key where it is no table."""
+    if not isinstance(table, Mapping):
+        raise Invalid("", f"must be a table, is {show_value(table)}", "write { key = value }")
+    known = {field.name: field for field in fields(cls)}  # type: ignore[arg-type]
+    for key in table:
+        if key not in known:
+            raise Invalid(
+                str(key), "is unknown", f"the nearest is {nearest_of(str(key), known)}; known are {', '.join(known)}"
+            )
+    hints = get_type_hints(cls, include_extras=True)
+    values = {key: convert_value(value, hints[key], key, known[key].default) for key, value in table.items()}
+    for key, field in known.items():
+        if key not in values and field.default is MISSING and field.default_factory is MISSING:
+            raise Invalid(key, "is missing", _remedy_for(hints[key]))
+    return cls(**values)
+
+
+def convert_field(value: object, cls: type[Any], key: str, is_text: bool = False) -> Any:
+    """Convert ``value`` to the type of one field of the dataclass ``cls``; as ``convert_value``."""
+    default = next(field.default for field in fields(cls) if field.name == key)
+    return convert_value(value, get_type_hints(cls, include_extras=True)[key], key, default, is_text)
+
+
+def convert_value(value: object, hint: Any, key: str = "", default: object = None, is_text: bool = False) -> Any:
+    """Convert ``value`` to the type ``hint``; raises ``Invalid``, with ``key``, and ``default`` as the example.
+
+    ``is_text``: it is a word of a command line, where lists are separated by commas.
+    """
+    extra = getattr(hint, "__metadata__", ())
+    raw = raw_of(hint)
+    try:
+        if is_text and get_origin(_base_of(raw)) is tuple:
+            value = [word.strip() for word in str(value).split(",") if word.strip()]
+        if is_text and raw is bool:
+            value = {"true": True, "false": False}.get(str(value), value)
+        result = convert(value, raw, strict=not is_text or raw is bool)
+        for step in extra:
+            result = step.apply(result) if isinstance(step, Then) else result
+        return result
+    except (MsgspecError, ValueError) as error:
+        if any(isinstance(each, Secret) for each in extra):
+            raise Invalid(key, "is not allowed (its value is not shown)", _remedy_for(hint)) from None
+        place, wrong = _innermost(value, error)
+        problem = str(error)
+        if isinstance(error, MsgspecError) or not problem:
+            unknown = re.match(r"Object .* field `.*?`", problem)
+            problem = f"has {unknown[0][7:]}" if unknown else f"is {show_value(wrong)}"
+        raise Invalid(key, f"{place} {problem}".strip(), _remedy_for(hint, default, wrong)) from None
+
+
+def raw_of(hint: Any) -> Any:
+    """The type of a value before its last steps."""
+    steps = [each for each in getattr(hint, "__metadata__", ()) if isinstance(each, Then)]
+    return next((step.raw for step in steps if step.raw is not None), hint)
+
+
+def show_value(value: object) -> str:
+    """``value`` as an error shows it: on one line, and not too long."""
+    text = json.dumps(value, default=str, ensure_ascii=False)
+    return text if len(text) <= MAX_SHOWN else text[: MAX_SHOWN - 3] + "..."
+
+
+def nearest_of(word: str, known: Iterable[str]) -> str:
+    """The known word that is most like ``word``."""
+    from difflib import get_close_matches  # only a mistake needs it
+
+    return get_close_matches(word[:64], list(known), n=1, cutoff=0.0)[0]
+
+
+def _base_of(hint: Any) -> Any:
+    return get_args(hint)[0] if hasattr(hint, "__metadata__") else hint
+
+
+def _innermost(value: object, error: Exception) -> tuple[str, object]:
+    """The place and value of the entry that ``msgspec`` complains of, by a path such as ``$[1].kind``."""
+    path = re.search(r" - at `(?:key in `)?\$([^`]*)`", str(error))
+    place = ""
+    for name, number in re.findall(r"\.(\w+)|\[(\d+)\]", path[1] if path else ""):
+        if isinstance(value, Mapping) and name in value:
+            value, place = value[name], f"{place}.{name}"
+        elif number and isinstance(value, list | tuple):
+            value, place = value[int(number)], f"{place}[{number}]"
+    return place, value
+
+
+def _expected_by(hint: Any) -> str:
+    """Describe the values that a type allows, for errors."""
+    extra = getattr(hint, "__metadata__", ())
+    metas = [each for each in extra if isinstance(each, Meta)]
+    for meta in metas:
+        if meta.description:
+            return meta.description
+    if raw_of(hint) is not hint:
+        return _expected_by(raw_of(hint))
+    base, unit = _base_of(hint), "".join(f" {each.name}" for each in extra if isinstance(each, Unit))
+    if get_origin(base) is Literal:
+        return f"one of {', '.join(map(json.dumps, get_args(base)))}"
+    if get_origin(base) in (list, tuple):
+        most = next(
+            (f" of {meta.min_length or 0} to {meta.max_length} entries" for meta in metas if meta.max_length), ""
+        )
+        entry = get_args(base)[0]
+        return f"a list{most}" if entry is Any else f"a list{most}, each {_expected_by(entry)}"
+    name = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}.get(base, "a table")
+    bounds = {"ge": "from", "gt": "above", "le": "to", "lt": "below", "pattern": "that matches"}
+    limits = [
+        f" {word} {limit:.15g}" if isinstance(limit, float) else f" {word} {limit}"
+        for meta in metas
+        if meta is not FINITE
+        for bound, word in bounds.items()
+        if (limit := getattr(meta, bound)) is not None
+    ]
+    lengths = [f" of {meta.min_length or 0} to {meta.max_length} characters" for meta in metas if meta.max_length]
+    return name + "".join([*limits, unit, *lengths])
+
+
+def _remedy_for(hint: Any, default: object = None, wrong: object = None) -> str:
+    words = _words_of(hint)
+    if words and isinstance(wrong, str):
+        return f'write {_expected_by(hint)}; the nearest is "{nearest_of(wrong, words)}"'
+    for meta in getattr(hint, "__metadata__", ()):
+        if isinstance(meta, Meta) and meta.examples:
+            default = meta.examples[0]
+    # TOML writes texts, numbers and lists as JSON does.
+    has_example = isinstance(default, int | float | str | list | tuple) and default not in (True, False, "", ())
+    return f"write {_expected_by(hint)}{f', such as {json.dumps(default)}' if has_example else ''}"
+
+
+def _words_of(hint: Any) -> list[str]:
+    """The words that a type allows by itself, or as entries of its list."""
+    base = _base_of(raw_of(hint))
+    if get_origin(base) is tuple:
+        base = _base_of(get_args(base)[0])
+    return [word for word in get_args(base) if isinstance(word, str)] if get_origin(base) is Literal else []
