@@ -11,16 +11,17 @@ from twisted.internet.defer import Deferred, maybeDeferred
 from drivers.driver import Permit
 from drivers.errors import StaleCommand
 from drivers.gate import Gate
-from middleware.commitment.acceptor import Acceptor
-from middleware.commitment.ballot import GRANTED, NONE, OVER, SEALED, Ballot, Reply, members_of
+from middleware.commitment.acceptor import LeaseAcceptor
 from middleware.commitment.charter import sign_change, sign_end
 from middleware.commitment.council import Council
-from middleware.commitment.ledger import Ledger
+from middleware.commitment.lease_codec import members_of, pack_reply
 from middleware.commitment.lessee import Lessee
 from middleware.commitment.patience import in_time
 from middleware.entangled.data.store import Store
 from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.quorum.ballot import NONE, Ballot
+from middleware.entangled.quorum.register import Kind, Reply
 from tests.invariants.machine import Machine
 
 if TYPE_CHECKING:
@@ -39,7 +40,7 @@ class Bidder:
         self.world = world
         self.place = place
         self.machine = machine
-        self.acceptor = Acceptor(Ledger(store, machine.seconds()), machine.seconds())
+        self.acceptor = LeaseAcceptor(store, machine.seconds())
         self.lessees: dict[str, Lessee] = {}
         self._gates: dict[str, Gate] = {}
         self._rng = rng
@@ -148,9 +149,9 @@ class Bidder:
         agent = self.world.contacts[source].node_id.hex()
         reply = self._methods[method](agent, *arguments)
         if isinstance(reply, Deferred):
-            packed: Deferred[object] = reply.addCallback(Reply.packed)
+            packed: Deferred[object] = reply.addCallback(pack_reply)
             return packed.result if packed.called else packed
-        return reply.packed() if isinstance(reply, Reply) else reply
+        return pack_reply(reply) if isinstance(reply, Reply) else reply
 
     def _prepare(self, agent: str, task_id: str, configuration: int, counter: int, ttl: float) -> Reply:
         return self.acceptor.prepare(task_id, configuration, Ballot(counter, agent), ttl, self.machine.seconds())
@@ -160,12 +161,12 @@ class Bidder:
     ) -> Deferred[Reply]:
         def proposed() -> Reply:
             ballot, now = Ballot(counter, agent), self.machine.seconds()
-            return self.acceptor.propose(task_id, configuration, ballot, token, ttl, now)
+            return self.acceptor.lease(task_id, configuration, ballot, token, ttl, now)
 
         return in_time(proposed, self.machine)
 
     def _release(self, agent: str, task_id: str, counter: int, rest: float) -> None:
-        freed = self.acceptor.release(task_id, Ballot(counter, agent), self.machine.seconds(), rest)
+        freed = self.acceptor.free(task_id, Ballot(counter, agent), self.machine.seconds(), rest)
         self._tell(freed, task_id, rest)
 
     def _tell(self, listeners: Sequence[str], task_id: str, rest: float) -> None:
@@ -175,7 +176,7 @@ class Bidder:
     def _close(self, agent: str, task_id: str, configuration: int, token: int) -> Reply:
         reply = self.acceptor.close(task_id, agent, configuration, token, self.machine.seconds())
         signature = sign_end(self._identity, task_id, configuration, agent, token)
-        return reply._replace(proof=signature) if reply.kind in (OVER, SEALED) else reply
+        return reply._replace(proof=signature) if reply.kind in (Kind.OVER, Kind.SEALED) else reply
 
     def _cancel(self, agent: str, task_id: str, configuration: int) -> Reply:
         return self.acceptor.close(task_id, "", configuration, 0, self.machine.seconds())
@@ -184,15 +185,15 @@ class Bidder:
         self, agent: str, task_id: str, configuration: int, counter: int, packed: list[object], token: int, keep: bool
     ) -> Reply:
         members, ballot = members_of(packed) or (), Ballot(counter, agent)
-        reply = self.acceptor.change(task_id, configuration, ballot, members, token, self.machine.seconds(), keep)
+        reply = self.acceptor.accept(task_id, configuration, ballot, members, self.machine.seconds(), token, keep)
         signature = sign_change(self._identity, task_id, configuration, ballot, members, reply.token)
-        return reply._replace(proof=signature) if reply.kind == GRANTED else reply
+        return reply._replace(proof=signature) if reply.kind is Kind.GRANTED else reply
 
     def _install(self, agent: str, task_id: str, packed: bytes, keep: bool, ttl: float) -> Reply | None:
         charter = self.world.judge.read(task_id, packed)
         if charter is None or not charter.links:
             return None
-        ballot = charter.ballot if keep and charter.ballot.agent == agent else NONE
+        ballot = charter.ballot if keep and charter.ballot.proposer == agent else NONE
         told = charter.configuration, charter.members, charter.token, self.machine.seconds(), ballot, ttl, packed
         return self.acceptor.install(task_id, *told)
 

@@ -13,14 +13,11 @@ from agents import circle
 from agents.docket import Docket
 from drivers.errors import StaleCommand
 from drivers.gate import Gate
-from middleware.commitment import charter, ledger, lessee
-from middleware.commitment import round as round_
-from middleware.commitment.acceptor import Acceptor
-from middleware.commitment.ballot import GRANTED, OVER, Reply
+from middleware.commitment import charter, lessee
 from middleware.commitment.charter import pin
 from middleware.commitment.council import Council
+from middleware.commitment.lease_codec import pack_members
 from middleware.commitment.lessee import Lease, Lessee
-from middleware.commitment.round import Round
 from middleware.consensus import bidder, nearest
 from middleware.consensus.nearest import Nearest
 from middleware.consensus.strategy import Report
@@ -32,12 +29,18 @@ from middleware.entangled.errors import EntangledError
 from middleware.entangled.kademlia import overlay
 from middleware.entangled.kademlia.overlay import Overlay
 from middleware.entangled.kademlia.roster import Roster
+from middleware.entangled.quorum import round as round_
+from middleware.entangled.quorum.acceptor import Acceptor
+from middleware.entangled.quorum.log import Log
+from middleware.entangled.quorum.proposer import Result, conclude
+from middleware.entangled.quorum.register import Kind, Reply
+from middleware.entangled.quorum.round import Round, Tally
 from middleware.entangled.record import Record, Slot
 from middleware.entangled.replication import owner, reader
 from middleware.entangled.replication.handover import Handover
 from middleware.entangled.replication.reader import Reader
 from middleware.entangled.replication.replica import Replica
-from middleware.entangled.space.decree import Result, Tally, Vote
+from middleware.entangled.space import council as takes
 from middleware.entangled.space.keeper import Keeper
 from middleware.entangled.space.seat import Seat
 from middleware.entangled.space.shelf import Shelf
@@ -79,40 +82,39 @@ def _any_answer(answers: dict[bytes, Any], voters: frozenset[bytes]) -> int:
 _GENUINE = {
     (place, name): getattr(place, name)
     for place, name in [
-        (Tally, "outcome"),
-        (Vote, "claim"),
         (Greeter, "on_who"),
         (Session, "open"),
+        (Seat, "_claimed"),
         (Seat, "_load"),
-        (ledger.Ledger, "keep"),
+        (Log, "keep"),
         (Acceptor, "release"),
     ]
 }
 
 
-def _won_by_one(self: Tally) -> Any:
-    outcome = _GENUINE[Tally, "outcome"].fget(self)
-    lost = outcome is not None and outcome.result in (Result.OUTBID, Result.LEASED, Result.SILENT)
-    is_promised = any(reply.kind is self._wanted for reply in self._replies)
-    return outcome._replace(result=Result.WON) if lost and is_promised else outcome
+def _won_by_one(tally: Tally) -> Any:
+    outcome = conclude(tally)
+    lost = outcome.result in (Result.OUTBID, Result.HELD, Result.SILENT)
+    return outcome._replace(result=Result.WON) if lost and tally.agreed else outcome
 
 
-def _claimed_for_ever(self: Vote, ballot: Any, lease: float, now: float) -> Any:
-    return _GENUINE[Vote, "claim"](self, ballot, lease + 1e6, now)
+def _claimed_for_ever(self: Seat, place: Any, ballot: Any, lease: float, now: float) -> Any:
+    return _GENUINE[Seat, "_claimed"](self, place, ballot, lease + 1e6, now)
 
 
 def _let_go_as_if_at_rest(self: Lessee, ballot: Any, heirs: Any = ()) -> Any:
     return self.council.let_go(ballot, heirs)
 
 
-def _released_at_rest(self: Acceptor, task_id: str, ballot: Any, now: float, rest: float = 0.0) -> Any:
-    return _GENUINE[Acceptor, "release"](self, task_id, ballot, now)
+def _released_at_rest(self: Acceptor[Any], key: Any, ballot: Any, now: float, rest: float = 0.0) -> Any:
+    return _GENUINE[Acceptor, "release"](self, key, ballot, now)
 
 
-def _load_without_votes(self: Seat) -> None:
-    _GENUINE[Seat, "_load"](self)
-    for votes in (self._votes, self._buckets, self._unsettled):
+def _load_without_votes(self: Seat) -> Any:
+    acceptor = _GENUINE[Seat, "_load"](self)
+    for votes in (acceptor.log.registers, acceptor.log._buckets, self._unsettled):
         votes.clear()
+    return acceptor
 
 
 def _told_what_is_known(self: Shelf, records: list[Record]) -> None:
@@ -170,8 +172,8 @@ def _held_for_ever(self: Lessee) -> Lease | None:
     return Lease(self.task_id, self.token, self._deadline) if self.token else None
 
 
-def _closed_and_forgotten(self: Acceptor, *_: Any) -> Reply:
-    return Reply(OVER)
+def _closed_and_forgotten(self: Acceptor[Any], *_: Any) -> Reply:
+    return Reply(Kind.OVER)
 
 
 def _only_listens(self: Lessee, asked: Round) -> None:
@@ -183,11 +185,11 @@ def _closest_now(self: Leases, place: int, task_id: str) -> Any:
     return pin(self.operator, task_id, tuple(self.contacts[n] for n in near[:3]))
 
 
-def _forgets_tokens(self: ledger.Ledger, task_id: str) -> None:
-    entry = self._entries[task_id]
-    token, entry.token = entry.token, 0
-    _GENUINE[ledger.Ledger, "keep"](self, task_id)
-    entry.token = token
+def _forgets_tokens(self: Log[Any], key: Any) -> None:
+    register = self.registers[key]
+    token, register.token = register.token, 0
+    _GENUINE[Log, "keep"](self, key)
+    register.token = token
 
 
 def _admits_lower_tokens(self: Gate, permit: Any, now: float) -> None:
@@ -197,9 +199,8 @@ def _admits_lower_tokens(self: Gate, permit: Any, now: float) -> None:
 
 
 async def _decided_by_the_new(self: Council, ballot: Any, members: Any, keep: bool) -> Round:
-    packed = [member.packed() for member in members]
-    question = (self.task_id, self.configuration, ballot.counter, packed, self.token, keep)
-    return await Round(members, self._ask, self._clock, "lease.change", question, (GRANTED,), self.ttl / 3).outcome
+    question = (self.task_id, self.configuration, ballot.counter, pack_members(members), self.token, keep)
+    return await self._asked(members, "lease.change", question, (Kind.GRANTED,)).outcome
 
 
 BUGS: dict[str, list[tuple[Any, str, Any]]] = {
@@ -223,9 +224,9 @@ BUGS: dict[str, list[tuple[Any, str, Any]]] = {
     "the absent are not sought": [(Roster, "absent", lambda self: [])],
     "any answer counts": [(reader, "_votes", _any_answer)],
     # Tuples.
-    "one promise is a majority": [(Tally, "outcome", property(_won_by_one))],
+    "one promise is a majority": [(takes, "conclude", _won_by_one)],
     "votes forgotten by a restart": [(Seat, "_load", _load_without_votes)],
-    "the lease of the dead never ends": [(Vote, "claim", _claimed_for_ever)],
+    "the lease of the dead never ends": [(Seat, "_claimed", _claimed_for_ever)],
     "a take is not noted": [(Keeper, "note", _nothing), (Keeper, "doubt", _idle)],
     "who waits is not woken": [(Shelf, "_changed", _told_what_is_known)],
     # The wire.
@@ -250,14 +251,14 @@ BUGS: dict[str, list[tuple[Any, str, Any]]] = {
     # Leases.
     "deadline from the time of the answer": [(Lessee, "_deadline_of", _deadline_from_the_answer)],
     "the own deadline is not looked at": [(Lessee, "lease", property(_held_for_ever))],
-    "one member of a council is a majority": [(round_, "quorum", lambda size: 1)],
+    "one member of a council is a majority": [(round_, "majority", lambda size: 1)],
     "the end of a task is not kept by its council": [(Acceptor, "close", _closed_and_forgotten)],
     "no clock margin": [(lessee, "CLOCK_MARGIN", 0.0)],
     "a clock that stands still while suspended": [(Machine, "COUNTS_SUSPENSION", False)],
     "the council is whoever is closest now": [(Leases, "council_for", _closest_now)],
     "a stand-by does not ask": [(Lessee, "_wait", _only_listens)],
     "minority grants are kept": [(Lessee, "_let_go_of_minority", _idle)],
-    "the token is not stored": [(ledger.Ledger, "keep", _forgets_tokens)],
+    "the token is not stored": [(Log, "keep", _forgets_tokens)],
     "the time to stop is ignored": [(Lessee, "_deadline_of", _deadline_without_the_stop)],
     "released before it stands still": [(Lessee, "_let_go", _let_go_as_if_at_rest)],
     "granted before it stands still": [(Acceptor, "release", _released_at_rest)],

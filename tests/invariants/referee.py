@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from drivers.driver import Permit
 from drivers.errors import StaleCommand
 from drivers.gate import Gate
-from middleware.commitment.ballot import quorum
+from middleware.entangled.quorum.ballot import majority
 from sim.team.checker import check
 from sim.team.event import Commanded, Halted, Held, Issued, Reached, Terms, Won
 from sim.team.history import History
@@ -96,7 +96,7 @@ class Referee:
             places = [self._world.place_of(member) for member in charter.members]
             for agent in self._world.agents:
                 near = [p for p in places if not {(agent, p), (p, agent)} & self._world.radio.cut]
-                is_reached, mine = len(near) >= quorum(len(places)), (task_id, agent)
+                is_reached, mine = len(near) >= majority(len(places)), (task_id, agent)
                 if is_reached == (mine in self._is_cut):
                     self._is_cut ^= {mine}
                     self.history.note(Reached, *mine, is_reached)

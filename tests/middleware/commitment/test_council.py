@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from middleware.commitment.ballot import LIFE, NoMajority, OpenClaim, Superseded
+from middleware.commitment.council import NoMajority, OpenClaim, Superseded
+from middleware.commitment.lease_codec import LIFE
 from middleware.entangled.errors import Refused
 from tests.middleware.commitment.room import TTL, RoomCase, T
 
@@ -26,7 +27,7 @@ class CouncilTests(RoomCase):
         self.assertLess(first, second)
         self.wanting(1)
         council.hear(self.outcome(council.round("lease.prepare", 1, TTL).outcome))
-        self.assertTrue(first.is_kin(second))
+        self.assertTrue(first.is_kin(second, LIFE))
         self.assertGreaterEqual(council.next_ballot().counter, 3 * LIFE)
 
     def test_change(self) -> None:

@@ -7,7 +7,7 @@ from twisted.internet.defer import Deferred
 from drivers.driver import Permit
 from drivers.errors import StaleCommand
 from drivers.gate import Gate
-from middleware.commitment.ballot import NoMajority, OpenClaim, Superseded
+from middleware.commitment.council import NoMajority, OpenClaim, Superseded
 from middleware.commitment.lessee import CLOCK_MARGIN, RENEWALS
 from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.kademlia.distance import closest

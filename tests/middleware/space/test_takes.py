@@ -12,11 +12,14 @@ from twisted.trial.unittest import SynchronousTestCase
 from benchmarks.takers import Trial
 from benchmarks.village import VillageTrial
 from middleware.entangled.node import EntangledNode
+from middleware.entangled.quorum.acceptor import Acceptor, Stand
+from middleware.entangled.quorum.ballot import Ballot
+from middleware.entangled.quorum.proposer import Outcome
+from middleware.entangled.quorum.register import Reply
 from middleware.entangled.space.council import Council
-from middleware.entangled.space.decree import Ballot, Outcome, Reply, Stand, Vote
 from middleware.entangled.space.keeper import Keeper
 from middleware.entangled.space.posting import Place, Posted
-from middleware.entangled.space.seat import Answers, Seat
+from middleware.entangled.space.seat import CODEC, TERMS, Answers, Seat
 from middleware.entangled.space.tuplespace import TupleSpace
 
 TUPLES = 100
@@ -117,28 +120,27 @@ class FaultTests(SynchronousTestCase):
         self._noticed(OneSlot, "was never taken")
 
 
-class AgreeableVote(Vote):
-    def _stand(self, ballot: Ballot, now: float) -> Stand:
-        return Stand.SAME if self.promised else Stand.HIGHER
+class AgreeableAcceptor(Acceptor[Place]):
+    def _stand(self, *_: Any) -> Stand:
+        return Stand.FREE
 
 
-class EndlessVote(Vote):
-    def claim(self, ballot: Ballot, lease: float, now: float) -> Reply:
-        return super().claim(ballot, 600.0, now)
+class EndlessAcceptor(Acceptor[Place]):
+    def prepare(
+        self, key: Place, configuration: int, ballot: Ballot, ttl: float, now: float, reserve: float = 0.0
+    ) -> Reply:
+        return super().prepare(key, configuration, ballot, ttl, now, 600.0)
 
 
 class FaultySeat(Seat):
-    kind: type[Vote]
+    kind: type[Acceptor[Place]]
 
-    def _claimed(self, place: Place, ballot: Ballot, lease: float, now: float) -> Reply:
-        if place not in self._votes:
-            super()._claimed(place, ballot, lease, now)
-            self._votes[place] = self.kind()
-        return self._votes[place].claim(ballot, lease, now)
+    def _load(self) -> Acceptor[Place]:
+        return self.kind(super()._load().log, CODEC, TERMS)
 
 
 class NoBallots(VillageTrial):
-    kind: type[Vote] = AgreeableVote
+    kind: type[Acceptor[Place]] = AgreeableAcceptor
 
     def furnish(self, node: EntangledNode, space: TupleSpace, rng: random.Random) -> None:
         node.seat = FaultySeat(node.endpoint, node.store, self.clock, rng)
@@ -146,7 +148,7 @@ class NoBallots(VillageTrial):
 
 
 class EndlessLease(NoBallots):
-    kind = EndlessVote
+    kind = EndlessAcceptor
 
 
 class HastyCouncil(Council):
@@ -156,14 +158,14 @@ class HastyCouncil(Council):
 
 class MinorityConfirm(VillageTrial):
     def furnish(self, node: EntangledNode, space: TupleSpace, rng: random.Random) -> None:
-        space._taker._council = HastyCouncil(space._taker._ask, rng, space._chores)
+        space._taker._council = HastyCouncil(space._taker._ask, self.clock, rng, space._chores)
 
 
 class ForgetfulSeat(Seat):
     def answer_claim(self, *question: Any) -> Answers:
-        if len(self._votes) > 2:
-            self._votes.clear()
-            self._buckets.clear()
+        if len(self) > 2:
+            self._votes.log.registers.clear()
+            self._votes.log._buckets.clear()
         return super().answer_claim(*question)
 
 

@@ -1,4 +1,4 @@
-"""Tests of ``middleware.commitment.ballot``."""
+"""Tests of ``middleware.commitment.lease_codec``."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.commitment.ballot import GRANTED, KINDS, LIFE, MAX_COUNCIL, Ballot, Reply, members_of, quorum, reply_of
+from middleware.commitment.lease_codec import LIFE, MAX_COUNCIL, members_of, pack_reply, unpack_reply
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address
+from middleware.entangled.quorum.ballot import Ballot, majority
+from middleware.entangled.quorum.register import Kind, Reply
 
 MEMBERS = tuple(Contact(bytes([n]) * 32, Address("10.0.0.1", 7000 + n)) for n in range(MAX_COUNCIL + 1))
 ANYTHING = st.recursive(
@@ -27,33 +29,35 @@ class BallotTests(SynchronousTestCase):
     def test_lives(self) -> None:
         """Ballots of one life of an agent are kin; those of another agent or another life are not."""
         one = Ballot(3 * LIFE + 7, "a")
-        self.assertTrue(one.is_kin(Ballot(9 * LIFE + 7, "a")))
-        self.assertFalse(one.is_kin(Ballot(3 * LIFE + 7, "b")))
-        self.assertFalse(one.is_kin(Ballot(3 * LIFE + 8, "a")))
+        self.assertTrue(one.is_kin(Ballot(9 * LIFE + 7, "a"), LIFE))
+        self.assertFalse(one.is_kin(Ballot(3 * LIFE + 7, "b"), LIFE))
+        self.assertFalse(one.is_kin(Ballot(3 * LIFE + 8, "a"), LIFE))
 
     def test_quorum(self) -> None:
         """Two quorums of one council always share a member."""
         for size in range(1, MAX_COUNCIL + 1):
-            self.assertGreater(2 * quorum(size), size)
+            self.assertGreater(2 * majority(size), size)
 
 
 class ReplyTests(SynchronousTestCase):
     def test_there_and_back(self) -> None:
         """What is packed is read as it was, of every kind."""
-        for kind in KINDS:
-            reply = Reply(kind, Ballot(5, "a"), 3, 1.25, 2, MEMBERS[:3])
-            self.assertEqual(reply_of(reply.packed()), reply)
+        for kind in Kind:
+            reply = Reply(kind, Ballot(5, "a"), 3, 1.25, 2)
+            if kind is Kind.SEALED:
+                reply = reply._replace(accepted=reply.promised, value=MEMBERS[:3])
+            self.assertEqual(unpack_reply(pack_reply(reply)), reply)
 
     def test_strange_durations(self) -> None:
         """What cannot be a duration counts as none."""
         for strange in (-1.0, float("nan")):
-            read = reply_of([GRANTED, 1, "a", 1, strange, 1, []])
+            read = unpack_reply(["granted", 1, "a", 1, strange, 1, []])
             assert read is not None
             self.assertEqual(read.remaining, 0.0)
 
     def test_unlawful(self) -> None:
         """Anything else is no reply."""
-        good = Reply(GRANTED, Ballot(5, "a"), 3, 1.25, 2).packed()
+        good = pack_reply(Reply(Kind.GRANTED, Ballot(5, "a"), 3, 1.25, 2))
         for place, bad in (
             (0, "yes"),
             (0, 1),
@@ -66,10 +70,10 @@ class ReplyTests(SynchronousTestCase):
             (5, "1"),
             (6, 0),
         ):
-            self.assertIsNone(reply_of([*good[:place], bad, *good[place + 1 :]]), (place, bad))
+            self.assertIsNone(unpack_reply([*good[:place], bad, *good[place + 1 :]]), (place, bad))
         others: tuple[object, ...] = (None, 5, [], good[:-1], [*good, 0], {})
         for other in others:
-            self.assertIsNone(reply_of(other))
+            self.assertIsNone(unpack_reply(other))
 
     def test_councils(self) -> None:
         """A council has contacts, not too many, and none twice."""
@@ -82,6 +86,6 @@ class ReplyTests(SynchronousTestCase):
     @given(ANYTHING)
     def test_total(self, answer: object) -> None:
         """Whatever a peer answers is read as a reply or as none, and never an accident."""
-        read = reply_of(answer)
+        read = unpack_reply(answer)
         self.assertTrue(read is None or read.remaining >= 0.0)
         members_of(answer)

@@ -1,0 +1,396 @@
+"""The acceptor: it promises, leases and accepts; every vote follows from ``TABLE``.
+
+A decision is Lamport's single-decree Paxos: prepare, then accept for ever.  A lease is PaxosLease: prepare, then lease
+for ``ttl`` seconds, extended by leasing again under the same ballot.  A change of the configuration is a decision that
+ends all leases (Vertical Paxos).  An acceptor is a function of (message, now) and of its log; ``docs/quorum.md`` has the
+invariants that are named here.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any, Generic
+
+from middleware.entangled.quorum.ballot import NONE, Ballot, Ceiling, Name
+from middleware.entangled.quorum.log import Codec, Key, Log
+from middleware.entangled.quorum.register import Kind, Register, Reply
+
+NO_ROOM = 1.0
+"""Seconds after which a proposer may ask again where there was no room for its register."""
+
+
+class State(Enum):
+    """What an acceptor knows of a register."""
+
+    UNKNOWN = "unknown"
+    OPEN = "open"
+    SEALED = "sealed"
+    OVER = "over"
+
+
+class Event(Enum):
+    """What a proposer asks."""
+
+    PREPARE = "prepare"
+    LEASE = "lease"
+    ACCEPT = "accept"
+    RELEASE = "release"
+
+
+class Stand(Enum):
+    """How a ballot stands to a register at one moment."""
+
+    BEHIND = "behind"
+    """Its configuration is newer than the one that is known here."""
+    MOVED = "moved"
+    """Its configuration is over."""
+    HELD = "held"
+    """The lease of another runs."""
+    LOWER = "lower"
+    """It was outbid or given back, or its numbers are not believed."""
+    OVERTAKEN = "overtaken"
+    """It is the holder's; what follows its lease is promised to another."""
+    OWN = "own"
+    """It is the holder's, and the lease runs."""
+    ENDING = "ending"
+    """The lease of another is about to end, or was given back by a holder whose device still moves."""
+    RESERVED = "reserved"
+    """The leased promise of another runs."""
+    FOREIGN = "foreign"
+    """It has nothing to give back here."""
+    FREE = "free"
+
+
+_VOTES = {
+    Event.PREPARE: {
+        Stand.BEHIND: Kind.BEHIND,
+        Stand.MOVED: Kind.MOVED,
+        Stand.HELD: Kind.HELD,  # L3: to prepare while a lease runs changes nothing
+        Stand.LOWER: Kind.OUTBID,
+        Stand.OVERTAKEN: Kind.OUTBID,
+        Stand.OWN: Kind.GRANTED,
+        Stand.ENDING: Kind.GRANTED,
+        Stand.RESERVED: Kind.HELD,
+        Stand.FREE: Kind.GRANTED,
+    },
+    Event.LEASE: {
+        Stand.BEHIND: Kind.BEHIND,
+        Stand.MOVED: Kind.MOVED,
+        Stand.HELD: Kind.HELD,  # L1: one holder at a time
+        Stand.LOWER: Kind.OUTBID,
+        Stand.OVERTAKEN: Kind.GRANTED,  # L4: a promise for the time after a lease ends no lease
+        Stand.OWN: Kind.GRANTED,
+        Stand.ENDING: Kind.HELD,  # L1: nothing is granted before the device rests
+        Stand.RESERVED: Kind.GRANTED,  # a majority elsewhere has promised this ballot: the reservation has lost
+        Stand.FREE: Kind.GRANTED,
+    },
+    Event.ACCEPT: {
+        Stand.BEHIND: Kind.BEHIND,
+        Stand.MOVED: Kind.MOVED,
+        Stand.HELD: Kind.HELD,  # C2: no value is accepted while a lease runs
+        Stand.LOWER: Kind.OUTBID,
+        Stand.OVERTAKEN: Kind.OUTBID,
+        Stand.OWN: Kind.HELD,
+        Stand.ENDING: Kind.HELD,
+        Stand.RESERVED: Kind.GRANTED,
+        Stand.FREE: Kind.GRANTED,
+    },
+    Event.RELEASE: {
+        Stand.FOREIGN: Kind.UNPREPARED,
+        Stand.LOWER: Kind.OUTBID,
+        Stand.HELD: Kind.GRANTED,
+        Stand.FREE: Kind.GRANTED,
+    },
+}
+
+
+def _rows() -> dict[tuple[State, Event, Stand], tuple[Kind, State]]:
+    rows = {}
+    for event, stands in _VOTES.items():
+        for stand, kind in stands.items():
+            for state in State:
+                answer, after = kind, state
+                if state is State.UNKNOWN and event is not Event.PREPARE:
+                    answer = Kind.UNPREPARED  # R4: what was promised here may be forgotten
+                elif state is State.OVER and event is not Event.RELEASE and stand is not Stand.BEHIND:
+                    answer = Kind.OVER  # C4: after the end nothing is granted
+                elif state is State.SEALED and event is Event.LEASE and stand not in (Stand.BEHIND, Stand.MOVED):
+                    answer = Kind.SEALED  # C1: a sealed configuration leases nothing
+                elif state is State.SEALED and event is Event.PREPARE and kind is Kind.GRANTED:
+                    answer = Kind.SEALED  # A2: a promise tells what was accepted
+                elif event is Event.ACCEPT and kind is Kind.GRANTED:
+                    after = State.SEALED
+                elif event is Event.PREPARE and kind is Kind.GRANTED and state is State.UNKNOWN:
+                    after = State.OPEN
+                rows[state, event, stand] = answer, after
+    return rows
+
+
+TABLE = _rows()
+"""(state, event, stand) to (answer, next state)."""
+
+
+@dataclass(frozen=True)
+class Terms:
+    """How one use of registers differs from another.
+
+    In the last ``ahead`` share of a lease what follows it is promised.  Under an accepted value its proposer has
+    ``finish`` seconds for itself before another may complete it.  With ``must_prepare`` a register that is unknown has to
+    be prepared before anything else.
+    """
+
+    ahead: float = 0.0
+    finish: float = 0.0
+    must_prepare: bool = False
+
+
+class Acceptor(Generic[Key]):
+    """A member of quorums since ``born_at``; what its log may have forgotten it keeps silent about for the longest ttl."""
+
+    def __init__(self, log: Log[Key], codec: Codec[Key], terms: Terms, born_at: float = -math.inf) -> None:
+        self.log = log
+        self._codec = codec
+        self._terms = terms
+        self._born_at = born_at
+
+    def prepare(
+        self, key: Key, configuration: int, ballot: Ballot, ttl: float, now: float, reserve: float = 0.0
+    ) -> Reply:
+        """Promise to accept nothing under a lower ballot, and lease the promise for ``reserve`` seconds.
+
+        ``ttl`` is that of the lease which is to follow.  A ballot of counter 0 only looks and is promised nothing: an
+        acceptor whose lease has run out, because it missed an extension, is not to be lost to the healthy holder.
+        """
+        found = self._judge(Event.PREPARE, key, configuration, ballot, now, ttl=ttl)
+        if isinstance(found, Reply):
+            return found
+        register, kind = found
+        if kind in (Kind.GRANTED, Kind.SEALED):
+            register.touched_at = now
+            is_new = ballot > register.promised or reserve != register.reserve
+            if ballot.counter > 0:
+                register.promised = ballot  # P1
+                register.reserve, register.reserved_until = reserve, now + reserve
+                self._keep(key, is_new)
+        reply = self._reply(kind, register, now)
+        is_own = ballot.is_kin(register.holder, self._codec.lives)
+        return reply._replace(remaining=0.0) if is_own else reply
+
+    def lease(self, key: Key, configuration: int, ballot: Ballot, token: int, ttl: float, now: float) -> Reply:
+        """Grant the lease for ``ttl`` seconds from now, or extend it."""
+        found = self._judge(Event.LEASE, key, configuration, ballot, now, token, ttl)
+        if isinstance(found, Reply):
+            return found
+        register, kind = found
+        if kind is Kind.GRANTED:
+            promised = max(register.promised, ballot)
+            before = register.promised, register.holder, register.token, register.ttl
+            register.promised, register.holder, register.token, register.ttl = promised, ballot, token, ttl
+            register.grantee = ballot.proposer
+            register.until, register.touched_at = now + ttl, now
+            self._keep(key, before != (promised, ballot, token, ttl))
+        return self._reply(kind, register, now)
+
+    def accept(
+        self,
+        key: Key,
+        configuration: int,
+        ballot: Ballot,
+        value: Any,
+        now: float,
+        token: int = 0,
+        gives_back: bool = False,
+    ) -> Reply:
+        """Accept ``value`` for ever.
+
+        With ``gives_back`` a holder says that its own lease is given back (its device is at rest), and kept for it so
+        long.  ``token`` is the highest that the proposer knows.
+        """
+        found = self._judge(Event.ACCEPT, key, configuration, ballot, now, token, gives_back=gives_back)
+        if isinstance(found, Reply):
+            return found
+        register, kind = found
+        if kind is Kind.GRANTED:
+            is_new = (register.accepted, register.value) != (ballot, value)
+            register.promised = register.accepted = ballot
+            register.value, register.touched_at = value, now
+            register.reserve, register.reserved_until = self._terms.finish, now + self._terms.finish
+            register.hear_token(token)
+            self._keep(key, is_new)
+        return self._reply(kind, register, now)
+
+    def release(self, key: Key, ballot: Ballot, now: float, rest: float = 0.0) -> Reply:
+        """End what was promised or leased under ``ballot``, or an older one of its life; what was accepted stays.
+
+        ``rest`` is how long the holder's device may still move: until then others are promised the lease, but not granted.
+        """
+        found = self._judge(Event.RELEASE, key, 0, ballot, now)
+        if isinstance(found, Reply):
+            return found
+        register, kind = found
+        if kind is Kind.GRANTED:
+            if self._stand(Event.RELEASE, register, 0, ballot, now) is Stand.HELD:
+                # It was promised for the time after another's lease, which goes on.
+                register.promised = max(register.promised, Ballot(ballot.counter + 1, self._codec.nobody))
+            else:
+                # B3: a request of that ballot may still be on its way: it comes too late.
+                register.spent = ballot
+            if register.promised <= ballot:
+                register.reserve, register.reserved_until = 0.0, now
+            if ballot.is_kin(register.holder, self._codec.lives) and register.holder <= ballot:
+                register.until = min(register.until, now + rest)
+                register.holder = register.holder if register.until > now else NONE
+            self._keep(key)
+        return self._reply(kind, register, now)
+
+    def close(self, key: Key, proposer: Name, configuration: int, token: int, now: float) -> Reply:
+        """Grant nothing any more; ``remaining`` is how long another may still act.
+
+        A proposer names the token that it was granted here, even if it has given the lease back since; any other one is
+        refused.  Token 0 is the word of a caller that needs no lease.  Where the configuration is another one by now, or
+        may be, that one has to be asked as well.
+        """
+        register = self._known(key, now)
+        if register is None:
+            return Reply(Kind.QUIET, remaining=NO_ROOM)
+        if token and (register.token, register.grantee) != (token, proposer):  # C5: a proof names the granted token
+            return self._reply(Kind.OUTBID if token < register.token else Kind.BEHIND, register, now)
+        if not register.is_over:
+            register.is_over, register.touched_at = True, now
+            self._keep(key)
+        has_moved, is_sealed = configuration < register.configuration, register.accepted != NONE
+        reply = self._reply(Kind.MOVED if has_moved else Kind.SEALED if is_sealed else Kind.OVER, register, now)
+        is_done = register.holder.proposer == proposer and register.token == token
+        return reply._replace(remaining=0.0) if is_done else reply
+
+    def install(
+        self,
+        key: Key,
+        configuration: int,
+        value: Any,
+        token: int,
+        now: float,
+        ballot: Ballot = NONE,
+        ttl: float = 0.0,
+        proof: bytes = b"",
+    ) -> Reply:
+        """Learn that the configuration before has decided on ``value``, and above which token that goes on.
+
+        The caller has checked it: ``proof`` is the certificate.  Only the proposer of ``ballot`` is granted the lease for
+        ``ttl`` seconds.
+        """
+        register = self._known(key, now)
+        if register is None:
+            return Reply(Kind.QUIET, remaining=NO_ROOM)
+        if configuration > register.configuration:  # C3: configurations only rise
+            register.configuration, register.value, register.accepted = configuration, value, NONE
+            register.holder, register.until = ballot, now if ballot == NONE else now + ttl
+            register.touched_at, register.proof = now, proof
+            register.hear_token(token, ballot.proposer)
+            register.ceiling = Ceiling(now, self._codec.lives, register.promised.counter, register.token)
+            self._keep(key)
+        return self._reply(Kind.GRANTED if configuration == register.configuration else Kind.MOVED, register, now)
+
+    # -- inside -----------------------------------------------------------------------------------------------------
+
+    def _judge(
+        self,
+        event: Event,
+        key: Key,
+        configuration: int,
+        ballot: Ballot,
+        now: float,
+        token: int = 0,
+        ttl: float = 0.0,
+        gives_back: bool = False,
+    ) -> tuple[Register, Kind] | Reply:
+        """The register and the answer of the table; a register that nothing is granted in takes no room."""
+        quiet = self._silence(ttl) - now
+        if quiet > 0.0 and event is not Event.RELEASE:  # R1: it may have granted what it has forgotten
+            return Reply(Kind.QUIET, remaining=quiet)
+        known = self.log.get(key)
+        register = known or self.log.blank(now)
+        state = state_of(register)
+        if known is None and (self._terms.must_prepare or event is Event.RELEASE):
+            state = State.UNKNOWN
+        stand = self._stand(event, register, configuration, ballot, now, token, gives_back)
+        kind, _ = TABLE[state, event, stand]
+        if known is None and kind is Kind.GRANTED and ballot.counter > 0 and not self.log.enter(key, register, now):
+            return Reply(Kind.QUIET, remaining=NO_ROOM)
+        return register, kind
+
+    def _stand(
+        self,
+        event: Event,
+        register: Register,
+        configuration: int,
+        ballot: Ballot,
+        now: float,
+        token: int = 0,
+        gives_back: bool = False,
+    ) -> Stand:
+        lives = self._codec.lives
+        left = register.until - now
+        is_own = ballot.is_kin(register.holder, lives)  # L2: an earlier life of the holder is another holder
+        is_held = left > 0.0 and not is_own and not register.is_given_back
+        if event is Event.RELEASE:
+            if not (is_own or ballot.is_kin(register.promised, lives)):
+                return Stand.FOREIGN
+            return Stand.LOWER if ballot <= register.spent else Stand.HELD if is_held else Stand.FREE
+        if configuration != register.configuration:  # C3
+            return Stand.BEHIND if configuration > register.configuration else Stand.MOVED
+        if is_held and (ballot.counter == 0 or left > self._terms.ahead * register.ttl):
+            return Stand.HELD
+        if ballot.counter > 0:
+            is_lower_token = token < register.token or (token == register.token and not is_own)
+            if event is Event.LEASE and is_lower_token:  # T2: a token belongs to one holder
+                return Stand.LOWER
+            if ballot <= register.spent:  # B3
+                return Stand.LOWER
+            if not register.ceiling.admits(now, ballot.counter, token):  # N1
+                return Stand.LOWER
+            if ballot < register.promised:  # P1
+                extends = left > 0.0 and is_own and not register.is_given_back and token == register.token
+                return Stand.OVERTAKEN if extends else Stand.LOWER
+        if left > 0.0 and not (gives_back and is_own):
+            return Stand.OWN if is_own else Stand.ENDING
+        is_reserved = register.reserved_until > now and not ballot.is_kin(register.promised, lives)
+        return Stand.RESERVED if is_reserved else Stand.FREE
+
+    def _silence(self, ttl: float) -> float:
+        """Until when nothing is granted."""
+        return -math.inf if self.log.is_whole else self._born_at + max(ttl, self.log.floor.longest)
+
+    def _known(self, key: Key, now: float) -> Register | None:
+        """A register to learn something about, or None where there is no room."""
+        register = self.log.get(key)
+        if register is None:
+            register = self.log.blank(now)
+            return register if self.log.enter(key, register, now) else None
+        return register
+
+    def _keep(self, key: Key, is_new: bool = True) -> None:
+        if is_new:  # D1: what is answered is noted before
+            self.log.keep(key)
+
+    def _reply(self, kind: Kind, register: Register, now: float) -> Reply:
+        remaining = max(0.0, register.until - now, register.reserved_until - now)
+        return Reply(
+            kind,
+            register.promised,
+            register.token,
+            remaining,
+            register.configuration,
+            register.accepted,
+            register.value,
+            register.proof if kind is Kind.MOVED else b"",
+        )
+
+
+def state_of(register: Register) -> State:
+    """Where a register stands in the table."""
+    if register.is_over:
+        return State.OVER
+    return State.OPEN if register.accepted == NONE else State.SEALED
