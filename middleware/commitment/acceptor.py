@@ -24,7 +24,7 @@ class LeaseAcceptor(Acceptor[str]):
     def __init__(self, store: Store, born_at: float) -> None:
         log = Log(store, CODEC, may_forget, born_at)
         log.is_whole = log.is_whole and store.origin != "replaced"
-        super().__init__(log, CODEC, Terms(AHEAD), born_at)
+        super().__init__(log, Terms(AHEAD), born_at)
 
     def prepare(
         self, key: str, configuration: int, ballot: Ballot, ttl: float, now: float, reserve: float = 0.0

@@ -1,20 +1,20 @@
 """The acceptor: it promises, leases and accepts; every vote follows from ``TABLE``.
 
-A decision is Lamport's single-decree Paxos: prepare, then accept for ever.  A lease is PaxosLease: prepare, then lease
-for ``ttl`` seconds, extended by leasing again under the same ballot.  A change of the configuration is a decision that
-ends all leases (Vertical Paxos).  An acceptor is a function of (message, now) and of its log; ``docs/quorum.md`` has the
-invariants that are named here.
+A decision is Lamport's single-decree Paxos: prepare, then accept for ever.  A lease is PaxosLease: prepare, then
+lease for ``ttl`` seconds, extended by leasing again under the same ballot.  A change of the configuration is a
+decision that ends all leases (Vertical Paxos).  ``docs/quorum.md`` has the invariants that are named here.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any, Generic
+from typing import Any, Generic, NamedTuple
 
-from middleware.entangled.quorum.ballot import NONE, Ballot, Ceiling, Name
-from middleware.entangled.quorum.log import Codec, Key, Log
+from middleware.entangled.quorum.ballot import FIRST, NONE, Ballot, Ceiling, Name
+from middleware.entangled.quorum.log import Key, Log
 from middleware.entangled.quorum.register import Kind, Register, Reply
 
 NO_ROOM = 1.0
@@ -63,72 +63,54 @@ class Stand(Enum):
     FREE = "free"
 
 
+class _Question(NamedTuple):
+    event: Event
+    ballot: Ballot
+    now: float
+    configuration: int = FIRST
+    token: int = 0
+    ttl: float = 0.0
+    gives_back: bool = False
+
+
+_COLUMNS = (Stand.HELD, Stand.LOWER, Stand.OVERTAKEN, Stand.OWN, Stand.ENDING, Stand.RESERVED, Stand.FREE)
+_G, _H, _O = Kind.GRANTED, Kind.HELD, Kind.OUTBID
 _VOTES = {
-    Event.PREPARE: {
-        Stand.BEHIND: Kind.BEHIND,
-        Stand.MOVED: Kind.MOVED,
-        Stand.HELD: Kind.HELD,  # L3: to prepare while a lease runs changes nothing
-        Stand.LOWER: Kind.OUTBID,
-        Stand.OVERTAKEN: Kind.OUTBID,
-        Stand.OWN: Kind.GRANTED,
-        Stand.ENDING: Kind.GRANTED,
-        Stand.RESERVED: Kind.HELD,
-        Stand.FREE: Kind.GRANTED,
-    },
-    Event.LEASE: {
-        Stand.BEHIND: Kind.BEHIND,
-        Stand.MOVED: Kind.MOVED,
-        Stand.HELD: Kind.HELD,  # L1: one holder at a time
-        Stand.LOWER: Kind.OUTBID,
-        Stand.OVERTAKEN: Kind.GRANTED,  # L4: a promise for the time after a lease ends no lease
-        Stand.OWN: Kind.GRANTED,
-        Stand.ENDING: Kind.HELD,  # L1: nothing is granted before the device rests
-        Stand.RESERVED: Kind.GRANTED,  # a majority elsewhere has promised this ballot: the reservation has lost
-        Stand.FREE: Kind.GRANTED,
-    },
-    Event.ACCEPT: {
-        Stand.BEHIND: Kind.BEHIND,
-        Stand.MOVED: Kind.MOVED,
-        Stand.HELD: Kind.HELD,  # C2: no value is accepted while a lease runs
-        Stand.LOWER: Kind.OUTBID,
-        Stand.OVERTAKEN: Kind.OUTBID,
-        Stand.OWN: Kind.HELD,
-        Stand.ENDING: Kind.HELD,
-        Stand.RESERVED: Kind.GRANTED,
-        Stand.FREE: Kind.GRANTED,
-    },
-    Event.RELEASE: {
-        Stand.FOREIGN: Kind.UNPREPARED,
-        Stand.LOWER: Kind.OUTBID,
-        Stand.HELD: Kind.GRANTED,
-        Stand.FREE: Kind.GRANTED,
-    },
+    # L3: to prepare while a lease runs changes nothing.
+    Event.PREPARE: (_H, _O, _O, _G, _G, _H, _G),
+    # L1: nothing is leased before the lease of another has ended and its device rests.
+    # L4: a promise for the time after a lease does not end it.
+    # A majority elsewhere has promised a ballot that comes under a reservation: the reservation has lost.
+    Event.LEASE: (_H, _O, _G, _G, _H, _G, _G),
+    # C2: no value is accepted while a lease runs.
+    Event.ACCEPT: (_H, _O, _O, _H, _H, _G, _G),
 }
+_RELEASES = {Stand.FOREIGN: Kind.UNPREPARED, Stand.LOWER: _O, Stand.HELD: _G, Stand.FREE: _G}
 
 
-def _rows() -> dict[tuple[State, Event, Stand], tuple[Kind, State]]:
-    rows = {}
-    for event, stands in _VOTES.items():
-        for stand, kind in stands.items():
-            for state in State:
+def _rows() -> Iterator[tuple[tuple[State, Event, Stand], tuple[Kind, State]]]:
+    for state in State:
+        is_unknown, is_sealed = state is State.UNKNOWN, state is State.SEALED
+        for stand, kind in _RELEASES.items():
+            yield (state, Event.RELEASE, stand), (Kind.UNPREPARED if is_unknown else kind, state)
+        for event, kinds in _VOTES.items():
+            stands = dict(zip(_COLUMNS, kinds, strict=True)) | {Stand.BEHIND: Kind.BEHIND, Stand.MOVED: Kind.MOVED}
+            for stand, kind in stands.items():
                 answer, after = kind, state
-                if state is State.UNKNOWN and event is not Event.PREPARE:
+                if is_unknown and event is not Event.PREPARE:
                     answer = Kind.UNPREPARED  # R4: what was promised here may be forgotten
-                elif state is State.OVER and event is not Event.RELEASE and stand is not Stand.BEHIND:
+                elif state is State.OVER and stand is not Stand.BEHIND:
                     answer = Kind.OVER  # C4: after the end nothing is granted
-                elif state is State.SEALED and event is Event.LEASE and stand not in (Stand.BEHIND, Stand.MOVED):
+                elif is_sealed and event is Event.LEASE and kind not in (Kind.BEHIND, Kind.MOVED):
                     answer = Kind.SEALED  # C1: a sealed configuration leases nothing
-                elif state is State.SEALED and event is Event.PREPARE and kind is Kind.GRANTED:
+                elif is_sealed and event is Event.PREPARE and kind is Kind.GRANTED:
                     answer = Kind.SEALED  # A2: a promise tells what was accepted
-                elif event is Event.ACCEPT and kind is Kind.GRANTED:
-                    after = State.SEALED
-                elif event is Event.PREPARE and kind is Kind.GRANTED and state is State.UNKNOWN:
-                    after = State.OPEN
-                rows[state, event, stand] = answer, after
-    return rows
+                elif kind is Kind.GRANTED and (is_unknown or event is Event.ACCEPT):
+                    after = State.OPEN if is_unknown else State.SEALED
+                yield (state, event, stand), (answer, after)
 
 
-TABLE = _rows()
+TABLE = dict(_rows())
 """(state, event, stand) to (answer, next state)."""
 
 
@@ -136,9 +118,8 @@ TABLE = _rows()
 class Terms:
     """How one use of registers differs from another.
 
-    In the last ``ahead`` share of a lease what follows it is promised.  Under an accepted value its proposer has
-    ``finish`` seconds for itself before another may complete it.  With ``must_prepare`` a register that is unknown has to
-    be prepared before anything else.
+    In the last ``ahead`` share of a lease what follows it is promised.  An accepted value is left to its proposer for
+    ``finish`` seconds before another may complete it.  With ``must_prepare`` an unknown register has to be prepared.
     """
 
     ahead: float = 0.0
@@ -147,11 +128,10 @@ class Terms:
 
 
 class Acceptor(Generic[Key]):
-    """A member of quorums since ``born_at``; what its log may have forgotten it keeps silent about for the longest ttl."""
+    """A member since ``born_at``; about what its log may have forgotten it keeps silent for the longest ttl."""
 
-    def __init__(self, log: Log[Key], codec: Codec[Key], terms: Terms, born_at: float = -math.inf) -> None:
+    def __init__(self, log: Log[Key], terms: Terms, born_at: float = -math.inf) -> None:
         self.log = log
-        self._codec = codec
         self._terms = terms
         self._born_at = born_at
 
@@ -163,7 +143,7 @@ class Acceptor(Generic[Key]):
         ``ttl`` is that of the lease which is to follow.  A ballot of counter 0 only looks and is promised nothing: an
         acceptor whose lease has run out, because it missed an extension, is not to be lost to the healthy holder.
         """
-        found = self._judge(Event.PREPARE, key, configuration, ballot, now, ttl=ttl)
+        found = self._judge(key, _Question(Event.PREPARE, ballot, now, configuration, ttl=ttl))
         if isinstance(found, Reply):
             return found
         register, kind = found
@@ -173,14 +153,15 @@ class Acceptor(Generic[Key]):
             if ballot.counter > 0:
                 register.promised = ballot  # P1
                 register.reserve, register.reserved_until = reserve, now + reserve
-                self._keep(key, is_new)
+                if is_new:  # D1
+                    self.log.keep(key)
         reply = self._reply(kind, register, now)
-        is_own = ballot.is_kin(register.holder, self._codec.lives)
+        is_own = ballot.is_kin(register.holder, self.log.codec.lives)
         return reply._replace(remaining=0.0) if is_own else reply
 
     def lease(self, key: Key, configuration: int, ballot: Ballot, token: int, ttl: float, now: float) -> Reply:
         """Grant the lease for ``ttl`` seconds from now, or extend it."""
-        found = self._judge(Event.LEASE, key, configuration, ballot, now, token, ttl)
+        found = self._judge(key, _Question(Event.LEASE, ballot, now, configuration, token, ttl))
         if isinstance(found, Reply):
             return found
         register, kind = found
@@ -190,7 +171,8 @@ class Acceptor(Generic[Key]):
             register.promised, register.holder, register.token, register.ttl = promised, ballot, token, ttl
             register.grantee = ballot.proposer
             register.until, register.touched_at = now + ttl, now
-            self._keep(key, before != (promised, ballot, token, ttl))
+            if before != (promised, ballot, token, ttl):  # D1: what is answered is noted before
+                self.log.keep(key)
         return self._reply(kind, register, now)
 
     def accept(
@@ -208,7 +190,7 @@ class Acceptor(Generic[Key]):
         With ``gives_back`` a holder says that its own lease is given back (its device is at rest), and kept for it so
         long.  ``token`` is the highest that the proposer knows.
         """
-        found = self._judge(Event.ACCEPT, key, configuration, ballot, now, token, gives_back=gives_back)
+        found = self._judge(key, _Question(Event.ACCEPT, ballot, now, configuration, token, 0.0, gives_back))
         if isinstance(found, Reply):
             return found
         register, kind = found
@@ -218,39 +200,41 @@ class Acceptor(Generic[Key]):
             register.value, register.touched_at = value, now
             register.reserve, register.reserved_until = self._terms.finish, now + self._terms.finish
             register.hear_token(token)
-            self._keep(key, is_new)
+            if is_new:  # D1
+                self.log.keep(key)
         return self._reply(kind, register, now)
 
     def release(self, key: Key, ballot: Ballot, now: float, rest: float = 0.0) -> Reply:
         """End what was promised or leased under ``ballot``, or an older one of its life; what was accepted stays.
 
-        ``rest`` is how long the holder's device may still move: until then others are promised the lease, but not granted.
+        ``rest`` is how long the holder's device may still move: until then the lease is promised, but not granted.
         """
-        found = self._judge(Event.RELEASE, key, 0, ballot, now)
+        question = _Question(Event.RELEASE, ballot, now)
+        found = self._judge(key, question)
         if isinstance(found, Reply):
             return found
         register, kind = found
         if kind is Kind.GRANTED:
-            if self._stand(Event.RELEASE, register, 0, ballot, now) is Stand.HELD:
+            if self._stand(register, question) is Stand.HELD:
                 # It was promised for the time after another's lease, which goes on.
-                register.promised = max(register.promised, Ballot(ballot.counter + 1, self._codec.nobody))
+                register.promised = max(register.promised, Ballot(ballot.counter + 1, self.log.codec.nobody))
             else:
                 # B3: a request of that ballot may still be on its way: it comes too late.
                 register.spent = ballot
             if register.promised <= ballot:
                 register.reserve, register.reserved_until = 0.0, now
-            if ballot.is_kin(register.holder, self._codec.lives) and register.holder <= ballot:
+            if ballot.is_kin(register.holder, self.log.codec.lives) and register.holder <= ballot:
                 register.until = min(register.until, now + rest)
                 register.holder = register.holder if register.until > now else NONE
-            self._keep(key)
+            self.log.keep(key)  # D1
         return self._reply(kind, register, now)
 
     def close(self, key: Key, proposer: Name, configuration: int, token: int, now: float) -> Reply:
         """Grant nothing any more; ``remaining`` is how long another may still act.
 
-        A proposer names the token that it was granted here, even if it has given the lease back since; any other one is
-        refused.  Token 0 is the word of a caller that needs no lease.  Where the configuration is another one by now, or
-        may be, that one has to be asked as well.
+        A proposer names the token that it was granted here, even if it has given the lease back since.  Token 0 is the
+        word of a caller that needs no lease.  Where the configuration has changed, or may have, the next one has to be
+        asked as well.
         """
         register = self._known(key, now)
         if register is None:
@@ -259,7 +243,7 @@ class Acceptor(Generic[Key]):
             return self._reply(Kind.OUTBID if token < register.token else Kind.BEHIND, register, now)
         if not register.is_over:
             register.is_over, register.touched_at = True, now
-            self._keep(key)
+            self.log.keep(key)  # D1
         has_moved, is_sealed = configuration < register.configuration, register.accepted != NONE
         reply = self._reply(Kind.MOVED if has_moved else Kind.SEALED if is_sealed else Kind.OVER, register, now)
         is_done = register.holder.proposer == proposer and register.token == token
@@ -278,8 +262,8 @@ class Acceptor(Generic[Key]):
     ) -> Reply:
         """Learn that the configuration before has decided on ``value``, and above which token that goes on.
 
-        The caller has checked it: ``proof`` is the certificate.  Only the proposer of ``ballot`` is granted the lease for
-        ``ttl`` seconds.
+        The caller has checked the certificate ``proof``.  For ``ttl`` seconds the lease is kept for the proposer of
+        ``ballot``.
         """
         register = self._known(key, now)
         if register is None:
@@ -289,49 +273,30 @@ class Acceptor(Generic[Key]):
             register.holder, register.until = ballot, now if ballot == NONE else now + ttl
             register.touched_at, register.proof = now, proof
             register.hear_token(token, ballot.proposer)
-            register.ceiling = Ceiling(now, self._codec.lives, register.promised.counter, register.token)
-            self._keep(key)
+            register.ceiling = Ceiling(now, self.log.codec.lives, register.promised.counter, register.token)
+            self.log.keep(key)  # D1
         return self._reply(Kind.GRANTED if configuration == register.configuration else Kind.MOVED, register, now)
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
-    def _judge(
-        self,
-        event: Event,
-        key: Key,
-        configuration: int,
-        ballot: Ballot,
-        now: float,
-        token: int = 0,
-        ttl: float = 0.0,
-        gives_back: bool = False,
-    ) -> tuple[Register, Kind] | Reply:
+    def _judge(self, key: Key, question: _Question) -> tuple[Register, Kind] | Reply:
         """The register and the answer of the table; a register that nothing is granted in takes no room."""
-        quiet = self._silence(ttl) - now
+        event, ballot, now, *_ = question
+        quiet = self._silence(question.ttl) - now
         if quiet > 0.0 and event is not Event.RELEASE:  # R1: it may have granted what it has forgotten
             return Reply(Kind.QUIET, remaining=quiet)
         known = self.log.get(key)
         register = known or self.log.blank(now)
-        state = state_of(register)
-        if known is None and (self._terms.must_prepare or event is Event.RELEASE):
-            state = State.UNKNOWN
-        stand = self._stand(event, register, configuration, ballot, now, token, gives_back)
-        kind, _ = TABLE[state, event, stand]
+        is_unknown = known is None and (self._terms.must_prepare or event is Event.RELEASE)
+        state = State.UNKNOWN if is_unknown else state_of(register)
+        kind, _ = TABLE[state, event, self._stand(register, question)]
         if known is None and kind is Kind.GRANTED and ballot.counter > 0 and not self.log.enter(key, register, now):
             return Reply(Kind.QUIET, remaining=NO_ROOM)
         return register, kind
 
-    def _stand(
-        self,
-        event: Event,
-        register: Register,
-        configuration: int,
-        ballot: Ballot,
-        now: float,
-        token: int = 0,
-        gives_back: bool = False,
-    ) -> Stand:
-        lives = self._codec.lives
+    def _stand(self, register: Register, question: _Question) -> Stand:
+        event, ballot, now, configuration, token, _, gives_back = question
+        lives = self.log.codec.lives
         left = register.until - now
         is_own = ballot.is_kin(register.holder, lives)  # L2: an earlier life of the holder is another holder
         is_held = left > 0.0 and not is_own and not register.is_given_back
@@ -371,22 +336,11 @@ class Acceptor(Generic[Key]):
             return register if self.log.enter(key, register, now) else None
         return register
 
-    def _keep(self, key: Key, is_new: bool = True) -> None:
-        if is_new:  # D1: what is answered is noted before
-            self.log.keep(key)
-
     def _reply(self, kind: Kind, register: Register, now: float) -> Reply:
         remaining = max(0.0, register.until - now, register.reserved_until - now)
-        return Reply(
-            kind,
-            register.promised,
-            register.token,
-            remaining,
-            register.configuration,
-            register.accepted,
-            register.value,
-            register.proof if kind is Kind.MOVED else b"",
-        )
+        proof = register.proof if kind is Kind.MOVED else b""
+        known = register.promised, register.token, remaining, register.configuration, register.accepted, register.value
+        return Reply(kind, *known, proof)
 
 
 def state_of(register: Register) -> State:

@@ -67,8 +67,8 @@ class Codec(Protocol[Key]):
 class Log(Generic[Key]):
     """The registers of one acceptor, in memory and in ``notes``.
 
-    ``is_whole`` says that nothing which an earlier process noted is missing.  ``may_forget`` says whether a register can
-    harm nothing any more.
+    ``is_whole`` says that nothing which an earlier process noted is missing, ``may_forget`` whether a register can be
+    asked for no more.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class Log(Generic[Key]):
     ) -> None:
         self.registers: dict[Key, Register] = {}
         self._notes = notes
-        self._codec = codec
+        self.codec = codec
         self._may_forget = may_forget
         self._buckets: dict[str, dict[Key, None]] = {}
         floor = codec.unpack_floor(notes.noted(codec.floor_name))
@@ -103,8 +103,8 @@ class Log(Generic[Key]):
         """A new register, not entered yet."""
         counter, token, _ = self.floor
         # R3: a ballot that may have been promised, or outbid, before it was forgotten is lower.
-        promised = Ballot(counter + 1, self._codec.nobody) if counter else NONE
-        ceiling = Ceiling(now, self._codec.lives, counter, token)
+        promised = Ballot(counter + 1, self.codec.nobody) if counter else NONE
+        ceiling = Ceiling(now, self.codec.lives, counter, token)
         return Register(ceiling, promised=promised, token=token, touched_at=now)
 
     def enter(self, key: Key, register: Register, now: float) -> bool:
@@ -120,21 +120,21 @@ class Log(Generic[Key]):
         if longest > self.floor.longest:
             self.floor = self.floor._replace(longest=longest)
             self._note_floor()
-        self._note(self._codec.bucket_of(key))
+        self._note(self.codec.bucket_of(key))
 
     def clear(self) -> None:
         """Forget everything: what others rely on of this acceptor is void."""
         self.registers.clear()
         self._buckets.clear()
         self.floor, self.is_whole = Floor(), True
-        for name in self._codec.names:
+        for name in self.codec.names:
             if self._notes.noted(name):
                 self._note(name)
         self._note_floor()
 
     def _add(self, key: Key, register: Register) -> None:
         self.registers[key] = register
-        self._buckets.setdefault(self._codec.bucket_of(key), {})[key] = None
+        self._buckets.setdefault(self.codec.bucket_of(key), {})[key] = None
 
     def _make_room(self, now: float) -> bool:
         """Forget old registers that can harm nothing."""
@@ -147,7 +147,7 @@ class Log(Generic[Key]):
             counter, token, longest = self.floor
             # R3: nothing that was forgotten lies above the floor.
             self.floor = Floor(max(counter, register.promised.counter), max(token, register.token), longest)
-            name = self._codec.bucket_of(key)
+            name = self.codec.bucket_of(key)
             del self._buckets[name][key]
             gone.add(name)
         if gone:
@@ -158,7 +158,7 @@ class Log(Generic[Key]):
 
     def _note(self, name: str) -> None:
         rows = {key: self.registers[key] for key in self._buckets.get(name, ())}
-        self._notes.note(name, self._codec.pack(rows))
+        self._notes.note(name, self.codec.pack(rows))
 
     def _note_floor(self) -> None:
-        self._notes.note(self._codec.floor_name, self._codec.pack_floor(self.floor))
+        self._notes.note(self.codec.floor_name, self.codec.pack_floor(self.floor))

@@ -52,12 +52,11 @@ class Reply(NamedTuple):
 class Register:
     """What an acceptor has promised, leased and accepted.
 
-    ``promised`` is the highest ballot promised; that promise is leased for ``reserve`` seconds, ``reserved_until`` then.
-    ``holder`` is the ballot of the lease, granted for ``ttl`` seconds ``until`` then; ``spent`` is the highest ballot
-    that was given back, by a holder whose device comes to rest until ``until``.  ``token`` is the fencing token, and
-    ``grantee`` the proposer to which this acceptor granted it, empty where it only heard of it.  ``value`` was accepted for
-    ever under ``accepted``; where that is none it is the present configuration, as far as known, and ``proof`` the
-    certificate of it.  Moments mean nothing to a later process and are not stored.
+    ``promised`` is the highest ballot promised, leased for ``reserve`` seconds, ``reserved_until`` then.  ``holder`` is
+    the ballot of the lease, granted for ``ttl`` seconds ``until`` then; ``spent`` the highest ballot given back.
+    ``token`` is the fencing token, ``grantee`` the proposer to which it was granted here, empty where it was only heard
+    of.  ``value`` was accepted for ever under ``accepted``; where that is none it is the present configuration, as far
+    as known, and ``proof`` its certificate.  Moments are on the clock of one process and are not stored.
     """
 
     ceiling: Ceiling

@@ -85,10 +85,10 @@ class Round:
     """``outcome`` fires with the round as soon as each of its ``tallies`` is decided.
 
     ``ask`` asks the member of a place.  A member where another's lease ends within ``short`` seconds is asked again
-    then, or soon where that is long.  An answer that ``decode`` does not take is none.  ``outcome`` also fires, undecided,
-    when everybody answered or ``patience`` seconds have passed, and soon after a majority has answered.  A member that
-    has not answered is asked every ``PAUSE`` seconds until the round is decided, and at least ``TRIES`` times in all; or
-    only once, where it is ``single``: then the transport asks again, and its failure is the member's answer.
+    then, or soon where that is long.  ``outcome`` also fires, undecided, when all answered or ``patience`` seconds have
+    passed, and soon after a majority has answered.  A silent member is asked every ``PAUSE`` seconds until the
+    round is decided, and at least ``TRIES`` times; or, where it is ``single``, once: then the transport asks again, and
+    its failure is the answer.
     """
 
     def __init__(

@@ -213,4 +213,4 @@ class Seat:
             self._life = self._rng.randbytes(INCARNATION_BYTES)
             self._store.note(_INCARNATION, self._life)
         self._unsettled = {place: now for place, vote in log.registers.items() if vote.accepted != NONE}
-        return Acceptor(log, CODEC, TERMS)
+        return Acceptor(log, TERMS)

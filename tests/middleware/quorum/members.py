@@ -48,7 +48,7 @@ class Member:
 
     def restart(self, now: float) -> None:
         """Begin another process."""
-        self.acceptor = Acceptor(Log(self.store, self.use.codec, lambda *_: False, now), self.use.codec, self.use.terms)
+        self.acceptor = Acceptor(Log(self.store, self.use.codec, lambda *_: False, now), self.use.terms)
 
     def prepare(self, ballot: Ballot, now: float, reserve: float = 0.0, configuration: int = FIRST) -> Reply:
         """Ask for a promise."""

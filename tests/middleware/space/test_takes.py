@@ -19,7 +19,7 @@ from middleware.entangled.quorum.register import Reply
 from middleware.entangled.space.council import Council
 from middleware.entangled.space.keeper import Keeper
 from middleware.entangled.space.posting import Place, Posted
-from middleware.entangled.space.seat import CODEC, TERMS, Answers, Seat
+from middleware.entangled.space.seat import TERMS, Answers, Seat
 from middleware.entangled.space.tuplespace import TupleSpace
 
 TUPLES = 100
@@ -136,7 +136,7 @@ class FaultySeat(Seat):
     kind: type[Acceptor[Place]]
 
     def _load(self) -> Acceptor[Place]:
-        return self.kind(super()._load().log, CODEC, TERMS)
+        return self.kind(super()._load().log, TERMS)
 
 
 class NoBallots(VillageTrial):
