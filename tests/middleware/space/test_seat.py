@@ -20,6 +20,7 @@ from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address
 from middleware.entangled.quorum import log as module
 from middleware.entangled.quorum.acceptor import Event
+from middleware.entangled.quorum.ballot import Ballot
 from middleware.entangled.quorum.register import Kind
 from middleware.entangled.record import Record
 from middleware.entangled.space.posting import (
@@ -210,10 +211,56 @@ class SeatTests(SynchronousTestCase):
         self.assertEqual(self._kind(self.successResultOf(answer), Event.PREPARE), Kind.GRANTED)
 
     def test_release(self) -> None:
-        """A released lease lets the next one in."""
+        """A released lease lets the next one in; what was released is over, and nobody releases for another."""
         self.claim(place(1), lease=50.0)
-        self.seat.answer_release(PEER, KEY, [place(1).packed()], self.seat.incarnation, 1, b"a")
+        self.release(place(1), 1, b"b")
+        self.assertEqual(self.claim(place(1), 2, b"b"), Kind.HELD)
+        self.release(place(1), 1, b"a")
+        self.assertEqual((self.confirm(place(1)), self.claim(place(1))), (Kind.OUTBID, Kind.OUTBID))
         self.assertEqual(self.claim(place(1), 2, b"b"), Kind.GRANTED)
+
+    def release(self, where: Place, counter: int, taker: bytes) -> None:
+        """Give a claim back."""
+        self.seat.answer_release(PEER, KEY, [where.packed()], self.seat.incarnation, counter, taker)
+
+    def test_lower_ballots(self) -> None:
+        """What is lower than what was promised gets no promise and is not accepted, nor after a restart."""
+        self.claim(place(1), 5, b"b", lease=0.5)
+        for _ in range(2):
+            self.clock.advance(1.0)
+            self.assertEqual((self.claim(place(1), 4, b"a"), self.confirm(place(1), 5, b"a")), (Kind.OUTBID,) * 2)
+            self.seat = self.made(2)
+        self.assertEqual(self.confirm(place(1), 5, b"b"), Kind.GRANTED)
+
+    def test_a_claim_keeps_others_out(self) -> None:
+        """A claim is renewed by its taker alone, ends in time, and stands against no ballot that has won elsewhere."""
+        self.claim(place(1), 1, b"a", lease=2.0)
+        self.clock.advance(1.5)
+        self.assertEqual(self.claim(place(1), 2, b"b"), Kind.HELD)
+        self.assertEqual(self.claim(place(1), 3, b"a"), Kind.GRANTED)
+        self.clock.advance(1.5)
+        self.assertEqual(self.claim(place(1), 4, b"b"), Kind.HELD)
+        self.clock.advance(0.5)
+        self.assertEqual(self.claim(place(1), 4, b"b"), Kind.GRANTED)
+        self.assertEqual(self.confirm(place(1), 5, b"c"), Kind.GRANTED)
+
+    def test_what_was_accepted_is_told(self) -> None:
+        """A later claimant is told what to complete, once the one before it has had a second to finish."""
+        self.claim(place(1), 1, b"a", lease=100.0)
+        self.assertEqual([self.confirm(place(1)) for _ in range(2)], [Kind.GRANTED] * 2)
+        self.assertEqual(self.claim(place(1), 2, b"b"), Kind.HELD)
+        self.clock.advance(1.0)
+        self.assertEqual(self.claim(place(1), 2, b"b"), Kind.GRANTED)
+        told = self.seat.answer_claim(PEER, KEY, [place(1).packed()], self.seat.incarnation, 3, b"b", 1.0)
+        reply = unpack_reply(told[0], Event.PREPARE)  # type: ignore[index]
+        assert reply is not None
+        self.assertEqual((reply.accepted, reply.value), (Ballot(1, b"a"), b"a"))
+
+    def test_numbers_are_bounded(self) -> None:
+        """A claimant cannot use up the ballots of a tuple."""
+        self.assertEqual(self.claim(place(1), 2**48 - 1), Kind.OUTBID)
+        self.assertEqual(self.claim(place(1), 1), Kind.GRANTED)
+        self.assertEqual(self.confirm(place(1), 2**48 - 1), Kind.OUTBID)
 
     @settings(max_examples=300, deadline=None, derandomize=True, database=None)
     @given(foreign=FOREIGN, noise=st.binary(max_size=60))
