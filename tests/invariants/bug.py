@@ -29,11 +29,13 @@ from middleware.entangled.errors import EntangledError
 from middleware.entangled.kademlia import overlay
 from middleware.entangled.kademlia.overlay import Overlay
 from middleware.entangled.kademlia.roster import Roster
+from middleware.entangled.quorum import acceptor as acceptor_
 from middleware.entangled.quorum import round as round_
-from middleware.entangled.quorum.acceptor import Acceptor
+from middleware.entangled.quorum.acceptor import TABLE, Acceptor, Event, Stand, State
+from middleware.entangled.quorum.ballot import NONE, Ballot
 from middleware.entangled.quorum.log import Log
 from middleware.entangled.quorum.proposer import Result, conclude
-from middleware.entangled.quorum.register import Kind, Reply
+from middleware.entangled.quorum.register import Kind, Register, Reply
 from middleware.entangled.quorum.round import Round, Tally
 from middleware.entangled.record import Record, Slot
 from middleware.entangled.replication import owner, reader
@@ -88,6 +90,8 @@ _GENUINE = {
         (Seat, "_load"),
         (Log, "keep"),
         (Acceptor, "release"),
+        (Acceptor, "_stand"),
+        (Register, "wake"),
     ]
 }
 
@@ -203,6 +207,42 @@ async def _decided_by_the_new(self: Council, ballot: Any, members: Any, keep: bo
     return await self._asked(members, "lease.change", question, (Kind.GRANTED,)).outcome
 
 
+def _row(event: Event, stand: Stand, kind: Kind, state: State = State.OPEN) -> list[tuple[Any, str, Any]]:
+    """The table with another answer in one row."""
+    return [(acceptor_, "TABLE", {**TABLE, (state, event, stand): (kind, TABLE[state, event, stand][1])})]
+
+
+def _forgets_promises(self: Log[Any], key: Any) -> None:
+    register = self.registers[key]
+    promised, register.promised = register.promised, max(register.holder, register.accepted)
+    if register.promised != NONE:
+        _GENUINE[Log, "keep"](self, key)
+    register.promised = promised
+
+
+def _wakes_free(self: Register, now: float, lives: int) -> None:
+    _GENUINE[Register, "wake"](self, now, lives)
+    self.until = self.reserved_until = 0.0
+
+
+def _any_configuration(self: Acceptor[Any], register: Register, question: Any) -> Any:
+    return _GENUINE[Acceptor, "_stand"](self, register, question._replace(configuration=register.configuration))
+
+
+def _nothing_is_lower(self: Acceptor[Any], register: Register, question: Any) -> Any:
+    stand = _GENUINE[Acceptor, "_stand"](self, register, question)
+    return Stand.FREE if stand is Stand.LOWER else stand
+
+
+def _lowest_accepted(self: Tally) -> Any:
+    accepted = [self.replies[place] for place in self.agreed if self.replies[place].accepted != NONE]
+    return min(accepted, key=lambda reply: reply.accepted).value if accepted else None
+
+
+def _same_name(self: Ballot, other: Ballot, lives: int) -> bool:
+    return bool(self.proposer == other.proposer)
+
+
 BUGS: dict[str, list[tuple[Any, str, Any]]] = {
     "tombstone dropped too early": [(owner, "TOMBSTONE_TTL", 3.0)],
     "acknowledged by a minority": [(Overlay, "voters", lambda self, key, targets: [c.node_id for c in targets[:1]])],
@@ -229,6 +269,21 @@ BUGS: dict[str, list[tuple[Any, str, Any]]] = {
     "the lease of the dead never ends": [(Seat, "_claimed", _claimed_for_ever)],
     "a take is not noted": [(Keeper, "note", _nothing), (Keeper, "doubt", _idle)],
     "who waits is not woken": [(Shelf, "_changed", _told_what_is_known)],
+    # Quorums.
+    "lower ballots are accepted": [(Acceptor, "_stand", _nothing_is_lower)],
+    "what was accepted is not completed": [(Tally, "to_complete", property(lambda self: None))],
+    "the lowest accepted value is completed": [(Tally, "to_complete", property(_lowest_accepted))],
+    "promises are not stored": [(Log, "keep", _forgets_promises)],
+    "a restart ends leases": [(Register, "wake", _wakes_free)],
+    "a lease is granted while another runs": _row(Event.LEASE, Stand.HELD, Kind.GRANTED),
+    "a lease is granted before the device rests": _row(Event.LEASE, Stand.ENDING, Kind.GRANTED),
+    "a promise ends the lease before it": _row(Event.LEASE, Stand.OVERTAKEN, Kind.OUTBID),
+    "a sealed council grants leases": _row(Event.LEASE, Stand.FREE, Kind.GRANTED, State.SEALED),
+    "a council changes while a lease runs": _row(Event.ACCEPT, Stand.HELD, Kind.GRANTED),
+    "a council that is over grants leases": [(Acceptor, "_stand", _any_configuration)],
+    "an earlier life holds the same lease": [(Ballot, "is_kin", _same_name)],
+    "a promise bars nobody": _row(Event.PREPARE, Stand.LOWER, Kind.GRANTED),
+    "a reservation keeps out what has won": _row(Event.ACCEPT, Stand.RESERVED, Kind.HELD),
     # The wire.
     "questions are not remembered": [(Ledger, "entry", _never_known)],
     "the window moves before the tag is checked": [(Session, "open", _moved_before_it_is_opened)],
@@ -277,6 +332,20 @@ FINDERS: dict[str, tuple[str, ...]] = {
     "the lease of the dead never ends": ("tuples",),
     "a take is not noted": ("tuples",),
     "who waits is not woken": ("tuples",),
+    "lower ballots are accepted": ("tuples", "leases"),
+    "what was accepted is not completed": ("tuples",),
+    "the lowest accepted value is completed": ("tuples",),
+    "promises are not stored": ("leases", "tuples"),
+    "a restart ends leases": ("leases",),
+    "a lease is granted while another runs": ("leases",),
+    "a lease is granted before the device rests": ("leases",),
+    "a promise ends the lease before it": ("leases",),
+    "a sealed council grants leases": ("leases",),
+    "a council changes while a lease runs": ("leases",),
+    "a council that is over grants leases": ("leases",),
+    "an earlier life holds the same lease": ("leases",),
+    "a promise bars nobody": ("leases",),
+    "a reservation keeps out what has won": ("tuples",),
     "questions are not remembered": ("wire",),
     "the window moves before the tag is checked": ("wire",),
     "a greeting is answered twice": ("wire",),
