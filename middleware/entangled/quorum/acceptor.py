@@ -17,8 +17,8 @@ from middleware.entangled.quorum.ballot import FIRST, NONE, Ballot, Ceiling, Nam
 from middleware.entangled.quorum.log import Key, Log
 from middleware.entangled.quorum.register import Kind, Register, Reply
 
-NO_ROOM = 1.0
-"""Seconds after which a proposer may ask again where there was no room for its register."""
+NO_ROOM = Reply(Kind.QUIET, remaining=1.0)
+"""The answer where there is no room for a register: ask again in a second."""
 
 
 class State(Enum):
@@ -143,37 +143,31 @@ class Acceptor(Generic[Key]):
         ``ttl`` is that of the lease which is to follow.  A ballot of counter 0 only looks and is promised nothing: an
         acceptor whose lease has run out, because it missed an extension, is not to be lost to the healthy holder.
         """
-        found = self._judge(key, _Question(Event.PREPARE, ballot, now, configuration, ttl=ttl))
-        if isinstance(found, Reply):
-            return found
-        register, kind = found
-        if kind in (Kind.GRANTED, Kind.SEALED):
+        register, reply = self._judge(key, _Question(Event.PREPARE, ballot, now, configuration, ttl=ttl))
+        if reply.kind in (Kind.GRANTED, Kind.SEALED):
             register.touched_at = now
-            is_new = ballot > register.promised or reserve != register.reserve
             if ballot.counter > 0:
+                is_new = ballot > register.promised or reserve != register.reserve
                 register.promised = ballot  # P1
                 register.reserve, register.reserved_until = reserve, now + reserve
-                if is_new:  # D1
+                if is_new:  # D1: what is answered is noted before
                     self.log.keep(key)
-        reply = self._reply(kind, register, now)
-        is_own = ballot.is_kin(register.holder, self.log.codec.lives)
-        return reply._replace(remaining=0.0) if is_own else reply
+            reply = self._reply(reply.kind, register, now)
+        return reply._replace(remaining=0.0) if ballot.is_kin(register.holder, self.log.codec.lives) else reply
 
     def lease(self, key: Key, configuration: int, ballot: Ballot, token: int, ttl: float, now: float) -> Reply:
         """Grant the lease for ``ttl`` seconds from now, or extend it."""
-        found = self._judge(key, _Question(Event.LEASE, ballot, now, configuration, token, ttl))
-        if isinstance(found, Reply):
-            return found
-        register, kind = found
-        if kind is Kind.GRANTED:
-            promised = max(register.promised, ballot)
-            before = register.promised, register.holder, register.token, register.ttl
-            register.promised, register.holder, register.token, register.ttl = promised, ballot, token, ttl
-            register.grantee = ballot.proposer
-            register.until, register.touched_at = now + ttl, now
-            if before != (promised, ballot, token, ttl):  # D1: what is answered is noted before
-                self.log.keep(key)
-        return self._reply(kind, register, now)
+        register, reply = self._judge(key, _Question(Event.LEASE, ballot, now, configuration, token, ttl))
+        if reply.kind is not Kind.GRANTED:
+            return reply
+        promised = max(register.promised, ballot)
+        before = register.promised, register.holder, register.token, register.ttl
+        register.promised, register.holder, register.token, register.ttl = promised, ballot, token, ttl
+        register.grantee = ballot.proposer
+        register.until, register.touched_at = now + ttl, now
+        if before != (promised, ballot, token, ttl):  # D1: what is answered is noted before
+            self.log.keep(key)
+        return self._reply(Kind.GRANTED, register, now)
 
     def accept(
         self,
@@ -190,19 +184,17 @@ class Acceptor(Generic[Key]):
         With ``gives_back`` a holder says that its own lease is given back (its device is at rest), and kept for it so
         long.  ``token`` is the highest that the proposer knows.
         """
-        found = self._judge(key, _Question(Event.ACCEPT, ballot, now, configuration, token, 0.0, gives_back))
-        if isinstance(found, Reply):
-            return found
-        register, kind = found
-        if kind is Kind.GRANTED:
-            is_new = (register.accepted, register.value) != (ballot, value)
-            register.promised = register.accepted = ballot
-            register.value, register.touched_at = value, now
-            register.reserve, register.reserved_until = self._terms.finish, now + self._terms.finish
-            register.hear_token(token)
-            if is_new:  # D1
-                self.log.keep(key)
-        return self._reply(kind, register, now)
+        register, reply = self._judge(key, _Question(Event.ACCEPT, ballot, now, configuration, token, 0.0, gives_back))
+        if reply.kind is not Kind.GRANTED:
+            return reply
+        is_new = (register.accepted, register.value) != (ballot, value)
+        register.promised = register.accepted = ballot
+        register.value, register.touched_at = value, now
+        register.reserve, register.reserved_until = self._terms.finish, now + self._terms.finish
+        register.hear_token(token)
+        if is_new:  # D1
+            self.log.keep(key)
+        return self._reply(Kind.GRANTED, register, now)
 
     def release(self, key: Key, ballot: Ballot, now: float, rest: float = 0.0) -> Reply:
         """End what was promised or leased under ``ballot``, or an older one of its life; what was accepted stays.
@@ -210,24 +202,22 @@ class Acceptor(Generic[Key]):
         ``rest`` is how long the holder's device may still move: until then the lease is promised, but not granted.
         """
         question = _Question(Event.RELEASE, ballot, now)
-        found = self._judge(key, question)
-        if isinstance(found, Reply):
-            return found
-        register, kind = found
-        if kind is Kind.GRANTED:
-            if self._stand(register, question) is Stand.HELD:
-                # It was promised for the time after another's lease, which goes on.
-                register.promised = max(register.promised, Ballot(ballot.counter + 1, self.log.codec.nobody))
-            else:
-                # B3: a request of that ballot may still be on its way: it comes too late.
-                register.spent = ballot
-            if register.promised <= ballot:
-                register.reserve, register.reserved_until = 0.0, now
-            if ballot.is_kin(register.holder, self.log.codec.lives) and register.holder <= ballot:
-                register.until = min(register.until, now + rest)
-                register.holder = register.holder if register.until > now else NONE
-            self.log.keep(key)  # D1
-        return self._reply(kind, register, now)
+        register, reply = self._judge(key, question)
+        if reply.kind is not Kind.GRANTED:
+            return reply
+        if self._stand(register, question) is Stand.HELD:
+            # It was promised for the time after another's lease, which goes on.
+            register.promised = max(register.promised, Ballot(ballot.counter + 1, self.log.codec.nobody))
+        else:
+            # B3: a request of that ballot may still be on its way: it comes too late.
+            register.spent = ballot
+        if register.promised <= ballot:
+            register.reserve, register.reserved_until = 0.0, now
+        if ballot.is_kin(register.holder, self.log.codec.lives) and register.holder <= ballot:
+            register.until = min(register.until, now + rest)
+            register.holder = register.holder if register.until > now else NONE
+        self.log.keep(key)  # D1
+        return self._reply(Kind.GRANTED, register, now)
 
     def close(self, key: Key, proposer: Name, configuration: int, token: int, now: float) -> Reply:
         """Grant nothing any more; ``remaining`` is how long another may still act.
@@ -238,7 +228,7 @@ class Acceptor(Generic[Key]):
         """
         register = self._known(key, now)
         if register is None:
-            return Reply(Kind.QUIET, remaining=NO_ROOM)
+            return NO_ROOM
         if token and (register.token, register.grantee) != (token, proposer):  # C5: a proof names the granted token
             return self._reply(Kind.OUTBID if token < register.token else Kind.BEHIND, register, now)
         if not register.is_over:
@@ -267,7 +257,7 @@ class Acceptor(Generic[Key]):
         """
         register = self._known(key, now)
         if register is None:
-            return Reply(Kind.QUIET, remaining=NO_ROOM)
+            return NO_ROOM
         if configuration > register.configuration:  # C3: configurations only rise
             register.configuration, register.value, register.accepted = configuration, value, NONE
             register.holder, register.until = ballot, now if ballot == NONE else now + ttl
@@ -279,20 +269,20 @@ class Acceptor(Generic[Key]):
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
-    def _judge(self, key: Key, question: _Question) -> tuple[Register, Kind] | Reply:
+    def _judge(self, key: Key, question: _Question) -> tuple[Register, Reply]:
         """The register and the answer of the table; a register that nothing is granted in takes no room."""
         event, ballot, now, *_ = question
-        quiet = self._silence(question.ttl) - now
-        if quiet > 0.0 and event is not Event.RELEASE:  # R1: it may have granted what it has forgotten
-            return Reply(Kind.QUIET, remaining=quiet)
         known = self.log.get(key)
         register = known or self.log.blank(now)
+        quiet = self._silence(question.ttl) - now
+        if quiet > 0.0 and event is not Event.RELEASE:  # R1: it may have granted what it has forgotten
+            return register, Reply(Kind.QUIET, remaining=quiet)
         is_unknown = known is None and (self._terms.must_prepare or event is Event.RELEASE)
         state = State.UNKNOWN if is_unknown else state_of(register)
         kind, _ = TABLE[state, event, self._stand(register, question)]
         if known is None and kind is Kind.GRANTED and ballot.counter > 0 and not self.log.enter(key, register, now):
-            return Reply(Kind.QUIET, remaining=NO_ROOM)
-        return register, kind
+            return register, NO_ROOM
+        return register, self._reply(kind, register, now)
 
     def _stand(self, register: Register, question: _Question) -> Stand:
         event, ballot, now, configuration, token, _, gives_back = question
@@ -330,11 +320,8 @@ class Acceptor(Generic[Key]):
 
     def _known(self, key: Key, now: float) -> Register | None:
         """A register to learn something about, or None where there is no room."""
-        register = self.log.get(key)
-        if register is None:
-            register = self.log.blank(now)
-            return register if self.log.enter(key, register, now) else None
-        return register
+        register = self.log.get(key) or self.log.blank(now)
+        return register if key in self.log.registers or self.log.enter(key, register, now) else None
 
     def _reply(self, kind: Kind, register: Register, now: float) -> Reply:
         remaining = max(0.0, register.until - now, register.reserved_until - now)

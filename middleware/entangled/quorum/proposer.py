@@ -7,7 +7,7 @@ from collections.abc import Awaitable, Callable
 from enum import Enum
 from typing import Any, NamedTuple
 
-from middleware.entangled.quorum.ballot import Ballot, Name
+from middleware.entangled.quorum.ballot import Ballot
 from middleware.entangled.quorum.register import Kind
 from middleware.entangled.quorum.round import Tally
 
@@ -56,52 +56,33 @@ def conclude(tally: Tally) -> Outcome:
     return Outcome(Result.HELD if Kind.HELD in kinds else Result.SILENT, None, counter, remaining)
 
 
-class Proposer:
-    """One proposer of one register; ``prepare`` and ``accept`` each ask every member under a ballot.
+async def decide(
+    ballot: Ballot,
+    value: Any,
+    prepare: Callable[[Ballot], Awaitable[Outcome]],
+    accept: Callable[[Ballot, Any], Awaitable[Outcome]],
+    sleep: Callable[[float], Awaitable[None]],
+    rng: random.Random,
+) -> tuple[Ballot, Any]:
+    """See a decision through, from ``ballot`` on, whatever it takes; return the last ballot and what was decided.
 
-    ``release`` gives a ballot back under which nothing is to be proposed.
+    ``value`` is proposed where nothing else was; with None nothing is, and None is returned where nothing was accepted.
     """
-
-    def __init__(
-        self,
-        name: Name,
-        prepare: Callable[[Ballot], Awaitable[Outcome]],
-        accept: Callable[[Ballot, Any], Awaitable[Outcome]],
-        release: Callable[[Ballot], object],
-        counter: int = 0,
-    ) -> None:
-        self._name = name
-        self._prepare = prepare
-        self._accept = accept
-        self._release = release
-        self._counter = counter
-
-    async def decide(self, value: Any, sleep: Callable[[float], Awaitable[object]], rng: random.Random) -> Any:
-        """See the decision through, whatever it takes, and return it.
-
-        ``value`` is proposed where nothing else was; with None nothing is, and None is returned where nothing was
-        accepted.  Ends only when a majority has decided, or with what ``sleep`` raises.
-        """
-        pause = BACK_OFF[0]
-        while True:
-            outcome = await self._attempt(value)
-            if outcome is None or outcome.result is Result.DECIDED:
-                return outcome and outcome.value
-            # Not for the whole of another's lease: it may end sooner, or with a decision.
-            await sleep(max(min(outcome.remaining, BACK_OFF[1]), pause * (0.5 + rng.random())))
-            pause = min(2 * pause, BACK_OFF[1])
-
-    async def _attempt(self, value: Any) -> Outcome | None:
-        """Both phases under a ballot above all that were seen; None where there is nothing to propose."""
-        ballot = Ballot(self._counter + 1, self._name)
-        prepared = await self._prepare(ballot)
-        self._counter = max(ballot.counter, prepared.counter)
-        if prepared.result is not Result.WON:
-            return prepared
-        chosen = value if prepared.value is None else prepared.value  # A2
-        if chosen is None:
-            self._release(ballot)
-            return None
-        accepted = await self._accept(ballot, chosen)
-        self._counter = max(self._counter, accepted.counter)
-        return Outcome(Result.DECIDED, chosen) if accepted.result is Result.WON else accepted
+    pause = BACK_OFF[0]
+    while True:
+        outcome = await prepare(ballot)
+        counter = max(ballot.counter, outcome.counter)
+        if outcome.result is Result.WON:
+            chosen = value if outcome.value is None else outcome.value  # A2
+            if chosen is None:
+                return ballot, None
+            outcome = await accept(ballot, chosen)
+            counter = max(counter, outcome.counter)
+            if outcome.result is Result.WON:
+                return ballot, chosen
+        if outcome.result is Result.DECIDED:
+            return ballot, outcome.value
+        # Not for the whole of another's lease: it may end sooner, or with a decision.
+        await sleep(max(min(outcome.remaining, BACK_OFF[1]), pause * (0.5 + rng.random())))
+        pause = min(2 * pause, BACK_OFF[1])
+        ballot = Ballot(counter + 1, ballot.proposer)

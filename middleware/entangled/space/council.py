@@ -17,7 +17,7 @@ from middleware.entangled.errors import EntangledError, NotRunning
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.quorum.acceptor import Event
 from middleware.entangled.quorum.ballot import Ballot
-from middleware.entangled.quorum.proposer import Outcome, Proposer, Result, conclude
+from middleware.entangled.quorum.proposer import Outcome, Result, conclude, decide
 from middleware.entangled.quorum.register import Reply
 from middleware.entangled.quorum.round import Round, Tally
 from middleware.entangled.space.posting import Member, Posted
@@ -79,9 +79,11 @@ class Council:
                 raise NotRunning("the tuple space was stopped while a take was being confirmed")
             await self._chores.sleep(seconds)
 
-        proposer = Proposer(bidder, prepare, accept, lambda ballot: self.release([posted], ballot), counter)
-        decided: bytes | None = await proposer.decide(value, sleep, self._rng)
-        return decided
+        ballot = Ballot(counter + 1, bidder)
+        ballot, decided = await decide(ballot, value, prepare, accept, sleep, self._rng)
+        if decided is None:
+            self.release([posted], ballot)
+        return decided  # type: ignore[no-any-return]
 
     async def _round(
         self, posted: Sequence[Posted], method: str, event: Event, ballot: Ballot, last: object

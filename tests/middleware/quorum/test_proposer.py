@@ -10,7 +10,7 @@ from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.quorum.ballot import Ballot
-from middleware.entangled.quorum.proposer import Outcome, Proposer, Result, conclude
+from middleware.entangled.quorum.proposer import Outcome, Result, conclude, decide
 from middleware.entangled.quorum.register import Kind, Reply
 from middleware.entangled.quorum.round import Tally
 from tests.middleware.quorum.members import LEASE, TAKE, Member, Use
@@ -70,7 +70,7 @@ class ConcludeTests(SynchronousTestCase):
 
 
 class DecideTests(SynchronousTestCase):
-    """Behaviour of ``Proposer.decide``, with the acceptors of both users."""
+    """Behaviour of ``decide``, with the acceptors of both users."""
 
     def decide(self, seed: int, use: Use) -> set[Any]:
         """What three proposers are told of one register, while losses and restarts come between their questions."""
@@ -98,8 +98,8 @@ class DecideTests(SynchronousTestCase):
             return await ask(lambda member: member.accept(ballot, value, now))
 
         for name, value in zip(use.names, use.values, strict=True):
-            deciding = Deferred.fromCoroutine(Proposer(name, prepare, accept, self.fail).decide(value, turn, rng))
-            deciding.addCallback(told.add)
+            deciding = decide(Ballot(1, name), value, prepare, accept, turn, rng)
+            Deferred.fromCoroutine(deciding).addCallback(lambda decided: told.add(decided[1]))
         for _ in range(20_000):
             if not waiting:
                 break
@@ -117,9 +117,9 @@ class DecideTests(SynchronousTestCase):
                 self.assertEqual(len(self.decide(seed, use)), 1, (use.key, seed))
 
     def test_nothing_to_propose(self) -> None:
-        """A proposer without a value gives back what it was promised, and completes what another began."""
+        """A proposer without a value proposes nothing, and completes what another began."""
         for use in (TAKE, LEASE):
-            member, released = Member(use), list[Ballot]()
+            member = Member(use)
 
             async def prepare(ballot: Ballot) -> Outcome:
                 return self._concluded(member.prepare(ballot, 9.0))  # noqa: B023
@@ -130,16 +130,14 @@ class DecideTests(SynchronousTestCase):
             async def sleep(seconds: float) -> None:
                 self.fail("nothing was in the way")
 
-            def decide(name: Any) -> Any:
-                proposer = Proposer(name, prepare, accept, released.append, 5)  # noqa: B023
-                return self.successResultOf(Deferred.fromCoroutine(proposer.decide(None, sleep, random.Random(1))))  # noqa: B023
-
-            first, second, third = use.names
-            self.assertEqual((decide(first), released), (None, [Ballot(6, first)]))
-            member.prepare(Ballot(7, second), 0.0)
-            member.accept(Ballot(7, second), use.values[1], 0.0)
-            member.restart(0.0)
-            self.assertEqual(decide(third), use.values[1])
+            first, second, third = (Ballot(number, name) for number, name in zip((6, 7, 8), use.names, strict=True))
+            rng, phases = random.Random(1), (prepare, accept, sleep)
+            told = Deferred.fromCoroutine(decide(first, None, *phases, rng))
+            self.assertEqual(self.successResultOf(told), (first, None))
+            member.prepare(second, 0.0)
+            member.accept(second, use.values[1], 0.0)
+            told = Deferred.fromCoroutine(decide(third, None, *phases, rng))
+            self.assertEqual(self.successResultOf(told), (third, use.values[1]))
 
     def _concluded(self, reply: Reply) -> Outcome:
         tally = Tally(1, (Kind.GRANTED, Kind.SEALED))
