@@ -60,7 +60,6 @@ class Team:
         self._seed = seed
         self._rates = rates
         self._places = {contact.public: n for n, contact in enumerate(self.contacts)}
-        self._by_id = {contact.node_id.hex(): n for n, contact in enumerate(self.contacts)}
         self._stores = [MemoryStore() for _ in range(self.n)]
         self._lives = 0
         self.bidders = [self.born(place) for place in range(self.n)]
@@ -110,12 +109,12 @@ class Team:
 
         self.radio.send(me.place, to, arrive)
 
-    def tell_freed(self, source: int, agent: str, task_id: str, rest: float) -> None:
-        """Carry the news that a lease was given back."""
-        to = self._by_id[agent]
+    def tell(self, source: int, contact: Contact, method: str, arguments: tuple[Any, ...]) -> None:
+        """Carry what nobody answers."""
+        to = self.place_of(contact)
 
         def arrive() -> None:
-            self.bidders[to].machine.take(self.bidders[to].freed, agent, task_id, 0, rest)
+            self.bidders[to].machine.take(self.bidders[to].answer, source, method, arguments)
 
         self.radio.send(source, to, arrive)
 
