@@ -39,11 +39,11 @@ class Tally:
         self.needed = majority(size)  # Q1
 
     def add(self, place: int, reply: Reply | None) -> None:
-        """Count the answer of one member; None for a member that cannot be heard.  A second one counts for nothing."""
+        """Count the answer of one member, which counts once (Q1); None for a member that cannot be heard."""
         if reply is None:
             self._lost.add(place)
         else:
-            self.replies.setdefault(place, reply)
+            self.replies[place] = reply
 
     @property
     def agreed(self) -> list[int]:

@@ -10,7 +10,7 @@ from middleware.commitment.acceptor import MAX_LISTENERS, LeaseAcceptor
 from middleware.commitment.lease_codec import LIFE
 from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.quorum import log
-from middleware.entangled.quorum.ballot import Ballot
+from middleware.entangled.quorum.ballot import ROOM, Ballot
 from middleware.entangled.quorum.register import Kind, Reply
 from tests.middleware.commitment.test_lease_codec import MEMBERS
 
@@ -161,6 +161,11 @@ class AcceptorTests(SynchronousTestCase):
             self.prepare(2, f"b{number:03d}", 0.5)
         told = self.acceptor.free("t", ballot(1, "a"), 1.0)
         self.assertEqual((len(told), told[-1]), (MAX_LISTENERS, f"b{3 * MAX_LISTENERS - 1:03d}"))
+
+    def test_numbers_are_bounded(self) -> None:
+        """The highest ballot that there is gets no promise, so that others can still ask."""
+        self.assertEqual(self.prepare(ROOM + 1, "a", 0.0).kind, Kind.OUTBID)
+        self.assertEqual(self.prepare(1, "b", 0.0).kind, Kind.GRANTED)
 
     def test_no_room(self) -> None:
         """A member that can remember no more tasks says so, and grants nothing that it would forget."""

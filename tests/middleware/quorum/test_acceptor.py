@@ -206,6 +206,13 @@ class NumberTests(SynchronousTestCase):
             self.assertEqual(member.lease(use.ballot(1, 0), ROOM + 1, 0.0).kind, Kind.OUTBID)
             self.assertEqual(member.prepare(huge, 1.0).kind, Kind.GRANTED)
 
+    def test_another_life(self) -> None:
+        """A proposer in another life waits for the lease of its former one, whose device may still move (L2)."""
+        member = Member(LEASE)
+        member.lease(LOW, 1, 0.0)
+        self.assertEqual(member.prepare(MID, 1.0).kind, Kind.GRANTED)
+        self.assertEqual(member.prepare(MID._replace(counter=MID.counter + 1), 1.0).kind, Kind.HELD)
+
     def test_restart(self) -> None:
         """Another process has promised, leased and accepted what the one before it had (D1, R2)."""
         for use in (TAKE, LEASE):
