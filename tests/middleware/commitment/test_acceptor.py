@@ -6,7 +6,7 @@ import math
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.commitment.acceptor import MAX_LISTENERS, LeaseAcceptor
+from middleware.commitment.acceptor import IDLE_AGE, MAX_LISTENERS, LeaseAcceptor
 from middleware.commitment.lease_codec import LIFE
 from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.quorum import log
@@ -218,6 +218,31 @@ class AcceptorTests(SynchronousTestCase):
         self.assertEqual(self.acceptor.install("t", 3, MEMBERS[:3], 9, 0.1).kind, Kind.GRANTED)
         self.assertEqual(self.acceptor.install("t", 2, MEMBERS[1:4], 5, 0.1).kind, Kind.MOVED)
         self.assertEqual(self.prepare(2, "b", 0.2, configuration=3).kind, Kind.HELD)
+
+    def test_restart(self) -> None:
+        """Another process leases what was leased for as long again, and keeps promises and tokens."""
+        store = MemoryStore()
+        self.acceptor = LeaseAcceptor(store, -math.inf)
+        self.prepare(2, "a", 0.0)
+        self.propose(2, "a", 5, 0.0)
+        self.acceptor = LeaseAcceptor(store, 50.0)
+        self.assertEqual(self.prepare(3, "b", 51.0).kind, Kind.HELD)
+        self.assertEqual(self.prepare(1, "b", 50.0 + TTL)[:3], (Kind.OUTBID, ballot(2, "a"), 5))
+        self.assertEqual(self.prepare(3, "b", 50.0 + TTL).kind, Kind.GRANTED)
+
+    def test_forgotten(self) -> None:
+        """What a member forgot for want of room leaves a floor under its ballots and tokens, also after a restart."""
+        self.patch(log, "MAX_REGISTERS", 1)
+        store = MemoryStore()
+        self.acceptor = LeaseAcceptor(store, -math.inf)
+        self.prepare(2, "b", 0.0)
+        self.propose(2, "b", 5, 0.0)
+        self.assertEqual(self.acceptor.prepare("u", 1, ballot(9, "a"), TTL, 0.9 * IDLE_AGE).kind, Kind.QUIET)
+        self.assertEqual(self.acceptor.prepare("u", 1, ballot(9, "a"), TTL, 1.1 * IDLE_AGE).kind, Kind.GRANTED)
+        self.patch(log, "MAX_REGISTERS", 2)
+        for acceptor in (self.acceptor, LeaseAcceptor(store, 1.2 * IDLE_AGE)):
+            asked = acceptor.prepare("t", 1, ballot(2, "a"), TTL, 1.3 * IDLE_AGE)
+            self.assertEqual((asked.kind, asked.token), (Kind.OUTBID, 5))
 
     def test_silence_after_a_restart(self) -> None:
         """Who may have forgotten grants nothing for the longest ttl, and says how long that is."""
