@@ -125,8 +125,8 @@ def team(node: SwarmNode) -> dict[str, Any]:
     """What team ``node`` is in; moments are unix seconds.
 
     An ``open`` one says in ``unprotected`` what that does not protect.  A ``closed`` one has a ``name``, a
-    ``fingerprint`` as ``swarm doctor`` shows it, and ``members`` with their roles and until when they are certified,
-    those first whose certificates end within ``ENDING_S``; ``me`` is this node.
+    ``fingerprint`` as ``swarm doctor`` shows it, and ``members`` with their roles, until when they are certified and
+    whether bootstrap nodes renew that, those first whose certificates end within ``ENDING_S``; ``me`` is this node.
     """
     closed = node.team
     if closed is None:
@@ -139,6 +139,7 @@ def team(node: SwarmNode) -> dict[str, Any]:
         "fingerprint": closed.door.fingerprint.hex(),
         "me": node.uuid,
         "until": me.not_after,
+        "is_renewable": me.is_renewable,
         "is_ending": me.not_after - now < ENDING_S,
         "known": len(found),
         "members": [
@@ -147,6 +148,7 @@ def team(node: SwarmNode) -> dict[str, Any]:
                 "name": each.name,
                 "roles": list(each.roles),
                 "until": each.not_after,
+                "is_renewable": each.is_renewable,
                 "is_ending": each.not_after - now < ENDING_S,
             }
             for each in found[:MAX_MEMBERS]

@@ -27,6 +27,7 @@ WORKS: dict[str, tuple[str, str]] = {
     "invitations": ("swarmnode.team.invitations", "the codes that can be used, and the members that used them"),
     "revoke": ("swarmnode.team.revoke", "put a member out, or end an invitation"),
     "rotate": ("swarmnode.team.rotate", "a new secret for the team"),
+    "renew": ("swarmnode.team.renew", "certify a member anew, also one that has expired"),
     "promote": ("swarmnode.team.promote", "let a member let others in"),
     "why": ("swarmnode.why", "who was chosen for a task, and why"),
     "doctor": ("swarmnode.doctor.command", "what keeps a node from its team, and what to do"),

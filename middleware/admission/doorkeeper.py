@@ -11,7 +11,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Collection
 from typing import Protocol
 
-from middleware.admission.certificate import ROOM, Member, entry_of, member_of, pass_of
+from middleware.admission.certificate import ROOM, Member, entries_of, member_by, member_of, pass_of
 from middleware.admission.membership import Membership
 from middleware.admission.roll import Roll
 from middleware.entangled.data.store import Store
@@ -99,29 +99,27 @@ class Doorkeeper:
     @property
     def me(self) -> Member:
         """What this node is in its team."""
-        return self._roll.known_as(self._me)
+        return self._roll.known_as(self._me, self._wall())
 
     @property
     def shown(self) -> bytes:
-        """The operator's last word about this node, or the pass that it got when it was let in."""
-        grant = self._roll.granted(self._me.public)
-        if grant is not None and grant[0].not_before >= self._me.not_before:
-            return pass_of(grant[1])
-        return self._membership().shown
+        """The operator's last word about this node, or the pass that it got when it was let in, as it was renewed."""
+        return self._roll.best_pass(self._me, self._membership().shown, self._wall())
 
     def judge(self, public: bytes, shown: bytes) -> str:
         """The name of the refusal of a node with this key that shows this pass; empty where it is let in."""
         try:
-            member = self._roll.known_as(self._read(public, shown))
+            member = self._read(public, shown)
         except RemoteError:
             return FOREIGN
-        return self._roll.refusal(member, self._wall()) or self._count_guest(member)
+        now = self._wall()
+        return self._roll.refusal(self._roll.known_as(member, now), now) or self._count_guest(member)
 
     def admit(self, public: bytes, shown: bytes) -> str:
         """Judge a node that has confirmed its session, and remember it where it is let in."""
         refusal = self.judge(public, shown)
         if not refusal:
-            member = self._roll.known_as(self._read(public, shown))
+            member = self._read(public, shown)
             refusal = self._list(public, shown, member)
         if not refusal:
             self._met[public] = member
@@ -146,14 +144,17 @@ class Doorkeeper:
         """Have a member on the membership list, so that all know it and the operator can revoke it by name.
 
         Returns the refusal of one for whom the list has no room: who is not on it is no member.  A guest is not listed;
-        its voucher is.
+        its voucher is.  A renewal that the list does not have is listed, too.
         """
-        entry = entry_of(public, shown) if member.voucher is None else None
-        if entry is not None and public != self._me.public and self.is_off_roll(public):
+        entries = entries_of(public, shown) if member.voucher is None else []
+        is_off_roll = self.is_off_roll(public)
+        if public != self._me.public and (is_off_roll or member.renewer):
             try:
-                self.list_entry(entry)
+                for entry in entries:
+                    if not self._roll.has(entry):
+                        self.list_entry(entry)
             except (Full, RemoteError):
-                return UNLISTED
+                return UNLISTED if is_off_roll else ""
         return ""
 
     def _count_guest(self, member: Member) -> str:
@@ -197,14 +198,18 @@ class Doorkeeper:
         """The operator's last word about an owner, or the pass that it showed; empty where neither is known."""
         if owner == self._me.public:
             return self.shown
-        grant, admission = self._roll.granted(owner), self._roll.admitted(owner)
-        if grant is not None and (admission is None or grant[0].not_before >= admission.member.not_before):
-            return pass_of(grant[1])
-        return self._shown.get(owner, b"") if admission is None else admission.shown
+        now, grant, admission = self._wall(), self._roll.granted(owner), self._roll.admitted(owner)
+        if admission is not None:
+            return self._roll.best_pass(admission.member, admission.shown, now)
+        if grant is not None:
+            return self._roll.best_pass(member_by(grant[0]), pass_of(grant[1]), now)
+        renewal = self._roll.renewal(owner)
+        return self._shown.get(owner, b"") if renewal is None else renewal.shown
 
     def is_off_roll(self, public: bytes) -> bool:
         """Whether the roll says nothing of the holder of ``public``: a guest, or a member of which it has yet to."""
-        return self._roll.granted(public) is None and self._roll.admitted(public) is None
+        known = self._roll.granted(public), self._roll.admitted(public), self._roll.renewal(public)
+        return known == (None, None, None)
 
     def learn(self, owner: bytes, certificate: bytes) -> bool:
         """Take in the pass of an owner that another node showed; whether it holds."""
@@ -214,17 +219,8 @@ class Doorkeeper:
         """What is known of the holder of ``public``, met or only heard of."""
         if public == self._me.public:
             return self.me
-        met = self._met.get(public)
-        if met is not None:
-            return self._roll.known_as(met)
-        admission = self._roll.admitted(public)
-        if admission is not None:
-            return self._roll.known_as(admission.member)
-        grant = self._roll.granted(public)
-        if grant is None:
-            return None
-        found, _ = grant
-        return Member(public, found.name, found.roles, found.not_before, found.not_after)
+        met, now = self._met.get(public), self._wall()
+        return self._roll.member(public, now) if met is None else self._roll.known_as(met, now)
 
     def swept(self) -> list[tuple[bytes, str]]:
         """Those that were met and are members no more, each with the name of the refusal; each is told once."""
@@ -232,7 +228,7 @@ class Doorkeeper:
         gone = [
             (public, refusal)
             for public, member in self._met.items()
-            if (refusal := self._roll.refusal(self._roll.known_as(member), now))
+            if (refusal := self._roll.refusal(self._roll.known_as(member, now), now))
         ]
         for public, _ in gone:
             del self._met[public]

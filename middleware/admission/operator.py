@@ -19,12 +19,14 @@ from middleware.admission.statement import (
     MAX_KEPT,
     MAX_LIFE,
     SECRET_BYTES,
+    YEAR,
     Grant,
     Invite,
     Revoke,
     Terms,
     member_id,
     named,
+    renewal_id,
     sealed_secret,
     signed,
     sized,
@@ -34,7 +36,6 @@ from middleware.entangled.errors import RemoteError
 from middleware.entangled.identity import Identity
 
 KIND = "swarm-node operator 1"
-YEAR = 365 * 86_400
 FIRST_SECRET = 1
 FIRST = ("device", "operator", "gateway", "bootstrap")
 """What the first node of a team may do: everything."""
@@ -94,15 +95,23 @@ class Operator:
         terms = Terms(drawn.key.public, sealed, int(now), end)
         return Invitation(drawn, signed(self.identity, invite), signed(self.identity, terms))
 
-    def revoke(self, public: bytes, name: str, now: float, kept: Iterable[bytes] = ()) -> bytes:
+    def revoke(
+        self,
+        public: bytes,
+        name: str,
+        now: float,
+        kept: Iterable[bytes] = (),
+        renewals: Iterable[tuple[bytes, int]] = (),
+    ) -> bytes:
         """Sign the end of a member's key or of an invitation's.
 
         ``kept`` are the public keys of the members that a bootstrap node admitted and that stay; the others go with it.
-        Raises ``ValueError`` where there are too many.
+        ``renewals`` are those of its renewals that go on to count, as the renewed key and its end.  Raises
+        ``ValueError`` where there are too many.
         """
-        ids = tuple(member_id(each) for each in kept)
+        ids = (*(member_id(each) for each in kept), *(renewal_id(*each) for each in renewals))
         if len(ids) > MAX_KEPT:
-            raise ValueError(f"a revocation keeps at most {MAX_KEPT} members, not {len(ids)}")
+            raise ValueError(f"a revocation keeps at most {MAX_KEPT} members and renewals, not {len(ids)}")
         return signed(self.identity, Revoke(public, name, int(now), int(now) + MAX_LIFE, ids))
 
     def rotate(self, number: int, members: Iterable[bytes], now: float, grace: float, rng: random.Random) -> bytes:

@@ -21,7 +21,7 @@ from middleware.admission.certificate import BOOTSTRAP, SKEW, chained, is_proof
 from middleware.admission.errors import WHY
 from middleware.admission.knock import Knock, Signer, Welcome
 from middleware.admission.roll import Roll, invitation_id, packed_admission
-from middleware.admission.statement import Invite
+from middleware.admission.statement import NUMBERED, Invite
 from middleware.entangled.errors import EntangledError, RemoteError
 from middleware.entangled.identity import Identity
 from middleware.entangled.network.network import Address
@@ -107,8 +107,8 @@ class Reception:
     async def _decide(self, heard: Knock, invite: Invite, packed: bytes) -> bytes | str:
         """The pass of who knocked, or the code of the refusal."""
         now = int(self._wall())
-        me = self._roll.granted(self._identity.public)
-        if me is None or BOOTSTRAP not in me[0].roles:
+        me, own = self._roll.granted(self._identity.public), self._roll.member(self._identity.public, now)
+        if me is None or own is None or BOOTSTRAP not in me[0].roles or self._roll.refusal(own, now):
             return "role"
         if self._roll.terms_of(invite.public) is None:
             return "old"
@@ -146,7 +146,7 @@ class Reception:
             return invite.name if invite.name not in taken else None
         if heard.wish:
             return heard.wish if heard.wish not in taken else None
-        free = (f"{invite.name[:36]}-{number}" for number in range(1, len(taken) + 2))
+        free = (f"{invite.name[:NUMBERED]}-{number}" for number in range(1, len(taken) + 2))
         return next((name for name in free if name not in taken), None)
 
     def _decided(

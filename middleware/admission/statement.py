@@ -26,6 +26,8 @@ DOMAIN = b"swarm-team-1 "
 ROLES = ("device", "operator", "viewer", "gateway", "bootstrap")
 """What a member may be; their places are the bits in which roles travel."""
 NAME = r"[A-Za-z0-9_-]{1,40}"
+NUMBERED = 36
+"""Letters of an invitation's name that go before the number of each newcomer by it."""
 MAX_USES = 100
 MAX_STATEMENT = 65_536
 MAX_TERMS = 320
@@ -36,10 +38,14 @@ MAX_LIFE = 10 * 365 * 86_400
 """Seconds for which a certificate can last."""
 REMEMBERED = 7 * 86_400
 """Seconds for which an invitation is remembered that has run out, so that its code is refused by name."""
+YEAR = 365 * 86_400
+"""Seconds of a certificate's life by default; one that the operator made for so long or longer is renewed."""
+EXPIRED_REMEMBERED_S = YEAR
+"""Seconds for which the list remembers a renewable certificate that has ended, so that the operator can renew it."""
 SECRET_BYTES = 32
 MEMBER_ID = 8
 MAX_KEPT = MAX_SEALED
-"""Members that one revocation of a bootstrap node can keep."""
+"""Members and renewals that one revocation of a bootstrap node can keep."""
 _LAST = 2**40
 _PUBLIC, _SIGNATURE, _MARK = 32, 64, 16
 
@@ -66,8 +72,13 @@ class Grant:
 
     @property
     def until(self) -> int:
-        """Until when it is worth being remembered."""
-        return self.not_after
+        """Until when it is worth being remembered: as long as what was said before of that key could last."""
+        return max(self.not_after, self.not_before + MAX_LIFE)
+
+    @property
+    def life(self) -> int:
+        """The seconds for which the operator made it."""
+        return self.not_after - self.not_before
 
 
 @dataclass(frozen=True)
@@ -101,6 +112,12 @@ class Invite:
         """Until when it is worth being remembered."""
         return self.not_after + REMEMBERED
 
+    def allows(self, name: str, wish: str) -> bool:
+        """Whether a newcomer that wished to be called ``wish`` (empty: as it comes) can have got ``name`` by it."""
+        if self.uses == 1:
+            return name == self.name
+        return name == wish if wish else name.startswith(f"{self.name[:NUMBERED]}-")
+
 
 @dataclass(frozen=True)
 class Terms:
@@ -131,8 +148,9 @@ class Terms:
 class Revoke:
     """The end of a member's key, or of an invitation's and with it of all that came by it; there is no way back.
 
-    ``name`` is what people called it.  ``kept`` freezes what a bootstrap node did: of those that it admitted, only the
-    members with these ids (``member_id``) stay, whatever dates their certificates bear.
+    ``name`` is what people called it.  ``kept`` freezes what a bootstrap node did, whatever dates it signs: of the
+    members that it admitted only those with these ids (``member_id``) stay, and of its renewals only those with these
+    ids (``renewal_id``) count.
     """
 
     public: bytes
@@ -219,6 +237,19 @@ def sealed_secret(
 def member_id(public: bytes) -> bytes:
     """Return the id by which a revocation names a member that it keeps."""
     return hashlib.blake2s(public, digest_size=MEMBER_ID, person=b"member").digest()
+
+
+def renewal_id(public: bytes, not_after: int) -> bytes:
+    """Return the id by which a revocation names a renewal that it keeps: that of ``public`` until ``not_after``."""
+    return hashlib.blake2s(public + not_after.to_bytes(8), digest_size=MEMBER_ID, person=b"renewal").digest()
+
+
+def remembered_until(not_after: int, life: int) -> int:
+    """Return until when the list remembers a certificate that ends at ``not_after`` and was made for ``life`` seconds.
+
+    What is not renewable goes when it ends.
+    """
+    return not_after + (EXPIRED_REMEMBERED_S if life >= YEAR else 0)
 
 
 def mark_of(secret: bytes) -> bytes:

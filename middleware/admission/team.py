@@ -12,18 +12,19 @@ from twisted.internet.interfaces import IReactorTime
 from twisted.logger import Logger
 
 from middleware.admission import knock
-from middleware.admission.certificate import Member, guest_pass
+from middleware.admission.certificate import Member, entries_of, guest_pass
 from middleware.admission.doorkeeper import Doorkeeper, Rules, begun
 from middleware.admission.errors import WHY, BadKeyFile
 from middleware.admission.gossip import COMPARED, Gossip
 from middleware.admission.knock import Welcome
 from middleware.admission.membership import Kept, Membership
 from middleware.admission.reception import Reception
-from middleware.admission.roll import MAX_ENTRIES, Admission, Entry, Roll, invitation_id, packed_admission
+from middleware.admission.renewal import Renewer
+from middleware.admission.roll import MAX_ENTRIES, Admission, Entry, Renewal, Roll, invitation_id
 from middleware.admission.statement import Grant, Invite, Revoke, Secret
 from middleware.entangled.background import Background
 from middleware.entangled.data.store import Store
-from middleware.entangled.errors import Full, Refused, RemoteError
+from middleware.entangled.errors import EntangledError, Full, Refused, RemoteError
 from middleware.entangled.identity import Identity, node_id
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.node import EntangledNode
@@ -81,6 +82,7 @@ class Team:
             self.roll, endpoint, node.overlay.contacts, self._rng, self._chores, self._wall, self._on_new
         )
         self.door.list_entry = self._gossip.add
+        self._renewer = Renewer(self.roll, self.identity, self.door.certificate, self._gossip.add, self._rng)
         reception = Reception(
             self.roll,
             self.identity,
@@ -174,9 +176,7 @@ class Team:
         except Exception:  # a rotten file may hold anything
             noted = []
         shown, public = self.membership.shown, self.identity.public
-        own = msgpack.unpackb(shown)
-        known = {0: [own[1]], 1: [packed_admission(public, shown)]}.get(own[0], [])  # of a guest nothing is kept
-        for packed in [*(noted if isinstance(noted, list) else []), *known]:
+        for packed in [*(noted if isinstance(noted, list) else []), *entries_of(public, shown)]:
             try:
                 self.roll.add(packed, self._wall())
             except (RemoteError, Full):
@@ -195,23 +195,64 @@ class Team:
         self._store.note(ROLL, msgpack.packb(self.roll.packed()))
         if isinstance(entry, Revoke):
             self._log.info("revoked: {name}", name=entry.name)
+            self._keep_pass()
             self._sweep()
             self._part_with(entry.public)
         elif isinstance(entry, Secret):
             self._heard_of(entry)
         elif isinstance(entry, Grant):
-            if entry.public == self.identity.public:
-                self._keep(replace(self.membership, shown=self.door.shown))
+            self._keep_pass()
             self._sweep()
         elif isinstance(entry, Admission):
             self._log.info("{name} is a member now", name=entry.member.name)
+        elif isinstance(entry, Renewal):
+            self._keep_pass()
+            self._log.info("the certificate of {name} is renewed", name=entry.member.name)
 
     def _look_after(self) -> None:
         self._sweep()
         self._go_by_secrets()
+        if self._renewer.is_time(self._wall()):
+            self._chores.fork(self._renew_due())
         newest = next(iter(self.roll.secrets()), None)
         if newest is not None and newest.number > self.membership.secrets[0][0]:
             self._chores.fork(self._ask_for(newest))
+
+    async def _renew_due(self) -> None:
+        """Renew some of the members that are due and present."""
+        due = [each for each in self._renewer.find_due(self._wall()) if self._may_be_here(each)]
+        for member in self._renewer.pick(due):
+            if await self._is_here(member):
+                self._renewer.renew(member, self._wall())
+
+    def _may_be_here(self, member: Member) -> bool:
+        """Whether ``member`` is in sight, or may be, since in a large network a node does not see everybody."""
+        assert self._node is not None
+        is_me = member.public == self.identity.public
+        overlay = self._node.overlay
+        return is_me or overlay.is_large or overlay.contact(node_id(member.public)) is not None
+
+    async def _is_here(self, member: Member) -> bool:
+        """Whether ``member`` is this node, or answers."""
+        assert self._node is not None
+        if member.public == self.identity.public:
+            return True
+        overlay, place = self._node.overlay, node_id(member.public)
+        contact = overlay.contact(place)
+        if contact is None:
+            found = await overlay.lookup(place)
+            contact = next((each for each in found if each.public == member.public), None)
+        if contact is None:
+            return False
+        try:
+            await overlay.check(contact)
+        except EntangledError:
+            return False
+        return True
+
+    def _keep_pass(self) -> None:
+        """Keep the pass that this node shows now, for its next start."""
+        self._keep(replace(self.membership, shown=self.door.shown))
 
     def _sweep(self) -> None:
         if self._node is not None:

@@ -92,7 +92,7 @@ def certificate(facts: Facts) -> Iterator[Finding]:
             "certificate-ends",
             f"The node's certificate ends in {_span(own.not_after - now)}.",
             f"Its last moment is {_day(own.not_after)}.",
-            "Have the operator invite it anew before that.",
+            "Let it run in sight of a bootstrap node for an hour, or have the operator renew it: swarm renew NAME.",
         )
 
 

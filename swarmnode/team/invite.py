@@ -7,8 +7,7 @@ import io
 from collections.abc import Sequence
 from typing import Any
 
-from middleware.admission.operator import YEAR
-from middleware.admission.statement import MAX_USES, ROLES
+from middleware.admission.statement import MAX_USES, ROLES, YEAR
 from swarmnode.asker import Refusal
 from swarmnode.team.office import Desk, Wrong, known, operator_in, options, run, seconds, span, tell
 
@@ -25,7 +24,12 @@ def main(words: Sequence[str] | None = None, desk: Desk | None = None) -> int:
     invite.add_argument("--uses", type=int, default=1, metavar="N", help=f"newcomers that may use it, 1 to {MAX_USES}")
     invite.add_argument("--expires", type=seconds, default=DAY, metavar="TIME", help="until when, as 10m or 24h (24h)")
     invite.add_argument(
-        "--for", dest="life", type=seconds, default=float(YEAR), metavar="TIME", help="how long it is a member (365d)"
+        "--for",
+        dest="life",
+        type=seconds,
+        default=float(YEAR),
+        metavar="TIME",
+        help="how long it is a member (365d); a year or more is renewed",
     )
     wishes = invite.parse_args(words)
     return run("invite", lambda: _invited(wishes, desk), wishes.json, desk.out)

@@ -1,4 +1,4 @@
-"""Members: ``swarm members``, who belongs to the team, and which invitations are open."""
+"""Members: ``swarm members``, who belongs to the team until when, and which invitations are open."""
 
 from __future__ import annotations
 
@@ -23,10 +23,15 @@ def main(words: Sequence[str] | None = None, desk: Desk | None = None) -> int:
                 "name": each.name,
                 "roles": list(each.roles),
                 "until": each.not_after,
+                "renews": each.is_renewable,
                 "at": found.here.get(each.public, ""),
                 "key": each.public.hex(),
             }
             for each in found.members(now)
+        ]
+        expired: list[dict[str, Any]] = [
+            {"name": each.name, "roles": list(each.roles), "until": each.not_after, "key": each.public.hex()}
+            for each in found.expired(now)
         ]
         used = [each.member.invitation for each in found.roll.admissions()]
         open_: list[dict[str, Any]] = [
@@ -37,17 +42,22 @@ def main(words: Sequence[str] | None = None, desk: Desk | None = None) -> int:
             if used.count(each.public) < each.uses
         ]
         revoked = [{"name": each.name, "at": each.at, "key": each.public.hex()} for each in found.roll.revocations()]
-        width = max((len(row["name"]) for row in [*rows, *open_]), default=0)
+        width = max((len(row["name"]) for row in [*rows, *expired, *open_]), default=0)
         lines = [f"team {found.team}, secret number {found.secret}"]
         for row in rows:
             until = time.strftime("%Y-%m-%d", time.gmtime(row["until"]))
             where = place(row["at"])
-            lines.append(f"  {row['name']:{width}}  {', '.join(row['roles'])}  until {until}  {where}")
+            renewal = "renewed automatically" if row["renews"] else "not renewed"
+            lines.append(f"  {row['name']:{width}}  {', '.join(row['roles'])}  until {until}, {renewal}  {where}")
+        for row in expired:
+            until = time.strftime("%Y-%m-%d", time.gmtime(row["until"]))
+            lines.append(f"  {row['name']:{width}}  expired {until}; to let it in again: swarm renew {row['name']}")
         for row in open_:
             until = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(row["until"]))
             lines.append(f"  {row['name']:{width}}  invited, {row['left']} left, until {until}")
         lines += [f"  {row['name']:{width}}  revoked" for row in revoked]
-        return {"team": found.team, "members": rows, "invitations": open_, "revoked": revoked}, lines
+        about = {"members": rows, "expired": expired, "invitations": open_, "revoked": revoked}
+        return {"team": found.team, **about}, lines
 
     return run("members", work, wishes.json, desk.out)
 

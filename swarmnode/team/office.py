@@ -25,6 +25,7 @@ from middleware.entangled.control.command import FAILED, WRONG, Ask, asked
 from middleware.entangled.control.place import NoControl, found
 from middleware.entangled.control.word import printable
 from middleware.entangled.errors import RemoteError
+from middleware.entangled.wire.door import EXPIRED
 from swarmnode.asker import Refusal
 
 VARIABLE = "SWARM_OPERATOR"
@@ -60,10 +61,16 @@ class Known:
         """All members, by name."""
         return self.roll.members(now)
 
-    def member(self, name: str, now: float) -> Member:
-        """The member that is called so; raises ``Refusal``."""
+    def expired(self, now: float) -> list[Member]:
+        """Those whose certificates have ended, and that the operator did not revoke."""
+        return [each for each, refusal in self.roll.remembered(now) if refusal == EXPIRED]
+
+    def member(self, name: str, now: float, has_expired: bool = False) -> Member:
+        """The member that is called so, or else, where ``has_expired``, one that has; raises ``Refusal``."""
         members = self.members(now)
-        called = [each for each in members if each.name == name or each.public.hex() == name]
+        called = [each for each in members if name in (each.name, each.public.hex())]
+        if not called and has_expired:
+            called = [each for each in self.expired(now) if name in (each.name, each.public.hex())]
         if len(called) == 1:
             return called[0]
         if called:

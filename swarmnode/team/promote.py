@@ -21,9 +21,9 @@ def main(words: Sequence[str] | None = None, desk: Desk | None = None) -> int:
         operator = operator_in(wishes.operator)
         member = known(wishes.node, desk, operator).member(wishes.name, desk.wall())
         roles = tuple(dict.fromkeys([*member.roles, wishes.role]))
-        # Later than what it had, or it would not hold; and as long as that.
-        begin = max(int(desk.wall()), member.not_before + 1)
-        life = max(1, member.not_after - begin)
+        # Later than the operator's last word, or it would not hold; what is not renewed ends when it did.
+        begin = max(int(desk.wall()), member.since + 1)
+        life = member.life if member.is_renewable else max(1, member.not_after - begin)
         tell(wishes.node, desk, operator.grant(member.public, member.name, roles, begin, life))
         return {"name": member.name, "roles": list(roles)}, [f"{member.name} is now {', '.join(roles)}"]
 

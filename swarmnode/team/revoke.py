@@ -17,7 +17,7 @@ def main(words: Sequence[str] | None = None, desk: Desk | None = None) -> int:
     revoke = options("revoke", "Put a member out of the team, or end an invitation and put out all that came by it.")
     revoke.add_argument("name", metavar="NAME", help="of a member, or of an invitation; or its key in hexadecimal")
     revoke.add_argument("--invitation", action="store_true", help="the invitation of that name, not the member")
-    revoke.add_argument("--all", action="store_true", help="a bootstrap node: with all that it let in")
+    revoke.add_argument("--all", action="store_true", help="a bootstrap node: with all that it let in or renewed")
     wishes = revoke.parse_args(words)
 
     def work() -> tuple[Any, list[str]]:
@@ -25,8 +25,10 @@ def main(words: Sequence[str] | None = None, desk: Desk | None = None) -> int:
         found = known(wishes.node, desk, operator)
         public, what, came = _meant(found, wishes.name, wishes.invitation, desk.wall())
         kept = [] if wishes.all else _admitted_by(found, public, desk.wall())
+        renewals = [] if wishes.all else _renewed_by(found, public, desk.wall())
         try:
-            statement = operator.revoke(public, wishes.name[:40], desk.wall(), [each.public for each in kept])
+            keys = [each.public for each in kept]
+            statement = operator.revoke(public, wishes.name[:40], desk.wall(), keys, renewals)
         except ValueError as error:
             raise Refusal(f"{error}; say --all, and invite those that are to stay anew") from error
         tell(wishes.node, desk, statement)
@@ -42,8 +44,12 @@ def main(words: Sequence[str] | None = None, desk: Desk | None = None) -> int:
 
 def _admitted_by(found: Known, public: bytes, now: float) -> list[Member]:
     """Return the present members that the bootstrap node ``public`` let in."""
-    admissions = [each.member for each in found.roll.admissions()]
-    return [each for each in admissions if each.admitter == public and not found.roll.refusal(each, now)]
+    return [each for each in found.members(now) if each.admitter == public]
+
+
+def _renewed_by(found: Known, public: bytes, now: float) -> list[tuple[bytes, int]]:
+    """Return the renewals of present members that the bootstrap node ``public`` signed: their keys and their ends."""
+    return [(each.public, each.not_after) for each in found.members(now) if each.renewer == public != each.public]
 
 
 def _meant(found: Known, name: str, is_invitation: bool, now: float) -> tuple[bytes, str, list[str]]:
@@ -53,7 +59,7 @@ def _meant(found: Known, name: str, is_invitation: bool, now: float) -> tuple[by
     try:
         if is_invitation:
             raise Refusal(f"no invitation is called {name!r}")
-        return found.member(name, now).public, "the member", []
+        return found.member(name, now, has_expired=True).public, "the member", []
     except Refusal:
         if not invites and re.fullmatch(r"[0-9a-f]{64}", name):
             return bytes.fromhex(name), "the key", []  # also of one that is on no list

@@ -412,12 +412,13 @@ def membership() -> Any:
             "name": f"dog{n}",
             "roles": ["device"] + ["bootstrap"] * (n == 1),
             "until": int(now + days * 86_400 + 3600),
+            "is_renewable": days > 14,
             "is_ending": days < 14,
         }
         for n, days in ((2, 9), (1, 365), (7, 365))
     ]
     told = {"kind": "closed", "name": "yard", "fingerprint": "1a2b3c4d5e6f7081", "me": "0a" * 16}
-    return told | {"until": int(now + 4e7), "is_ending": False, "known": 3, "members": members}
+    return told | {"until": int(now + 4e7), "is_renewable": True, "is_ending": False, "known": 3, "members": members}
 
 
 def inventory() -> Any:

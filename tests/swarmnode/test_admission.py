@@ -28,7 +28,7 @@ from middleware.errors import BadSetting
 from middleware.settings import Settings
 from swarmnode.assembly import assembled
 from swarmnode.rehearsal import VirtualTeam
-from swarmnode.team import init, invitations, invite, join, members, promote, revoke, rotate
+from swarmnode.team import init, invitations, invite, join, members, promote, renew, revoke, rotate
 from swarmnode.team.office import Desk
 from tests.swarmnode.shell import Shell
 from tests.swarmnode.team import KEY, World
@@ -298,6 +298,60 @@ class AdmissionTests(SynchronousTestCase):
         assert dog is not None
         self.assertEqual(dog.door.me.roles, ("device", "bootstrap"))
         self.assertIn("dog1", str(self.done(members.main)))
+
+    def test_promote_keeps_what_renews(self) -> None:
+        """A promoted member has a whole life before it; where its certificate is not renewed, it ends as it did."""
+        self.team.clock.advance(100.0)
+        ends = {row["name"]: row for row in self.done(members.main)["members"]}
+        self.done(promote.main, "dog1")
+        self.team.clock.advance(2.0)
+        promoted = {row["name"]: row for row in self.done(members.main)["members"]}
+        self.assertTrue(promoted["dog1"]["renews"])
+        self.assertGreaterEqual(promoted["dog1"]["until"], ends["dog1"]["until"] + 100)
+        self.done(renew.main, "dog1", "--for", "1h")
+        self.done(promote.main, "dog1", "--role", "viewer")
+        self.team.clock.advance(2.0)
+        row = next(row for row in self.done(members.main)["members"] if row["name"] == "dog1")
+        self.assertFalse(row["renews"])
+        self.assertLess(row["until"], self.team.clock.seconds() + 3600.0)
+
+    def test_renew_who_has_expired(self) -> None:
+        """A member whose certificate has ended is shown as expired, and is back in place when it is renewed."""
+        self.done(renew.main, "dog1", "--for", "60s")
+        self.team.clock.advance(70.0)
+        shown = self.done(members.main)
+        self.assertEqual(([row["name"] for row in shown["members"]], shown["expired"][0]["name"]), (["vaio"], "dog1"))
+        self.assertIn("swarm renew dog1", self.run_verb(members.main)[1])
+        renewed = self.done(renew.main, "dog1")
+        self.team.clock.advance(15.0)
+        found = self.done(members.main)
+        self.assertEqual((renewed["roles"], renewed["renews"], found["expired"]), (["device"], True, []))
+        dog = next(row for row in found["members"] if row["name"] == "dog1")
+        self.assertEqual((dog["key"], bool(dog["at"])), (shown["expired"][0]["key"], True))
+        self.done(revoke.main, "dog1")
+        self.assertEqual(self.run_verb(renew.main, "dog1")[0], 1)
+
+    def renewer_after(self, *words: str) -> bytes:
+        """Who renewed the laptop, when the bootstrap node that did so was revoked with these words."""
+        dog, laptop = self.team.services["dog1"].assembly.node.team, self.laptop.team
+        assert dog is not None and laptop is not None
+        self.done(promote.main, "dog1")
+        self.team.clock.advance(50.0)
+        self.assertTrue(dog._renewer.renew(laptop.door.me, self.team.clock.seconds()))
+        self.team.clock.advance(2.0)
+        self.assertEqual(laptop.door.me.renewer, dog.identity.public)
+        self.done(revoke.main, "dog1", *words)
+        self.team.clock.advance(2.0)
+        self.assertIn("vaio", self.names())
+        return laptop.door.me.renewer
+
+    def test_revoke_keeps_renewals(self) -> None:
+        """The renewals that a revoked bootstrap node signed for present members go on to count."""
+        self.assertNotEqual(self.renewer_after(), b"")
+
+    def test_revoke_with_all_renewals(self) -> None:
+        """With ``--all`` they do not count: the members have again what they had before."""
+        self.assertEqual(self.renewer_after("--all"), b"")
 
     def test_keys_of_others(self) -> None:
         """Another team's key, one that others can read, and none at all are each refused with the remedy."""

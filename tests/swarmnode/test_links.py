@@ -114,6 +114,7 @@ class TeamTests(SynchronousTestCase):
         self.assertEqual([member["name"] for member in told["members"]], ["dog1", "dog2", "vaio"])
         self.assertEqual(told["members"][0]["uuid"], self.dog.uuid)
         self.assertFalse(told["is_ending"] or any(member["is_ending"] for member in told["members"]))
+        self.assertTrue(told["is_renewable"] and all(member["is_renewable"] for member in told["members"]))
 
     def test_ending_certificate(self) -> None:
         """Whose certificate ends within two weeks stands first, and is said to be so."""
@@ -125,6 +126,7 @@ class TeamTests(SynchronousTestCase):
         found = [(member["name"], member["is_ending"]) for member in told["members"]]
         self.assertEqual(found, [("dog2", True), ("dog1", False), ("vaio", False)])
         self.assertEqual((told["is_ending"], team(dog)["is_ending"]), (False, True))
+        self.assertEqual([member["is_renewable"] for member in told["members"]], [False, True, True])
 
     def test_refusals(self) -> None:
         """Who was revoked is named with the remedy by those that put it out, and by itself."""

@@ -58,7 +58,7 @@ ROUTES = (
         "Open or closed; of a closed team its members, their roles, and until when they are certified",
         "viewer",
         team,
-        gives="kind; unprotected, or name, fingerprint, me, until, is_ending, known, members",
+        gives="kind; unprotected, or name, fingerprint, me, until, is_renewable, is_ending, known, members",
     ),
     Route(
         "GET",

@@ -7,9 +7,10 @@ const EVERY = 10000;
 
 const day = (seconds) => new Date(1000 * seconds).toISOString().slice(0, 10);
 const grouped = (digits) => digits.replace(/(.{4})(?=.)/g, "$1 ");
+const renewal = ({ is_renewable }) => (is_renewable ? "renewed automatically" : "not renewed");
 
 function ending({ until, name }, now) {
-  return `ends in ${span(until - now)}; then let it in again: swarm invite ${name}`;
+  return `ends in ${span(until - now)}; to renew it: swarm renew ${name}`;
 }
 
 function update(item, member, { model, me }) {
@@ -18,7 +19,7 @@ function update(item, member, { model, me }) {
   words(name, member.name);
   words(roles, `${member.roles.join(", ")}${isHere ? "" : ", not here"}`);
   attribute(item, "data-ending", member.is_ending);
-  words(until, member.is_ending ? `! ${ending(member, model.now)}` : `until ${day(member.until)}`);
+  words(until, member.is_ending ? `! ${ending(member, model.now)}` : `until ${day(member.until)}, ${renewal(member)}`);
   words(command, model.me.role === "operator" && member.uuid !== me ? `swarm revoke ${member.name}` : "");
 }
 
@@ -27,7 +28,7 @@ function show(told, model) {
   words(at("team-kind"), isOpen ? "Open team" : `Closed team ${told.name}`);
   attribute(at("team-kind"), "data-kind", told.kind);
   words(at("team-about"), isOpen ? `Not protected: ${told.unprotected}. A closed team is made by swarm init.`
-    : `Fingerprint ${grouped(told.fingerprint)}. This node is certified until ${day(told.until)}${told.is_ending ? `: that is in ${span(told.until - model.now)}` : ""}.`);
+    : `Fingerprint ${grouped(told.fingerprint)}. This node is certified until ${day(told.until)}, ${renewal(told)}${told.is_ending ? `: that is in ${span(told.until - model.now)}` : ""}.`);
   const members = told.members ?? [];
   words(at("members-line"), isOpen ? "" : `${told.known} members${model.me.role === "operator" ? "; the commands are for the machine that has the operator's key, which no node has" : ""}`);
   keyed(at("members"), members, ({ uuid }) => uuid,

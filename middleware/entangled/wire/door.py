@@ -34,7 +34,7 @@ DOUBLED, SUPERSEDED, ROLE, UNLISTED = "doubled", "superseded", "role", "unlisted
 
 _REFUSALS = {
     EXPIRED: "the certificate has expired, or one of the two clocks is wrong; look at both clocks (swarm doctor tells"
-    " which is off), else have the operator invite that node again (swarm invite)",
+    " which is off), else have the operator renew that node (swarm renew)",
     EARLY: "the certificate is not valid yet, or one of the two clocks is wrong; look at both clocks (swarm doctor"
     " tells which is off), else wait until it is",
     REVOKED: "the operator revoked the certificate; only a new code lets that node in again (swarm invite, swarm join)",

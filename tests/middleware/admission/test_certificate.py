@@ -17,7 +17,9 @@ from middleware.admission.certificate import (
     member_of,
     pass_of,
     proof,
+    renewed,
 )
+from middleware.admission.statement import YEAR
 from middleware.entangled.errors import Forged, Malformed
 from tests.middleware.admission.paper import LATER, NOW, admitted, granted, identity, invited, operator, roll
 
@@ -40,10 +42,21 @@ class CertificateTests(SynchronousTestCase):
         """Invitation, proof and admission together make a member with the invitation's roles and its life."""
         member = member_of(OPERATOR.public, DOG.public, admitted(OPERATOR, "dog"))
         _, _, invite = invited(OPERATOR)
-        expected = Member(
-            DOG.public, "dog", ("device",), NOW, NOW + invite.life, invite.public, identity("vaio").public, uses=1
-        )
-        self.assertEqual(member, expected)
+        expected = (DOG.public, "dog", ("device",), NOW, NOW + invite.life, invite.public, identity("vaio").public)
+        self.assertEqual(member, Member(*expected, uses=1, since=NOW, life=invite.life))
+
+    def test_renewed_by_a_bootstrap_node(self) -> None:
+        """A renewal moves the end of a certificate, by a grant or by a code, and can itself be renewed."""
+        vaio, grant = identity("vaio"), granted(OPERATOR, "vaio", "bootstrap")
+        for shown in (pass_of(granted(OPERATOR, "dog")), admitted(OPERATOR, "dog")):
+            before = member_of(OPERATOR.public, DOG.public, shown)
+            for year in (1, 2, 3):
+                shown = renewed(vaio, grant, member_of(OPERATOR.public, DOG.public, shown), shown, NOW + year * YEAR)
+                after = member_of(OPERATOR.public, DOG.public, shown)
+                self.assertEqual((after.name, after.roles, after.renewer), (before.name, before.roles, vaio.public))
+                self.assertEqual((after.not_after, after.admitter), (NOW + (year + 1) * YEAR, before.admitter))
+            self.assertRaises((Forged, Malformed), member_of, OPERATOR.public, vaio.public, shown)
+            self.assertLessEqual(len(shown), ROOM)
 
     def test_it_takes_two(self) -> None:
         """A bootstrap node without the code, and the code with a node that is no bootstrap, admit nobody."""
@@ -95,6 +108,10 @@ class CertificateTests(SynchronousTestCase):
         shown = guest_pass(page, admitted(OPERATOR, "page"), phone.public, "phone-of-a-visitor", NOW)
         voucher = member_of(OPERATOR.public, phone.public, shown).voucher
         self.assertEqual(None if voucher is None else voucher.name, "page")
+        grant, own = granted(OPERATOR, "vaio", "bootstrap"), admitted(OPERATOR, "page")
+        again = renewed(identity("vaio"), grant, member_of(OPERATOR.public, page.public, own), own, NOW + YEAR)
+        shown = guest_pass(page, again, phone.public, "phone-of-a-visitor", NOW + YEAR)
+        self.assertEqual(member_of(OPERATOR.public, phone.public, shown).name, "phone-of-a-visitor")
         long = admitted(OPERATOR, "n" * 40, bootstrap="b" * 40, wish="w" * 40)
         self.assertRaises(Malformed, guest_pass, page, long, phone.public, "phone", NOW)
 
@@ -109,7 +126,10 @@ class CertificateTests(SynchronousTestCase):
     @settings(max_examples=200, deadline=None)
     def test_reads_anything(self, data: st.DataObject) -> None:
         """Whatever is shown, cut and changed in any way, is refused by name and never raises anything else."""
-        whole = bytearray(admitted(OPERATOR, "dog"))
+        old = data.draw(st.sampled_from((admitted(OPERATOR, "dog"), pass_of(granted(OPERATOR, "dog")))))
+        member, grant = member_of(OPERATOR.public, DOG.public, old), granted(OPERATOR, "vaio", "bootstrap")
+        again = renewed(identity("vaio"), grant, member, old, NOW + YEAR)
+        whole = bytearray(data.draw(st.sampled_from((old, again))))
         place = data.draw(st.integers(0, len(whole) - 1))
         whole[place] ^= data.draw(st.integers(1, 255))
         cut = bytes(whole[: data.draw(st.integers(0, len(whole)) | st.just(len(whole)))])

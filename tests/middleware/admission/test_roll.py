@@ -8,14 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.admission.certificate import member_of
+from middleware.admission.certificate import member_of, pass_of, renewed
 from middleware.admission.roll import MAX_SECRETS, Roll, invitation_id, packed_admission
-from middleware.admission.statement import REMEMBERED
+from middleware.admission.statement import REMEMBERED, YEAR
 from middleware.entangled.errors import Forged, Malformed
 from tests.middleware.admission.paper import LATER, NOW, admitted, granted, identity, invited, operator, roll
 
 OPERATOR = operator()
-DOG, VAIO = identity("dog").public, identity("vaio").public
+DOG, CAT, VAIO = (identity(name).public for name in ("dog", "cat", "vaio"))
 
 
 def entries() -> list[bytes]:
@@ -60,6 +60,26 @@ class RollTests(SynchronousTestCase):
     def test_order_does_not_matter(self, order: list[bytes]) -> None:
         """Two rolls that heard the same in any order know the same, and have one digest."""
         self.assertEqual(roll(OPERATOR, *order).digest, roll(OPERATOR, *ENTRIES).digest)
+
+    @given(st.permutations(range(7)))
+    @settings(max_examples=60, deadline=None)
+    def test_order_of_renewals(self, order: list[int]) -> None:
+        """Rolls that heard of renewals, a later grant and a revocation in any order agree when they have compared."""
+        vaio, grant, later = identity("vaio"), granted(OPERATOR, "vaio", "bootstrap"), NOW + 300 * 86_400
+        found = [grant, packed_admission(CAT, admitted(OPERATOR, "cat")), granted(OPERATOR, "dog")]
+        for name, shown, moment in (
+            ("dog", pass_of(found[2]), later - 99),
+            ("dog", pass_of(found[2]), later),
+            ("cat", admitted(OPERATOR, "cat"), later),
+        ):
+            public = identity(name).public
+            again = renewed(vaio, grant, member_of(OPERATOR.public, public, shown), shown, moment)
+            found.append(packed_admission(public, again))
+        found.append(OPERATOR.revoke(VAIO, "vaio", later, [CAT], [(DOG, later - 99 + YEAR)]))
+        mine = roll(OPERATOR, *[found[place] for place in [*order, *order]], now=later)
+        ends = {each.name: each.not_after for each in mine.members(later)}
+        self.assertEqual(ends, {"cat": NOW + YEAR, "dog": later - 99 + YEAR})
+        self.assertEqual(mine.digest, roll(OPERATOR, *found, *found, now=later).digest)
 
     def test_revoked_key(self) -> None:
         """Who is revoked is refused for good, whatever is granted to the same key afterwards."""

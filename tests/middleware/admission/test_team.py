@@ -332,7 +332,7 @@ class StrangersTests(VillageCase):
             village.move_in(old)
         lines = [formatEvent(event) for event in events]
         [line] = [line for line in lines if "of this node" in line]
-        for words in ("expired", "clock", "swarm invite"):
+        for words in ("expired", "clock", "swarm renew"):
             self.assertIn(words, line)
 
     def test_refusals_are_logged_once(self) -> None:

@@ -10,10 +10,10 @@ from nacl import bindings
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.admission import knock
-from middleware.admission.certificate import chained, guest_pass, pass_of, proof
+from middleware.admission.certificate import chained, guest_pass, member_of, pass_of, proof, renewed
 from middleware.admission.code import Code
 from middleware.admission.roll import digest_of, packed_admission
-from middleware.admission.statement import Grant, Invite, Revoke, Terms, sealed_secret, signed
+from middleware.admission.statement import YEAR, Grant, Invite, Revoke, Terms, sealed_secret, signed
 from middleware.admission.terms import TermsContent, seal_terms
 from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact
@@ -41,6 +41,13 @@ def made() -> dict[str, str]:
     secret = sealed_secret(b"s" * 32, 2, [vaio.public], NOW, 60, dice)
     came = (dog.public, "rex", proof(code.key, dog.public, "rex"))
     chain = chained(vaio, grant, (packed, invite), came, "rex", NOW + 1)
+    boot = Identity(bytes([5]) * 32)
+    anchor = signed(operator, Grant(boot.public, "boot", ("bootstrap",), NOW, NOW + YEAR))
+    lasting = signed(operator, Grant(vaio.public, "vaio", ("gateway",), NOW, NOW + YEAR))
+    held = member_of(operator.public, vaio.public, pass_of(lasting))
+    whole_year = Invite(code.key.public, "dog", ("device",), 2, NOW, NOW + 100, YEAR)
+    by_code = chained(vaio, grant, (signed(operator, whole_year), whole_year), came, "rex", NOW + 1)
+    came_in = member_of(operator.public, dog.public, by_code)
     ephemeral = b"e" * 32
     shared = bindings.crypto_scalarmult_base(ephemeral)
     contact = Contact(vaio.public, Address("10.0.0.1", 7000))
@@ -55,6 +62,8 @@ def made() -> dict[str, str]:
         "pass by the operator": pass_of(grant),
         "pass by a code": chain,
         "pass of a guest": guest_pass(vaio, pass_of(grant), phone.public, "phone", NOW),
+        "renewed pass by the operator": renewed(boot, anchor, held, pass_of(lasting), NOW + 9),
+        "renewed pass by a code": renewed(boot, anchor, came_in, by_code, NOW + 9),
         "admission": packed_admission(dog.public, chain),
         "digest of the admission": digest_of(packed_admission(dog.public, chain)),
         "KNOCK": knock.knock(code.key, dog.public, shared, "rex", dice),

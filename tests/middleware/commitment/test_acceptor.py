@@ -180,6 +180,25 @@ class AcceptorTests(SynchronousTestCase):
             self.assertEqual(reply.kind, Kind.QUIET)
             self.assertGreater(reply.remaining, 0.0)
 
+    def test_close_after_release(self) -> None:
+        """An agent that gave its lease back may end the task under its token, also after a restart; nobody else."""
+        store = MemoryStore()
+        self.acceptor = LeaseAcceptor(store, -math.inf)
+        self.propose(1, "a", 3, 0.0)
+        self.acceptor.free("t", ballot(1, "a"), 0.5)
+        self.propose(2, "b", 4, 0.5)
+        self.acceptor.free("t", ballot(2, "b"), 1.0)
+        self.acceptor = LeaseAcceptor(store, -math.inf)
+        kinds = [self.acceptor.close("t", "a", 1, token, 1.0).kind for token in (3, 4)]
+        self.assertEqual(kinds, [Kind.OUTBID, Kind.BEHIND])
+        self.assertEqual(self.acceptor.close("t", "b", 1, 4, 1.0).kind, Kind.OVER)
+
+    def test_close_under_a_token_of_others(self) -> None:
+        """A member that only heard of a token signs no end under it."""
+        self.propose(1, "a", 3, 0.0)
+        self.acceptor.accept("t", 1, ballot(2, "b"), MEMBERS, 3.0, 5)
+        self.assertEqual([self.acceptor.close("t", agent, 1, 5, 3.0).kind for agent in ("a", "b")], [Kind.BEHIND] * 2)
+
     def test_close(self) -> None:
         """After the end nothing is granted or renewed; who ends it learns how long another may still act."""
         self.prepare(1, "a", 0.0)

@@ -1,0 +1,384 @@
+"""Attack S25: to outlive the operator's word by renewals: one's own, backdated ones, and those of hostile nodes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import msgpack
+from twisted.internet.defer import Deferred
+
+from middleware.admission.certificate import ROOM, Member, chained, member_of, pass_of, proof, renewed
+from middleware.admission.code import read
+from middleware.admission.membership import Membership
+from middleware.admission.roll import invitation_id, packed_admission
+from middleware.admission.statement import YEAR, Invite
+from middleware.entangled.errors import NotAdmitted
+from middleware.entangled.identity import Identity
+from middleware.entangled.wire.door import EXPIRED, FOREIGN, REVOKED, UNLISTED
+from tests.attacks.siege import SOURCE, ClosedTeam, SiegeCase
+from tests.middleware.admission.paper import identity
+
+DAY = 86_400
+DOG = identity("dog")
+
+
+class YearsTeam(ClosedTeam):
+    """A closed team whose wall clock can be put forward."""
+
+    days = 0.0
+
+    def wall(self) -> float:
+        """The wall clock of every node."""
+        return super().wall() + self.days * DAY
+
+
+class RenewalCase(SiegeCase):
+    """A team with two bootstrap nodes, of which the second one is hostile, and a plain member that judges."""
+
+    def setUp(self) -> None:
+        """Make the team."""
+        super().setUp()
+        self.port = 700
+        self.team = YearsTeam(1, bootstraps=2)
+        self.addCleanup(self.left, self.team)
+        self.addCleanup(self.team.stop)
+        self.judge = self.team.enlist("cat")
+        self.honest, self.thief = (self.grant_of(house.public) for house in self.team.houses[:2])
+        self.keys = [house.kept.membership.identity for house in self.team.houses[:2]]
+        self.team.run(2.0)
+
+    def grant_of(self, public: bytes) -> bytes:
+        """The packed grant of a member."""
+        found = self.team.houses[0].team.roll.granted(public)
+        assert found is not None
+        return found[1]
+
+    def word(self, roles: Sequence[str] = ("device",), life: float = YEAR, own: Identity = DOG) -> bytes:
+        """The pass of a key by a grant of the operator from now on."""
+        return pass_of(self.team.signer.grant(own.public, "dog", roles, self.team.wall(), life))
+
+    def read(self, shown: bytes, own: Identity = DOG) -> Member:
+        """What a pass says."""
+        return member_of(self.team.signer.public, own.public, shown)
+
+    def renew(self, shown: bytes, ago: float = 0.0, own: Identity = DOG, by: int = 1) -> bytes:
+        """The pass ``shown`` as a bootstrap node, the thief unless another is named, renews it: some time ago."""
+        member, begin = self.read(shown, own), int(self.team.wall() - ago)
+        return renewed(self.keys[by], (self.honest, self.thief)[by], member, shown, begin)
+
+    def said(self, shown: bytes, own: Identity = DOG) -> str:
+        """How the honest nodes judge a pass: their refusal; empty where the key is let in."""
+        answers = {self.team.houses[place].team.door.admit(own.public, shown) for place in (0, 2)}
+        self.assertEqual(len(answers), 1, answers)
+        return answers.pop()
+
+    def packed(self, invite: Invite) -> bytes:
+        """An invitation, as packed."""
+        found = self.judge.team.roll.invited(invitation_id(invite.public))
+        assert found is not None
+        return found[1]
+
+    def tell(self, statement: bytes) -> None:
+        """Let the operator tell the team."""
+        self.outcome(self.team, self.team.tell(statement))
+        self.team.run(2.0)
+
+    def enter(self, shown: bytes, own: Identity = DOG) -> object:
+        """The answer of a node to a question of the key that shows this pass."""
+        secret = self.judge.kept.membership.secrets[0][1]
+        self.port += 1
+        endpoint = self.attacker(self.team, own, secret, shown, SOURCE._replace(port=self.port))
+        asked = endpoint.ask(self.team.contact(self.judge), "ping", bytes(8), changes=True)
+        return self.outcome(self.team, asked, 4.0)
+
+
+class RevokedBootstrapTests(RenewalCase):
+    """Renewals of a bootstrap node that was revoked."""
+
+    def test_backdated(self) -> None:
+        """Of a revoked bootstrap node's renewals those count that the operator kept, whatever dates others bear."""
+        old = self.word()
+        self.team.days = 300
+        kept = self.renew(old)
+        self.assertEqual(self.said(kept), "")
+        end = self.read(kept).not_after
+        self.team.days = 310
+        renewals = [(DOG.public, end)]
+        self.tell(self.team.signer.revoke(self.keys[1].public, "boot1", self.team.wall(), renewals=renewals))
+        self.team.days = 400
+        self.assertEqual(self.said(kept), "")
+        for ago in (0, 95 * DAY, 100 * DAY, 399 * DAY):
+            late = self.renew(old, ago)
+            if late != kept:
+                self.assertEqual(self.said(late), "")  # the kept one is on the list
+        member = self.judge.team.door.member(DOG.public)
+        self.assertEqual(None if member is None else member.not_after, end)
+        self.team.days = 300 + 366
+        self.assertEqual({self.said(self.renew(old, ago * DAY)) for ago in (0, 10, 300, 360)}, {EXPIRED})
+
+    def test_not_kept(self) -> None:
+        """Its renewals are void where they were not kept; the member has what it had, and another node renews it."""
+        old = self.word()
+        self.team.days = 300
+        self.assertEqual(self.said(self.renew(old)), "")
+        self.tell(self.team.signer.revoke(self.keys[1].public, "boot1", self.team.wall()))
+        member = self.judge.team.door.member(DOG.public)
+        self.assertEqual(None if member is None else member.not_after, self.read(old).not_after)
+        self.team.days = 370
+        self.assertEqual(self.said(self.renew(old, 80 * DAY)), EXPIRED)
+        error = self.enter(self.renew(old, 80 * DAY))
+        self.assertEqual((isinstance(error, NotAdmitted), getattr(error, "code", "")), (True, EXPIRED))
+        self.assertEqual(self.said(self.renew(old, by=0)), "")
+
+    def test_behind_a_void_renewal(self) -> None:
+        """A member that shows a void renewal of a grant that still holds is let in by the grant, and is on the list."""
+        ghost = identity("ghost")
+        old = pass_of(self.team.signer.grant(ghost.public, "ghost", ("viewer",), self.team.wall()))
+        self.tell(self.team.signer.revoke(self.keys[1].public, "boot1", self.team.wall()))
+        self.assertEqual(self.said(self.renew(old, own=ghost), ghost), "")
+        self.assertEqual([("ghost" in self.team.members(place)) for place in (0, 2)], [True, True])
+
+    def test_without_the_role(self) -> None:
+        """A bootstrap node from which the operator took that role renews nobody, by its earlier grant either."""
+        old = self.word()
+        self.team.days = 300
+        grant = self.team.signer.grant(self.keys[1].public, "boot1", ("device",), self.team.wall())
+        self.tell(grant)
+        self.team.days = 370
+        self.assertEqual({self.said(self.renew(old, ago * DAY)) for ago in (0, 80, 360)}, {EXPIRED})
+
+    def test_laundered_admission(self) -> None:
+        """Whom a bootstrap node let in, and the operator did not keep, goes with it, though another node renewed it."""
+        code = read(self.team.invite("pup"))
+        invite = next(each for each in self.judge.team.roll.invites() if each.name == "pup")
+        packed = self.packed(invite)
+        came = (DOG.public, "", proof(code.key, DOG.public, ""))
+        shown = chained(self.keys[1], self.thief, (packed, invite), came, "pup", int(self.team.wall()))
+        self.team.days = 300
+        shown = self.renew(shown, by=0)
+        self.assertEqual(self.said(shown), "")
+        self.tell(self.team.signer.revoke(self.keys[1].public, "boot1", self.team.wall()))
+        self.assertEqual(self.said(shown), REVOKED)
+        self.assertNotIn("pup", self.team.members(2))
+
+
+class SelfRenewalTests(RenewalCase):
+    """Members that renew themselves."""
+
+    def test_a_plain_member(self) -> None:
+        """A renewal that a member without the role bootstrap signs, for itself or for another, is none."""
+        old = self.word(("device", "operator", "gateway"))
+        grant = msgpack.unpackb(old)[1]
+        self.team.days = 360
+        mine = renewed(DOG, grant, self.read(old), old, int(self.team.wall()))
+        self.assertEqual(self.said(mine), FOREIGN)
+        forged = renewed(DOG, self.honest, self.read(old), old, int(self.team.wall()))
+        self.assertEqual(self.said(forged), FOREIGN)
+
+    def test_a_bootstrap_node_beside_others(self) -> None:
+        """A bootstrap node that was left to expire does not renew itself while there is another one."""
+        old, own = pass_of(self.thief), self.keys[1]
+        self.team.days = 300
+        mine = [self.renew(old, ago, own) for ago in (0, 200 * DAY)]
+        self.tell_renewal(0)
+        self.team.days = 370
+        self.assertEqual({self.said(each, own) for each in mine}, {EXPIRED})
+
+    def tell_renewal(self, place: int) -> None:
+        """Have the honest bootstrap node renewed by the other one, as is usual."""
+        shown = pass_of((self.honest, self.thief)[place])
+        public = self.keys[place].public
+        again = self.renew(shown, own=self.keys[place], by=1 - place)
+        self.team.houses[2].team._gossip.add(packed_admission(public, again))
+        self.team.run(2.0)
+
+    def test_a_short_one_renews_nobody(self) -> None:
+        """A bootstrap node that the operator named for a month renews nobody, also not within that month."""
+        own = identity("helper")
+        grant = self.team.signer.grant(own.public, "helper", ("bootstrap",), self.team.wall(), 30 * DAY)
+        old = self.word()
+        again = renewed(own, grant, self.read(old), old, int(self.team.wall()))
+        self.assertEqual(self.said(again), FOREIGN)
+
+
+class WideningTests(RenewalCase):
+    """Renewals that would change more than the end."""
+
+    def test_roles_that_were_taken_away(self) -> None:
+        """A renewal of an earlier grant does not bring back roles that the operator took away since."""
+        old = self.word(("device", "operator"))
+        self.team.days = 1
+        self.tell(msgpack.unpackb(self.word(("viewer",)))[1])
+        self.team.days = 2
+        again = self.renew(old)
+        self.assertEqual(self.said(again), "")
+        self.assertEqual(self.judge.team.door.roles_of(DOG.public), {"viewer"})
+
+    def test_when_the_narrower_grant_has_ended(self) -> None:
+        """A grant that has ended still stands before what the operator said earlier of that key."""
+        old = self.word(("device", "operator"))
+        self.assertEqual(self.said(old), "")
+        self.team.days = 1
+        self.tell(msgpack.unpackb(self.word(("viewer",), 10 * DAY))[1])
+        self.team.days = 20
+        self.team.run(12.0)
+        self.assertEqual(self.said(old), EXPIRED)
+        self.assertEqual(self.said(self.renew(old)), EXPIRED)
+
+    def test_another_word(self) -> None:
+        """Roles, name, life and dates of a renewal are signed: what is changed in it is refused."""
+        old = self.word()
+        self.team.days = 300
+        fields = msgpack.unpackb(self.renew(old))
+        wider = msgpack.unpackb(self.word(("operator",)))[1]
+        for place, value in ((1, [wider]), (2, fields[2] + 1), (3, fields[3] + 1), (3, fields[3] + YEAR)):
+            changed = [*fields[:place], value, *fields[place + 1 :]]
+            self.assertEqual(self.said(msgpack.packb(changed)), FOREIGN)
+
+    def test_longer_than_its_life(self) -> None:
+        """A renewal that a bootstrap node signs for longer than the operator made the certificate is refused."""
+        old = self.word()
+        member = self.read(old)
+        long = Member(member.public, "dog", member.roles, 0, 0, since=member.since, life=3 * YEAR)
+        again = renewed(self.keys[1], self.thief, long, old, int(self.team.wall()))
+        self.assertEqual(self.said(again), FOREIGN)
+
+    def test_a_name_by_a_bootstrap_node(self) -> None:
+        """A bootstrap node that renews who came by a code gives it no other name."""
+        dog = self.team.welcome("dog")
+        shown, own = dog.kept.membership.shown, dog.kept.membership.identity
+        fields = msgpack.unpackb(shown)
+        fields[4] = "vaio"
+        again = renewed(self.keys[1], self.thief, self.read(shown, own), msgpack.packb(fields), int(self.team.wall()))
+        self.assertEqual(self.said(again, own), FOREIGN)
+
+    def test_shortened(self) -> None:
+        """A bootstrap node shortens nothing that another one, or the operator, gave."""
+        old = self.word()
+        self.team.days = 300
+        good = self.renew(old, by=0)
+        self.assertEqual(self.said(good), "")
+        self.assertEqual(self.said(self.renew(old, 290 * DAY)), "")
+        member = self.judge.team.door.member(DOG.public)
+        self.assertEqual(None if member is None else member.not_after, self.read(good).not_after)
+
+    def end(self, own: Identity = DOG) -> int:
+        """When the certificate of a key ends, by the list of a plain member."""
+        member = self.judge.team.roll.member(own.public, self.team.wall())
+        assert member is not None
+        return member.not_after
+
+    def test_in_the_place_of_a_good_one(self) -> None:
+        """A renewal of an earlier word, which lasts longer, does not keep out one of the present word."""
+        old = self.word(life=3 * YEAR)
+        self.team.days = 1
+        new = self.word()
+        self.tell(msgpack.unpackb(new)[1])
+        self.team.days = 300
+        self.said(self.renew(old))
+        good = self.renew(new, by=0)
+        self.assertEqual((self.said(good), self.end()), ("", self.read(good).not_after))
+
+    def test_another_origin(self) -> None:
+        """A renewal that gives a member by a code another name or admitting node keeps out no good one, and is none."""
+        dog = self.team.move_in(self.successResultOf(self.knocked("pup", 2)))
+        shown, own = dog.kept.membership.shown, dog.kept.membership.identity
+        self.team.days = 300
+        fields = msgpack.unpackb(shown)
+        fields[4] = "pup-9"
+        other = msgpack.packb(fields)
+        member = self.read(shown, own)
+        bad = renewed(self.keys[1], self.thief, member, other, int(self.team.wall()) + 99)
+        self.assertEqual((member.name, self.read(bad, own).name), ("pup-1", "pup-9"))
+        for place in (0, 2):
+            self.assertIsNone(
+                self.team.houses[place].team.roll.add(packed_admission(own.public, bad), self.team.wall())
+            )
+        good = self.renew(shown, own=own, by=0)
+        self.assertEqual((self.said(good, own), self.end(own)), ("", self.read(good, own).not_after))
+        self.assertIn("pup-1", self.team.members(2))
+
+    def knocked(self, name: str, uses: int) -> Deferred[Membership]:
+        """A newcomer that was let in by a code for several."""
+        knocked = self.team.knock(self.team.invite(name, uses))
+        self.team.run(2.0)
+        return knocked
+
+    def test_ahead_of_time(self) -> None:
+        """A renewal that begins in the future does not count before that, and lasts no longer than others."""
+        old = self.word()
+        self.team.days = 300
+        ahead = self.renew(old, -100 * DAY)
+        self.assertEqual(self.said(ahead), "")
+        self.team.days = 370
+        self.assertEqual(self.said(ahead), EXPIRED)
+
+
+class RevivalTests(RenewalCase):
+    """Keys that the operator meant to be out."""
+
+    def test_revoked_member(self) -> None:
+        """A revoked member stays out, whoever renews it, before or after its revocation, and no node offers to."""
+        dog = self.team.enlist("dog")
+        shown, own = dog.kept.membership.shown, dog.kept.membership.identity
+        before = self.renew(shown, own=own, by=0)
+        self.assertEqual(self.said(before, own), "")
+        self.tell(self.team.signer.revoke(own.public, "dog", self.team.wall()))
+        self.team.days = 300
+        for again in (before, self.renew(shown, own=own), self.renew(shown, 300 * DAY, own)):
+            self.assertEqual(self.said(again, own), REVOKED)
+        due = self.team.houses[0].team._renewer.find_due(self.team.wall())
+        self.assertNotIn(own.public, [each.public for each in due])
+
+    def test_temporary_guest(self) -> None:
+        """A bootstrap node revives nobody whom the operator let in for less than a year, by a grant or by a code."""
+        short = self.word(life=YEAR - 1)
+        code, packed, terms = self.team.signer.invite(
+            "pup", ("device",), 1, self.team.wall(), 3600.0, self.team.dice, life=float(DAY)
+        )
+        for each in (terms, packed):
+            self.tell(each)
+        invite = self.judge.team.roll.invites()[0]
+        came = (DOG.public, "", proof(code.key, DOG.public, ""))
+        guest = chained(self.keys[1], self.thief, (packed, invite), came, "pup", int(self.team.wall()))
+        for shown in (short, guest):
+            self.assertEqual(self.said(self.renew(shown)), FOREIGN)
+        self.assertEqual(self.said(guest), "")
+        self.team.days = 370
+        for shown in (short, guest):
+            self.assertEqual(self.said(self.renew(shown)), FOREIGN)
+            error = self.enter(self.renew(shown))
+            self.assertEqual(getattr(error, "code", ""), FOREIGN)
+
+    def test_more_keys_than_the_code_has(self) -> None:
+        """Renewals bring in no more keys by a code than it is good for, also where no admission is known."""
+        code = read(self.team.invite("dog", uses=2))
+        invite: Invite = self.judge.team.roll.invites()[0]
+        packed = self.packed(invite)
+        answers = []
+        for number in range(1, 5):
+            own = Identity(bytes([number]) * 32)
+            came = (own.public, "", proof(code.key, own.public, ""))
+            shown = chained(self.keys[1], self.thief, (packed, invite), came, f"dog-{number}", int(self.team.wall()))
+            answers.append(self.said(self.renew(shown, own=own), own))
+        self.assertEqual(answers, ["", "", UNLISTED, UNLISTED])
+
+
+class SizeTests(RenewalCase):
+    """What travels in handshakes."""
+
+    def test_longest_fits(self) -> None:
+        """The renewed pass of the longest names fits into a handshake."""
+        long, wish = "n" * 40, "w" * 40
+        grant = self.team.signer.grant(self.keys[1].public, "b" * 40, ("bootstrap",), self.team.wall())
+        code, packed, _ = self.team.signer.invite(
+            long, ("device",), 1, self.team.wall(), 3600.0, self.team.dice, float(YEAR)
+        )
+        invite = Invite(
+            code.key.public, long, ("device",), 1, int(self.team.wall()), int(self.team.wall()) + 3600, YEAR
+        )
+        came = (DOG.public, wish, proof(code.key, DOG.public, wish))
+        shown = chained(self.keys[1], grant, (packed, invite), came, long, int(self.team.wall()))
+        again = renewed(self.keys[1], grant, self.read(shown), shown, int(self.team.wall()))
+        self.assertLessEqual(len(again), ROOM)
+        self.assertEqual(self.read(again).name, long)

@@ -1,0 +1,221 @@
+"""Tests of renewal: a team over a year and a half of virtual time, with nobody attending."""
+
+from __future__ import annotations
+
+from twisted.internet.defer import Deferred, succeed
+
+from middleware.admission.certificate import Member, member_of
+from middleware.admission.membership import Membership, unpacked
+from middleware.admission.renewal import BATCH
+from middleware.admission.statement import YEAR
+from middleware.entangled.errors import NotAdmitted
+from tests.middleware.admission.village import House, Village, VillageCase
+
+DAY = 86_400.0
+STEP_DAYS, STEP_S = 2, 12.0
+"""The wall clock advances by so many days while the nodes run for so many seconds."""
+
+
+class Years(Village):
+    """A village whose wall clock advances faster than the clock by which nodes measure time."""
+
+    days = 0.0
+
+    def wall(self) -> float:
+        """The wall clock of every node."""
+        return super().wall() + self.days * DAY
+
+    def live(self, days: int) -> None:
+        """Let so many days pass while the nodes run."""
+        for _ in range(days // STEP_DAYS):
+            self.days += STEP_DAYS
+            self.run(STEP_S)
+
+    def end_of(self, house: House, at: int = 0) -> int:
+        """When the certificate of a house ends, as another one knows."""
+        member = self.houses[at].team.door.member(house.public)
+        assert member is not None
+        return member.not_after
+
+
+class YearsCase(VillageCase):
+    """A test of years."""
+
+    def years(self, bootstraps: int = 2) -> Years:
+        """A village of five, of which the first are bootstrap nodes, stopped when the test ends."""
+        years = Years(bootstraps=bootstraps)
+        self.addCleanup(self.left, years)
+        self.addCleanup(years.stop)
+        for name in ("dog", "cat", "pig", "cow")[: 5 - bootstraps]:
+            years.welcome(name)
+        years.run(5.0)
+        return years
+
+    def asked(self, years: Years, house: House, other: House) -> object:
+        """What comes of a question of one house to another."""
+        found: list[object] = []
+        asked = house.node.call(years.contact(other), "ping", bytes(8), changes=True)
+        asked.addCallbacks(found.append, lambda failure: found.append(failure.value))
+        years.run(3.0)
+        return found[0]
+
+
+class YearAndAHalfTests(YearsCase):
+    """A team of five for a year and a half."""
+
+    def test_nobody_attends(self) -> None:
+        """All five renew, one that sleeps for 60 days is back in place, and one that was revoked stays out."""
+        years = self.years()
+        vaio, boot, dog, cat, pig = years.houses
+        publics = [house.public for house in years.houses]
+        years.live(300)
+        years.close(dog)
+        years.live(60)
+        years.open(dog)
+        years.run(10.0)
+        self.assertEqual(self.asked(years, dog, cat), self.asked(years, vaio, cat))
+        years.tell(years.signer.revoke(pig.public, "pig", years.wall()))
+        years.live(190)
+        self.assertEqual([years.members(place) for place in range(4)], [["boot1", "cat", "dog", "vaio"]] * 4)
+        self.assertEqual([house.public for house in years.houses], publics)
+        for house in (vaio, boot, dog, cat):
+            self.assertGreater(years.end_of(house), years.wall() + YEAR / 3 - 20 * DAY)
+            self.assertIsNot(getattr(self.asked(years, house, vaio), "code", ""), "expired")
+        error = self.asked(years, pig, vaio)
+        self.assertIsInstance(error, NotAdmitted)
+        self.assertEqual(getattr(error, "code", ""), "revoked")
+
+    def test_one_bootstrap_node(self) -> None:
+        """The only bootstrap node renews itself and all others, over restarts too."""
+        years = self.years(bootstraps=1)
+        years.live(300)
+        for house in years.houses:
+            years.close(house)
+        years.run(2.0)
+        for house in years.houses:
+            years.open(house)
+        years.live(250)
+        self.assertEqual(years.members(1), ["cat", "cow", "dog", "pig", "vaio"])
+        self.assertEqual(years.houses[0].team.door.me.renewer, years.houses[0].public)
+
+    def test_a_bootstrap_node_is_gone_for_good(self) -> None:
+        """When one of two bootstrap nodes is gone, the other one goes on, and renews itself in the end."""
+        years = self.years()
+        years.live(200)
+        years.close(years.houses[1], is_sudden=True)
+        years.live(500)
+        self.assertEqual(years.members(2), ["cat", "dog", "pig", "vaio"])
+        years.open(years.houses[1])
+
+
+class LargeTeamTests(YearsCase):
+    """A team in which a bootstrap node does not see everybody."""
+
+    def test_not_in_sight(self) -> None:
+        """A member that is no contact of the bootstrap node is looked up in a large team, and has to answer."""
+        years = self.years(bootstraps=1)
+        vaio, dog, cat = years.houses[:3]
+        years.close(cat, is_sudden=True)
+        overlay = vaio.node.overlay
+        self.patch(overlay, "contact", lambda node_id: None)
+        answers: list[bool] = []
+        for house in (dog, cat):
+            member = vaio.team.door.member(house.public)
+            assert member is not None
+            self.assertEqual([vaio.team._may_be_here(member), self.is_large_and_may(vaio, member)], [False, True])
+            Deferred.fromCoroutine(vaio.team._is_here(member)).addCallback(answers.append)
+            years.run(20.0)
+        self.assertEqual(answers, [True, False])
+        years.open(cat)
+
+    def is_large_and_may(self, house: House, member: Member) -> bool:
+        """Whether a member that is not in sight may be there for a house in a large team."""
+        overlay = house.node.overlay
+        overlay.is_large = True
+        found = house.team._may_be_here(member)
+        overlay.is_large = False
+        return found
+
+
+class BatchTests(YearsCase):
+    """Many members of one day."""
+
+    def test_a_few_at_once(self) -> None:
+        """A bootstrap node signs a few renewals at a time, and goes on until all are renewed."""
+        years = self.years(bootstraps=1)
+        for number in range(BATCH + 3):
+            years.tell(years.signer.grant(bytes([number]) * 32, f"p{number}", ("device",), years.wall()))
+        team = years.houses[0].team
+        self.patch(team, "_may_be_here", lambda member: True)
+        self.patch(team, "_is_here", lambda member: succeed(True))
+        years.days += 300
+        years.run(6.0)
+        before = len([each for each in team.members() if each.renewer])
+        self.assertEqual(before, BATCH)
+        years.days += 1
+        years.run(6.0)
+        self.assertEqual({bool(each.renewer) for each in team.members()}, {True})
+
+
+class SleeperTests(YearsCase):
+    """A member that sleeps beyond its end."""
+
+    def slept(self, years: Years, house: House) -> None:
+        """Have a house asleep from before its renewal until after its end."""
+        years.live(230)
+        years.close(house)
+        years.live(160)
+
+    def test_renewed_by_the_operator(self) -> None:
+        """One that slept through its end is let in nowhere, until the operator grants its key a certificate anew."""
+        years = self.years()
+        vaio, _, dog, cat, _ = years.houses
+        before = dog.kept.membership
+        self.slept(years, dog)
+        self.assertNotIn("dog", years.members())
+        known = [(each.name, why) for each, why in vaio.team.roll.remembered(years.wall()) if why]
+        self.assertEqual(known, [("dog", "expired")])
+        years.open(dog)
+        years.run(10.0)
+        for house in (vaio, cat):
+            self.assertEqual(getattr(self.asked(years, dog, house), "code", ""), "expired")
+        years.live(20)
+        self.assertNotIn("dog", years.members())
+        years.tell(years.signer.grant(dog.public, "dog", ("device",), years.wall()))
+        years.run(30.0)
+        self.assertEqual(self.asked(years, dog, cat), self.asked(years, vaio, cat))
+        self.assertEqual((dog.public, dog.name, dog.team.door.me.trouble(years.wall())), (key_of(before), "dog", ""))
+        self.assertGreater(member_of(before.operator, dog.public, dog.kept.membership.shown).not_after, years.wall())
+        self.assertEqual(years.members(dog.place), years.members())
+
+    def test_renewed_while_it_sleeps(self) -> None:
+        """One that the operator renewed while it slept comes back at once, though it knows no newer certificate."""
+        years = self.years()
+        vaio, _, dog, cat, _ = years.houses
+        self.slept(years, dog)
+        years.tell(years.signer.grant(dog.public, "dog", ("device",), years.wall()))
+        years.live(2)
+        years.open(dog)
+        years.run(10.0)
+        self.assertEqual(self.asked(years, dog, cat), self.asked(years, vaio, cat))
+        years.live(300)
+        self.assertIn("dog", years.members())
+
+
+def key_of(membership: Membership) -> bytes:
+    """The key of a membership, read again as from its file."""
+    return unpacked(membership.packed()).identity.public
+
+
+class TemporaryTests(YearsCase):
+    """Certificates that the operator made for less than a year."""
+
+    def test_not_renewed(self) -> None:
+        """One that was made for 30 days ends then, though it is present all the time."""
+        years = self.years()
+        guest = years.signer.grant(years.houses[2].public, "dog", ("device",), years.wall() + 1, 30 * DAY)
+        years.tell(guest)
+        years.live(28)
+        self.assertIn("dog", years.members())
+        years.live(6)
+        self.assertNotIn("dog", years.members())
