@@ -100,12 +100,27 @@ class Council:
         kinds: tuple[Kind, ...] = (Kind.GRANTED,),
         short: float = PAUSE,
         is_genuine: IsGenuine = lambda place, reply: True,
+        others: tuple[Contact, ...] = (),
     ) -> Round:
-        """Ask every member; tell ``hear`` what came of it.  ``short`` is the wait for another's lease that is one."""
-        self._note_silence()
-        question = (self.task_id, self.configuration, *arguments)
-        asked = self._asked(self.members, method, question, kinds, short, is_genuine)
-        self._last = asked, self.members
+        """Ask every member, or ``others``; tell ``hear`` what came of it.
+
+        ``short`` is the wait for another's lease that is one.
+        """
+        members = others or self.members
+        question = (self.task_id, *arguments) if others else (self.task_id, self.configuration, *arguments)
+
+        def ask(place: int) -> Deferred[Any]:
+            return self._ask(members[place], method, question)
+
+        def decode(place: int, answer: object) -> list[Reply] | None:
+            reply = unpack_reply(answer)
+            return None if reply is None or not is_genuine(place, reply) else [reply]
+
+        if not others:
+            self._note_silence()
+        asked = Round([Tally(len(members), kinds)], ask, decode, self._clock, self.ttl / 3, short)
+        if not others:
+            self._last = asked, members
         return asked
 
     def visit(self) -> None:
@@ -188,24 +203,6 @@ class Council:
             for place in asked.silent:
                 self._silent_since.setdefault(members[place].node_id, asked.began_at)
 
-    def _asked(
-        self,
-        members: tuple[Contact, ...],
-        method: str,
-        question: tuple[Any, ...],
-        kinds: tuple[Kind, ...],
-        short: float = PAUSE,
-        is_genuine: IsGenuine = lambda place, reply: True,
-    ) -> Round:
-        def ask(place: int) -> Deferred[Any]:
-            return self._ask(members[place], method, question)
-
-        def decode(place: int, answer: object) -> list[Reply] | None:
-            reply = unpack_reply(answer)
-            return None if reply is None or not is_genuine(place, reply) else [reply]
-
-        return Round([Tally(len(members), kinds)], ask, decode, self._clock, self.ttl / 3, short)
-
     async def _close(self, token: int) -> None:
         over_at = 0.0
         question = ("lease.close", token) if token else ("lease.cancel",)
@@ -228,8 +225,8 @@ class Council:
                 # A change was accepted by some: it may be decided, so the council to come has to know as well.
                 if token:
                     raise NoMajority("the end of the task is not recorded: its council is changing; try again")
-                asked = (self.task_id, configuration + 1)
-                done = await self._asked(done.tally.to_complete, "lease.cancel", asked, ended).outcome
+                others = done.tally.to_complete
+                done = await self.round("lease.cancel", configuration + 1, kinds=ended, others=others).outcome
                 over_at = max(over_at, self._over_at(done))
             if not done.tally.is_won:
                 done.close()
@@ -288,9 +285,8 @@ class Council:
             (place, accepted.tally.replies[place]) for place in sorted(accepted.tally.agreed)[: majority(len(old))]
         ]
         charter = before.extended(members, ballot, tuple((place, reply.token, reply.proof) for place, reply in votes))
-        question = (self.task_id, charter.packed, keep, self.ttl)
-        kinds = (Kind.GRANTED, Kind.MOVED)
-        installed = await self._asked(members, "lease.install", question, kinds).outcome
+        question, kinds = (charter.packed, keep, self.ttl), (Kind.GRANTED, Kind.MOVED)
+        installed = await self.round("lease.install", *question, kinds=kinds, others=members).outcome
         if not installed.tally.is_won:
             raise NoMajority("the new council is chosen, but too few of its members know; ask for the change again")
         self._adopt(charter)

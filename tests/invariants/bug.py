@@ -203,8 +203,8 @@ def _admits_lower_tokens(self: Gate, permit: Any, now: float) -> None:
 
 
 async def _decided_by_the_new(self: Council, ballot: Any, members: Any, keep: bool) -> Round:
-    question = (self.task_id, self.configuration, ballot.counter, pack_members(members), self.token, keep)
-    return await self._asked(members, "lease.change", question, (Kind.GRANTED,)).outcome
+    question = self.configuration, ballot.counter, pack_members(members), self.token, keep
+    return await self.round("lease.change", *question, others=members).outcome
 
 
 def _row(event: Event, stand: Stand, kind: Kind, state: State = State.OPEN) -> list[tuple[Any, str, Any]]:
@@ -268,6 +268,7 @@ BUGS: dict[str, list[tuple[Any, str, Any]]] = {
     "votes forgotten by a restart": [(Seat, "_load", _load_without_votes)],
     "the lease of the dead never ends": [(Seat, "_claimed", _claimed_for_ever)],
     "a take is not noted": [(Keeper, "note", _nothing), (Keeper, "doubt", _idle)],
+    "slots are used too early": [(Keeper, "_slot", lambda self, key: "only")],
     "who waits is not woken": [(Shelf, "_changed", _told_what_is_known)],
     # Quorums.
     "lower ballots are accepted": [(Acceptor, "_stand", _nothing_is_lower)],
@@ -331,6 +332,7 @@ FINDERS: dict[str, tuple[str, ...]] = {
     "votes forgotten by a restart": ("tuples",),
     "the lease of the dead never ends": ("tuples",),
     "a take is not noted": ("tuples",),
+    "slots are used too early": ("tuples",),
     "who waits is not woken": ("tuples",),
     "lower ballots are accepted": ("leases",),
     "what was accepted is not completed": ("tuples",),
