@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from middleware.commitment.lease_codec import AHEAD, LeaseCodec
+from middleware.commitment.lease_codec import AHEAD, CODEC
 from middleware.entangled.data.store import Store
 from middleware.entangled.quorum.acceptor import Acceptor, Terms
 from middleware.entangled.quorum.ballot import FIRST, Ballot
@@ -12,7 +12,6 @@ from middleware.entangled.quorum.register import Kind, Register, Reply
 MAX_LISTENERS = 16
 ENDED_AGE, IDLE_AGE = 600.0, 86_400.0
 """Seconds after which a register may go that was not touched: of a task that has ended, and of any other."""
-CODEC = LeaseCodec()
 
 
 class LeaseAcceptor(Acceptor[str]):

@@ -16,6 +16,7 @@ from middleware.entangled.quorum.register import Kind, Register, Reply
 
 MAX_COUNCIL = 7
 MAX_PROOF_BYTES = 2**16
+_BUCKETS = 64
 LIFE = 2**20
 """The lowest digits of a counter are drawn anew in each life of an agent."""
 AHEAD = 0.2
@@ -66,45 +67,36 @@ def members_of(packed: object) -> tuple[Contact, ...] | None:
     return members if len(members) == len(packed) == len({member.public for member in members}) else None
 
 
-class LeaseCodec(Codec[str]):
-    """How the leases of tasks stand in notes."""
+def _bucket_of(key: str) -> str:
+    return f"lease/{zlib.crc32(key.encode()) % _BUCKETS}"
 
-    floor_name = "lease/state"
-    names = tuple(f"lease/{number}" for number in range(64))
-    nobody = ""
-    lives = LIFE
 
-    def bucket_of(self, key: str) -> str:
-        """The name of the bucket that has ``key``."""
-        return f"lease/{zlib.crc32(key.encode()) % len(self.names)}"
+def _pack(registers: dict[str, Register]) -> bytes:
+    return bytes(msgpack.packb({task_id: _pack_row(register) for task_id, register in registers.items()}))
 
-    def pack(self, registers: dict[str, Register]) -> bytes:
-        """A bucket."""
-        return bytes(msgpack.packb({task_id: _pack_row(register) for task_id, register in registers.items()}))
 
-    def unpack(self, noted: bytes) -> tuple[dict[str, Register], bool]:
-        """What can be read of a bucket, and whether that is all."""
-        rows = unpack_note(noted)
-        if not isinstance(rows, dict):
-            return {}, False
-        read = {task_id: unpack_row(row) for task_id, row in rows.items()}
-        good = {task_id: each for task_id, each in read.items() if each is not None and isinstance(task_id, str)}
-        return good, len(good) == len(rows)
+def _unpack(noted: bytes) -> tuple[dict[str, Register], bool]:
+    rows = unpack_note(noted)
+    if not isinstance(rows, dict):
+        return {}, False
+    read = {task_id: unpack_row(row) for task_id, row in rows.items()}
+    good = {task_id: each for task_id, each in read.items() if each is not None and isinstance(task_id, str)}
+    return good, len(good) == len(rows)
 
-    def pack_floor(self, floor: Floor) -> bytes:
-        """The note of the floor."""
-        return bytes(msgpack.packb([floor.counter, floor.longest, floor.token]))
 
-    def unpack_floor(self, noted: bytes | None) -> Floor | None:
-        """The floor, or None where there is none that can be read."""
-        state = unpack_note(noted or b"")
-        if isinstance(state, list) and len(state) == 2:
-            state = [*state, state[0]]  # of a version that had one floor for both
-        if not isinstance(state, list) or len(state) != 3:
-            return None
-        counter, longest, token = state
-        is_lawful = isinstance(longest, float) and is_number(counter) and is_number(token)
-        return Floor(counter, token, longest) if is_lawful else None
+def _pack_floor(floor: Floor) -> bytes:
+    return bytes(msgpack.packb([floor.counter, floor.longest, floor.token]))
+
+
+def _unpack_floor(noted: bytes | None) -> Floor | None:
+    state = unpack_note(noted or b"")
+    if isinstance(state, list) and len(state) == 2:
+        state = [*state, state[0]]  # of a version that had one floor for both
+    if not isinstance(state, list) or len(state) != 3:
+        return None
+    counter, longest, token = state
+    is_lawful = isinstance(longest, float) and is_number(counter) and is_number(token)
+    return Floor(counter, token, longest) if is_lawful else None
 
 
 def unpack_row(row: object) -> Register | None:
@@ -147,3 +139,16 @@ def _pack_row(register: Register) -> list[object]:
     members, grantee = pack_members(register.value or ()), register.grantee
     token, ttl = register.token, register.ttl
     return [register.configuration, ballots, token, ttl, members, register.is_over, register.proof, grantee]
+
+
+CODEC: Codec[str] = Codec(
+    "lease/state",
+    tuple(f"lease/{number}" for number in range(_BUCKETS)),
+    "",
+    LIFE,
+    _bucket_of,
+    _pack,
+    _unpack,
+    _pack_floor,
+    _unpack_floor,
+)

@@ -7,6 +7,7 @@ tokens.
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable
+from dataclasses import dataclass
 from typing import Generic, NamedTuple, Protocol, TypeVar
 
 from middleware.entangled.quorum.ballot import NONE, Ballot, Ceiling, Name
@@ -37,31 +38,23 @@ class Notes(Protocol):
         """What was kept, or None."""
 
 
-class Codec(Protocol[Key]):
-    """How the registers of one use stand in notes; no decoder raises."""
+@dataclass(frozen=True)
+class Codec(Generic[Key]):
+    """How the registers of one use stand in notes; no decoder raises.
+
+    ``names`` are those of all buckets, ``nobody`` is below all names of proposers, and the counters of two lives of a
+    proposer differ modulo ``lives`` (1 where their names differ).  ``unpack`` also says whether that was all.
+    """
 
     floor_name: str
     names: tuple[str, ...]
-    """The names of all buckets."""
     nobody: Name
-    """The name below all those of proposers."""
     lives: int
-    """The counters of two lives of a proposer differ by this modulus; 1 where their names differ."""
-
-    def bucket_of(self, key: Key) -> str:
-        """The name of the bucket that has ``key``."""
-
-    def pack(self, registers: dict[Key, Register]) -> bytes:
-        """A bucket."""
-
-    def unpack(self, noted: bytes) -> tuple[dict[Key, Register], bool]:
-        """What can be read of a bucket, and whether that is all."""
-
-    def pack_floor(self, floor: Floor) -> bytes:
-        """The note of the floor."""
-
-    def unpack_floor(self, noted: bytes | None) -> Floor | None:
-        """The floor, or None where there is none that can be read."""
+    bucket_of: Callable[[Key], str]
+    pack: Callable[[dict[Key, Register]], bytes]
+    unpack: Callable[[bytes], tuple[dict[Key, Register], bool]]
+    pack_floor: Callable[[Floor], bytes]
+    unpack_floor: Callable[[bytes | None], Floor | None]
 
 
 class Log(Generic[Key]):

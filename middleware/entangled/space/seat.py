@@ -23,13 +23,12 @@ from middleware.entangled.quorum.log import MAX_REGISTERS, Log
 from middleware.entangled.quorum.register import Kind, Register, Reply
 from middleware.entangled.record import KEY_BYTES
 from middleware.entangled.space.posting import INCARNATION_BYTES, Place, Posted, is_name, place_unpacked, posting
-from middleware.entangled.space.take_codec import MAX_LEASE, TakeCodec, is_counter, pack_reply
+from middleware.entangled.space.take_codec import CODEC, MAX_LEASE, is_counter, pack_reply
 
 MAX_PLACES = 12
 """Decrees in one question: more would not fit into a datagram."""
 UNSETTLED = 3.0
 """Seconds after which a member looks after a confirmation of which it has not heard the end."""
-CODEC = TakeCodec()
 TERMS = Terms(finish=1.0, must_prepare=True)
 _INCARNATION: Final = "decree/incarnation"
 

@@ -51,42 +51,33 @@ def unpack_reply(fields: object, event: Event) -> Reply | None:
     return Reply(kind, Ballot(counter, b""), remaining=remaining, accepted=told[0], value=told[1])
 
 
-class TakeCodec(Codec[Place]):
-    """How the votes about tuples stand in notes."""
+def _bucket_of(key: Place) -> str:
+    return f"decree/{hashlib.blake2s(key.mark + key.owner, digest_size=1).hexdigest()}"
 
-    floor_name = "decree/floor"
-    names = tuple(f"decree/{number:02x}" for number in range(256))
-    nobody = b""
-    lives = 1
 
-    def bucket_of(self, key: Place) -> str:
-        """The name of the bucket that has ``key``."""
-        return f"decree/{hashlib.blake2s(key.mark + key.owner, digest_size=1).hexdigest()}"
+def _pack(registers: dict[Place, Register]) -> bytes:
+    rows: list[list[Any]] = []
+    for place, register in registers.items():
+        accepted = _pack_accepted(register.accepted, register.value)
+        rows.append([place.key, place.packed(), *register.promised, register.reserve, accepted])
+    return bytes(msgpack.packb(rows))
 
-    def pack(self, registers: dict[Place, Register]) -> bytes:
-        """A bucket."""
-        rows: list[list[Any]] = []
-        for place, register in registers.items():
-            accepted = _pack_accepted(register.accepted, register.value)
-            rows.append([place.key, place.packed(), *register.promised, register.reserve, accepted])
-        return bytes(msgpack.packb(rows))
 
-    def unpack(self, noted: bytes) -> tuple[dict[Place, Register], bool]:
-        """What can be read of a bucket, and whether that is all."""
-        try:
-            rows = msgpack.unpackb(noted, strict_map_key=True, max_ext_len=0)
-        except Exception:  # foreign code, and bytes that may have rotted
-            return {}, False
-        pairs = [_unpack_row(row) for row in rows] if isinstance(rows, list) else [None]
-        return dict(pair for pair in pairs if pair is not None), None not in pairs
+def _unpack(noted: bytes) -> tuple[dict[Place, Register], bool]:
+    try:
+        rows = msgpack.unpackb(noted, strict_map_key=True, max_ext_len=0)
+    except Exception:  # foreign code, and bytes that may have rotted
+        return {}, False
+    pairs = [_unpack_row(row) for row in rows] if isinstance(rows, list) else [None]
+    return dict(pair for pair in pairs if pair is not None), None not in pairs
 
-    def pack_floor(self, floor: Floor) -> bytes:
-        """The note of the floor."""
-        return floor.counter.to_bytes(8, "big")
 
-    def unpack_floor(self, noted: bytes | None) -> Floor:
-        """The floor; a member that never had to forget has noted none."""
-        return Floor(int.from_bytes(noted or b""))
+def _pack_floor(floor: Floor) -> bytes:
+    return floor.counter.to_bytes(8, "big")
+
+
+def _unpack_floor(noted: bytes | None) -> Floor:
+    return Floor(int.from_bytes(noted or b""))
 
 
 def _unpack_row(row: object) -> tuple[Place, Register] | None:
@@ -97,7 +88,7 @@ def _unpack_row(row: object) -> tuple[Place, Register] | None:
     if place is None or told is None or not (is_counter(counter) and is_name(taker) and is_lease(lease)):
         return None
     ballot, value = told
-    ceiling = Ceiling(0.0, TakeCodec.lives)
+    ceiling = Ceiling(0.0, 1)
     return place, Register(ceiling, promised=Ballot(counter, taker), accepted=ballot, value=value, reserve=lease)
 
 
@@ -113,3 +104,16 @@ def _unpack_accepted(fields: object) -> tuple[Ballot, bytes | None] | None:
         return None
     counter, taker, value = fields
     return (Ballot(counter, taker), value) if is_counter(counter) and is_name(taker) and is_name(value) else None
+
+
+CODEC: Codec[Place] = Codec(
+    "decree/floor",
+    tuple(f"decree/{number:02x}" for number in range(256)),
+    b"",
+    1,
+    _bucket_of,
+    _pack,
+    _unpack,
+    _pack_floor,
+    _unpack_floor,
+)

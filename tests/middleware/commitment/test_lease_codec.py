@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import zlib
+
+import msgpack
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.commitment.lease_codec import LIFE, MAX_COUNCIL, members_of, pack_reply, unpack_reply
+from middleware.commitment.lease_codec import CODEC, LIFE, MAX_COUNCIL, members_of, pack_reply, unpack_reply
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address
 from middleware.entangled.quorum.ballot import Ballot, majority
+from middleware.entangled.quorum.log import Floor
 from middleware.entangled.quorum.register import Kind, Reply
 
 MEMBERS = tuple(Contact(bytes([n]) * 32, Address("10.0.0.1", 7000 + n)) for n in range(MAX_COUNCIL + 1))
@@ -89,3 +93,29 @@ class ReplyTests(SynchronousTestCase):
         read = unpack_reply(answer)
         self.assertTrue(read is None or read.remaining >= 0.0)
         members_of(answer)
+
+
+class NoteTests(SynchronousTestCase):
+    """Notes as the versions before wrote them."""
+
+    def test_old_notes(self) -> None:
+        """What was promised, leased, accepted and closed is read, whether the row has a proof and a grantee or not."""
+        codec, members = CODEC, [member.packed() for member in MEMBERS[:3]]
+        row = [2, [9, "b", 7, "a", 5, "c", 9, "b"], 4, 1.5, members, True, b"proof", "d"]
+        for length, proof, grantee in ((6, b"", "a"), (7, b"proof", "a"), (8, b"proof", "d")):
+            registers, is_whole = codec.unpack(msgpack.packb({"t": row[:length]}))
+            self.assertTrue(is_whole)
+            found = registers["t"]
+            ballots = found.promised, found.holder, found.spent, found.accepted
+            self.assertEqual(ballots, (Ballot(9, "b"), Ballot(7, "a"), Ballot(5, "c"), Ballot(9, "b")))
+            self.assertEqual((found.configuration, found.token, found.ttl, found.value), (2, 4, 1.5, MEMBERS[:3]))
+            self.assertEqual((found.is_over, found.proof, found.grantee), (True, proof, grantee))
+        self.assertEqual(codec.pack(registers), msgpack.packb({"t": row}))
+        self.assertEqual(codec.bucket_of("t"), f"lease/{zlib.crc32(b't') % 64}")
+
+    def test_old_floors(self) -> None:
+        """The floor of the version that had one for ballots and tokens, and that of the one before this."""
+        self.assertEqual(CODEC.unpack_floor(msgpack.packb([40, 2.0])), Floor(40, 40, 2.0))
+        self.assertEqual(CODEC.unpack_floor(msgpack.packb([40, 2.0, 7])), Floor(40, 7, 2.0))
+        self.assertEqual(CODEC.pack_floor(Floor(40, 7, 2.0)), msgpack.packb([40, 2.0, 7]))
+        self.assertEqual([CODEC.unpack_floor(rotten) for rotten in (None, b"?", msgpack.packb([1]))], [None] * 3)

@@ -5,14 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from middleware.commitment import acceptor as lease
+from middleware.commitment import lease_codec
 from middleware.commitment.lease_codec import AHEAD
 from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.quorum.acceptor import Acceptor, Terms
 from middleware.entangled.quorum.ballot import FIRST, Ballot
 from middleware.entangled.quorum.log import Codec, Log
 from middleware.entangled.quorum.register import Reply
-from middleware.entangled.space import seat
+from middleware.entangled.space import seat, take_codec
 from middleware.entangled.space.posting import Place
 from tests.middleware.commitment.test_lease_codec import MEMBERS
 
@@ -34,8 +34,10 @@ class Use:
         return Ballot(number * self.codec.lives, self.names[name])
 
 
-TAKE = Use(Place(b"k" * 20, b"o" * 32, "t", b"m" * 8), seat.CODEC, seat.TERMS, (b"a", b"b", b"c"), (b"x", b"y", b"z"))
-LEASE = Use("t", lease.CODEC, Terms(AHEAD), ("a", "b", "c"), (MEMBERS[:3], MEMBERS[1:4], MEMBERS[2:5]))
+TAKE = Use(
+    Place(b"k" * 20, b"o" * 32, "t", b"m" * 8), take_codec.CODEC, seat.TERMS, (b"a", b"b", b"c"), (b"x", b"y", b"z")
+)
+LEASE = Use("t", lease_codec.CODEC, Terms(AHEAD), ("a", "b", "c"), (MEMBERS[:3], MEMBERS[1:4], MEMBERS[2:5]))
 
 
 class Member:

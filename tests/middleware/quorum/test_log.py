@@ -8,8 +8,8 @@ import msgpack
 from hypothesis import given, settings
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.commitment.acceptor import CODEC, may_forget
-from middleware.commitment.lease_codec import unpack_row
+from middleware.commitment.acceptor import may_forget
+from middleware.commitment.lease_codec import CODEC, unpack_row
 from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.quorum import log as module
 from middleware.entangled.quorum.ballot import FIRST, NONE, Ballot

@@ -35,8 +35,8 @@ from middleware.entangled.space.posting import (
     posting,
     standing,
 )
-from middleware.entangled.space.seat import CODEC, MAX_PLACES, Seat
-from middleware.entangled.space.take_codec import unpack_reply
+from middleware.entangled.space.seat import MAX_PLACES, Seat
+from middleware.entangled.space.take_codec import CODEC, unpack_reply
 
 ME = Identity(b"m" * 32)
 PEER = Contact(ME.public, Address("10.0.0.1", 1))

@@ -14,7 +14,7 @@ from middleware.entangled.quorum.ballot import NONE, Ballot
 from middleware.entangled.quorum.log import Floor
 from middleware.entangled.quorum.register import Kind, Reply
 from middleware.entangled.space.posting import Place
-from middleware.entangled.space.take_codec import TakeCodec, pack_reply, unpack_reply
+from middleware.entangled.space.take_codec import CODEC, pack_reply, unpack_reply
 
 REPLIES = st.tuples(
     st.sampled_from([Kind.GRANTED, Kind.HELD, Kind.OUTBID, Kind.UNPREPARED]),
@@ -72,7 +72,7 @@ class NoteTests(SynchronousTestCase):
 
     def test_old_notes(self) -> None:
         """What was promised, leased and accepted is read, and written as it was."""
-        codec, key, owner = TakeCodec(), b"k" * 20, b"o" * 32
+        codec, key, owner = CODEC, b"k" * 20, b"o" * 32
         rows = [
             [key, [owner, "one", b"m" * 8], 3, b"a", 2.5, None],
             [key, [owner, "two", b"n" * 8], 9, b"b", 1.0, [7, b"c", b"value"]],
