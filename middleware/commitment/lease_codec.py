@@ -143,7 +143,8 @@ def _pack_row(register: Register) -> list[object]:
 
 CODEC: Codec[str] = Codec(
     "lease/state",
-    tuple(f"lease/{number}" for number in range(_BUCKETS)),
+    "lease/{}",
+    _BUCKETS,
     "",
     LIFE,
     _bucket_of,

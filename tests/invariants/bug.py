@@ -32,7 +32,7 @@ from middleware.entangled.kademlia.roster import Roster
 from middleware.entangled.quorum import acceptor as acceptor_
 from middleware.entangled.quorum import round as round_
 from middleware.entangled.quorum.acceptor import TABLE, Acceptor, Event, Stand, State
-from middleware.entangled.quorum.ballot import NONE, Ballot
+from middleware.entangled.quorum.ballot import NONE
 from middleware.entangled.quorum.log import Log
 from middleware.entangled.quorum.proposer import Result, conclude
 from middleware.entangled.quorum.register import Kind, Register, Reply
@@ -92,6 +92,8 @@ _GENUINE = {
         (Acceptor, "release"),
         (Acceptor, "_stand"),
         (Register, "wake"),
+        (Tally, "add"),
+        (Keeper, "_slot"),
     ]
 }
 
@@ -212,14 +214,6 @@ def _row(event: Event, stand: Stand, kind: Kind, state: State = State.OPEN) -> l
     return [(acceptor_, "TABLE", {**TABLE, (state, event, stand): (kind, TABLE[state, event, stand][1])})]
 
 
-def _forgets_promises(self: Log[Any], key: Any) -> None:
-    register = self.registers[key]
-    promised, register.promised = register.promised, max(register.holder, register.accepted)
-    if register.promised != NONE:
-        _GENUINE[Log, "keep"](self, key)
-    register.promised = promised
-
-
 def _wakes_free(self: Register, now: float, lives: int) -> None:
     _GENUINE[Register, "wake"](self, now, lives)
     self.until = self.reserved_until = 0.0
@@ -234,13 +228,22 @@ def _nothing_is_lower(self: Acceptor[Any], register: Register, question: Any) ->
     return Stand.FREE if stand is Stand.LOWER else stand
 
 
-def _lowest_accepted(self: Tally) -> Any:
-    accepted = [self.replies[place] for place in self.agreed if self.replies[place].accepted != NONE]
-    return min(accepted, key=lambda reply: reply.accepted).value if accepted else None
+def _release_ends_nothing(self: Acceptor[Any], *_: Any) -> Reply:
+    return Reply(Kind.GRANTED)
 
 
-def _same_name(self: Ballot, other: Ballot, lives: int) -> bool:
-    return bool(self.proposer == other.proposer)
+def _counted_twice(self: Tally, place: int, reply: Reply | None) -> None:
+    for each in (place, (place + 1) % self.size):
+        _GENUINE[Tally, "add"](self, each, reply)
+
+
+def _chosen_by_one(self: Tally) -> Any:
+    return next((reply.value for reply in self.replies.values() if reply.accepted != NONE), None)
+
+
+def _only_slot(self: Keeper, key: bytes) -> str:
+    _GENUINE[Keeper, "_slot"](self, key)
+    return "only"
 
 
 BUGS: dict[str, list[tuple[Any, str, Any]]] = {
@@ -268,23 +271,19 @@ BUGS: dict[str, list[tuple[Any, str, Any]]] = {
     "votes forgotten by a restart": [(Seat, "_load", _load_without_votes)],
     "the lease of the dead never ends": [(Seat, "_claimed", _claimed_for_ever)],
     "a take is not noted": [(Keeper, "note", _nothing), (Keeper, "doubt", _idle)],
-    "slots are used too early": [(Keeper, "_slot", lambda self, key: "only")],
+    "slots are used too early": [(Keeper, "_slot", _only_slot)],
     "who waits is not woken": [(Shelf, "_changed", _told_what_is_known)],
     # Quorums.
     "lower ballots are accepted": [(Acceptor, "_stand", _nothing_is_lower)],
     "what was accepted is not completed": [(Tally, "to_complete", property(lambda self: None))],
-    "the lowest accepted value is completed": [(Tally, "to_complete", property(_lowest_accepted))],
-    "promises are not stored": [(Log, "keep", _forgets_promises)],
     "a restart ends leases": [(Register, "wake", _wakes_free)],
     "a lease is granted while another runs": _row(Event.LEASE, Stand.HELD, Kind.GRANTED),
     "a lease is granted before the device rests": _row(Event.LEASE, Stand.ENDING, Kind.GRANTED),
-    "a promise ends the lease before it": _row(Event.LEASE, Stand.OVERTAKEN, Kind.OUTBID),
-    "a sealed council grants leases": _row(Event.LEASE, Stand.FREE, Kind.GRANTED, State.SEALED),
-    "a council changes while a lease runs": _row(Event.ACCEPT, Stand.HELD, Kind.GRANTED),
     "a council that is over grants leases": [(Acceptor, "_stand", _any_configuration)],
-    "an earlier life holds the same lease": [(Ballot, "is_kin", _same_name)],
     "a promise bars nobody": _row(Event.PREPARE, Stand.LOWER, Kind.GRANTED),
-    "a reservation keeps out what has won": _row(Event.ACCEPT, Stand.RESERVED, Kind.HELD),
+    "a release ends nothing": [(Acceptor, "release", _release_ends_nothing)],
+    "an answer counts for two members": [(Tally, "add", _counted_twice)],
+    "what one member accepted is chosen": [(Tally, "chosen", property(_chosen_by_one))],
     # The wire.
     "questions are not remembered": [(Ledger, "entry", _never_known)],
     "the window moves before the tag is checked": [(Session, "open", _moved_before_it_is_opened)],
@@ -336,18 +335,14 @@ FINDERS: dict[str, tuple[str, ...]] = {
     "who waits is not woken": ("tuples",),
     "lower ballots are accepted": ("leases",),
     "what was accepted is not completed": ("tuples",),
-    "the lowest accepted value is completed": ("tuples",),
-    "promises are not stored": ("leases",),
     "a restart ends leases": ("leases",),
     "a lease is granted while another runs": ("leases",),
     "a lease is granted before the device rests": ("leases",),
-    "a promise ends the lease before it": ("leases",),
-    "a sealed council grants leases": ("leases",),
-    "a council changes while a lease runs": ("leases",),
     "a council that is over grants leases": ("leases",),
-    "an earlier life holds the same lease": ("leases",),
     "a promise bars nobody": ("leases",),
-    "a reservation keeps out what has won": ("tuples",),
+    "a release ends nothing": ("leases",),
+    "an answer counts for two members": ("leases",),
+    "what one member accepted is chosen": ("tuples",),
     "questions are not remembered": ("wire",),
     "the window moves before the tag is checked": ("wire",),
     "a greeting is answered twice": ("wire",),

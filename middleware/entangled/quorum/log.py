@@ -6,7 +6,7 @@ tokens.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterator
 from dataclasses import dataclass
 from typing import Generic, NamedTuple, Protocol, TypeVar
 
@@ -42,12 +42,14 @@ class Notes(Protocol):
 class Codec(Generic[Key]):
     """How the registers of one use stand in notes; no decoder raises.
 
-    ``names`` are those of all buckets, ``nobody`` is below all names of proposers, and the counters of two lives of a
-    proposer differ modulo ``lives`` (1 where their names differ).  ``unpack`` also says whether that was all.
+    ``name`` is the format of the names of its ``buckets``, ``nobody`` is below all names of proposers, and the counters
+    of two lives of a proposer differ modulo ``lives`` (1 where their names differ).  ``unpack`` also says whether that
+    was all.
     """
 
     floor_name: str
-    names: tuple[str, ...]
+    name: str
+    buckets: int
     nobody: Name
     lives: int
     bucket_of: Callable[[Key], str]
@@ -55,6 +57,11 @@ class Codec(Generic[Key]):
     unpack: Callable[[bytes], tuple[dict[Key, Register], bool]]
     pack_floor: Callable[[Floor], bytes]
     unpack_floor: Callable[[bytes | None], Floor | None]
+
+    @property
+    def names(self) -> Iterator[str]:
+        """The names of all buckets."""
+        return map(self.name.format, range(self.buckets))
 
 
 class Log(Generic[Key]):

@@ -108,7 +108,8 @@ def _unpack_accepted(fields: object) -> tuple[Ballot, bytes | None] | None:
 
 CODEC: Codec[Place] = Codec(
     "decree/floor",
-    tuple(f"decree/{number:02x}" for number in range(256)),
+    "decree/{:02x}",
+    256,
     b"",
     1,
     _bucket_of,
