@@ -237,10 +237,6 @@ def _counted_twice(self: Tally, place: int, reply: Reply | None) -> None:
         _GENUINE[Tally, "add"](self, each, reply)
 
 
-def _chosen_by_one(self: Tally) -> Any:
-    return next((reply.value for reply in self.replies.values() if reply.accepted != NONE), None)
-
-
 def _only_slot(self: Keeper, key: bytes) -> str:
     _GENUINE[Keeper, "_slot"](self, key)
     return "only"
@@ -283,7 +279,6 @@ BUGS: dict[str, list[tuple[Any, str, Any]]] = {
     "a promise bars nobody": _row(Event.PREPARE, Stand.LOWER, Kind.GRANTED),
     "a release ends nothing": [(Acceptor, "release", _release_ends_nothing)],
     "an answer counts for two members": [(Tally, "add", _counted_twice)],
-    "what one member accepted is chosen": [(Tally, "chosen", property(_chosen_by_one))],
     # The wire.
     "questions are not remembered": [(Ledger, "entry", _never_known)],
     "the window moves before the tag is checked": [(Session, "open", _moved_before_it_is_opened)],
@@ -342,7 +337,6 @@ FINDERS: dict[str, tuple[str, ...]] = {
     "a promise bars nobody": ("leases",),
     "a release ends nothing": ("leases",),
     "an answer counts for two members": ("leases",),
-    "what one member accepted is chosen": ("tuples",),
     "questions are not remembered": ("wire",),
     "the window moves before the tag is checked": ("wire",),
     "a greeting is answered twice": ("wire",),

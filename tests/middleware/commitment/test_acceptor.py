@@ -199,6 +199,11 @@ class AcceptorTests(SynchronousTestCase):
         self.acceptor.accept("t", 1, ballot(2, "b"), MEMBERS, 3.0, 5)
         self.assertEqual([self.acceptor.close("t", agent, 1, 5, 3.0).kind for agent in ("a", "b")], [Kind.BEHIND] * 2)
 
+    def test_lower_token_that_is_heard(self) -> None:
+        """A proposer of a change that knows only a lower token lowers none."""
+        self.propose(1, "a", 3, 0.0)
+        self.assertEqual(self.acceptor.accept("t", 1, ballot(2, "b"), MEMBERS, TTL, 1).token, 3)
+
     def test_close(self) -> None:
         """After the end nothing is granted or renewed; who ends it learns how long another may still act."""
         self.prepare(1, "a", 0.0)
