@@ -32,7 +32,6 @@ from middleware.entangled.kademlia.roster import Roster
 from middleware.entangled.quorum import acceptor as acceptor_
 from middleware.entangled.quorum import round as round_
 from middleware.entangled.quorum.acceptor import TABLE, Acceptor, Event, Stand, State
-from middleware.entangled.quorum.ballot import NONE
 from middleware.entangled.quorum.log import Log
 from middleware.entangled.quorum.proposer import Result, conclude
 from middleware.entangled.quorum.register import Kind, Register, Reply
