@@ -7,7 +7,7 @@ import math
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.commitment.acceptor import IDLE_AGE, MAX_LISTENERS, LeaseAcceptor
-from middleware.commitment.lease_codec import LIFE
+from middleware.commitment.lease_codec import CODEC, LIFE
 from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.quorum import log
 from middleware.entangled.quorum.ballot import ROOM, Ballot
@@ -253,6 +253,23 @@ class AcceptorTests(SynchronousTestCase):
         self.assertEqual(self.prepare(3, "b", 51.0).kind, Kind.HELD)
         self.assertEqual(self.prepare(1, "b", 50.0 + TTL)[:3], (Kind.OUTBID, ballot(2, "a"), 5))
         self.assertEqual(self.prepare(3, "b", 50.0 + TTL).kind, Kind.GRANTED)
+
+    def test_promise_survives_a_restart(self) -> None:
+        """What was only promised is promised by another process, too; where a note is rotten it grants nothing."""
+        store = MemoryStore()
+        LeaseAcceptor(store, -math.inf).prepare("t", 1, ballot(2, "a"), TTL, 0.0)
+        self.acceptor = LeaseAcceptor(store, 50.0)
+        self.assertEqual(self.prepare(1, "b", 51.0).kind, Kind.OUTBID)
+        store.note(CODEC.bucket_of("t"), b"rotten")
+        self.acceptor = LeaseAcceptor(store, 50.0)
+        self.assertEqual(self.prepare(1, "b", 51.0).kind, Kind.QUIET)
+
+    def test_release_of_others(self) -> None:
+        """A ballot that was promised nothing here ends nothing, and bars nobody."""
+        self.propose(1, "a", 1, 0.0)
+        self.assertEqual(self.acceptor.free("t", ballot(9, "b"), 0.5), [])
+        self.assertEqual(self.prepare(2, "b", 0.5).kind, Kind.HELD)
+        self.assertEqual(self.prepare(2, "b", TTL).kind, Kind.GRANTED)
 
     def test_forgotten(self) -> None:
         """What a member forgot for want of room leaves a floor under its ballots and tokens, also after a restart."""
