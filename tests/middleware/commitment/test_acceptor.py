@@ -260,9 +260,18 @@ class AcceptorTests(SynchronousTestCase):
         LeaseAcceptor(store, -math.inf).prepare("t", 1, ballot(2, "a"), TTL, 0.0)
         self.acceptor = LeaseAcceptor(store, 50.0)
         self.assertEqual(self.prepare(1, "b", 51.0).kind, Kind.OUTBID)
+        self.acceptor.accept("t", 1, ballot(2, "a"), MEMBERS[:3], 51.0)
+        self.acceptor = LeaseAcceptor(store, 60.0)
+        self.assertEqual(self.prepare(3, "b", 61.0).kind, Kind.SEALED)
         store.note(CODEC.bucket_of("t"), b"rotten")
         self.acceptor = LeaseAcceptor(store, 50.0)
         self.assertEqual(self.prepare(1, "b", 51.0).kind, Kind.QUIET)
+
+    def test_look(self) -> None:
+        """To look is promised nothing, and lowers no promise."""
+        self.prepare(2, "a", 0.0)
+        self.assertEqual(self.prepare(0, "b", 0.0).kind, Kind.GRANTED)
+        self.assertEqual(self.prepare(1, "c", 0.0).kind, Kind.OUTBID)
 
     def test_release_of_others(self) -> None:
         """A ballot that was promised nothing here ends nothing, and bars nobody."""
