@@ -12,7 +12,7 @@ from twisted.internet.interfaces import IReactorTime
 from agents.behaviour import Behaviour
 from agents.caretaker import Caretaker
 from agents.engagement import Engagement
-from middleware.commitment.ballot import Superseded
+from middleware.commitment.council import Superseded
 from middleware.consensus.strategy import ConsensusAlgorithm
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.record import Record

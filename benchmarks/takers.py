@@ -23,10 +23,10 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--loss", default="0.0-0.5", help="share of datagrams lost, or the range it goes through")
     parser.add_argument("--trials", type=int, default=6, help="trials, from the least loss to the greatest")
     parser.add_argument("--seed", type=int, default=1, help="seed of the first trial")
-    parser.add_argument("--village", action="store_true", help="replicate no records: the councils alone, much faster")
+    parser.add_argument("--light", action="store_true", help="replicate no records: the councils alone, much faster")
     parser.add_argument("--calm", action="store_true", help="kill nobody and cut nothing")
     wanted = parser.parse_args(arguments)
-    kind = LightTrial if wanted.village else Trial
+    kind = LightTrial if wanted.light else Trial
     low, _, high = wanted.loss.partition("-")
     least, most = float(low), float(high or low)
     print("seed  loss  churn  tuples  confirmed  twice  lost  seen again  simulated s  datagrams/tuple  real s")

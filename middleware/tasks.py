@@ -15,7 +15,8 @@ from typing import Any
 
 import msgpack
 
-from middleware.commitment.charter import MAX_BYTES, Charter, charter_of, ending_of
+from middleware.commitment.charter import Charter, charter_of, ending_of
+from middleware.commitment.lease_codec import MAX_PROOF_BYTES
 from middleware.entangled.identity import node_id
 from middleware.entangled.kademlia.contact import Contact, unpacked
 from middleware.entangled.record import Record, hashed_key
@@ -31,7 +32,7 @@ MEMBER = "member"
 RESULT = "result"
 ORDER = "order"
 COUNCIL, DONE = "council", "done"
-MAX_DONE = 2 * MAX_BYTES
+MAX_DONE = 2 * MAX_PROOF_BYTES
 MAX_PRIORITY = 1000
 MAX_CHOICE = 64
 MAX_PLACES = 8

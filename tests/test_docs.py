@@ -22,7 +22,7 @@ from drivers.errors import UsageError
 from drivers.phone import driver, option
 from drivers.registry import KINDS, describe
 from middleware import gauge, halt, stop_set, survey
-from middleware.commitment import ballot, lessee
+from middleware.commitment import lease_codec, lessee
 from middleware.consensus import guard, strategy, worker
 from middleware.deployment import confinement, deployment, frame, manifest, module, runner
 from middleware.dissemination import check, party, scale, teller, tree
@@ -67,7 +67,7 @@ FIGURES: Sequence[tuple[str, str]] = (
     ("consensus", f"Each rank waits {lessee.STAGGER:g} s longer than the one before it"),
     ("consensus", f"News of a release is believed for {lessee.FRESH:g} s"),
     ("consensus", f"*sending* + ttl x {1.0 - lessee.CLOCK_MARGIN:g}"),
-    ("consensus", f"the lowest {ballot.LIFE.bit_length() - 1} bits of the counter"),
+    ("consensus", f"the lowest {lease_codec.LIFE.bit_length() - 1} bits of the counter"),
     ("consensus", f"go to its post, for {engagement.SEARCH_TTL:g} s at a time"),
     ("consensus", f"enormous (above {strategy.MAX_NUMBER:.0e})".replace("e+0", "e")),
     ("consensus", f"a process of their own with {worker.DEADLINE_S:g} s for each answer"),

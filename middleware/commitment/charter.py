@@ -13,14 +13,15 @@ from typing import Any, NamedTuple
 
 import msgpack
 
-from middleware.commitment.ballot import FIRST, MAX_COUNCIL, NONE, ROOM, Ballot, Reply, is_number, members_of, quorum
+from middleware.commitment.lease_codec import MAX_COUNCIL, MAX_PROOF_BYTES, members_of, pack_members, unpack_note
 from middleware.entangled.errors import Refused
 from middleware.entangled.identity import Identity, verified
 from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.quorum.ballot import FIRST, NONE, ROOM, Ballot, is_number, majority
+from middleware.entangled.quorum.register import Reply
 
 MAX_LINKS = 64
 """Changes of one task's council; a change of three members takes 350 bytes, one of seven 700."""
-MAX_BYTES = 2**16
 LEAST = 3
 """Members of a council that was changed, at least: of a smaller one a single member would be a majority."""
 MAX_TOKEN = 2 * ROOM
@@ -86,8 +87,8 @@ class Charter:
     @cached_property
     def packed(self) -> bytes:
         """The charter as it stands in a message, a record or a note."""
-        links = [[_packed(link.members), *link.ballot, [list(vote) for vote in link.votes]] for link in self.links]
-        return bytes(msgpack.packb([self.owner, _packed(self.first), self.signature, links]))
+        links = [[pack_members(link.members), *link.ballot, [list(vote) for vote in link.votes]] for link in self.links]
+        return bytes(msgpack.packb([self.owner, pack_members(self.first), self.signature, links]))
 
 
 def pin(identity: Identity, task_id: str, members: tuple[Contact, ...]) -> Charter:
@@ -109,7 +110,7 @@ def sign_end(identity: Identity, task_id: str, configuration: int, agent: str, t
 
 def charter_of(packed: object) -> Charter | None:
     """The charter that ``packed`` is, or None where it cannot be one; its signatures are not checked.  Never raises."""
-    return _charter_of(packed) if isinstance(packed, bytes) and 0 < len(packed) <= MAX_BYTES else None
+    return _charter_of(packed) if isinstance(packed, bytes) and 0 < len(packed) <= MAX_PROOF_BYTES else None
 
 
 def is_change_signed(
@@ -149,7 +150,7 @@ class Ending:
 
 def ending_of(packed: object, pinned: Charter) -> Ending | None:
     """The proof that ``packed`` is for the task that was published with ``pinned``, or None.  Never raises."""
-    fields = _unpacked(packed) if isinstance(packed, bytes) and len(packed) <= 2 * MAX_BYTES else None
+    fields = unpack_note(packed) if isinstance(packed, bytes) and len(packed) <= 2 * MAX_PROOF_BYTES else None
     if not isinstance(fields, list) or len(fields) != 2 or not isinstance(fields[1], list):
         return None
     charter, signatures = charter_of(fields[0]) if fields[0] else pinned, fields[1]
@@ -196,14 +197,14 @@ def _is_genuine(packed: bytes, task_id: str) -> bool:
 
 def _is_majority(members: tuple[Contact, ...], signed: Mapping[int, tuple[bytes, bytes]]) -> bool:
     """Whether a majority of ``members`` signed, each the statement at its place."""
-    if len(signed) < quorum(len(members)) or any(place >= len(members) for place in signed):
+    if len(signed) < majority(len(members)) or any(place >= len(members) for place in signed):
         return False
     return all(verified(members[place].public, *pair) for place, pair in signed.items())
 
 
 @lru_cache(maxsize=64)
 def _charter_of(packed: bytes) -> Charter | None:
-    fields = _unpacked(packed)
+    fields = unpack_note(packed)
     if not isinstance(fields, list) or len(fields) != 4:
         return None
     owner, first, signature, rows = fields
@@ -238,24 +239,13 @@ def _is_bytes(value: object, size: int) -> bool:
 
 
 def _pinned(task_id: str, members: tuple[Contact, ...]) -> bytes:
-    return bytes(msgpack.packb([b"swarm-council-1", task_id, FIRST, _packed(members)]))
+    return bytes(msgpack.packb([b"swarm-council-1", task_id, FIRST, pack_members(members)]))
 
 
 def _changed(task_id: str, configuration: int, ballot: Ballot, members: tuple[Contact, ...], token: int) -> bytes:
-    fields = [b"swarm-council-change-1", task_id, configuration, *ballot, _packed(members), token]
+    fields = [b"swarm-council-change-1", task_id, configuration, *ballot, pack_members(members), token]
     return bytes(msgpack.packb(fields))
 
 
 def _ended(task_id: str, configuration: int, agent: str, token: int) -> bytes:
     return bytes(msgpack.packb([b"swarm-task-end-1", task_id, configuration, agent, token]))
-
-
-def _packed(members: tuple[Contact, ...]) -> list[list[object]]:
-    return [member.packed() for member in members]
-
-
-def _unpacked(packed: bytes) -> object:
-    try:
-        return msgpack.unpackb(packed, strict_map_key=True, max_ext_len=0)
-    except Exception:  # the decoder raises many kinds on crafted bytes
-        return None

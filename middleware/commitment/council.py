@@ -15,35 +15,33 @@ from typing import Any
 from twisted.internet.defer import Deferred, DeferredList
 from twisted.internet.interfaces import IReactorTime
 
-from middleware.commitment.ballot import (
-    BEHIND,
-    FIRST,
-    GRANTED,
-    HELD,
-    LIFE,
-    MAX_COUNCIL,
-    MOVED,
-    OUTBID,
-    OVER,
-    SEALED,
-    Ballot,
-    NoMajority,
-    OpenClaim,
-    Reply,
-    Superseded,
-    believed,
-    quorum,
-)
 from middleware.commitment.charter import Charter, Ending, is_change_signed, is_end_signed
-from middleware.commitment.round import PAUSE, Ask, Round
+from middleware.commitment.lease_codec import LIFE, MAX_COUNCIL, pack_members, unpack_reply
 from middleware.entangled.errors import Refused
 from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.quorum.ballot import FIRST, Ballot, believed, majority
+from middleware.entangled.quorum.register import Kind, Reply
+from middleware.entangled.quorum.round import PAUSE, Round, Tally
 
+Ask = Callable[[Contact, str, tuple[Any, ...]], Deferred[Any]]
+"""Ask a council member: (member, method, arguments)."""
 IsGenuine = Callable[[int, Reply], bool]
 Read = Callable[[str, object], Charter | None]
 """Makes a charter of what a member sent, where it holds: (task id, packed)."""
 LEAP = 16
 """More ballots than a holder needs until a stand-by looks."""
+
+
+class OpenClaim(Refused):
+    """The council cannot change: an agent holds a lease of it."""
+
+
+class Superseded(Refused):
+    """Another council was chosen than the one that was asked for; the present one is known now."""
+
+
+class NoMajority(Refused):
+    """Too few members of the council answered, or another proposer was faster; try again."""
 
 
 class Council:
@@ -83,7 +81,7 @@ class Council:
         self._clock = clock
         self._rounds = 0
         self._life = rng.randrange(LIFE)
-        self._last: Round | None = None
+        self._last: tuple[Round, tuple[Contact, ...]] | None = None
         self._silent_since: dict[bytes, float] = {}
 
     def next_ballot(self) -> Ballot:
@@ -99,16 +97,31 @@ class Council:
         self,
         method: str,
         *arguments: Any,
-        kinds: tuple[str, ...] = (GRANTED,),
+        kinds: tuple[Kind, ...] = (Kind.GRANTED,),
         short: float = PAUSE,
         is_genuine: IsGenuine = lambda place, reply: True,
+        others: tuple[Contact, ...] = (),
     ) -> Round:
-        """Ask every member; tell ``hear`` what came of it.  ``short`` is the wait for another's lease that is one."""
-        self._note_silence()
-        question = (self.task_id, self.configuration, *arguments)
-        told = method, question, kinds, self.ttl / 3, short, is_genuine
-        self._last = Round(self.members, self._ask, self._clock, *told)
-        return self._last
+        """Ask every member, or ``others``; tell ``hear`` what came of it.
+
+        ``short`` is the wait for another's lease that is one.
+        """
+        members = others or self.members
+        question = (self.task_id, *arguments) if others else (self.task_id, self.configuration, *arguments)
+
+        def ask(place: int) -> Deferred[Any]:
+            return self._ask(members[place], method, question)
+
+        def decode(place: int, answer: object) -> list[Reply] | None:
+            reply = unpack_reply(answer)
+            return None if reply is None or not is_genuine(place, reply) else [reply]
+
+        if not others:
+            self._note_silence()
+        asked = Round([Tally(len(members), kinds)], ask, decode, self._clock, self.ttl / 3, short)
+        if not others:
+            self._last = asked, members
+        return asked
 
     def visit(self) -> None:
         """Ask the members for nothing but whether they are there; ``silent`` knows it later."""
@@ -132,17 +145,17 @@ class Council:
 
     def hear(self, round_: Round) -> None:
         """Learn from answers which numbers are taken, and whether the council is another one now."""
-        replies, size = round_.replies.values(), len(self.members)
-        self._rounds = max(self._rounds, believed((reply.ballot.counter // LIFE for reply in replies), size))
+        replies, size = round_.tally.replies.values(), len(self.members)
+        self._rounds = max(self._rounds, believed((reply.promised.counter // LIFE for reply in replies), size))
         self.token = max(self.token, believed((reply.token for reply in replies), size))
-        told = [self._read(self.task_id, reply.proof) for reply in replies if reply.kind == MOVED]
+        told = [self._read(self.task_id, reply.proof) for reply in replies if reply.kind is Kind.MOVED]
         newest = max((each for each in told if each is not None), key=_configuration, default=None)
         if newest is not None and newest.configuration > self.configuration:
             self._adopt(newest)
             return
         # Who was away when this council was chosen is told by whoever meets it.
-        for place, reply in round_.replies.items():
-            if reply.kind == BEHIND and reply.configuration < self.configuration:
+        for place, reply in round_.tally.replies.items():
+            if reply.kind is Kind.BEHIND and reply.configuration < self.configuration:
                 self._install(self.members[place])
 
     def let_go(self, ballot: Ballot, heirs: Sequence[Contact] = (), rest: float = 0.0) -> Deferred[Any]:
@@ -177,23 +190,23 @@ class Council:
 
     async def finish(self, ballot: Ballot, prepared: Round, keep: bool = True) -> None:
         """Complete a change that a member has accepted: it may be decided already, so no other may follow."""
-        sealed = [reply for reply in prepared.replies.values() if reply.kind == SEALED]
-        await self._decide(ballot, max(sealed, key=lambda reply: reply.ballot).members, keep)
+        await self._decide(ballot, prepared.tally.to_complete, keep)
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
     def _note_silence(self) -> None:
         """Who did not answer the last round, though it was asked often enough; who did is there."""
         if self._last is not None:
-            for member in self._last.answered:
-                self._silent_since.pop(member.node_id, None)
-            for member in self._last.silent:
-                self._silent_since.setdefault(member.node_id, self._last.began_at)
+            asked, members = self._last
+            for place in asked.answered:
+                self._silent_since.pop(members[place].node_id, None)
+            for place in asked.silent:
+                self._silent_since.setdefault(members[place].node_id, asked.began_at)
 
     async def _close(self, token: int) -> None:
         over_at = 0.0
         question = ("lease.close", token) if token else ("lease.cancel",)
-        ended = (OVER, SEALED)
+        ended = (Kind.OVER, Kind.SEALED)
         while True:
             configuration, members = self.configuration, self.members
 
@@ -207,26 +220,25 @@ class Council:
             if self.configuration != configuration:
                 done.close()
                 continue  # there is another council by now
-            sealed = [reply for reply in done.replies.values() if reply.kind == SEALED]
-            if done.is_won and sealed and len(done.yes) - len(sealed) < quorum(len(self.members)):
+            sealed = [reply for reply in done.tally.replies.values() if reply.kind is Kind.SEALED]
+            if done.tally.is_won and sealed and len(done.tally.agreed) - len(sealed) < majority(len(self.members)):
                 # A change was accepted by some: it may be decided, so the council to come has to know as well.
                 if token:
                     raise NoMajority("the end of the task is not recorded: its council is changing; try again")
-                following = max(sealed, key=lambda reply: reply.ballot).members
-                asked = (self.task_id, configuration + 1)
-                done = await Round(
-                    following, self._ask, self._clock, "lease.cancel", asked, ended, self.ttl / 3
-                ).outcome
+                others = done.tally.to_complete
+                done = await self.round("lease.cancel", configuration + 1, kinds=ended, others=others).outcome
                 over_at = max(over_at, self._over_at(done))
-            if not done.is_won:
+            if not done.tally.is_won:
                 done.close()
-                if any(reply.kind == OUTBID for reply in done.replies.values()):
+                if any(reply.kind is Kind.OUTBID for reply in done.tally.replies.values()):
                     raise Superseded("the end of the task is not recorded: a higher token was granted")
                 _raise(done, "the end of the task is not recorded")
             break
         if token and self.charter is not None:
-            votes = [(place, reply.proof) for place, reply in sorted(done.replies.items()) if reply.kind == OVER]
-            self.ending = Ending(self.charter, tuple(votes[: quorum(len(self.members))])).packed
+            votes = [
+                (place, reply.proof) for place, reply in sorted(done.tally.replies.items()) if reply.kind is Kind.OVER
+            ]
+            self.ending = Ending(self.charter, tuple(votes[: majority(len(self.members))])).packed
         rest = over_at - self._clock.seconds()
         if rest > 0.0:
             waited: Deferred[None] = Deferred()
@@ -235,20 +247,22 @@ class Council:
 
     def _over_at(self, done: Round) -> float:
         """When a lease ends that may be in force: a member that granted it is among any majority that closed."""
-        return self._clock.seconds() + max((done.replies[place].remaining for place in done.yes), default=0.0)
+        return self._clock.seconds() + max(
+            (done.tally.replies[place].remaining for place in done.tally.agreed), default=0.0
+        )
 
     async def _change(self, wanted: tuple[Contact, ...], keep: bool) -> None:
         before = self.configuration
         ballot = self.next_ballot()
-        asked = self.round("lease.prepare", ballot.counter, self.ttl, kinds=(GRANTED, SEALED))
+        asked = self.round("lease.prepare", ballot.counter, self.ttl, kinds=(Kind.GRANTED, Kind.SEALED))
         prepared = await asked.outcome
         prepared.close()
         self.hear(prepared)
         if self.configuration != before:
             raise Superseded(f"the council is at configuration {self.configuration} already; look at it again")
-        if not prepared.is_won:
+        if not prepared.tally.is_won:
             _raise(prepared, "the council stays as it is")
-        if any(reply.kind == SEALED for reply in prepared.replies.values()):
+        if prepared.tally.to_complete is not None:
             await self.finish(ballot, prepared, keep)
         else:
             await self._decide(ballot, wanted, keep)
@@ -263,16 +277,17 @@ class Council:
             raise Refused("the council of this task was not signed when it was published; make the task anew")
         accepted = await self._decision(ballot, members, keep)
         accepted.close()
-        if not accepted.is_won:
+        if not accepted.tally.is_won:
             self.hear(accepted)
             self.let_go(ballot, rest=self.ttl)  # a lease that this agent holds goes on
             _raise(accepted, "the council stays as it is")
-        votes = [(place, accepted.replies[place]) for place in sorted(accepted.yes)[: quorum(len(old))]]
+        votes = [
+            (place, accepted.tally.replies[place]) for place in sorted(accepted.tally.agreed)[: majority(len(old))]
+        ]
         charter = before.extended(members, ballot, tuple((place, reply.token, reply.proof) for place, reply in votes))
-        question = (self.task_id, charter.packed, keep, self.ttl)
-        told = Round(members, self._ask, self._clock, "lease.install", question, (GRANTED, MOVED), self.ttl / 3)
-        installed = await told.outcome
-        if not installed.is_won:
+        question, kinds = (charter.packed, keep, self.ttl), (Kind.GRANTED, Kind.MOVED)
+        installed = await self.round("lease.install", *question, kinds=kinds, others=members).outcome
+        if not installed.tally.is_won:
             raise NoMajority("the new council is chosen, but too few of its members know; ask for the change again")
         self._adopt(charter)
         for member in old:
@@ -286,10 +301,9 @@ class Council:
 
         def is_genuine(place: int, reply: Reply) -> bool:
             change = self.task_id, configuration, ballot, members, reply
-            return reply.kind != GRANTED or is_change_signed(old[place], *change)
+            return reply.kind is not Kind.GRANTED or is_change_signed(old[place], *change)
 
-        packed = [member.packed() for member in members]
-        question = ballot.counter, packed, self.token, keep
+        question = ballot.counter, pack_members(members), self.token, keep
         return await self.round("lease.change", *question, is_genuine=is_genuine).outcome
 
     def _install(self, member: Contact, charter: Charter | None = None) -> None:
@@ -312,12 +326,12 @@ def _configuration(charter: Charter) -> int:
 
 def _raise(round_: Round, what: str) -> None:
     """Say by name why a majority did not agree."""
-    replies: list[Reply] = list(round_.replies.values())
-    held = [reply.remaining for reply in replies if reply.kind == HELD]
+    replies: list[Reply] = list(round_.tally.replies.values())
+    held = [reply.remaining for reply in replies if reply.kind is Kind.HELD]
     if held:
         raise OpenClaim(f"{what}: a claim is open and runs out in {max(held):.2f} s unless it is renewed")
-    if any(reply.kind == OUTBID for reply in replies):
+    if any(reply.kind is Kind.OUTBID for reply in replies):
         raise NoMajority(f"{what}: another claimant was faster; try again")
-    if any(reply.kind == OVER for reply in replies) and OVER not in round_.kinds:
+    if any(reply.kind is Kind.OVER for reply in replies) and Kind.OVER not in round_.tally.kinds:
         raise Refused(f"{what}: the task has ended")
     raise NoMajority(f"{what}: {len(replies)} members answered, too few of them with yes; try again")

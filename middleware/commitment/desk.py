@@ -13,15 +13,16 @@ from weakref import WeakValueDictionary
 from twisted.internet.defer import Deferred, maybeDeferred
 from twisted.internet.interfaces import IReactorTime
 
-from middleware.commitment.acceptor import Acceptor
-from middleware.commitment.ballot import GRANTED, MAX_COUNCIL, MAX_NUMBER, NONE, OVER, SEALED, Ballot, Reply, members_of
+from middleware.commitment.acceptor import LeaseAcceptor
 from middleware.commitment.charter import LEAST, Judge, sign_change, sign_end
-from middleware.commitment.ledger import Ledger
+from middleware.commitment.lease_codec import MAX_COUNCIL, members_of, pack_reply
 from middleware.commitment.patience import in_time
 from middleware.entangled.data.store import Store
 from middleware.entangled.errors import Refused
 from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.quorum.ballot import MAX_NUMBER, NONE, Ballot
+from middleware.entangled.quorum.register import Kind, Reply
 from middleware.entangled.record import MAX_NAME
 from middleware.entangled.wire.endpoint import Endpoint
 from middleware.entangled.wire.method import Method
@@ -57,7 +58,7 @@ class Desk:
         self._may_sit = may_sit
         self._store = store
         self._clock = clock
-        self._acceptor = Acceptor(Ledger(store, born_at), born_at)
+        self._acceptor = LeaseAcceptor(store, born_at)
         self._lessees: WeakValueDictionary[str, Lessee] = WeakValueDictionary()
         self._contacts: dict[str, Contact] = {}
         self._methods = {
@@ -103,20 +104,20 @@ class Desk:
         ballot, ttl = Ballot(counter, peer.node_id.hex()), float(ttl)
 
         def proposed() -> Reply:
-            return self._acceptor.propose(task_id, configuration, ballot, token, ttl, self._clock.seconds())
+            return self._acceptor.lease(task_id, configuration, ballot, token, ttl, self._clock.seconds())
 
         return in_time(proposed, self._clock).addCallback(self._kept)
 
     def _release(self, peer: Contact, task_id: str, counter: int, rest: float) -> None:
         _check(task_id, counter, rest=rest)
         ballot = Ballot(counter, peer.node_id.hex())
-        self._tell(self._acceptor.release(task_id, ballot, self._clock.seconds(), float(rest)), task_id, rest)
+        self._tell(self._acceptor.free(task_id, ballot, self._clock.seconds(), float(rest)), task_id, rest)
 
     def _close(self, peer: Contact, task_id: str, configuration: int, token: int) -> Answer:
         _check(task_id, configuration, token)
         agent, now = peer.node_id.hex(), self._clock.seconds()
         reply = self._acceptor.close(task_id, agent, configuration, token, now)
-        if reply.kind in (OVER, SEALED):
+        if reply.kind in (Kind.OVER, Kind.SEALED):
             reply = reply._replace(proof=sign_end(self._identity, task_id, configuration, agent, token))
         return self._kept(reply)
 
@@ -139,8 +140,8 @@ class Desk:
         if members is None or len(members) < LEAST or not all(self._may_sit(member.public) for member in members):
             raise Refused(f"the next council has {LEAST} to {MAX_COUNCIL} members of the team that are no viewers")
         ballot, now = Ballot(counter, peer.node_id.hex()), self._clock.seconds()
-        reply = self._acceptor.change(task_id, configuration, ballot, members, token, now, keep)
-        if reply.kind == GRANTED:
+        reply = self._acceptor.accept(task_id, configuration, ballot, members, now, token, keep)
+        if reply.kind is Kind.GRANTED:
             signature = sign_change(self._identity, task_id, configuration, ballot, members, reply.token)
             reply = reply._replace(proof=signature)
         return self._kept(reply)
@@ -150,7 +151,7 @@ class Desk:
         charter = self._judge.read(task_id, packed)
         if charter is None or not charter.links:
             raise Refused("a council is installed with the signatures of a majority of the one before it")
-        mine = keep and charter.ballot.agent == peer.node_id.hex()
+        mine = keep and charter.ballot.proposer == peer.node_id.hex()
         reply = self._acceptor.install(
             task_id,
             charter.configuration,
@@ -191,7 +192,7 @@ class Desk:
 
     def _kept(self, reply: Reply) -> Answer:
         """The answer, once everything that it promises survives the end of the process."""
-        packed = reply.packed()
+        packed = pack_reply(reply)
         written = self._store.written()
         return packed if written.called and written.result is None else written.addCallback(lambda _: packed)
 

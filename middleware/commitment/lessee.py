@@ -18,11 +18,13 @@ from twisted.internet.defer import Deferred, succeed
 from twisted.internet.interfaces import IDelayedCall, IReactorTime
 from twisted.internet.task import deferLater
 
-from middleware.commitment.ballot import AHEAD, GRANTED, NONE, OUTBID, OVER, QUIET, SEALED, Ballot, quorum
 from middleware.commitment.council import Council
-from middleware.commitment.round import PAUSE, Round
+from middleware.commitment.lease_codec import AHEAD
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.quorum.ballot import NONE, Ballot, majority
+from middleware.entangled.quorum.register import Kind
+from middleware.entangled.quorum.round import PAUSE, Round
 
 CLOCK_MARGIN = 0.02
 """Share by which the clocks of two correct nodes may drift apart: 2 rho, with rho = 1 %."""
@@ -206,7 +208,7 @@ class Lessee:
         self._cancel()
         self._only_looks = False
         self._claimed = ballot = self.council.next_ballot()
-        kinds = (GRANTED, SEALED)
+        kinds = (Kind.GRANTED, Kind.SEALED)
         question = ballot.counter, self.council.ttl
         self._round = asked = self.council.round("lease.prepare", *question, kinds=kinds, short=self._short)
         asked.outcome.addCallback(self._promised, ballot, self.council.configuration)
@@ -217,10 +219,10 @@ class Lessee:
             return
         if self.council.configuration != configuration:
             return self._claim()
-        if not asked.is_won:
+        if not asked.tally.is_won:
             return self._failed(asked)
         asked.close()
-        if any(reply.kind == SEALED for reply in asked.replies.values()):
+        if asked.tally.to_complete is not None:
             self._round = None
             finishing = Deferred.fromCoroutine(self.council.finish(ballot, asked))
             finishing.addErrback(lambda failure: failure.trap(EntangledError))
@@ -252,8 +254,8 @@ class Lessee:
         if self._round is not asked or self._has_ended(asked):
             return
         # Who may not grant anything yet needs no other ballot later.
-        self._must_prepare = any(reply.kind not in (GRANTED, QUIET) for reply in asked.replies.values())
-        deadline = self._deadline_of(asked) if asked.is_won else 0.0
+        self._must_prepare = any(reply.kind not in (Kind.GRANTED, Kind.QUIET) for reply in asked.tally.replies.values())
+        deadline = self._deadline_of(asked) if asked.tally.is_won else 0.0
         if deadline <= self._clock.seconds():
             return self._failed(asked)
         self._ballot, self.token, self._deadline = ballot, token, deadline
@@ -271,7 +273,7 @@ class Lessee:
         if self.lease is not None:
             # There is time for another renewal before the deadline; a member that has promised a higher ballot
             # meanwhile needs a new one.
-            self._must_prepare = any(reply.kind == OUTBID for reply in asked.replies.values())
+            self._must_prepare = any(reply.kind is Kind.OUTBID for reply in asked.tally.replies.values())
             return self._again(min(RETRY, self._deadline - self._clock.seconds()))
         was_held = self.token != 0
         self._let_go_of_minority()
@@ -282,7 +284,7 @@ class Lessee:
 
     def _wait(self, asked: Round) -> None:
         """Claim when the lease may be free; look again in a third of a ttl at any rate, for a push may be lost."""
-        is_outbid = any(reply.kind == OUTBID for reply in asked.replies.values())
+        is_outbid = any(reply.kind is Kind.OUTBID for reply in asked.tally.replies.values())
         free_in = asked.free_in()
         if is_outbid and free_in == math.inf:
             free_in = 0.0  # the others were not heard; with a higher ballot they are
@@ -310,7 +312,7 @@ class Lessee:
         if self.council.configuration != configuration:
             # Only the members of now know who stands by, and tell it of a release.
             return self._look()
-        if asked.is_won and not self._stagger():
+        if asked.tally.is_won and not self._stagger():
             self._claim()
         else:
             self._wait(asked)
@@ -363,8 +365,8 @@ class Lessee:
 
     def _has_ended(self, asked: Round) -> bool:
         """Whether a majority says that the task has ended: then nobody may act, not even whoever could for a while."""
-        over = [reply for reply in asked.replies.values() if reply.kind == OVER]
-        if len(over) >= quorum(len(self.council.members)):
+        over = [reply for reply in asked.tally.replies.values() if reply.kind is Kind.OVER]
+        if len(over) >= majority(len(self.council.members)):
             self.is_over, self._is_wanted = True, False
             self._cancel()
             self._lose()

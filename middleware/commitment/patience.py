@@ -8,7 +8,7 @@ from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorTime
 from twisted.internet.task import deferLater
 
-from middleware.commitment.ballot import HELD, Reply
+from middleware.entangled.quorum.register import Kind, Reply
 
 MOST = 0.15
 """Seconds for which an answer is put off."""
@@ -26,7 +26,7 @@ def in_time(propose: Callable[[], Reply], clock: IReactorTime) -> Deferred[Reply
 
 async def _in_time(propose: Callable[[], Reply], clock: IReactorTime) -> Reply:
     reply = propose()
-    while reply.kind == HELD and reply.remaining <= MOST:
+    while reply.kind is Kind.HELD and reply.remaining <= MOST:
         await deferLater(clock, max(LEAST, reply.remaining))
         reply = propose()
     return reply

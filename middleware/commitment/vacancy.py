@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from middleware.commitment.ballot import quorum
 from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.quorum.ballot import majority
 
 
 def filled(
@@ -33,4 +33,4 @@ def odd(members: Sequence[Contact]) -> tuple[Contact, ...]:
 
 def _spare(here: int, size: int) -> int:
     """How many of those that are ``here`` may be lost before no majority of ``size`` is left."""
-    return here - quorum(size)
+    return here - majority(size)

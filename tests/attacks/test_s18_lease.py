@@ -9,11 +9,12 @@ from twisted.internet.defer import Deferred
 
 from middleware import roles
 from middleware.admission.team import Team
-from middleware.commitment.ballot import GRANTED, MOVED, OVER, Reply
+from middleware.commitment.lease_codec import pack_members
 from middleware.commitment.lessee import Lessee
 from middleware.entangled.errors import Refused
 from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.quorum.register import Kind, Reply
 from middleware.entangled.record import Record
 from middleware.group import Group
 from middleware.node import SwarmNode
@@ -144,10 +145,8 @@ class ReconfigurationTests(LeaseCase):
         holder = self.held_by(self.members()[0])
         liar, accomplices = self.members()[1], self.outsiders()
         forged = tuple(self.team.contact(self.team.houses[place]) for place in accomplices)
-        acceptor: Any = self.team.nodes[liar].councils.desk._acceptor
-        reply = Reply(MOVED, configuration=9, members=forged)
-        for name in ("prepare", "propose"):
-            setattr(acceptor, name, lambda *_, **__: reply)
+        desk: Any = self.team.nodes[liar].councils.desk
+        desk._kept = lambda reply: ["moved", 0, "", 0, 0.0, 9, pack_members(forged)]
         second = self.lessee(accomplices[0])
         second.want()
         self.team.run(3.0)
@@ -212,8 +211,8 @@ class ClosingTests(LeaseCase):
         """One member that lies about the end keeps no healthy claimant from the lease."""
         liar = self.members()[1]
         acceptor: Any = self.team.nodes[liar].councils.desk._acceptor
-        for name in ("prepare", "propose"):
-            setattr(acceptor, name, lambda *_, **__: Reply(OVER))
+        for name in ("prepare", "lease"):
+            setattr(acceptor, name, lambda *_, **__: Reply(Kind.OVER))
         self.held_by(self.outsiders()[0], 2.0)
 
 
@@ -254,7 +253,7 @@ class NumberTests(LeaseCase):
 
         def lie(*arguments: Any) -> Reply:
             reply: Reply = genuine(*arguments)
-            return reply._replace(kind=GRANTED, token=HUGE, ballot=reply.ballot._replace(counter=HUGE))
+            return reply._replace(kind=Kind.GRANTED, token=HUGE, promised=reply.promised._replace(counter=HUGE))
 
         acceptor.prepare = lie
         self.held_by(self.outsiders()[0], 3.0)

@@ -13,14 +13,11 @@ from agents import circle
 from agents.docket import Docket
 from drivers.errors import StaleCommand
 from drivers.gate import Gate
-from middleware.commitment import charter, ledger, lessee
-from middleware.commitment import round as round_
-from middleware.commitment.acceptor import Acceptor
-from middleware.commitment.ballot import GRANTED, OVER, Reply
+from middleware.commitment import charter, lessee
 from middleware.commitment.charter import pin
 from middleware.commitment.council import Council
+from middleware.commitment.lease_codec import pack_members
 from middleware.commitment.lessee import Lease, Lessee
-from middleware.commitment.round import Round
 from middleware.consensus import bidder, nearest
 from middleware.consensus.nearest import Nearest
 from middleware.consensus.strategy import Report
@@ -32,12 +29,19 @@ from middleware.entangled.errors import EntangledError
 from middleware.entangled.kademlia import overlay
 from middleware.entangled.kademlia.overlay import Overlay
 from middleware.entangled.kademlia.roster import Roster
+from middleware.entangled.quorum import acceptor as acceptor_
+from middleware.entangled.quorum import round as round_
+from middleware.entangled.quorum.acceptor import TABLE, Acceptor, Event, Stand, State
+from middleware.entangled.quorum.log import Log
+from middleware.entangled.quorum.proposer import Result, conclude
+from middleware.entangled.quorum.register import Kind, Register, Reply
+from middleware.entangled.quorum.round import Round, Tally
 from middleware.entangled.record import Record, Slot
 from middleware.entangled.replication import owner, reader
 from middleware.entangled.replication.handover import Handover
 from middleware.entangled.replication.reader import Reader
 from middleware.entangled.replication.replica import Replica
-from middleware.entangled.space.decree import Result, Tally, Vote
+from middleware.entangled.space import council as takes
 from middleware.entangled.space.keeper import Keeper
 from middleware.entangled.space.seat import Seat
 from middleware.entangled.space.shelf import Shelf
@@ -79,40 +83,43 @@ def _any_answer(answers: dict[bytes, Any], voters: frozenset[bytes]) -> int:
 _GENUINE = {
     (place, name): getattr(place, name)
     for place, name in [
-        (Tally, "outcome"),
-        (Vote, "claim"),
         (Greeter, "on_who"),
         (Session, "open"),
+        (Seat, "_claimed"),
         (Seat, "_load"),
-        (ledger.Ledger, "keep"),
+        (Log, "keep"),
         (Acceptor, "release"),
+        (Acceptor, "_stand"),
+        (Register, "wake"),
+        (Tally, "add"),
+        (Keeper, "_slot"),
     ]
 }
 
 
-def _won_by_one(self: Tally) -> Any:
-    outcome = _GENUINE[Tally, "outcome"].fget(self)
-    lost = outcome is not None and outcome.result in (Result.OUTBID, Result.LEASED, Result.SILENT)
-    is_promised = any(reply.kind is self._wanted for reply in self._replies)
-    return outcome._replace(result=Result.WON) if lost and is_promised else outcome
+def _won_by_one(tally: Tally) -> Any:
+    outcome = conclude(tally)
+    lost = outcome.result in (Result.OUTBID, Result.HELD, Result.SILENT)
+    return outcome._replace(result=Result.WON) if lost and tally.agreed else outcome
 
 
-def _claimed_for_ever(self: Vote, ballot: Any, lease: float, now: float) -> Any:
-    return _GENUINE[Vote, "claim"](self, ballot, lease + 1e6, now)
+def _claimed_for_ever(self: Seat, place: Any, ballot: Any, lease: float, now: float) -> Any:
+    return _GENUINE[Seat, "_claimed"](self, place, ballot, lease + 1e6, now)
 
 
 def _let_go_as_if_at_rest(self: Lessee, ballot: Any, heirs: Any = ()) -> Any:
     return self.council.let_go(ballot, heirs)
 
 
-def _released_at_rest(self: Acceptor, task_id: str, ballot: Any, now: float, rest: float = 0.0) -> Any:
-    return _GENUINE[Acceptor, "release"](self, task_id, ballot, now)
+def _released_at_rest(self: Acceptor[Any], key: Any, ballot: Any, now: float, rest: float = 0.0) -> Any:
+    return _GENUINE[Acceptor, "release"](self, key, ballot, now)
 
 
-def _load_without_votes(self: Seat) -> None:
-    _GENUINE[Seat, "_load"](self)
-    for votes in (self._votes, self._buckets, self._unsettled):
+def _load_without_votes(self: Seat) -> Any:
+    acceptor = _GENUINE[Seat, "_load"](self)
+    for votes in (acceptor.log.registers, acceptor.log._buckets, self._unsettled):
         votes.clear()
+    return acceptor
 
 
 def _told_what_is_known(self: Shelf, records: list[Record]) -> None:
@@ -170,8 +177,8 @@ def _held_for_ever(self: Lessee) -> Lease | None:
     return Lease(self.task_id, self.token, self._deadline) if self.token else None
 
 
-def _closed_and_forgotten(self: Acceptor, *_: Any) -> Reply:
-    return Reply(OVER)
+def _closed_and_forgotten(self: Acceptor[Any], *_: Any) -> Reply:
+    return Reply(Kind.OVER)
 
 
 def _only_listens(self: Lessee, asked: Round) -> None:
@@ -183,11 +190,11 @@ def _closest_now(self: Leases, place: int, task_id: str) -> Any:
     return pin(self.operator, task_id, tuple(self.contacts[n] for n in near[:3]))
 
 
-def _forgets_tokens(self: ledger.Ledger, task_id: str) -> None:
-    entry = self._entries[task_id]
-    token, entry.token = entry.token, 0
-    _GENUINE[ledger.Ledger, "keep"](self, task_id)
-    entry.token = token
+def _forgets_tokens(self: Log[Any], key: Any) -> None:
+    register = self.registers[key]
+    token, register.token = register.token, 0
+    _GENUINE[Log, "keep"](self, key)
+    register.token = token
 
 
 def _admits_lower_tokens(self: Gate, permit: Any, now: float) -> None:
@@ -197,9 +204,41 @@ def _admits_lower_tokens(self: Gate, permit: Any, now: float) -> None:
 
 
 async def _decided_by_the_new(self: Council, ballot: Any, members: Any, keep: bool) -> Round:
-    packed = [member.packed() for member in members]
-    question = (self.task_id, self.configuration, ballot.counter, packed, self.token, keep)
-    return await Round(members, self._ask, self._clock, "lease.change", question, (GRANTED,), self.ttl / 3).outcome
+    question = self.configuration, ballot.counter, pack_members(members), self.token, keep
+    return await self.round("lease.change", *question, others=members).outcome
+
+
+def _row(event: Event, stand: Stand, kind: Kind, state: State = State.OPEN) -> list[tuple[Any, str, Any]]:
+    """The table with another answer in one row."""
+    return [(acceptor_, "TABLE", {**TABLE, (state, event, stand): (kind, TABLE[state, event, stand][1])})]
+
+
+def _wakes_free(self: Register, now: float, lives: int) -> None:
+    _GENUINE[Register, "wake"](self, now, lives)
+    self.until = self.reserved_until = 0.0
+
+
+def _any_configuration(self: Acceptor[Any], register: Register, question: Any) -> Any:
+    return _GENUINE[Acceptor, "_stand"](self, register, question._replace(configuration=register.configuration))
+
+
+def _nothing_is_lower(self: Acceptor[Any], register: Register, question: Any) -> Any:
+    stand = _GENUINE[Acceptor, "_stand"](self, register, question)
+    return Stand.FREE if stand is Stand.LOWER else stand
+
+
+def _release_ends_nothing(self: Acceptor[Any], *_: Any) -> Reply:
+    return Reply(Kind.GRANTED)
+
+
+def _counted_twice(self: Tally, place: int, reply: Reply | None) -> None:
+    for each in (place, (place + 1) % self.size):
+        _GENUINE[Tally, "add"](self, each, reply)
+
+
+def _only_slot(self: Keeper, key: bytes) -> str:
+    _GENUINE[Keeper, "_slot"](self, key)
+    return "only"
 
 
 BUGS: dict[str, list[tuple[Any, str, Any]]] = {
@@ -223,11 +262,22 @@ BUGS: dict[str, list[tuple[Any, str, Any]]] = {
     "the absent are not sought": [(Roster, "absent", lambda self: [])],
     "any answer counts": [(reader, "_votes", _any_answer)],
     # Tuples.
-    "one promise is a majority": [(Tally, "outcome", property(_won_by_one))],
+    "one promise is a majority": [(takes, "conclude", _won_by_one)],
     "votes forgotten by a restart": [(Seat, "_load", _load_without_votes)],
-    "the lease of the dead never ends": [(Vote, "claim", _claimed_for_ever)],
+    "the lease of the dead never ends": [(Seat, "_claimed", _claimed_for_ever)],
     "a take is not noted": [(Keeper, "note", _nothing), (Keeper, "doubt", _idle)],
+    "slots are used too early": [(Keeper, "_slot", _only_slot)],
     "who waits is not woken": [(Shelf, "_changed", _told_what_is_known)],
+    # Quorums.
+    "lower ballots are accepted": [(Acceptor, "_stand", _nothing_is_lower)],
+    "what was accepted is not completed": [(Tally, "to_complete", property(lambda self: None))],
+    "a restart ends leases": [(Register, "wake", _wakes_free)],
+    "a lease is granted while another runs": _row(Event.LEASE, Stand.HELD, Kind.GRANTED),
+    "a lease is granted before the device rests": _row(Event.LEASE, Stand.ENDING, Kind.GRANTED),
+    "a council that is over grants leases": [(Acceptor, "_stand", _any_configuration)],
+    "a promise bars nobody": _row(Event.PREPARE, Stand.LOWER, Kind.GRANTED),
+    "a release ends nothing": [(Acceptor, "release", _release_ends_nothing)],
+    "an answer counts for two members": [(Tally, "add", _counted_twice)],
     # The wire.
     "questions are not remembered": [(Ledger, "entry", _never_known)],
     "the window moves before the tag is checked": [(Session, "open", _moved_before_it_is_opened)],
@@ -250,14 +300,14 @@ BUGS: dict[str, list[tuple[Any, str, Any]]] = {
     # Leases.
     "deadline from the time of the answer": [(Lessee, "_deadline_of", _deadline_from_the_answer)],
     "the own deadline is not looked at": [(Lessee, "lease", property(_held_for_ever))],
-    "one member of a council is a majority": [(round_, "quorum", lambda size: 1)],
+    "one member of a council is a majority": [(round_, "majority", lambda size: 1)],
     "the end of a task is not kept by its council": [(Acceptor, "close", _closed_and_forgotten)],
     "no clock margin": [(lessee, "CLOCK_MARGIN", 0.0)],
     "a clock that stands still while suspended": [(Machine, "COUNTS_SUSPENSION", False)],
     "the council is whoever is closest now": [(Leases, "council_for", _closest_now)],
     "a stand-by does not ask": [(Lessee, "_wait", _only_listens)],
     "minority grants are kept": [(Lessee, "_let_go_of_minority", _idle)],
-    "the token is not stored": [(ledger.Ledger, "keep", _forgets_tokens)],
+    "the token is not stored": [(Log, "keep", _forgets_tokens)],
     "the time to stop is ignored": [(Lessee, "_deadline_of", _deadline_without_the_stop)],
     "released before it stands still": [(Lessee, "_let_go", _let_go_as_if_at_rest)],
     "granted before it stands still": [(Acceptor, "release", _released_at_rest)],
@@ -275,7 +325,17 @@ FINDERS: dict[str, tuple[str, ...]] = {
     "votes forgotten by a restart": ("tuples",),
     "the lease of the dead never ends": ("tuples",),
     "a take is not noted": ("tuples",),
+    "slots are used too early": ("tuples",),
     "who waits is not woken": ("tuples",),
+    "lower ballots are accepted": ("leases",),
+    "what was accepted is not completed": ("tuples",),
+    "a restart ends leases": ("leases",),
+    "a lease is granted while another runs": ("leases",),
+    "a lease is granted before the device rests": ("leases",),
+    "a council that is over grants leases": ("leases",),
+    "a promise bars nobody": ("leases",),
+    "a release ends nothing": ("leases",),
+    "an answer counts for two members": ("leases",),
     "questions are not remembered": ("wire",),
     "the window moves before the tag is checked": ("wire",),
     "a greeting is answered twice": ("wire",),

@@ -11,10 +11,11 @@ from twisted.python.failure import Failure
 
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.node import EntangledNode
+from middleware.entangled.quorum.acceptor import Event
 from middleware.entangled.record import Record
 from middleware.entangled.space.claim import Claim
-from middleware.entangled.space.decree import reply_unpacked
 from middleware.entangled.space.posting import Place, Posted
+from middleware.entangled.space.take_codec import unpack_reply
 from middleware.entangled.space.template import ANY, Field, Tuple
 from middleware.entangled.space.tuplespace import TupleSpace
 from sim.team import event
@@ -208,7 +209,7 @@ class Tuples:
                     asked.addCallbacks(self._said_again, _weather, (posted, value))
 
     def _said_again(self, answer: Any, posted: Posted, value: bytes) -> None:
-        reply = reply_unpacked(answer[0]) if isinstance(answer, list) and answer else None
+        reply = unpack_reply(answer[0], Event.ACCEPT) if isinstance(answer, list) and answer else None
         self._history.note(event.Repeated, posted.fields, value, reply.value if reply is not None else None)
 
     # -- the end ----------------------------------------------------------------------------------------------------

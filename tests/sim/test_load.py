@@ -8,11 +8,12 @@ from typing import Any
 from twisted.internet.defer import Deferred, succeed
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.commitment.acceptor import Acceptor
-from middleware.commitment.ballot import GRANTED, Ballot, Reply
+from middleware.commitment.acceptor import LeaseAcceptor
 from middleware.entangled.clock import HeapClock
 from middleware.entangled.kademlia.distance import distance
 from middleware.entangled.node import EntangledNode
+from middleware.entangled.quorum.ballot import Ballot
+from middleware.entangled.quorum.register import Kind, Reply
 from middleware.entangled.record import Record
 from sim.team.figure import Figure
 from sim.team.load.catalogue import LOADS
@@ -231,16 +232,16 @@ class TaskTests(SynchronousTestCase):
     def test_two_holders_show(self) -> None:
         """Where a lease is given to whoever asks, it shows that two hold one."""
 
-        def promising(acceptor: Acceptor, task_id: str, configuration: int, ballot: Ballot, *rest: Any) -> Reply:
-            return Reply(GRANTED, ballot)
+        def promising(acceptor: LeaseAcceptor, task_id: str, configuration: int, ballot: Ballot, *rest: Any) -> Reply:
+            return Reply(Kind.GRANTED, ballot)
 
         def granting(
-            acceptor: Acceptor, task_id: str, configuration: int, ballot: Ballot, token: int, *rest: Any
+            acceptor: LeaseAcceptor, task_id: str, configuration: int, ballot: Ballot, token: int, *rest: Any
         ) -> Reply:
-            return Reply(GRANTED, ballot, token)
+            return Reply(Kind.GRANTED, ballot, token)
 
-        self.patch(Acceptor, "prepare", promising)
-        self.patch(Acceptor, "propose", granting)
+        self.patch(LeaseAcceptor, "prepare", promising)
+        self.patch(LeaseAcceptor, "lease", granting)
         outcome, _ = played(self.TEXT)
         self.assertTrue(any(line.startswith("E2") for line in outcome.violations), outcome.violations)
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from twisted.internet.defer import Deferred
 
 from middleware.entangled.errors import Refused
-from middleware.entangled.space.decree import Ballot
+from middleware.entangled.quorum.ballot import Ballot
 from middleware.entangled.space.posting import Posted
 from middleware.entangled.space.template import Tuple
 

@@ -1,6 +1,6 @@
 """Council: the conversation of a claimant with the members that are pinned in a tuple.
 
-It asks, counts by ``Tally`` and sees a decree through to its end; it knows no node, only a way to ask a member.
+It claims, confirms and sees a decision through to its end; it knows no node, only a way to ask a member.
 """
 
 from __future__ import annotations
@@ -10,15 +10,20 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from twisted.internet.defer import Deferred
+from twisted.internet.interfaces import IReactorTime
 
 from middleware.entangled.background import Background
 from middleware.entangled.errors import EntangledError, NotRunning
 from middleware.entangled.kademlia.contact import Contact
-from middleware.entangled.space.decree import Ballot, Kind, Outcome, Result, Tally, reply_unpacked
+from middleware.entangled.quorum.acceptor import Event
+from middleware.entangled.quorum.ballot import Ballot
+from middleware.entangled.quorum.proposer import Outcome, Result, conclude, decide
+from middleware.entangled.quorum.register import Reply
+from middleware.entangled.quorum.round import Round, Tally
 from middleware.entangled.space.posting import Member, Posted
+from middleware.entangled.space.take_codec import unpack_reply
 
 RESOLVE_LEASE = 2.0
-BACK_OFF = (0.05, 2.0)
 
 Ask = Callable[[Contact, str, tuple[object, ...]], "Deferred[Any]"]
 """Ask a member: (contact, method, arguments)."""
@@ -27,8 +32,9 @@ Ask = Callable[[Contact, str, tuple[object, ...]], "Deferred[Any]"]
 class Council:
     """How one claimant talks with councils; ``chores`` are its own, and end with it."""
 
-    def __init__(self, ask: Ask, rng: random.Random, chores: Background) -> None:
+    def __init__(self, ask: Ask, clock: IReactorTime, rng: random.Random, chores: Background) -> None:
         self._ask = ask
+        self._clock = clock
         self._rng = rng
         self._chores = chores
 
@@ -43,11 +49,11 @@ class Council:
 
     async def renew(self, posted: Sequence[Posted], ballot: Ballot, lease: float) -> list[Outcome]:
         """One round of claims under a ballot that has won before; where it fails, what is left of the lease stays."""
-        return await self._round(posted, "decree.claim", Kind.PROMISED, ballot, lease)
+        return await self._round(posted, "decree.claim", Event.PREPARE, ballot, lease)
 
     async def confirm(self, posted: Sequence[Posted], ballot: Ballot, value: bytes) -> list[Outcome]:
         """One round of confirmation, of tuples of one key and council."""
-        return await self._round(posted, "decree.confirm", Kind.ACCEPTED, ballot, value)
+        return await self._round(posted, "decree.confirm", Event.ACCEPT, ballot, value)
 
     def release(self, posted: Sequence[Posted], ballot: Ballot) -> None:
         """Give leases back, as far as the members can be heard; the others let them run out."""
@@ -61,60 +67,41 @@ class Council:
         ``value`` is proposed where nothing else was; with None nothing is, and None is returned where nothing was
         accepted.  Ends only when the council has decided; raises ``NotRunning`` when the claimant itself is stopped.
         """
-        pause = BACK_OFF[0]
-        while True:
-            counter += 1
-            ballot = Ballot(counter, bidder)
-            [claimed] = await self.claim([posted], ballot, RESOLVE_LEASE)
-            counter = max(counter, claimed.counter)
-            outcome = claimed
-            if claimed.result is Result.WON:
-                chosen = claimed.value or value
-                if chosen is None:
-                    self.release([posted], ballot)
-                    return None
-                [outcome] = await self.confirm([posted], ballot, chosen)
-                counter = max(counter, outcome.counter)
-                if outcome.result is Result.WON:
-                    return chosen
-            if outcome.result is Result.DECIDED:
-                return outcome.value
+
+        async def prepare(ballot: Ballot) -> Outcome:
+            return (await self.claim([posted], ballot, RESOLVE_LEASE))[0]
+
+        async def accept(ballot: Ballot, chosen: bytes) -> Outcome:
+            return (await self.confirm([posted], ballot, chosen))[0]
+
+        async def sleep(seconds: float) -> None:
             if self._chores.is_stopped:
                 raise NotRunning("the tuple space was stopped while a take was being confirmed")
-            # Not for the whole of another's lease: it may end sooner, or with a decision.
-            await self._chores.sleep(max(min(outcome.remaining, BACK_OFF[1]), pause * (0.5 + self._rng.random())))
-            pause = min(2 * pause, BACK_OFF[1])
+            await self._chores.sleep(seconds)
+
+        ballot = Ballot(counter + 1, bidder)
+        ballot, decided = await decide(ballot, value, prepare, accept, sleep, self._rng)
+        if decided is None:
+            self.release([posted], ballot)
+        return decided  # type: ignore[no-any-return]
 
     async def _round(
-        self, posted: Sequence[Posted], method: str, wanted: Kind, ballot: Ballot, last: object
+        self, posted: Sequence[Posted], method: str, event: Event, ballot: Ballot, last: object
     ) -> list[Outcome]:
         council = posted[0].council
-        tallies = [Tally(len(council), wanted) for _ in posted]
-        done: Deferred[None] = Deferred()
 
-        def settle() -> None:
-            if not done.called and all(tally.outcome is not None for tally in tallies):
-                done.callback(None)
+        def ask(place: int) -> Deferred[Any]:
+            return self._ask(council[place].contact, method, (*_arguments(posted, council[place], ballot), last))
 
-        def answered(answer: object) -> None:
-            replies = answer if isinstance(answer, list) and len(answer) == len(posted) else [None] * len(posted)
-            for tally, fields in zip(tallies, replies, strict=True):
-                tally.add(reply_unpacked(fields))
-            settle()
+        def decode(place: int, answer: object) -> list[Reply | None] | None:
+            replies = answer if isinstance(answer, list) and len(answer) == len(posted) else None
+            return replies and [unpack_reply(fields, event) for fields in replies]
 
-        def lost(failure: Any) -> None:
-            for tally in tallies:
-                tally.add(None)
-            settle()
-            failure.trap(EntangledError)
-
-        for member in council:
-            asked = self._ask(member.contact, method, (*_arguments(posted, member, ballot), last))
-            asked.addCallbacks(answered, lost)
-        await done
-        return [tally.outcome or Outcome(Result.SILENT) for tally in tallies]
+        tallies = [Tally(len(council)) for _ in posted]
+        await Round(tallies, ask, decode, self._clock, short=0.0, single=True).outcome
+        return [conclude(tally) for tally in tallies]
 
 
 def _arguments(posted: Sequence[Posted], member: Member, ballot: Ballot) -> tuple[object, ...]:
     places = [one.place.packed() for one in posted]
-    return (posted[0].place.key, places, member.incarnation, ballot.counter, ballot.taker)
+    return (posted[0].place.key, places, member.incarnation, ballot.counter, ballot.proposer)

@@ -15,12 +15,12 @@ from middleware.entangled.errors import Malformed
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.contact import unpacked as contact_unpacked
 from middleware.entangled.record import MAX_NAME, Record, Slot, hashed_key
-from middleware.entangled.space.decree import is_name
 from middleware.entangled.space.template import Tuple, tuple_unpacked
 
 MAX_COUNCIL = 5
 MARK_BYTES = 8
 INCARNATION_BYTES = 8
+MAX_NAME_BYTES = 40
 _POSTED, _TAKEN = 1, 2
 
 
@@ -105,6 +105,11 @@ def posting(record: Record) -> Posted | Taken | None:
             about = place_unpacked(record.key, place)
             return None if about is None else Taken(about, taker)
     return None
+
+
+def is_name(value: object) -> bool:
+    """Whether ``value`` may be the name of a taker."""
+    return type(value) is bytes and 0 < len(value) <= MAX_NAME_BYTES
 
 
 def place_unpacked(key: bytes, fields: object) -> Place | None:

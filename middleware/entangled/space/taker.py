@@ -17,9 +17,10 @@ from middleware.entangled.errors import EntangledError, NoAnswer, Refused
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.distance import closest
 from middleware.entangled.node import EntangledNode
+from middleware.entangled.quorum.ballot import Ballot
+from middleware.entangled.quorum.proposer import Outcome, Result
 from middleware.entangled.space.claim import Claim, ClaimLost
 from middleware.entangled.space.council import Council
-from middleware.entangled.space.decree import Ballot, Outcome, Result
 from middleware.entangled.space.keeper import Keeper
 from middleware.entangled.space.posting import INCARNATION_BYTES, Member, Place, Posted, standing
 from middleware.entangled.space.seat import MAX_PLACES
@@ -70,7 +71,7 @@ class Taker:
         self._chores = chores
         self._keeper = keeper
         self._size = council
-        self._council = Council(self._ask, rng, chores)
+        self._council = Council(self._ask, clock, rng, chores)
         self._seed = zlib.crc32(node.identity.node_id)
         self._counters: dict[Place, int] = {}
         self._not_before: dict[Place, float] = {}
@@ -181,7 +182,7 @@ class Taker:
         for claim in claims:
             claim.is_over = True
         ballot = claims[0].ballot
-        outcomes = await self._council.confirm([claim.posted for claim in claims], ballot, ballot.taker)
+        outcomes = await self._council.confirm([claim.posted for claim in claims], ballot, ballot.proposer)
         pairs = zip(claims, outcomes, strict=True)
         works = [Deferred.fromCoroutine(self._settled(claim, outcome, wait)) for claim, outcome in pairs]
         try:
@@ -190,7 +191,7 @@ class Taker:
             error.subFailure.raiseException()
 
     async def _settled(self, claim: Claim, outcome: Outcome, wait: Waits | None) -> bool:
-        taker, place = claim.ballot.taker, claim.posted.place
+        taker, place = claim.ballot.proposer, claim.posted.place
         winner = taker if outcome.result is Result.WON else outcome.value
         if winner is None:
             counter = max(claim.ballot.counter, outcome.counter)
@@ -224,7 +225,7 @@ class Taker:
         if outcome.result is Result.DECIDED and outcome.value is not None:
             self._over(place, outcome.value)
             self._keeper.doubt(place, outcome.value)
-        elif outcome.result is Result.LEASED:
+        elif outcome.result is Result.HELD:
             self._not_before[place] = now + min(outcome.remaining, LEASED_RETRY) + self._rng.uniform(*CONTEST_RETRY)
         elif outcome.result is Result.OUTBID:
             self._not_before[place] = now + self._rng.uniform(*CONTEST_RETRY)

@@ -14,19 +14,18 @@ from twisted.internet.defer import Deferred, maybeDeferred
 from drivers.driver import Permit
 from drivers.errors import StaleCommand
 from drivers.gate import Gate
-from middleware.commitment.acceptor import Acceptor
-from middleware.commitment.ballot import GRANTED, NONE, OVER, SEALED, Ballot, Reply, members_of, quorum
-from middleware.commitment.charter import Charter, Judge, pin, sign_change, sign_end
+from middleware.commitment.charter import Charter, Judge, pin
 from middleware.commitment.council import Council
-from middleware.commitment.ledger import Ledger
+from middleware.commitment.desk import Desk
 from middleware.commitment.lessee import Lessee
-from middleware.commitment.patience import in_time
 from middleware.entangled.clock import HeapClock
 from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.data.store import Store
+from middleware.entangled.errors import Refused
 from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address
+from middleware.entangled.quorum.ballot import majority
 from sim.team.checker import check
 from sim.team.event import Born, Commanded, Died, Halted, Held, Issued, Reached, Terms, Won
 from sim.team.history import History
@@ -46,20 +45,12 @@ class Bidder:
         self.world = world
         self.place = place
         self.machine = machine
-        self.acceptor = Acceptor(Ledger(store, machine.seconds()), machine.seconds())
+        identity, born_at = world.identities[place], machine.seconds()
+        self._desk = Desk(self, identity, store, machine, born_at, world.judge, lambda public: True)  # type: ignore[arg-type]
+        self.acceptor = self._desk._acceptor
         self.lessees: dict[str, Lessee] = {}
         self._gates: dict[str, Gate] = {}
         self._rng = rng
-        self._methods: dict[str, Callable[..., object]] = {
-            "lease.prepare": self._prepare,
-            "lease.propose": self._propose,
-            "lease.release": self._release,
-            "lease.close": self._close,
-            "lease.cancel": self._cancel,
-            "lease.change": self._change,
-            "lease.install": self._install,
-            "lease.freed": self.freed,
-        }
         machine.callLater(rng.random() * world.tick, self._tick)
 
     # -- the agent --------------------------------------------------------------------------------------------------
@@ -84,6 +75,7 @@ class Bidder:
             council.moved = lambda: self.world.moved(task_id, council)
             changed = lambda: self.world.referee.on_change(self, task_id)  # noqa: E731
             self.lessees[task_id] = Lessee(council, self.machine, self._rng, changed, self.world.stop_time)
+            self._desk.enter(self.lessees[task_id])
             self._gates[task_id] = Gate()
         return self.lessees[task_id]
 
@@ -98,13 +90,6 @@ class Bidder:
         lessee = self.lessees.get(task_id)
         if lessee is not None:
             lessee.release([self.world.contacts[heir] for heir in heirs])
-
-    def freed(self, agent: str, task_id: str, token: int, rest: float) -> None:
-        """Hear that the lease was given back."""
-        self._tell(self.acceptor.freed(task_id, agent, token, self.machine.seconds(), rest), task_id, rest)
-        lessee = self.lessees.get(task_id)
-        if lessee is not None:
-            lessee.freed(token, rest)
 
     def _tick(self) -> None:
         for task_id, lessee in self.lessees.items():
@@ -150,62 +135,17 @@ class Bidder:
             self.machine.callLater(0.15, ask)
         return answered
 
+    def tell(self, contact: Contact, method: str, *arguments: Any) -> None:
+        """Tell a peer something, as an ``Endpoint`` does."""
+        self.world.tell(self.place, contact, method, arguments)
+
     def answer(self, source: int, method: str, arguments: tuple[Any, ...]) -> object:
-        """Do what a peer asks; an answer that is not there yet is a Deferred."""
-        agent = self.world.contacts[source].node_id.hex()
-        reply = self._methods[method](agent, *arguments)
-        if isinstance(reply, Deferred):
-            packed: Deferred[object] = reply.addCallback(Reply.packed)
-            return packed.result if packed.called else packed
-        return reply.packed() if isinstance(reply, Reply) else reply
-
-    def _prepare(self, agent: str, task_id: str, configuration: int, counter: int, ttl: float) -> Reply:
-        return self.acceptor.prepare(task_id, configuration, Ballot(counter, agent), ttl, self.machine.seconds())
-
-    def _propose(
-        self, agent: str, task_id: str, configuration: int, counter: int, token: int, ttl: float
-    ) -> Deferred[Reply]:
-        def proposed() -> Reply:
-            ballot, now = Ballot(counter, agent), self.machine.seconds()
-            return self.acceptor.propose(task_id, configuration, ballot, token, ttl, now)
-
-        return in_time(proposed, self.machine)
-
-    def _release(self, agent: str, task_id: str, counter: int, rest: float) -> None:
-        freed = self.acceptor.release(task_id, Ballot(counter, agent), self.machine.seconds(), rest)
-        self._tell(freed, task_id, rest)
-
-    def _tell(self, listeners: Sequence[str], task_id: str, rest: float) -> None:
-        for listener in listeners:
-            self.world.tell_freed(self.place, listener, task_id, rest)
-
-    def _close(self, agent: str, task_id: str, configuration: int, token: int) -> Reply:
-        reply = self.acceptor.close(task_id, agent, configuration, token, self.machine.seconds())
-        signature = sign_end(self._identity, task_id, configuration, agent, token)
-        return reply._replace(proof=signature) if reply.kind in (OVER, SEALED) else reply
-
-    def _cancel(self, agent: str, task_id: str, configuration: int) -> Reply:
-        return self.acceptor.close(task_id, "", configuration, 0, self.machine.seconds())
-
-    def _change(
-        self, agent: str, task_id: str, configuration: int, counter: int, packed: list[object], token: int, keep: bool
-    ) -> Reply:
-        members, ballot = members_of(packed) or (), Ballot(counter, agent)
-        reply = self.acceptor.change(task_id, configuration, ballot, members, token, self.machine.seconds(), keep)
-        signature = sign_change(self._identity, task_id, configuration, ballot, members, reply.token)
-        return reply._replace(proof=signature) if reply.kind == GRANTED else reply
-
-    def _install(self, agent: str, task_id: str, packed: bytes, keep: bool, ttl: float) -> Reply | None:
-        charter = self.world.judge.read(task_id, packed)
-        if charter is None or not charter.links:
+        """Do what a peer asks; an answer that is not there yet is a Deferred, one that is refused None."""
+        try:
+            reply = self._desk.answer(method, self.world.contacts[source], arguments)
+        except Refused:
             return None
-        ballot = charter.ballot if keep and charter.ballot.agent == agent else NONE
-        told = charter.configuration, charter.members, charter.token, self.machine.seconds(), ballot, ttl, packed
-        return self.acceptor.install(task_id, *told)
-
-    @property
-    def _identity(self) -> Identity:
-        return self.world.identities[self.place]
+        return reply.result if isinstance(reply, Deferred) and reply.called else reply
 
 
 class Referee:
@@ -287,7 +227,7 @@ class Referee:
             places = [self._world.place_of(member) for member in charter.members]
             for agent in self._world.agents:
                 near = [p for p in places if not {(agent, p), (p, agent)} & self._world.radio.cut]
-                is_reached, mine = len(near) >= quorum(len(places)), (task_id, agent)
+                is_reached, mine = len(near) >= majority(len(places)), (task_id, agent)
                 if is_reached == (mine in self._is_cut):
                     self._is_cut ^= {mine}
                     self.history.note(Reached, *mine, is_reached)
@@ -331,7 +271,6 @@ class LeaseTeam:
         self._seed = seed
         self._rates = rates
         self._places = {contact.public: n for n, contact in enumerate(self.contacts)}
-        self._by_id = {contact.node_id.hex(): n for n, contact in enumerate(self.contacts)}
         self._stores = [MemoryStore() for _ in range(self.n)]
         self._lives = 0
         self.bidders = [self.born(place) for place in range(self.n)]
@@ -381,12 +320,12 @@ class LeaseTeam:
 
         self.radio.send(me.place, to, arrive)
 
-    def tell_freed(self, source: int, agent: str, task_id: str, rest: float) -> None:
-        """Carry the news that a lease was given back."""
-        to = self._by_id[agent]
+    def tell(self, source: int, contact: Contact, method: str, arguments: tuple[Any, ...]) -> None:
+        """Carry what nobody answers."""
+        to = self.place_of(contact)
 
         def arrive() -> None:
-            self.bidders[to].machine.take(self.bidders[to].freed, agent, task_id, 0, rest)
+            self.bidders[to].machine.take(self.bidders[to].answer, source, method, arguments)
 
         self.radio.send(source, to, arrive)
 

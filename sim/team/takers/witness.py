@@ -9,10 +9,13 @@ from typing import Any
 from twisted.internet.defer import maybeDeferred
 
 from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.quorum.acceptor import Event
+from middleware.entangled.quorum.ballot import NONE
+from middleware.entangled.quorum.register import Kind, Reply
 from middleware.entangled.record import Record
-from middleware.entangled.space.decree import Kind, Reply, reply_unpacked
 from middleware.entangled.space.posting import Place, Posted, place_unpacked, posting
 from middleware.entangled.space.seat import Seat
+from middleware.entangled.space.take_codec import unpack_reply
 
 
 class Witness:
@@ -33,14 +36,14 @@ class Witness:
         confirm: Callable[..., Any] = seat.answer_confirm
         claim: Callable[..., Any] = seat.answer_claim
 
-        def told(key: bytes, places: list[object], answers: list[object]) -> list[tuple[Place, Reply]]:
-            pairs = [(place_unpacked(key, p), reply_unpacked(a)) for p, a in zip(places, answers, strict=True)]
+        def told(event: Event, key: bytes, places: list[object], answers: list[object]) -> list[tuple[Place, Reply]]:
+            pairs = [(place_unpacked(key, p), unpack_reply(a, event)) for p, a in zip(places, answers, strict=True)]
             return [(place, reply) for place, reply in pairs if place is not None and reply is not None]
 
         def confirmed(peer: Contact, key: bytes, places: list[object], incarnation: bytes, *ballot: Any) -> Any:
             def noted(answers: list[object]) -> list[object]:
-                for place, reply in told(key, places, answers):
-                    if reply.kind is Kind.ACCEPTED:
+                for place, reply in told(Event.ACCEPT, key, places, answers):
+                    if reply.kind is Kind.GRANTED:
                         self.accepted(place, ballot, member)
                 return answers
 
@@ -49,8 +52,8 @@ class Witness:
         def claimed(peer: Contact, key: bytes, places: list[object], *rest: Any) -> Any:
             def noted(answers: list[object]) -> list[object]:
                 # One whose disk was full when it accepted could not say so, and tells it with the next it can write.
-                for place, reply in told(key, places, answers):
-                    if reply.accepted is not None and reply.value is not None:
+                for place, reply in told(Event.PREPARE, key, places, answers):
+                    if reply.accepted != NONE:
                         self.accepted(place, (*reply.accepted, reply.value), member)
                 return answers
 

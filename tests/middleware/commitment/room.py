@@ -8,9 +8,9 @@ from typing import Any
 from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.commitment.ballot import Ballot
 from middleware.commitment.charter import Charter, sign_change
 from middleware.commitment.lessee import Lessee
+from middleware.entangled.quorum.ballot import Ballot
 from sim.team.leases.team import LeaseTeam
 
 TTL = 1.5

@@ -8,7 +8,6 @@ import msgpack
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from middleware.commitment.ballot import ROOM, Ballot, Ceiling, believed
 from middleware.commitment.charter import (
     MAX_LINKS,
     MAX_TOKEN,
@@ -22,6 +21,7 @@ from middleware.commitment.charter import (
     sign_end,
 )
 from middleware.entangled.errors import Refused
+from middleware.entangled.quorum.ballot import ROOM, Ballot, Ceiling, believed
 from tests.middleware.commitment.room import RoomCase, T
 
 
@@ -121,12 +121,12 @@ class CharterTests(RoomCase):
 class NumberTests(RoomCase):
     def test_ceiling(self) -> None:
         """Numbers rise by so much at once and so much a second, counted from what was known."""
-        ceiling = Ceiling(10.0)
+        ceiling = Ceiling(10.0, 2**20)
         self.assertTrue(ceiling.admits(10.0, ROOM * 2**20, ROOM))
         self.assertFalse(ceiling.admits(10.0, 0, ROOM + 1))
         self.assertFalse(ceiling.admits(10.0, (ROOM + 1) * 2**20))
         self.assertTrue(ceiling.admits(11.0, 0, ROOM + 1024))
-        self.assertTrue(Ceiling(10.0, token=2 * ROOM).admits(10.0, 0, 2 * ROOM))
+        self.assertTrue(Ceiling(10.0, 2**20, token=2 * ROOM).admits(10.0, 0, 2 * ROOM))
 
     def test_believed(self) -> None:
         """Of the numbers that members tell one alone is believed only where it is low."""

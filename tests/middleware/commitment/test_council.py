@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from middleware.commitment.ballot import LIFE, NoMajority, OpenClaim, Superseded
+from middleware.commitment.council import NoMajority, OpenClaim, Superseded
+from middleware.commitment.lease_codec import LIFE
 from middleware.entangled.errors import Refused
+from middleware.entangled.quorum.ballot import Ballot
 from tests.middleware.commitment.room import TTL, RoomCase, T
 
 
@@ -26,7 +28,7 @@ class CouncilTests(RoomCase):
         self.assertLess(first, second)
         self.wanting(1)
         council.hear(self.outcome(council.round("lease.prepare", 1, TTL).outcome))
-        self.assertTrue(first.is_kin(second))
+        self.assertTrue(first.is_kin(second, LIFE))
         self.assertGreaterEqual(council.next_ballot().counter, 3 * LIFE)
 
     def test_change(self) -> None:
@@ -159,6 +161,16 @@ class CouncilTests(RoomCase):
         self.assertIsInstance(error, NoMajority)
         self.wanting(0, 0.5)
         self.assertEqual((self.places(0), self.holders()), ([0, 2, 6], [0]))
+
+    def test_change_of_the_highest_ballot_is_completed(self) -> None:
+        """Of two changes that were accepted by one member each the later one may be decided, so that one follows."""
+        for place, council in ((4, (0, 2, 6)), (3, (1, 2, 6))):
+            members = tuple(self.room.contacts[n] for n in council)
+            acceptor, now = self.room.bidders[place].acceptor, self.room.bidders[place].machine.seconds()
+            acceptor.accept(T, 1, Ballot(5 - place, "x"), members, now)
+        self.cut(0, 5)
+        self.assertIsInstance(self.change(0, 1, 3, 6), Superseded)
+        self.assertEqual(self.places(0), [1, 2, 6])
 
     def test_another_change_came_first(self) -> None:
         """Who asks for a change of a council that was changed meanwhile is told so."""

@@ -54,7 +54,7 @@ class LesseeTests(RoomCase):
             self.run_for(TTL)
             self.room.kill(0)
             members = [self.room.bidders[place] for place in (3, 4, 5)]
-            _, ends, _ = sorted(one.machine.at(one.acceptor._ledger.get(T).until) for one in members)  # type: ignore[union-attr]
+            _, ends, _ = sorted(one.machine.at(one.acceptor.log.get(T).until) for one in members)  # type: ignore[union-attr]
             self.run_for(ends - self.room.clock.seconds() - 0.001)
             self.assertIsNone(self.lessee(1).lease, seed)
             self.run_for(0.02)
@@ -66,7 +66,7 @@ class LesseeTests(RoomCase):
         self.lessee(1).stand_by(1)
         self.run_for(TTL)
         self.cut(0, 3, 4, 5)
-        until = [self.room.bidders[place].acceptor._ledger.get(T).until for place in (3, 4, 5)]  # type: ignore[union-attr]
+        until = [self.room.bidders[place].acceptor.log.get(T).until for place in (3, 4, 5)]  # type: ignore[union-attr]
         self.run_for(min(until) - self.room.bidders[3].machine.seconds() - 0.2)
         self.room.radio.cut.clear()
         self.run_for(2 * TTL)
@@ -139,10 +139,10 @@ class LesseeTests(RoomCase):
         self.room._stores[3] = MemoryStore()
         self.room.bidders[3] = self.room.born(3)
         self.wanting(0)
-        first = self.room.bidders[4].acceptor._ledger.get(T).ballot  # type: ignore[union-attr]
+        first = self.room.bidders[4].acceptor.log.get(T).holder  # type: ignore[union-attr]
         self.run_for(2 * TTL)
         for place in (3, 4):
-            self.assertEqual(self.room.bidders[place].acceptor._ledger.get(T).ballot, first)  # type: ignore[union-attr]
+            self.assertEqual(self.room.bidders[place].acceptor.log.get(T).holder, first)  # type: ignore[union-attr]
 
     def test_stand_by_that_is_named(self) -> None:
         """Who stands by and is wanted then keeps its place; who holds the lease is not put off by a rank."""
@@ -239,7 +239,7 @@ class LesseeTests(RoomCase):
         self.run_for(0.1)
         for place in (3, 4, 5):
             bidder = self.room.bidders[place]
-            until = bidder.machine.at(bidder.acceptor._ledger.get(T).until)  # type: ignore[union-attr]
+            until = bidder.machine.at(bidder.acceptor.log.get(T).until)  # type: ignore[union-attr]
             self.assertGreaterEqual(until, stopped + 0.3)
 
     def test_rough_weather(self) -> None:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.commitment.ballot import GRANTED, HELD, OUTBID, Reply
 from middleware.commitment.patience import MOST, in_time
 from middleware.entangled.clock import HeapClock
+from middleware.entangled.quorum.register import Kind, Reply
 
 
 class InTimeTests(SynchronousTestCase):
@@ -17,7 +17,7 @@ class InTimeTests(SynchronousTestCase):
     def proposed(self) -> Reply:
         """A member that grants from a moment on."""
         left = self.until - self.clock.seconds()
-        return Reply(HELD, remaining=left) if left > 0.0 else Reply(GRANTED)
+        return Reply(Kind.HELD, remaining=left) if left > 0.0 else Reply(Kind.GRANTED)
 
     def test_answers_when_the_lease_ends(self) -> None:
         """What comes a moment too early is granted at the moment from which it may be, not refused."""
@@ -26,7 +26,7 @@ class InTimeTests(SynchronousTestCase):
         self.clock.advance(MOST - 0.02)
         self.assertNoResult(answer)
         self.clock.advance(0.01)
-        self.assertEqual(self.successResultOf(answer).kind, GRANTED)
+        self.assertEqual(self.successResultOf(answer).kind, Kind.GRANTED)
 
     def test_a_lease_that_is_renewed(self) -> None:
         """Who was waited for in vain, since the lease goes on, is refused as late as it would have been granted."""
@@ -34,11 +34,11 @@ class InTimeTests(SynchronousTestCase):
         answer = in_time(self.proposed, self.clock)
         self.until = 2.0
         self.clock.advance(0.05)
-        self.assertEqual(self.successResultOf(answer).kind, HELD)
+        self.assertEqual(self.successResultOf(answer).kind, Kind.HELD)
 
     def test_answers_at_once(self) -> None:
         """Whatever is no matter of a moment is answered now."""
-        for reply in (Reply(GRANTED), Reply(OUTBID), Reply(HELD, remaining=MOST + 0.01)):
+        for reply in (Reply(Kind.GRANTED), Reply(Kind.OUTBID), Reply(Kind.HELD, remaining=MOST + 0.01)):
             self.assertEqual(self.successResultOf(in_time(lambda reply=reply: reply, self.clock)), reply)  # type: ignore[misc]
 
     def test_nobody_waits_any_more(self) -> None:

@@ -7,7 +7,7 @@ from twisted.internet.defer import Deferred
 from drivers.driver import Permit
 from drivers.errors import StaleCommand
 from drivers.gate import Gate
-from middleware.commitment.ballot import NoMajority, OpenClaim, Superseded
+from middleware.commitment.council import NoMajority, OpenClaim, Superseded
 from middleware.commitment.lessee import CLOCK_MARGIN, RENEWALS
 from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.kademlia.distance import closest
@@ -142,7 +142,7 @@ class RuleTests(RoomCase):
         self.wanting(0)
         self.lessee(1).stand_by()
         self.run_for(TTL)
-        self.room.tell_freed = lambda *_: None  # type: ignore[method-assign]
+        self.room.tell = lambda *_: None  # type: ignore[method-assign]
         self.lessee(0).release()
         self.run_for(TTL / RENEWALS + 0.1)
         self.assertEqual(self.holders(), [1])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.commitment.vacancy import filled
-from tests.middleware.commitment.test_ballot import MEMBERS
+from tests.middleware.commitment.test_lease_codec import MEMBERS
 
 
 class VacancyTests(SynchronousTestCase):

@@ -18,9 +18,11 @@ from middleware.entangled.errors import Refused
 from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address
+from middleware.entangled.quorum import log as module
+from middleware.entangled.quorum.acceptor import Event
+from middleware.entangled.quorum.ballot import Ballot
+from middleware.entangled.quorum.register import Kind
 from middleware.entangled.record import Record
-from middleware.entangled.space import seat as module
-from middleware.entangled.space.decree import Kind, reply_unpacked
 from middleware.entangled.space.posting import (
     Member,
     Place,
@@ -33,7 +35,8 @@ from middleware.entangled.space.posting import (
     posting,
     standing,
 )
-from middleware.entangled.space.seat import MAX_PLACES, Seat, packed_votes, votes_of
+from middleware.entangled.space.seat import MAX_PLACES, Seat
+from middleware.entangled.space.take_codec import CODEC, unpack_reply
 
 ME = Identity(b"m" * 32)
 PEER = Contact(ME.public, Address("10.0.0.1", 1))
@@ -86,16 +89,16 @@ class SeatTests(SynchronousTestCase):
     def claim(self, where: Place, counter: int = 1, taker: bytes = b"a", lease: float = 2.0) -> Kind:
         """What the member answers to a claim."""
         answer: Any = self.seat.answer_claim(PEER, KEY, [where.packed()], self.seat.incarnation, counter, taker, lease)
-        return self._kind(answer)
+        return self._kind(answer, Event.PREPARE)
 
     def confirm(self, where: Place, counter: int = 1, taker: bytes = b"a") -> Kind:
         """What the member answers to a confirm."""
         life = self.seat.incarnation
         answer: Any = self.seat.answer_confirm(PEER, KEY, [where.packed()], life, counter, taker, taker)
-        return self._kind(answer)
+        return self._kind(answer, Event.ACCEPT)
 
-    def _kind(self, answer: Any) -> Kind:
-        reply = reply_unpacked(answer[0])
+    def _kind(self, answer: Any, event: Event) -> Kind:
+        reply = unpack_reply(answer[0], event)
         assert reply is not None
         return reply.kind
 
@@ -110,15 +113,15 @@ class SeatTests(SynchronousTestCase):
         self.assertEqual(self.seat.incarnation, life)
         vote = self.seat.vote(place(1))
         self.assertEqual(vote and vote.value, b"a")
-        self.assertEqual(self.claim(place(2), 2, b"b"), Kind.LEASED)
+        self.assertEqual(self.claim(place(2), 2, b"b"), Kind.HELD)
         self.clock.advance(5.0)
-        self.assertEqual(self.claim(place(2), 2, b"b"), Kind.PROMISED)
+        self.assertEqual(self.claim(place(2), 2, b"b"), Kind.GRANTED)
 
     def test_lost_memory_is_another_life(self) -> None:
         """A member whose store is empty or rotten has another incarnation, and refuses what counts on the old one."""
         life = self.seat.incarnation
         self.claim(place(1))
-        note = module._bucket_name(module._bucket(place(1)))
+        note = CODEC.bucket_of(place(1))
         rotten = MemoryStore()
         rotten.note("decree/incarnation", life)
         rotten.note(note, b"rotten")
@@ -128,7 +131,7 @@ class SeatTests(SynchronousTestCase):
             self.assertNotEqual(self.seat.incarnation, life)
             self.assertRaises(Refused, self.seat.answer_claim, PEER, KEY, [place(1).packed()], life, 9, b"b", 1.0)
             self.assertIsNone(self.seat.vote(place(1)))
-            self.assertEqual(self.claim(place(1)), Kind.PROMISED)
+            self.assertEqual(self.claim(place(1)), Kind.GRANTED)
 
     def test_wrong_questions(self) -> None:
         """What is no lawful question is refused, and changes nothing."""
@@ -147,13 +150,13 @@ class SeatTests(SynchronousTestCase):
 
     def test_confirm_needs_a_claim(self) -> None:
         """A confirm of what was never promised here is refused and not remembered."""
-        self.assertEqual(self.confirm(place(1)), Kind.UNCLAIMED)
+        self.assertEqual(self.confirm(place(1)), Kind.UNPREPARED)
         self.assertEqual(len(self.seat), 0)
 
     def test_nothing_is_promised_about_what_is_over(self) -> None:
         """A tuple that its publisher removed, or whose slot holds another one by now, is not given away any more."""
         self.store.put(tuple_record(place(1)), 99.0)
-        self.assertEqual(self.claim(place(1)), Kind.PROMISED)
+        self.assertEqual(self.claim(place(1)), Kind.GRANTED)
         self.store.put(tuple_record(place(2)), 99.0)
         self.store.put(record(place(2).name, None, 2), 99.0)
         self.assertEqual(self.claim(place(2)), Kind.OUTBID)
@@ -163,13 +166,13 @@ class SeatTests(SynchronousTestCase):
 
     def test_bounded(self) -> None:
         """A full member forgets what harms nobody, never an open acceptance, and keeps its promises by a floor."""
-        self.patch(module, "MAX_VOTES", 4)
+        self.patch(module, "MAX_REGISTERS", 4)
         for number in range(4):
             self.claim(place(number), counter=number + 1, lease=100.0)
             self.confirm(place(number), counter=number + 1)
         self.assertRaises(Refused, self.claim, place(9))
         self.store.put(record(place(1).name, None), 99.0)
-        self.assertEqual(self.claim(place(9), counter=1), Kind.PROMISED)
+        self.assertEqual(self.claim(place(9), counter=1), Kind.GRANTED)
         self.assertIsNone(self.seat.vote(place(1)))
         self.assertEqual(self.claim(place(1), counter=9), Kind.OUTBID)
         self.store.put(record(place(0).name, None), 99.0)
@@ -205,20 +208,66 @@ class SeatTests(SynchronousTestCase):
         answer: Any = self.seat.answer_claim(PEER, KEY, [place(1).packed()], life, 1, b"a", 1.0)
         self.assertNoResult(answer)
         disk.callback(None)
-        self.assertEqual(self._kind(self.successResultOf(answer)), Kind.PROMISED)
+        self.assertEqual(self._kind(self.successResultOf(answer), Event.PREPARE), Kind.GRANTED)
 
     def test_release(self) -> None:
-        """A released lease lets the next one in."""
+        """A released lease lets the next one in; what was released is over, and nobody releases for another."""
         self.claim(place(1), lease=50.0)
-        self.seat.answer_release(PEER, KEY, [place(1).packed()], self.seat.incarnation, 1, b"a")
-        self.assertEqual(self.claim(place(1), 2, b"b"), Kind.PROMISED)
+        self.release(place(1), 1, b"b")
+        self.assertEqual(self.claim(place(1), 2, b"b"), Kind.HELD)
+        self.release(place(1), 1, b"a")
+        self.assertEqual((self.confirm(place(1)), self.claim(place(1))), (Kind.OUTBID, Kind.OUTBID))
+        self.assertEqual(self.claim(place(1), 2, b"b"), Kind.GRANTED)
+
+    def release(self, where: Place, counter: int, taker: bytes) -> None:
+        """Give a claim back."""
+        self.seat.answer_release(PEER, KEY, [where.packed()], self.seat.incarnation, counter, taker)
+
+    def test_lower_ballots(self) -> None:
+        """What is lower than what was promised gets no promise and is not accepted, nor after a restart."""
+        self.claim(place(1), 5, b"b", lease=0.5)
+        for _ in range(2):
+            self.clock.advance(1.0)
+            self.assertEqual((self.claim(place(1), 4, b"a"), self.confirm(place(1), 5, b"a")), (Kind.OUTBID,) * 2)
+            self.seat = self.made(2)
+        self.assertEqual(self.confirm(place(1), 5, b"b"), Kind.GRANTED)
+
+    def test_a_claim_keeps_others_out(self) -> None:
+        """A claim is renewed by its taker alone, ends in time, and stands against no ballot that has won elsewhere."""
+        self.claim(place(1), 1, b"a", lease=2.0)
+        self.clock.advance(1.5)
+        self.assertEqual(self.claim(place(1), 2, b"b"), Kind.HELD)
+        self.assertEqual(self.claim(place(1), 3, b"a"), Kind.GRANTED)
+        self.clock.advance(1.5)
+        self.assertEqual(self.claim(place(1), 4, b"b"), Kind.HELD)
+        self.clock.advance(0.5)
+        self.assertEqual(self.claim(place(1), 4, b"b"), Kind.GRANTED)
+        self.assertEqual(self.confirm(place(1), 5, b"c"), Kind.GRANTED)
+
+    def test_what_was_accepted_is_told(self) -> None:
+        """A later claimant is told what to complete, once the one before it has had a second to finish."""
+        self.claim(place(1), 1, b"a", lease=100.0)
+        self.assertEqual([self.confirm(place(1)) for _ in range(2)], [Kind.GRANTED] * 2)
+        self.assertEqual(self.claim(place(1), 2, b"b"), Kind.HELD)
+        self.clock.advance(1.0)
+        self.assertEqual(self.claim(place(1), 2, b"b"), Kind.GRANTED)
+        told = self.seat.answer_claim(PEER, KEY, [place(1).packed()], self.seat.incarnation, 3, b"b", 1.0)
+        reply = unpack_reply(told[0], Event.PREPARE)  # type: ignore[index]
+        assert reply is not None
+        self.assertEqual((reply.accepted, reply.value), (Ballot(1, b"a"), b"a"))
+
+    def test_numbers_are_bounded(self) -> None:
+        """A claimant cannot use up the ballots of a tuple."""
+        self.assertEqual(self.claim(place(1), 2**48 - 1), Kind.OUTBID)
+        self.assertEqual(self.claim(place(1), 1), Kind.GRANTED)
+        self.assertEqual(self.confirm(place(1), 2**48 - 1), Kind.OUTBID)
 
     @settings(max_examples=300, deadline=None, derandomize=True, database=None)
     @given(foreign=FOREIGN, noise=st.binary(max_size=60))
     def test_notes_are_decoded_totally(self, foreign: Any, noise: bytes) -> None:
         """A rotten note gives None, and never an exception."""
         good = [KEY, place(1).packed(), 1, b"a", 1.0, None]
-        self.assertIsNotNone(votes_of(packed_votes({})))
+        self.assertEqual(CODEC.unpack(CODEC.pack({})), ({}, True))
         rows = [[foreign], [[*good[:5], foreign]], [[*good[:5], [1, b"a", foreign]]], foreign]
         rows += [[[*good[:n], foreign, *good[n + 1 :]]] for n in range(5)]
         for fields in rows:
@@ -226,9 +275,9 @@ class SeatTests(SynchronousTestCase):
                 packed = msgpack.packb(fields)
             except (ValueError, OverflowError):
                 continue
-            found = votes_of(packed)
-            self.assertTrue(found is None or isinstance(found, dict))
-        votes_of(noise)
+            found, is_whole = CODEC.unpack(packed)
+            self.assertTrue(found or not is_whole or fields == [])
+        CODEC.unpack(noise)
 
 
 class PostingTests(SynchronousTestCase):

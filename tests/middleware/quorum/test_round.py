@@ -1,4 +1,4 @@
-"""Tests of ``middleware.commitment.round``."""
+"""Tests of ``middleware.entangled.quorum.round``."""
 
 from __future__ import annotations
 
@@ -8,14 +8,19 @@ from typing import Any
 from twisted.internet.defer import Deferred, fail, succeed
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.commitment.ballot import GRANTED, HELD, Reply
-from middleware.commitment.round import NEWS, PAUSE, TRIES, Round
+from middleware.commitment.lease_codec import pack_reply, unpack_reply
 from middleware.entangled.clock import HeapClock
 from middleware.entangled.errors import NoAnswer
-from middleware.entangled.kademlia.contact import Contact
-from tests.middleware.commitment.test_ballot import MEMBERS
+from middleware.entangled.quorum.register import Kind, Reply
+from middleware.entangled.quorum.round import NEWS, PAUSE, TRIES, Round, Tally
 
-YES, NO = Reply(GRANTED), Reply(HELD, remaining=1.0)
+YES, NO = Reply(Kind.GRANTED), Reply(Kind.HELD, remaining=1.0)
+
+
+def decoded(place: int, answer: object) -> list[Reply] | None:
+    """As a claimant of a lease reads what comes."""
+    reply = unpack_reply(answer)
+    return None if reply is None else [reply]
 
 
 class RoundTests(SynchronousTestCase):
@@ -23,18 +28,18 @@ class RoundTests(SynchronousTestCase):
         self.clock = HeapClock()
         self.asked: list[tuple[float, int, Deferred[Any]]] = []
 
-    def ask(self, member: Contact, method: str, arguments: tuple[Any, ...]) -> Deferred[Any]:
+    def ask(self, place: int) -> Deferred[Any]:
         """Note that a member is asked."""
-        self.asked.append((self.clock.seconds(), MEMBERS.index(member), Deferred()))
+        self.asked.append((self.clock.seconds(), place, Deferred()))
         return self.asked[-1][2]
 
     def round(self, size: int = 3, short: float = PAUSE) -> Round:
         """A question to the first members."""
-        return Round(MEMBERS[:size], self.ask, self.clock, "lease.prepare", ("t",), (GRANTED,), 0.5, short)
+        return Round([Tally(size)], self.ask, decoded, self.clock, 0.5, short)
 
     def answer(self, number: int, reply: Reply) -> None:
         """Answer the question of that number."""
-        self.asked[number][2].callback(reply.packed())
+        self.asked[number][2].callback(pack_reply(reply))
 
     def test_decided_by_a_majority(self) -> None:
         """The outcome is there with the second yes of three, and not before."""
@@ -42,7 +47,7 @@ class RoundTests(SynchronousTestCase):
         self.answer(0, YES)
         self.assertNoResult(asked.outcome)
         self.answer(2, YES)
-        self.assertTrue(self.successResultOf(asked.outcome).is_won)
+        self.assertTrue(self.successResultOf(asked.outcome).tally.is_won)
 
     def test_lost_as_soon_as_no_majority_can_be(self) -> None:
         """The second no of three decides it."""
@@ -50,19 +55,19 @@ class RoundTests(SynchronousTestCase):
         self.answer(0, NO)
         self.assertNoResult(asked.outcome)
         self.answer(1, NO)
-        self.assertFalse(self.successResultOf(asked.outcome).is_won)
+        self.assertFalse(self.successResultOf(asked.outcome).tally.is_won)
 
     def test_members_about_to_be_free_are_asked_again(self) -> None:
         """A member where another's lease ends within 100 ms is asked again then; any other has said no."""
         asked = self.round()
-        self.answer(0, Reply(HELD, remaining=0.03))
+        self.answer(0, Reply(Kind.HELD, remaining=0.03))
         self.answer(1, NO)
         self.assertNoResult(asked.outcome)
         self.clock.advance(0.03)
         self.assertEqual([member for _, member, _ in self.asked[3:]], [0])
         self.answer(3, YES)
         self.answer(2, YES)
-        self.assertTrue(self.successResultOf(asked.outcome).is_won)
+        self.assertTrue(self.successResultOf(asked.outcome).tally.is_won)
 
     def test_news_that_a_member_has_not_heard(self) -> None:
         """Where the lease was given back, who still counts it is asked again soon; who only looks takes it as it is."""
@@ -74,22 +79,22 @@ class RoundTests(SynchronousTestCase):
         self.assertEqual([member for _, member, _ in self.asked[3:]], [0, 1])
         self.answer(3, YES)
         self.answer(4, YES)
-        self.assertTrue(self.successResultOf(asked.outcome).is_won)
+        self.assertTrue(self.successResultOf(asked.outcome).tally.is_won)
         self.asked.clear()
         looked = self.round(short=0.0)
-        self.answer(0, Reply(HELD, remaining=0.03))
-        self.answer(1, Reply(HELD, remaining=0.03))
-        self.assertFalse(self.successResultOf(looked.outcome).is_won)
+        self.answer(0, Reply(Kind.HELD, remaining=0.03))
+        self.answer(1, Reply(Kind.HELD, remaining=0.03))
+        self.assertFalse(self.successResultOf(looked.outcome).tally.is_won)
 
     def test_who_is_silent(self) -> None:
         """Whoever answers anything is there; who does not is silent once it was asked three times, and not before."""
         asked = self.round()
         self.answer(1, NO)
-        self.assertEqual((asked.answered, asked.silent), ([MEMBERS[1]], []))
+        self.assertEqual((asked.answered, asked.silent), ([1], []))
         self.clock.advance(PAUSE * (TRIES - 1))
-        self.assertEqual(asked.silent, [MEMBERS[0], MEMBERS[2]])
-        self.answer(0, Reply(HELD, remaining=0.05))
-        self.assertEqual((asked.answered, asked.silent), ([MEMBERS[1], MEMBERS[0]], [MEMBERS[2]]))
+        self.assertEqual(asked.silent, [0, 2])
+        self.answer(0, Reply(Kind.HELD, remaining=0.05))
+        self.assertEqual((asked.answered, asked.silent), ([1, 0], [2]))
 
     def test_silent_members_are_asked_again(self) -> None:
         """Who has not answered is asked each 100 ms until it is decided, and three times at least; who has, once."""
@@ -111,7 +116,7 @@ class RoundTests(SynchronousTestCase):
         self.clock.advance(0.49)
         self.assertNoResult(asked.outcome)
         self.clock.advance(0.02)
-        self.assertFalse(self.successResultOf(asked.outcome).is_won)
+        self.assertFalse(self.successResultOf(asked.outcome).tally.is_won)
         self.assertEqual(self.clock.getDelayedCalls(), [])
 
     def test_a_member_that_is_down_holds_nobody_up(self) -> None:
@@ -120,7 +125,7 @@ class RoundTests(SynchronousTestCase):
         self.answer(0, YES)
         self.answer(1, NO)
         self.clock.advance(PAUSE + 0.01)
-        self.assertFalse(self.successResultOf(asked.outcome).is_won)
+        self.assertFalse(self.successResultOf(asked.outcome).tally.is_won)
 
     def test_sent_at_counts_the_latest_majority(self) -> None:
         """A majority's grants count from when the question was sent that its last needed member answered."""
@@ -145,7 +150,7 @@ class RoundTests(SynchronousTestCase):
         self.asked[1][2].errback(NoAnswer("late"))
         self.asked[2][2].callback(["?"])
         self.assertNoResult(asked.outcome)
-        self.assertEqual(len(asked.replies), 1)
+        self.assertEqual(len(asked.tally.replies), 1)
         asked.close()
 
     def test_closed(self) -> None:
@@ -153,25 +158,25 @@ class RoundTests(SynchronousTestCase):
         asked = self.round()
         asked.close()
         self.answer(0, YES)
-        self.assertEqual((self.clock.getDelayedCalls(), asked.replies), ([], {}))
+        self.assertEqual((self.clock.getDelayedCalls(), asked.tally.replies), ([], {}))
 
     def test_council_of_nobody(self) -> None:
         """A council without members says no."""
-        self.assertFalse(self.successResultOf(self.round(0).outcome).is_won)
+        self.assertFalse(self.successResultOf(self.round(0).outcome).tally.is_won)
 
     def test_answers_at_once(self) -> None:
         """Members on this very node may answer before the question returns, or fail at once."""
-        for answer, is_won in ((lambda: succeed(YES.packed()), True), (lambda: fail(NoAnswer("x")), False)):
-            asked = Round(MEMBERS[:3], lambda *_: answer(), self.clock, "m", (), (GRANTED,), 0.5)  # noqa: B023
+        for answer, is_won in ((lambda: succeed(pack_reply(YES)), True), (lambda: fail(NoAnswer("x")), False)):
+            asked = Round([Tally(3)], lambda _: answer(), decoded, self.clock, 0.5)  # noqa: B023
             self.clock.advance(1.0)
-            self.assertEqual(self.successResultOf(asked.outcome).is_won, is_won)
+            self.assertEqual(self.successResultOf(asked.outcome).tally.is_won, is_won)
 
     def test_free_in(self) -> None:
         """A majority may be free when the second shortest lease has run out, as counted on the members' clocks."""
         asked = self.round()
         self.clock.advance(0.04)
-        self.answer(0, Reply(HELD, remaining=0.2))
-        self.answer(1, Reply(HELD, remaining=0.9))
+        self.answer(0, Reply(Kind.HELD, remaining=0.2))
+        self.answer(1, Reply(Kind.HELD, remaining=0.9))
         # Of the third nothing is known; the second is needed; it counted half way from 0.00 to 0.04.
         self.assertAlmostEqual(asked.free_in(), 0.88)
         unheard = self.round()

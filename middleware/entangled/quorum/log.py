@@ -1,0 +1,164 @@
+"""The durable log of an acceptor: a restart lets no token fall and forgets no promise.
+
+Registers lie in buckets, each a note of a store.  What is forgotten to make room leaves a floor under ballots and
+tokens.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Iterator
+from dataclasses import dataclass
+from typing import Generic, NamedTuple, Protocol, TypeVar
+
+from middleware.entangled.quorum.ballot import NONE, Ballot, Ceiling, Name
+from middleware.entangled.quorum.register import Register
+
+MAX_REGISTERS = 4096
+LOOKED_AT = 256
+"""The oldest registers that are looked at when there is no room for a new one; all of them would take too long."""
+
+Key = TypeVar("Key", bound=Hashable)
+
+
+class Floor(NamedTuple):
+    """What lies above everything forgotten: counters, tokens; and the longest ttl ever granted."""
+
+    counter: int = 0
+    token: int = 0
+    longest: float = 0.0
+
+
+class Notes(Protocol):
+    """Where small facts are kept under a name; a ``Store`` does it."""
+
+    def note(self, name: str, value: bytes) -> None:
+        """Keep ``value``."""
+
+    def noted(self, name: str) -> bytes | None:
+        """What was kept, or None."""
+
+
+@dataclass(frozen=True)
+class Codec(Generic[Key]):
+    """How the registers of one use stand in notes; no decoder raises.
+
+    ``name`` is the format of the names of its ``buckets``, ``nobody`` is below all names of proposers, and the counters
+    of two lives of a proposer differ modulo ``lives`` (1 where their names differ).  ``unpack`` also says whether that
+    was all.
+    """
+
+    floor_name: str
+    name: str
+    buckets: int
+    nobody: Name
+    lives: int
+    bucket_of: Callable[[Key], str]
+    pack: Callable[[dict[Key, Register]], bytes]
+    unpack: Callable[[bytes], tuple[dict[Key, Register], bool]]
+    pack_floor: Callable[[Floor], bytes]
+    unpack_floor: Callable[[bytes | None], Floor | None]
+
+    @property
+    def names(self) -> Iterator[str]:
+        """The names of all buckets."""
+        return map(self.name.format, range(self.buckets))
+
+
+class Log(Generic[Key]):
+    """The registers of one acceptor, in memory and in ``notes``.
+
+    ``is_whole`` says that nothing which an earlier process noted is missing, ``may_forget`` whether a register can be
+    asked for no more.
+    """
+
+    def __init__(
+        self, notes: Notes, codec: Codec[Key], may_forget: Callable[[Key, Register, float], bool], now: float = 0.0
+    ) -> None:
+        self.registers: dict[Key, Register] = {}
+        self._notes = notes
+        self.codec = codec
+        self._may_forget = may_forget
+        self._buckets: dict[str, dict[Key, None]] = {}
+        floor = codec.unpack_floor(notes.noted(codec.floor_name))
+        self.is_whole = floor is not None
+        self.floor = floor or Floor()
+        for name in codec.names:
+            noted = notes.noted(name)
+            rows, is_whole = codec.unpack(noted) if noted else ({}, True)
+            self.is_whole = self.is_whole and is_whole
+            for key, register in rows.items():
+                register.wake(now, codec.lives)
+                self._add(key, register)
+        if floor is None:
+            self._note_floor()
+
+    def __len__(self) -> int:
+        return len(self.registers)
+
+    def get(self, key: Key) -> Register | None:
+        """What is known of a register."""
+        return self.registers.get(key)
+
+    def blank(self, now: float) -> Register:
+        """A new register, not entered yet."""
+        counter, token, _ = self.floor
+        # R3: a ballot that may have been promised, or outbid, before it was forgotten is lower.
+        promised = Ballot(counter + 1, self.codec.nobody) if counter else NONE
+        ceiling = Ceiling(now, self.codec.lives, counter, token)
+        return Register(ceiling, promised=promised, token=token, touched_at=now)
+
+    def enter(self, key: Key, register: Register, now: float) -> bool:
+        """Take in a new register, if there is room."""
+        if len(self.registers) >= MAX_REGISTERS and not self._make_room(now):
+            return False
+        self._add(key, register)
+        return True
+
+    def keep(self, key: Key) -> None:
+        """Note a register as it is now."""
+        longest = self.registers[key].ttl
+        if longest > self.floor.longest:
+            self.floor = self.floor._replace(longest=longest)
+            self._note_floor()
+        self._note(self.codec.bucket_of(key))
+
+    def clear(self) -> None:
+        """Forget everything: what others rely on of this acceptor is void."""
+        self.registers.clear()
+        self._buckets.clear()
+        self.floor, self.is_whole = Floor(), True
+        for name in self.codec.names:
+            if self._notes.noted(name):
+                self._note(name)
+        self._note_floor()
+
+    def _add(self, key: Key, register: Register) -> None:
+        self.registers[key] = register
+        self._buckets.setdefault(self.codec.bucket_of(key), {})[key] = None
+
+    def _make_room(self, now: float) -> bool:
+        """Forget old registers that can harm nothing."""
+        gone = set()
+        for key in list(self.registers)[:LOOKED_AT]:
+            register = self.registers.pop(key)
+            if not self._may_forget(key, register, now):
+                self.registers[key] = register  # to the end of the queue
+                continue
+            counter, token, longest = self.floor
+            # R3: nothing that was forgotten lies above the floor.
+            self.floor = Floor(max(counter, register.promised.counter), max(token, register.token), longest)
+            name = self.codec.bucket_of(key)
+            del self._buckets[name][key]
+            gone.add(name)
+        if gone:
+            self._note_floor()  # before what it stands for goes
+        for name in sorted(gone):
+            self._note(name)
+        return len(self.registers) < MAX_REGISTERS
+
+    def _note(self, name: str) -> None:
+        rows = {key: self.registers[key] for key in self._buckets.get(name, ())}
+        self._notes.note(name, self.codec.pack(rows))
+
+    def _note_floor(self) -> None:
+        self._notes.note(self.codec.floor_name, self.codec.pack_floor(self.floor))

@@ -1,0 +1,120 @@
+"""How decisions about tuples stand in messages (``decree.*``) and in notes of the store; pure."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any
+
+import msgpack
+
+from middleware.entangled.quorum.acceptor import Event
+from middleware.entangled.quorum.ballot import NONE, Ballot, Ceiling
+from middleware.entangled.quorum.log import Codec, Floor
+from middleware.entangled.quorum.register import Kind, Register, Reply
+from middleware.entangled.record import KEY_BYTES
+from middleware.entangled.space.posting import Place, is_name, place_unpacked
+
+MAX_COUNTER = 2**48
+MAX_LEASE = 600.0
+_GRANTED = {Event.PREPARE: 0, Event.ACCEPT: 1, Event.RELEASE: 5}
+_OTHERS = {Kind.HELD: 2, Kind.OUTBID: 3, Kind.UNPREPARED: 4}
+_KINDS = {code: kind for kind, code in _OTHERS.items()}
+
+
+def is_counter(value: object) -> bool:
+    """Whether ``value`` may be the counter of a ballot."""
+    return type(value) is int and 0 < value < MAX_COUNTER
+
+
+def is_lease(value: object) -> bool:
+    """Whether ``value`` may be what is left of a lease, in seconds."""
+    return type(value) is float and 0.0 <= value <= MAX_LEASE
+
+
+def pack_reply(reply: Reply, event: Event) -> list[object]:
+    """The reply to ``event`` as it stands in a message."""
+    code = _OTHERS.get(reply.kind, _GRANTED[event])
+    return [code, reply.promised.counter, min(reply.remaining, MAX_LEASE), _pack_accepted(reply.accepted, reply.value)]
+
+
+def unpack_reply(fields: object, event: Event) -> Reply | None:
+    """The reply to ``event`` that ``pack_reply`` made, or None where the fields cannot be one."""
+    if not isinstance(fields, list) or len(fields) != 4:
+        return None
+    code, counter, remaining, accepted = fields
+    if type(code) is not int or not (is_counter(counter) or (type(counter) is int and counter == 0)):
+        return None
+    kind = Kind.GRANTED if code == _GRANTED[event] else _KINDS.get(code)
+    told = _unpack_accepted(accepted)
+    if kind is None or not is_lease(remaining) or told is None:
+        return None
+    return Reply(kind, Ballot(counter, b""), remaining=remaining, accepted=told[0], value=told[1])
+
+
+def _bucket_of(key: Place) -> str:
+    return f"decree/{hashlib.blake2s(key.mark + key.owner, digest_size=1).hexdigest()}"
+
+
+def _pack(registers: dict[Place, Register]) -> bytes:
+    rows: list[list[Any]] = []
+    for place, register in registers.items():
+        accepted = _pack_accepted(register.accepted, register.value)
+        rows.append([place.key, place.packed(), *register.promised, register.reserve, accepted])
+    return bytes(msgpack.packb(rows))
+
+
+def _unpack(noted: bytes) -> tuple[dict[Place, Register], bool]:
+    try:
+        rows = msgpack.unpackb(noted, strict_map_key=True, max_ext_len=0)
+    except Exception:  # foreign code, and bytes that may have rotted
+        return {}, False
+    pairs = [_unpack_row(row) for row in rows] if isinstance(rows, list) else [None]
+    return dict(pair for pair in pairs if pair is not None), None not in pairs
+
+
+def _pack_floor(floor: Floor) -> bytes:
+    return floor.counter.to_bytes(8, "big")
+
+
+def _unpack_floor(noted: bytes | None) -> Floor:
+    return Floor(int.from_bytes(noted or b""))
+
+
+def _unpack_row(row: object) -> tuple[Place, Register] | None:
+    if not isinstance(row, list) or len(row) != 6 or not isinstance(row[0], bytes) or len(row[0]) != KEY_BYTES:
+        return None
+    key, fields, counter, taker, lease, accepted = row
+    place, told = place_unpacked(key, fields), _unpack_accepted(accepted)
+    if place is None or told is None or not (is_counter(counter) and is_name(taker) and is_lease(lease)):
+        return None
+    ballot, value = told
+    ceiling = Ceiling(0.0, 1)
+    return place, Register(ceiling, promised=Ballot(counter, taker), accepted=ballot, value=value, reserve=lease)
+
+
+def _pack_accepted(ballot: Ballot, value: object) -> list[object] | None:
+    return None if ballot == NONE else [*ballot, value]
+
+
+def _unpack_accepted(fields: object) -> tuple[Ballot, bytes | None] | None:
+    """The ballot and value that were accepted, ``NONE`` where nothing was, or None where the fields cannot be some."""
+    if fields is None:
+        return NONE, None
+    if not isinstance(fields, list) or len(fields) != 3:
+        return None
+    counter, taker, value = fields
+    return (Ballot(counter, taker), value) if is_counter(counter) and is_name(taker) and is_name(value) else None
+
+
+CODEC: Codec[Place] = Codec(
+    "decree/floor",
+    "decree/{:02x}",
+    256,
+    b"",
+    1,
+    _bucket_of,
+    _pack,
+    _unpack,
+    _pack_floor,
+    _unpack_floor,
+)

@@ -1,0 +1,69 @@
+"""Acceptors with the codec and terms of each user, for tests of what holds for either."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from middleware.commitment import lease_codec
+from middleware.commitment.lease_codec import AHEAD
+from middleware.entangled.data.memory import MemoryStore
+from middleware.entangled.quorum.acceptor import Acceptor, Terms
+from middleware.entangled.quorum.ballot import FIRST, Ballot
+from middleware.entangled.quorum.log import Codec, Log
+from middleware.entangled.quorum.register import Reply
+from middleware.entangled.space import seat, take_codec
+from middleware.entangled.space.posting import Place
+from tests.middleware.commitment.test_lease_codec import MEMBERS
+
+TTL = 10.0
+
+
+@dataclass(frozen=True)
+class Use:
+    """How one user names its register, its proposers and its values."""
+
+    key: Any
+    codec: Codec[Any]
+    terms: Terms
+    names: tuple[Any, ...]
+    values: tuple[Any, ...]
+
+    def ballot(self, number: int, name: int) -> Ballot:
+        """A ballot of the only life of a proposer."""
+        return Ballot(number * self.codec.lives, self.names[name])
+
+
+TAKE = Use(
+    Place(b"k" * 20, b"o" * 32, "t", b"m" * 8), take_codec.CODEC, seat.TERMS, (b"a", b"b", b"c"), (b"x", b"y", b"z")
+)
+LEASE = Use("t", lease_codec.CODEC, Terms(AHEAD), ("a", "b", "c"), (MEMBERS[:3], MEMBERS[1:4], MEMBERS[2:5]))
+
+
+class Member:
+    """An acceptor of one user, and the store that outlives its processes."""
+
+    def __init__(self, use: Use) -> None:
+        self.use = use
+        self.store = MemoryStore()
+        self.restart(0.0)
+
+    def restart(self, now: float) -> None:
+        """Begin another process."""
+        self.acceptor = Acceptor(Log(self.store, self.use.codec, lambda *_: False, now), self.use.terms)
+
+    def prepare(self, ballot: Ballot, now: float, reserve: float = 0.0, configuration: int = FIRST) -> Reply:
+        """Ask for a promise."""
+        return self.acceptor.prepare(self.use.key, configuration, ballot, TTL, now, reserve)
+
+    def lease(self, ballot: Ballot, token: int, now: float, configuration: int = FIRST) -> Reply:
+        """Ask for a lease."""
+        return self.acceptor.lease(self.use.key, configuration, ballot, token, TTL, now)
+
+    def accept(self, ballot: Ballot, value: Any, now: float, configuration: int = FIRST) -> Reply:
+        """Ask to accept a value."""
+        return self.acceptor.accept(self.use.key, configuration, ballot, value, now)
+
+    def release(self, ballot: Ballot, now: float, rest: float = 0.0) -> Reply:
+        """Give a ballot back."""
+        return self.acceptor.release(self.use.key, ballot, now, rest)

@@ -1,0 +1,234 @@
+"""Tests of ``middleware.entangled.quorum.acceptor``: the table row by row, and every state that can be reached."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.entangled.quorum.acceptor import TABLE, Event, Stand, State, state_of
+from middleware.entangled.quorum.ballot import FIRST, NONE, ROOM
+from middleware.entangled.quorum.register import Kind, Register, Reply
+from tests.middleware.quorum.members import LEASE, TAKE, TTL, Member, Use
+
+ENDING_AT = 0.9 * TTL
+LOW, MID, HIGH, OTHER = LEASE.ballot(1, 0), LEASE.ballot(2, 0), LEASE.ballot(3, 0), LEASE.ballot(2, 1)
+HELD_BY_LOW = {"promised": LOW, "holder": LOW, "token": 1, "ttl": TTL, "until": TTL}
+HELD_BY_OTHER = {**HELD_BY_LOW, "promised": LEASE.ballot(1, 1), "holder": LEASE.ballot(1, 1)}
+RESERVED = {"promised": LEASE.ballot(1, 1), "reserve": TTL, "reserved_until": TTL}
+RECIPES: dict[Stand, tuple[dict[str, Any], Any, float, int]] = {
+    Stand.BEHIND: ({}, MID, 1.0, FIRST + 1),
+    Stand.MOVED: ({"configuration": FIRST + 1}, MID, 1.0, FIRST),
+    Stand.HELD: ({**HELD_BY_OTHER, "promised": MID}, MID, 1.0, FIRST),
+    Stand.LOWER: ({"promised": OTHER}, LOW, 1.0, FIRST),
+    Stand.OVERTAKEN: ({**HELD_BY_LOW, "promised": OTHER}, LOW, ENDING_AT, FIRST),
+    Stand.OWN: (HELD_BY_LOW, LOW, 1.0, FIRST),
+    Stand.ENDING: (HELD_BY_OTHER, MID, ENDING_AT, FIRST),
+    Stand.RESERVED: (RESERVED, MID, 1.0, FIRST),
+    Stand.FOREIGN: ({"promised": OTHER}, MID, 1.0, FIRST),
+    Stand.FREE: ({"promised": LOW}, MID, 1.0, FIRST),
+}
+"""What a register holds, and the ballot, moment and configuration that then stand so to it."""
+GIVEN_BACK = {"promised": MID, "spent": HIGH}
+"""What a release of a ballot finds that was given back before."""
+
+
+class TableTests(SynchronousTestCase):
+    """Behaviour of ``TABLE``."""
+
+    def test_every_row(self) -> None:
+        """Each state, event and stand of a ballot gives the answer and the next state of its row."""
+        for (state, event, stand), (kind, after) in TABLE.items():
+            if state is State.UNKNOWN:
+                continue
+            member = Member(LEASE)
+            fields, ballot, now, configuration = RECIPES[stand]
+            if (event, stand) == (Event.RELEASE, Stand.LOWER):
+                fields, ballot = GIVEN_BACK, MID
+            register = replace(member.acceptor.log.blank(0.0), **fields)
+            if state is State.SEALED:
+                register.accepted, register.value = LEASE.ballot(1, 2), LEASE.values[2]
+            register.is_over = state is State.OVER
+            member.acceptor.log.enter(LEASE.key, register, 0.0)
+            token = 1 if stand in (Stand.OWN, Stand.OVERTAKEN) else 2
+            if event is Event.LEASE:
+                reply = member.lease(ballot, token, now, configuration)
+            elif event is Event.ACCEPT:
+                reply = member.accept(ballot, LEASE.values[0], now, configuration)
+            else:
+                is_release = event is Event.RELEASE
+                reply = member.release(ballot, now) if is_release else member.prepare(ballot, now, 0.0, configuration)
+            self.assertEqual((reply.kind, state_of(register)), (kind, after), (state, event, stand))
+
+    def test_unknown(self) -> None:
+        """What was never prepared accepts and gives back nothing where that has to come first, and takes no room."""
+        for use in (TAKE, LEASE):
+            member = Member(use)
+            ballot = use.ballot(1, 0)
+            accepts = Kind.UNPREPARED if use.terms.must_prepare else Kind.GRANTED
+            self.assertEqual(member.release(ballot, 0.0).kind, Kind.UNPREPARED)
+            self.assertEqual(len(member.acceptor.log), 0)
+            self.assertEqual(member.accept(ballot, use.values[0], 0.0).kind, accepts)
+            self.assertEqual(len(member.acceptor.log), accepts is Kind.GRANTED)
+            self.assertEqual(Member(use).prepare(ballot, 0.0).kind, Kind.GRANTED)
+
+    def test_no_row_is_missing(self) -> None:
+        """Every state has a row for every event and every stand that can be found for it."""
+        found = {stand for _, event, stand in TABLE if event is not Event.RELEASE}
+        released = {Stand.FOREIGN, Stand.LOWER, Stand.HELD, Stand.FREE}
+        wanted = {(s, e, st) for s in State for e in Event for st in (released if e is Event.RELEASE else found)}
+        self.assertEqual(set(TABLE), wanted)
+        self.assertEqual(found | released, set(Stand))
+
+
+class ReachableTests(SynchronousTestCase):
+    """What holds in every state that a few proposers can bring about."""
+
+    def test_take(self) -> None:
+        """Two takers, three ballots each: promises and acceptances never fall, and are never for two."""
+        self.assertGreater(self.explore(TAKE, tuple(self.questions(TAKE))), 300)
+
+    def test_lease(self) -> None:
+        """Two holders, also in a second life: never two at a time, no lower token, nothing after a change."""
+        self.assertGreater(self.explore(LEASE, tuple(self.questions(LEASE))), 2000)
+
+    def questions(self, use: Use) -> Iterator[tuple[str, Any, int]]:
+        """Everything that is asked: (event, ballot, token)."""
+        ballots = [use.ballot(number, name) for number in (1, 2) for name in (0, 1)]
+        for ballot in ballots:
+            yield "prepare", ballot, 0
+            yield "accept", ballot, 0
+            yield "release", ballot, 0
+        if use is TAKE:
+            yield "reserve", ballots[0], 0
+            yield "reserve", ballots[3], 0
+        else:
+            for ballot in (*ballots, ballots[2]._replace(counter=ballots[2].counter + 1)):
+                for token in (1, 2):
+                    yield "lease", ballot, token
+
+    def explore(self, use: Use, questions: tuple[tuple[str, Any, int], ...]) -> int:
+        """Ask everything in every state that can be reached in five steps of a third of a ttl; how many there are."""
+        start = (Member(use).acceptor.log.blank(0.0), 0)
+        states, seen = [start], {self.digest(*start)}
+        for register, step in states:
+            later = [(register, step + 1)] if step < 4 else []
+            for event, ballot, token in questions:
+                member, now = Member(use), step * 0.4 * TTL
+                after = replace(register, listeners={})
+                if register.promised != NONE:
+                    member.acceptor.log.enter(use.key, after, 0.0)
+                reply = self.ask(member, event, ballot, token, now)
+                after = member.acceptor.log.get(use.key) or after
+                self.verify(use, register, after, event, ballot, token, now, reply)
+                later.append((after, step))
+            for each in later:
+                if self.digest(*each) not in seen:
+                    seen.add(self.digest(*each))
+                    states.append(each)
+        return len(states)
+
+    def digest(self, register: Register, step: int) -> tuple[Any, ...]:
+        """What tells two states apart: periods that have ended are alike."""
+        now = step * 0.4 * TTL
+        told = register.promised, register.holder, register.spent, register.accepted, register.token, register.grantee
+        return (*told, max(0.0, register.until - now), max(0.0, register.reserved_until - now), step)
+
+    def ask(self, member: Member, event: str, ballot: Any, token: int, now: float) -> Reply:
+        """Ask one thing; the value says under which ballot it was asked for."""
+        match event:
+            case "prepare":
+                return member.prepare(ballot, now)
+            case "reserve":
+                return member.prepare(ballot, now, TTL / 2)
+            case "lease":
+                return member.lease(ballot, token, now)
+            case "accept":
+                return member.accept(ballot, member.use.values[ballot.counter // member.use.codec.lives], now)
+        return member.release(ballot, now, TTL / 4)
+
+    def verify(
+        self,
+        use: Use,
+        before: Register,
+        after: Register,
+        event: str,
+        ballot: Any,
+        token: int,
+        now: float,
+        reply: Reply,
+    ) -> None:
+        """The invariants of one step, by their names in ``docs/quorum.md``."""
+        case = event, ballot, token, now, before
+        lives = use.codec.lives
+        is_held = before.until > now and not ballot.is_kin(before.holder, lives)
+        if reply.kind not in (Kind.GRANTED, Kind.SEALED):
+            self.assertEqual(self.digest(before, 0), self.digest(after, 0), case)  # a refusal changes nothing
+        self.assertGreaterEqual(after.promised, before.promised, case)  # P1
+        self.assertGreaterEqual(after.accepted, before.accepted, case)  # A1
+        self.assertGreaterEqual(after.token, before.token, case)  # T1
+        self.assertGreaterEqual(after.spent, NONE)
+        if event == "lease" and reply.kind is Kind.GRANTED:
+            self.assertFalse(is_held, case)  # L1
+            self.assertEqual(before.accepted, NONE, case)  # C1
+            self.assertGreater(ballot, before.spent, case)  # B3
+            extends = before.until > now and token == before.token and before.holder > before.spent
+            self.assertTrue(ballot >= before.promised or extends, case)  # P1, L4
+            self.assertTrue(token > before.token or ballot.is_kin(before.holder, lives), case)  # T2
+        if event == "accept" and reply.kind is Kind.GRANTED:
+            self.assertFalse(before.until > now, case)  # C2
+            self.assertTrue(ballot >= before.promised and ballot > before.spent, case)  # P1, B3
+            self.assertTrue(not use.terms.must_prepare or before.promised != NONE, case)  # R4
+        if event in ("prepare", "reserve") and reply.kind in (Kind.GRANTED, Kind.SEALED):
+            self.assertEqual(reply.accepted, before.accepted, case)  # A2
+            self.assertEqual(reply.kind is Kind.SEALED, before.accepted != NONE, case)
+            is_reserved = before.reserved_until > now and not ballot.is_kin(before.promised, lives)
+            self.assertFalse(is_reserved, case)  # L3
+            self.assertTrue(not is_held or before.is_given_back or before.until - now <= 0.2 * TTL, case)  # L3
+        if event != "release":
+            self.assertGreaterEqual(after.until, before.until, case)  # L3: only the holder shortens a lease
+        elif is_held:
+            self.assertEqual(after.until, before.until, case)
+
+
+class NumberTests(SynchronousTestCase):
+    """Numbers that one proposer invents."""
+
+    def test_numbers_are_bounded(self) -> None:
+        """The highest ballots and tokens there are get no promise, so that others can still propose (N1)."""
+        for use in (TAKE, LEASE):
+            member, huge = Member(use), use.ballot(ROOM + 1, 0)
+            self.assertEqual(member.prepare(huge, 0.0).kind, Kind.OUTBID)
+            self.assertEqual(member.prepare(use.ballot(1, 0), 0.0).kind, Kind.GRANTED)
+            self.assertEqual(member.accept(huge, use.values[0], 0.0).kind, Kind.OUTBID)
+            self.assertEqual(member.lease(use.ballot(1, 0), ROOM + 1, 0.0).kind, Kind.OUTBID)
+            self.assertEqual(member.prepare(huge, 1.0).kind, Kind.GRANTED)
+
+    def test_another_life(self) -> None:
+        """A proposer in another life waits for the lease of its former one, whose device may still move (L2)."""
+        member = Member(LEASE)
+        member.lease(LOW, 1, 0.0)
+        self.assertEqual(member.prepare(MID, 1.0).kind, Kind.GRANTED)
+        self.assertEqual(member.prepare(MID._replace(counter=MID.counter + 1), 1.0).kind, Kind.HELD)
+
+    def test_restart(self) -> None:
+        """Another process has promised, leased and accepted what the one before it had (D1, R2)."""
+        for use in (TAKE, LEASE):
+            member, first, second = Member(use), use.ballot(1, 0), use.ballot(2, 1)
+            member.prepare(second, 0.0)
+            member.restart(50.0)
+            self.assertEqual(member.prepare(first, 50.0).kind, Kind.OUTBID)
+            member.accept(second, use.values[0], 50.0)
+            member.restart(99.0)
+            told = member.prepare(use.ballot(3, 1), 99.0)
+            self.assertEqual((told.kind, told.accepted, told.value), (Kind.SEALED, second, use.values[0]))
+        leased = Member(LEASE)
+        leased.lease(LOW, 1, 0.0)
+        leased.restart(50.0)
+        self.assertEqual(leased.prepare(OTHER, 51.0).kind, Kind.HELD)
+        reserved = Member(TAKE)
+        reserved.prepare(TAKE.ballot(1, 0), 0.0, TTL)
+        reserved.restart(50.0)
+        self.assertEqual(reserved.prepare(TAKE.ballot(2, 1), 51.0).kind, Kind.HELD)

@@ -1,0 +1,125 @@
+"""Tests of ``middleware.entangled.quorum.log``, with the codecs of both users."""
+
+from __future__ import annotations
+
+import random
+
+import msgpack
+from hypothesis import given, settings
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.commitment.acceptor import may_forget
+from middleware.commitment.lease_codec import CODEC, unpack_row
+from middleware.entangled.data.memory import MemoryStore
+from middleware.entangled.quorum import log as module
+from middleware.entangled.quorum.ballot import FIRST, NONE, Ballot
+from middleware.entangled.quorum.log import Log
+from middleware.entangled.quorum.register import Register
+from tests.middleware.commitment.test_lease_codec import ANYTHING, MEMBERS
+
+
+def entered(log: Log[str], task_id: str, now: float) -> Register | None:
+    """A new register, if there was room."""
+    register = log.blank(now)
+    return register if log.enter(task_id, register, now) else None
+
+
+def granted(log: Log[str], task_id: str, token: int, now: float, ttl: float = 2.0) -> Register:
+    """A register with a lease in it, kept."""
+    register = entered(log, task_id, now)
+    assert register is not None
+    register.promised = register.holder = Ballot(token, "a")
+    register.token, register.ttl, register.until = token, ttl, now + ttl
+    log.keep(task_id)
+    return register
+
+
+class LogTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.store = MemoryStore()
+        self.log = self.opened()
+
+    def opened(self, now: float = 0.0) -> Log[str]:
+        """The log of a process on that store."""
+        return Log(self.store, CODEC, may_forget, now)
+
+    def test_first_life_may_lack_something(self) -> None:
+        """Who finds nothing may have lost it, and is not whole; whoever finds what it kept is."""
+        self.assertFalse(self.log.is_whole)
+        self.assertTrue(self.opened().is_whole)
+
+    def test_everything_is_back_after_a_restart(self) -> None:
+        """Promises, tokens, councils and ends are kept; what was leased is leased for as long again."""
+        entry = granted(self.log, "t", 7, 0.0)
+        entry.accepted, entry.value, entry.spent, entry.is_over = Ballot(9, "b"), MEMBERS[:3], Ballot(1, "c"), True
+        self.log.keep("t")
+        back = self.opened(100.0).get("t")
+        assert back is not None
+        self.assertEqual(CODEC.pack({"t": back}), CODEC.pack({"t": entry}))
+        self.assertEqual(back.until, 102.0)
+
+    def test_released_lease_is_not_leased_again(self) -> None:
+        """What was given back before the restart holds nobody up after it."""
+        entry = granted(self.log, "t", 7, 0.0)
+        entry.holder = NONE
+        self.log.keep("t")
+        back = self.opened(100.0).get("t")
+        assert back is not None
+        self.assertEqual(back.until, 0.0)
+
+    def test_longest_ttl_is_remembered(self) -> None:
+        """The longest lease ever granted is known after a restart: so long may others rely on what was forgotten."""
+        granted(self.log, "t", 1, 0.0, ttl=9.0)
+        granted(self.log, "u", 1, 0.0, ttl=2.0)
+        self.assertEqual(self.opened().floor.longest, 9.0)
+
+    def test_rotten_notes(self) -> None:
+        """Where a note cannot be read the rest is used, and the ledger knows that something is missing."""
+        granted(self.log, "t", 7, 0.0)
+        for rotten in (b"\xc1", msgpack.packb([1]), msgpack.packb({"t": [1]}), msgpack.packb({"t": 5})):
+            for name in filter(self.store.noted, CODEC.names):
+                self.store.note(name, rotten)
+            self.assertFalse(self.opened().is_whole)
+        self.store.note("lease/state", b"?")
+        self.assertFalse(self.opened().is_whole)
+
+    def test_bounded(self) -> None:
+        """A full ledger forgets what is long over, keeps a floor under its numbers, and else takes no more."""
+        self.patch(module, "MAX_REGISTERS", 3)
+        granted(self.log, "old", 40, 0.0)
+        granted(self.log, "done", 30, 0.0).is_over = True
+        granted(self.log, "new", 5, 700.0)
+        fresh = entered(self.log, "t", 701.0)
+        self.assertIsNotNone(fresh)
+        above = self.log.blank(701.0)
+        self.assertEqual((self.log.get("done"), above.token, above.promised.counter), (None, 30, 31))
+        self.assertIsNone(entered(self.log, "u", 702.0))
+        self.assertEqual(len(self.log), 3)
+        late = entered(self.log, "u", 90_000.0)
+        self.assertIsNotNone(late)
+        self.assertEqual(self.log.blank(90_000.0).token, 40)
+        again = self.opened()
+        self.assertEqual(again.floor[:2], (40, 40))
+
+    def test_changed_councils_are_not_forgotten(self) -> None:
+        """That a council was changed is known for as long as its task is open: an old council must not rise again."""
+        self.patch(module, "MAX_REGISTERS", 1)
+        granted(self.log, "t", 1, 0.0).configuration = FIRST + 1
+        self.assertIsNone(entered(self.log, "u", 1e9))
+
+    def test_many_tasks(self) -> None:
+        """Hundreds of tasks are all back after a restart, whatever their names."""
+        names = [f"{random.Random(n).randbytes(4).hex()} ü" for n in range(300)]
+        for number, name in enumerate(names, start=1):
+            granted(self.log, name, number, 0.0)
+        back = self.opened()
+        tokens = [entry.token for name in names if (entry := back.get(name)) is not None]
+        self.assertEqual(tokens, list(range(1, 301)))
+
+    @settings(max_examples=200, deadline=None, derandomize=True, database=None)
+    @given(ANYTHING)
+    def test_rows_are_total(self, row: object) -> None:
+        """Whatever stands in a row is an entry or none, and never an accident."""
+        self.assertIsNone(unpack_row(row))
+        unpack_row([1, row, 1, 1.0, row, False])
+        unpack_row([row, [0, ""] * 4, row, row, [], row])
