@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 from agents.decision import Decision
 from middleware.consensus.strategy import ConsensusAlgorithm
+from middleware.consensus.verdict import Verdict, verdict_from
 from middleware.consensus.view import view_of
-from middleware.presence import EXECUTING
-from middleware.tasks import Member, Task
-from middleware.verdict import Verdict, verdict_from
+from middleware.directory.presence import EXECUTING
+from middleware.tasks.task import Member, Task
 
 PAUSE = 1.0
 """Seconds between two accounts of a decision of which nothing changed but the reports."""

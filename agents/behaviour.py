@@ -14,9 +14,9 @@ from agents.context import Context
 from agents.means import STAND as STAND
 from agents.means import Means
 from drivers.reading import Action, Observation
-from middleware.deployed import BEHAVIOUR, Deployed, is_deployed, maker_of
+from middleware.consensus.deployed import BEHAVIOUR, Deployed, is_deployed, maker_of
 from middleware.errors import MissingExtra, UnknownTask
-from middleware.tasks import Task
+from middleware.tasks.task import Task
 
 KINDS = {
     "find-target": "agents.search:SearchAndApproach",

@@ -11,12 +11,12 @@ from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorTime
 
 from agents.engagement import Engagement
+from middleware.entangled.contact import Contact
 from middleware.entangled.errors import EntangledError
-from middleware.entangled.kademlia.contact import Contact
 from middleware.node import SwarmNode
 
 if TYPE_CHECKING:
-    from middleware.commitment.council import Council
+    from middleware.lease.council import Council
 
 VISIT = 5.0
 """Seconds between two looks; a council that nobody asks for a lease is asked then whether it is there."""

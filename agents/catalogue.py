@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from middleware.errors import UnknownTask
-from middleware.tasks import Task
+from middleware.tasks.task import Task
 
 DEMO = "find-red-target"
 STOP = 0.1

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from agents.epoch import is_older
-from middleware.presence import IDLE
-from middleware.tasks import Member, is_bid, is_stale
+from middleware.directory.presence import IDLE
+from middleware.tasks.task import Member, is_bid, is_stale
 
 LINGERING = 3.0
 """Seconds for which a late report of who left is still known to be old."""

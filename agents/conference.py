@@ -9,10 +9,10 @@ from agents.circle import Circle
 from agents.decision import Decision, decide
 from agents.division import Division
 from agents.epoch import Epoch
+from middleware.bidding.panel import Panel
 from middleware.consensus.strategy import ConsensusAlgorithm
-from middleware.panel import Panel
-from middleware.presence import EXECUTING
-from middleware.tasks import Member, Task
+from middleware.directory.presence import EXECUTING
+from middleware.tasks.task import Member, Task
 
 
 class Conference:

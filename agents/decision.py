@@ -9,11 +9,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+from middleware.bidding.panel import PATIENCE
 from middleware.consensus.strategy import Consensus, ConsensusAlgorithm, Report, agreement
 from middleware.consensus.view import view_of
-from middleware.panel import PATIENCE
-from middleware.presence import EXECUTING
-from middleware.tasks import Member
+from middleware.directory.presence import EXECUTING
+from middleware.tasks.task import Member
 
 REASON = 100
 """Characters of a strategy's reason for naming nobody: it travels in each report."""

@@ -16,8 +16,8 @@ from middleware.consensus.guard import Guard
 from middleware.consensus.item import Item
 from middleware.consensus.strategy import Consensus, Report, digest_of
 from middleware.consensus.view import view_of
-from middleware.presence import EXECUTING
-from middleware.tasks import Member, Task
+from middleware.directory.presence import EXECUTING
+from middleware.tasks.task import Member, Task
 
 GATHERING = 1.0
 """Seconds for which no task may have come to a group before it is divided: they are submitted one after the other."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable
 
 from middleware.entangled.record import TOLERATED_ABSENCE
-from middleware.tasks import MAX_LEASE_TTL, Task
+from middleware.tasks.task import MAX_LEASE_TTL, Task
 
 KEPT = TOLERATED_ABSENCE + MAX_LEASE_TTL
 """Seconds for which the end of a task is remembered at least."""

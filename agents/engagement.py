@@ -26,15 +26,15 @@ from agents.report import Reporter
 from agents.state import Course, State
 from drivers.driver import Permit
 from drivers.reading import Action, Observation
-from middleware.commitment.lessee import Lease, Lessee
+from middleware.bidding.panel import Panel
 from middleware.consensus.strategy import ConsensusAlgorithm, reads_of
+from middleware.consensus.verdict import Verdict
+from middleware.directory.presence import EXECUTING
+from middleware.entangled.contact import Contact
 from middleware.entangled.errors import EntangledError
-from middleware.entangled.kademlia.contact import Contact
-from middleware.order import PAUSE, Order
-from middleware.panel import Panel
-from middleware.presence import EXECUTING
-from middleware.tasks import COMPLETED, FAILED, Member, Result, Task
-from middleware.verdict import Verdict
+from middleware.lease.lessee import Lease, Lessee
+from middleware.tasks.order import PAUSE, Order
+from middleware.tasks.task import COMPLETED, FAILED, Member, Result, Task
 
 HEIRS = 2
 """So many of those that wait are ready to take over at once: each asks the council now and then."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
-from middleware.tasks import Member
+from middleware.tasks.task import Member
 
 Basis = tuple[object, ...]
 """Everything that a decision depends on: who is present, what they bid, who holds which lease, which task it is."""

@@ -13,7 +13,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 from agents.behaviour import Behaviour
-from middleware.tasks import Member
+from middleware.tasks.task import Member
 
 CLOSE = math.radians(20.0)
 """A robot that stands no farther than this from its post is there."""

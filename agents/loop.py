@@ -17,13 +17,13 @@ from agents.engagement import Engagement
 from agents.part import Part
 from drivers.driver import Driver
 from drivers.reading import Observation
+from middleware.directory.presence import DONE, IDLE
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.record import Record
 from middleware.errors import SwarmError
-from middleware.halt import GOES_ON, NO_ROBOT, STANDS
 from middleware.node import CAMERA, SwarmNode
-from middleware.presence import DONE, IDLE
-from middleware.tasks import Member, Task, group_key, outcome_of, refusals, tasks_of
+from middleware.stop.halt import GOES_ON, NO_ROBOT, STANDS
+from middleware.tasks.task import Member, Task, group_key, outcome_of, refusals, tasks_of
 
 TICK = 0.05
 REENGAGE = 0.5

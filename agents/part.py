@@ -12,16 +12,16 @@ from twisted.internet.interfaces import IReactorTime
 from agents.behaviour import Behaviour
 from agents.caretaker import Caretaker
 from agents.engagement import Engagement
-from middleware.commitment.council import Superseded
+from middleware.bidding.panel import panel_of
 from middleware.consensus.strategy import ConsensusAlgorithm
+from middleware.consensus.verdict import Verdict
+from middleware.directory.presence import IDLE
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.record import Record
+from middleware.lease.council import Superseded
 from middleware.node import SwarmNode
-from middleware.order import order_of
-from middleware.panel import panel_of
-from middleware.presence import IDLE
-from middleware.tasks import Member, Result, Task, council_of, group_key
-from middleware.verdict import Verdict
+from middleware.tasks.order import order_of
+from middleware.tasks.task import Member, Result, Task, council_of, group_key
 
 AGAIN = 0.5
 """Seconds until an outcome that no majority could be told is told again."""

@@ -10,7 +10,7 @@ from typing import Any
 from agents.context import Context
 from agents.means import Means
 from drivers.reading import Frame, Observation
-from middleware.deployed import Make
+from middleware.consensus.deployed import Make
 
 OPTIONAL: Mapping[str, object] = {
     "is_safe": True,

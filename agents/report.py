@@ -10,7 +10,7 @@ from twisted.internet.interfaces import IReactorTime
 
 from agents.behaviour import Behaviour
 from drivers.reading import Observation
-from middleware.tasks import Member, is_bid, is_choice, is_value, is_weight
+from middleware.tasks.task import Member, is_bid, is_choice, is_value, is_weight
 
 FARTHER, NEARER, STEP = 1.15, 0.85, 0.05
 """A report is renewed when the distance grew by 15 % and 5 cm (the target was moved), or shrank so much while the body

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from enum import Enum
 
-from middleware import presence
+from middleware.directory import presence
 
 
 class State(Enum):

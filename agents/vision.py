@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from agents.means import VIEW
-from standards.jpeg import size_of
+from formats.jpeg import size_of
 
 cv2.setNumThreads(1)
 

@@ -1,8 +1,8 @@
 """The directory in a large team: what each node holds of it, and what it costs to list, up to 10,000 devices.
 
-The model has ids only: each device knows its nearest ones, as it would, and stands where ``middleware.prefix`` says;
-each place is held by the k nodes closest to it, and lists are made by ``middleware.listing``.  The team is of the very
-nodes that ship, on a turned clock and one switchboard.
+The model has ids only: each device knows its nearest ones, as it would, and stands where
+``middleware.directory.prefix`` says; each place is held by the k nodes closest to it, and lists are made by
+``middleware.directory.listing``.  The team is of the very nodes that ship, on a turned clock and one switchboard.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 
 from benchmarks.dissemination import BITS, K, Ring
-from middleware.entangled.kademlia.contact import Contact
+from middleware.directory.listing import Listing
+from middleware.directory.prefix import WHOLE, depth_for, lease_at, places_of, size_of
+from middleware.directory.presence import MAX_DEPTH, Device, device_of
+from middleware.entangled.contact import Contact
 from middleware.entangled.kademlia.distance import closest
 from middleware.entangled.network.switchboard import Weather
 from middleware.entangled.record import Record
-from middleware.listing import Listing
-from middleware.prefix import WHOLE, depth_for, lease_at, places_of, size_of
-from middleware.presence import MAX_DEPTH, Device, device_of
 from sim.team.world import SwarmFleet
 
 SHARE = 0.01

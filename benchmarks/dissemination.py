@@ -20,15 +20,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from middleware.bidding.announcement import Announcement
+from middleware.bidding.auction import Auction
+from middleware.bidding.bid import Bid
+from middleware.bidding.errand import Cry, Errand, Notice, Offer
+from middleware.bidding.party import Party
+from middleware.bidding.rule import Rule
+from middleware.bidding.scale import Scale
 from middleware.consensus.strategy import Report, strategy_for
-from middleware.dissemination.announcement import Announcement
-from middleware.dissemination.auction import Auction
-from middleware.dissemination.bid import Bid
-from middleware.dissemination.errand import Cry, Errand, Notice, Offer
-from middleware.dissemination.party import Party
-from middleware.dissemination.rule import Rule
-from middleware.dissemination.scale import Scale
-from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.contact import Contact
 from middleware.entangled.kademlia.distance import closest
 from middleware.entangled.kademlia.routing import RoutingTable
 from middleware.entangled.network.network import Address

@@ -22,11 +22,11 @@ from twisted.internet import reactor as running  # noqa: E402
 from twisted.internet.protocol import Protocol  # noqa: E402
 from twisted.internet.stdio import StandardIO  # noqa: E402
 
-from middleware import roles  # noqa: E402
+from middleware.admission import roles  # noqa: E402
 from middleware.admission.membership import MembershipFile  # noqa: E402
 from middleware.admission.team import Team  # noqa: E402
+from middleware.entangled.contact import Contact  # noqa: E402
 from middleware.entangled.data.memory import MemoryStore  # noqa: E402
-from middleware.entangled.kademlia.contact import Contact  # noqa: E402
 from middleware.entangled.network.network import Address  # noqa: E402
 from middleware.entangled.network.udp import UdpNetwork  # noqa: E402
 from middleware.entangled.node import EntangledNode  # noqa: E402

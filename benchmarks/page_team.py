@@ -17,9 +17,9 @@ from typing import Any
 from twisted.internet.stdio import StandardIO
 from twisted.protocols.basic import LineReceiver
 
+from middleware.config.settings import Settings
 from middleware.entangled.clock import use_monotonic_time
 from middleware.node import CAMERA
-from middleware.settings import Settings
 from swarmnode.ballast import drop_tls
 from swarmnode.service import NodeService
 from swarmnode.warmth import STARTED_S, warmed_up

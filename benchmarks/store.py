@@ -144,7 +144,7 @@ def serve(path: str) -> None:
     drop_tls()
     from twisted.internet import reactor
 
-    from middleware.settings import Settings
+    from middleware.config.settings import Settings
     from swarmnode.service import NodeService
     from swarmnode.world import real_seams
 

@@ -8,7 +8,7 @@ from msgspec import Meta
 
 from drivers.driver import MAX_FPS
 from drivers.errors import UsageError
-from validation.convert import Invalid, Unit, convert_table
+from formats.convert import Invalid, Unit, convert_table
 
 T = TypeVar("T")
 Port = Annotated[int, Meta(ge=1, le=65535)]

@@ -18,45 +18,45 @@ from twisted.internet.defer import Deferred, maybeDeferred
 from twisted.internet.interfaces import IReactorTime
 from twisted.logger import Logger
 
+from middleware.bidding.group import Group, Heard
+from middleware.consensus.deployed import Deployed, is_deployed
 from middleware.consensus.strategy import place_of
-from middleware.deployed import Deployed, is_deployed
-from middleware.directory import Directory, Matches, Page
+from middleware.directory.directory import Directory, Matches, Page
+from middleware.directory.following import Following
+from middleware.directory.listing import Listing
+from middleware.directory.prefix import LONGEST
+from middleware.directory.presence import Device, Presence, devices_of
 from middleware.entangled.background import Background
+from middleware.entangled.contact import Contact, unpacked
 from middleware.entangled.data.store import Store
 from middleware.entangled.errors import EntangledError, NotRunning, Refused, WeatherError
 from middleware.entangled.identity import Identity
-from middleware.entangled.kademlia.contact import Contact, unpacked
 from middleware.entangled.network.multicast import Multicast
 from middleware.entangled.network.network import Address, Network
 from middleware.entangled.node import EntangledNode
 from middleware.entangled.record import Record, Slot
 from middleware.entangled.replication.owner import Stored
 from middleware.entangled.replication.watch import Changed, Watch
+from middleware.entangled.streams import Streams
+from middleware.entangled.value import bounded
 from middleware.entangled.wire.door import OPEN, Door
 from middleware.errors import UnknownStrategy
-from middleware.following import Following
-from middleware.group import Group, Heard
-from middleware.halt import Halt
-from middleware.listing import Listing
-from middleware.prefix import LONGEST
-from middleware.presence import Device, Presence, devices_of
-from middleware.streams import Streams
-from middleware.tasks import COUNCIL, MEMBER, ORDER, RESULT, TASKS, Result, Task, council_of, group_key
-from middleware.value import bounded
+from middleware.stop.halt import Halt
+from middleware.tasks.task import COUNCIL, MEMBER, ORDER, RESULT, TASKS, Result, Task, council_of, group_key
 
 if TYPE_CHECKING:
     from middleware.admission.team import Team
-    from middleware.commitment.councils import Councils
-    from middleware.commitment.lessee import Lessee
+    from middleware.bidding.auctions import Dissemination
+    from middleware.bidding.bidding import Bidding
+    from middleware.bidding.panel import Panel
+    from middleware.bidding.party import OnSummary
     from middleware.consensus.guard import Guard
     from middleware.consensus.selection import Strategies
+    from middleware.consensus.verdict import Verdict
     from middleware.consensus.view import View
-    from middleware.dissemination.bidding import Bidding
-    from middleware.dissemination.dissemination import Dissemination
-    from middleware.dissemination.party import OnSummary
-    from middleware.gauge import Gauge
-    from middleware.panel import Panel
-    from middleware.verdict import Verdict
+    from middleware.entangled.control.gauge import Gauge
+    from middleware.lease.lessee import Lessee
+    from middleware.tasks.councils import Councils
 
 CAMERA = "camera"
 LEASE_VERBS = ("prepare", "propose", "release", "close", "cancel", "change", "install", "freed")
@@ -258,7 +258,7 @@ class SwarmNode(Service):
 
     def team_size(self) -> int:
         """About how many nodes the team has, this one included."""
-        from middleware.dissemination.scale import team_size
+        from middleware.bidding.scale import team_size
 
         overlay = self.entangled.overlay
         return team_size(overlay.own_id, overlay.contacts(), overlay.is_large)
@@ -303,7 +303,7 @@ class SwarmNode(Service):
 
         Then, in a large team, a ``panel`` writes records for all; tasks that are divided together need all of them.
         """
-        from middleware.panel import panel_of
+        from middleware.bidding.panel import panel_of
 
         panel = panel or panel_of(self.uuid, group_key(task.task_id))
         enter = partial(self.bidding, task, task.generation) if task.council else None
@@ -314,14 +314,14 @@ class SwarmNode(Service):
 
     def bidding(self, task: Task, epoch: int, on_summary: OnSummary) -> Bidding:
         """Bid for ``task`` in ``epoch``: ``on_summary`` is told which bids the task's council announces."""
-        from middleware.dissemination.auction import MAX_WAITING, Auction
+        from middleware.bidding.auction import MAX_WAITING, Auction
 
         waiting = min(float(task.waiting_period), MAX_WAITING)
         auction = Auction(task.task_id, epoch, task.council, task.strategy, waiting, task.exclusive)
         return self.dissemination.enter(auction, on_summary)
 
     def order(self, task_id: str, order: bytes) -> Deferred[Stored]:
-        """Record what an operator wants of a task that is under way (``middleware.order``, packed)."""
+        """Record what an operator wants of a task that is under way (``middleware.tasks.order``, packed)."""
         return self.entangled.put(group_key(task_id), ORDER, order, "team")
 
     def conclude(self, task_id: str, result: Result) -> Deferred[Stored]:
@@ -368,7 +368,7 @@ class SwarmNode(Service):
 
     async def _record(self, task: Task) -> None:
         """Record the present council of ``task``, unless that or a newer one is recorded already."""
-        from middleware.commitment.charter import charter_of
+        from middleware.lease.charter import charter_of
 
         charter = charter_of(task.charter)
         if charter is not None:
@@ -384,7 +384,7 @@ class SwarmNode(Service):
     def councils(self) -> Councils:
         """The councils of the team's tasks: where this node sits in them, and how it asks them."""
         # Imported by the first who calls it to one: a node that is in none is spared the memory.
-        from middleware.commitment.councils import Councils
+        from middleware.tasks.councils import Councils
 
         def moved(task: Task) -> None:
             self._quietly(Deferred.fromCoroutine(self._record(task)))
@@ -398,7 +398,7 @@ class SwarmNode(Service):
     def gauge(self) -> Gauge:
         """How good the ways to this node's peers are."""
         # Imported by the first who wants to know.
-        from middleware.gauge import Gauge
+        from middleware.entangled.control.gauge import Gauge
 
         return Gauge(self.entangled, self.clock, self._chores.fork, self._chores.later)
 
@@ -414,7 +414,7 @@ class SwarmNode(Service):
     def dissemination(self) -> Dissemination:
         """How the bids for tasks travel through this node."""
         # Imported by the first bid: a node that never carries one is spared the memory.
-        from middleware.dissemination.dissemination import Dissemination, Surroundings
+        from middleware.bidding.auctions import Dissemination, Surroundings
 
         entangled = self.entangled
 
@@ -450,7 +450,7 @@ class SwarmNode(Service):
 
     def _learn_bidders(self, peer: Contact, bids: list[object]) -> Deferred[None] | None:
         """Ask ``peer`` for the certificates of those bidders that are unknown here; None where all are known."""
-        from middleware.dissemination.errand import MAX_BIDS
+        from middleware.bidding.errand import MAX_BIDS
 
         certificates = self.entangled.replica.certificates
         owners = [each[0] for each in bids[:MAX_BIDS] if isinstance(each, list) and each and type(each[0]) is bytes]

@@ -6,11 +6,11 @@ import base64
 from pathlib import Path
 from typing import Any
 
+from middleware.directory.presence import DEVICES, Device, devices_of
 from middleware.entangled.control import word
 from middleware.entangled.control.command import Ask
 from middleware.entangled.control.place import found
 from middleware.entangled.record import MAX_TTL, Record, hashed_key
-from middleware.presence import DEVICES, Device, devices_of
 
 
 class Refusal(Exception):

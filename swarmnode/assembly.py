@@ -15,19 +15,19 @@ from drivers.driver import MAX_FPS, Driver, Filming
 from drivers.errors import DriverError
 from drivers.option import Fps
 from drivers.registry import describe, driver_for
+from formats.convert import convert_value
+from middleware.config.settings import Settings
+from middleware.config.tuning import Knob, answer_tuning
+from middleware.diagnostics.survey import answer_survey
+from middleware.directory.presence import Device
 from middleware.entangled.data.store import Store
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.identity import Identity
 from middleware.entangled.wire.door import OPEN, UNPROTECTED
 from middleware.errors import BadSetting, SwarmError
-from middleware.halt import answer_halt
 from middleware.node import SwarmNode
-from middleware.presence import Device
-from middleware.settings import Settings
-from middleware.survey import answer_survey
-from middleware.tuning import Knob, answer_tuning
+from middleware.stop.halt import answer_halt
 from swarmnode.seams import Seams
-from validation.convert import convert_value
 from webnode.errors import WebError
 
 if TYPE_CHECKING:
@@ -188,7 +188,7 @@ def _closed_team(seams: Seams) -> Team | None:
     """The closed team that the node is a member of; a node of an open one loads none of this."""
     if seams.membership is None:
         return None
-    from middleware import roles
+    from middleware.admission import roles
     from middleware.admission.team import Team
 
     return Team(seams.membership, seams.store, seams.wall, seams.rng, roles)

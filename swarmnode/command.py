@@ -10,7 +10,7 @@ from importlib.util import find_spec
 from middleware.errors import MissingExtra
 from swarmnode.ballast import drop_tls
 
-OURS = ("agents", "drivers", "middleware", "sim", "standards", "swarmnode", "validation", "webnode")
+OURS = ("agents", "drivers", "formats", "middleware", "sim", "swarmnode", "webnode")
 # A verb whose module is not here is not offered.
 WORKS: dict[str, tuple[str, str]] = {
     "demo": ("sim.demo.demonstration", "three robots, a red target and the page, on this machine"),

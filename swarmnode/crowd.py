@@ -13,11 +13,11 @@ from typing import Any
 from twisted.internet.defer import Deferred
 
 from agents.catalogue import DEMO, task_named
+from middleware.config.settings import Settings
 from middleware.entangled.network.network import Address
 from middleware.entangled.network.switchboard import Weather
 from middleware.entangled.replication.watch import Watch
-from middleware.settings import Settings
-from middleware.tasks import Task, outcome_of
+from middleware.tasks.task import Task, outcome_of
 from sim.robots.crowd.command import main as run_crowd
 from sim.robots.crowd.controller import Controller, wander
 from sim.robots.crowd.ground import Ground

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
-from middleware.deployed import KINDS, PREFIX
+from middleware.consensus.deployed import KINDS, PREFIX
 from middleware.deployment.manifest import (
     DEPLOYMENTS,
     MAX_SOURCE,

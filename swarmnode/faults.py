@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TextIO
 
+from middleware.directory.presence import Device
 from middleware.entangled.control.command import FAILED, WRONG, Ask, asked
 from middleware.entangled.control.place import NoControl
 from middleware.entangled.control.word import printable
@@ -16,8 +17,7 @@ from middleware.errors import BadFault, BadSetting
 from middleware.faults.kinds import ASKED, ASSIGN, CAUSE, KINDS, MAX_S, MIN_S, USUAL_S, Fault, begins_in, parse_fault
 from middleware.faults.play import NobodyThere, play
 from middleware.faults.scenario import Scenario, Step, loaded
-from middleware.presence import Device
-from middleware.tasks import outcome_of, tasks_of
+from middleware.tasks.task import outcome_of, tasks_of
 from swarmnode.asker import Asker, Refusal
 
 RUN, LIST = "run", "list"

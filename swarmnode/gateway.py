@@ -19,13 +19,9 @@ from twisted.logger import Logger
 
 from drivers.phone.driver import SIGHT, PhoneDriver
 from drivers.phone.option import FPS, MOST_SIDE
+from formats.jpeg import size_of
 from middleware.admission.certificate import GATEWAY
-from middleware.entangled.data.memory import MemoryStore
-from middleware.entangled.identity import Identity
-from middleware.entangled.token_bucket import TokenBucket
-from middleware.node import SwarmNode
-from middleware.presence import DEVICES, DONE, EXECUTING, IDLE, Device, devices_of
-from middleware.settings import (
+from middleware.config.settings import (
     IN_MEMORY,
     AgentSettings,
     DeploymentSettings,
@@ -34,7 +30,11 @@ from middleware.settings import (
     Settings,
     WebSettings,
 )
-from standards.jpeg import size_of
+from middleware.directory.presence import DEVICES, DONE, EXECUTING, IDLE, Device, devices_of
+from middleware.entangled.data.memory import MemoryStore
+from middleware.entangled.identity import Identity
+from middleware.entangled.token_bucket import TokenBucket
+from middleware.node import SwarmNode
 from swarmnode.assembly import FAULTS, assembled
 from swarmnode.seams import Seams
 from webnode.board import Phones, Wanted

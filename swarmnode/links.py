@@ -1,6 +1,7 @@
 """Links: ``swarm links``, how a node of this machine reaches each of its peers, and how well.
 
-The figures are those of the page and of ``swarm doctor``: small questions to each peer, judged by ``middleware.link``.
+The figures are those of the page and of ``swarm doctor``: small questions to each peer, judged by
+``middleware.entangled.control.link``.
 """
 
 from __future__ import annotations
@@ -13,9 +14,9 @@ from dataclasses import asdict
 from typing import Any, TextIO
 
 from middleware.entangled.control.command import FAILED, WRONG, Ask, asked
+from middleware.entangled.control.link import Link, link
 from middleware.entangled.control.place import NoControl
 from middleware.entangled.control.word import printable
-from middleware.link import Link, link
 from swarmnode.asker import Asker, Refusal
 
 WAYS = {

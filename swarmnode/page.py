@@ -17,9 +17,9 @@ from twisted.internet.defer import gatherResults, maybeDeferred
 from agents.catalogue import DEMO, TASKS
 from drivers.link import TcpConnector
 from drivers.sim.operator import YardOperator
+from middleware.config.settings import IN_MEMORY, Settings
 from middleware.entangled.data.sqlite import read_records
 from middleware.node import SwarmNode
-from middleware.settings import IN_MEMORY, Settings
 from swarmnode.gateway import gateway
 from swarmnode.invitation import at_terminal, invited
 from swarmnode.seams import Seams

@@ -15,11 +15,11 @@ from twisted.python import usage
 from drivers.errors import DriverError
 from middleware.admission.errors import BadKeyFile
 from middleware.admission.keyfile import MAX_FILE, read_bytes
+from middleware.config.settings import COMMAND_LINE, Settings
 from middleware.entangled.clock import use_monotonic_time
 from middleware.entangled.errors import BadStore, PortInUse, TunnelPortInUse
 from middleware.errors import BadSetting, MissingExtra, SwarmError, UnknownAgent
 from middleware.node import SwarmNode
-from middleware.settings import COMMAND_LINE, Settings
 from swarmnode.assembly import FAULTS, checked_team
 from swarmnode.ballast import drop_tls
 from swarmnode.ports import given_way

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from twisted.logger import Logger
 
-from middleware.settings import Settings
+from middleware.config.settings import Settings
 
 NEXT = 8
 """Ports that are tried, the usual one and those after it, so that a firewall can be opened for them; then any."""

@@ -15,10 +15,10 @@ from drivers.sim.operator import YardOperator
 from middleware.admission.membership import MemoryMembership
 from middleware.admission.operator import FIRST, drawn
 from middleware.admission.statement import SECRET_BYTES
+from middleware.config.settings import Settings
 from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.network.network import Address
 from middleware.entangled.network.switchboard import Weather
-from middleware.settings import Settings
 from sim.demo.trials import main as run_trials
 from sim.robots.scene import loaded
 from sim.robots.yard import Yard

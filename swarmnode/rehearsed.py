@@ -6,9 +6,9 @@ from typing import Any
 
 from twisted.internet.defer import Deferred
 
+from middleware.directory.presence import Device, devices_of
 from middleware.faults.kinds import ASSIGN, CAUSE, Fault, begins_in
-from middleware.presence import Device, devices_of
-from middleware.tasks import TASKS, group_key, outcome_of, tasks_of
+from middleware.tasks.task import TASKS, group_key, outcome_of, tasks_of
 from swarmnode.asker import Refusal
 from swarmnode.rehearsal import VirtualTeam
 

@@ -15,7 +15,7 @@ from contextlib import suppress
 from functools import partial
 
 from agents.pushed import BehaviourKind
-from middleware.deployed import BEHAVIOUR, STRATEGY
+from middleware.consensus.deployed import BEHAVIOUR, STRATEGY
 from middleware.deployment.channel import Channel
 from middleware.deployment.confinement import confine
 from middleware.deployment.frame import MAX_QUESTION, Splitter
@@ -29,7 +29,7 @@ LIBRARIES = (
     *("json", "math", "numbers", "operator", "random", "re", "statistics", "string", "struct", "textwrap", "time"),
     *("traceback", "types", "typing", "zlib", "cv2", "numpy"),
 )
-PREFIXES = ("agents.", "drivers.reading", "middleware.consensus.", "middleware.value", "numpy.")
+PREFIXES = ("agents.", "drivers.reading", "middleware.consensus.", "middleware.entangled.value", "numpy.")
 """Where else a module may import from: names that begin so."""
 LATER = {"numpy": ("numpy.fft", "numpy.random")}
 """Modules that a library imports at first use, which is too late here."""

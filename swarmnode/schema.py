@@ -11,8 +11,8 @@ from typing import Any, TextIO, get_type_hints
 
 import msgspec
 
-from middleware.settings import TABLES
-from validation.convert import raw_of
+from formats.convert import raw_of
+from middleware.config.settings import TABLES
 
 
 def json_schema() -> dict[str, Any]:

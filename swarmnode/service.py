@@ -10,8 +10,8 @@ from twisted.internet.defer import Deferred, gatherResults, maybeDeferred
 from twisted.internet.interfaces import IDelayedCall
 from twisted.logger import Logger
 
+from middleware.config.settings import Settings
 from middleware.node import SwarmNode
-from middleware.settings import Settings
 from swarmnode.assembly import FAULTS, assembled
 from swarmnode.seams import Seams
 

@@ -18,12 +18,12 @@ from typing import Any
 from twisted.internet import reactor as _reactor
 from twisted.internet.defer import Deferred
 
+from middleware.config.settings import Settings
 from middleware.entangled.clock import use_monotonic_time
+from middleware.entangled.contact import Contact
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.identity import Identity
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.node import EntangledNode
-from middleware.settings import Settings
 from swarmnode.world import real_seams
 
 Order = dict[str, Any]

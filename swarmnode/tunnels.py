@@ -9,9 +9,9 @@ from typing import Any
 
 from twisted.logger import Logger
 
+from middleware.config.settings import NodeSettings
 from middleware.entangled.network.network import Network
 from middleware.entangled.network.url import Proxy, Url
-from middleware.settings import NodeSettings
 
 _log = Logger()
 

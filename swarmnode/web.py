@@ -9,9 +9,9 @@ from typing import Any
 
 from twisted.application.service import IService
 
+from middleware.config.settings import Settings
 from middleware.errors import BadSetting, MissingExtra
 from middleware.node import SwarmNode
-from middleware.settings import Settings
 from swarmnode.seams import Seams
 
 

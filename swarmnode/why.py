@@ -12,12 +12,12 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import TextIO
 
+from middleware.consensus.verdict import verdict_of, verdicts_text
+from middleware.diagnostics.explanation import as_text, explained
 from middleware.entangled.control.command import FAILED, WRONG, Ask, asked
 from middleware.entangled.control.place import NoControl
 from middleware.entangled.control.word import printable
-from middleware.explanation import as_text, explained
-from middleware.tasks import Task, outcome_of, tasks_of
-from middleware.verdict import verdict_of, verdicts_text
+from middleware.tasks.task import Task, outcome_of, tasks_of
 from swarmnode.asker import Asker, Refusal
 
 LAST = "last"

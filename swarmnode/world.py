@@ -15,6 +15,7 @@ from typing import Any
 from twisted.application.service import IService, Service
 from twisted.logger import Logger
 
+from middleware.config.settings import IN_MEMORY, Settings
 from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.data.sqlite import SqliteStore
 from middleware.entangled.data.store import Store
@@ -22,7 +23,6 @@ from middleware.entangled.network.interface import is_loopback
 from middleware.entangled.network.network import EVERYWHERE, Address
 from middleware.errors import BadSetting
 from middleware.node import SwarmNode
-from middleware.settings import IN_MEMORY, Settings
 from swarmnode.seams import Seams
 from swarmnode.tunnels import with_tunnels
 

@@ -1,11 +1,11 @@
-"""The role table in docs/security.md, written from ``middleware.roles``: ``python -m tests.role_table``."""
+"""The role table in docs/security.md, written from ``middleware.admission.roles``: ``python -m tests.role_table``."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from pathlib import Path
 
-from middleware.roles import METHODS, NAMESPACES, OTHER_METHODS, ROLES
+from middleware.admission.roles import METHODS, NAMESPACES, OTHER_METHODS, ROLES
 
 PAGE = Path(__file__).parents[1] / "docs" / "security.md"
 BEGIN, END = "<!-- role table: python -m tests.role_table -->\n", "<!-- end of the role table -->\n"

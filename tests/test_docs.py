@@ -21,19 +21,21 @@ from drivers.deadman import keeper, process
 from drivers.errors import UsageError
 from drivers.phone import driver, option
 from drivers.registry import KINDS, describe
-from middleware import gauge, halt, stop_set, survey
-from middleware.commitment import lease_codec, lessee
+from formats.head import MAX_HEAD
+from middleware.bidding import check, party, scale, teller, tree
+from middleware.config.settings import Settings
 from middleware.consensus import guard, strategy, worker
 from middleware.deployment import confinement, deployment, frame, manifest, module, runner
-from middleware.dissemination import check, party, scale, teller, tree
-from middleware.entangled.control import port
+from middleware.diagnostics import survey
+from middleware.entangled.control import gauge, port
 from middleware.entangled.kademlia import detour, membership, roster
 from middleware.entangled.network import bundle, link, tcp, tunnel, websocket
 from middleware.entangled.replication import handover, pusher, replica, subscriber
 from middleware.entangled.space import shelf, template
 from middleware.entangled.wire import rebuff
 from middleware.faults import kinds, takeover
-from middleware.settings import Settings
+from middleware.lease import lease_codec, lessee
+from middleware.stop import halt, stop_set
 from sim.demo.cast import CASTS
 from sim.demo.configuration import DOGS
 from sim.robots import dog, scene, sensor, world
@@ -41,7 +43,6 @@ from sim.robots.crowd import crowd, ray
 from sim.robots.emulator import aibo, rosbridge
 from sim.robots.table import Robots
 from sim.robots.yard import Yard
-from standards.head import MAX_HEAD
 from swarmnode import gateway
 from swarmnode.driver import pilot
 from tests.role_table import write_tables

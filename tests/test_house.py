@@ -13,36 +13,9 @@ from pathlib import Path
 
 from twisted.trial.unittest import SynchronousTestCase
 
+from tests.layers import LAYERS, TOP, is_within, may_import
+
 ROOT = Path(__file__).resolve().parent.parent
-BELOW = ("agents", "drivers", "middleware", "sim", "standards", "validation", "webnode")
-ROOMS = (*BELOW, "swarmnode")
-
-FAULTS_USE = tuple(f"middleware.{name}" for name in ("errors", "node", "presence", "tasks", "value"))
-
-# From the most special name to the room: what a module may import of the house.  The longest name that fits holds.
-MAY_IMPORT: dict[str, tuple[str, ...]] = {
-    "standards": ("standards",),
-    "validation": ("validation",),
-    "middleware": ("middleware", "validation"),
-    "middleware.entangled": ("middleware.entangled", "standards"),
-    "middleware.entangled.quorum": ("middleware.entangled.quorum",),
-    "middleware.faults": ("middleware.faults", "middleware.entangled", "validation", *FAULTS_USE),
-    "middleware.admission": ("middleware.admission", "middleware.entangled"),
-    "drivers": ("drivers", "standards", "validation"),
-    "sim": ("sim", "drivers", "validation"),
-    "sim.robots": ("sim.robots", "drivers", "middleware.faults.stream", "validation"),
-    "sim.namespaces": ("sim", "middleware"),
-    "sim.team": (
-        "sim.team",
-        "middleware",
-        "validation",
-        *(f"drivers.{name}" for name in ("driver", "errors", "gate", "link")),
-    ),
-    "webnode": ("webnode", "middleware", "standards", "validation"),
-    "agents": ("agents", "middleware", "drivers.driver", "drivers.reading", "drivers.errors", "standards"),
-    "swarmnode": ROOMS,
-}
-
 # Plain objects: bytes and ``now`` in, decisions out.
 PURE = (
     "agents.behaviour",
@@ -67,7 +40,7 @@ PURE = (
     "drivers.aibo.sense",
     "drivers.errors",
     "drivers.gate",
-    "standards.jpeg",
+    "formats.jpeg",
     "drivers.reading",
     "drivers.rosbridge.websocket",
     "middleware.admission.certificate",
@@ -77,48 +50,48 @@ PURE = (
     "middleware.admission.roll",
     "middleware.admission.sealed",
     "middleware.admission.statement",
-    "middleware.consensus.average",
-    "middleware.consensus.bidder",
-    "middleware.consensus.capability_cost",
-    "middleware.consensus.cbba",
+    "middleware.consensus.strategies.average",
+    "middleware.consensus.strategies.bidder",
+    "middleware.consensus.strategies.capability_cost",
+    "middleware.consensus.strategies.cbba",
     "middleware.consensus.conformance",
-    "middleware.consensus.exchange",
-    "middleware.consensus.group_optimal",
-    "middleware.consensus.hungarian",
+    "middleware.consensus.strategies.exchange",
+    "middleware.consensus.strategies.group_optimal",
+    "middleware.consensus.strategies.hungarian",
     "middleware.consensus.item",
-    "middleware.consensus.nearest",
-    "middleware.consensus.push_sum",
+    "middleware.consensus.strategies.nearest",
+    "middleware.consensus.strategies.push_sum",
     "middleware.consensus.remote",
-    "middleware.consensus.rendezvous",
-    "middleware.consensus.sequential",
+    "middleware.consensus.strategies.rendezvous",
+    "middleware.consensus.strategies.sequential",
     "middleware.consensus.strategy",
-    "middleware.dissemination.announcement",
-    "middleware.dissemination.auction",
-    "middleware.dissemination.audience",
-    "middleware.dissemination.bid",
-    "middleware.dissemination.bidding",
-    "middleware.dissemination.check",
-    "middleware.dissemination.direct",
-    "middleware.dissemination.errand",
-    "middleware.dissemination.flood",
-    "middleware.dissemination.parties",
-    "middleware.dissemination.party",
-    "middleware.dissemination.roll",
-    "middleware.dissemination.route",
-    "middleware.dissemination.rule",
-    "middleware.dissemination.scale",
-    "middleware.dissemination.summary",
-    "middleware.dissemination.teller",
-    "middleware.dissemination.tree",
+    "middleware.bidding.announcement",
+    "middleware.bidding.auction",
+    "middleware.bidding.audience",
+    "middleware.bidding.bid",
+    "middleware.bidding.bidding",
+    "middleware.bidding.check",
+    "middleware.bidding.direct",
+    "middleware.bidding.errand",
+    "middleware.bidding.flood",
+    "middleware.bidding.parties",
+    "middleware.bidding.party",
+    "middleware.bidding.roll",
+    "middleware.bidding.route",
+    "middleware.bidding.rule",
+    "middleware.bidding.scale",
+    "middleware.bidding.summary",
+    "middleware.bidding.teller",
+    "middleware.bidding.tree",
     "middleware.consensus.view",
-    "middleware.consensus.weighted_vote",
-    "middleware.deployed",
+    "middleware.consensus.strategies.weighted_vote",
+    "middleware.consensus.deployed",
     "middleware.deployment.frame",
     "middleware.deployment.manifest",
     "middleware.entangled.replication.cache",
     "middleware.entangled.errors",
     "middleware.entangled.identity",
-    "middleware.entangled.kademlia.contact",
+    "middleware.entangled.contact",
     "middleware.entangled.kademlia.lookup",
     "middleware.entangled.kademlia.pace",
     "middleware.entangled.kademlia.routing",
@@ -152,17 +125,17 @@ PURE = (
     "middleware.faults.kinds",
     "middleware.faults.stream",
     "middleware.faults.takeover",
-    "middleware.link",
-    "middleware.listing",
-    "middleware.order",
-    "middleware.panel",
-    "middleware.explanation",
-    "middleware.presence",
-    "middleware.prefix",
-    "middleware.roles",
-    "middleware.settings",
-    "middleware.tasks",
-    "middleware.verdict",
+    "middleware.entangled.control.link",
+    "middleware.directory.listing",
+    "middleware.tasks.order",
+    "middleware.bidding.panel",
+    "middleware.diagnostics.explanation",
+    "middleware.directory.presence",
+    "middleware.directory.prefix",
+    "middleware.admission.roles",
+    "middleware.config.settings",
+    "middleware.tasks.task",
+    "middleware.consensus.verdict",
     "sim.robots.crowd.body",
     "sim.robots.crowd.controller",
     "sim.robots.crowd.crowd",
@@ -193,8 +166,7 @@ PURE = (
     "sim.team.scale.theory",
     "sim.team.scenario",
     "sim.team.session",
-    "standards",
-    "validation",
+    "formats",
     "swarmnode.doctor.diagnosis",
     "swarmnode.doctor.facts",
     "swarmnode.doctor.finding",
@@ -231,10 +203,10 @@ EDGES = (
     "middleware.faults.process",
 )
 WORLD = ("time", "socket", "threading", "asyncio", "selectors", "subprocess", "secrets", "twisted.internet.reactor")
-GUARDED = ("standards", "validation", "middleware", "agents", "drivers")
+GUARDED = ("formats", "middleware", "agents", "drivers")
 
 ON_DEMAND = (
-    *("middleware.deployment", "middleware.explanation", "middleware.verdict"),
+    *("middleware.deployment", "middleware.diagnostics.explanation", "middleware.consensus.verdict"),
     *("middleware.admission.team", "middleware.admission.roll"),
 )
 HEAVY = (
@@ -246,7 +218,7 @@ HEAVY = (
 
 def _files() -> dict[str, Path]:
     found = {}
-    for room in ROOMS:
+    for room in TOP:
         for path in sorted((ROOT / room).rglob("*.py")):
             parts = path.relative_to(ROOT).with_suffix("").parts
             found[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
@@ -257,8 +229,8 @@ FILES = _files()
 TREES = {module: ast.parse(path.read_text(encoding="utf-8"), str(path)) for module, path in FILES.items()}
 
 
-def _within(name: str, *allowed: str) -> bool:
-    return any(name == one or name.startswith(one + ".") for one in allowed)
+def _is_within_any(name: str, *packages: str) -> bool:
+    return any(is_within(name, one) for one in packages)
 
 
 def _imports(module: str) -> list[str]:
@@ -278,21 +250,16 @@ def _import_names(module: str) -> Iterator[str]:
 
 
 def _ours(module: str) -> list[str]:
-    return [name for name in _imports(module) if _within(name, "tests", *ROOMS)]
+    return [name for name in _imports(module) if _is_within_any(name, "tests", *TOP)]
 
 
-def _allowed(module: str) -> tuple[str, ...]:
-    room = max((name for name in MAY_IMPORT if _within(module, name)), key=len)
-    allowed = MAY_IMPORT[room]
-    parts = module.split(".")
-    if parts[0] == "drivers" and module != "drivers.registry":
+def _crosses(module: str, name: str) -> bool:
+    """Say whether ``module`` may not import ``name``."""
+    if module.startswith("drivers.") and name.startswith("drivers.") and module != "drivers.registry":
         # A kind of robot never knows another kind; only the registry knows them all.
-        kinds = sorted({name.split(".")[1] for name in FILES if re.fullmatch(r"drivers\.\w+\.maker", name)})
-        own = parts[1] if len(parts) > 2 or module in (f"drivers.{kind}" for kind in kinds) else ""
-        contract = tuple(name for name in FILES if name.startswith("drivers.") and name.split(".")[1] not in kinds)
-        contract += ("standards", "validation")
-        allowed = (*contract, f"drivers.{own}") if own else contract
-    return allowed
+        kinds = {file.split(".")[1] for file in FILES if re.fullmatch(r"drivers\.\w+\.maker", file)}
+        return name.split(".")[1] in kinds - {module.split(".")[1]}
+    return not may_import(module, name)
 
 
 class FloorPlanTests(SynchronousTestCase):
@@ -300,13 +267,27 @@ class FloorPlanTests(SynchronousTestCase):
 
     def test_imports_follow_the_floor_plan(self) -> None:
         """No module imports a room that lies above it, beside it, or behind a contract."""
-        wrong = [
-            f"{module} imports {name}"
-            for module in FILES
-            for name in _ours(module)
-            if not _within(name, *_allowed(module))
-        ]
+        wrong = [f"{module} imports {name}" for module in FILES for name in _ours(module) if _crosses(module, name)]
         self.assertEqual(wrong, [])
+
+    def test_every_layer_has_a_wall(self) -> None:
+        """A module of any package but the topmost that imported a package above it would be named."""
+        above = [
+            ("middleware.entangled.wire", "middleware.entangled.kademlia.overlay"),
+            ("middleware.entangled.space", "middleware.entangled.node"),
+            ("middleware.lease", "middleware.tasks.task"),
+            ("middleware.tasks", "middleware.consensus.strategy"),
+            ("middleware.consensus", "middleware.bidding.bid"),
+            ("middleware", "middleware.config.settings"),
+            *((package, "swarmnode.service") for package in LAYERS if package != "swarmnode"),
+        ]
+        self.assertEqual([pair for pair in above if not _crosses(f"{pair[0]}.new", pair[1])], [])
+
+    def test_middleware_has_packages(self) -> None:
+        """``middleware`` has no modules of its own but the node and the errors."""
+        flat = {module for module in FILES if module.count(".") == 1 and module.startswith("middleware.")}
+        modules = {module for module in flat if FILES[module].name != "__init__.py"}
+        self.assertEqual(modules, {"middleware.errors", "middleware.node"})
 
     def test_imports_are_absolute(self) -> None:
         """No module uses a relative import, so the tree can be searched by name."""
@@ -345,9 +326,9 @@ class PurityTests(SynchronousTestCase):
         wrong = [
             f"{module} imports {name}"
             for module in FILES
-            if _within(module, *PURE) or module.split(".")[-1] in PURE_LAST_NAMES
+            if _is_within_any(module, *PURE) or module.split(".")[-1] in PURE_LAST_NAMES
             for name in _imports(module)
-            if _within(name, *NOT_IN_PURE)
+            if _is_within_any(name, *NOT_IN_PURE)
         ]
         self.assertEqual(wrong, [])
 
@@ -356,9 +337,9 @@ class PurityTests(SynchronousTestCase):
         wrong = [
             f"{module} imports {name}; take it as an argument, or make it an edge"
             for module in FILES
-            if _within(module, *GUARDED) and module not in EDGES
+            if _is_within_any(module, *GUARDED) and module not in EDGES
             for name in _imports(module)
-            if _within(name, *WORLD)
+            if _is_within_any(name, *WORLD)
         ]
         self.assertEqual(wrong, [])
 
@@ -372,7 +353,7 @@ class PurityTests(SynchronousTestCase):
                     named = node.attr
                 elif isinstance(node, ast.ImportFrom) and node.module == "random":
                     named = next((alias.name for alias in node.names if alias.name != "Random"), "")
-                if named not in ("", "Random") and (named != "SystemRandom" or _within(module, *GUARDED)):
+                if named not in ("", "Random") and (named != "SystemRandom" or _is_within_any(module, *GUARDED)):
                     wrong.append(f"{module} line {getattr(node, 'lineno', 0)}: random.{named}")
         self.assertEqual(wrong, [])
 
@@ -404,7 +385,7 @@ class PurityTests(SynchronousTestCase):
         """A node without agent, page and deployment loads neither the verdicts nor what runs foreign modules."""
         program = "import sys, swarmnode.plugin; print(*[n for n in sys.modules if n.startswith(('middleware.',))])"
         child = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=60)
-        unwanted = [name for name in child.stdout.split() if _within(name, *ON_DEMAND)]
+        unwanted = [name for name in child.stdout.split() if _is_within_any(name, *ON_DEMAND)]
         self.assertEqual((child.returncode, unwanted), (0, []), child.stderr)
 
     def test_node_runs_no_pushed_code(self) -> None:
@@ -427,14 +408,12 @@ class PackagingTests(SynchronousTestCase):
     def test_listed_packages_are_the_folders(self) -> None:
         """A forgotten package works in an editable install and is missing in the wheel, so the list is compared."""
         listed = set(self.setup["options"]["packages"].split())
-        found = {
-            ".".join(path.parent.relative_to(ROOT).parts) for room in ROOMS for path in (ROOT / room).rglob("*.py")
-        }
+        found = {".".join(path.parent.relative_to(ROOT).parts) for room in TOP for path in (ROOT / room).rglob("*.py")}
         self.assertEqual(listed, found | {"twisted.plugins"})
 
     def test_every_room_is_marked_as_typed(self) -> None:
         """Each room ships ``py.typed``, or type checkers of users ignore our annotations."""
-        self.assertEqual([room for room in ROOMS if not (ROOT / room / "py.typed").exists()], [])
+        self.assertEqual([room for room in TOP if not (ROOT / room / "py.typed").exists()], [])
 
     def test_twisted_is_not_hidden(self) -> None:
         """No ``__init__.py`` in our ``twisted`` folders: one would hide Twisted itself, or the plugin."""
@@ -445,7 +424,7 @@ class PackagingTests(SynchronousTestCase):
         owners = packages_distributions()
         foreign = {
             room: others
-            for room in ROOMS
+            for room in TOP
             if (others := sorted({name for name in owners.get(room, []) if name.lower() != "swarm-node"}))
         }
         self.assertEqual(foreign, {}, "give swarm-node a virtual environment of its own")

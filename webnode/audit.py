@@ -10,7 +10,7 @@ from pathlib import Path
 
 from twisted.logger import Logger
 
-from middleware.settings import IN_MEMORY
+from middleware.config.settings import IN_MEMORY
 from webnode.board import AUDITED, Audit, MemoryAudit, Visitor
 from webnode.field import Json
 from webnode.ground import Ground

@@ -8,7 +8,7 @@ from typing import Protocol
 from twisted.internet.interfaces import IDelayedCall, IReactorTime
 from twisted.web.http import Request
 
-from standards.jpeg import size_of
+from formats.jpeg import size_of
 from webnode.errors import Refusal
 
 POLL_S = 5.0

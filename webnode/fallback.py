@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 from math import inf
 from urllib.parse import urlsplit
 
+from middleware.admission.roles import GATEWAY
+from middleware.directory.presence import Device, devices_of
 from middleware.entangled.record import Record
 from middleware.node import SwarmNode
-from middleware.presence import Device, devices_of
-from middleware.roles import GATEWAY
 from webnode.board import Page
 from webnode.ground import Ground
 from webnode.guard import is_local_name

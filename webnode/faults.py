@@ -9,13 +9,13 @@ from typing import Any
 from twisted.internet.defer import Deferred, fail
 from twisted.logger import Logger
 
+from middleware.directory.presence import devices_of
 from middleware.entangled.errors import EntangledError, NoAnswer
 from middleware.entangled.record import Record
 from middleware.errors import BadFault
 from middleware.faults.kinds import ASKED, CAUSE, KINDS, Fault, begins_in, parse_fault
 from middleware.faults.takeover import Takeover, acting
 from middleware.node import SwarmNode
-from middleware.presence import devices_of
 from webnode.board import Faults
 from webnode.errors import Refusal
 from webnode.field import Json, text

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from middleware.config.settings import Settings
 from middleware.node import SwarmNode
-from middleware.settings import Settings
 from webnode.team import TeamDesk
 
 

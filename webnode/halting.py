@@ -7,11 +7,11 @@ from collections.abc import Callable, Sequence
 
 from twisted.internet.defer import Deferred
 
-from middleware.entangled.kademlia.contact import Contact
+from middleware.directory.presence import DEVICES, devices_of
+from middleware.entangled.contact import Contact
 from middleware.entangled.record import Record
 from middleware.node import SwarmNode
-from middleware.presence import DEVICES, devices_of
-from middleware.stop_set import ID_BYTES
+from middleware.stop.stop_set import ID_BYTES
 from webnode.board import Halts
 from webnode.errors import Refusal
 from webnode.ground import Ground

@@ -10,13 +10,13 @@ from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any
 
+from middleware.consensus.verdict import verdict_of, verdicts_key
+from middleware.diagnostics.explanation import explained
+from middleware.directory.presence import DEVICES, Device, devices_of
 from middleware.entangled.record import Record
-from middleware.explanation import explained
-from middleware.halt import HALT, stops_in
-from middleware.order import PAUSE, order_of
-from middleware.presence import DEVICES, Device, devices_of
-from middleware.tasks import TASKS, Task, council_of, group_key, member_of, outcome_of, refusals, tasks_of
-from middleware.verdict import verdict_of, verdicts_key
+from middleware.stop.halt import HALT, stops_in
+from middleware.tasks.order import PAUSE, order_of
+from middleware.tasks.task import TASKS, Task, council_of, group_key, member_of, outcome_of, refusals, tasks_of
 from webnode.state import Departed, State, state_of
 from webnode.stopped import stopped_view
 

@@ -13,8 +13,8 @@ import msgpack
 
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.record import Record, hashed_key
+from middleware.entangled.value import LARGEST, bounded, is_number, mapping_of
 from middleware.node import SwarmNode
-from middleware.value import LARGEST, bounded, is_number, mapping_of
 
 REVOKED = hashed_key("signed-out")
 SLOT = "signed-out"

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta
 
-from validation.convert import Invalid, Secret, Unit, convert_value, nearest_of
+from formats.convert import Invalid, Secret, Unit, convert_value, nearest_of
 from webnode.board import Board, Role, Visitor
 from webnode.errors import Refusal
 from webnode.field import Json, text

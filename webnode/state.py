@@ -187,7 +187,7 @@ def _result(fields: Fields) -> State:
 
 
 def _ruling_view(fields: Fields) -> State:
-    """One epoch of ``middleware.explanation.Explanation``: a row for each who reported, and for each who differs."""
+    """One epoch of an ``Explanation``: a row for each who reported, and for each who differs."""
     standby, winner = list(fields["standby"]), fields["winner"]
     differ = {each["name"]: each["what"] for each in fields["differ"]}
     rows: dict[str, State] = {}

@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from middleware.halt import STANDS
-from middleware.presence import STOPS_SHOWN
+from middleware.directory.presence import STOPS_SHOWN
+from middleware.stop.halt import STANDS
 from webnode.state import GONE, State
 
 MOST = 64

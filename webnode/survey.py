@@ -11,14 +11,14 @@ from typing import Any
 
 from twisted.internet.defer import Deferred, DeferredList, maybeDeferred, succeed
 
+from middleware.diagnostics.survey import INVENTORY, LINKS, NETWORK, inventory, links, network, team
+from middleware.directory.presence import DEVICES, Device, devices_of
+from middleware.entangled.control.link import Link
 from middleware.entangled.errors import EntangledError, Refused
 from middleware.entangled.reach.passage import KINDS
 from middleware.entangled.record import Record
 from middleware.entangled.wire.rebuff import SIDES
-from middleware.link import Link
 from middleware.node import SwarmNode
-from middleware.presence import DEVICES, Device, devices_of
-from middleware.survey import INVENTORY, LINKS, NETWORK, inventory, links, network, team
 from webnode.board import Survey
 from webnode.errors import Refusal
 from webnode.field import MAX_ENTRIES, Json, count, distance, number, text

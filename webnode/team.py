@@ -10,15 +10,15 @@ from typing import Any, Protocol
 from twisted.internet.defer import Deferred, DeferredList, fail
 from twisted.logger import Logger
 
+from middleware.consensus.verdict import verdicts_key
+from middleware.directory.presence import DEVICES, Device, devices_of
 from middleware.entangled.errors import EntangledError, Refused
 from middleware.entangled.record import Record
 from middleware.entangled.replication.watch import Watch
-from middleware.halt import HALT
 from middleware.node import CAMERA, SwarmNode
-from middleware.order import PAUSE, RESUME, Order
-from middleware.presence import DEVICES, Device, devices_of
-from middleware.tasks import CANCELLED, TASKS, Result, Task, group_key, member_of, outcome_of, tasks_of
-from middleware.verdict import verdicts_key
+from middleware.stop.halt import HALT
+from middleware.tasks.order import PAUSE, RESUME, Order
+from middleware.tasks.task import CANCELLED, TASKS, Result, Task, group_key, member_of, outcome_of, tasks_of
 from webnode.camera import OnFrame
 from webnode.errors import Refusal
 from webnode.ledger import refused_by

@@ -20,8 +20,8 @@ from twisted.protocols.tls import BufferingTLSTransport, TLSMemoryBIOFactory
 from twisted.web.server import Site
 from zope.interface import implementer
 
+from middleware.config.settings import IN_MEMORY
 from middleware.entangled.data.store import Store
-from middleware.settings import IN_MEMORY
 from webnode.certificate import Authority, Leaf, authority, leaf, nameable, plain, read
 from webnode.ground import Ground
 from webnode.keyfile import Unsafe, keep, kept

@@ -7,8 +7,8 @@ from typing import Any
 
 from twisted.internet.defer import Deferred
 
+from middleware.config.tuning import SETTINGS, TUNE, WRONG
 from middleware.entangled.errors import Refused
-from middleware.tuning import SETTINGS, TUNE, WRONG
 from webnode.board import Knob, Tuning
 from webnode.errors import Refusal
 from webnode.field import Json, number, properties, text

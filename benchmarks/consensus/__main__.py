@@ -23,8 +23,8 @@ from benchmarks.consensus.oracle import least_star, least_way, travelled
 from benchmarks.consensus.outcome import ALL, gathered, outcome
 from benchmarks.consensus.plot import drawn
 from benchmarks.consensus.talk import ROUND_S, talked
-from middleware.consensus import hungarian
-from middleware.consensus.sequential import ways_of
+from middleware.consensus.strategies import hungarian
+from middleware.consensus.strategies.sequential import ways_of
 
 SIZES = (3, 10, 30, 100, 300, 1000)
 QUICK = (3, 10, 30, 100)

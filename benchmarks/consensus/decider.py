@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from benchmarks.consensus.mission import Mission
-from middleware.consensus.cbba import Cbba, greedy
-from middleware.consensus.group_optimal import BIDS, GroupOptimal
 from middleware.consensus.item import GroupAlgorithm, capacities, exact
-from middleware.consensus.nearest import Nearest
-from middleware.consensus.sequential import Sequential
+from middleware.consensus.strategies.cbba import Cbba, greedy
+from middleware.consensus.strategies.group_optimal import BIDS, GroupOptimal
+from middleware.consensus.strategies.nearest import Nearest
+from middleware.consensus.strategies.sequential import Sequential
 from middleware.consensus.strategy import Consensus, Report
 
 Owners = dict[str, str]

@@ -7,8 +7,8 @@ import random
 from typing import Any
 
 from benchmarks.consensus.mission import Mission
-from middleware.consensus import hungarian
-from middleware.consensus.sequential import insertion, length
+from middleware.consensus.strategies import hungarian
+from middleware.consensus.strategies.sequential import insertion, length
 
 STEPS_S = 60_000
 """Steps of our own search for short ways in place of each second that OR-Tools would get."""

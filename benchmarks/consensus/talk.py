@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import msgpack
 
 from benchmarks.consensus.mission import SIDE, Mission
-from middleware.consensus.bidder import Bidder, Score, Statement
-from middleware.consensus.exchange import met, partners
+from middleware.consensus.strategies.bidder import Bidder, Score, Statement
+from middleware.consensus.strategies.exchange import met, partners
 
 PAUSE = 5
 """Rounds between two messages of an agent: what it learns meanwhile goes in one."""

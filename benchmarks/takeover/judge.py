@@ -6,7 +6,7 @@ import random
 from collections.abc import Collection
 
 from benchmarks.takeover.cause import FROZEN_S, Cause, Trial
-from middleware.tasks import COMPLETED, Result
+from middleware.tasks.task import COMPLETED, Result
 
 LOOK_S = 0.01
 

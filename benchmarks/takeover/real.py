@@ -25,7 +25,7 @@ from drivers.link import TcpConnector
 from drivers.sim.operator import YardOperator
 from middleware.entangled.data.sqlite import read_records
 from middleware.entangled.errors import EntangledError
-from middleware.tasks import TASKS, group_key, outcome_of, tasks_of
+from middleware.tasks.task import TASKS, group_key, outcome_of, tasks_of
 from sim.demo.configuration import BOOTSTRAP, DOGS, toml
 from sim.demo.processes import on_leash
 

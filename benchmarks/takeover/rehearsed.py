@@ -12,7 +12,7 @@ from benchmarks.takeover.cause import PHASE_S, WEB, WITNESSES, Cause, Trial
 from benchmarks.takeover.judge import LOOK_S, Judge
 from middleware.entangled.network.switchboard import Weather
 from middleware.entangled.record import Record
-from middleware.tasks import Task, outcome_of
+from middleware.tasks.task import Task, outcome_of
 from swarmnode.rehearsal import VirtualTeam
 
 WEATHER = Weather(delay_s=0.03, jitter_s=0.01)

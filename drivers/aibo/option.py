@@ -12,7 +12,7 @@ from msgspec import Meta
 from drivers.aibo.sense import MODEL, NOD, PAN, TILT
 from drivers.option import Fps, Host, Port, convert_options, fault_of
 from drivers.reading import Description
-from validation.convert import Then
+from formats.convert import Then
 
 PORTS: dict[str, int] = {"main": 10020, "estop": 10053, "state": 10031, "walk": 10050, "head": 10052, "camera": 10011}
 """What the driver connects to, and where Tekkotsu serves it."""

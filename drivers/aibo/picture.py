@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from drivers.aibo.cursor import Cursor, Short, string
 from drivers.errors import BadFrame
-from standards.jpeg import size_of
+from formats.jpeg import size_of
 
 REQUEST = b"connection request"
 COLOUR, SINGLE = 0, 1

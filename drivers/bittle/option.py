@@ -13,7 +13,7 @@ from drivers.bittle.gait import GAITS, Velocity
 from drivers.errors import UsageError
 from drivers.option import Port, convert_options, fault_of
 from drivers.reading import Description
-from validation.convert import Then
+from formats.convert import Then
 
 Baud = Literal[57600, 115200]
 Board = Literal["auto", "biboard", "nyboard"]

@@ -13,7 +13,7 @@ from drivers.driver import MAX_FPS
 from drivers.errors import UsageError
 from drivers.option import convert_options
 from drivers.reading import Description
-from validation.convert import LINE, Unit
+from formats.convert import LINE, Unit
 
 LEAST_SIDE, MOST_SIDE = 16, 1920
 """Pixels of a side of a picture."""

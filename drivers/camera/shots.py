@@ -13,7 +13,7 @@ from typing import Any, Protocol
 
 from drivers.camera.option import Options
 from drivers.errors import BadFrame, LinkLost
-from standards.jpeg import size_of
+from formats.jpeg import size_of
 
 MOST_FILES = 10_000
 MOST_BYTES = 4 * 1024 * 1024

@@ -14,7 +14,7 @@ from drivers.camera.shots import Shot
 from drivers.camera.thread import Retry, Viewer
 from drivers.errors import BadFrame
 from drivers.link import Connector, Line, Link
-from standards.jpeg import size_of
+from formats.jpeg import size_of
 
 SILENCE_S = 5.0
 """Without a whole picture for so long the camera is hung up on, and called again."""

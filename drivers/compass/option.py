@@ -11,7 +11,7 @@ from msgspec import Meta
 from drivers.errors import UsageError
 from drivers.option import Port, convert_options
 from drivers.reading import Description
-from validation.convert import LINE, Unit
+from formats.convert import LINE, Unit
 
 PORT = 10110
 """The TCP port that is registered for NMEA 0183."""

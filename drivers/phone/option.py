@@ -10,7 +10,7 @@ from msgspec import Meta
 
 from drivers.option import convert_options
 from drivers.reading import Description
-from validation.convert import Unit
+from formats.convert import Unit
 
 LENS_DEG = 65.0
 """Across the longer side of the picture.  No browser tells it; those of phones are from 60 to 75."""

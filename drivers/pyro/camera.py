@@ -8,7 +8,7 @@ from typing import Any
 from drivers.errors import BadFrame, UsageError
 from drivers.pyro.device import Device
 from drivers.reading import Frame, Value
-from standards.jpeg import size_of
+from formats.jpeg import size_of
 
 Blob = tuple[int, int, int, int, int]
 """Left, top, right and bottom in pixels from the upper left corner, and the area; all 0: none."""

@@ -15,7 +15,7 @@ from typing import Any
 
 from drivers.errors import BadFrame
 from drivers.reading import Value
-from standards.jpeg import size_of
+from formats.jpeg import size_of
 
 FAR_M, FAST, PULL = 1e6, 100.0, 1000.0
 """Beyond so many m, m/s or rad/s, and m/s2 a reading is absurd."""

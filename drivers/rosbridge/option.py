@@ -12,7 +12,7 @@ from msgspec import Meta
 from drivers.errors import UsageError
 from drivers.option import Fps, Port, convert_options
 from drivers.reading import Description
-from validation.convert import LINE, Then, Unit
+from formats.convert import LINE, Then, Unit
 
 DEFAULT_PORT = 9090
 VelocityType = Literal["auto", "twist", "twist_stamped"]

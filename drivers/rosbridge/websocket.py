@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from wsproto.events import AcceptConnection, RejectConnection, Request
 
-from standards.websocket import End
+from formats.websocket import End
 
 MAX_MESSAGE = 4 * 1024 * 1024
 """Bytes of a message: a compressed picture of 2 megapixels fits, in base64."""

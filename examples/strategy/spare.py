@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from middleware.consensus.capability_cost import CapabilityCost
+from middleware.consensus.strategies.capability_cost import CapabilityCost
 from middleware.consensus.strategy import Report
 
 

@@ -15,8 +15,8 @@ from twisted.python.failure import Failure
 
 from middleware.admission.roll import DIGEST, Entry, Roll, digest_of
 from middleware.entangled.background import Background
+from middleware.entangled.contact import Contact
 from middleware.entangled.errors import EntangledError, Full, RemoteError
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.wire.endpoint import Endpoint
 
 SPREAD = 8

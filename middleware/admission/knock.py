@@ -32,9 +32,9 @@ from middleware.admission.errors import WHY
 from middleware.admission.roll import ID, invitation_id
 from middleware.admission.statement import SECRET_BYTES, Grant, moment, named, opened, sized
 from middleware.admission.terms import TermsContent, open_terms
+from middleware.entangled.contact import Contact, unpacked
 from middleware.entangled.errors import Forged, Malformed
 from middleware.entangled.identity import Identity, verified
-from middleware.entangled.kademlia.contact import Contact, unpacked
 from middleware.entangled.network.network import MAX_DATAGRAM
 
 KNOCK, WELCOME = 0x17, 0x18

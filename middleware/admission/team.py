@@ -23,10 +23,10 @@ from middleware.admission.renewal import Renewer
 from middleware.admission.roll import MAX_ENTRIES, Admission, Entry, Renewal, Roll, invitation_id
 from middleware.admission.statement import Grant, Invite, Revoke, Secret
 from middleware.entangled.background import Background
+from middleware.entangled.contact import Contact
 from middleware.entangled.data.store import Store
 from middleware.entangled.errors import EntangledError, Full, Refused, RemoteError
 from middleware.entangled.identity import Identity, node_id
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.node import EntangledNode
 from middleware.entangled.wire.door import REVOKED, meaning
 

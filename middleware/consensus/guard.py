@@ -13,7 +13,7 @@ from dataclasses import replace
 from twisted.logger import Logger
 
 from middleware.consensus.item import Item, capacities, listed
-from middleware.consensus.nearest import Nearest
+from middleware.consensus.strategies.nearest import Nearest
 from middleware.consensus.strategy import (
     MAX_NAME,
     MAX_NUMBER,

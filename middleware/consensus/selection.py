@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from middleware.consensus.deployed import Deployed, is_deployed
 from middleware.consensus.guard import Guard
 from middleware.consensus.strategy import BUILT_IN, place_of, strategy_for
-from middleware.deployed import Deployed, is_deployed
 from middleware.errors import UnknownStrategy
 
 

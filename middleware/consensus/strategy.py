@@ -13,21 +13,21 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
-from middleware.deployed import STRATEGY, Deployed, is_deployed, maker_of
+from middleware.consensus.deployed import STRATEGY, Deployed, is_deployed, maker_of
 from middleware.errors import UnknownStrategy
 
 PROTOCOL = 2
 BUILT_IN = {
-    "average": "middleware.consensus.average:Average",
-    "capability_cost": "middleware.consensus.capability_cost:CapabilityCost",
-    "cbba": "middleware.consensus.cbba:Cbba",
-    "group_optimal": "middleware.consensus.group_optimal:GroupOptimal",
-    "nearest": "middleware.consensus.nearest:Nearest",
-    "rendezvous": "middleware.consensus.rendezvous:Rendezvous",
-    "rendezvous_centre": "middleware.consensus.rendezvous:Centre",
-    "rendezvous_median": "middleware.consensus.rendezvous:Median",
-    "sequential": "middleware.consensus.sequential:Sequential",
-    "weighted_vote": "middleware.consensus.weighted_vote:WeightedVote",
+    "average": "middleware.consensus.strategies.average:Average",
+    "capability_cost": "middleware.consensus.strategies.capability_cost:CapabilityCost",
+    "cbba": "middleware.consensus.strategies.cbba:Cbba",
+    "group_optimal": "middleware.consensus.strategies.group_optimal:GroupOptimal",
+    "nearest": "middleware.consensus.strategies.nearest:Nearest",
+    "rendezvous": "middleware.consensus.strategies.rendezvous:Rendezvous",
+    "rendezvous_centre": "middleware.consensus.strategies.rendezvous:Centre",
+    "rendezvous_median": "middleware.consensus.strategies.rendezvous:Median",
+    "sequential": "middleware.consensus.strategies.sequential:Sequential",
+    "weighted_vote": "middleware.consensus.strategies.weighted_vote:WeightedVote",
 }
 ENTRY_POINTS = "swarm_node.strategies"
 MAX_NUMBER = 1e9

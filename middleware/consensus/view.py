@@ -16,7 +16,7 @@ from dataclasses import replace
 from typing import Any
 
 from middleware.consensus.strategy import READABLE, Report, reads_of, refusal
-from middleware.tasks import Member, is_bid, is_choice, is_value
+from middleware.tasks.task import Member, is_bid, is_choice, is_value
 
 
 class View:

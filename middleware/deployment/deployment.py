@@ -16,17 +16,17 @@ import msgpack
 from twisted.internet.defer import Deferred
 from twisted.logger import Logger
 
-from middleware.deployed import STRATEGY, Make
+from middleware.admission.roles import OPERATOR
+from middleware.config.settings import DeploymentSettings
+from middleware.consensus.deployed import STRATEGY, Make
 from middleware.deployment.channel import Spawn
 from middleware.deployment.manifest import MAX_SOURCE, Manifest, digest_of, manifest_of, manifests_key, source_key
 from middleware.deployment.runner import PushedStrategy, Runner, State
 from middleware.deployment.shelf import Shelf
+from middleware.directory.presence import Presence
 from middleware.entangled.errors import EntangledError, NotRunning
 from middleware.entangled.node import EntangledNode
 from middleware.entangled.record import Record, hashed_key, unpacked
-from middleware.presence import Presence
-from middleware.roles import OPERATOR
-from middleware.settings import DeploymentSettings
 
 RETRY = 2.0
 """Seconds after which a source that nobody could send is asked for again."""

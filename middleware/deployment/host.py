@@ -10,9 +10,9 @@ import traceback
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
+from middleware.consensus.deployed import STRATEGY, Make
 from middleware.consensus.remote import answer as answer_of
 from middleware.consensus.strategy import reads_of
-from middleware.deployed import STRATEGY, Make
 from middleware.deployment import frame
 from middleware.deployment.frame import CALL, DROP, FIRST, LOAD, MAKE
 from middleware.deployment.manifest import Manifest

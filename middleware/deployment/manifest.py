@@ -13,9 +13,9 @@ from dataclasses import asdict, dataclass
 
 import msgpack
 
-from middleware.deployed import KINDS
+from middleware.consensus.deployed import KINDS
 from middleware.entangled.record import Record, hashed_key
-from middleware.value import bounded, is_whole, mapping_of
+from middleware.entangled.value import bounded, is_whole, mapping_of
 
 DEPLOYMENTS = "deployments"
 NAME = r"[a-z][a-z0-9_-]{0,31}"

@@ -14,8 +14,8 @@ from contextlib import suppress
 from types import FrameType, ModuleType
 from typing import Any, TypeVar
 
+from middleware.consensus.deployed import BEHAVIOUR, PREFIX, STRATEGY, Make
 from middleware.consensus.strategy import Report
-from middleware.deployed import BEHAVIOUR, PREFIX, STRATEGY, Make
 from middleware.deployment.manifest import MAX_SOURCE, Manifest, digest_of
 from middleware.errors import Undeployable
 

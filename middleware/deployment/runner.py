@@ -15,10 +15,10 @@ from typing import Any
 
 from twisted.logger import Logger
 
+from middleware.consensus.deployed import PREFIX
 from middleware.consensus.guard import STRIKES, Lost, NoOpinion
 from middleware.consensus.remote import RemoteStrategy
 from middleware.consensus.strategy import READABLE
-from middleware.deployed import PREFIX
 from middleware.deployment import frame
 from middleware.deployment.channel import Channel, Gone, Spawn
 from middleware.deployment.frame import CALL, DROP, FIRST, LOAD, MAKE

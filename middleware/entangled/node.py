@@ -17,10 +17,10 @@ from twisted.internet.interfaces import IReactorTime
 from twisted.logger import Logger
 
 from middleware.entangled.background import Background
+from middleware.entangled.contact import Contact, unpacked
 from middleware.entangled.data.store import Store
 from middleware.entangled.errors import NotRunning, Refused, TooLarge
 from middleware.entangled.identity import Identity, node_id
-from middleware.entangled.kademlia.contact import Contact, unpacked
 from middleware.entangled.kademlia.discovery import Discovery
 from middleware.entangled.kademlia.membership import Membership
 from middleware.entangled.kademlia.overlay import Overlay
@@ -295,6 +295,10 @@ class EntangledNode:
         """The k live nodes closest to ``node_id``, by an iterative lookup (Kademlia, section 2.3)."""
         self._check(node_id)
         return _run(self.overlay.lookup(node_id))
+
+    def newest(self, contact: Contact) -> Contact:
+        """Return the node of ``contact`` with the last address it was heard from."""
+        return self.overlay.table.get(contact.node_id) or contact
 
     # -- inside -----------------------------------------------------------------------------------------------------
 

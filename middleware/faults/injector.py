@@ -17,8 +17,8 @@ from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorTime
 from twisted.logger import Logger
 
+from middleware.entangled.contact import Contact
 from middleware.entangled.errors import Refused
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Network
 from middleware.entangled.network.switchboard import CALM, Weather
 from middleware.errors import BadFault, UnknownTask
@@ -26,7 +26,7 @@ from middleware.faults.battery import LowBattery
 from middleware.faults.kinds import ASKED, ASSIGN, CAUSE, KINDS, Fault, parse_fault
 from middleware.faults.network import FaultyNetwork
 from middleware.node import SwarmNode
-from middleware.tasks import Task
+from middleware.tasks.task import Task
 
 MakeTask = Callable[[str, str, float], Task]
 """A predefined task by its name, a new task id, and the wall clock."""

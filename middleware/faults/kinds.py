@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from middleware.entangled.value import is_number
 from middleware.errors import BadFault
-from middleware.value import is_number
 
 CAUSE, ASKED, ASSIGN = "device.fault", "device.faults", "device.assign"
 """Methods of a node that allows faults: inject one; list its kinds and the active ones; publish a predefined task."""

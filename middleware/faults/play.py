@@ -10,10 +10,10 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Protocol
 
+from middleware.directory.presence import Device
 from middleware.faults.kinds import KINDS, Fault
 from middleware.faults.scenario import ANY, WHO_ACTS, Scenario
 from middleware.faults.takeover import TARGET_S, Takeover, acting
-from middleware.presence import Device
 
 LOOK_S = 0.05
 PATIENCE_S = 60.0

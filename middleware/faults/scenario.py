@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from middleware.entangled.value import is_number, is_whole
 from middleware.errors import BadFault, BadSetting
 from middleware.faults.kinds import Fault, parse_fault
-from middleware.value import is_number, is_whole
 
 WHO_ACTS, ANY = "executing", "any"
 MAX_FAULTS, MAX_AT = 100, 3600.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from middleware.presence import EXECUTING, Device
+from middleware.directory.presence import EXECUTING, Device
 
 TARGET_S = 2.0
 """Seconds within which another device should take over."""

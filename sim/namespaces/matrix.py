@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from random import Random
 from typing import Any
 
+from middleware.config.settings import NodeSettings
 from middleware.entangled.identity import Identity
-from middleware.settings import NodeSettings
 from sim.namespaces.hosts import Hosts
 from sim.namespaces.internet import PUB, PUBS, Internet, Site
 from sim.namespaces.kind import Kind

@@ -14,8 +14,8 @@ from typing import Annotated
 
 from msgspec import Meta
 
+from formats.convert import Unit, one_of
 from middleware.entangled.network.network import Address
-from validation.convert import Unit, one_of
 
 KINDS = ("none", "lan", "wifi", "internet")
 MEAN_RTT = 0.156

@@ -15,12 +15,12 @@ from typing import Annotated, Any, TypeVar
 
 from msgspec import Meta
 
+from formats.convert import LINE, Invalid, Unit, convert_field, convert_table, one_of, some_of
 from middleware.errors import BadSetting
 from sim.team.faults.settings import Fault, fault_problem
 from sim.team.figure import Bound, bound_of
 from sim.team.link import LinkSettings
 from sim.team.session import KINDS, Session
-from validation.convert import LINE, Invalid, Unit, convert_field, convert_table, one_of, some_of
 
 FOLDER = Path(__file__).resolve().parent.parent / "scenarios"
 NODE_KINDS = ("entangled", "swarm")

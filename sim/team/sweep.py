@@ -23,7 +23,7 @@ from middleware.errors import BadSetting
 T = TypeVar("T")
 
 ROOT = Path(__file__).resolve().parents[2]
-ROOMS = ("standards", "validation", "middleware", "agents", "drivers", "sim", "benchmarks", "tests")
+ROOMS = ("formats", "middleware", "agents", "drivers", "sim", "benchmarks", "tests")
 """What a run is made of; other trees may differ in the rest."""
 AHEAD = 4
 """So many runs are given out for each worker, that none has to wait for its next one."""

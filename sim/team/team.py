@@ -16,6 +16,7 @@ from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IDelayedCall, IReactorTime
 from twisted.logger import Logger
 
+from middleware.directory.presence import Device
 from middleware.entangled.clock import HeapClock
 from middleware.entangled.errors import NotRunning
 from middleware.entangled.identity import Identity
@@ -24,7 +25,6 @@ from middleware.entangled.network.network import Address, Network
 from middleware.entangled.network.switchboard import Switchboard, Traffic
 from middleware.entangled.node import EntangledNode
 from middleware.node import SwarmNode
-from middleware.presence import Device
 from sim.team.disk import Disk, Memory, next_life
 from sim.team.event import Born, Died
 from sim.team.history import History

@@ -32,7 +32,7 @@ class Workload(Protocol):
 
 @dataclass(frozen=True)
 class Kind:
-    """A sort of workload: ``settings`` is a frozen dataclass whose fields have rules (``middleware.setting``).
+    """A sort of workload: ``settings`` is a frozen dataclass whose fields have rules (``middleware.config.types``).
 
     ``make(team, settings)`` makes one.
     """

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 from twisted.internet.defer import Deferred
 
+from middleware.directory.presence import Device
 from middleware.entangled.clock import HeapClock
 from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.data.store import Store
@@ -19,7 +20,6 @@ from middleware.entangled.network.network import Address
 from middleware.entangled.network.switchboard import CALM, Switchboard, SwitchboardNetwork, Traffic, Weather
 from middleware.entangled.node import EntangledNode
 from middleware.node import SwarmNode
-from middleware.presence import Device
 
 TEAM = b"t" * 32
 JOINING = 0.3

@@ -9,13 +9,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from typing import Any, TextIO
 
+from middleware.config.settings import Settings
 from middleware.entangled.control.command import Ask, asked
+from middleware.entangled.control.link import Link, link
 from middleware.entangled.control.place import NoControl, found
 from middleware.entangled.control.word import printable
 from middleware.entangled.network.interface import interfaces
 from middleware.errors import SwarmError
-from middleware.link import Link, link
-from middleware.settings import Settings
 from swarmnode.doctor.diagnosis import diagnosed
 from swarmnode.doctor.facts import Facts, Health
 from swarmnode.doctor.finding import Finding

@@ -25,6 +25,7 @@ from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
 
+from middleware.config.settings import IN_MEMORY, Settings
 from middleware.entangled.errors import Forged, Malformed
 from middleware.entangled.network.interface import Interface, chosen, interfaces, is_any
 from middleware.entangled.network.multicast import GROUP
@@ -32,7 +33,6 @@ from middleware.entangled.network.network import Address
 from middleware.entangled.wire.greeting import opened_greeting, who
 from middleware.entangled.wire.hail import ECHO, echo_of, hail
 from middleware.entangled.wire.session import derived_key
-from middleware.settings import IN_MEMORY, Settings
 from swarmnode.doctor.facts import Answer, Certificate, Facts, Health, Lan, Probe, Storage, is_local
 from swarmnode.ports import is_free
 

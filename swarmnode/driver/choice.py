@@ -117,7 +117,7 @@ def _named(kind: str, wishes: argparse.Namespace) -> Choice:
 
 
 def _configured(path: str, wishes: argparse.Namespace) -> Choice:
-    from middleware.settings import Settings
+    from middleware.config.settings import Settings
 
     settings = Settings.load(path)
     if not settings.driver.kind:

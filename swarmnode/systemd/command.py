@@ -15,9 +15,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TextIO
 
+from middleware.config.settings import IN_MEMORY, Settings
 from middleware.entangled.control.word import printable
 from middleware.errors import SwarmError
-from middleware.settings import IN_MEMORY, Settings
 from swarmnode.systemd.unit import MEMORY, PREFIX, SETTINGS, Unit, unit_for
 
 DONE, FAILED, WRONG = 0, 1, 2

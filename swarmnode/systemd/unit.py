@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import PurePosixPath
 
-from middleware.settings import Settings
+from middleware.config.settings import Settings
 
 PREFIX = "swarm-node-"
 MEMORY = "256M"

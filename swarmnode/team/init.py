@@ -14,10 +14,10 @@ from middleware.admission import operator as operators
 from middleware.admission.membership import Membership
 from middleware.admission.operator import FIRST, Operator
 from middleware.admission.statement import ROLES
+from middleware.config.settings import COMMAND_LINE, NODE_PORT, Settings
 from middleware.entangled.network.interface import is_loopback
 from middleware.entangled.network.network import EVERYWHERE
 from middleware.errors import BadSetting
-from middleware.settings import COMMAND_LINE, NODE_PORT, Settings
 from swarmnode.team.office import ENDING, Desk, Wrong, key_folder, options, run
 
 MEMBERSHIP, SETTINGS = ".membership", ".toml"

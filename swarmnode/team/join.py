@@ -22,11 +22,11 @@ from middleware.admission.errors import BadCode, BadKeyFile
 from middleware.admission.membership import Membership
 from middleware.admission.newcomer import PATIENCE, Newcomer
 from middleware.admission.statement import NAME, sized
+from middleware.config.settings import COMMAND_LINE, NodeSettings, Settings
 from middleware.entangled.errors import EntangledError, RemoteError
 from middleware.entangled.network.interface import is_loopback
 from middleware.entangled.network.network import EVERYWHERE, Address
 from middleware.errors import BadSetting
-from middleware.settings import COMMAND_LINE, NodeSettings, Settings
 from swarmnode.asker import Refusal
 from swarmnode.team.init import SHARED, settings_text, written
 from swarmnode.team.office import Desk, Wrong, options, run, seconds

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from agents.pushed import BehaviourKind
-from middleware.deployed import Make
+from middleware.consensus.deployed import Make
 from middleware.deployment import frame
 
 

@@ -12,7 +12,7 @@ from twisted.trial.unittest import SynchronousTestCase
 from agents.behaviour import KINDS, behaviour_for
 from agents.means import Means
 from middleware.errors import MissingExtra, UnknownTask
-from middleware.tasks import Task
+from middleware.tasks.task import Task
 from tests.agents.loopback import Loopback
 
 TASK = Task("t1", "turn-around", "Turn")

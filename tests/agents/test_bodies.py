@@ -15,7 +15,7 @@ from agents.search import SearchAndApproach
 from agents.vision import Sighting
 from drivers.bittle.gait import Velocity
 from drivers.reading import Action, Observation, Value
-from middleware.tasks import refusals
+from middleware.tasks.task import refusals
 from sim.robots.sensor import NOSE
 from tests.agents.roamer import Roamer, described, quantised
 

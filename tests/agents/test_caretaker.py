@@ -10,11 +10,11 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from agents.caretaker import AGAIN, VISIT
 from agents.catalogue import task_named
-from middleware.commitment.charter import pin
-from middleware.commitment.councils import SILENT
 from middleware.entangled.record import Record
-from middleware.order import PAUSE, RESUME, Order
-from middleware.tasks import COMPLETED, TASKS, Task, council_of, outcome_of, tasks_of
+from middleware.lease.charter import pin
+from middleware.tasks.councils import SILENT
+from middleware.tasks.order import PAUSE, RESUME, Order
+from middleware.tasks.task import COMPLETED, TASKS, Task, council_of, outcome_of, tasks_of
 from swarmnode.rehearsal import VirtualTeam
 
 OTHERS = ("witness1", "witness2", "witness3")

@@ -10,8 +10,8 @@ from drivers.registry import describe
 from middleware.consensus.strategy import strategy_for
 from middleware.entangled.record import Record
 from middleware.errors import UnknownTask
-from middleware.tasks import TASKS as KEY
-from middleware.tasks import refusals, task_of
+from middleware.tasks.task import TASKS as KEY
+from middleware.tasks.task import refusals, task_of
 
 
 class CatalogueTests(SynchronousTestCase):

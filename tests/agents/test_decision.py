@@ -10,12 +10,12 @@ from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 
 from agents.decision import Decision, decide
+from middleware.bidding.panel import PATIENCE
 from middleware.consensus.guard import Guard
-from middleware.consensus.nearest import Nearest
+from middleware.consensus.strategies.nearest import Nearest
 from middleware.consensus.strategy import strategy_for
-from middleware.panel import PATIENCE
-from middleware.presence import EXECUTING, SEARCHING, WAITING
-from middleware.tasks import Member
+from middleware.directory.presence import EXECUTING, SEARCHING, WAITING
+from middleware.tasks.task import Member
 
 
 def member(uuid: str, cost: float | None, status: str = WAITING) -> Member:

@@ -17,8 +17,8 @@ from agents.loop import due
 from middleware.consensus.guard import Guard
 from middleware.consensus.item import Item, Sharing
 from middleware.consensus.strategy import Consensus, Report, strategy_for
-from middleware.presence import EXECUTING, SEARCHING, WAITING
-from middleware.tasks import Member, Task
+from middleware.directory.presence import EXECUTING, SEARCHING, WAITING
+from middleware.tasks.task import Member, Task
 from tests.invariants.groups import Groups
 
 AGENTS = ("a", "b", "c")

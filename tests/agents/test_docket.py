@@ -6,7 +6,7 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from agents.docket import KEPT, MOST, Docket, next_task
 from middleware.entangled.record import TOLERATED_ABSENCE
-from middleware.tasks import MAX_LEASE_TTL, Task
+from middleware.tasks.task import MAX_LEASE_TTL, Task
 
 
 def task(name: str, created: float = 0.0, priority: int = 0) -> Task:

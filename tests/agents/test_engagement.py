@@ -14,18 +14,18 @@ from agents.engagement import SEARCH_TTL, Deed, Engagement
 from agents.state import State
 from drivers.driver import Permit
 from drivers.reading import Action, Observation
-from middleware.commitment.lessee import Lease
 from middleware.consensus.guard import Guard
-from middleware.consensus.nearest import Nearest
+from middleware.consensus.strategies.nearest import Nearest
 from middleware.consensus.strategy import Consensus, Report
+from middleware.consensus.verdict import Verdict
+from middleware.directory.presence import ASSIGNED, DONE, EXECUTING, SEARCHING, WAITING
 from middleware.entangled.clock import HeapClock
+from middleware.entangled.contact import Contact
 from middleware.entangled.identity import Identity
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address
-from middleware.order import PAUSE, RESUME, Order
-from middleware.presence import ASSIGNED, DONE, EXECUTING, SEARCHING, WAITING
-from middleware.tasks import CANCELLED, COMPLETED, FAILED, Member, Result, Task
-from middleware.verdict import Verdict
+from middleware.lease.lessee import Lease
+from middleware.tasks.order import PAUSE, RESUME, Order
+from middleware.tasks.task import CANCELLED, COMPLETED, FAILED, Member, Result, Task
 
 TASK = Task("t1", "find-target", "Find it", waiting_period=2.0)
 LOOK, GO, HOLD = {"base.wz": 1.0}, {"base.vx": 0.1}, {"base.wz": 0.0}

@@ -8,7 +8,7 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from agents.circle import LINGERING, Circle
 from agents.epoch import Epoch, is_older
-from middleware.tasks import Member
+from middleware.tasks.task import Member
 
 B = Member("b", "dog2", "WAITING", 2.0, "a", "d1", epoch=3, serial=1)
 

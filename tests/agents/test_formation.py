@@ -11,7 +11,7 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from agents.circling import NEAREST, Circling
 from agents.formation import Formation, Post, posts, sector
-from middleware.tasks import Member
+from middleware.tasks.task import Member
 
 ANGLES = st.lists(st.floats(-math.pi, math.pi), min_size=1, max_size=6, unique=True)
 

@@ -13,9 +13,9 @@ from agents.context import Context
 from agents.guarded import FRESH_S, Guarded
 from agents.means import Means
 from drivers.reading import Action, Frame, Observation
-from middleware.deployed import Make
+from middleware.consensus.deployed import Make
 from middleware.errors import UnknownTask
-from middleware.tasks import Task
+from middleware.tasks.task import Task
 from tests.agents.loopback import Loopback
 
 GO = {"base.vx": 0.1}

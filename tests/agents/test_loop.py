@@ -13,9 +13,9 @@ from agents.loop import Agent
 from drivers.driver import Permit
 from drivers.errors import NotEnabled
 from drivers.reading import Action, Frame, Observation
-from middleware.commitment.lessee import Lease
 from middleware.errors import UnknownStrategy
-from middleware.tasks import TASKS, Task
+from middleware.lease.lessee import Lease
+from middleware.tasks.task import TASKS, Task
 from swarmnode.rehearsal import VirtualTeam
 
 

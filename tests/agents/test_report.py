@@ -11,7 +11,7 @@ from agents.report import PAUSE, Reporter
 from drivers.reading import Observation
 from middleware.consensus.strategy import READABLE
 from middleware.entangled.clock import HeapClock
-from middleware.tasks import Member
+from middleware.tasks.task import Member
 
 ME = Member("a", "dog", "WAITING")
 

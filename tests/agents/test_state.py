@@ -5,7 +5,7 @@ from __future__ import annotations
 from twisted.trial.unittest import SynchronousTestCase
 
 from agents.state import NEXT, Course, IllegalStep, State
-from middleware.presence import STATUSES
+from middleware.directory.presence import STATUSES
 
 S = State
 

@@ -2,8 +2,8 @@
 
 ``python -m tests.attacks.role_matrix`` prints the counts.  The subjects are a viewer, a device, a gateway, and an
 operator whose certificate was revoked.  Each has a real key and a real certificate, and speaks the real protocol.  The
-role table (``middleware.roles``) says which attempts are forbidden: each of these has to be refused by every node, and
-the state of the team has to stay as it was.
+role table (``middleware.admission.roles``) says which attempts are forbidden: each of these has to be refused by every
+node, and the state of the team has to stay as it was.
 """
 
 from __future__ import annotations
@@ -16,13 +16,7 @@ from typing import Any
 
 from twisted.internet.defer import maybeDeferred
 
-from middleware.entangled.errors import NotAdmitted, Refused
-from middleware.entangled.identity import Identity
-from middleware.entangled.kademlia.contact import Contact
-from middleware.entangled.record import Record, Slot
-from middleware.entangled.wire.door import ROLE
-from middleware.entangled.wire.endpoint import Endpoint
-from middleware.roles import (
+from middleware.admission.roles import (
     DEVICE,
     GATEWAY,
     KINDS,
@@ -35,6 +29,12 @@ from middleware.roles import (
     may_call,
     may_store,
 )
+from middleware.entangled.contact import Contact
+from middleware.entangled.errors import NotAdmitted, Refused
+from middleware.entangled.identity import Identity
+from middleware.entangled.record import Record, Slot
+from middleware.entangled.wire.door import ROLE
+from middleware.entangled.wire.endpoint import Endpoint
 from swarmnode.rehearsal import VirtualTeam
 from tests.attacks.siege import PaperDoor
 

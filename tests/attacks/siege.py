@@ -7,10 +7,10 @@ from typing import Any
 
 from twisted.internet.defer import Deferred
 
-from middleware import roles
+from middleware.admission import roles
 from middleware.admission.membership import Membership
+from middleware.entangled.contact import Contact
 from middleware.entangled.identity import Identity
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address
 from middleware.entangled.network.switchboard import SwitchboardNetwork
 from middleware.entangled.wire.door import Authority, Life, OpenDoor

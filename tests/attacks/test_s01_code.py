@@ -18,7 +18,7 @@ from middleware.entangled.wire.message import Answer, Question, Told, decoded, e
 from tests.fleet import FleetCase
 
 ROOT = Path(__file__).resolve().parents[2]
-ROOMS = ("standards", "validation", "middleware", "webnode", "agents", "swarmnode", "drivers")
+ROOMS = ("formats", "middleware", "webnode", "agents", "swarmnode", "drivers")
 UNSAFE = (
     *("pickle", "cPickle", "_pickle", "marshal", "shelve", "dill", "cloudpickle", "joblib", "yaml", "jsonpickle"),
     *("code", "codeop", "runpy", "xmlrpc", "imp"),

@@ -9,12 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from middleware.admission.certificate import pass_of
+from middleware.admission.roles import KINDS, METHODS, ROLES, VIEWER, kind_of, may_call, may_store
+from middleware.entangled.contact import Contact
 from middleware.entangled.errors import NotAdmitted, Refused
 from middleware.entangled.identity import Identity
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.record import Record, hashed_key
 from middleware.entangled.replication.replica import FORBIDDEN
-from middleware.roles import KINDS, METHODS, ROLES, VIEWER, kind_of, may_call, may_store
 from tests.attacks.siege import SOURCE, SiegeCase
 from tests.middleware.admission.paper import NOW
 

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule, run_state_machine_as_test
 from twisted.trial.unittest import SynchronousTestCase
 
+from middleware.entangled.contact import Contact
 from middleware.entangled.errors import NoAnswer
 from middleware.entangled.identity import Identity
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address
 from middleware.entangled.wire.greeting import HERE, WHO, here, who
 from middleware.entangled.wire.hail import ECHO, HAIL

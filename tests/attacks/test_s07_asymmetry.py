@@ -11,8 +11,8 @@ from twisted.logger import LogLevel, globalLogPublisher
 from middleware.admission import certificate, knock, reception
 from middleware.admission.code import drawn
 from middleware.admission.roll import invitation_id
+from middleware.entangled.contact import Contact
 from middleware.entangled.identity import Identity, exchange_key
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address
 from middleware.entangled.wire import answerer
 from middleware.entangled.wire import endpoint as wire

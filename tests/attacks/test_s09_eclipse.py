@@ -7,9 +7,9 @@ from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
+from middleware.entangled.contact import Contact
 from middleware.entangled.errors import NotAdmitted
 from middleware.entangled.identity import Identity, node_id
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.routing import RoutingTable
 from middleware.entangled.network.network import Address
 from middleware.entangled.record import hashed_key

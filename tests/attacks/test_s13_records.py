@@ -7,14 +7,14 @@ from typing import Any
 
 import msgpack
 
+from middleware.admission.roles import DEVICE, OPERATOR, VIEWER
 from middleware.entangled.identity import Identity
 from middleware.entangled.record import Record, hashed_key
 from middleware.entangled.replication.watch import Watch
 from middleware.entangled.space.tuplespace import TupleSpace
-from middleware.halt import HALT, SLOT
-from middleware.roles import DEVICE, OPERATOR, VIEWER
-from middleware.stop_set import Statement
-from middleware.tasks import TASKS
+from middleware.stop.halt import HALT, SLOT
+from middleware.stop.stop_set import Statement
+from middleware.tasks.task import TASKS
 from tests.attacks.siege import SOURCE, ClosedTeam, SiegeCase
 from tests.middleware.admission.village import House
 

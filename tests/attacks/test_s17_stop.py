@@ -9,13 +9,13 @@ from typing import Any
 import msgpack
 from twisted.internet.defer import Deferred, fail
 
+from middleware.admission.roles import DEVICE, GATEWAY, OPERATOR, ROLES, VIEWER, may_call
+from middleware.entangled.contact import Contact
 from middleware.entangled.errors import Refused, Unwritable
 from middleware.entangled.identity import Identity
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.record import Record, Slot
-from middleware.halt import HALT, METHOD, NO_ROBOT, SLOT, STANDS, UNSAVED, Halt, answer_halt
-from middleware.roles import DEVICE, GATEWAY, OPERATOR, ROLES, VIEWER, may_call
-from middleware.stop_set import ID_BYTES, MAX_NAMED, MAX_OF_SENDER, MAX_RELEASED, MAX_SENDERS
+from middleware.stop.halt import HALT, METHOD, NO_ROBOT, SLOT, STANDS, UNSAVED, Halt, answer_halt
+from middleware.stop.stop_set import ID_BYTES, MAX_NAMED, MAX_OF_SENDER, MAX_RELEASED, MAX_SENDERS
 from tests.attacks.siege import SOURCE, ClosedTeam, SiegeCase, Tape
 from tests.middleware.admission.village import House
 

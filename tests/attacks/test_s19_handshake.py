@@ -8,17 +8,17 @@ from typing import Any
 
 from twisted.internet.defer import Deferred
 
+from middleware.admission.roles import METHODS
+from middleware.entangled.contact import Contact
 from middleware.entangled.identity import Identity, exchange_key
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address
 from middleware.entangled.record import hashed_key
+from middleware.entangled.streams import PART_BYTES, Streams
 from middleware.entangled.wire import peer
 from middleware.entangled.wire.door import MAX_LIVES, Life, Stamps
 from middleware.entangled.wire.endpoint import Endpoint
 from middleware.entangled.wire.message import Question, encoded
 from middleware.entangled.wire.session import INIT, RESPONSES_S, Credentials, Hello, Invitation
-from middleware.roles import METHODS
-from middleware.streams import PART_BYTES, Streams
 from tests.attacks.siege import ClosedTeam, SiegeCase, Tape, network_of
 from tests.fuzz.ground import state_of
 from tests.middleware.admission.village import House

@@ -32,10 +32,10 @@ from drivers.pyro.camera import Camera as PyroCamera
 from drivers.reading import Frame, Observation
 from drivers.registry import describe, driver_for
 from drivers.rosbridge import codec
-from middleware.tasks import Task
+from formats.jpeg import MAX_DECODED, MAX_SIDE, size_of
+from middleware.tasks.task import Task
 from sim.robots.emulator.body import MemoryBody
 from sim.robots.emulator.mjpeg import MjpegCamera
-from standards.jpeg import MAX_DECODED, MAX_SIDE, size_of
 from swarmnode.gateway import sides
 from webnode.camera import Camera as WebCamera
 from webnode.camera import MemoryFrames

@@ -15,10 +15,10 @@ from drivers.link import MemoryConnector
 from drivers.rosbridge.codec import MOST_DIGITS, MOST_VALUES, Answered, Status, decoded
 from drivers.rosbridge.driver import RosbridgeDriver
 from drivers.rosbridge.websocket import MAX_MESSAGE
+from formats.websocket import MAX_FRAMES, End
 from sim.robots.emulator.body import MemoryBody
 from sim.robots.emulator.rosbridge import RosbridgeRobot
-from standards.websocket import MAX_FRAMES, End
-from tests.standards.rfc6455 import CONTINUATION, PING, PONG, TEXT, framed
+from tests.formats.rfc6455 import CONTINUATION, PING, PONG, TEXT, framed
 
 READ = 65536
 """Bytes that a reactor reads at once."""

@@ -15,7 +15,7 @@ from middleware.admission.membership import MemoryMembership
 from middleware.deployment.shelf import MemoryShelf
 from middleware.entangled.control.place import made
 from middleware.node import SwarmNode
-from middleware.tasks import Task
+from middleware.tasks.task import Task
 from swarmnode.deploy import main
 from swarmnode.rehearsal import VirtualTeam
 from tests.swarmnode.shell import Shell
@@ -23,7 +23,7 @@ from tests.swarmnode.shell import Shell
 CANARY = "swarm_canary"
 SOURCE = f"""
 import sys
-from middleware.consensus.nearest import Nearest
+from middleware.consensus.strategies.nearest import Nearest
 sys.modules["{CANARY}"] = sys
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.roles import DEVICE, GATEWAY, KINDS, METHODS, VIEWER, kind_of, may_call, may_store
+from middleware.admission.roles import DEVICE, GATEWAY, KINDS, METHODS, VIEWER, kind_of, may_call, may_store
 from tests.attacks.role_matrix import REVOKED_OPERATOR, Counts, list_slots, try_everything
 
 

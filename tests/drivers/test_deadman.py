@@ -43,7 +43,7 @@ from sim.robots.emulator.bittle import Bittle
 from sim.robots.emulator.body import MemoryBody
 from sim.robots.emulator.create2 import Create2
 from sim.robots.emulator.rosbridge import RosbridgeRobot
-from tests.standards.rfc6455 import masked
+from tests.formats.rfc6455 import masked
 
 STEP = 0.005
 

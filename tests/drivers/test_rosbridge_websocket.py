@@ -5,8 +5,8 @@ from __future__ import annotations
 from twisted.trial.unittest import SynchronousTestCase
 
 from drivers.rosbridge.websocket import MAX_MESSAGE, WebSocket
-from standards.head import MAX_HEAD
-from tests.standards.rfc6455 import BINARY, CLOSE, PING, PONG, TEXT, answer_to, framed
+from formats.head import MAX_HEAD
+from tests.formats.rfc6455 import BINARY, CLOSE, PING, PONG, TEXT, answer_to, framed
 
 
 def client() -> WebSocket:

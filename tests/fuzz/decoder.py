@@ -9,8 +9,8 @@ import contextlib
 
 import msgpack
 
+from middleware.entangled import contact
 from middleware.entangled.errors import Malformed
-from middleware.entangled.kademlia import contact
 from middleware.entangled.record import unpacked
 from middleware.entangled.wire.message import decoded, encoded, packed_receipt, part_of, receipt_of
 from tests.fuzz.ground import Violation

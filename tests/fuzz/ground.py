@@ -18,9 +18,9 @@ from twisted.logger import ILogObserver, LogLevel, globalLogPublisher
 from zope.interface import implementer
 
 from middleware.entangled.clock import HeapClock
+from middleware.entangled.contact import Contact
 from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.identity import Identity
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address, Network
 from middleware.entangled.network.switchboard import Switchboard
 from middleware.entangled.node import EntangledNode

@@ -11,8 +11,8 @@ import random
 
 from nacl import bindings
 
+from middleware.entangled.contact import Contact
 from middleware.entangled.identity import Identity, exchange_key
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import MAX_DATAGRAM, Address
 from middleware.entangled.wire.greeting import COOKIE
 from middleware.entangled.wire.noise import Initiator, Responder

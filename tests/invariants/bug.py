@@ -13,13 +13,8 @@ from agents import circle
 from agents.docket import Docket
 from drivers.errors import StaleCommand
 from drivers.gate import Gate
-from middleware.commitment import charter, lessee
-from middleware.commitment.charter import pin
-from middleware.commitment.council import Council
-from middleware.commitment.lease_codec import pack_members
-from middleware.commitment.lessee import Lease, Lessee
-from middleware.consensus import bidder, nearest
-from middleware.consensus.nearest import Nearest
+from middleware.consensus.strategies import bidder, nearest
+from middleware.consensus.strategies.nearest import Nearest
 from middleware.consensus.strategy import Report
 from middleware.entangled.data import schema
 from middleware.entangled.data.memory import MemoryStore
@@ -49,6 +44,11 @@ from middleware.entangled.wire import greeting
 from middleware.entangled.wire.greeting import Cookies, Greeter
 from middleware.entangled.wire.method import Ledger
 from middleware.entangled.wire.session import Session
+from middleware.lease import charter, lessee
+from middleware.lease.charter import pin
+from middleware.lease.council import Council
+from middleware.lease.lease_codec import pack_members
+from middleware.lease.lessee import Lease, Lessee
 from sim.team.machine import Machine
 from tests.invariants.leases import Leases
 

@@ -12,8 +12,8 @@ import math
 import random
 
 from benchmarks.consensus.mission import Mission
-from middleware.consensus import bidder
-from middleware.consensus.nearest import Nearest
+from middleware.consensus.strategies import bidder
+from middleware.consensus.strategies.nearest import Nearest
 from middleware.consensus.strategy import Report
 from sim.team.schedule import Schedule
 

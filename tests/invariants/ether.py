@@ -14,15 +14,15 @@ from typing import Any
 
 from twisted.internet.defer import Deferred, fail, succeed
 
-from middleware.commitment.lessee import Lease
+from middleware.consensus.deployed import Deployed
 from middleware.consensus.guard import Guard
 from middleware.consensus.selection import Strategies
-from middleware.deployed import Deployed
 from middleware.entangled.clock import HeapClock
 from middleware.entangled.errors import Unavailable
 from middleware.entangled.record import Record
-from middleware.order import Order
-from middleware.tasks import ORDER, RESULT, TASKS, Member, Result, Task, group_key
+from middleware.lease.lessee import Lease
+from middleware.tasks.order import Order
+from middleware.tasks.task import ORDER, RESULT, TASKS, Member, Result, Task, group_key
 
 PRESENCE = 1.0
 REPEAT = 0.5

@@ -6,9 +6,9 @@ from typing import Any
 
 from twisted.python.failure import Failure
 
+from middleware.entangled.contact import Contact
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.identity import Identity
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.overlay import K
 from middleware.entangled.node import EntangledNode
 from middleware.entangled.record import Record, hashed_key

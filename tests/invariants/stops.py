@@ -23,15 +23,15 @@ from twisted.internet.defer import Deferred, fail, succeed
 from twisted.internet.task import Clock
 from twisted.python.failure import Failure
 
-from middleware import roles
+from middleware.admission import roles
+from middleware.entangled.contact import Contact
 from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.errors import EntangledError, NoAnswer, Refused, Unavailable
 from middleware.entangled.identity import Identity
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address
 from middleware.entangled.record import Record, Slot
-from middleware.halt import HALT, METHOD, NOTE, SLOT, STANDS, UNSAVED, Halt, answer_halt
-from middleware.stop_set import ID_BYTES, MAX_NAMED, MAX_RELEASED, statement_of
+from middleware.stop.halt import HALT, METHOD, NOTE, SLOT, STANDS, UNSAVED, Halt, answer_halt
+from middleware.stop.stop_set import ID_BYTES, MAX_NAMED, MAX_RELEASED, statement_of
 
 STEPS = 60
 TEAM = {

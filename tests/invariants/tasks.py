@@ -19,8 +19,8 @@ from agents.loop import Agent
 from agents.state import State
 from middleware.consensus.strategy import ConsensusAlgorithm
 from middleware.entangled.clock import HeapClock
-from middleware.order import PAUSE, RESUME, Order
-from middleware.tasks import CANCELLED, Member, Result, Task
+from middleware.tasks.order import PAUSE, RESUME, Order
+from middleware.tasks.task import CANCELLED, Member, Result, Task
 from sim.team.checker import check
 from sim.team.event import Born, Calm, Concluded, Decided, Died, Engaged, Expired, Open, Report
 from sim.team.history import History

@@ -98,7 +98,9 @@ class ControlTests(SynchronousTestCase):
         child = self.start("--config", str(settings))
         module = self.runtime / "mine.py"
         for number in (1, 2):
-            module.write_text(f"from middleware.consensus.nearest import Nearest as Strategy\nVERSION = {number}\n")
+            module.write_text(
+                f"from middleware.consensus.strategies.nearest import Nearest as Strategy\nVERSION = {number}\n"
+            )
             self.said("deploy", "push", str(module), "--name", "mine", "--kind", "strategy")
             self.until(f"  a  {number} ")
         self.assertIn("went back", self.said("deploy", "rollback", "mine"))

@@ -15,7 +15,7 @@ from twisted.internet.defer import Deferred, inlineCallbacks
 from twisted.internet.task import deferLater
 from twisted.trial.unittest import SkipTest, TestCase
 
-from middleware import roles
+from middleware.admission import roles
 from middleware.admission.membership import Membership, MemoryMembership
 from middleware.admission.operator import drawn
 from middleware.admission.team import Team

@@ -16,7 +16,7 @@ from drivers.driver import Permit
 from drivers.link import TcpLinkFactory
 from drivers.reading import Observation
 from drivers.registry import driver_for
-from middleware.settings import Settings
+from middleware.config.settings import Settings
 from sim.robots.emulator.body import MemoryBody
 from sim.robots.emulator.create2 import Create2
 from sim.robots.emulator.mjpeg import MjpegCamera

@@ -15,9 +15,9 @@ from twisted.trial.unittest import SkipTest, SynchronousTestCase
 from agents.behaviour import STAND
 from agents.guarded import Guarded
 from drivers.reading import Frame, Observation
+from middleware.consensus.deployed import BEHAVIOUR, STRATEGY
 from middleware.consensus.guard import STRIKES, Guard, NoOpinion
 from middleware.consensus.strategy import Report
-from middleware.deployed import BEHAVIOUR, STRATEGY
 from middleware.deployment.manifest import pushed
 from middleware.deployment.process import ProcessChannel
 from middleware.deployment.runner import PATIENCE_S, PushedStrategy, Runner, State
@@ -31,7 +31,7 @@ ATTEMPT = ("call", [0, "merge", [[list(astuple(Report("ask", 1.0)))], []]])
 CHOICE = [field.name for field in fields(Report)].index("choice")
 BASE = """
 import ctypes, os, signal, socket, sys, threading, time
-from middleware.consensus.nearest import Nearest
+from middleware.consensus.strategies.nearest import Nearest
 from middleware.consensus.strategy import Report
 
 

@@ -13,11 +13,11 @@ from middleware.consensus.selection import Strategies
 from middleware.consensus.strategy import Report
 from middleware.consensus.worker import Worker
 from middleware.errors import UnknownStrategy
-from middleware.tasks import Task
+from middleware.tasks.task import Task
 from swarmnode.rehearsal import VirtualTeam
 
 ROOT = str(Path(__file__).resolve().parents[2])
-MODULE = "from middleware.consensus.nearest import Nearest\n\n\nclass Spare(Nearest):\n    name = 'spare'\n"
+MODULE = "from middleware.consensus.strategies.nearest import Nearest\n\n\nclass Spare(Nearest):\n    name = 'spare'\n"
 ENTRY = "[swarm_node.strategies]\nspare = spare_of_tests:Spare\n"
 
 

@@ -10,11 +10,11 @@ from pathlib import Path
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.consensus.cbba import Cbba
 from middleware.consensus.guard import STRIKES, Guard
 from middleware.consensus.item import Item
-from middleware.consensus.nearest import Nearest
 from middleware.consensus.selection import guarded
+from middleware.consensus.strategies.cbba import Cbba
+from middleware.consensus.strategies.nearest import Nearest
 from middleware.consensus.strategy import Consensus, Report
 from middleware.consensus.worker import DEADLINE_S, Worker
 

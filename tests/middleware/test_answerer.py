@@ -6,8 +6,8 @@ from typing import Any
 
 from twisted.internet.defer import CancelledError, Deferred
 
+from middleware.entangled.contact import Contact
 from middleware.entangled.errors import NoAnswer, Refused
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.wire.message import NO_LIMIT_MS, Cancel, Question, aged, decoded, encoded
 from middleware.entangled.wire.method import BadArguments
 from tests.middleware.test_endpoint import DELAY, EndpointCase

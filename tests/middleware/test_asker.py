@@ -6,8 +6,8 @@ from typing import Any
 
 from twisted.internet.defer import CancelledError, Deferred
 
+from middleware.entangled.contact import Contact
 from middleware.entangled.errors import Crowded, NoAnswer
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.switchboard import Weather
 from middleware.entangled.wire import asker
 from middleware.entangled.wire.asker import MAX_IN_FLIGHT

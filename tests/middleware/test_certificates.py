@@ -8,9 +8,9 @@ from twisted.internet.defer import Deferred, fail, succeed
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.clock import HeapClock
+from middleware.entangled.contact import Contact
 from middleware.entangled.errors import NoAnswer
 from middleware.entangled.identity import Identity
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address
 from middleware.entangled.replication.certificates import MAX_OWNERS, MAX_UNASKED, UNASKED_S, Certificates
 from middleware.entangled.wire.door import FOREIGN, Authority, OpenDoor

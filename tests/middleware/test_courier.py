@@ -5,8 +5,8 @@ from __future__ import annotations
 import random
 from typing import Any
 
+from middleware.entangled.contact import Contact
 from middleware.entangled.errors import Crowded, NoAnswer, Refused, TooLarge
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.switchboard import Weather
 from middleware.entangled.wire import courier
 from middleware.entangled.wire.courier import MAX_IN_OF_PEER, MAX_OUT_OF_PEER, Assembly

@@ -7,8 +7,8 @@ import random
 from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
+from middleware.entangled.contact import Contact, unpacked
 from middleware.entangled.identity import Identity
-from middleware.entangled.kademlia.contact import Contact, unpacked
 from middleware.entangled.network.joint import JointNetwork
 from middleware.entangled.network.network import Address, relayed
 from middleware.entangled.network.pipes import Pipes

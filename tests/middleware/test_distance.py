@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 
+from middleware.entangled.contact import Contact
 from middleware.entangled.identity import ID_BYTES
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.distance import bucket_index, closest, distance
 from middleware.entangled.network.network import Address
 

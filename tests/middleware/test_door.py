@@ -10,9 +10,9 @@ from twisted.logger import ILogObserver, LogEvent, LogLevel, formatEvent, global
 from twisted.trial.unittest import SynchronousTestCase
 from zope.interface import implementer
 
+from middleware.entangled.contact import Contact
 from middleware.entangled.errors import NoAnswer, NotAdmitted, Refused
 from middleware.entangled.identity import Identity, exchange_key
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.address import address_of, packed_address
 from middleware.entangled.network.network import MAX_DATAGRAM, Address
 from middleware.entangled.node import EntangledNode

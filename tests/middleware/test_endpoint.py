@@ -10,9 +10,9 @@ from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.clock import HeapClock
+from middleware.entangled.contact import Contact
 from middleware.entangled.errors import NoAnswer, NotRunning, Refused, TooLarge
 from middleware.entangled.identity import Identity, exchange_key
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address
 from middleware.entangled.network.switchboard import Switchboard, SwitchboardNetwork, Weather
 from middleware.entangled.wire import method, peer

@@ -8,9 +8,9 @@ from typing import Any
 
 from twisted.internet.defer import Deferred
 
+from middleware.entangled.contact import Contact
 from middleware.entangled.identity import ID_BYTES
 from middleware.entangled.kademlia import membership, overlay, roster
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.distance import closest
 from middleware.entangled.kademlia.membership import LARGE_FOR
 from middleware.entangled.kademlia.overlay import MOST_HEDGE, K

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.contact import Contact
 from middleware.entangled.kademlia.distance import closest
 from middleware.entangled.kademlia.lookup import Lookup
 from middleware.entangled.kademlia.routing import RoutingTable

@@ -7,8 +7,8 @@ from typing import Any
 
 import msgpack
 
+from middleware.entangled.contact import Contact
 from middleware.entangled.errors import NoAnswer, NotRunning, Refused, TooLarge, Unavailable
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.distance import closest
 from middleware.entangled.kademlia.overlay import K
 from middleware.entangled.network.switchboard import Weather

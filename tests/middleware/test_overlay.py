@@ -11,8 +11,8 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.background import Background
 from middleware.entangled.clock import HeapClock
+from middleware.entangled.contact import Contact
 from middleware.entangled.identity import Identity
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.distance import closest
 from middleware.entangled.kademlia.overlay import (
     FRESH,

@@ -10,8 +10,8 @@ from typing import Any
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.clock import HeapClock
+from middleware.entangled.contact import Contact
 from middleware.entangled.identity import Identity
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address
 from middleware.entangled.network.switchboard import Switchboard, Weather
 from middleware.entangled.wire.endpoint import Endpoint

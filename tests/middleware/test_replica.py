@@ -10,10 +10,10 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.background import Background
 from middleware.entangled.clock import HeapClock
+from middleware.entangled.contact import Contact
 from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.errors import Refused, Unwritable
 from middleware.entangled.identity import Identity
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address
 from middleware.entangled.network.switchboard import Switchboard
 from middleware.entangled.record import Lifetime, Record, hashed_key, unpacked

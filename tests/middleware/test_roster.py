@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from twisted.trial.unittest import SynchronousTestCase
 
+from middleware.entangled.contact import Contact
 from middleware.entangled.identity import Identity
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.distance import closest
 from middleware.entangled.kademlia.roster import COUNTED_S, MAX_MEMBERS, STRUCK_S, Roster
 from middleware.entangled.network.network import Address

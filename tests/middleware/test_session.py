@@ -6,9 +6,9 @@ import random
 
 from twisted.trial.unittest import SynchronousTestCase
 
+from middleware.entangled.contact import Contact
 from middleware.entangled.errors import Forged
 from middleware.entangled.identity import Identity
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import MAX_DATAGRAM, Address
 from middleware.entangled.wire.noise import TransportKeys
 from middleware.entangled.wire.session import MAX_PLAIN, OVERHEAD, WINDOW, Session, index_of

@@ -6,9 +6,9 @@ from typing import Any
 
 from twisted.internet.defer import Deferred
 
+from middleware.entangled.contact import Contact
 from middleware.entangled.errors import EntangledError, Refused
 from middleware.entangled.identity import Identity
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.record import TEAM_TTL, Record, hashed_key
 from middleware.entangled.replication.replica import Replica
 from middleware.entangled.replication.shipper import ROOM, Shipper

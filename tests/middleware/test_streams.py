@@ -7,13 +7,13 @@ import random
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.clock import HeapClock
+from middleware.entangled.contact import Contact
 from middleware.entangled.errors import Refused
 from middleware.entangled.identity import Identity
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address
 from middleware.entangled.network.switchboard import Switchboard, Weather
+from middleware.entangled.streams import MAX_PARTS, MAX_VIEWERS, OPEN_TTL, PART_BYTES, Streams
 from middleware.entangled.wire.endpoint import Endpoint
-from middleware.streams import MAX_PARTS, MAX_VIEWERS, OPEN_TTL, PART_BYTES, Streams
 
 TEAM = b"t" * 32
 CAMERA = "camera"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 
-from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.contact import Contact
 from middleware.entangled.network.network import Address
 from middleware.entangled.record import Record, hashed_key
 from middleware.entangled.replication.pusher import FEW, MAX_TTL, MAX_WATCHERS

@@ -6,11 +6,11 @@ import random
 
 from twisted.trial.unittest import SynchronousTestCase
 
+from formats.head import MAX_HEAD
 from middleware.entangled.network.network import Address
 from middleware.entangled.network.url import Proxy, Url
 from middleware.entangled.network.websocket import MAX_PAYLOAD, WebSocket
-from standards.head import MAX_HEAD
-from tests.standards.rfc6455 import BINARY, CLOSE, CONTINUATION, PING, framed
+from tests.formats.rfc6455 import BINARY, CLOSE, CONTINUATION, PING, framed
 
 URL = Url.of("wss://node.example:443/swarm")
 

@@ -16,6 +16,7 @@ from drivers.aibo.driver import AiboDriver
 from drivers.driver import Permit
 from drivers.errors import UsageError
 from drivers.registry import describe
+from formats.jpeg import size_of
 from sim.robots.dog import LIMITS
 from sim.robots.emulator.aibo import AiboEmulator
 from sim.robots.emulator.bittle import Bittle
@@ -26,7 +27,6 @@ from sim.robots.scene import loaded
 from sim.robots.table import Robots
 from sim.robots.world import TICK
 from sim.robots.yard import Yard
-from standards.jpeg import size_of
 
 
 class YardCase(SynchronousTestCase):

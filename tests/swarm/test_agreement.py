@@ -8,9 +8,9 @@ from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
 from agents.behaviour import KINDS
-from middleware.explanation import as_text, explained
-from middleware.tasks import Member, Task, group_key, member_of
-from middleware.verdict import verdict_of, verdicts_key
+from middleware.consensus.verdict import verdict_of, verdicts_key
+from middleware.diagnostics.explanation import as_text, explained
+from middleware.tasks.task import Member, Task, group_key, member_of
 from swarmnode.rehearsal import VirtualTeam
 from tests.swarm.facing import Facing
 

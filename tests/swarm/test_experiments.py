@@ -12,7 +12,7 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from agents.catalogue import task_named
 from drivers.link import MemoryLink
-from middleware.tasks import Task
+from middleware.tasks.task import Task
 from sim.demo.experiment import TOUCH_M
 from sim.demo.trials import trial
 from sim.robots.scene import FOOTPRINT

@@ -9,9 +9,9 @@ from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
 from agents.behaviour import KINDS
-from middleware.explanation import Ruling, explained
-from middleware.tasks import Member, Task, group_key, member_of
-from middleware.verdict import verdict_of, verdicts_key
+from middleware.consensus.verdict import verdict_of, verdicts_key
+from middleware.diagnostics.explanation import Ruling, explained
+from middleware.tasks.task import Member, Task, group_key, member_of
 from swarmnode.rehearsal import VirtualTeam
 
 TASKS = {"t0": 1.5, "t1": 2.5, "t2": -2.5}

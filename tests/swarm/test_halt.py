@@ -7,8 +7,8 @@ from typing import Any
 from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.halt import HALT, SLOT, UNHEARD
-from middleware.presence import DEVICES
+from middleware.directory.presence import DEVICES
+from middleware.stop.halt import HALT, SLOT, UNHEARD
 from swarmnode.rehearsal import VirtualTeam
 from webnode.halting import TeamHalts
 

@@ -10,8 +10,8 @@ from benchmarks.takeover.cause import Cause, Trial
 from benchmarks.takeover.judge import Judge
 from benchmarks.takeover.rehearsed import trial
 from benchmarks.takeover.report import drawn, table
-from middleware.presence import EXECUTING
-from middleware.tasks import COMPLETED, Result
+from middleware.directory.presence import EXECUTING
+from middleware.tasks.task import COMPLETED, Result
 from swarmnode.rehearsal import VirtualTeam
 
 

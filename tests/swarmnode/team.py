@@ -6,11 +6,11 @@ import random
 
 from twisted.application.service import Service
 
+from middleware.config.settings import Settings
 from middleware.entangled.clock import HeapClock
 from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.network.switchboard import Switchboard
 from middleware.node import SwarmNode
-from middleware.settings import Settings
 from swarmnode.seams import Seams
 from swarmnode.service import NodeService
 

@@ -21,11 +21,11 @@ from middleware.admission import operator as operators
 from middleware.admission.code import Code
 from middleware.admission.membership import Membership, MembershipFile, MemoryMembership
 from middleware.admission.newcomer import Newcomer
+from middleware.config.settings import Settings
 from middleware.entangled.control.place import made
 from middleware.entangled.errors import EntangledError, NoAnswer
 from middleware.entangled.network.network import Address
 from middleware.errors import BadSetting
-from middleware.settings import Settings
 from swarmnode.assembly import assembled
 from swarmnode.rehearsal import VirtualTeam
 from swarmnode.team import init, invitations, invite, join, members, promote, renew, revoke, rotate

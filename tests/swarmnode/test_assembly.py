@@ -10,9 +10,9 @@ from twisted.trial.unittest import SynchronousTestCase
 from zope.interface import implementer
 
 from drivers.driver import Filming
+from middleware.config.settings import Settings
 from middleware.entangled.data.memory import MemoryStore
 from middleware.errors import BadSetting
-from middleware.settings import Settings
 from swarmnode.assembly import assembled, identity_in
 from tests.swarmnode.team import KEY, World
 

@@ -13,10 +13,10 @@ from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
 from agents.catalogue import DEMO, TASKS
+from middleware.consensus.verdict import Verdict, verdict_of, verdicts_key
 from middleware.deployment.shelf import MemoryShelf
 from middleware.entangled.control.place import made
 from middleware.entangled.identity import node_id
-from middleware.verdict import Verdict, verdict_of, verdicts_key
 from swarmnode.deploy import main
 from swarmnode.rehearsal import VirtualTeam
 from tests.swarmnode.shell import Shell

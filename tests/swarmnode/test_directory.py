@@ -11,8 +11,8 @@ from typing import Any
 
 from twisted.internet.defer import Deferred
 
+from middleware.diagnostics.survey import inventory
 from middleware.entangled.control.place import made
-from middleware.survey import inventory
 from swarmnode.asker import Asker
 from swarmnode.team.verb import TeamVerbs
 from tests.fleet import FleetCase, SwarmFleet

@@ -8,8 +8,8 @@ from functools import partial
 
 from twisted.trial.unittest import SynchronousTestCase
 
+from middleware.directory.presence import DEVICES, devices_of
 from middleware.entangled.data.memory import MemoryStore
-from middleware.presence import DEVICES, devices_of
 from swarmnode.gateway import FIRST_S, LOOKS, MOST, SILENCE_S, Gateway, seed_of, sides
 from swarmnode.rehearsal import VirtualTeam
 from swarmnode.seams import Seams

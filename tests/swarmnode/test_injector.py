@@ -6,10 +6,10 @@ from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
+from middleware.directory.presence import devices_of
 from middleware.faults.injector import TRANSITIONS, State
 from middleware.faults.kinds import ASKED, CAUSE, KINDS, Fault
 from middleware.faults.takeover import TARGET_S, Takeover, acting
-from middleware.presence import devices_of
 from swarmnode.asker import Refusal
 from swarmnode.rehearsal import VirtualTeam
 from swarmnode.rehearsed import RehearsedStage

@@ -14,10 +14,10 @@ from typing import Any
 from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
+from middleware.diagnostics.survey import ENDING_S, links, team
+from middleware.entangled.control.link import link
 from middleware.entangled.control.place import made
 from middleware.entangled.errors import Refused
-from middleware.link import link
-from middleware.survey import ENDING_S, links, team
 from swarmnode.links import main
 from swarmnode.rehearsal import VirtualTeam
 from tests.swarmnode.shell import Shell

@@ -6,7 +6,7 @@ from importlib.util import find_spec
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.settings import Settings
+from middleware.config.settings import Settings
 
 MISSING = [name for name in ("flask",) if find_spec(name) is None]
 if not MISSING:

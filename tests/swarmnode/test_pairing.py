@@ -14,8 +14,8 @@ from zope.interface import implementer
 
 from agents.catalogue import DEMO, TASKS
 from drivers.registry import describe
-from middleware.presence import Device
-from middleware.settings import Settings
+from middleware.config.settings import Settings
+from middleware.directory.presence import Device
 from sim.robots.emulator.aibo import AiboEmulator
 from sim.robots.emulator.body import MemoryBody
 from swarmnode.service import NodeService

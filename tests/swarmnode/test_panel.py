@@ -14,9 +14,9 @@ from agents.context import Context
 from agents.engagement import Engagement
 from agents.state import State
 from drivers.reading import Action, Observation
+from middleware.bidding.panel import SEATS
 from middleware.entangled.record import Record
-from middleware.panel import SEATS
-from middleware.tasks import Task, member_of
+from middleware.tasks.task import Task, member_of
 from sim.robots.crowd.ground import Ground
 from swarmnode.crowd import DESK, CrowdTeam
 

@@ -7,7 +7,7 @@ import sys
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.settings import Settings
+from middleware.config.settings import Settings
 from swarmnode.password import main
 from webnode.password import is_password
 

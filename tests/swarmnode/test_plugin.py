@@ -12,10 +12,10 @@ from typing import Any
 from twisted.trial.unittest import SynchronousTestCase
 
 from drivers.registry import kinds
+from middleware.config.settings import Settings
 from middleware.entangled.errors import BadStore, PortInUse, TunnelPortInUse
 from middleware.entangled.network.network import Address
 from middleware.errors import BadSetting, UnknownAgent
-from middleware.settings import Settings
 from swarmnode.plugin import Options, makeService, told
 from swarmnode.world import resolved
 

@@ -7,7 +7,7 @@ from collections.abc import Collection
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.settings import NODE_PORT, Settings
+from middleware.config.settings import NODE_PORT, Settings
 from swarmnode.ports import NEXT, IsFree, given_way
 
 

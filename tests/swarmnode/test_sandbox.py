@@ -12,7 +12,7 @@ import math, numpy as np, os
 import subprocess
 import agents.means
 from collections.abc import Sequence
-from middleware.consensus.nearest import Nearest
+from middleware.consensus.strategies.nearest import Nearest
 from swarmnode.plugin import Options
 def late():
     import statistics
@@ -26,7 +26,14 @@ class SandboxTests(SynchronousTestCase):
         self.assertEqual(
             wanted(SOURCE),
             [
-                *("agents.means", "collections.abc", "math", "middleware.consensus.nearest", "numpy", "numpy.fft"),
+                *(
+                    "agents.means",
+                    "collections.abc",
+                    "math",
+                    "middleware.consensus.strategies.nearest",
+                    "numpy",
+                    "numpy.fft",
+                ),
                 *("numpy.random", "statistics"),
             ],
         )

@@ -8,7 +8,7 @@ from dataclasses import fields
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.settings import TABLES
+from middleware.config.settings import TABLES
 from swarmnode.command import main
 
 

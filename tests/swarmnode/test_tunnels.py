@@ -8,13 +8,13 @@ from typing import Any
 from twisted.internet.testing import MemoryReactorClock
 from twisted.trial.unittest import SynchronousTestCase
 
+from middleware.config.settings import Settings
 from middleware.entangled.clock import HeapClock
 from middleware.entangled.network.joint import JointNetwork
 from middleware.entangled.network.network import Network, detours_of
 from middleware.entangled.network.switchboard import Switchboard
 from middleware.entangled.network.url import Proxy, Url
 from middleware.faults.network import FaultyNetwork
-from middleware.settings import Settings
 from swarmnode.tunnels import proxy_for, with_tunnels
 
 

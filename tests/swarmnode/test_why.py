@@ -12,7 +12,7 @@ from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.control.place import made
-from middleware.tasks import Task
+from middleware.tasks.task import Task
 from swarmnode.asker import Refusal
 from swarmnode.rehearsal import VirtualTeam
 from swarmnode.why import chosen, main

@@ -10,7 +10,7 @@ from typing import Any, cast
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.settings import IN_MEMORY, Settings
+from middleware.config.settings import IN_MEMORY, Settings
 from tests.webnode.guests import Guests
 from webnode.app import create_app
 from webnode.audit import QUIET_S, FileAudit, audit

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.presence import Device
+from middleware.directory.presence import Device
 from tests.fleet import FleetCase, SwarmFleet
 from webnode.board import Page
 from webnode.fallback import REMEMBERED_S, TeamFallbacks, origin_of, pages_of, urls_at

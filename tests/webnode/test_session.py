@@ -9,9 +9,9 @@ from typing import Any, cast
 from twisted.internet.defer import Deferred, succeed
 from twisted.trial.unittest import SynchronousTestCase
 
+from middleware.config.settings import Settings
 from middleware.entangled.identity import Identity
 from middleware.errors import BadSetting
-from middleware.settings import Settings
 from webnode.board import OpenSessions, Token, Visitor
 from webnode.code import draw_code
 from webnode.errors import Refusal

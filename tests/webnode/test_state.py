@@ -9,8 +9,8 @@ from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.explanation import Difference, Explanation, Ruling
-from middleware.verdict import Reported
+from middleware.consensus.verdict import Reported
+from middleware.diagnostics.explanation import Difference, Explanation, Ruling
 from webnode.state import Departed, group_view, state_of
 
 

@@ -1,15 +1,15 @@
-"""What ``webnode.survey`` and ``middleware.survey`` promise, over nodes on one turned clock."""
+"""What ``webnode.survey`` and ``middleware.diagnostics.survey`` promise, over nodes on one turned clock."""
 
 from __future__ import annotations
 
 from typing import Any
 
+from middleware.diagnostics.survey import LINKS, NETWORK, answer_survey, network
+from middleware.entangled.control.link import Link
 from middleware.entangled.network.switchboard import Weather
 from middleware.entangled.record import hashed_key
 from middleware.entangled.wire.door import UNPROTECTED
-from middleware.link import Link
 from middleware.node import SwarmNode
-from middleware.survey import LINKS, NETWORK, answer_survey, network
 from tests.fleet import FleetCase, SwarmFleet
 from tests.webnode.guests import Guests
 from webnode.app import create_app

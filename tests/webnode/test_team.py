@@ -10,7 +10,7 @@ from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
 from agents.catalogue import DEMO, TASKS
-from middleware.tasks import TASKS as ALL_TASKS
+from middleware.tasks.task import TASKS as ALL_TASKS
 from swarmnode.rehearsal import VirtualTeam
 from webnode.errors import Refusal
 from webnode.team import ASKING, PATIENCE, PLACING, TeamDesk

@@ -30,7 +30,7 @@ from webnode.live import SENT_AHEAD, SYSTEM_AHEAD, Viewer
 
 MISSING = [name for name in ("OpenSSL", "cryptography") if find_spec(name) is None]
 if not MISSING:
-    from middleware.settings import Settings
+    from middleware.config.settings import Settings
     from webnode.certificate import authority, leaf, read
     from webnode.ground import Ground
     from webnode.keyfile import keep

@@ -1,4 +1,4 @@
-"""What ``webnode.tuner`` and ``middleware.tuning`` promise: settings of running devices, in a small team in memory."""
+"""Tests of ``webnode.tuner`` and ``config.tuning``: settings of running devices, in a small team in memory."""
 
 from __future__ import annotations
 

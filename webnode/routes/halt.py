@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from middleware.halt import NO_ROBOT, STANDS
-from middleware.stop_set import MAX_RELEASED
+from middleware.stop.halt import NO_ROBOT, STANDS
+from middleware.stop.stop_set import MAX_RELEASED
 from webnode.board import Halts
 from webnode.errors import Refusal
 from webnode.field import Json

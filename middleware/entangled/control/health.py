@@ -9,8 +9,8 @@ from twisted.internet.defer import Deferred, DeferredList
 from twisted.internet.interfaces import IReactorTime
 from twisted.internet.task import deferLater
 
+from middleware.entangled.contact import Contact
 from middleware.entangled.errors import EntangledError
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import is_relayed
 from middleware.entangled.node import EntangledNode
 

@@ -10,10 +10,10 @@ from typing import Any, cast, get_args
 from twisted.internet.defer import Deferred, maybeDeferred
 from twisted.internet.interfaces import IReactorTime
 
+from middleware.entangled.contact import Contact
 from middleware.entangled.control import word
 from middleware.entangled.control.health import health, links
 from middleware.entangled.errors import LocalError
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address
 from middleware.entangled.node import EntangledNode
 from middleware.entangled.record import KEY_BYTES, Lifetime, Record, hashed_key

@@ -15,8 +15,8 @@ from twisted.internet.interfaces import IReactorTime
 from twisted.logger import Logger
 
 from middleware.entangled.background import Background, first
+from middleware.entangled.contact import Contact
 from middleware.entangled.errors import NoAnswer
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.overlay import Overlay
 from middleware.entangled.network.network import Address
 from middleware.entangled.wire.endpoint import Endpoint

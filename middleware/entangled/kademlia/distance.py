@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.contact import Contact
 
 
 def distance(a: bytes, b: bytes) -> int:

@@ -10,7 +10,7 @@ from bisect import insort
 from collections.abc import Iterable
 from enum import Enum
 
-from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.contact import Contact
 from middleware.entangled.kademlia.distance import closest, distance
 
 

@@ -17,8 +17,8 @@ from twisted.internet.interfaces import IReactorTime
 from twisted.logger import Logger
 
 from middleware.entangled.background import Background
+from middleware.entangled.contact import Contact, unpacked
 from middleware.entangled.errors import NoAnswer, NotRunning, Refused
-from middleware.entangled.kademlia.contact import Contact, unpacked
 from middleware.entangled.kademlia.detour import Detour
 from middleware.entangled.kademlia.overlay import Overlay, contacts_of
 from middleware.entangled.kademlia.roster import MAX_MEMBERS

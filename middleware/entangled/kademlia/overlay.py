@@ -17,8 +17,8 @@ from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorTime
 
 from middleware.entangled.background import Background
+from middleware.entangled.contact import Contact, unpacked
 from middleware.entangled.errors import EntangledError, NoAnswer, Refused
-from middleware.entangled.kademlia.contact import Contact, unpacked
 from middleware.entangled.kademlia.distance import closest
 from middleware.entangled.kademlia.lookup import Lookup
 from middleware.entangled.kademlia.roster import MAX_MEMBERS, Roster

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.contact import Contact
 
 MAX_MEMBERS = 64
 """Members that are known whole.  Beyond it a walk by Kademlia costs less than keeping everybody in mind."""

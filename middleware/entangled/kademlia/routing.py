@@ -13,8 +13,8 @@ import random
 from bisect import bisect_right
 from dataclasses import dataclass, field
 
+from middleware.entangled.contact import Contact
 from middleware.entangled.identity import ID_BYTES
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.distance import bucket_index, closest
 
 STALE_AFTER = 3

@@ -10,8 +10,8 @@ import random
 from collections.abc import Callable
 
 from middleware.entangled.background import Background
+from middleware.entangled.contact import Contact
 from middleware.entangled.errors import NoAnswer
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.overlay import K, Overlay
 from middleware.entangled.kademlia.pace import Pace
 from middleware.entangled.wire.endpoint import Endpoint

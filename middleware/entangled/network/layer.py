@@ -7,7 +7,7 @@ import ssl
 from tempfile import NamedTemporaryFile
 from typing import Protocol
 
-from standards.head import MAX_HEAD, head, taken
+from formats.head import MAX_HEAD, head, taken
 
 _PIECE = 16384
 

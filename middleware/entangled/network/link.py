@@ -15,10 +15,10 @@ from twisted.internet.protocol import Protocol as StreamProtocol
 from twisted.python.failure import Failure
 from zope.interface import implementer
 
+from formats.websocket import NORMAL
 from middleware.entangled.network.layer import Layer
 from middleware.entangled.network.network import Address
 from middleware.entangled.network.websocket import WebSocket
-from standards.websocket import NORMAL
 
 SHORT = 300
 """Heartbeats, receipts, greetings and most questions have fewer bytes; parts of parcels have 1400."""

@@ -6,8 +6,8 @@ import re
 
 from wsproto.events import AcceptConnection, RejectConnection, Request
 
+from formats.websocket import End
 from middleware.entangled.network.url import PATH, Url
-from standards.websocket import End
 
 SUBPROTOCOL = "swarm-tunnel-1"
 TOKEN = "X-Swarm-Tunnel"

@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Iterable
 
 from twisted.internet.interfaces import IReactorTime
 
-from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.contact import Contact
 from middleware.entangled.network.network import Address, is_relayed
 from middleware.entangled.reach.carrier import Carriers
 from middleware.entangled.reach.known import LIVELY_S, keep

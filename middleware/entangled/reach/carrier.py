@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from twisted.internet.interfaces import IReactorTime
 
+from middleware.entangled.contact import Contact
 from middleware.entangled.identity import ID_BYTES
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address, is_relayed, relayed
 from middleware.entangled.reach.known import keep
 from middleware.entangled.reach.path import PathNetwork

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from twisted.internet.interfaces import IReactorTime
 
+from middleware.entangled.contact import Contact
 from middleware.entangled.errors import EntangledError, Refused
 from middleware.entangled.identity import ID_BYTES
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address, is_relayed
 from middleware.entangled.reach.allowance import Allowance
 from middleware.entangled.reach.candidate import is_possible, packed, unpacked

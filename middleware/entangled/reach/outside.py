@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable
 from twisted.internet.interfaces import IReactorTime
 
 from middleware.entangled.background import Background
-from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.contact import Contact
 from middleware.entangled.network.network import Address, is_relayed
 from middleware.entangled.reach.candidate import is_near, is_possible
 from middleware.entangled.reach.known import keep

@@ -18,10 +18,10 @@ from functools import cached_property
 from twisted.internet.interfaces import IReactorTime
 
 from middleware.entangled.background import Background, until
+from middleware.entangled.contact import Contact
+from middleware.entangled.contact import unpacked as contact_in
 from middleware.entangled.errors import Refused
 from middleware.entangled.identity import node_id
-from middleware.entangled.kademlia.contact import Contact
-from middleware.entangled.kademlia.contact import unpacked as contact_in
 from middleware.entangled.network.network import Address, is_relayed, relayed
 from middleware.entangled.reach.acquaintance import Acquaintances
 from middleware.entangled.reach.allowance import Allowance

@@ -6,7 +6,7 @@ from typing import Literal
 
 from twisted.internet.interfaces import IReactorTime
 
-from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.contact import Contact
 from middleware.entangled.network.network import is_relayed
 from middleware.entangled.reach.carrier import Carriers
 from middleware.entangled.reach.known import keep

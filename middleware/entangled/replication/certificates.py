@@ -11,8 +11,8 @@ from collections.abc import Iterable
 
 from twisted.internet.interfaces import IReactorTime
 
+from middleware.entangled.contact import Contact
 from middleware.entangled.errors import EntangledError
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.record import Slot
 from middleware.entangled.wire.door import FOREIGN, OPEN, Door
 from middleware.entangled.wire.endpoint import Endpoint

@@ -16,9 +16,9 @@ from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorTime
 
 from middleware.entangled.background import Background, first
+from middleware.entangled.contact import Contact
 from middleware.entangled.data.store import Store
 from middleware.entangled.errors import EntangledError, Refused
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.distance import distance
 from middleware.entangled.kademlia.overlay import K, Overlay
 from middleware.entangled.kademlia.roster import STRUCK_S

@@ -10,8 +10,8 @@ from collections.abc import Callable
 
 from twisted.internet.interfaces import IReactorTime
 
+from middleware.entangled.contact import Contact
 from middleware.entangled.errors import Refused
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.overlay import Overlay
 from middleware.entangled.record import Record, Slot, slot_unpacked
 from middleware.entangled.replication.replica import PAGE_BYTES, Replica

@@ -16,10 +16,10 @@ from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorTime
 
 from middleware.entangled.background import Background, paced, until
+from middleware.entangled.contact import Contact
 from middleware.entangled.data.store import Store
 from middleware.entangled.errors import OWNER_FULL, Conflict, EntangledError, Full, NoAnswer, NotAcknowledged, Refused
 from middleware.entangled.identity import Identity
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.overlay import Overlay
 from middleware.entangled.record import TEAM_TTL, TOMBSTONE_TTL, Lifetime, Record, Slot
 from middleware.entangled.replication.replica import FORBIDDEN, HELD, NO_ROOM, Replica, pages_of

@@ -13,8 +13,8 @@ from twisted.internet.interfaces import IReactorTime
 from twisted.python.failure import Failure
 
 from middleware.entangled.background import Background
+from middleware.entangled.contact import Contact
 from middleware.entangled.errors import NotRunning, Refused, WeatherError
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.record import Record, Slot
 from middleware.entangled.wire.endpoint import Endpoint
 

@@ -12,8 +12,8 @@ from typing import Literal
 from twisted.internet.defer import Deferred
 
 from middleware.entangled.background import Background, until
+from middleware.entangled.contact import Contact
 from middleware.entangled.errors import EntangledError, Refused, Unavailable
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.lookup import Lookup
 from middleware.entangled.kademlia.overlay import ALPHA, K, Overlay, contacts_of
 from middleware.entangled.record import Record, Slot, unpacked

@@ -15,9 +15,9 @@ from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorTime
 
 from middleware.entangled.background import Background
+from middleware.entangled.contact import Contact
 from middleware.entangled.data.store import Store
 from middleware.entangled.errors import OWNER_FULL, Full, Refused
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.record import KEY_BYTES, Record, Signed, Slot, unpacked
 from middleware.entangled.replication.cache import PathCache
 from middleware.entangled.replication.certificates import Certificates

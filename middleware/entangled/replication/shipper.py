@@ -11,8 +11,8 @@ from collections import deque
 from twisted.internet.defer import Deferred
 
 from middleware.entangled.background import Background
+from middleware.entangled.contact import Contact
 from middleware.entangled.errors import Crowded, EntangledError, NoAnswer, Refused
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.overlay import Overlay
 from middleware.entangled.record import Record
 

@@ -9,9 +9,9 @@ from twisted.internet.interfaces import IReactorTime
 from twisted.logger import Logger
 
 from middleware.entangled.background import Background
+from middleware.entangled.contact import Contact
 from middleware.entangled.errors import EntangledError, Refused
 from middleware.entangled.identity import node_id
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.distance import closest
 from middleware.entangled.kademlia.overlay import Overlay
 from middleware.entangled.record import Record, Slot, unpacked

@@ -13,8 +13,8 @@ from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorTime
 
 from middleware.entangled.background import Background
+from middleware.entangled.contact import Contact
 from middleware.entangled.errors import EntangledError, NotRunning
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.quorum.acceptor import Event
 from middleware.entangled.quorum.ballot import Ballot
 from middleware.entangled.quorum.proposer import Outcome, Result, conclude, decide

@@ -9,8 +9,8 @@ import random
 from dataclasses import dataclass, field
 
 from middleware.entangled.background import Background
-from middleware.entangled.node import EntangledNode
 from middleware.entangled.record import Record
+from middleware.entangled.space.peer import Peer
 from middleware.entangled.space.posting import (
     MARK_BYTES,
     Member,
@@ -47,7 +47,7 @@ class _Ledger:
 class Keeper:
     """The slots of one node in the keys of one space."""
 
-    def __init__(self, node: EntangledNode, rng: random.Random, chores: Background) -> None:
+    def __init__(self, node: Peer, rng: random.Random, chores: Background) -> None:
         self._node = node
         self._rng = rng
         self._chores = chores
@@ -70,7 +70,7 @@ class Keeper:
             self._ledgers[key] = _Ledger()
 
     async def post(self, key: bytes, fields: Tuple, council: list[Member], ttl: float | None) -> None:
-        """Put a tuple, and take it out after ``ttl`` seconds where nobody took it; fails as ``EntangledNode.put``."""
+        """Put a tuple, and take it out after ``ttl`` seconds where nobody took it; fails as ``Peer.put``."""
         name = self._slot(key)
         place = Place(key, self._node.identity.public, name, self._rng.randbytes(MARK_BYTES))
         self._ledgers[key].holds[name] = place

@@ -15,10 +15,10 @@ from twisted.internet.defer import Deferred
 
 from middleware.entangled.background import first
 from middleware.entangled.errors import LocalError, NoAnswer, TooLarge
-from middleware.entangled.node import EntangledNode
 from middleware.entangled.record import MAX_NAME, MAX_VALUE, Record, hashed_key
 from middleware.entangled.replication.owner import Stored
 from middleware.entangled.replication.watch import Watch
+from middleware.entangled.space.peer import Records
 
 MAX_WORDS = 16
 
@@ -60,7 +60,7 @@ def matches(records: Iterable[Record], wanted: Sequence[str]) -> list[Match]:
 class Keywords:
     """Keyword publishing over one node."""
 
-    def __init__(self, node: EntangledNode) -> None:
+    def __init__(self, node: Records) -> None:
         self._node = node
 
     def publish(self, name: str, data: bytes) -> Deferred[None]:

@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import msgpack
 
+from middleware.entangled.contact import Contact
+from middleware.entangled.contact import unpacked as contact_unpacked
 from middleware.entangled.errors import Malformed
-from middleware.entangled.kademlia.contact import Contact
-from middleware.entangled.kademlia.contact import unpacked as contact_unpacked
 from middleware.entangled.record import MAX_NAME, Record, Slot, hashed_key
 from middleware.entangled.space.template import Tuple, tuple_unpacked
 

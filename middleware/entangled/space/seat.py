@@ -14,9 +14,9 @@ from typing import Final, Protocol
 from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorTime
 
+from middleware.entangled.contact import Contact
 from middleware.entangled.data.store import Store
 from middleware.entangled.errors import Refused
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.quorum.acceptor import Acceptor, Event, Terms
 from middleware.entangled.quorum.ballot import FIRST, NONE, Ballot
 from middleware.entangled.quorum.log import MAX_REGISTERS, Log

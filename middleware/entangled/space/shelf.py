@@ -11,9 +11,9 @@ from collections.abc import Callable
 from twisted.internet.defer import Deferred
 
 from middleware.entangled.background import Background
-from middleware.entangled.node import EntangledNode
 from middleware.entangled.record import Record
 from middleware.entangled.replication.watch import Watch
+from middleware.entangled.space.peer import Peer
 from middleware.entangled.space.posting import Posted, Reader
 
 POLL = 0.7
@@ -25,7 +25,7 @@ LINGER = 5.0
 class Shelf:
     """What stands under ``key``; ``posted`` are the tuples that nobody took, as far as is known."""
 
-    def __init__(self, node: EntangledNode, key: bytes, chores: Background) -> None:
+    def __init__(self, node: Peer, key: bytes, chores: Background) -> None:
         self.key = key
         self.posted: list[Posted] = []
         self._node = node

@@ -13,15 +13,15 @@ from twisted.internet.defer import Deferred, FirstError, gatherResults
 from twisted.internet.interfaces import IReactorTime
 
 from middleware.entangled.background import Background, first
+from middleware.entangled.contact import Contact
 from middleware.entangled.errors import EntangledError, NoAnswer, Refused
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.distance import closest
-from middleware.entangled.node import EntangledNode
 from middleware.entangled.quorum.ballot import Ballot
 from middleware.entangled.quorum.proposer import Outcome, Result
 from middleware.entangled.space.claim import Claim, ClaimLost
 from middleware.entangled.space.council import Council
 from middleware.entangled.space.keeper import Keeper
+from middleware.entangled.space.peer import Peer
 from middleware.entangled.space.posting import INCARNATION_BYTES, Member, Place, Posted, standing
 from middleware.entangled.space.seat import MAX_PLACES
 from middleware.entangled.space.template import Template, Tuple
@@ -54,7 +54,7 @@ class Taker:
 
     def __init__(
         self,
-        node: EntangledNode,
+        node: Peer,
         clock: IReactorTime,
         rng: random.Random,
         chores: Background,
@@ -119,8 +119,7 @@ class Taker:
             answer = getattr(node.seat, method.replace("decree.", "answer_"))
             return defer.maybeDeferred(answer, node.contact, *arguments)
         # A member may have moved since the tuple was put; its key is still the same.
-        contact = node.overlay.table.get(contact.node_id) or contact
-        return node.endpoint.ask(contact, method, *arguments, changes=method != "decree.enrol")
+        return node.endpoint.ask(node.newest(contact), method, *arguments, changes=method != "decree.enrol")
 
     # -- choosing ---------------------------------------------------------------------------------------------------
 

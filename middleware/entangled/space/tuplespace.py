@@ -16,9 +16,9 @@ from twisted.logger import Logger
 
 from middleware.entangled.background import Background
 from middleware.entangled.errors import EntangledError, NoAnswer, NotRunning, WeatherError
-from middleware.entangled.node import EntangledNode
 from middleware.entangled.space.claim import Claim
 from middleware.entangled.space.keeper import Keeper
+from middleware.entangled.space.peer import Peer
 from middleware.entangled.space.posting import Place, space_key, standing
 from middleware.entangled.space.shelf import Shelf
 from middleware.entangled.space.taker import Taker
@@ -63,7 +63,7 @@ class TupleSpace:
 
     def __init__(
         self,
-        node: EntangledNode,
+        node: Peer,
         clock: IReactorTime,
         rng: random.Random,
         name: str = "default",

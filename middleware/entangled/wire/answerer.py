@@ -15,7 +15,7 @@ from twisted.internet.interfaces import IReactorTime
 from twisted.logger import Logger
 from twisted.python.failure import Failure as Trouble
 
-from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.contact import Contact
 from middleware.entangled.token_bucket import TokenBucket
 from middleware.entangled.wire.courier import Courier
 from middleware.entangled.wire.door import ROLE, meaning

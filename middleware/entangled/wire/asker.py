@@ -14,8 +14,8 @@ from twisted.internet import defer
 from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IDelayedCall, IReactorTime
 
+from middleware.entangled.contact import Contact
 from middleware.entangled.errors import Crowded, NoAnswer, TooLarge
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address
 from middleware.entangled.wire.congestion import LONGEST
 from middleware.entangled.wire.courier import Courier

@@ -16,9 +16,9 @@ from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorTime
 from twisted.logger import Logger
 
+from middleware.entangled.contact import Contact
 from middleware.entangled.errors import Forged, Malformed, NotAdmitted, NotRunning
 from middleware.entangled.identity import Identity
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import MAX_CARRIED, MAX_DATAGRAM, Address, Network
 from middleware.entangled.wire.answerer import Answerer
 from middleware.entangled.wire.asker import PATIENCE, Asker

@@ -20,8 +20,8 @@ from nacl.exceptions import CryptoError
 from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IDelayedCall, IReactorTime
 
+from middleware.entangled.contact import Contact
 from middleware.entangled.errors import Forged, NoAnswer
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address, Network
 from middleware.entangled.token_bucket import TokenBucket
 from middleware.entangled.wire.congestion import BACK_OFF, FIRST_GUESS, LONGEST

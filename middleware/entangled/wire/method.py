@@ -21,8 +21,8 @@ from twisted.internet.defer import CancelledError, Deferred
 from twisted.internet.interfaces import IDelayedCall
 from twisted.python.failure import Failure as Trouble
 
+from middleware.entangled.contact import Contact
 from middleware.entangled.errors import Refused
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.wire.message import BAD_ARGUMENTS, CANCELLED, Failure, is_code
 from middleware.entangled.wire.peer import cancel
 from middleware.entangled.wire.session import Session

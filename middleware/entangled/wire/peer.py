@@ -14,8 +14,8 @@ from types import MappingProxyType
 
 from twisted.internet.interfaces import IDelayedCall, IReactorTime
 
+from middleware.entangled.contact import Contact
 from middleware.entangled.identity import exchange_key
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address, Network, is_relayed
 from middleware.entangled.wire.congestion import BACK_OFF, FIRST_GUESS, LONGEST, RoundTrip
 from middleware.entangled.wire.door import OPEN, Door

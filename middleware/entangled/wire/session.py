@@ -17,9 +17,9 @@ import struct
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+from middleware.entangled.contact import Contact
 from middleware.entangled.errors import Forged
 from middleware.entangled.identity import Identity, exchange_key
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.address import ADDRESS, address_of, packed_address
 from middleware.entangled.network.network import MAX_DATAGRAM, Address
 from middleware.entangled.wire.door import NONCE, UNCOUNTED, Life, is_refusal

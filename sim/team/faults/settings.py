@@ -7,7 +7,7 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from validation.convert import UNIQUE, Unit, one_of
+from formats.convert import UNIQUE, Unit, one_of
 
 _WHOM = ("count", "share", "places")
 TAKES: dict[str, tuple[str, ...]] = {

@@ -14,18 +14,18 @@ from twisted.internet.defer import Deferred, maybeDeferred
 from drivers.driver import Permit
 from drivers.errors import StaleCommand
 from drivers.gate import Gate
-from middleware.commitment.charter import Charter, Judge, pin
-from middleware.commitment.council import Council
-from middleware.commitment.desk import Desk
-from middleware.commitment.lessee import Lessee
 from middleware.entangled.clock import HeapClock
+from middleware.entangled.contact import Contact
 from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.data.store import Store
 from middleware.entangled.errors import Refused
 from middleware.entangled.identity import Identity
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address
 from middleware.entangled.quorum.ballot import majority
+from middleware.lease.charter import Charter, Judge, pin
+from middleware.lease.council import Council
+from middleware.lease.desk import Desk
+from middleware.lease.lessee import Lessee
 from sim.team.checker import check
 from sim.team.event import Born, Commanded, Died, Halted, Held, Issued, Reached, Terms, Won
 from sim.team.history import History

@@ -13,13 +13,13 @@ from dataclasses import dataclass
 
 from twisted.internet.interfaces import IReactorTime
 
-from middleware.commitment.lessee import Lessee
-from middleware.consensus.nearest import Nearest
+from middleware.bidding.auction import Auction
+from middleware.bidding.bidding import Bidding
+from middleware.consensus.strategies.nearest import Nearest
 from middleware.consensus.strategy import Report
-from middleware.dissemination.auction import Auction
-from middleware.dissemination.bidding import Bidding
 from middleware.entangled.errors import EntangledError
-from middleware.tasks import Task
+from middleware.lease.lessee import Lessee
+from middleware.tasks.task import Task
 from sim.team.load.deputies import Deputies
 from sim.team.load.deputy import Deputy
 

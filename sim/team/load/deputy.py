@@ -13,18 +13,18 @@ from typing import Any
 
 from twisted.internet.interfaces import IReactorTime
 
-from middleware.commitment.councils import Councils
-from middleware.commitment.lessee import Lessee
+from middleware.bidding.auction import Auction
+from middleware.bidding.auctions import Dissemination, Surroundings
+from middleware.bidding.bidding import Bidding
+from middleware.bidding.party import OnSummary
+from middleware.bidding.scale import team_size
 from middleware.consensus.strategy import strategy_for
-from middleware.dissemination.auction import Auction
-from middleware.dissemination.bidding import Bidding
-from middleware.dissemination.dissemination import Dissemination, Surroundings
-from middleware.dissemination.party import OnSummary
-from middleware.dissemination.scale import team_size
-from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.contact import Contact
 from middleware.entangled.node import EntangledNode
+from middleware.lease.lessee import Lessee
 from middleware.node import LEASE_VERBS, SwarmNode
-from middleware.tasks import Task
+from middleware.tasks.councils import Councils
+from middleware.tasks.task import Task
 from sim.team.load.tally import Tally
 from sim.team.team import Node, core
 

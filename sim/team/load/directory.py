@@ -12,13 +12,13 @@ from typing import Annotated
 
 from msgspec import Meta
 
+from formats.convert import Unit
+from middleware.directory.presence import device_of, devices_of
 from middleware.entangled.record import Record
 from middleware.node import SwarmNode
-from middleware.presence import device_of, devices_of
 from sim.team.figure import Figure, mean, share, spread
 from sim.team.load.residents import Residents
 from sim.team.team import Team
-from validation.convert import Unit
 
 
 @dataclass(frozen=True)

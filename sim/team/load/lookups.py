@@ -20,16 +20,16 @@ from typing import Annotated
 from msgspec import Meta
 from twisted.python.failure import Failure
 
+from formats.convert import Unit
+from middleware.entangled.contact import Contact
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.identity import ID_BYTES
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.overlay import K
 from middleware.entangled.node import EntangledNode
 from sim.team.figure import Figure, at_most, mean, share, spread
 from sim.team.load.pace import Pace
 from sim.team.load.residents import Residents
 from sim.team.team import Team
-from validation.convert import Unit
 
 LISTED = 20
 """Violations that are told one by one."""

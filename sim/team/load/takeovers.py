@@ -14,16 +14,16 @@ from typing import Annotated
 from msgspec import Meta
 from twisted.internet.defer import Deferred
 
-from middleware.commitment.lessee import Lessee
+from formats.convert import Unit
 from middleware.entangled.errors import EntangledError
-from middleware.tasks import Task
+from middleware.lease.lessee import Lessee
+from middleware.tasks.task import Task
 from sim.team.figure import Figure, at_most, share, spread
 from sim.team.load.deputies import deputies_of
 from sim.team.load.deputy import Deputy
 from sim.team.load.pace import Pace
 from sim.team.load.residents import Residents
 from sim.team.team import Team
-from validation.convert import Unit
 
 AGENTS = 3
 PATIENCE = 30.0

@@ -11,8 +11,8 @@ from typing import Any
 from twisted.internet.defer import Deferred
 from twisted.python.failure import Failure
 
+from middleware.entangled.contact import Contact
 from middleware.entangled.errors import Refused
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.wire.endpoint import Endpoint
 
 MARK, HEAD = b"bid.", 64

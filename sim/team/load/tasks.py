@@ -12,14 +12,14 @@ from typing import Annotated
 from msgspec import Meta
 from twisted.internet.defer import Deferred
 
-from middleware.tasks import Task
+from formats.convert import Unit
+from middleware.tasks.task import Task
 from sim.team.figure import Figure, at_most, share, spread
 from sim.team.load.contest import Contest
 from sim.team.load.deputies import deputies_of
 from sim.team.load.lookups import LISTED
 from sim.team.load.residents import Residents
 from sim.team.team import Team
-from validation.convert import Unit
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,10 @@ from typing import Annotated
 from msgspec import Meta
 from twisted.python.failure import Failure
 
+from formats.convert import Unit, one_of
+from middleware.entangled.contact import Contact
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.identity import node_id
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.distance import distance
 from middleware.entangled.kademlia.overlay import K
 from middleware.entangled.node import EntangledNode
@@ -30,7 +31,6 @@ from sim.team.load.lookups import LISTED
 from sim.team.load.pace import Pace
 from sim.team.load.residents import Residents
 from sim.team.team import Team
-from validation.convert import Unit, one_of
 
 QUORUM, NONE = "quorum", "none"
 AGAIN = 2.0

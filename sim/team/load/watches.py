@@ -9,6 +9,7 @@ from typing import Annotated
 from msgspec import Meta
 from twisted.python.failure import Failure
 
+from formats.convert import Unit
 from middleware.entangled.errors import EntangledError, NotAcknowledged
 from middleware.entangled.node import EntangledNode
 from middleware.entangled.record import Record, hashed_key
@@ -16,7 +17,6 @@ from sim.team.figure import Figure, share, spread
 from sim.team.load.pace import Pace
 from sim.team.load.residents import Residents
 from sim.team.team import Team
-from validation.convert import Unit
 
 NAME = "watched"
 

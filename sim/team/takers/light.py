@@ -14,8 +14,8 @@ from typing import Any, cast
 from twisted.internet import defer
 from twisted.internet.defer import Deferred
 
+from middleware.entangled.contact import Contact
 from middleware.entangled.identity import Identity
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.kademlia.distance import closest
 from middleware.entangled.node import EntangledNode
 from middleware.entangled.record import Record, Slot

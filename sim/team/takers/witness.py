@@ -8,7 +8,7 @@ from typing import Any
 
 from twisted.internet.defer import maybeDeferred
 
-from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.contact import Contact
 from middleware.entangled.quorum.acceptor import Event
 from middleware.entangled.quorum.ballot import NONE
 from middleware.entangled.quorum.register import Kind, Reply

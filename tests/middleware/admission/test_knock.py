@@ -17,8 +17,8 @@ from middleware.admission.certificate import ROOM, is_proof
 from middleware.admission.code import Code
 from middleware.admission.knock import Hint, Reply, Signer, Welcome
 from middleware.admission.terms import TermsContent, seal_terms
+from middleware.entangled.contact import Contact
 from middleware.entangled.errors import Forged, Malformed
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address
 from tests.middleware.admission.paper import granted, identity, invited, operator
 

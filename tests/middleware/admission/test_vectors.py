@@ -15,8 +15,8 @@ from middleware.admission.code import Code
 from middleware.admission.roll import digest_of, packed_admission
 from middleware.admission.statement import YEAR, Grant, Invite, Revoke, Terms, sealed_secret, signed
 from middleware.admission.terms import TermsContent, seal_terms
+from middleware.entangled.contact import Contact
 from middleware.entangled.identity import Identity
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address
 
 VECTORS = Path(__file__).parents[1] / "vectors" / "admission.json"

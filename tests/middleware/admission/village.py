@@ -14,8 +14,8 @@ from middleware.admission.membership import Membership, MemoryMembership
 from middleware.admission.newcomer import Newcomer
 from middleware.admission.operator import Operator
 from middleware.admission.team import Team
+from middleware.entangled.contact import Contact
 from middleware.entangled.errors import NotRunning
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import Address
 from middleware.entangled.network.switchboard import CALM, Weather
 from middleware.entangled.node import EntangledNode

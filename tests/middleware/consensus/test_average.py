@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.consensus.average import Average
-from middleware.consensus.push_sum import PushSum, Share
-from middleware.consensus.rendezvous import Centre, Median, Rendezvous, centre, median
+from middleware.consensus.strategies.average import Average
+from middleware.consensus.strategies.push_sum import PushSum, Share
+from middleware.consensus.strategies.rendezvous import Centre, Median, Rendezvous, centre, median
 from middleware.consensus.strategy import Report
 
 numbers = st.floats(-1e6, 1e6, allow_nan=False).map(lambda x: round(x, 3))

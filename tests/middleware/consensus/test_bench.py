@@ -13,7 +13,7 @@ from benchmarks.consensus.oracle import least_star, least_way, travelled
 from benchmarks.consensus.outcome import outcome
 from benchmarks.consensus.plot import AFTER, BAR, CALM, drawn
 from benchmarks.consensus.talk import talked
-from middleware.consensus.sequential import ways_of
+from middleware.consensus.strategies.sequential import ways_of
 
 
 class BenchConsensusTests(SynchronousTestCase):

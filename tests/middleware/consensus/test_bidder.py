@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.consensus.bidder import Bidder, Score, Statement
-from middleware.consensus.cbba import greedy
+from middleware.consensus.strategies.bidder import Bidder, Score, Statement
+from middleware.consensus.strategies.cbba import greedy
 
 Costs = dict[str, dict[str, float]]
 

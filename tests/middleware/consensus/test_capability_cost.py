@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.consensus.capability_cost import CapabilityCost
+from middleware.consensus.strategies.capability_cost import CapabilityCost
 from middleware.consensus.strategy import Report, refused
 
 shares = st.floats(0.0, 1.0)

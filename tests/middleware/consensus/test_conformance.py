@@ -11,18 +11,18 @@ from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.consensus.average import Average
-from middleware.consensus.capability_cost import CapabilityCost
-from middleware.consensus.cbba import Cbba
 from middleware.consensus.conformance import CHECKS, Conformance, broken
-from middleware.consensus.group_optimal import GroupOptimal
 from middleware.consensus.guard import Guard
 from middleware.consensus.item import Item
-from middleware.consensus.nearest import Nearest
-from middleware.consensus.rendezvous import Centre, Median, Rendezvous
-from middleware.consensus.sequential import Sequential
+from middleware.consensus.strategies.average import Average
+from middleware.consensus.strategies.capability_cost import CapabilityCost
+from middleware.consensus.strategies.cbba import Cbba
+from middleware.consensus.strategies.group_optimal import GroupOptimal
+from middleware.consensus.strategies.nearest import Nearest
+from middleware.consensus.strategies.rendezvous import Centre, Median, Rendezvous
+from middleware.consensus.strategies.sequential import Sequential
+from middleware.consensus.strategies.weighted_vote import WeightedVote
 from middleware.consensus.strategy import BUILT_IN, Consensus, Report, digest_of, strategy_for
-from middleware.consensus.weighted_vote import WeightedVote
 from tests.replay import replayed
 
 ROOT = Path(__file__).resolve().parents[3]

@@ -10,11 +10,11 @@ from statistics import fmean
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.consensus.cbba import Cbba, greedy
-from middleware.consensus.exchange import exchanged
-from middleware.consensus.group_optimal import GroupOptimal
 from middleware.consensus.item import Item, exact
-from middleware.consensus.sequential import Sequential, length, ways_of
+from middleware.consensus.strategies.cbba import Cbba, greedy
+from middleware.consensus.strategies.exchange import exchanged
+from middleware.consensus.strategies.group_optimal import GroupOptimal
+from middleware.consensus.strategies.sequential import Sequential, length, ways_of
 from middleware.consensus.strategy import Consensus, Report
 
 Place = tuple[float, float]

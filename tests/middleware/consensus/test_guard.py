@@ -8,11 +8,11 @@ from dataclasses import replace
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.consensus.cbba import Cbba
 from middleware.consensus.guard import SPAN, STRIKES, Guard, Lost
 from middleware.consensus.item import Item
-from middleware.consensus.nearest import Nearest
 from middleware.consensus.selection import guarded
+from middleware.consensus.strategies.cbba import Cbba
+from middleware.consensus.strategies.nearest import Nearest
 from middleware.consensus.strategy import Consensus, Report
 from middleware.errors import UnknownStrategy
 

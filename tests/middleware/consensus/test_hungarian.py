@@ -8,8 +8,8 @@ from itertools import permutations
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.consensus import hungarian
-from middleware.consensus.hungarian import assigned, solved, total
+from middleware.consensus.strategies import hungarian
+from middleware.consensus.strategies.hungarian import assigned, solved, total
 
 
 class HungarianTests(SynchronousTestCase):

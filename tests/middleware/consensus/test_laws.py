@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.consensus.conformance import team
-from middleware.consensus.nearest import KEPT
+from middleware.consensus.strategies.nearest import KEPT
 from middleware.consensus.strategy import BUILT_IN, Report, strategy_for
 
 reports = st.builds(

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.consensus.cbba import Cbba
-from middleware.consensus.nearest import Nearest
+from middleware.consensus.deployed import Make
 from middleware.consensus.selection import Strategies
-from middleware.deployed import Make
+from middleware.consensus.strategies.cbba import Cbba
+from middleware.consensus.strategies.nearest import Nearest
 from middleware.errors import UnknownStrategy
 
 

@@ -7,10 +7,10 @@ from dataclasses import replace
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.consensus.guard import Guard
-from middleware.consensus.nearest import Nearest
+from middleware.consensus.strategies.nearest import Nearest
 from middleware.consensus.strategy import BUILT_IN, READABLE, Report, digest_of, strategy_for
 from middleware.consensus.view import View, view_of
-from middleware.tasks import Member
+from middleware.tasks.task import Member
 
 FULL = Member(
     "a", "dog", "WAITING", 2.5, load=3, battery=0.5, value=(1.0, 2.0), choice="red", weight=2.0, electorate=5.0

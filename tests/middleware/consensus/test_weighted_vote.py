@@ -6,8 +6,8 @@ import random
 
 from twisted.trial.unittest import SynchronousTestCase
 
+from middleware.consensus.strategies.weighted_vote import WeightedVote
 from middleware.consensus.strategy import Report
-from middleware.consensus.weighted_vote import WeightedVote
 
 
 def vote(agent: str, choice: str, weight: float = 1.0, **more: object) -> Report:

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import msgpack
 
+from middleware.config.settings import DeploymentSettings
+from middleware.consensus.deployed import BEHAVIOUR, STRATEGY
 from middleware.consensus.strategy import strategy_for
-from middleware.deployed import BEHAVIOUR, STRATEGY
 from middleware.deployment.deployment import RETRY, Author, Deployment
 from middleware.deployment.manifest import (
     MAX_SOURCE,
@@ -23,13 +24,12 @@ from middleware.deployment.shelf import FileShelf, MemoryShelf, Shelf
 from middleware.entangled.record import Record, hashed_key
 from middleware.errors import UnknownStrategy
 from middleware.node import SwarmNode
-from middleware.settings import DeploymentSettings
 from swarmnode.sandbox import simulated
 from tests.fleet import FleetCase
 
 SOURCE = b"""
 import sys
-from middleware.consensus.nearest import Nearest
+from middleware.consensus.strategies.nearest import Nearest
 sys.modules["swarm_canary"] = sys
 
 class Strategy(Nearest):

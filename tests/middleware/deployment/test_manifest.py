@@ -9,7 +9,7 @@ from dataclasses import replace
 import msgpack
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.deployed import STRATEGY
+from middleware.consensus.deployed import STRATEGY
 from middleware.deployment.manifest import (
     KEPT,
     MAX_VERSION,
@@ -23,7 +23,7 @@ from middleware.deployment.manifest import (
 )
 from middleware.entangled.identity import Identity
 from middleware.entangled.record import Record
-from middleware.value import MAX_VALUE
+from middleware.entangled.value import MAX_VALUE
 
 OPERATOR = Identity(bytes([9]) * 32)
 

@@ -6,8 +6,8 @@ import sys
 
 from twisted.trial.unittest import SynchronousTestCase
 
+from middleware.consensus.deployed import BEHAVIOUR, STRATEGY
 from middleware.consensus.strategy import Report
-from middleware.deployed import BEHAVIOUR, STRATEGY
 from middleware.deployment.manifest import pushed
 from middleware.deployment.module import loaded
 from middleware.errors import Undeployable
@@ -15,7 +15,7 @@ from middleware.errors import Undeployable
 GOOD = """
 from __future__ import annotations
 from dataclasses import dataclass
-from middleware.consensus.nearest import Nearest
+from middleware.consensus.strategies.nearest import Nearest
 
 @dataclass
 class Weight:
@@ -34,7 +34,9 @@ class Behaviour:
     def hold(self, now): return {}
     def execute(self, now): raise RuntimeError("dizzy")
 """
-BASE = "from middleware.consensus.nearest import Nearest\nfrom middleware.consensus.strategy import Consensus\n"
+BASE = (
+    "from middleware.consensus.strategies.nearest import Nearest\nfrom middleware.consensus.strategy import Consensus\n"
+)
 
 
 class ModuleTests(SynchronousTestCase):

@@ -8,9 +8,9 @@ from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
+from middleware.consensus.deployed import BEHAVIOUR, STRATEGY
 from middleware.consensus.guard import STRIKES, Lost, NoOpinion
 from middleware.consensus.strategy import Report
-from middleware.deployed import BEHAVIOUR, STRATEGY
 from middleware.deployment import frame
 from middleware.deployment.channel import Gone
 from middleware.deployment.manifest import pushed
@@ -18,7 +18,7 @@ from middleware.deployment.runner import MAX_PENDING, PATIENCE_S, START_S, TRANS
 from middleware.errors import UnknownTask
 from swarmnode.sandbox import simulated
 
-NEAREST = b"from middleware.consensus.nearest import Nearest as Strategy\n"
+NEAREST = b"from middleware.consensus.strategies.nearest import Nearest as Strategy\n"
 ONE = [0, "find", []]
 
 

@@ -7,10 +7,10 @@ from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
+from middleware.directory.presence import EXECUTING, SEARCHING, Device
 from middleware.errors import BadFault
 from middleware.faults.kinds import KINDS, Fault, begins_in, parse_fault
 from middleware.faults.takeover import WATCHED_S, Takeover, acting
-from middleware.presence import EXECUTING, SEARCHING, Device
 
 
 class FaultTests(SynchronousTestCase):

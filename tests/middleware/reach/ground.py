@@ -9,9 +9,9 @@ from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.clock import HeapClock
+from middleware.entangled.contact import Contact
 from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.identity import Identity
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.nat import Nat, NatKind
 from middleware.entangled.network.network import Address
 from middleware.entangled.network.switchboard import Switchboard, SwitchboardNetwork, Weather

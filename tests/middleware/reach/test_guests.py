@@ -5,9 +5,9 @@ from __future__ import annotations
 import random
 from typing import Any
 
+from middleware.entangled.contact import Contact, unpacked
 from middleware.entangled.errors import Refused
 from middleware.entangled.identity import Identity
-from middleware.entangled.kademlia.contact import Contact, unpacked
 from middleware.entangled.network.network import Address, relayed
 from middleware.entangled.network.switchboard import Weather
 from middleware.entangled.reach.allowance import MEETS, MEETS_AT_ONCE

@@ -8,8 +8,8 @@ from collections import Counter
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.clock import HeapClock
+from middleware.entangled.contact import Contact
 from middleware.entangled.identity import Identity
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import MAX_CARRIED, MAX_DATAGRAM, Address, relayed
 from middleware.entangled.reach.relay import (
     CARRIED,

@@ -8,8 +8,8 @@ from collections import Counter
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.clock import HeapClock
+from middleware.entangled.contact import Contact
 from middleware.entangled.identity import Identity
-from middleware.entangled.kademlia.contact import Contact
 from middleware.entangled.network.network import relayed
 from middleware.entangled.network.switchboard import Switchboard
 from middleware.entangled.reach.upgrade import GIVEN_UP_S, PAUSES, TURN, Upgrades

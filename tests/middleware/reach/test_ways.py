@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 from typing import Any
 
-from middleware.entangled.kademlia.contact import Contact
+from middleware.entangled.contact import Contact
 from middleware.entangled.network.network import Address, relayed
 from middleware.entangled.network.switchboard import Weather
 from middleware.entangled.node import EntangledNode

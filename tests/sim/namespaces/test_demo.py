@@ -7,7 +7,7 @@ from pathlib import Path
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.settings import Settings
+from middleware.config.settings import Settings
 from sim.demo.cast import CASTS, LOOPBACK
 from sim.demo.configuration import DOGS, JUDGE, Place
 from sim.namespaces.demo import HOSTS, NODE_PORT, SITES, planned

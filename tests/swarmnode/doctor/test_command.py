@@ -13,8 +13,8 @@ from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
+from middleware.config.settings import Settings
 from middleware.entangled.control.place import ENDING, FOLDER
-from middleware.settings import Settings
 from swarmnode.doctor.command import main
 from swarmnode.doctor.facts import Facts, Health
 from tests.swarmnode.doctor.test_diagnosis import WELL

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from twisted.trial.unittest import SynchronousTestCase
 
-from middleware.settings import Settings
+from middleware.config.settings import Settings
 from swarmnode.doctor.measure import measured
 
 

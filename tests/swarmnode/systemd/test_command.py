@@ -13,7 +13,7 @@ from pathlib import Path
 
 from twisted.trial.unittest import SkipTest, SynchronousTestCase
 
-from middleware.settings import Settings
+from middleware.config.settings import Settings
 from swarmnode.systemd.command import main
 from swarmnode.systemd.unit import Unit, unit_for
 

@@ -1,0 +1,1 @@
+"""The built-in strategies, loaded by name (``consensus.strategy.BUILT_IN``)."""

@@ -1,0 +1,179 @@
+"""Survey: what a node answers when it is asked what it stores, whom it knows, and how well it reaches them.
+
+But for the ways to its peers nothing is measured for the answer: it is what the node has seen anyway.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from typing import Any
+
+from middleware.directory.prefix import is_place
+from middleware.directory.presence import DEVICES
+from middleware.entangled.contact import Contact
+from middleware.entangled.data.store import weight
+from middleware.entangled.identity import node_id
+from middleware.entangled.record import hashed_key
+from middleware.entangled.wire.door import UNPROTECTED
+from middleware.node import SwarmNode
+from middleware.tasks.task import TASKS, group_key, tasks_of
+
+INVENTORY, NETWORK, LINKS = "device.inventory", "device.network", "device.links"
+NEWEST = 16
+"""Records that are listed one by one."""
+MAX_CONTACTS = 64
+"""Contacts that are told, those heard last."""
+MAX_TOLD = 16
+"""Refusals that are told, the newest."""
+MAX_MEMBERS = 256
+ENDING_S = 14 * 86_400.0
+"""Seconds before its end from which a certificate is told to be about to expire."""
+HALT = hashed_key("halt")
+
+
+def answer_survey(node: SwarmNode) -> None:
+    """Have ``node`` answer ``device.inventory``, ``device.network`` and ``device.links``."""
+    node.entangled.endpoint.expose(INVENTORY, lambda peer: inventory(node))
+    node.entangled.endpoint.expose(NETWORK, lambda peer: network(node))
+    node.entangled.endpoint.expose(LINKS, lambda peer: links(node))
+
+
+def inventory(node: SwarmNode) -> dict[str, Any]:
+    """What the store of ``node`` holds: how much of each kind, and its newest records one by one.
+
+    ``newest`` are [kind, name, bytes, lifetime]; ``deleted`` counts the slots that say only that they are empty.
+    """
+    store = node.store
+    kinds = _kinds(node)
+    records = store.records()
+    held = [(kinds.get(record.key, "other"), record) for record in records if not record.is_tombstone]
+    newest = [[kind, record.name, weight(record), record.lifetime] for kind, record in reversed(held[-NEWEST:])]
+    usage = store.usage
+    return {
+        "records": len(held),
+        "deleted": len(records) - len(held),
+        "bytes": usage.bytes,
+        "most_bytes": usage.max_bytes,
+        "kinds": dict(Counter(kind for kind, _ in held)),
+        "newest": newest,
+    }
+
+
+def network(node: SwarmNode) -> dict[str, Any]:
+    """Whom ``node`` knows, how far they are and when they were heard; its traffic; and its newest lookups.
+
+    ``rtt_ms`` is None where nobody was timed yet, ``heard_s`` where nothing was heard.
+    """
+    overlay, endpoint = node.entangled.overlay, node.entangled.endpoint
+    traffic = endpoint.traffic
+
+    def told(contact: Contact) -> dict[str, Any]:
+        round_trip, silence = endpoint.round_trip(contact), overlay.silence(contact)
+        return {
+            "uuid": contact.node_id.hex(),
+            "rtt_ms": None if round_trip is None else round(1000 * round_trip, 2),
+            "heard_s": round(silence, 2) if math.isfinite(silence) else None,
+        }
+
+    contacts = sorted(overlay.contacts(), key=lambda contact: (overlay.silence(contact), contact.node_id))
+    return {
+        "contacts": [told(contact) for contact in contacts[:MAX_CONTACTS]],
+        "known": len(contacts),
+        "sent": traffic.get("sent", 0),
+        "received": traffic.get("received", 0),
+        "lost": sum(endpoint.counters.values()) + traffic.get("unsent", 0),
+        "lookups": [
+            {
+                "key": each.key.hex(),
+                "asked": each.asked,
+                "hops": each.hops,
+                "found": each.found,
+                "ms": _ms(each.seconds),
+            }
+            for each in reversed(overlay.lookups)
+        ],
+    }
+
+
+def links(node: SwarmNode) -> dict[str, Any]:
+    """The ways from ``node`` to its peers, as ``Gauge.links`` gives them, and whom it met lately that was not let in.
+
+    Each refusal has ``who`` (a name of the team, or the beginning of a key, or nothing), ``at``, ``side`` as in
+    ``Rebuff``, ``code``, ``reason``, ``ago`` (seconds since the last time) and ``count``.
+    """
+    now = node.clock.seconds()
+    rebuffs = node.entangled.endpoint.rebuffs.newest(now)[:MAX_TOLD]
+    return {
+        "links": node.gauge.links(),
+        "refusals": [
+            {
+                "who": _named(node, each.who),
+                "at": each.address,
+                "side": each.side,
+                "code": each.code,
+                "reason": each.reason,
+                "ago": round(now - each.last_at, 1),
+                "count": each.count,
+            }
+            for each in rebuffs
+        ],
+    }
+
+
+def team(node: SwarmNode) -> dict[str, Any]:
+    """What team ``node`` is in; moments are unix seconds.
+
+    An ``open`` one says in ``unprotected`` what that does not protect.  A ``closed`` one has a ``name``, a
+    ``fingerprint`` as ``swarm doctor`` shows it, and ``members`` with their roles, until when they are certified and
+    whether bootstrap nodes renew that, those first whose certificates end within ``ENDING_S``; ``me`` is this node.
+    """
+    closed = node.team
+    if closed is None:
+        return {"kind": "open", "unprotected": UNPROTECTED}
+    now, me = node.wall(), closed.door.me
+    found = sorted(closed.members(), key=lambda each: (each.not_after - now >= ENDING_S, each.name))
+    return {
+        "kind": "closed",
+        "name": closed.membership.team,
+        "fingerprint": closed.door.fingerprint.hex(),
+        "me": node.uuid,
+        "until": me.not_after,
+        "is_renewable": me.is_renewable,
+        "is_ending": me.not_after - now < ENDING_S,
+        "known": len(found),
+        "members": [
+            {
+                "uuid": node_id(each.public).hex(),
+                "name": each.name,
+                "roles": list(each.roles),
+                "until": each.not_after,
+                "is_renewable": each.is_renewable,
+                "is_ending": each.not_after - now < ENDING_S,
+            }
+            for each in found[:MAX_MEMBERS]
+        ],
+    }
+
+
+def _named(node: SwarmNode, public: bytes) -> str:
+    member = node.team.door.member(public) if node.team is not None and public else None
+    return public.hex()[:16] if member is None else member.name
+
+
+def _ms(seconds: float) -> float:
+    return round(1000 * seconds, 1)
+
+
+def _kinds(node: SwarmNode) -> dict[bytes, str]:
+    # Imported by the first who is asked: a node that never is is spared the memory.
+    from middleware.consensus.verdict import verdicts_key
+
+    tasks = tasks_of(node.store.get(TASKS))
+    places = {record.key for record in node.store.records() if is_place(record.key, node_id(record.owner))}
+    named = {**dict.fromkeys(places, "devices"), DEVICES: "devices", TASKS: "tasks", HALT: "halt"}
+    return {
+        **named,
+        **{group_key(task): "bids and results" for task in tasks},
+        **{verdicts_key(task): "verdicts" for task in tasks},
+    }

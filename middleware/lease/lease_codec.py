@@ -1,0 +1,155 @@
+"""How leases stand in messages (``lease.*``) and in notes of the store; every decoder is total.
+
+Durations travel, never moments (PaxosLease, arXiv 1209.4187).
+"""
+
+from __future__ import annotations
+
+import zlib
+
+import msgpack
+
+from middleware.entangled.contact import Contact, unpacked
+from middleware.entangled.quorum.ballot import NONE, Ballot, Ceiling, is_number
+from middleware.entangled.quorum.log import Codec, Floor
+from middleware.entangled.quorum.register import Kind, Register, Reply
+
+MAX_COUNCIL = 7
+MAX_PROOF_BYTES = 2**16
+_BUCKETS = 64
+LIFE = 2**20
+"""The lowest digits of a counter are drawn anew in each life of an agent."""
+AHEAD = 0.2
+"""Share of a ttl before the end of a lease from which on its successor is promised."""
+
+
+def pack_reply(reply: Reply) -> list[object]:
+    """The reply as it stands in a message; most have no proof."""
+    is_sealed = reply.kind is Kind.SEALED
+    ballot, members = (reply.accepted, reply.value) if is_sealed else (reply.promised, ())
+    proof = [reply.proof] if reply.proof else []
+    return [reply.kind.value, *ballot, reply.token, reply.remaining, reply.configuration, pack_members(members), *proof]
+
+
+def unpack_reply(answer: object) -> Reply | None:
+    """The reply that ``pack_reply`` made, or None where the answer cannot be one; never raises."""
+    if not isinstance(answer, list) or not 7 <= len(answer) <= 8:
+        return None
+    name, counter, agent, token, remaining, configuration, packed = answer[:7]
+    proof = answer[7] if len(answer) > 7 else b""
+    kind = next((kind for kind in Kind if kind.value == name), None)
+    members = members_of(packed)
+    lawful = (
+        all(map(is_number, (counter, token, configuration)))
+        and isinstance(agent, str)
+        and isinstance(remaining, float)
+        and isinstance(proof, bytes)
+    )
+    if not lawful or kind is None or members is None:
+        return None
+    # What cannot be a duration counts as none.
+    remaining = remaining if remaining > 0.0 else 0.0
+    ballot = Ballot(counter, agent)
+    accepted, value = (ballot, members) if kind is Kind.SEALED else (NONE, None)
+    return Reply(kind, ballot, token, remaining, configuration, accepted, value, proof)
+
+
+def pack_members(members: tuple[Contact, ...]) -> list[list[object]]:
+    """The members of a council as they stand in a message."""
+    return [member.packed() for member in members]
+
+
+def members_of(packed: object) -> tuple[Contact, ...] | None:
+    """The members that ``pack_members`` packed, or None where these cannot be some."""
+    if not isinstance(packed, list) or len(packed) > MAX_COUNCIL:
+        return None
+    members = tuple(contact for fields in packed if (contact := unpacked(fields)) is not None)
+    return members if len(members) == len(packed) == len({member.public for member in members}) else None
+
+
+def _bucket_of(key: str) -> str:
+    return f"lease/{zlib.crc32(key.encode()) % _BUCKETS}"
+
+
+def _pack(registers: dict[str, Register]) -> bytes:
+    return bytes(msgpack.packb({task_id: _pack_row(register) for task_id, register in registers.items()}))
+
+
+def _unpack(noted: bytes) -> tuple[dict[str, Register], bool]:
+    rows = unpack_note(noted)
+    if not isinstance(rows, dict):
+        return {}, False
+    read = {task_id: unpack_row(row) for task_id, row in rows.items()}
+    good = {task_id: each for task_id, each in read.items() if each is not None and isinstance(task_id, str)}
+    return good, len(good) == len(rows)
+
+
+def _pack_floor(floor: Floor) -> bytes:
+    return bytes(msgpack.packb([floor.counter, floor.longest, floor.token]))
+
+
+def _unpack_floor(noted: bytes | None) -> Floor | None:
+    state = unpack_note(noted or b"")
+    if isinstance(state, list) and len(state) == 2:
+        state = [*state, state[0]]  # of a version that had one floor for both
+    if not isinstance(state, list) or len(state) != 3:
+        return None
+    counter, longest, token = state
+    is_lawful = isinstance(longest, float) and is_number(counter) and is_number(token)
+    return Floor(counter, token, longest) if is_lawful else None
+
+
+def unpack_row(row: object) -> Register | None:
+    """The register of one task as it stands in a note, or None where the row cannot be one; never raises."""
+    if not isinstance(row, list) or not 6 <= len(row) <= 8:
+        return None
+    configuration, ballots, token, ttl, packed, is_over = row[:6]
+    proof = row[6] if len(row) > 6 else b""  # the version before kept none
+    if not isinstance(ballots, list) or len(ballots) != 8:
+        return None
+    grantee = row[7] if len(row) > 7 else ballots[3]  # the versions before knew that of a lease not given back
+    members = members_of(packed)
+    lawful = (
+        all(map(is_number, (configuration, token, *ballots[::2])))
+        and all(isinstance(agent, str) for agent in (*ballots[1::2], grantee))
+        and isinstance(ttl, float)
+        and isinstance(is_over, bool)
+        and isinstance(proof, bytes)
+        and len(proof) <= MAX_PROOF_BYTES
+    )
+    if not lawful or members is None:
+        return None
+    promised, holder, spent, accepted = (Ballot(ballots[n], ballots[n + 1]) for n in range(0, 8, 2))
+    return Register(
+        Ceiling(0.0, LIFE), configuration, promised, holder, spent, accepted, token, grantee, ttl,
+        value=members, is_over=is_over, proof=proof,
+    )  # fmt: skip
+
+
+def unpack_note(noted: bytes) -> object:
+    """What msgpack makes of bytes, or None."""
+    try:
+        return msgpack.unpackb(noted, strict_map_key=True, max_ext_len=0)
+    except Exception:  # the decoder raises many kinds on rotten or crafted bytes
+        return None
+
+
+def _pack_row(register: Register) -> list[object]:
+    ballots = [*register.promised, *register.holder, *register.spent, *register.accepted]
+    members, grantee = pack_members(register.value or ()), register.grantee
+    token, ttl = register.token, register.ttl
+    return [register.configuration, ballots, token, ttl, members, register.is_over, register.proof, grantee]
+
+
+CODEC: Codec[str] = Codec(
+    "lease/state",
+    "lease/{}",
+    _BUCKETS,
+    "",
+    LIFE,
+    _bucket_of,
+    _pack,
+    _unpack,
+    _pack_floor,
+    _unpack_floor,
+)

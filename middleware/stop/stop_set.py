@@ -1,0 +1,192 @@
+"""StopSet: the stops that a node knows, and the releases that ended some of them.  Pure.
+
+A stop has a random id, and a release names the ids of the stops that it ends.  The team is stopped while any stop is
+not released.  Stops and releases are merged as in a two-phase set: in whatever order they arrive, and however often,
+the result is the same, and a released stop does not come back.  No stop outranks another one, so there is no number by
+which a sender could disable later stops.
+
+Each sender has places of its own, so no sender can displace the stop of another one.  Where a table is full the node
+stands for longer, never for less: the two oldest stops of a sender are joined to one under an id of its own, which has
+to be released; of the releases the oldest is forgotten, and its stop may have to be released again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import msgpack
+
+from middleware.entangled.value import is_whole
+
+ID_BYTES = 16
+MAX_NAMED = 8
+"""Stops that one statement names."""
+MAX_OF_SENDER = 16
+"""Stops of one sender that are kept apart."""
+MAX_SENDERS = 64
+"""Senders whose stops are kept apart; further ones share the places of one."""
+MAX_RELEASED = 512
+"""Releases that are remembered, and stops that one release may name."""
+MAX_BY = 64
+"""Characters in the name of the operator."""
+BY_BYTES = 48
+"""Bytes of that name in what a node sends: eight stops fit into a record that every device holds."""
+_SHARED = b""
+"""The sender under which the stops of senders beyond ``MAX_SENDERS`` are kept."""
+
+
+@dataclass(frozen=True)
+class Statement:
+    """The orders of one sender: its stops (id to operator) that are in force, and the stops that it released.
+
+    ``by`` is the operator who gave the newest order.
+    """
+
+    stops: Mapping[bytes, str]
+    released: tuple[bytes, ...] = ()
+    by: str = ""
+
+    def packed(self) -> list[object]:
+        """The arguments of ``device.halt``, and the value of the record."""
+        return [[[stop, by] for stop, by in self.stops.items()], list(self.released), self.by]
+
+
+class StopSet:
+    """The stops by sender (a public key), and the ids of released ones; the newest are last."""
+
+    def __init__(self) -> None:
+        self._stops: dict[bytes, dict[bytes, str]] = {}
+        self._released: dict[bytes, None] = {}
+
+    @property
+    def in_force(self) -> dict[bytes, str]:
+        """The stops that are not released, id to operator; the team goes on where there are none."""
+        return {stop: by for stops in self._stops.values() for stop, by in stops.items()}
+
+    def of(self, sender: bytes) -> dict[bytes, str]:
+        """The stops of ``sender`` that are in force, the newest last."""
+        return dict(self._stops.get(sender, {}))
+
+    def merge(self, sender: bytes, statement: Statement, may_release: bool = True) -> bool:
+        """Merge what ``sender`` orders, its releases only where it ``may_release``; whether anything is new."""
+        is_new = False
+        for stop in statement.released if may_release else ():
+            is_new |= self._release(stop)
+        for stop, by in statement.stops.items():
+            if stop not in self._released:
+                is_new |= self._add(sender, stop, by)
+        return is_new
+
+    def packed(self) -> list[object]:
+        """What ``unpacked`` reads."""
+        stops = [[sender, [[stop, by] for stop, by in stops.items()]] for sender, stops in self._stops.items()]
+        return [stops, list(self._released)]
+
+    def _release(self, stop: bytes) -> bool:
+        if stop in self._released:
+            return False
+        self._released[stop] = None
+        if len(self._released) > MAX_RELEASED:
+            del self._released[next(iter(self._released))]
+        for stops in self._stops.values():
+            stops.pop(stop, None)
+        self._stops = {sender: stops for sender, stops in self._stops.items() if stops}
+        return True
+
+    def _add(self, sender: bytes, stop: bytes, by: str) -> bool:
+        if sender not in self._stops and len(self._stops) >= MAX_SENDERS:
+            sender = _SHARED
+        stops = self._stops.setdefault(sender, {})
+        if stop in stops:
+            return False
+        stops[stop] = by
+        if len(stops) > MAX_OF_SENDER:
+            (first, _), (second, by) = list(stops.items())[:2]
+            rest = {each: by for each, by in stops.items() if each not in (first, second)}
+            self._stops[sender] = {derived_id(first, second): by, **rest}
+        return True
+
+
+def derived_id(*parts: bytes) -> bytes:
+    """The id of a stop that has none of its own."""
+    return hashlib.blake2s(b"".join(parts), digest_size=ID_BYTES, person=b"stop").digest()
+
+
+def clipped(by: str) -> str:
+    """The name of an operator in at most ``BY_BYTES`` bytes."""
+    return by.encode(errors="ignore")[:BY_BYTES].decode(errors="ignore")
+
+
+def statement_of(fields: object) -> Statement | None:
+    """The statement that ``packed`` made, or None where the fields cannot be one."""
+    if not isinstance(fields, list) or len(fields) != 3:
+        return None
+    stops, released, by = fields
+    found = _stops_of(stops, MAX_NAMED)
+    if found is None or not _are_ids(released) or not _is_name(by):
+        return None
+    return Statement(found, tuple(released), by)
+
+
+def statement_in(owner: bytes, value: bytes | None) -> Statement | None:
+    """The statement in a record of ``owner``, or None where there is none; never raises.
+
+    An earlier version wrote ``[number, is on, by]``.  Where that is on it counts as a stop, which a release has to
+    name; where it is off it names no stop, and ends none.
+    """
+    try:
+        fields: Any = msgpack.unpackb(value or b"")
+    except Exception:  # the decoder raises many kinds on crafted bytes
+        return None
+    if (
+        isinstance(fields, list)
+        and len(fields) == 3
+        and fields[1] is True
+        and is_whole(fields[0])
+        and _is_name(fields[2])
+    ):
+        by = clipped(fields[2])
+        return Statement({derived_id(owner, value or b""): by}, (), by)
+    return statement_of(fields)
+
+
+def unpacked(fields: object) -> StopSet:
+    """The set that ``packed`` made; raises ``ValueError`` where the fields cannot be one."""
+    stops, released = fields if isinstance(fields, list) and len(fields) == 2 else (None, None)
+    found = StopSet()
+    if not isinstance(stops, list) or len(stops) > MAX_SENDERS + 1 or not _are_ids(released):
+        raise ValueError("not a set of stops")
+    for entry in stops:
+        sender, listed = entry if isinstance(entry, list) and len(entry) == 2 else (None, None)
+        of_sender = _stops_of(listed, MAX_OF_SENDER)
+        if not isinstance(sender, bytes) or not of_sender:
+            raise ValueError("not the stops of a sender")
+        found._stops[sender] = of_sender
+    found._released = dict.fromkeys(released or ())
+    return found
+
+
+def are_ids(values: Iterable[object]) -> bool:
+    """Whether each of ``values`` is the id of a stop."""
+    return all(isinstance(value, bytes) and len(value) == ID_BYTES for value in values)
+
+
+def _are_ids(values: object) -> bool:
+    return isinstance(values, list) and len(values) <= MAX_RELEASED and are_ids(values)
+
+
+def _is_name(by: object) -> bool:
+    return isinstance(by, str) and len(by) <= MAX_BY
+
+
+def _stops_of(listed: object, most: int) -> dict[bytes, str] | None:
+    if not isinstance(listed, list) or len(listed) > most:
+        return None
+    pairs: list[Any] = [pair for pair in listed if isinstance(pair, list) and len(pair) == 2 and are_ids(pair[:1])]
+    if len(pairs) < len(listed) or not all(_is_name(by) for _, by in pairs):
+        return None
+    found: dict[bytes, str] = dict(pairs)
+    return found

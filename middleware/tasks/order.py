@@ -1,0 +1,44 @@
+"""Order: what an operator wants of a task that is under way; a slot of its own under the task's group key."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, fields
+
+import msgpack
+
+from middleware.entangled.record import Record
+from middleware.entangled.value import bounded, is_number, mapping_of
+from middleware.tasks.task import ORDER
+
+PAUSE, RESUME = "PAUSE", "RESUME"
+WORDS = (PAUSE, RESUME)
+
+
+@dataclass(frozen=True)
+class Order:
+    """One wish, a word of ``WORDS``; of several the newest holds, by ``at`` in unix seconds of whoever wrote it."""
+
+    word: str
+    by: str
+    at: float
+
+    def packed(self) -> bytes:
+        """The value of the order's record."""
+        return bounded(bytes(msgpack.packb(asdict(self))))
+
+
+def order_of(records: list[Record]) -> Order | None:
+    """The newest order to a group, or None where there was none; every node that holds the same names the same."""
+    orders = [order for record in records if (order := _order_in(record)) is not None]
+    return max(orders, key=lambda order: (order.at, order.word, order.by), default=None)
+
+
+def _order_in(record: Record) -> Order | None:
+    content = mapping_of(record)
+    if record.name != ORDER or content is None:
+        return None
+    try:
+        order = Order(**{f.name: content[f.name] for f in fields(Order) if f.name in content})
+    except TypeError:
+        return None
+    return order if order.word in WORDS and isinstance(order.by, str) and is_number(order.at) else None

@@ -1,0 +1,34 @@
+"""Tests of ``formats.head``."""
+
+from __future__ import annotations
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from formats.head import MAX_HEAD, head, taken
+
+
+class HeadTests(SynchronousTestCase):
+    def test_one_is_made_and_read(self) -> None:
+        """The first line and the fields come back, whatever the case of their names and the blanks around them."""
+        buffer = bytearray(head("GET / HTTP/1.1", "Host: h:1", "uPgrade:  x , y  ") + b"rest")
+        found = taken(buffer)
+        assert found is not None
+        self.assertEqual(found.first, b"GET / HTTP/1.1")
+        self.assertEqual(found.fields, {b"host": b"h:1", b"upgrade": b"x , y"})
+        self.assertEqual(bytes(buffer), b"rest")
+
+    def test_the_end_is_waited_for(self) -> None:
+        """Nothing is taken before the end is there, nor where it comes later than it may."""
+        whole = head("HTTP/1.1 200 OK", "Server: x")
+        for length in range(len(whole)):
+            self.assertIsNone(taken(bytearray(whole[:length])))
+        longest = b"x" * (MAX_HEAD - 4) + b"\r\n\r\n"
+        self.assertIsNotNone(taken(bytearray(longest)))
+        self.assertIsNone(taken(bytearray(b"x" + longest)))
+
+    def test_said_for_people(self) -> None:
+        """The beginning of the first line is text, though it were none, and an empty line is one as well."""
+        for bare, said in ((b"SSH-2.0-box", "SSH-2.0-box"), (b"", ""), (b"\xff" + b"x" * 99, "\ufffd" + "x" * 59)):
+            found = taken(bytearray(bare + b"\r\n\r\n"))
+            assert found is not None
+            self.assertEqual((found.said, found.fields), (said, {}))

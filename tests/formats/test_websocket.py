@@ -1,0 +1,134 @@
+"""Tests of ``formats.websocket``: the limits around ``wsproto``."""
+
+from __future__ import annotations
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from twisted.trial.unittest import SynchronousTestCase
+from wsproto.events import AcceptConnection, RejectConnection, Request
+
+from formats.head import MAX_HEAD
+from formats.websocket import MAX_FRAMES, End
+from tests.formats.rfc6455 import BINARY, CLOSE, CONTINUATION, MASK, PING, PONG, TEXT, answer_to, framed
+
+settings.register_profile("websocket", derandomize=True, database=None, deadline=None, max_examples=80)
+settings.load_profile("websocket")
+
+LONGEST = 1 << 17
+
+
+class Plain(End):
+    """An end that accepts every other one."""
+
+    def __init__(self, is_client: bool = True) -> None:
+        super().__init__(LONGEST, Request("server.example.com", "/chat") if is_client else None)
+
+    def _answer(self, request: Request) -> AcceptConnection | RejectConnection:
+        return AcceptConnection()
+
+    def _fault_of(self, answer: AcceptConnection | RejectConnection | Exception) -> str:
+        return "" if isinstance(answer, AcceptConnection) else "not so"
+
+
+def client() -> Plain:
+    """One that has been greeted."""
+    one = Plain()
+    one.received(answer_to(one.opening()))
+    assert one.is_open
+    return one
+
+
+class GreetingTests(SynchronousTestCase):
+    def test_refused_greetings(self) -> None:
+        """A refused greeting opens no connection and no frame is read after it; a server answers in HTTP."""
+        for old, new in ((b"101 Switching", b"200 OK"), (b"Accept: ", b"Accept: x"), (b"e: websocket", b"e: h2c")):
+            one = Plain()
+            answer = answer_to(one.opening())
+            self.assertEqual(one.received(answer.replace(old, new) + framed(TEXT, b"x", None)), ([], b""))
+            self.assertEqual((one.is_open, one.fault, one.received(answer)), (False, "not so", ([], b"")))
+        for request in (b"GET / HTTP/1.1\r\nHost: h\r\n\r\n", b"GET / HTTP/1.1\r\nHost: \xff\r\n\r\n", b"SSH\r\n\r\n"):
+            server = Plain(is_client=False)
+            self.assertTrue(server.received(request)[1].startswith(b"HTTP/1.1 400"), request)
+            self.assertTrue(server.fault and not server.is_open)
+
+    def test_endless_greetings(self) -> None:
+        """An end that never finishes its greeting is not listened to for ever."""
+        one = Plain(is_client=False)
+        one.received(b"GET /" + b"x" * (MAX_HEAD - 6))
+        self.assertEqual(one.fault, "")
+        one.received(b"x")
+        self.assertIn("no end", one.fault)
+
+
+class FrameTests(SynchronousTestCase):
+    def test_joins_fragments(self) -> None:
+        """The two fragments of the RFC are one Hello, and a ping between them is answered."""
+        one = client()
+        said = bytes.fromhex("010348656c") + bytes.fromhex("890548656c6c6f") + bytes.fromhex("80026c6f")
+        messages, reply = one.received(said)
+        self.assertEqual((messages, reply[0] & 0x0F), ([b"Hello"], PONG))
+        self.assertEqual(one.received(bytes.fromhex("0100") + bytes.fromhex("800161"))[0], [b"a"])
+        self.assertEqual(one.received(framed(PONG, b"", None)), ([], b""))
+        self.assertEqual((one.fault, one.frames), ("", 6))
+
+    def test_answers_a_close(self) -> None:
+        """A close is answered once, and nothing is heard or sent after it."""
+        one = client()
+        messages, reply = one.received(framed(CLOSE, b"\x03\xe8bye", None) + framed(TEXT, b"x", None))
+        self.assertEqual((messages, reply[0] & 0x0F), ([], CLOSE))
+        self.assertIn("goodbye", one.fault)
+        self.assertEqual((one.closing(), one.ping(), one.text(b"x")), (b"", b"", b""))
+
+    def test_refuses_what_the_rfc_forbids(self) -> None:
+        """Masks from a server, extensions, unknown opcodes, strange fragments and too much are faults."""
+        part = b"\x7f" + (LONGEST // 2 + 1).to_bytes(8, "big") + bytes(LONGEST // 2 + 1)
+        for said in (
+            framed(TEXT, b"x", MASK),
+            b"\xc1\x01x",
+            b"\x83\x00",
+            b"\x80\x01x",
+            b"\x01\x01x\x81\x01x",
+            b"\x09\x00",
+            b"\x89\x7e\x00\x80",
+            b"\x82\x7f" + (2**62).to_bytes(8, "big") + bytes(LONGEST + 1),
+            b"\x82\x7f" + b"\xff" * 8,
+            bytes([BINARY]) + part + bytes([0x80 | CONTINUATION]) + part,
+        ):
+            one = client()
+            messages, reply = one.received(said)
+            self.assertEqual((messages, reply[0] & 0x0F), ([], CLOSE), said[:20])
+            self.assertTrue(one.fault)
+            self.assertEqual(one.received(framed(TEXT, b"x", None)), ([], b""))
+
+    def test_counts_frames(self) -> None:
+        """So many frames in one read, and no more; the next read may have as many."""
+        one = client()
+        for _ in range(2):
+            self.assertEqual(len(one.received(framed(TEXT, b"", None) * MAX_FRAMES)[0]), MAX_FRAMES)
+        one.received(framed(PING, b"", None) * (MAX_FRAMES + 1))
+        self.assertIn("frames", one.fault)
+
+    @given(st.lists(st.binary(max_size=200), max_size=4))
+    def test_both_ends_understand_each_other_cut_anyhow(self, said: list[bytes]) -> None:
+        """What one end says the other hears, though each byte arrives alone."""
+        near, far = Plain(), Plain(is_client=False)
+        heard: list[bytes] = []
+        for place in near.opening():
+            near.received(far.received(bytes([place]))[1])
+        self.assertTrue(near.is_open)
+        for payload in said:
+            for place in near.framed(payload):
+                heard += far.received(bytes([place]))[0]
+            for place in far.framed(payload):
+                heard += near.received(bytes([place]))[0]
+        self.assertEqual(heard, [payload for payload in said for _ in "ab"])
+        self.assertEqual((near.fault, far.fault), ("", ""))
+
+    @given(st.lists(st.binary(max_size=40), max_size=6))
+    def test_any_bytes(self, pieces: list[bytes]) -> None:
+        """Whatever arrives is messages or a fault, and nothing is raised."""
+        for one in (client(), Plain(), Plain(is_client=False)):
+            one.opening()
+            for piece in pieces:
+                one.received(piece)
+                one.received(b"\r\n\r\n")

@@ -1,0 +1,221 @@
+"""Tests of ``admission.roles``: the table has everything that a node exposes and writes, and a team can live by it."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.admission import roles
+from middleware.admission.roles import (
+    BOOTSTRAP,
+    DEVICE,
+    GATEWAY,
+    KINDS,
+    METHODS,
+    OPERATOR,
+    OTHER,
+    ROLES,
+    VIEWER,
+    kind_of,
+    may_call,
+    may_store,
+)
+from middleware.config.settings import Settings
+from middleware.consensus import verdict
+from middleware.deployment.manifest import manifests_key
+from middleware.directory import presence
+from middleware.directory.prefix import places_of
+from middleware.entangled.identity import Identity
+from middleware.entangled.record import Slot, hashed_key
+from middleware.entangled.wire.door import Authority, Life, OpenDoor
+from middleware.node import SwarmNode
+from middleware.stop import halt
+from middleware.tasks import task as tasks
+from sim.demo.trials import trial
+from swarmnode import assembly, deploy
+from swarmnode.rehearsal import VirtualTeam
+from tests.swarmnode.team import KEY, World
+from webnode import revocation
+
+ABSENT = ("roll.", "reach.")
+"""What the methods begin with that not every node has."""
+
+
+class RoleDoor(OpenDoor):
+    """Lets everybody in; ``roles`` by public key say what each may, and ``refusals`` has what was not allowed."""
+
+    room = 0
+    shown = b""
+    life = Life()
+    fingerprint = bytes(8)
+
+    def __init__(self, known: dict[bytes, tuple[str, ...]], refusals: list[tuple[tuple[str, ...], str]]) -> None:
+        self._known = known
+        self._refusals = refusals
+
+    def judge(self, public: bytes, shown: bytes) -> str:
+        """Everybody is in."""
+        return ""
+
+    def may(self, public: bytes, method: str) -> bool:
+        """By the table."""
+        return self._noted(may_call(self._known[public], method), public, method)
+
+    def may_store(self, slot: Slot) -> bool:
+        """By the table."""
+        return self._noted(may_store(self._known[slot.owner], slot), slot.owner, kind_of(slot))
+
+    def may_stay(self, slot: Slot) -> bool:
+        """What may be written."""
+        return may_store(self._known[slot.owner], slot)
+
+    def authority(self, owner: bytes) -> Authority:
+        """By what the test says."""
+        return Authority("", self._known[owner])
+
+    def certificate(self, owner: bytes) -> bytes:
+        """Nobody has one."""
+        return b""
+
+    def learn(self, owner: bytes, certificate: bytes) -> bool:
+        """Nobody needs one."""
+        return False
+
+    def _noted(self, is_allowed: bool, public: bytes, what: str) -> bool:
+        if not is_allowed:
+            self._refusals.append((self._known[public], what))
+        return is_allowed
+
+
+def slot(key: bytes, name: str = "x") -> Slot:
+    """A slot of somebody."""
+    return Slot(key, Identity(bytes(32)).public, name)
+
+
+class TableTests(SynchronousTestCase):
+    """What is in the table."""
+
+    def exposed(self) -> set[str]:
+        """The methods of a real node that has a robot, an agent, and allows all that can be allowed."""
+        tables: dict[str, Any] = {
+            "node": {"name": "a", "team_key": KEY},
+            "driver": {"kind": "sim"},
+            "agent": {"module": "search"},
+            "faults": {"allow": True},
+            "deployment": {"allow": True},
+        }
+        made = assembly.assembled(Settings.from_mapping(tables, "test"), World().seams("a", 7000))
+        node = made.node
+        _ = node.entangled.seat, node.councils, node.dissemination
+        return set(node.entangled.endpoint._answerer.methods)
+
+    def test_every_method_has_an_entry(self) -> None:
+        """A method that a node exposes and nobody put into the table fails here, and so does one that is gone."""
+        exposed = self.exposed()
+        self.assertGreater(len(exposed), 40)
+        self.assertEqual(sorted(exposed - set(METHODS)), [])
+        self.assertEqual(sorted(name for name in set(METHODS) - exposed if not name.startswith(ABSENT)), [])
+
+    def test_roles_are_known(self) -> None:
+        """Every entry names roles that there are, and at least one."""
+        for allowed in (*METHODS.values(), *KINDS.values(), roles.OTHER_METHODS):
+            self.assertTrue(allowed)
+            self.assertLessEqual(allowed, set(ROLES))
+
+    def test_kinds_by_key(self) -> None:
+        """The keys that the middleware and the page write under are those of the table, whatever the slot is called."""
+        keys = {
+            presence.DEVICES: roles.PRESENCE,
+            tasks.TASKS: roles.TASKS,
+            halt.HALT: roles.HALT,
+            manifests_key(): roles.DEPLOYMENTS,
+            revocation.REVOKED: roles.SIGNED_OUT,
+        }
+        for key, kind in keys.items():
+            for name in ("x", "order", "member"):
+                self.assertEqual(kind_of(slot(key, name)), kind)
+
+    def test_presence_in_a_large_team(self) -> None:
+        """A viewer announces itself at its own places of the directory, and writes nowhere else there."""
+        own, other = Identity(bytes(32)), Identity(b"1" * 32)
+        for depth in range(presence.MAX_DEPTH + 1):
+            for key in places_of(own.node_id, depth):
+                self.assertTrue(may_store([VIEWER], Slot(key, own.public, "phone")))
+        strange = [key for key in places_of(other.node_id, 9) if key not in places_of(own.node_id, 9)]
+        self.assertEqual([may_store([VIEWER], Slot(key, own.public, "phone")) for key in strange], [False] * 2)
+
+    def test_kinds_by_name(self) -> None:
+        """The slots of tasks and modules are known by their names, all others are of no kind."""
+        key = tasks.group_key("t")
+        names = {
+            tasks.MEMBER: roles.MEMBER,
+            tasks.RESULT: roles.RESULT,
+            tasks.ORDER: roles.ORDER,
+            tasks.COUNCIL: roles.COUNCIL,
+            tasks.DONE: roles.ENDED,
+            verdict.slot_of(7): roles.VERDICT,
+            deploy.SOURCE: roles.SOURCE,
+            "0": OTHER,
+            "orders": OTHER,
+            "": OTHER,
+        }
+        self.assertEqual({name: kind_of(slot(key, name)) for name in names}, names)
+
+    def test_a_viewer_changes_nothing(self) -> None:
+        """A viewer is present, reads and asks, and can neither act, order, bid nor write anything else."""
+        writes = {kind for kind, allowed in KINDS.items() if VIEWER in allowed}
+        self.assertEqual(writes, {roles.PRESENCE})
+        for method in ("find_value", "watch", "device.settings", "device.inventory", "stream.open"):
+            self.assertTrue(may_call((VIEWER,), method))
+        for method in ("device.halt", "device.tune", "device.message", "lease.propose", "decree.claim", "made.up"):
+            self.assertFalse(may_call((VIEWER,), method), method)
+
+    def test_who_orders_and_who_acts(self) -> None:
+        """Operators and gateways order, devices and gateways act, and no bootstrap does either by that alone."""
+        for method in ("device.halt", "device.tune", "device.message", "device.disconnect", "device.fault"):
+            self.assertEqual([role for role in ROLES if may_call((role,), method)], [OPERATOR, GATEWAY])
+        self.assertEqual([role for role in ROLES if may_call((role,), "lease.propose")], [DEVICE, GATEWAY])
+        self.assertEqual([role for role in ROLES if may_call((role,), "lease.close")], [DEVICE, GATEWAY])
+        self.assertEqual([role for role in ROLES if may_call((role,), "lease.cancel")], [OPERATOR, GATEWAY])
+        for written in (slot(tasks.TASKS), slot(tasks.group_key("t"), tasks.RESULT)):
+            self.assertEqual([role for role in ROLES if may_store((role,), written)], [OPERATOR, GATEWAY])
+        self.assertEqual([role for role in ROLES if may_store((role,), slot(halt.HALT))], [OPERATOR, GATEWAY])
+        self.assertTrue(may_store((BOOTSTRAP,), slot(hashed_key("tuples/admission/2"))))
+
+    def test_several_roles_add_up(self) -> None:
+        """A member with two roles may do what either may; one without any may nothing."""
+        self.assertTrue(may_call((VIEWER, OPERATOR), "device.halt"))
+        self.assertFalse(may_call((), "ping"))
+        self.assertFalse(may_store((), slot(presence.DEVICES)))
+
+
+class TeamTests(SynchronousTestCase):
+    """A team that lives by the table."""
+
+    def test_the_experiments_by_roles(self) -> None:
+        """With a gateway, dogs as devices and somebody who looks on, both experiments pass, and nobody is refused."""
+        plain: Any = SwarmNode
+        for experiment in (1, 2):
+            known: dict[bytes, tuple[str, ...]] = {}
+            refusals: list[tuple[tuple[str, ...], str]] = []
+
+            def made(
+                device: Any,
+                identity: Identity,
+                *rest: Any,
+                known: Any = known,
+                refusals: Any = refusals,
+                **more: Any,
+            ) -> Any:
+                role = {"vaio": GATEWAY, "looker": VIEWER}.get(device.name, DEVICE)
+                known[identity.public] = (role,)
+                return plain(device, identity, *rest, **{**more, "door": RoleDoor(known, refusals)})
+
+            self.patch(assembly, "SwarmNode", made)
+            outcome = trial(partial(VirtualTeam, others=("looker",)), experiment, 3)
+            # Whether a viewer may be a member of a council is asked, and it may not.
+            refusals = [refusal for refusal in refusals if refusal != ((VIEWER,), "lease.freed")]
+            self.assertEqual((outcome.broken, refusals), ([], []))
+            self.assertTrue(outcome.found)

@@ -1,0 +1,71 @@
+"""Tests of the strategy of the thesis."""
+
+from __future__ import annotations
+
+import math
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.consensus.strategies.nearest import KEPT, Nearest
+from middleware.consensus.strategy import Consensus, Report, refusal
+
+costs = st.one_of(st.floats(), st.sampled_from([0.0, -0.0, 1.0, 2.0]))
+reports = st.lists(st.builds(Report, st.sampled_from("abcde"), costs), max_size=8)
+
+
+class NearestTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.nearest = Nearest()
+
+    def test_lowest_cost_wins(self) -> None:
+        """The nearest acts, the others stand by in the order of their distances."""
+        found = self.nearest.find([Report("a", 2.0), Report("b", 0.5), Report("c", 1.0)])
+        self.assertEqual((found.assigned_agent, found.standby), ("b", ("c", "a")))
+
+    def test_ties(self) -> None:
+        """Equal costs are decided by the id, so there is never none and never two; 0 and -0 are equal."""
+        self.assertEqual(self.nearest.find([Report("b", 1.0), Report("a", 1.0)]).assigned_agent, "a")
+        self.assertEqual(self.nearest.find([Report("b", -0.0), Report("a", 0.0)]).assigned_agent, "a")
+
+    def test_nobody(self) -> None:
+        """Without any lawful report nobody is assigned."""
+        for contacts in ([], [Report("a", c) for c in (math.nan, math.inf, -math.inf, -1.0)]):
+            self.assertEqual(self.nearest.find(contacts), Consensus(None))
+
+    def test_a_liar_does_not_win(self) -> None:
+        """A distance below zero, infinite or none at all counts as no report."""
+        for lie in (-1.0, math.nan, math.inf, -math.inf):
+            self.assertEqual(self.nearest.find([Report("a", lie), Report("b", 9.0)]).assigned_agent, "b")
+
+    @settings(max_examples=100, deadline=None, derandomize=True, database=None)
+    @given(reports, st.randoms(use_true_random=False))
+    def test_order_and_repetition_do_not_matter(self, contacts: list[Report], rng: object) -> None:
+        """The same reports in any order, some of them twice, give the same consensus point, digest included."""
+        found = self.nearest.find(contacts)
+        mixed = [*contacts, *contacts[:2]]
+        rng.shuffle(mixed)  # type: ignore[attr-defined]
+        self.assertEqual(self.nearest.find(mixed), found)
+        named = [found.assigned_agent, *found.standby] if found.assigned_agent else []
+        lawful = {r.agent for r in contacts if not refusal(r)}
+        self.assertEqual((len(named), len(set(named))), (min(KEPT, len(lawful)),) * 2)
+        self.assertLessEqual(set(named), lawful)
+
+    def test_improves(self) -> None:
+        """Only an offer nearer by more than the share takes over; what is no distance gives way and never wins."""
+        rows = [
+            (1.0, 0.89, True),
+            (1.0, 0.9, False),
+            (1.0, 0.95, False),
+            (1.0, 2.0, False),
+            (0.0, 0.0, False),
+            (math.inf, 1.0, True),
+            (1.0, -5.0, False),
+            (1.0, math.nan, False),
+            (1.0, -math.inf, False),
+            (math.nan, 1.0, True),
+        ]
+        for current, offer, expected in rows:
+            improves = self.nearest.improves(Report("a", current), Report("b", offer), 0.1)
+            self.assertEqual(improves, expected, (current, offer))

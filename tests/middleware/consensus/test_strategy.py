@@ -1,0 +1,118 @@
+"""Tests of how strategies are found."""
+
+from __future__ import annotations
+
+import math
+import sys
+from dataclasses import replace
+from typing import Any
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.consensus.strategies.nearest import Nearest
+from middleware.consensus.strategy import BUILT_IN, Report, better, digest_of, refusal, refused, standing, strategy_for
+from middleware.errors import UnknownStrategy
+
+
+class Broken:
+    """A strategy that cannot even be made."""
+
+    def __init__(self) -> None:
+        raise ZeroDivisionError("broken")
+
+
+class StrategyTests(SynchronousTestCase):
+    def test_built_in(self) -> None:
+        """The thesis' strategy is there by name."""
+        self.assertIsInstance(strategy_for("nearest"), Nearest)
+
+    def test_unknown_names_the_known(self) -> None:
+        """A name that nobody has is answered with those that there are."""
+        error = self.assertRaises(UnknownStrategy, strategy_for, "farthest")
+        self.assertIn("'farthest'", str(error))
+        self.assertIn("nearest", str(error))
+
+    def test_dotted_only_on_demand(self) -> None:
+        """A task that comes from a peer cannot name a module to import; the own settings can."""
+        sys.modules.pop("this", None)
+        self.assertRaises(UnknownStrategy, strategy_for, "this:s")
+        self.assertNotIn("this", sys.modules)
+        self.assertIsInstance(strategy_for("middleware.consensus.strategies.nearest:Nearest", dotted=True), Nearest)
+
+    def test_what_cannot_be_loaded(self) -> None:
+        """A module that is missing, a class that is, an empty name or a broken class all are an unknown strategy."""
+        broken = f"{__name__}:Broken"
+        for name in (
+            "no.such:X",
+            "middleware.consensus.strategies.nearest:No",
+            ":X",
+            ".x:Y",
+            "math:",
+            broken,
+            "math:pi",
+        ):
+            self.assertRaises(UnknownStrategy, strategy_for, name, dotted=True)
+
+    def test_every_built_in_loads(self) -> None:
+        """Whatever is in the box can be made, and says the name by which it was asked for."""
+        for name in BUILT_IN:
+            self.assertEqual(strategy_for(name).name, name)
+
+    def test_refused_by_name(self) -> None:
+        """Each report that counts for nothing is named, with what is wrong with it."""
+        rows = [
+            ({"cost": math.nan}, "cost is not a number"),
+            ({"cost": math.inf}, "cost is infinite"),
+            ({"cost": -math.inf}, "cost is infinite"),
+            ({"cost": -2.0}, "cost -2 is negative"),
+            ({"cost": 1e12}, "cost 1e+12 is enormous"),
+            ({"cost": True}, "cost is no number"),
+            ({"cost": "1"}, "cost is no number"),
+            ({"cost": None}, "cost is no number"),
+            ({"cost": 10**5000}, "cost a number of thousands of digits is enormous"),
+            ({"weight": -1.0}, "weight -1 is negative"),
+            ({"electorate": math.inf}, "electorate is infinite"),
+            ({"value": (0.0, math.nan)}, "value is not a number"),
+            ({"value": (1e300,)}, "value 1e+300 is enormous"),
+            ({"value": [1.0]}, "value is no place"),
+            ({"battery": 1.5}, "battery 1.5 is no share"),
+            ({"epoch": -1}, "-1 is no epoch, sequence or capacity"),
+            ({"capacity": 2.0}, "2 is no epoch, sequence or capacity"),
+            ({"choice": "x" * 999}, "task or choice is no text, or too long"),
+            ({"agent": ""}, "the agent has no name, or too long a one"),
+            ({"unmet": ("has no camera", "has no gripper")}, "cannot do it: has no camera, has no gripper"),
+            ({"age": 6.5, "valid_for": 5.0}, "stale: 6.5 s old, valid for 5 s"),
+        ]
+        for change, why in rows:
+            bad = replace(Report("dog", 1.0), **change)  # type: ignore[arg-type]
+            self.assertEqual(refusal(bad), why)
+            self.assertEqual(refused([bad, Report("cat", 1.0)]), ((bad.agent, why),))
+        self.assertEqual(refused([Report("dog", 0.0, age=4.0, valid_for=5.0), Report("cat", 1, value=(-9.0,))]), ())
+
+    def test_newest_epoch_stands(self) -> None:
+        """Bids of an epoch that is over count no more, however low; within one the lowest of an agent stands."""
+        old, first, later = Report("a", 0.0), Report("a", 5.0, epoch=2), Report("a", 4.0, epoch=2)
+        other = Report("b", 9.0, epoch=2)
+        self.assertEqual(standing([old, other, first, later]), (later, other))
+
+    def test_better(self) -> None:
+        """Better is lawful, and lower by more than the share."""
+        self.assertTrue(better(Report("a", 10.0), Report("b", 8.9), 0.1))
+        for cost in (9.0, 10.0, math.nan, -1.0):
+            self.assertFalse(better(Report("a", 10.0), Report("b", cost), 0.1))
+
+    def test_what_counts_for_nothing_gives_way(self) -> None:
+        """Whatever a holder's cost is, a strategy answers; whose report does not count gives way to any that does."""
+        strategies = [strategy_for(name) for name in BUILT_IN]
+        nonsense: list[Any] = [None, "1", True, [], -1.0, math.nan, math.inf, 1e300, 10**400, 10**5000]
+        for cost in nonsense:
+            for strategy in strategies:
+                self.assertIs(strategy.improves(Report("a", cost), Report("b", 9e8), 0.5), True, strategy.name)
+                self.assertIs(strategy.improves(Report("a", cost), Report("b", cost), 0.5), False, strategy.name)
+        self.assertTrue(better(Report("a", 1.0, unmet=("has no camera",)), Report("b", 9.0), 0.1))
+
+    def test_digest(self) -> None:
+        """Equal reports have one digest in any order, duplicates included, and another cost has another."""
+        a, b, c = Report("a", 1.0), Report("a", 2.0), Report("b", 1.0)
+        self.assertEqual(digest_of([a, b, c]), digest_of([c, b, a]))
+        self.assertEqual(len({digest_of(each) for each in ([a, c], [b, c], [a], [])}), 4)

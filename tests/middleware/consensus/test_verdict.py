@@ -1,0 +1,174 @@
+"""Tests of ``middleware.consensus.verdict``: what one agent writes down of its decision, and what others read."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import replace
+
+import msgpack
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.consensus.strategies.nearest import Nearest
+from middleware.consensus.strategy import READABLE, Consensus, Report
+from middleware.consensus.verdict import (
+    BEST,
+    KEPT,
+    MANY,
+    MAX_VERDICT,
+    Verdict,
+    slot_of,
+    verdict_from,
+    verdict_of,
+    verdicts_key,
+)
+from middleware.consensus.view import View
+from middleware.directory.presence import EXECUTING, WAITING
+from middleware.entangled.identity import Identity
+from middleware.entangled.record import MAX_NAME, Record
+from middleware.tasks.task import Member
+
+
+def identity(number: int) -> Identity:
+    return Identity(number.to_bytes(32, "big"))
+
+
+def member(number: int, cost: float | None, status: str = WAITING) -> Member:
+    return Member(identity(number).node_id.hex(), f"dog{number}", status, cost)
+
+
+def decided(
+    number: int, members: list[Member], epoch: int = 1, version: str = "1", assigned: int | None = None
+) -> Verdict:
+    """What dog ``number`` writes when it has heard of ``members``; ``assigned`` where hysteresis kept another."""
+    me = next(m for m in members if m.name == f"dog{number}")
+    others = [m for m in members if m is not me]
+    consensus = Nearest().find([Report(m.uuid, m.cost) for m in members if m.cost is not None])
+    named = consensus.assigned_agent if assigned is None else identity(assigned).node_id.hex()
+    return verdict_from("t1", epoch, me, others, "nearest", version, consensus, named, 0.1)
+
+
+def record_of(number: int, verdict: Verdict, value: bytes | None = None, name: str = "") -> Record:
+    """The record that dog ``number`` publishes."""
+    content = verdict.packed() if value is None else value
+    slot = name or verdict.slot
+    return Record(verdicts_key("t1"), slot, identity(number).public, 1, "team", 60.0, content).signed(identity(number))
+
+
+THREE = [member(1, 1.5), member(2, 0.5), member(3, 1.0)]
+
+
+class VerdictTests(SynchronousTestCase):
+    def test_survives_the_wire(self) -> None:
+        """What is packed and signed is read back as it was, its agent taken from the signature's key."""
+        verdict = replace(decided(1, THREE), token=7)
+        self.assertEqual(verdict_of(record_of(1, verdict)), verdict)
+        self.assertEqual([r.name for r in verdict.reports], ["dog2", "dog3", "dog1"])
+        self.assertEqual(verdict.winner, THREE[1].uuid)
+        self.assertEqual(verdict.standby, (THREE[2].uuid, THREE[0].uuid))
+
+    def test_nobody_testifies_for_another(self) -> None:
+        """A copy of dog1's account in dog2's slot is dog2's account."""
+        copied = verdict_of(record_of(2, decided(1, THREE)))
+        self.assertEqual(copied is not None and copied.agent, identity(2).node_id.hex())
+
+    def test_many_reports_are_the_best_and_a_count(self) -> None:
+        """Of thirty reports all are written, of more the best eight and the count; the size stays bounded."""
+        for n, written in ((MANY, MANY), (MANY + 1, BEST), (500, BEST)):
+            members = [member(i, float(i)) for i in range(1, n + 1)]
+            verdict = decided(1, members)
+            self.assertEqual((len(verdict.reports), verdict.reported), (written, n))
+            self.assertEqual(verdict_of(record_of(1, verdict)), verdict)
+        long = [replace(member(i, float(i)), name="\N{SNOWMAN}" * 90) for i in range(1, MANY + 1)]
+        long += [replace(member(i, None), name="w" * 90) for i in range(100, 200)]
+        consensus = Consensus(long[0].uuid, tuple(m.uuid for m in long), "d" * 90)
+        given = ("t" * 64, 2**53, long[0], long, "r" * 90, "v" * 90, consensus, long[0].uuid, 0.1, 2**53)
+        self.assertLessEqual(len(verdict_from(*given).packed()), MAX_VERDICT)
+        minded = [replace(m, battery=0.123, load=2**53, value=(1e9,) * 8, choice="\N{SNOWMAN}" * 64) for m in long]
+        agreed = replace(consensus, value=(1e9 / 7,) * 8, choice="\N{SNOWMAN}" * 64)
+        given = ("t" * 64, 2**53, minded[0], minded, "r" * 90, "v" * 90, agreed, long[0].uuid, 0.1, 2**53)
+        packed = verdict_from(*given, View(READABLE)).packed()
+        self.assertLessEqual(len(packed), MAX_VERDICT)
+
+    def test_what_counted_is_told(self) -> None:
+        """What a strategy went by beside the cost, and what was agreed on, is on the account, and nothing else."""
+        members = [replace(member(1, 1.5), battery=0.4, load=3), replace(member(2, 0.5), choice="red", weight=2.0)]
+        members.append(replace(member(3, 1.0), value=(1.0, 2.0)))
+        found = Consensus(members[1].uuid, value=(1.0, 2.5), choice="red")
+        given = ("t1", 1, members[0], members[1:], "any", "1", found, found.assigned_agent, 0.1, 0)
+        verdict = verdict_of(record_of(1, verdict_from(*given, View(READABLE))))
+        assert verdict is not None
+        self.assertEqual((verdict.value, verdict.choice), ((1.0, 2.5), "red"))
+        told = {r.name: r.more for r in verdict.reports}
+        self.assertEqual(told["dog1"], "battery 40%, 2 other tasks")
+        self.assertEqual((told["dog2"], told["dog3"]), ("for red, weight 2", "at (1.00, 2.00)"))
+        self.assertEqual({r.more for r in verdict_from(*given, View()).reports}, {""})
+
+    def test_hysteresis_is_told(self) -> None:
+        """The account says in words what became of whoever acted before."""
+        acting = [member(1, 1.0, EXECUTING), member(2, 0.95), member(3, None)]
+        for assigned, words in (
+            (1, "dog2 is the best, but not better by 10% than dog1, who acts"),
+            (2, "dog2 is better by more than 10% than dog1, who acted"),
+        ):
+            self.assertEqual(decided(3, acting, assigned=assigned).hysteresis, words)
+        self.assertEqual(decided(1, THREE).hysteresis, "nobody acted before")
+        found = Consensus(THREE[2].uuid, task="t1", reason="divided with 2 others among 3")
+        shared = verdict_from("t1", 1, THREE[0], THREE[1:], "group_optimal", "1", found, found.assigned_agent, 0.1)
+        self.assertEqual(shared.hysteresis, "nobody acted before; divided with 2 others among 3")
+        open_ = Consensus(None, reason="no vote; more than half of 3 decides")
+        words = verdict_from("t1", 1, THREE[0], THREE[1:], "weighted_vote", "1", open_, None, 0.1).hysteresis
+        self.assertEqual(words, "no vote; more than half of 3 decides")
+        self.assertIn("nobody is better", decided(2, [member(1, 0.5, EXECUTING), member(2, 0.7)]).hysteresis)
+        self.assertEqual(decided(1, [member(1, None)]).hysteresis, "no report counts")
+
+    def test_decoder_is_total(self) -> None:
+        """No value of a record, however crafted, raises; what is no verdict is None."""
+        good = decided(1, THREE)
+        content = msgpack.unpackb(good.packed())
+        bad: dict[str, list[object]] = {
+            "name": [None, 7, "a\x1b[2J"],
+            "epoch": [-1, 2**60, 1.5, True, "1", 2],
+            "winner": ["ab", b"ab", None],
+            "standby": [None, [b"x"], [1], [bytes(20)] * 9],
+            "reports": [None, [[]], [[bytes(20), "a", float("nan")]], [[bytes(20), "a", -1.0]], [[b"", "a", 1.0]]],
+            "silent": [None, [7], ["\n"]],
+            "reported": [0, 99],
+            "participants": [0, None],
+            "value": [5, ["x"], [float("nan")], [0.0] * 9],
+            "choice": [None, 7, "a\x1b[2J", "x" * 65],
+            "more": [None, [7], ["\n"], ["a"] * 4],
+        }
+        for field, values in bad.items():
+            for value in values:
+                packed = msgpack.packb({**content, field: value})
+                self.assertIsNone(verdict_of(record_of(1, good, packed)), f"{field} {value!r}")
+        for raw in (b"", b"\xc1", b"\x90", msgpack.packb({}), bytes(MAX_VERDICT + 1)):
+            self.assertIsNone(verdict_of(record_of(1, good, raw)))
+        self.assertIsNone(verdict_of(replace(record_of(1, good), value=None)))
+        self.assertIsNone(verdict_of(record_of(1, good, name="member")))
+        self.assertIsNone(verdict_of(record_of(1, good, name=slot_of(good.epoch + 1))))
+        rng = random.Random(5)
+        for _ in range(500):
+            crafted = bytearray(good.packed())
+            for _ in range(rng.randint(1, 5)):
+                crafted[rng.randrange(len(crafted))] = rng.randrange(256)
+            verdict_of(record_of(1, good, bytes(crafted)))
+
+    def test_name_of_another_spoils_nothing(self) -> None:
+        """A member whose name would clear a terminal is shown without it, and does not make the account unreadable."""
+        hostile = replace(member(2, 0.5), name="a\x1b[2J\ud800")
+        verdict = verdict_of(record_of(1, decided(1, [hostile, member(1, 1.0)])))
+        self.assertIsNotNone(verdict)
+        self.assertEqual(verdict and verdict.reports[0].name, "a?[2J?")
+
+    def test_of_many_the_best_tell(self) -> None:
+        """In a group of up to thirty all write; in a larger one the eight best."""
+        members = [member(i, float(i)) for i in range(1, MANY + 2)]
+        self.assertTrue(all(decided(n, members[:MANY]).is_witness for n in range(1, MANY + 1)))
+        told = [verdict for n in range(1, MANY + 2) if (verdict := decided(n, members)).is_witness]
+        self.assertEqual([verdict.name for verdict in told], [f"dog{n}" for n in range(1, BEST + 1)])
+
+    def test_slots_are_few(self) -> None:
+        """However many epochs a task has, an agent fills few slots under it."""
+        self.assertEqual(len({slot_of(epoch) for epoch in range(1000)}), KEPT)
+        self.assertLessEqual(max(len(slot_of(epoch)) for epoch in range(1000)), MAX_NAME)

@@ -1,0 +1,416 @@
+"""Tests of the directory as a team grows, shrinks, falls apart and heals: nobody is missing, and nobody is there twice.
+
+Most of them are of many devices over one table of records, which forgets what is leased as replicas do; the last ones
+are of real nodes.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterable
+from typing import Any, cast
+
+from twisted.internet.defer import Deferred, fail, succeed
+
+from middleware.directory.directory import Directory, Page
+from middleware.directory.listing import Listing
+from middleware.directory.prefix import WHOLE, places_of, prefix_of
+from middleware.directory.presence import DEVICES, Device, device_of, devices_of
+from middleware.entangled.background import Background
+from middleware.entangled.clock import HeapClock
+from middleware.entangled.contact import Contact
+from middleware.entangled.errors import Unavailable
+from middleware.entangled.identity import Identity
+from middleware.entangled.kademlia.distance import closest
+from middleware.entangled.network.network import Address
+from middleware.entangled.network.switchboard import Weather
+from middleware.entangled.node import EntangledNode
+from middleware.entangled.record import Record, Slot
+from tests.fleet import FleetCase, SwarmFleet
+
+REVIEW = 10.0
+
+
+class Table:
+    """What all holders together hold, those of one side of a cut; ``silent`` keys are answered by nobody."""
+
+    def __init__(self, clock: HeapClock) -> None:
+        self.clock = clock
+        self.slots: dict[Slot, tuple[Record, float]] = {}
+        self.silent: set[bytes] = set()
+        self.reads = 0
+
+    def get(self, key: bytes, concern: str = "majority") -> Deferred[list[Record]]:
+        """The live records under ``key``."""
+        self.reads += 1
+        if key in self.silent:
+            return fail(Unavailable(0, 5))
+        now = self.clock.seconds()
+        live = [record for slot, (record, until) in self.slots.items() if slot.key == key and until > now]
+        return succeed(sorted(live, key=lambda record: record.owner))
+
+    def keys(self) -> dict[bytes, int]:
+        """How many records there are under each key."""
+        counts: dict[bytes, int] = {}
+        for slot, (_, until) in self.slots.items():
+            if until > self.clock.seconds():
+                counts[slot.key] = counts.get(slot.key, 0) + 1
+        return counts
+
+
+class Roster:
+    """As much of a roster as the directory asks for."""
+
+    is_full = False
+
+
+class Neighbour:
+    """A device with its directory over a table; it knows whom a node of its network would know."""
+
+    def __init__(self, town: Town, number: int) -> None:
+        self.town = town
+        self.table = town.table
+        self.identity = Identity(random.Random(f"{town.seed}/{number}").randbytes(32))
+        self.contact = Contact(self.identity.public, Address("10.0.0.1", 1 + number))
+        self.lease = 1.0
+        self.overlay = self
+        self.roster = Roster()
+        self.is_placed = True
+        self.sequence = 0
+        self.error = 1.0
+        self.own: dict[Slot, float] = {}
+        self.chores = Background(town.clock)
+        self.directory = Directory(cast(EntangledNode, self), self.chores, lambda work: None)
+
+    @property
+    def is_large(self) -> bool:
+        """Whether there are too many to know all."""
+        return len(self.seen()) >= WHOLE
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether all are known."""
+        return not self.is_large
+
+    def seen(self) -> list[Contact]:
+        """Those on this side of the cut."""
+        return [n.contact for n in self.town.neighbours if n.table is self.table and n is not self]
+
+    def contacts(self) -> list[Contact]:
+        """The nearest, and some others; who errs knows fewer, or more that are not there any more."""
+        seen = self.seen()
+        if len(seen) < WHOLE:
+            return seen
+        near = closest(seen, self.identity.node_id, max(8, int(8 * self.error)))
+        return near[int(8 * self.error) - 8 :] if self.error > 1.0 else near
+
+    def get(self, key: bytes, concern: str = "majority") -> Deferred[list[Record]]:
+        """Read the table."""
+        return self.table.get(key, concern)
+
+    def put(self, key: bytes, name: str, value: bytes, lifetime: str, lease: float) -> Deferred[None]:
+        """Write, and keep alive."""
+        self.sequence += 1
+        slot = Slot(key, self.identity.public, name)
+        record = Record(key, name, self.identity.public, self.sequence, "leased", lease, value, bytes(64))
+        self.own[slot] = lease
+        self.table.slots[slot] = (record, self.town.clock.seconds() + lease)
+        return succeed(None)
+
+    def release(self, key: bytes, name: str) -> None:
+        """Keep alive no more."""
+        self.own.pop(Slot(key, self.identity.public, name))
+
+    def say(self) -> None:
+        """Announce the device where it stands now."""
+        device = Device(self.identity.node_id.hex(), "d", depth=self.directory.depth)
+        self.directory.announce("d", device.packed(), device.depth)
+
+    def enter(self) -> None:
+        """Join; the depth is looked at now and then."""
+        Deferred.fromCoroutine(self.directory.arrive())
+        self.say()
+        self.chores.later(self.town.dice.uniform(0.0, REVIEW), self.review)
+        self.chores.every(0.3, self.beat)
+
+    def review(self) -> None:
+        """Move where the team is of another size."""
+        self.chores.later(REVIEW, self.review)
+        before = self.directory.depth
+        if self.directory.review() != before:
+            self.say()
+
+    def beat(self) -> None:
+        """Keep what is owned alive, in whichever table this side has."""
+        for slot, lease in self.own.items():
+            if slot in self.table.slots:
+                record, _ = self.table.slots[slot]
+                self.table.slots[slot] = (record, self.town.clock.seconds() + lease)
+
+
+class Town:
+    """Neighbours that come and go, on one clock and one table, or two while it is cut in two."""
+
+    def __init__(self, seed: int = 1) -> None:
+        self.seed = seed
+        self.clock = HeapClock()
+        self.dice = random.Random(f"{seed}/town")
+        self.table = Table(self.clock)
+        self.neighbours: list[Neighbour] = []
+        self.number = 0
+
+    def come(self, count: int, pause: float) -> None:
+        """So many newcomers, one after the other."""
+        for _ in range(count):
+            self.number += 1
+            self.neighbours.append(Neighbour(self, self.number))
+            self.neighbours[-1].enter()
+            self.clock.advance(pause)
+
+    def go(self, gone: Iterable[Neighbour]) -> None:
+        """Some vanish without a word."""
+        for neighbour in list(gone):
+            neighbour.chores.stop()
+            self.neighbours.remove(neighbour)
+
+    def cut(self, away: Iterable[Neighbour]) -> None:
+        """From now on ``away`` read and write a table of their own."""
+        other = Table(self.clock)
+        other.slots = dict(self.table.slots)
+        for neighbour in away:
+            neighbour.table = other
+
+    def heal(self) -> None:
+        """One table again, in which the newer record of each slot holds."""
+        for table in {id(n.table): n.table for n in self.neighbours if n.table is not self.table}.values():
+            for slot, (record, until) in table.slots.items():
+                known = self.table.slots.get(slot)
+                if known is None or (record.sequence, until) > (known[0].sequence, known[1]):
+                    self.table.slots[slot] = (record, until)
+        for neighbour in self.neighbours:
+            neighbour.table = self.table
+
+
+def result(case: FleetCase, work: Any) -> Any:
+    """What a coroutine or Deferred that waits for nothing came to."""
+    return case.successResultOf(work if isinstance(work, Deferred) else Deferred.fromCoroutine(work))
+
+
+class DirectoryTests(FleetCase):
+    def listed(self, reader: Neighbour) -> list[bytes]:
+        """The ids that one of them lists, each as often as it is listed."""
+        listing: Listing = result(self, reader.directory.listed())
+        self.assertTrue(listing.is_complete)
+        return [device_of(record).uuid for record in listing.records]  # type: ignore[union-attr, misc]
+
+    def all_there(self, town: Town, readers: int = 3, also: Iterable[Neighbour] = ()) -> None:
+        """Some readers list everybody who is here, each once, and nobody who left but those in ``also``."""
+        here = {n.identity.node_id.hex() for n in town.neighbours}
+        late = {n.identity.node_id.hex() for n in also}
+        for reader in town.dice.sample(town.neighbours, min(readers, len(town.neighbours))):
+            listed = self.listed(reader)
+            self.assertEqual(len(listed), len(set(listed)), "somebody is listed twice")
+            self.assertEqual(here - set(listed), set(), "somebody is missing")
+            self.assertEqual(set(listed) - here - late, set(), "somebody is listed who left")
+
+    def all_stay(self, town: Town, readers: int = 2, times: int = 12, pause: float = 5.0) -> None:
+        """They are all there so many ``times``, ``pause`` seconds apart."""
+        for _ in range(times):
+            town.clock.advance(pause)
+            self.all_there(town, readers)
+
+    def test_growth_and_back(self) -> None:
+        """From 3 devices to 300 and back, at every moment everybody is listed once, and at the end it is one key."""
+        town = Town()
+        town.come(3, 1.0)
+        self.assertEqual(set(town.table.keys()), {DEVICES})
+        while len(town.neighbours) < 300:
+            town.come(9, 0.4)
+            self.all_there(town, 2)
+        self.assertGreater(min(n.directory.depth for n in town.neighbours), 1)
+        town.clock.advance(60.0)
+        self.assertLess(max(town.table.keys().values()), 80)
+        while len(town.neighbours) > 12:
+            gone = town.dice.sample(town.neighbours, 9)
+            town.go(gone)
+            self.all_there(town, 1, gone)
+            town.clock.advance(max(n.directory.lease for n in gone))
+            self.all_there(town, 2)
+        town.clock.advance(10 * REVIEW + 60.0)
+        self.assertEqual({n.directory.depth for n in town.neighbours}, {0})
+        self.assertEqual(town.table.keys(), {DEVICES: len(town.neighbours)})
+
+    def test_flash_crowd(self) -> None:
+        """Two hundred that come at one moment are all listed at once, and the first ones who were there before."""
+        town = Town(2)
+        town.come(20, 1.0)
+        town.come(200, 0.0)
+        self.all_there(town, 5)
+        self.all_stay(town)
+
+    def test_estimates_that_disagree(self) -> None:
+        """Where some know few of their neighbours and some many that left, all are listed all the same, by all."""
+        town = Town(3)
+        town.come(250, 0.1)
+        for neighbour in town.dice.sample(town.neighbours, 60):
+            neighbour.error = town.dice.choice((1.0, 1.5, 2.0))
+        self.all_stay(town, 4, 10, REVIEW)
+
+    def test_partition_and_healing(self) -> None:
+        """Both sides of a cut list themselves; when it heals, everybody lists all at once, though they stand apart."""
+        town = Town(4)
+        town.come(240, 0.1)
+        town.clock.advance(60.0)
+        away = town.dice.sample(town.neighbours, 20)
+        town.cut(away)
+        town.clock.advance(200.0)
+        few = self.listed(away[0])
+        self.assertEqual(set(few), {n.identity.node_id.hex() for n in away})
+        self.assertEqual({n.directory.depth for n in away}, {0})
+        self.assertEqual(len(self.listed(next(n for n in town.neighbours if n not in away))), 220)
+        town.heal()
+        self.all_there(town, 5)
+        self.all_stay(town)
+
+    def test_half_vanish(self) -> None:
+        """When half of all vanish at once, the others are never missing, and within a lease nobody else is listed."""
+        town = Town(5)
+        town.come(240, 0.1)
+        town.clock.advance(60.0)
+        gone = town.dice.sample(town.neighbours, 120)
+        town.go(gone)
+        self.all_there(town, 3, gone)
+        town.clock.advance(max(n.directory.lease for n in gone))
+        self.all_there(town, 1)
+        self.all_stay(town, 1, 19)
+
+    def test_liars(self) -> None:
+        """Whoever writes where it does not stand is not listed there, hides nobody, and costs few reads."""
+        town = Town(6)
+        town.come(150, 0.1)
+        town.clock.advance(60.0)
+        honest = len(self.listed(town.neighbours[0]))
+        before = town.table.reads
+        self.listed(town.neighbours[0])
+        usual = town.table.reads - before
+        keys = sorted(town.table.keys())
+        for number in range(40):
+            liar = Neighbour(town, 1000 + number)
+            wrong = [key for key in keys if key not in places_of(liar.identity.node_id, 3)]
+            device = Device(liar.identity.node_id.hex(), "liar", depth=town.dice.choice((3, 16)))
+            for key in town.dice.sample(wrong, 3):
+                liar.put(key, "liar", device.packed(), "leased", 600.0)
+        before = town.table.reads
+        self.assertEqual(len(self.listed(town.neighbours[0])), honest)
+        self.assertEqual(town.table.reads - before, usual)
+
+    def test_a_place_whose_holders_are_lost(self) -> None:
+        """A place that nobody answers for leaves the list incomplete, and says which part of all ids it lacks."""
+        town = Town(7)
+        town.come(150, 0.1)
+        town.clock.advance(60.0)
+        victim = town.neighbours[5]
+        key = prefix_of(victim.identity.node_id, victim.directory.depth).key
+        town.table.silent.add(key)
+        listing: Listing = result(self, town.neighbours[0].directory.listed())
+        self.assertFalse(listing.is_complete)
+        seen = {record.owner for record in listing.records}
+        for neighbour in town.neighbours:
+            is_missed = any(place.has(neighbour.identity.node_id) for place in listing.missed)
+            self.assertTrue(neighbour.identity.public in seen or is_missed)
+
+    def test_newcomers_read_their_neighbourhood(self) -> None:
+        """In a large team a newcomer reads one place, not all, and sees those that stand around it."""
+        town = Town(8)
+        town.come(200, 0.1)
+        town.clock.advance(60.0)
+        reader = town.neighbours[100]
+        before = town.table.reads
+        around = result(self, reader.directory.around())
+        self.assertEqual(town.table.reads - before, 1)
+        self.assertIn(reader.identity.public, [record.owner for record in around])
+        self.assertLess(len(around), 60)
+
+    def test_some(self) -> None:
+        """Who wants a few reads a few places, next to itself; going on from page to page shows everybody."""
+        town = Town(9)
+        town.come(300, 0.1)
+        town.clock.advance(60.0)
+        reader = town.neighbours[7]
+        before = town.table.reads
+        page: Page = result(self, reader.directory.some(20))
+        self.assertLess(town.table.reads - before, 20)
+        self.assertTrue(20 <= len(page.records) < 150 and page.is_complete and page.following)
+        self.assertIn(reader.identity.public, [record.owner for record in page.records])
+        seen = {record.owner for record in page.records}
+        for _ in range(40):
+            if page.following is None:
+                break
+            page = result(self, reader.directory.some(20, after=page.following))
+            seen |= {record.owner for record in page.records}
+        self.assertIsNone(page.following)
+        self.assertEqual(seen, {n.identity.public for n in town.neighbours})
+
+    def test_some_that_match(self) -> None:
+        """A search for one by name goes on until it is found, and ends where nobody has that name."""
+        town = Town(10)
+        town.come(300, 0.1)
+        town.clock.advance(60.0)
+        sought = town.neighbours[120].identity.node_id.hex()
+        reader = town.neighbours[3].directory
+        page: Page = result(self, reader.some(1, lambda device: device.uuid == sought))
+        self.assertEqual([device.uuid for device, _ in devices_of(page.records)], [sought])
+        nobody: Page = result(self, reader.some(1, lambda device: device.name == "nobody"))
+        self.assertEqual((nobody.records, nobody.following), ([], None))
+        first: Page = result(self, reader.some(1, lambda device: device.name == "nobody", most_reads=1))
+        self.assertIsNotNone(first.following)
+
+    def test_small_team_some(self) -> None:
+        """In a team with one place a page is the whole team, by one read."""
+        town = Town(11)
+        town.come(30, 0.1)
+        before = town.table.reads
+        page: Page = result(self, town.neighbours[3].directory.some(5))
+        self.assertEqual((len(page.records), page.following, town.table.reads - before), (30, None, 1))
+
+
+class TeamTests(FleetCase):
+    """Real nodes; ``python -m benchmarks.directory --team 100`` has more than are known whole."""
+
+    def names(self, fleet: SwarmFleet, place: int) -> list[str]:
+        """The names of all whom one node lists."""
+        listing = self.done(fleet, fleet.nodes[place].list_devices(), 1.0)
+        self.assertTrue(listing.is_complete)
+        return sorted(device.name for device, _ in listing.devices)
+
+    def test_apart_and_together_again(self) -> None:
+        """Real nodes that stand as in a large team are listed and followed whole, then all the way back to one key."""
+        fleet = self.swarm(12, weather=Weather(0.01))
+        told: list[list[Record]] = []
+        following = fleet.nodes[1].watch_devices(told.append)
+        fleet.run(1.0)
+        self.assertEqual(len(told[-1]), 12)
+        for node in fleet.nodes:
+            node.directory.depth = 3
+            node.presence.change(depth=3)
+        fleet.run(1.5)
+        here = sorted(f"dog{n}" for n in range(12))
+        self.assertEqual({n.presence.device.depth for n in fleet.nodes}, {3})
+        self.assertEqual(self.names(fleet, 0), here)
+        fleet.nodes[4].vanish()
+        fleet.nodes[5].stopService()
+        here = sorted(set(here) - {"dog4", "dog5"})
+        fleet.run(9.0)
+        while any(node.presence.device.depth for node in fleet.nodes if node.running):
+            self.assertEqual(self.names(fleet, 7), here)
+            self.assertEqual(sorted(device.name for device, _ in devices_of(following.records)), here)
+        fleet.run(8.0)
+        self.assertEqual(self.names(fleet, 7), here)
+        records = self.done(fleet, fleet.nodes[8].entangled.get(DEVICES), 1.0)
+        self.assertEqual(sorted(device.name for device, _ in devices_of(records)), here)
+        self.assertEqual(sorted(device.name for device, _ in devices_of(following.records)), here)
+        following.stop()
+        before = len(told)
+        fleet.nodes[8].presence.say(1.0, "hello")
+        fleet.run(5.0)
+        self.assertEqual(len(told), before)

@@ -1,0 +1,165 @@
+"""Tests of the walk through the directory: everybody once, by any reader, and it knows whom it may have missed."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Mapping
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.directory.listing import Listing, standing
+from middleware.directory.prefix import ROOT, places_of, prefix_of
+from middleware.directory.presence import DEVICES, MAX_DEPTH, Device
+from middleware.entangled.identity import node_id
+from middleware.entangled.record import Record
+
+Places = dict[bytes, list[Record]]
+
+
+def owners(count: int, seed: int = 1) -> list[bytes]:
+    """So many random public keys."""
+    dice = random.Random(seed)
+    return [dice.randbytes(32) for _ in range(count)]
+
+
+def record(key: bytes, owner: bytes, depth: int, sequence: int = 1) -> Record:
+    """What a device that says it is at ``depth`` has written under ``key``."""
+    value = Device(node_id(owner).hex(), "d", depth=depth).packed()
+    return Record(key, "d", owner, sequence, "leased", 1.0, value, bytes(64))
+
+
+def announced(depths: Mapping[bytes, int]) -> Places:
+    """What is under each key when every owner stands at its depth."""
+    places: Places = {}
+    for owner, depth in depths.items():
+        for key in places_of(node_id(owner), depth):
+            places.setdefault(key, []).append(record(key, owner, depth))
+    return places
+
+
+def listed(places: Places, listing: Listing, silent: frozenset[bytes] = frozenset()) -> Listing:
+    """The listing when it has ended; nobody answers for the keys in ``silent``."""
+    seen: list[bytes] = []
+    while (place := listing.next()) is not None:
+        seen.append(place.key)
+        if place.key in silent:
+            listing.failed(place)
+        else:
+            listing.read(place, places.get(place.key, []))
+    assert len(set(seen)) == len(seen), "a place was read twice"
+    return listing
+
+
+class ListingTests(SynchronousTestCase):
+    def test_small_team_is_one_read(self) -> None:
+        """A directory that is not split is one read of the old key."""
+        listing = listed(announced(dict.fromkeys(owners(20), 0)), Listing())
+        self.assertEqual((listing.reads, len(listing.records), listing.is_complete), (1, 20, True))
+
+    def test_everybody_once(self) -> None:
+        """All devices are found, each once, with one read for each place, whatever depth the reader expects."""
+        depths = dict.fromkeys(owners(600), 5)
+        for floor in (0, 3, 5):
+            listing = listed(announced(depths), Listing(floor))
+            self.assertEqual([r.owner for r in listing.records], sorted(depths))
+            self.assertEqual(listing.reads, 32)
+            self.assertTrue(listing.is_complete)
+
+    @settings(max_examples=60, deadline=None)
+    @given(st.integers(2, 6), st.integers(0, 2**32))
+    def test_neighbours_disagree(self, depth: int, seed: int) -> None:
+        """Where each device is at this depth or the next by chance, all are found."""
+        dice = random.Random(seed)
+        depths = {owner: depth + dice.randint(0, 1) for owner in owners(24 << depth, seed)}
+        listing = listed(announced(depths), Listing(max(0, depth - 1)))
+        self.assertEqual(len(listing.records), len(depths))
+
+    def test_one_that_is_ahead_or_behind(self) -> None:
+        """A single device one depth below all others is found, and any above them."""
+        team = owners(400)
+        for odd in team[:40]:
+            for depth in (5, 3, 1, 0):
+                depths = {**dict.fromkeys(team, 4), odd: depth}
+                self.assertEqual(len(listed(announced(depths), Listing(3)).records), len(team), depth)
+
+    def test_two_networks_become_one(self) -> None:
+        """After a partition of 20 and 600 all are found, though the few stand under the old key alone."""
+        depths = {**dict.fromkeys(owners(600), 5), **dict.fromkeys(owners(20, 2), 0)}
+        for floor in (0, 4):
+            self.assertEqual(len(listed(announced(depths), Listing(floor)).records), 620)
+
+    def test_some_know_sooner_that_the_team_is_small(self) -> None:
+        """Where most of 40 stand under the old key again, those that are two depths below are listed, too."""
+        team = owners(40)
+        for deep in (1, 2):
+            depths = {owner: deep if node_id(owner)[0] >> 7 != DEVICES[0] >> 7 else 0 for owner in team}
+            self.assertEqual(len(listed(announced(depths), Listing()).records), 40, deep)
+
+    def test_the_newer_record_holds(self) -> None:
+        """A device that stands at two places is listed once, by its newest record."""
+        (owner,) = owners(1)
+        own, above = next(keys for d in range(9) if len(keys := places_of(node_id(owner), d)) == 2)
+        depth = next(d for d in range(9) if places_of(node_id(owner), d) == [own, above])
+        places = {own: [record(own, owner, depth, 7)], above: [record(above, owner, depth, 8)]}
+        found = listed(places, Listing(depth)).records
+        self.assertEqual([r.sequence for r in found], [8])
+
+    def test_a_place_that_does_not_answer(self) -> None:
+        """The list says that it is not complete, and which prefix is missing."""
+        depths = dict.fromkeys(owners(600), 5)
+        lost = prefix_of(node_id(next(iter(depths))), 5)
+        listing = listed(announced(depths), Listing(), frozenset([lost.key]))
+        self.assertFalse(listing.is_complete)
+        (missed,) = listing.missed
+        self.assertTrue(missed.has(lost.first))
+        self.assertEqual(missed.key, lost.key)
+        absent = set(depths) - {r.owner for r in listing.records}
+        self.assertTrue(absent and all(missed.has(node_id(owner)) for owner in absent))
+
+    def test_wrong_places(self) -> None:
+        """Who writes where it does not stand is not listed there, and sends nobody anywhere."""
+        team, liars = owners(20), owners(200, 9)
+        places = announced(dict.fromkeys(team, 0))
+        places[DEVICES] += [record(DEVICES, liar, 9) for liar in liars]
+        told = [liar for liar in liars if DEVICES in places_of(node_id(liar), 9)]
+        self.assertLess(len(told), 5)
+        listing = listed(places, Listing())
+        self.assertEqual({r.owner for r in listing.records}, {*team, *told})
+        if not told:
+            self.assertEqual(listing.reads, 1)
+        for strange in (-1, MAX_DEPTH + 1, 1.0, "1", True):
+            crafted = record(DEVICES, team[0], strange)  # type: ignore[arg-type]
+            self.assertEqual(standing(DEVICES, [crafted]), [], strange)
+
+    def test_a_liar_costs_little(self) -> None:
+        """Who claims the deepest place there is, and stands there, costs a reader one read for each depth."""
+        seed = next(s for s in range(10**6) if DEVICES[:2] == node_id(owners(1, s)[0])[:2])
+        (liar,) = owners(1, seed)
+        places = announced({**dict.fromkeys(owners(20), 0), liar: MAX_DEPTH})
+        listing = listed(places, Listing())
+        self.assertEqual((len(listing.records), listing.reads), (21, 1 + MAX_DEPTH))
+
+    def test_only_below_a_prefix(self) -> None:
+        """A list of one part reads that part only."""
+        depths = dict.fromkeys(owners(600), 5)
+        under = prefix_of(node_id(next(iter(depths))), 3)
+        listing = listed(announced(depths), Listing(5, under))
+        self.assertEqual(listing.reads, 4)
+        self.assertLessEqual({o for o in depths if under.has(node_id(o))}, {r.owner for r in listing.records})
+
+    def test_what_is_open_is_not_over(self) -> None:
+        """As long as an answer is awaited nothing is said to be complete."""
+        listing = Listing(1)
+        self.assertFalse(listing.is_over)
+        first = listing.next()
+        self.assertEqual(first, ROOT)
+        self.assertIsNone(listing.next())
+        self.assertFalse(listing.is_over)
+        listing.read(ROOT, [])
+        second = listing.next()
+        assert second is not None
+        self.assertFalse(listing.is_complete)
+        listing.read(second, [])
+        self.assertTrue(listing.is_complete)

@@ -1,0 +1,110 @@
+"""Tests of the places in the directory: which keys there are, who stands where, and how long it is listed."""
+
+from __future__ import annotations
+
+import random
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.directory.prefix import (
+    FEW,
+    LONGEST,
+    ROOT,
+    SHALLOW,
+    STILL_WHOLE,
+    WHOLE,
+    depth_for,
+    lease_at,
+    places_of,
+    prefix_of,
+    size_of,
+)
+from middleware.directory.presence import DEVICES, MAX_DEPTH
+from middleware.entangled.contact import Contact
+from middleware.entangled.identity import ID_BYTES
+from middleware.entangled.network.network import Address
+
+
+def ids(count: int, seed: int = 1) -> list[bytes]:
+    """So many random ids."""
+    dice = random.Random(seed)
+    return [dice.randbytes(ID_BYTES) for _ in range(count)]
+
+
+class PrefixTests(SynchronousTestCase):
+    def test_depth_zero_is_the_old_key(self) -> None:
+        """At depth 0 everybody stands under the one key that small teams have always used."""
+        self.assertEqual(ROOT.key, DEVICES)
+        for node_id in ids(20):
+            self.assertEqual(places_of(node_id, 0), [DEVICES])
+
+    def test_a_key_begins_as_its_devices_do(self) -> None:
+        """So the nodes closest to a place are neighbours of those that it lists."""
+        for node_id in ids(20):
+            for depth in range(MAX_DEPTH + 1):
+                place = prefix_of(node_id, depth)
+                self.assertTrue(place.has(node_id) and place.has(place.key))
+                self.assertTrue(place.has(place.first) and place.first <= node_id)
+
+    def test_halves(self) -> None:
+        """Of the two halves of a place one has its key and one another, and each id is in one of them."""
+        for node_id in ids(20):
+            place = prefix_of(node_id, 5)
+            self.assertEqual(place.along.key, place.key)
+            self.assertNotEqual(place.aside.key, place.key)
+            self.assertNotEqual(place.along.has(node_id), place.aside.has(node_id))
+
+    def test_two_places_and_one_stays(self) -> None:
+        """A device that moves by one depth stands at one of its places all the while."""
+        for node_id in ids(50):
+            for depth in range(MAX_DEPTH):
+                before, after = places_of(node_id, depth), places_of(node_id, depth + 1)
+                self.assertTrue(set(before) & set(after))
+                self.assertLessEqual(len(after), 3 if depth < SHALLOW else 2)
+
+    def test_small_team_is_never_split(self) -> None:
+        """Up to the members that are known whole the depth is 0, and a little fewer have to be left to return to it."""
+        self.assertEqual([depth_for(size, 0) for size in (1, 8, 48, WHOLE)], [0] * 4)
+        self.assertEqual([depth_for(size) for size in (1, 8, 48, WHOLE)], [0] * 4)
+        self.assertEqual(depth_for(WHOLE + 1, 0), 1)
+        self.assertEqual(depth_for(STILL_WHOLE + 1, 1), 1)
+        self.assertEqual(depth_for(STILL_WHOLE, 1), 0)
+
+    def test_hysteresis(self) -> None:
+        """Coming from any depth one arrives within a depth of the right one, and a size that sways moves nobody."""
+        for exponent in range(1, MAX_DEPTH):
+            size = FEW * 2.0**exponent * 1.4
+            if size <= WHOLE:
+                continue
+            for depth in (0, 3, MAX_DEPTH):
+                for _ in range(2 * MAX_DEPTH):
+                    depth = depth_for(size, depth)
+                self.assertLessEqual(abs(depth - exponent), 1)
+                self.assertEqual(depth_for(size * 1.1, depth), depth)
+                self.assertEqual(depth_for(size / 1.1, depth), depth)
+        border = FEW * 2.0**6
+        self.assertEqual([depth_for(border * 1.05, 5), depth_for(border / 1.05, 6)], [5, 6])
+
+    def test_steps_of_one(self) -> None:
+        """However large the difference, a device moves by one depth, and never below 0 or beyond the deepest."""
+        self.assertEqual(depth_for(1e9, 0), 1)
+        self.assertEqual(depth_for(3, 9), 8)
+        self.assertEqual(depth_for(1, 0), 0)
+        self.assertEqual(depth_for(1e30, MAX_DEPTH), MAX_DEPTH)
+        self.assertEqual(depth_for(1e30), MAX_DEPTH)
+
+    def test_lease_grows_with_the_depth(self) -> None:
+        """A team with one place keeps its lease; each depth doubles it up to a minute, and none is shortened."""
+        self.assertEqual([lease_at(depth, 1.0) for depth in (0, 1, 2, 5)], [1.0, 2.0, 4.0, 32.0])
+        self.assertEqual(lease_at(MAX_DEPTH, 1.0), LONGEST)
+        self.assertEqual([lease_at(0, 90.0), lease_at(4, 90.0)], [90.0, 90.0])
+
+    def test_size(self) -> None:
+        """Few contacts are counted; of many nodes the nearest ones tell how many there are, within a factor of two."""
+        contacts = [Contact(random.Random(n).randbytes(32), Address("10.0.0.1", 7000)) for n in range(3000)]
+        self.assertEqual(size_of(contacts[0].node_id, contacts[1:7]), 7)
+        right = 0
+        for contact in contacts[:100]:
+            near = sorted(contacts, key=lambda c: int.from_bytes(c.node_id) ^ int.from_bytes(contact.node_id))[1:9]
+            right += 1500 < size_of(contact.node_id, near) < 6000
+        self.assertGreaterEqual(right, 90)

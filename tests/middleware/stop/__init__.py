@@ -1,0 +1,1 @@
+"""Tests of stops of the team."""

@@ -1,0 +1,57 @@
+"""Some hundred random sequences of ``tests.invariants.stops``, and a look at whether they bite."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.stop.halt import Halt
+from middleware.stop.stop_set import Statement, StopSet
+from tests.invariants.stops import Violation, run
+
+SEQUENCES = 100
+BITING = 40
+
+
+class SequenceTests(SynchronousTestCase):
+    """What holds in every sequence."""
+
+    def test_stop_holds(self) -> None:
+        """Whatever happens, a robot that acknowledged a stop stands until a release names that very stop."""
+        counts: Counter[str] = Counter()
+        for seed in range(1, SEQUENCES + 1):
+            run(seed, counts)
+        self.assertEqual(counts["sequences"], SEQUENCES)
+        for name in ("acknowledged", "releases", "restarts", "partitions", "hostile", "refused", "repeated", "revoked"):
+            self.assertGreater(counts[name], SEQUENCES // 4, name)
+
+    def found(self) -> bool:
+        """Whether a few sequences show a violation."""
+        for seed in range(1, BITING + 1):
+            try:
+                run(seed, Counter())
+            except Violation:
+                return True
+        return False
+
+    def test_they_bite(self) -> None:
+        """A release that ends stops that it does not name, one that anybody may order, and lost notes are found."""
+        merge = StopSet.merge
+
+        def ends_all(self: StopSet, sender: bytes, order: Statement, may_release: bool = True) -> bool:
+            named = tuple(self.in_force) if order.released and may_release else ()
+            return merge(self, sender, Statement(order.stops, named, order.by), may_release)
+
+        def by_anybody(self: StopSet, sender: bytes, order: Statement, may_release: bool = True) -> bool:
+            return merge(self, sender, order)
+
+        for owner, name, bug in (
+            (StopSet, "merge", ends_all),
+            (StopSet, "merge", by_anybody),
+            (Halt, "_save", lambda self: None),
+        ):
+            patch = self.patch(owner, name, bug)
+            self.assertTrue(self.found(), bug)
+            patch.restore()
+        self.assertFalse(self.found())

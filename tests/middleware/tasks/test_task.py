@@ -1,0 +1,256 @@
+"""Tests of tasks, reports and results as records, and of who can do what."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import msgpack
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.directory.presence import Capabilities
+from middleware.entangled.contact import Contact
+from middleware.entangled.identity import Identity
+from middleware.entangled.network.network import Address
+from middleware.entangled.record import Record, hashed_key
+from middleware.tasks.task import (
+    CANCELLED,
+    COMPLETED,
+    FAILED,
+    MEMBER,
+    RESULT,
+    Member,
+    Result,
+    Task,
+    group_key,
+    member_of,
+    outcome_of,
+    refusals,
+    result_of,
+    task_of,
+)
+
+DOG = Identity(b"\1" * 32)
+CAT = Identity(b"\2" * 32)
+COUNCIL = tuple(Contact(who.public, Address("10.0.0.1", 7000)) for who in (DOG, CAT))
+TASK = Task("t1", "search", "Find it", {"camera": {"width": 208}}, {"radius": 0.3}, created=5.0, council=COUNCIL)
+UUID = DOG.node_id.hex()
+REPORT = Member(UUID, "dog", "WAITING", 1.5, UUID, "abcd", 3, "nearest")
+DONE = Result(COMPLETED, "dog", 12.5, 3, (("dog", 1.5),))
+
+
+def record(name: str, value: object, owner: Identity = DOG) -> Record:
+    """A record with this value; anything but bytes is packed."""
+    packed = value if isinstance(value, bytes) or value is None else bytes(msgpack.packb(value))
+    return Record(hashed_key("any"), name, owner.public, 1, "team", 1.0, packed, bytes(64))
+
+
+def changed(packed: bytes, **changes: object) -> dict[str, object]:
+    """What stands in a value, changed."""
+    return {**msgpack.unpackb(packed), **changes}
+
+
+anything = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers(-(2**63), 2**63)
+    | st.floats()
+    | st.text(max_size=4)
+    | st.binary(max_size=4),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=3), inner, max_size=3),
+)
+NAMES = sorted({*msgpack.unpackb(TASK.packed()), *msgpack.unpackb(REPORT.packed()), *msgpack.unpackb(DONE.packed())})
+DEPTH = b"\x91" * 900
+
+
+class DecoderTests(SynchronousTestCase):
+    def test_there_and_back(self) -> None:
+        """A task, a report and a result come out of their records as they went in."""
+        self.assertEqual(task_of(record("t1", TASK.packed())), TASK)
+        self.assertEqual(member_of(record(MEMBER, REPORT.packed())), REPORT)
+        self.assertEqual(result_of(record(RESULT, DONE.packed())), DONE)
+        minded = replace(REPORT, battery=0.5, value=(1.0, -2.5), choice="red", weight=2.0, electorate=5.0)
+        self.assertEqual(member_of(record(MEMBER, minded.packed())), minded)
+        bare = replace(REPORT, cost=None)
+        self.assertEqual(member_of(record(MEMBER, bare.packed())), bare)
+
+    def test_in_another_slot(self) -> None:
+        """A task in the slot of another name, a report or a result elsewhere than in its slot, are none."""
+        self.assertIsNone(task_of(record("t2", TASK.packed())))
+        self.assertIsNone(member_of(record(RESULT, REPORT.packed())))
+        self.assertIsNone(result_of(record(MEMBER, DONE.packed())))
+
+    def test_nobody_reports_for_another(self) -> None:
+        """A report in the name of another node is none."""
+        self.assertIsNone(member_of(record(MEMBER, REPORT.packed(), CAT)))
+
+    def test_crafted_tasks(self) -> None:
+        """A task with a wrong type, a wrong number or a member of the council that is none, is no task."""
+        bad: dict[str, list[object]] = {
+            "task_id": [5, None],
+            "kind": [5],
+            "title": [b"x"],
+            "requirements": [5, {"camera": 5}, {"camera": {"width": [1]}}, {5: {}}, {"camera": {"width": None}}],
+            "parameters": [5, {"radius": []}, {"radius": float("nan")}],
+            "strategy": [5, None],
+            "waiting_period": ["8", -1.0, float("inf"), float("nan"), True],
+            "lease_ttl": [0, -1, 61.0, float("nan"), "1"],
+            "hysteresis": [-0.1, None],
+            "created": [float("inf"), 1e300, "now"],
+            "priority": [1.0, 1001, None, "high"],
+            "deadline": [-1.0, float("nan"), None],
+            "stop_time": [-1.0, "1"],
+            "stall_limit": [-1.0, []],
+            "value": [-1.0, float("inf")],
+            "generation": [-1, 0.5],
+            "configuration": [-1, None],
+            "group": [5, None],
+            "preemptible": [1, None],
+            "exclusive": [0, "no"],
+            "council": [5, None, [5], [[b"x", "10.0.0.1", 7000]], [COUNCIL[0].packed(), 5], {"a": 1}],
+        }
+        for name, values in bad.items():
+            for value in values:
+                self.assertIsNone(task_of(record("t1", changed(TASK.packed(), **{name: value}))), (name, value))
+        for value in (None, b"", b"\xc1", [1], {}, {"task_id": "t1"}, DEPTH):
+            self.assertIsNone(task_of(record("t1", value)), value)
+
+    def test_crafted_reports(self) -> None:
+        """A report with a wrong type is none; one whose cost is no distance has nothing to report."""
+        for name, value in [
+            ("name", 5),
+            ("status", 5),
+            ("assigned", None),
+            ("digest", 5),
+            ("token", -1),
+            ("why", 5),
+            ("token", 1.0),
+            ("token", 2**60),
+            ("epoch", -1),
+            ("serial", 0.5),
+            ("state", None),
+            ("available", 1),
+            ("load", -1),
+            ("age", -1.0),
+            ("valid_for", float("nan")),
+            ("progress", "half"),
+            ("angle", float("inf")),
+            ("post", [1.0]),
+            ("uuid", 5),
+            ("battery", 1.5),
+            ("battery", None),
+            ("battery", float("nan")),
+            ("value", 5),
+            ("value", "ab"),
+            ("value", ["a"]),
+            ("value", [float("inf")]),
+            ("value", [1e12]),
+            ("value", [0.0] * 9),
+            ("choice", 5),
+            ("choice", "x" * 65),
+            ("choice", "red\x1b[2J"),
+            ("weight", -1.0),
+            ("weight", 1e12),
+            ("weight", True),
+            ("electorate", float("nan")),
+            ("electorate", "all"),
+        ]:
+            self.assertIsNone(member_of(record(MEMBER, changed(REPORT.packed(), **{name: value}))), (name, value))
+        for cost in ("near", -1.0, float("nan"), float("inf"), True, [1]):
+            report = member_of(record(MEMBER, changed(REPORT.packed(), cost=cost)))
+            self.assertEqual(report, replace(REPORT, cost=None), cost)
+        for nothing in (None, b"", {}, {"uuid": UUID}, DEPTH):
+            self.assertIsNone(member_of(record(MEMBER, nothing)), nothing)
+
+    def test_report_that_is_stale_when_it_comes(self) -> None:
+        """A report older than it is valid for has nothing to report; one that says nothing of that counts."""
+        for age, valid_for, cost in ((2.0, 1.0, None), (1.0, 2.0, 1.5), (9.0, 0.0, 1.5)):
+            report = member_of(record(MEMBER, changed(REPORT.packed(), age=age, valid_for=valid_for)))
+            self.assertEqual(report and report.cost, cost, (age, valid_for))
+
+    def test_usual_fields_take_no_room(self) -> None:
+        """What is as usual is left out of a record, and comes out as usual."""
+        plain = Task("t1", "search", "Find it")
+        self.assertEqual(
+            sorted(msgpack.unpackb(plain.packed())), ["kind", "parameters", "requirements", "task_id", "title"]
+        )
+        self.assertEqual(task_of(record("t1", plain.packed())), plain)
+        full = replace(TASK, priority=5, deadline=9.0, preemptible=True, exclusive=False, group="g", configuration=2)
+        self.assertEqual(task_of(record("t1", full.packed())), full)
+
+    def test_crafted_results(self) -> None:
+        """A result with a wrong type, number or outcome is none."""
+        for name, value in [
+            ("outcome", "WON"),
+            ("outcome", []),
+            ("by", 5),
+            ("why", 5),
+            ("took", "5"),
+            ("took", float("nan")),
+            ("token", float("inf")),
+            ("token", "5"),
+            ("token", -1),
+            ("bids", 5),
+            ("bids", [5]),
+            ("bids", [["a"]]),
+            ("bids", [["a", "b"]]),
+            ("bids", [[5, 1.0]]),
+        ]:
+            self.assertIsNone(result_of(record(RESULT, changed(DONE.packed(), **{name: value}))), (name, value))
+        for value in (None, b"", {}, {"outcome": COMPLETED}, DEPTH):
+            self.assertIsNone(result_of(record(RESULT, value)), value)
+
+    @settings(max_examples=250, deadline=None, derandomize=True, database=None)
+    @given(st.binary(max_size=60) | st.dictionaries(st.sampled_from(NAMES), anything, max_size=4) | anything)
+    def test_total(self, value: object) -> None:
+        """Whatever stands in a record, reading it gives something lawful or nothing, and never raises."""
+        values = [value]
+        if isinstance(value, dict) and all(isinstance(name, str) for name in value):
+            values += [changed(one, **value) for one in (TASK.packed(), REPORT.packed(), DONE.packed())]
+        for one in values:
+            task = task_of(record("t1", one))
+            if task is not None:
+                lacking = refusals({"camera": {"width": 1}}, task.requirements)
+                self.assertTrue(all(isinstance(line, str) for line in lacking), lacking)
+            self.assertIsInstance(member_of(record(MEMBER, one)), Member | None)
+            self.assertIsInstance(outcome_of(TASK, [record(RESULT, one)]), Result | None)
+
+
+class OutcomeTests(SynchronousTestCase):
+    def test_highest_token_holds(self) -> None:
+        """Of several results the one with the highest token holds, in any order; without any the task is open."""
+        late = Result(FAILED, "cat", 1.0, 7)
+        records = [record(RESULT, DONE.packed()), record(RESULT, late.packed(), CAT), record(MEMBER, REPORT.packed())]
+        self.assertEqual(outcome_of(TASK, records), late)
+        self.assertEqual(outcome_of(TASK, records[::-1]), late)
+        self.assertIsNone(outcome_of(TASK, records[2:]))
+        self.assertEqual(outcome_of(TASK, [record(RESULT, Result(CANCELLED, "x").packed())]), Result(CANCELLED, "x"))
+
+    def test_groups_are_apart(self) -> None:
+        """Two tasks never share a key."""
+        self.assertNotEqual(group_key("t1"), group_key("t2"))
+
+
+class RefusalTests(SynchronousTestCase):
+    def test_reasons(self) -> None:
+        """A device can do what asks no more than it has; otherwise each thing that lacks is named."""
+        has: Capabilities = {"camera": {"width": 208, "colour": "rgb"}, "legs": {}}
+        rows: list[tuple[Capabilities, list[str]]] = [
+            ({}, []),
+            ({"legs": {}}, []),
+            ({"camera": {"width": 208}}, []),
+            ({"camera": {"colour": "rgb"}}, []),
+            ({"arm": {}}, ["has no arm"]),
+            ({"camera": {"width": 640}}, ["camera width is 208, less than 640"]),
+            ({"camera": {"height": 1}}, ["camera does not say its height"]),
+            ({"camera": {"colour": "grey"}}, ["camera colour is rgb, not grey"]),
+            ({"camera": {"width": "wide"}}, ["camera width is 208, not wide"]),
+            ({"arm": {}, "camera": {"width": 209}}, ["has no arm", "camera width is 208, less than 209"]),
+        ]
+        for requirements, reasons in rows:
+            self.assertEqual(refusals(has, requirements), reasons)
+
+    def test_a_number_that_is_none_is_not_enough(self) -> None:
+        """A capability of NaN meets no requirement."""
+        self.assertEqual(len(refusals({"camera": {"width": float("nan")}}, {"camera": {"width": 1}})), 1)
