@@ -47,8 +47,8 @@ class Waits(Protocol):
 class Taker:
     """The takes of one node in one space; ``held`` are the tuples it holds, ``gone`` those it knows to be taken.
 
-    ``on_free`` is called when this node gives up a tuple that it held or failed to claim, ``put_back`` with a tuple that was confirmed to
-    a call for which nobody waits any more.
+    ``on_free`` is called when this node gives up a tuple that it held or failed to claim, ``put_back`` with a tuple
+    that was confirmed to a call for which nobody waits any more.
     """
 
     def __init__(
