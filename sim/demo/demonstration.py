@@ -27,7 +27,7 @@ from sim.demo.cast import CASTS, LOOPBACK
 from sim.demo.configuration import DOGS, JUDGE, YARD, Plan
 from sim.demo.experiment import Experiment, report, table
 from sim.demo.port import PortBusy
-from sim.demo.processes import Team
+from sim.demo.processes import RESTART_S, Team
 from sim.demo.stage import WEB_PORT, Trouble, arranged, fresh, has_tls
 from sim.demo.story import present, told
 from sim.demo.visitor import PageError, Visitor
@@ -140,7 +140,8 @@ class Demonstration:
         """Say when a process ends; the team starts it again."""
         missing = set(self._team.missing())
         for name in sorted(missing - self._lost):
-            self._tell(f"the process of {name} ended; it starts again in 15 s (see {self._plan.run_dir / name}.log)")
+            log = self._plan.run_dir / f"{name}.log"
+            self._tell(f"the process of {name} ended; it starts again in {RESTART_S:g} s (see {log})")
         self._lost = missing
         self._reactor.callLater(1.0, self.watch)
 

@@ -21,6 +21,8 @@ from twisted.logger import Logger
 from twisted.runner.procmon import ProcessMonitor
 
 TAIL_LINES = 12
+RESTART_S = 30.0
+"""Seconds after which a dead process starts again: longer than another robot needs to finish on a busy machine."""
 
 
 class Said(Protocol):
@@ -41,7 +43,7 @@ class Team:
 
     log = Logger()
 
-    def __init__(self, reactor: Any, run_dir: Path, said: Said | None = None, restart_delay: float = 15.0) -> None:
+    def __init__(self, reactor: Any, run_dir: Path, said: Said | None = None, restart_delay: float = RESTART_S) -> None:
         self._clock = IReactorTime(reactor)
         self._run_dir = run_dir
         self._said = said

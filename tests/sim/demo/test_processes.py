@@ -13,7 +13,7 @@ from twisted.python.failure import Failure
 from twisted.trial.unittest import SynchronousTestCase
 from zope.interface import implementer
 
-from sim.demo.processes import Team, on_leash
+from sim.demo.processes import RESTART_S, Team, on_leash
 
 
 class MemoryProcess:
@@ -93,13 +93,13 @@ class TeamTests(SynchronousTestCase):
         self.assertEqual(team.tail("dog1"), ["one", "two"])
 
     def test_killed_process_stays_away_for_the_delay(self) -> None:
-        """A process killed after a long life comes back after 15 seconds and not before; the others go on."""
+        """A process killed after a long life comes back after ``RESTART_S`` and not before; the others go on."""
         team, reactor = self.team()
         reactor.advance(100.0)
         team.kill("dog1")
         reactor.advance(0.0)
         self.assertEqual((reactor.started[0].signals, team.missing()), (["KILL"], ["dog1"]))
-        reactor.advance(14.9)
+        reactor.advance(RESTART_S - 0.1)
         self.assertIsNone(team.pid("dog1"))
         reactor.advance(0.2)
         self.assertEqual((team.pid("dog1"), team.pid("dog2")), (102, 101))
