@@ -45,6 +45,7 @@ from sim.robots.table import Robots
 from sim.robots.yard import Yard
 from swarmnode import gateway
 from swarmnode.driver import pilot
+from tests.layers import write_table
 from tests.role_table import write_tables
 from webnode import channel, limits, live, team
 from webnode.board import AUDITED
@@ -219,6 +220,10 @@ class DocumentTests(SynchronousTestCase):
     def test_role_tables_are_those_of_the_code(self) -> None:
         """The tables of roles on the security page are made from the role table."""
         self.assertIn(write_tables(), (ROOT / "docs" / "security.md").read_text(encoding="utf-8"))
+
+    def test_layers_are_those_of_the_tests(self) -> None:
+        """The table of packages on the architecture page is made from the layers that the tests hold."""
+        self.assertIn(write_table(), (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8"))
 
     def test_every_robot_is_listed(self) -> None:
         """The table of robots in the README has each kind of driver and no other, and leads to its page."""
