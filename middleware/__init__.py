@@ -1,5 +1,4 @@
-"""The node: peers, records, who is here, what is to be done, and who does it.  It knows no robot.
+"""The node: peers, records, devices, tasks, and consensus on who does them.  It knows no robot.
 
-``entangled`` is the peer-to-peer library; ``presence``, ``tasks``, ``consensus`` and ``streams`` stand on it;
-``node`` wires them.
+``entangled`` is the peer-to-peer library, and ``node`` wires the packages that stand on it.
 """

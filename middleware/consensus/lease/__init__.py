@@ -1,0 +1,1 @@
+"""Task leases: a majority of a task's council grants one lease, with a fencing token that only grows."""
