@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable
-from types import SimpleNamespace
 from typing import Any, cast
 
 from twisted.internet import defer
@@ -28,7 +27,7 @@ FOREVER = 1e9
 
 
 class LightNode:
-    """One node of a trial: what ``TupleSpace`` needs of an ``EntangledNode``."""
+    """One node of a trial, with the interface that a tuple space needs (``space.peer.Peer``)."""
 
     def __init__(self, trial: LightTrial, place: int, identity: Identity, rng: random.Random) -> None:
         self.identity = identity
@@ -39,7 +38,6 @@ class LightNode:
         self._network = trial.network(place)
         self.contact = Contact(identity.public, self._network.address)
         self.endpoint = Endpoint(identity, TEAM, self._network, trial.clock, rng)
-        self.overlay = SimpleNamespace(table={})
         self.seat = Seat(self.endpoint, self.store, trial.clock, rng)
 
     def start(self) -> None:
@@ -58,6 +56,10 @@ class LightNode:
         """The others who live, the closest first."""
         others = [node.contact for node in self._trial.living_nodes() if node is not self]
         return defer.succeed(closest(others, target, 8))
+
+    def newest(self, contact: Contact) -> Contact:
+        """Return ``contact``: addresses do not change here."""
+        return contact
 
     def put(self, key: bytes, name: str, value: bytes | None) -> Deferred[int]:
         """Store a record a little later, unless this node dies before."""
