@@ -174,7 +174,7 @@ def _deadline_without_the_stop(self: Lessee, won: Round) -> float:
 
 
 def _held_for_ever(self: Lessee) -> Lease | None:
-    return Lease(self.task_id, self.token, self._deadline) if self.token else None
+    return Lease(self.task_id, self.token, self._held.deadline) if self.token else None
 
 
 def _closed_and_forgotten(self: Acceptor[Any], *_: Any) -> Reply:

@@ -1,10 +1,11 @@
-"""Lessee: one agent's lease on one task: claim it, keep it, give it back; and stand by for it.
+"""The lease client of one agent for one task: it claims the lease, renews it, gives it back, and stands by for it.
 
-A claim has two phases: a majority promises (and tells the highest token), a majority grants.  A renewal needs the
-second one only.  The deadline is counted from when the granted question was *sent*, less a margin for clocks that drift
-and the time in which the robot comes to rest, so it ends before any member would grant another (consensus rule 5).
+A claim has two phases: a majority promises and reports the highest token, then a majority grants.  A renewal needs the
+second phase only.  The deadline counts from the time at which the granted request was *sent*, less a margin for clock
+drift and the time that the robot needs to stop, so it ends before any member grants another lease (consensus rule 5).
 
-``clock`` has to go on while the machine is suspended, where there is such a clock (rule 7).
+The states and transitions of the client are in ``client_states``; this module performs the actions.  ``clock`` has to
+run while the machine is suspended, if the system has such a clock (rule 7).
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from twisted.internet.defer import Deferred, succeed
 from twisted.internet.interfaces import IDelayedCall, IReactorTime
 from twisted.internet.task import deferLater
 
+from middleware.consensus.lease.client_states import ACTIVE, Action, Event, State, next_step
 from middleware.consensus.lease.council import Council
 from middleware.consensus.lease.lease_codec import AHEAD
 from middleware.entangled.contact import Contact
@@ -59,10 +61,36 @@ class Lease:
     deadline: float
 
 
-class Lessee:
-    """One agent's claim on the task of ``council``; ``changed`` is called when the lease is won, renewed or lost.
+@dataclass
+class _Held:
+    """The lease that was granted last: its token (0: none), deadline and ballot."""
 
-    ``stop_time`` is how long the robot takes to come to rest, in seconds.
+    token: int = 0
+    deadline: float = 0.0
+    ballot: Ballot = NONE
+
+
+@dataclass
+class _Line:
+    """The client's ``rank`` among the standbys, and its knowledge of the lease of another agent.
+
+    ``freed_at`` is the time at which the robot of an agent that gave the lease back stands still, ``ends_at`` the
+    estimated end of the lease, and ``is_outbid`` says whether a higher ballot was promised in the last round.
+    """
+
+    rank: int = 0
+    freed_at: float = -math.inf
+    ends_at: float = -math.inf
+    is_outbid: bool = False
+
+
+class Lessee:
+    """The claim of one agent to the task of ``council``.
+
+    :param clock: a clock that runs while the machine is suspended
+    :param rng: the source of random pauses
+    :param changed: called when the lease is granted, renewed or lost
+    :param stop_time: the time in seconds that the robot needs to stop
     """
 
     def __init__(
@@ -75,349 +103,369 @@ class Lessee:
     ) -> None:
         self.task_id = council.task_id
         self.council = council
-        self.token = 0
-        self.is_over = False
         self.pauses = 0
+        self.state = State.IDLE
         self._clock = clock
         self._rng = rng
         self._changed = changed
         self._stop_time = stop_time
-        self._deadline = 0.0
-        self._rests_at = -math.inf
-        self._ballot = NONE
+        self._held = _Held()
         self._claimed = NONE
-        self._rank = 0
-        self._is_wanted = False
-        self._free_at = -math.inf
-        self._only_looks = False
-        self._must_prepare = False
-        self._is_promised = False
-        self._is_outbid = False
-        self._ends_at = -math.inf
+        self._rests_at = -math.inf
+        self._line = _Line()
         self._round: Round | None = None
         self._timer: IDelayedCall | None = None
         self._due_at = 0.0
 
     @property
+    def token(self) -> int:
+        """The token of the lease that is or was held, 0 for none."""
+        return self._held.token
+
+    @property
+    def is_over(self) -> bool:
+        """Whether a majority said that the task has ended."""
+        return self.state is State.OVER
+
+    @property
     def lease(self) -> Lease | None:
-        """The lease if it is held now."""
-        if self.token and self._clock.seconds() < self._deadline:
-            return Lease(self.task_id, self.token, self._deadline)
+        """The lease while it is held."""
+        if self.token and self._clock.seconds() < self._held.deadline:
+            return Lease(self.task_id, self.token, self._held.deadline)
         return None
 
+    # -- calls of the agent -----------------------------------------------------------------------------------------
+
     def want(self) -> None:
-        """Claim the lease and keep it, trying again until it is won."""
-        self._move_up(0)
-        if not self._is_wanted and not self.is_over:
-            self._is_wanted = True
-            self._claim()
+        """Claim the lease and keep it, with further tries until it is granted."""
+        self._set_rank(0)
+        self._handle(Event.WANT)
 
     def stand_by(self, rank: int = 1) -> None:
-        """Claim the lease when it is given back or has run out, the lower ranks first; until then listen and ask.
+        """Claim the lease when it was given back or has expired, lower ranks first; until then listen and ask.
 
-        Who holds the lease or wants it already only takes the rank.
+        A client that holds the lease or claims it only takes the rank.
         """
-        self._move_up(max(1, rank))
-        if not self._is_wanted and not self.is_over:
-            self._is_wanted = self._only_looks = True
-            self._again(self._rank * self.council.ttl / RENEWALS)
+        self._set_rank(max(1, rank))
+        self._handle(Event.STAND_BY)
 
     def suspect(self) -> None:
-        """The holder may be gone: ask now how long its lease runs, and be ready when it ends.  It shortens no lease."""
-        if self._only_looks and self._is_wanted and not (self._is_asking or self._is_freed or self.lease is not None):
-            self._look()
+        """Ask now when the lease ends, because the holder may have failed.  It shortens no lease."""
+        if not self._is_freed and self.lease is None:
+            self._handle(Event.SUSPECT)
 
     def freed(self, token: int, rest: float = 0.0) -> None:
-        """Somebody says that the lease with that token was given back; its robot moves for ``rest`` more seconds.
+        """Learn that the lease with ``token`` was given back, and that its robot moves for ``rest`` more seconds.
 
-        The first in line asks for it at once, so that only the grant is left to ask for when that robot stands still.
+        The first standby asks for promises at once, so that only the grant is left when that robot stands still.
         """
         self.council.note_token(token)
-        if self._is_wanted and self.lease is None:
-            is_news = not self._is_freed
-            self._free_at = self._ends_at = self._clock.seconds() + rest
-            if is_news:
-                self.council.leap()
-                if self._is_looking:
-                    self._cancel()
-                if not self._is_asking:
-                    self._only_looks = False
-                    self._again(self._turn())
+        if self.state in ACTIVE and self.lease is None:
+            is_new = not self._is_freed
+            self._line.freed_at = self._line.ends_at = self._clock.seconds() + rest
+            if is_new:
+                self._handle(Event.FREED)
 
     def outrank(self, token: int) -> None:
-        """A device has obeyed ``token``: from now on nothing is claimed that is not higher, and nothing lower used."""
+        """Learn that a device has obeyed ``token``: claims are higher from now on, and a lower lease is lost."""
         self.council.token = max(self.council.token, token)
         if 0 < self.token < token:
-            self._lose()
-            self._claim()
+            self._handle(Event.OUTRANK)
 
     def release(self, heirs: Sequence[Contact] = (), rest: float = 0.0) -> Deferred[object]:
         """Give the lease back (stop the device first), or stop claiming it; fires when the council knows.
 
-        The council is told how long the robot takes to come to rest, and grants nothing before: ``rest`` seconds until
-        it stops, where it can't be told to, and those that it takes to stop.  Its members tell those that stand by;
-        ``heirs`` are told from here, and so half a round trip earlier.
+        The council learns how long the robot needs to stop, and grants nothing before: ``rest`` seconds for a robot
+        that cannot be told, and its own stop time.  The members notify the standbys; ``heirs`` are notified from here,
+        half a round trip earlier.
         """
-        told: Deferred[object] = succeed(None)
+        done: Deferred[object] = succeed(None)
         if self.lease is not None:
-            # With the margin from the beginning: what is left of it is said again when a later claim is let go of.
+            # With the margin from the beginning: a later release of another claim repeats what is left of it.
             moves = (rest + self._stop_time) * (1.0 + CLOCK_MARGIN)
             self._rests_at = min(self._rests_at, self._clock.seconds() + moves)
-        self._is_wanted = False
-        self._cancel()
-        if self._ballot != NONE:
-            told = self._let_go(max(self._ballot, self._claimed), heirs)  # which ends the older one, too
+        self._handle(Event.RELEASE)
+        if self._held.ballot != NONE:
+            done = self._let_go(max(self._held.ballot, self._claimed), heirs)  # which ends the older one, too
         else:
             self._let_go_of_minority()
-        self.token, self._deadline, self._ballot, self._claimed = 0, 0.0, NONE, NONE
-        return told
+        self._held, self._claimed = _Held(), NONE
+        return done
 
     def move(self, members: Sequence[Contact]) -> Deferred[None]:
         """Have ``members`` be the council (stop the device first).
 
-        A lease that is held goes back with it, and is kept for this agent until it has claimed it again there.  Fails
-        as ``Council.change`` does; then the lease is claimed again where it was.
+        A lease that is held goes back with it, and is reserved for this client until it has claimed it again there.
+        Fails as ``Council.change`` does; then the lease is claimed again where it was.
         """
         return Deferred.fromCoroutine(self._move(members))
 
     def end(self, token: int) -> Deferred[bytes]:
-        """Have no lease granted any more (stop the device first): the task was done under ``token``.
+        """Have the council grant no lease any more (stop the device first): the task was done under ``token``.
 
-        Where this agent holds a later one by now, that one counts.  Fires with the proof, signed by a
-        majority of the council; fails as ``Council.close`` does.
+        If this client holds a later token by now, that one counts.  Fires with the proof, signed by a majority of the
+        council; fails as ``Council.close`` does.
         """
         return self.council.close(max(token, self.token)).addCallback(lambda _: self.council.ending)
 
     async def _move(self, members: Sequence[Contact]) -> None:
-        self._cancel()
+        self._handle(Event.MOVE)
         if self.lease is not None:
-            self.token, self._deadline = 0, 0.0
+            self._held.token, self._held.deadline = 0, 0.0
             moves = self._stop_time * (1.0 + CLOCK_MARGIN)
             self._rests_at = self._clock.seconds() + moves
             await deferLater(self._clock, moves)
         try:
             await self.council.change(members, keep=True)
-        finally:
-            if self._is_wanted and not self._is_asking:
-                self._claim()
+        except Exception:  # but not when the coroutine of a node that is gone is collected as garbage
+            self._handle(Event.MOVED)
+            raise
+        self._handle(Event.MOVED)
 
-    # -- claiming ---------------------------------------------------------------------------------------------------
+    def _set_rank(self, rank: int) -> None:
+        """Take a rank among the standbys; a claim that is due becomes due as much sooner or later."""
+        before, self._line.rank = self._stagger(), rank
+        if self._stagger() != before and self.lease is None and not self._is_freed:
+            self._handle(Event.RANK)
 
-    def _claim(self) -> None:
-        """Ask for promises; while a lease is held it stays in force meanwhile."""
+    # -- transitions ------------------------------------------------------------------------------------------------
+
+    def _handle(self, event: Event, asked: Round | None = None, delay: float = 0.0) -> None:
+        """Go to the next state and perform the actions.
+
+        :param asked: the round whose result the event is
+        :param delay: seconds, for an event that sets the timer
+        """
+        self.state, actions = next_step(self.state, event)
+        for action in actions:
+            self._perform(action, asked, delay)
+
+    def _perform(self, action: Action, asked: Round | None, delay: float) -> None:
+        match action:
+            case Action.CANCEL:
+                self._cancel()
+            case Action.LOOK:
+                self._look()
+            case Action.PREPARE:
+                self._prepare()
+            case Action.PROPOSE:
+                self._propose(self._claimed, self._next_token())
+            case Action.RENEW:
+                self._cancel()
+                self._propose(self._held.ballot, self.token)
+            case Action.COMPLETE:
+                assert asked is not None
+                completing = Deferred.fromCoroutine(self.council.finish(self._claimed, asked))
+                completing.addErrback(lambda failure: failure.trap(EntangledError))
+                completing.addBoth(lambda _: self._handle(Event.COMPLETED))
+            case Action.LEAP:
+                self.council.leap()
+            case Action.LOSE:
+                self._lose()
+            case Action.DROP:
+                was_held = self.token != 0
+                self._let_go_of_minority()
+                if was_held:
+                    self._let_go(self._held.ballot)
+                    self._lose()
+            case Action.NOTIFY:
+                self._changed()
+            case Action.LINE_UP if asked is not None:
+                self._wait(asked)
+            case Action.LINE_UP:
+                self._line_up(self._rng.uniform(*JITTER))
+            case Action.AFTER_RANK:
+                self._again(self._line.rank * self._poll_period)
+            case Action.AFTER_POLL | Action.AFTER_WAIT | Action.AFTER_PREVIOUS:
+                self._again(delay)
+            case Action.AFTER_TURN:
+                self._again(self._turn())
+            case Action.AFTER_RENEWAL:
+                self._again(self._poll_period)
+            case Action.AFTER_RETRY:
+                self._again(min(RETRY, self._held.deadline - self._clock.seconds()))
+            case Action.AFTER_BACK_OFF:
+                self._again(self._rng.uniform(*BACK_OFF))
+
+    # -- rounds -----------------------------------------------------------------------------------------------------
+
+    def _look(self) -> None:
+        """Ask whether the lease is free, without a promise."""
         self._cancel()
-        self._only_looks = False
+        self._round = asked = self.council.round("lease.prepare", 0, self.council.ttl, short=0.0)
+        asked.outcome.addCallback(self._looked, self.council.configuration)
+
+    def _looked(self, asked: Round, configuration: int) -> None:
+        if not self._counts(asked):
+            return
+        asked.close()
+        if self.council.configuration != configuration:
+            # Only members of the newest council know the standbys, and notify them of a release.
+            self._handle(Event.RECONFIGURED)
+        else:
+            is_free = asked.tally.is_won and not self._stagger()
+            self._handle(Event.FREE if is_free else Event.TAKEN, asked)
+
+    def _prepare(self) -> None:
+        """Ask for promises; a lease that is held stays valid meanwhile."""
+        self._cancel()
         self._claimed = ballot = self.council.next_ballot()
         kinds = (Kind.GRANTED, Kind.SEALED)
         question = ballot.counter, self.council.ttl
         self._round = asked = self.council.round("lease.prepare", *question, kinds=kinds, short=self._short)
-        asked.outcome.addCallback(self._promised, ballot, self.council.configuration)
+        asked.outcome.addCallback(self._promised, self.council.configuration)
 
-    def _promised(self, asked: Round, ballot: Ballot, configuration: int) -> None:
-        self.council.hear(asked)
-        if self._round is not asked or self._has_ended(asked):
+    def _promised(self, asked: Round, configuration: int) -> None:
+        if not self._counts(asked):
             return
         if self.council.configuration != configuration:
-            return self._claim()
+            return self._handle(Event.RECONFIGURED)
         if not asked.tally.is_won:
             return self._failed(asked)
         asked.close()
-        if asked.tally.to_complete is not None:
-            self._round = None
-            finishing = Deferred.fromCoroutine(self.council.finish(ballot, asked))
-            finishing.addErrback(lambda failure: failure.trap(EntangledError))
-            finishing.addBoth(lambda _: self._go_on())
-            return
         wait = asked.free_in() - LEAD if self.lease is None else 0.0
-        if wait > 0.0:
-            # The lease is about to run out, or the robot of who gave it back to stand still.
-            self._is_promised = True
-            self._timer = self._clock.callLater(wait, lambda: self._propose(ballot, self._next_token()))
+        if asked.tally.to_complete is not None:
+            self._handle(Event.UNFINISHED, asked)
+        elif wait > 0.0:
+            # The lease is about to expire, or the robot of the agent that gave it back to stop.
+            self._handle(Event.EARLY_PROMISES, delay=wait)
         else:
-            self._propose(ballot, self._next_token())
+            self._handle(Event.PROMISES)
 
     def _next_token(self) -> int:
-        """The token to claim: the one that is held while nobody was granted a higher one, else above all seen."""
+        """Return the token to claim: the own one if no higher one was granted, else one above all known."""
         if self.lease is not None and self.token >= self.council.token:
             return self.token
         self.council.token += 1
         return self.council.token
 
     def _propose(self, ballot: Ballot, token: int) -> None:
-        self._is_promised = False
         question = ballot.counter, token, self.council.ttl
         self._round = asked = self.council.round("lease.propose", *question, short=self._short)
         asked.outcome.addCallback(self._granted, ballot, token)
 
     def _granted(self, asked: Round, ballot: Ballot, token: int) -> None:
-        self.council.hear(asked)
-        if self._round is not asked or self._has_ended(asked):
+        if not self._counts(asked):
             return
-        # Who may not grant anything yet needs no other ballot later.
-        self._must_prepare = any(reply.kind not in (Kind.GRANTED, Kind.QUIET) for reply in asked.tally.replies.values())
         deadline = self._deadline_of(asked) if asked.tally.is_won else 0.0
         if deadline <= self._clock.seconds():
             return self._failed(asked)
-        self._ballot, self.token, self._deadline = ballot, token, deadline
+        self._held = _Held(token, deadline, ballot)
         self._rests_at = deadline + self._stop_time
-        self._again(self._poll_period())
-        self._changed()
+        # A member that may not grant anything yet needs no other ballot later.
+        others = [reply for reply in asked.tally.replies.values() if reply.kind not in (Kind.GRANTED, Kind.QUIET)]
+        self._handle(Event.PARTIAL_GRANTS if others else Event.GRANTS)
 
     def _deadline_of(self, won: Round) -> float:
-        """Until when the robot must stand still again, on our clock."""
+        """Return the time by which the robot must stand still again, on the own clock."""
         return won.sent_at + self.council.ttl * (1.0 - CLOCK_MARGIN) - self._stop_time
+
+    def _counts(self, asked: Round) -> bool:
+        """Learn from a round; return whether it is the newest one, and the task has not ended."""
+        self.council.hear(asked)
+        if self._round is not asked:
+            return False
+        over = [reply for reply in asked.tally.replies.values() if reply.kind is Kind.OVER]
+        if len(over) >= majority(len(self.council.members)):
+            self._handle(Event.ENDED)
+        return not self.is_over
 
     def _failed(self, asked: Round) -> None:
         asked.close()
-        self._round = None
-        if self.lease is not None:
-            # There is time for another renewal before the deadline; a member that has promised a higher ballot
-            # meanwhile needs a new one.
-            self._must_prepare = any(reply.kind is Kind.OUTBID for reply in asked.tally.replies.values())
-            return self._again(min(RETRY, self._deadline - self._clock.seconds()))
-        was_held = self.token != 0
-        self._let_go_of_minority()
-        if was_held:
-            self._let_go(self._ballot)
-            self._lose()
-        self._wait(asked)
+        if self.lease is None:
+            self._handle(Event.REJECTED, asked)
+        else:
+            # A member that has promised a higher ballot needs a new one; there is time for it before the deadline.
+            is_outbid = any(reply.kind is Kind.OUTBID for reply in asked.tally.replies.values())
+            self._handle(Event.OUTBID if is_outbid else Event.KEPT)
+
+    # -- times ------------------------------------------------------------------------------------------------------
 
     def _wait(self, asked: Round) -> None:
-        """Claim when the lease may be free; look again in a third of a ttl at any rate, for a push may be lost."""
+        """Estimate the end of the lease from a round that failed, and set the timer."""
         is_outbid = any(reply.kind is Kind.OUTBID for reply in asked.tally.replies.values())
         free_in = asked.free_in()
         if is_outbid and free_in == math.inf:
-            free_in = 0.0  # the others were not heard; with a higher ballot they are
-        self._ends_at, self._is_outbid = self._clock.seconds() + free_in, is_outbid
+            free_in = 0.0  # the other members did not answer; under a higher ballot they may
+        self._line.ends_at, self._line.is_outbid = self._clock.seconds() + free_in, is_outbid
         self._line_up(self._rng.uniform(*(BACK_OFF if is_outbid else JITTER)))
 
     def _line_up(self, pause: float) -> None:
-        """Claim ``pause`` seconds after its turn has come, or look whether it has where that is long, or not known."""
+        """Set the timer for the claim; if that is late or unknown, for a look, because a notification may be lost."""
         wait = self._turn() if self._is_freed else self._claims_in()
-        # A healthy holder renews well before: what runs out that soon is claimed in time, without a look before.
-        self._only_looks = wait > SOON * self._poll_period()
-        self._again((self._poll_period() if self._only_looks else wait) + pause)
+        # A healthy holder renews well before the end: a lease that expires so soon is claimed without a look.
+        is_far = wait > SOON * self._poll_period
+        self._handle(Event.FAR if is_far else Event.NEAR, delay=(self._poll_period if is_far else wait) + pause)
 
-    def _look(self) -> None:
-        """Ask whether the lease is free, and be promised nothing."""
-        self._cancel()
-        self._round = asked = self.council.round("lease.prepare", 0, self.council.ttl, short=0.0)
-        asked.outcome.addCallback(self._looked, self.council.configuration)
-
-    def _looked(self, asked: Round, configuration: int) -> None:
-        self.council.hear(asked)
-        if self._round is not asked or self._has_ended(asked):
-            return
-        asked.close()
-        if self.council.configuration != configuration:
-            # Only the members of now know who stands by, and tell it of a release.
-            return self._look()
-        if asked.tally.is_won and not self._stagger():
-            self._claim()
-        else:
-            self._wait(asked)
-
+    @property
     def _poll_period(self) -> float:
         return self.council.ttl / RENEWALS
 
-    def _move_up(self, rank: int) -> None:
-        """Take a place in the line; a claim that is due is due as much sooner or later."""
-        before, self._rank = self._stagger(), rank
-        waits = self._is_wanted and self.lease is None and not (self._only_looks or self._is_asking or self._is_freed)
-        if waits and self._stagger() != before:
-            self._line_up(self._rng.uniform(*JITTER))
-
     def _claims_in(self) -> float:
-        """Seconds until it claims what runs out: the first in line is promised it before, and so has time for it."""
-        is_first = not (self._stagger() or self._is_outbid)
+        """Return the seconds until the claim of a lease that expires; the first standby gets the promises before."""
+        is_first = not (self._stagger() or self._line.is_outbid)
         lead = EARLY * AHEAD * self.council.ttl if is_first else 0.0
-        return max(0.0, self._ends_at + self._stagger() - lead - self._clock.seconds())
+        return max(0.0, self._line.ends_at + self._stagger() - lead - self._clock.seconds())
 
     def _stagger(self) -> float:
-        return STAGGER * max(0, self._rank - 1)
+        return STAGGER * max(0, self._line.rank - 1)
 
     def _turn(self) -> float:
-        """Seconds until it claims what was given back: the first in line while the robot still moves, then by rank."""
+        """Return the seconds until the claim of a lease that was given back; the first standby claims at once."""
         wait = self._stagger()
-        return wait and max(0.0, self._free_at - self._clock.seconds()) + wait
-
-    # -- keeping ----------------------------------------------------------------------------------------------------
-
-    def _due(self) -> None:
-        """Renew, or ask again; a timer that is late may mean that this process or machine stood still."""
-        self._timer = None
-        self.pauses += self._clock.seconds() - self._due_at > TICK
-        if self.lease is not None and not self._must_prepare:
-            self._cancel()
-            self._propose(self._ballot, self.token)
-            return
-        if self.token and self.lease is None:
-            self._lose()
-        if self._only_looks and not self._is_freed and self.lease is None:
-            self._look()
-        else:
-            self._claim()
-
-    def _lose(self) -> None:
-        """It is over before it was given back."""
-        self.token, self._deadline, self._ballot = 0, 0.0, NONE
-        self._changed()
-
-    def _has_ended(self, asked: Round) -> bool:
-        """Whether a majority says that the task has ended: then nobody may act, not even whoever could for a while."""
-        over = [reply for reply in asked.tally.replies.values() if reply.kind is Kind.OVER]
-        if len(over) >= majority(len(self.council.members)):
-            self.is_over, self._is_wanted = True, False
-            self._cancel()
-            self._lose()
-        return self.is_over
-
-    # -- inside -----------------------------------------------------------------------------------------------------
+        return wait and max(0.0, self._line.freed_at - self._clock.seconds()) + wait
 
     @property
     def _is_freed(self) -> bool:
-        """Whether the lease was given back just now: the news may be here before it is at every member."""
-        return self._clock.seconds() < self._free_at + FRESH
+        """Whether the lease was given back a moment ago: some members may not know it yet."""
+        return self._clock.seconds() < self._line.freed_at + FRESH
 
     @property
     def _short(self) -> float:
-        """Seconds for which a lease that is in the way is waited for: one that was given back does not last."""
+        """The longest remaining lease in seconds that a round waits for; one that was given back ends soon."""
         return math.inf if self._is_freed else PAUSE
 
-    @property
-    def _is_asking(self) -> bool:
-        return self._is_promised or (self._round is not None and self._round.is_open)
-
-    @property
-    def _is_looking(self) -> bool:
-        return self._only_looks and self._is_asking
-
-    def _go_on(self) -> None:
-        if self._is_wanted and not self._is_asking:
-            self._again(self._rng.uniform(*BACK_OFF))
-
-    def _let_go(self, ballot: Ballot, heirs: Sequence[Contact] = ()) -> Deferred[object]:
-        """Tell the council, and for how long the robot may still move (it was told to stop at the deadline at most)."""
-        rest = max(0.0, self._rests_at - self._clock.seconds())
-        return self.council.let_go(ballot, heirs, rest * (1.0 + CLOCK_MARGIN))
-
-    def _let_go_of_minority(self) -> None:
-        """What a minority granted must not keep a healthier claimant waiting."""
-        if self._claimed not in (self._ballot, NONE):
-            self._let_go(self._claimed)
-
-    def _cancel(self) -> None:
-        """What a round under way still brings is not used any more."""
-        if self._round is not None:
-            self._round.close()
-            self._round = None
-        self._is_promised = False
-        if self._timer is not None and self._timer.active():
-            self._timer.cancel()
+    def _due(self) -> None:
+        """Handle the timer; one that is late may mean that this process or machine was suspended."""
         self._timer = None
+        self.pauses += self._clock.seconds() - self._due_at > TICK
+        if self.state is State.PROMISED:
+            self._handle(Event.DUE)
+        elif self.token and self.lease is None:
+            self._handle(Event.EXPIRED)
+        elif self._is_freed and self.lease is None:
+            self._handle(Event.DUE_FREED)
+        else:
+            self._handle(Event.DUE)
 
     def _again(self, delay: float) -> None:
         if self._timer is not None and self._timer.active():
             self._timer.cancel()
         self._due_at = self._clock.seconds() + delay
         self._timer = self._clock.callLater(delay, self._due)
+
+    def _cancel(self) -> None:
+        """Drop the round under way and the timer."""
+        if self._round is not None:
+            self._round.close()
+            self._round = None
+        if self._timer is not None and self._timer.active():
+            self._timer.cancel()
+        self._timer = None
+
+    # -- giving back ------------------------------------------------------------------------------------------------
+
+    def _lose(self) -> None:
+        """Forget a lease that was not given back, and notify the listener."""
+        self._held = _Held()
+        self._changed()
+
+    def _let_go(self, ballot: Ballot, heirs: Sequence[Contact] = ()) -> Deferred[object]:
+        """Release ``ballot`` at the council, with the time for which the robot may still move."""
+        rest = max(0.0, self._rests_at - self._clock.seconds())
+        return self.council.let_go(ballot, heirs, rest * (1.0 + CLOCK_MARGIN))
+
+    def _let_go_of_minority(self) -> None:
+        """Release a claim that only a minority granted, so that it delays no other claimant."""
+        if self._claimed not in (self._held.ballot, NONE):
+            self._let_go(self._claimed)

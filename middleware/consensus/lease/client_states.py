@@ -1,0 +1,222 @@
+"""The states of a lease client, and its transition table.  Pure.
+
+The client (``lessee``) turns calls, timers and the results of rounds into events, looks up the transition, and performs
+its actions.  A claim runs through PREPARING, PROMISED where the previous lease has not ended, and PROPOSING to HOLDING;
+a standby alternates between WATCHING and LOOKING until the lease is about to end.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from enum import Enum
+from typing import NamedTuple
+
+
+class State(Enum):
+    """The value says what the client does in the state."""
+
+    IDLE = "does not want the lease"
+    WATCHING = "waits, and then asks when the lease ends"
+    LOOKING = "asks when the lease ends"
+    WAITING = "waits, and then claims"
+    PREPARING = "asks the council for promises"
+    PROMISED = "has the promises of a majority, and waits for the end of the previous lease"
+    PROPOSING = "asks the council to grant or renew the lease"
+    COMPLETING = "completes a change of the council that another proposer began"
+    HOLDING = "holds the lease"
+    OUTBID = "holds the lease, and needs a new ballot to renew it"
+    OVER = "knows that the task has ended"
+
+
+class Event(Enum):
+    """The value says what happened."""
+
+    WANT = "the agent wants the lease"
+    STAND_BY = "the agent wants the lease when its holder loses it"
+    RANK = "the agent's rank among the standbys changed while the lease is not held"
+    SUSPECT = "the holder may have failed"
+    FREED = "the holder gave the lease back"
+    OUTRANK = "the device obeyed a higher token"
+    RELEASE = "the agent gives the lease back or stops to claim it"
+    MOVE = "the agent changes the council"
+    MOVED = "the change of the council has ended"
+    DUE = "the timer fired"
+    DUE_FREED = "the timer fired soon after the lease was given back"
+    EXPIRED = "the timer fired after the deadline of the own lease"
+    NEAR = "the lease ends soon"
+    FAR = "the lease ends late, or at an unknown time"
+    FREE = "a majority says that the lease is free"
+    TAKEN = "no majority says that the lease is free"
+    RECONFIGURED = "a member named a newer council"
+    PROMISES = "a majority promised, and the lease is free"
+    EARLY_PROMISES = "a majority promised before the end of the previous lease"
+    UNFINISHED = "a majority promised, and a member accepted a change of the council before"
+    COMPLETED = "that change is complete"
+    GRANTS = "a majority granted the lease, and no member needs another ballot"
+    PARTIAL_GRANTS = "a majority granted the lease, and some member needs another ballot"
+    KEPT = "the round failed while the own lease is valid"
+    OUTBID = "the round failed by a higher ballot while the own lease is valid"
+    REJECTED = "the round failed, and there is no own lease"
+    ENDED = "a majority says that the task has ended"
+
+
+class Action(Enum):
+    """The value says what the client does at the transition."""
+
+    CANCEL = "drop the round and the timer"
+    LOOK = "ask when the lease ends"
+    PREPARE = "ask for promises under a new ballot"
+    PROPOSE = "ask for the lease under the promised ballot"
+    RENEW = "ask for the lease again under the ballot that it was granted under"
+    COMPLETE = "complete the change of the council"
+    LEAP = "choose the next ballot above those of other standbys"
+    LOSE = "forget the own lease, and notify the listener"
+    DROP = "give back what a minority granted, and lose the own lease"
+    NOTIFY = "notify the listener of the own lease"
+    LINE_UP = "estimate the end of the lease: NEAR or FAR follows"
+    AFTER_RANK = "set the timer for the first look, later for higher ranks"
+    AFTER_POLL = "set the timer for the next look"
+    AFTER_WAIT = "set the timer for the claim at the end of the lease"
+    AFTER_TURN = "set the timer for the claim of a lease that was given back"
+    AFTER_PREVIOUS = "set the timer for the end of the previous lease"
+    AFTER_RENEWAL = "set the timer for the renewal"
+    AFTER_RETRY = "set the timer for another try before the deadline"
+    AFTER_BACK_OFF = "set the timer for a random back-off"
+
+
+class Step(NamedTuple):
+    """A transition: the next state, and the actions in their order."""
+
+    state: State
+    actions: tuple[Action, ...] = ()
+
+
+S, E, A = State, Event, Action
+
+_CLAIM = Step(S.PREPARING, (A.PREPARE,))
+_RECLAIM = Step(S.PREPARING, (A.LOSE, A.PREPARE))
+_IDLE = Step(S.IDLE, (A.CANCEL,))
+_ENDED = Step(S.OVER, (A.CANCEL, A.LOSE))
+_PAUSED = Step(S.WAITING, (A.CANCEL,))
+_LINE_UP = Step(S.WAITING, (A.LINE_UP,))
+_TURN = Step(S.WAITING, (A.LEAP, A.AFTER_TURN))
+_FAILED: Mapping[Event, Step] = {
+    E.KEPT: Step(S.HOLDING, (A.AFTER_RETRY,)),
+    E.OUTBID: Step(S.OUTBID, (A.AFTER_RETRY,)),
+    E.REJECTED: Step(S.WAITING, (A.DROP, A.LINE_UP)),
+    E.ENDED: _ENDED,
+}
+_ALWAYS: Mapping[Event, Step] = {E.RELEASE: _IDLE, E.OUTRANK: _RECLAIM, E.MOVE: _PAUSED}
+
+TABLE: Mapping[State, Mapping[Event, Step]] = {
+    S.IDLE: {E.WANT: _CLAIM, E.STAND_BY: Step(S.WATCHING, (A.AFTER_RANK,)), E.RELEASE: _IDLE},
+    S.WATCHING: {
+        **_ALWAYS,
+        E.DUE: Step(S.LOOKING, (A.LOOK,)),
+        E.DUE_FREED: _CLAIM,
+        E.EXPIRED: Step(S.LOOKING, (A.LOSE, A.LOOK)),
+        E.SUSPECT: Step(S.LOOKING, (A.LOOK,)),
+        E.FREED: _TURN,
+        E.MOVE: Step(S.WATCHING, (A.CANCEL,)),
+        E.MOVED: _CLAIM,
+        E.COMPLETED: Step(S.WATCHING, (A.AFTER_BACK_OFF,)),
+    },
+    S.LOOKING: {
+        **_ALWAYS,
+        E.FREE: _CLAIM,
+        E.TAKEN: _LINE_UP,
+        E.RECONFIGURED: Step(S.LOOKING, (A.LOOK,)),
+        E.FREED: Step(S.WAITING, (A.LEAP, A.CANCEL, A.AFTER_TURN)),
+        E.MOVE: Step(S.WATCHING, (A.CANCEL,)),
+        E.ENDED: _ENDED,
+    },
+    S.WAITING: {
+        **_ALWAYS,
+        E.DUE: _CLAIM,
+        E.DUE_FREED: _CLAIM,
+        E.EXPIRED: _RECLAIM,
+        E.NEAR: Step(S.WAITING, (A.AFTER_WAIT,)),
+        E.FAR: Step(S.WATCHING, (A.AFTER_POLL,)),
+        E.RANK: _LINE_UP,
+        E.FREED: _TURN,
+        E.MOVED: _CLAIM,
+        E.COMPLETED: Step(S.WAITING, (A.AFTER_BACK_OFF,)),
+    },
+    S.PREPARING: {
+        **_ALWAYS,
+        **_FAILED,
+        E.PROMISES: Step(S.PROPOSING, (A.PROPOSE,)),
+        E.EARLY_PROMISES: Step(S.PROMISED, (A.AFTER_PREVIOUS,)),
+        E.UNFINISHED: Step(S.COMPLETING, (A.COMPLETE,)),
+        E.RECONFIGURED: _CLAIM,
+        E.FREED: Step(S.PREPARING, (A.LEAP,)),
+    },
+    S.PROMISED: {**_ALWAYS, E.DUE: Step(S.PROPOSING, (A.PROPOSE,)), E.FREED: Step(S.PROMISED, (A.LEAP,))},
+    S.PROPOSING: {
+        **_ALWAYS,
+        **_FAILED,
+        E.GRANTS: Step(S.HOLDING, (A.AFTER_RENEWAL, A.NOTIFY)),
+        E.PARTIAL_GRANTS: Step(S.OUTBID, (A.AFTER_RENEWAL, A.NOTIFY)),
+        E.FREED: Step(S.PROPOSING, (A.LEAP,)),
+    },
+    S.COMPLETING: {
+        **_ALWAYS,
+        E.COMPLETED: Step(S.WAITING, (A.AFTER_BACK_OFF,)),
+        E.RANK: _LINE_UP,
+        E.FREED: _TURN,
+        E.MOVED: _CLAIM,
+    },
+    S.HOLDING: {
+        **_ALWAYS,
+        E.DUE: Step(S.PROPOSING, (A.RENEW,)),
+        E.EXPIRED: _RECLAIM,
+        E.FREED: Step(S.HOLDING, (A.LEAP, A.AFTER_TURN)),
+        E.MOVED: _CLAIM,
+        E.COMPLETED: Step(S.HOLDING, (A.AFTER_BACK_OFF,)),
+    },
+    S.OUTBID: {
+        **_ALWAYS,
+        E.DUE: _CLAIM,
+        E.EXPIRED: _RECLAIM,
+        E.FREED: Step(S.OUTBID, (A.LEAP, A.AFTER_TURN)),
+        E.MOVED: _CLAIM,
+        E.COMPLETED: Step(S.OUTBID, (A.AFTER_BACK_OFF,)),
+    },
+    S.OVER: {E.RELEASE: Step(S.OVER, (A.CANCEL,))},
+}
+"""The transitions.  A pair that stands neither here nor in ``IMPOSSIBLE`` changes nothing."""
+
+TIMED = (S.WATCHING, S.WAITING, S.PROMISED, S.HOLDING, S.OUTBID)
+"""States in which a timer runs, but for the time between MOVE and MOVED."""
+ASKING = (S.LOOKING, S.PREPARING, S.PROPOSING)
+"""States with a round under way."""
+ACTIVE = tuple(state for state in State if state not in (S.IDLE, S.OVER))
+"""States in which the agent wants the lease."""
+_OF_TIMERS = (E.DUE, E.DUE_FREED, E.EXPIRED)
+_OF_ROUNDS = {
+    S.LOOKING: (E.FREE, E.TAKEN, E.RECONFIGURED, E.ENDED),
+    S.PREPARING: (*_FAILED, E.PROMISES, E.EARLY_PROMISES, E.UNFINISHED, E.RECONFIGURED),
+    S.PROPOSING: (*_FAILED, E.GRANTS, E.PARTIAL_GRANTS),
+}
+_LISTED = {event for events in _OF_ROUNDS.values() for event in events}
+
+IMPOSSIBLE: frozenset[tuple[State, Event]] = frozenset(
+    [
+        *((state, event) for state in State if state not in TIMED for event in _OF_TIMERS),
+        *((state, event) for state in State for event in _LISTED if event not in _OF_ROUNDS.get(state, ())),
+        *((state, event) for state in State if state is not S.WAITING for event in (E.NEAR, E.FAR)),
+        *((S.PROMISED, event) for event in (E.DUE_FREED, E.EXPIRED)),
+        *((state, E.DUE_FREED) for state in (S.HOLDING, S.OUTBID)),
+    ]
+)
+"""Pairs that the client never meets: the result of a round in another state, and the like."""
+
+
+def next_step(state: State, event: Event) -> Step:
+    """Return the transition of ``event`` in ``state``; an event that changes nothing returns ``state`` itself.
+
+    :raises ValueError: for a pair of ``IMPOSSIBLE``
+    """
+    if (state, event) in IMPOSSIBLE:
+        raise ValueError(f"{event.name} cannot happen while a lease client is {state.name}")
+    return TABLE[state].get(event, Step(state))
