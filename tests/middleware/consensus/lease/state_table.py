@@ -38,9 +38,9 @@ def _rows() -> str:
                 target, actions = row[event]
                 goal = "" if target is state else target.name
                 steps.setdefault((goal, ", ".join(action.name for action in actions)), []).append(state)
-        for number, ((goal, actions), states) in enumerate(steps.items()):
+        for number, ((goal, performed), states) in enumerate(steps.items()):
             name = "| " if number else f"{event.name} | {event.value}"
-            text += f"| {name} | {_list(states)} | {goal} | {actions} |\n"
+            text += f"| {name} | {_list(states)} | {goal} | {performed} |\n"
     return text
 
 
