@@ -14,7 +14,7 @@ from middleware.entangled.contact import Contact
 from middleware.entangled.errors import NotAdmitted, Refused
 from middleware.entangled.identity import Identity
 from middleware.entangled.record import Record, hashed_key
-from middleware.entangled.replication.replica import FORBIDDEN
+from middleware.entangled.replication.store_reply import Outcome
 from tests.attacks.siege import SOURCE, SiegeCase
 from tests.middleware.admission.paper import NOW
 
@@ -90,7 +90,7 @@ class RecordTests(SiegeCase):
                     [verdict] = self.outcome(team, asked, 0.1)
                     held = house.node.replica.holds(record)
                     self.assertEqual(held, may_store((role,), record.slot, role), (role, key, name))
-                    self.assertEqual(verdict == FORBIDDEN, not held, (role, key, name))
+                    self.assertEqual(verdict == Outcome.FORBIDDEN.value, not held, (role, key, name))
         self.assertEqual(kinds, set(KINDS))
 
 

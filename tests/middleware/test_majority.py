@@ -13,7 +13,7 @@ from middleware.entangled.kademlia.roster import COUNTED_S, STRUCK_S
 from middleware.entangled.network.switchboard import Weather
 from middleware.entangled.record import Record, hashed_key
 from middleware.entangled.replication.owner import Stored
-from middleware.entangled.replication.replica import HELD
+from middleware.entangled.replication.store_reply import Outcome
 from tests.fleet import Fleet, FleetCase
 
 KEY = hashed_key("colour")
@@ -135,7 +135,7 @@ class CutTests(MajorityCase):
         genuine, unsure.is_sure = unsure.is_sure, lambda: False
         owner = fleet.identity(0)
         record = Record(KEY, "a", owner.public, 2**40, "team", 60.0, b"x").signed(owner)
-        self.assertEqual(unsure.answer_store(fleet.nodes[0].contact, [record.packed()]), [HELD])
+        self.assertEqual(unsure.answer_store(fleet.nodes[0].contact, [record.packed()]), [Outcome.UNSYNCED.value])
         self.assertEqual(unsure.held(KEY), [record])
         stored = fleet.nodes[0].put(KEY, "b", b"x")
         fleet.run(0.5)

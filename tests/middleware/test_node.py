@@ -424,7 +424,7 @@ class KeepTests(NodeCase):
         self.page.watch(KEY, lambda records: None, keep=True)
         self.world.run(3.0)
         record = self.page.store.get(KEY)[0]
-        self.assertEqual(self.page.replica.keep(record), 0)
+        self.assertTrue(self.page.replica.keep(record).is_stored)
         self.assertEqual(self.page.replica.held(KEY), [record])
         self.dog.vanish()
         self.world.run(2.0)

@@ -12,6 +12,7 @@ from middleware.entangled.identity import Identity
 from middleware.entangled.record import TEAM_TTL, Record, hashed_key
 from middleware.entangled.replication.replica import Replica
 from middleware.entangled.replication.shipper import ROOM, Shipper
+from middleware.entangled.replication.store_reply import StoreReply
 from middleware.entangled.wire.asker import PATIENCE
 from tests.fleet import Fleet, FleetCase
 
@@ -74,7 +75,7 @@ class ShipperTests(FleetCase):
         """A replica without room for one of the records takes the others that came with it."""
         replica, keep = self.world.nodes[1].replica, Replica.keep
 
-        def picky(record: Record, left: float | None = None) -> int:
+        def picky(record: Record, left: float | None = None) -> StoreReply:
             if record.name == "3":
                 raise Refused("not this one")
             return keep(replica, record, left)

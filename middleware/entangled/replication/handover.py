@@ -27,6 +27,7 @@ from middleware.entangled.replication.overlap import BITS, GROUPS, PLACES, Mark,
 from middleware.entangled.replication.owner import REPUBLISH, Owner
 from middleware.entangled.replication.replica import Replica, pages_of
 from middleware.entangled.replication.standing import ELDER, NOVICE, SURE, Standing
+from middleware.entangled.replication.store_reply import StoreReply
 from middleware.entangled.replication.watch import digest_of
 from middleware.entangled.wire.endpoint import Endpoint
 
@@ -247,7 +248,7 @@ class Handover:
             with suppress(Refused):
                 await self._overlay.ask(contact, "store", [r.packed() for r in page], lives, changes=True)
 
-    async def _give(self, contact: Contact, record: Record) -> int:
+    async def _give(self, contact: Contact, record: Record) -> StoreReply:
         return await self._owner.store_at(contact, record, self._replica.left(record))
 
     async def _catch_up(self) -> None:

@@ -22,8 +22,9 @@ from middleware.entangled.errors import OWNER_FULL, Conflict, EntangledError, Fu
 from middleware.entangled.identity import Identity
 from middleware.entangled.kademlia.overlay import Overlay
 from middleware.entangled.record import TEAM_TTL, TOMBSTONE_TTL, Lifetime, Record, Slot
-from middleware.entangled.replication.replica import FORBIDDEN, HELD, NO_ROOM, Replica, pages_of
+from middleware.entangled.replication.replica import Replica, pages_of
 from middleware.entangled.replication.shipper import Shipper
+from middleware.entangled.replication.store_reply import STORED, UNSYNCED, Outcome, StoreReply, decode_reply
 from middleware.entangled.replication.watch import digest_of
 from middleware.entangled.wire.door import ROLE, meaning
 from middleware.entangled.wire.endpoint import Endpoint
@@ -47,7 +48,6 @@ LONG = 2**16
 """Bytes of a value from which on its copies are sent in two waves."""
 SPARE_S = 0.5
 """Seconds after which the second wave is not held back any longer, whatever became of the first."""
-MAX_SEQUENCE = 2**62
 OWNERS_FAULT = (ROLE, OWNER_FULL)
 """Codes of refusals that are due to the owner of the record, and no fault of the replica."""
 SEQUENCES = "sequences"
@@ -196,11 +196,11 @@ class Owner:
         voters = frozenset(self._overlay.voters(record.key, targets))
         needed = {"one": 1, "majority": len(voters) // 2 + 1, "all": len(voters)}[concern]
 
-        def is_vote(node_id: bytes, verdict: int) -> bool:
-            return concern == "one" or (node_id in voters and verdict != HELD)
+        def is_vote(node_id: bytes, reply: StoreReply) -> bool:
+            return concern == "one" or (node_id in voters and reply.outcome is not Outcome.UNSYNCED)
 
         left = self.left(record)
-        verdicts: dict[bytes, int] = {}
+        replies: dict[bytes, StoreReply] = {}
         forbidden: list[Refused] = []
         counted = [c for c in targets if concern == "one" or c.node_id in voters]
         spare = self._spare(record, targets, counted, needed)
@@ -214,35 +214,35 @@ class Owner:
             if contact.node_id in spare:
                 await released
             try:
-                verdict = await self._verdict(contact, record, left)
+                reply = await self._store_latest(contact, record, left)
             except EntangledError as error:
                 release()
                 if isinstance(error, Refused) and error.code in OWNERS_FAULT:
                     forbidden.append(error)
                 raise
             for pause in UNSURE_FOR if concern != "one" and contact.node_id in voters else ():
-                if verdict != HELD:
+                if reply.outcome is not Outcome.UNSYNCED:
                     break
                 release()
                 await self._chores.sleep(pause)
-                verdict = await self._verdict(contact, record, left)
-            verdicts[contact.node_id] = verdict
-            votes = sum(1 for node_id, verdict in verdicts.items() if verdict == 0 and node_id in voters)
-            if len(verdicts) == len(targets) and votes > len(voters) // 2:
+                reply = await self._store_latest(contact, record, left)
+            replies[contact.node_id] = reply
+            votes = sum(node_id in voters for node_id, reply in replies.items() if reply.outcome is Outcome.STORED)
+            if len(replies) == len(targets) and votes > len(voters) // 2:
                 self._settled(record)
 
         work = until(
-            lambda _: sum(1 for node_id, verdict in verdicts.items() if is_vote(node_id, verdict)) >= needed,
+            lambda _: sum(1 for node_id, reply in replies.items() if is_vote(node_id, reply)) >= needed,
             [store(c) for c in sorted(targets, key=lambda c: c.node_id != self._identity.node_id)],
         )
         in_time = self._chores.later(SPARE_S, release) if spare else release
         await work
         in_time()
         release()
-        answers = dict(verdicts)
-        newest = max([0, *answers.values()])
-        held = sum(1 for verdict in answers.values() if verdict in (0, HELD))
-        votes = sum(1 for node_id, verdict in answers.items() if verdict in (0, HELD) and is_vote(node_id, verdict))
+        answers = dict(replies)
+        newest = max([0, *(reply.sequence for reply in answers.values())])
+        held = sum(1 for reply in answers.values() if reply.is_stored)
+        votes = sum(1 for node_id, reply in answers.items() if reply.is_stored and is_vote(node_id, reply))
         if votes < needed and not newest:
             if forbidden:
                 if forbidden[0].code == ROLE:
@@ -251,19 +251,20 @@ class Owner:
             raise NotAcknowledged(votes, needed)
         return held, newest
 
-    async def store_at(self, contact: Contact, record: Record, left: float | None = None) -> int:
-        """Store at one replica: 0, ``HELD``, or the sequence that holds there against ``record``.  Raises ``Refused``.
+    async def store_at(self, contact: Contact, record: Record, left: float | None = None) -> StoreReply:
+        """Store at one replica: STORED, UNSYNCED or SUPERSEDED.  Raises ``Refused``.
 
         ``left`` are the seconds that it is to be kept, where it is not this node's own.
         """
         if contact.node_id == self._identity.node_id:
             return self._replica.store(record, left)
-        verdict = await self._shipper.store(contact, record, left)
-        if type(verdict) is int and (verdict in (0, HELD) or record.sequence <= verdict < MAX_SEQUENCE):
-            return verdict
-        if verdict == FORBIDDEN:
+        reply = decode_reply(await self._shipper.store(contact, record, left), record)
+        outcome = None if reply is None else reply.outcome
+        if reply is not None and (reply.is_stored or outcome is Outcome.SUPERSEDED):
+            return reply
+        if outcome is Outcome.FORBIDDEN:
             raise Refused(f"{contact.address} does not take {record.name!r} from its owner: {meaning(ROLE)}", ROLE)
-        if verdict == NO_ROOM:
+        if outcome is Outcome.NO_ROOM:
             text = f"{contact.address} holds all that it may of the owner of {record.name!r}; remove some records"
             raise Full(text, OWNER_FULL)
         raise Refused(f"{contact.address} does not take the record")
@@ -289,19 +290,20 @@ class Owner:
 
     # -- inside -----------------------------------------------------------------------------------------------------
 
-    async def _verdict(self, contact: Contact, record: Record, left: float | None) -> int:
-        """As ``store_at``.  Where a later record of this very life stands, ``record`` is not lost, it is history.
+    async def _store_latest(self, contact: Contact, record: Record, left: float | None) -> StoreReply:
+        """Store as ``store_at``; if a later record of this very life supersedes ``record``, store that one.
 
-        What that replica says of the later one holds for it, too: it may be one whose word does not count.
+        The reply about the later one is valid for ``record`` too: the replica may be one whose word does not count.
         """
-        verdict = await self.store_at(contact, record, left)
-        if record.owner != self._identity.public or not self._first <= verdict <= self._last:
-            return verdict
+        reply = await self.store_at(contact, record, left)
+        is_own = record.owner == self._identity.public and reply.outcome is Outcome.SUPERSEDED
+        if not (is_own and self._first <= reply.sequence <= self._last):
+            return reply
         later = self._own.get(record.slot)
         if later is None:
-            return 0  # it was a tombstone, and everybody has it
-        verdict = await self.store_at(contact, later)
-        return HELD if verdict > 0 else verdict
+            return STORED  # it was a tombstone, and every replica has it
+        reply = await self.store_at(contact, later)
+        return UNSYNCED if reply.outcome is Outcome.SUPERSEDED else reply
 
     def _spare(self, record: Record, targets: list[Contact], counted: list[Contact], needed: int) -> frozenset[bytes]:
         """Of a long record, those that get it only when enough others have it: all at once would share the way."""

@@ -19,7 +19,8 @@ from middleware.entangled.kademlia.overlay import ALPHA, K, Overlay, contacts_of
 from middleware.entangled.record import Record, Slot, unpacked
 from middleware.entangled.replication.cache import MAX_AGE
 from middleware.entangled.replication.owner import OWNERS_FAULT, Owner
-from middleware.entangled.replication.replica import CACHED, HELD, SURE, UNSURE, Replica
+from middleware.entangled.replication.replica import CACHED, SURE, UNSURE, Replica
+from middleware.entangled.replication.store_reply import Outcome
 from middleware.entangled.replication.watch import digest_of
 
 ReadConcern = Literal["fast", "majority"]
@@ -161,7 +162,8 @@ class Reader:
 
             async def mend(contact: Contact, record: Record = record, holding: set[bytes] = holding) -> None:
                 try:
-                    if await self._owner.store_at(contact, record, self._owner.left(record)) == HELD:
+                    reply = await self._owner.store_at(contact, record, self._owner.left(record))
+                    if reply.outcome is Outcome.UNSYNCED:
                         return
                 except Refused as error:
                     if error.code not in OWNERS_FAULT:

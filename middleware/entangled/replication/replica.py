@@ -23,6 +23,7 @@ from middleware.entangled.replication.cache import PathCache
 from middleware.entangled.replication.certificates import Certificates
 from middleware.entangled.replication.keepsake import Keepsakes
 from middleware.entangled.replication.pusher import WATCH_TTL, Pusher
+from middleware.entangled.replication.store_reply import STORED, UNSYNCED, Outcome, StoreReply
 from middleware.entangled.replication.watch import digest_of
 from middleware.entangled.wire.door import Authority
 from middleware.entangled.wire.endpoint import Endpoint
@@ -38,14 +39,6 @@ MAX_DOUBTFUL = 4096
 
 UNSURE, SURE, CACHED = 0, 1, 2
 """What an answer is worth: of a replica that has yet to catch up, of one that has, a copy from the path."""
-
-HELD = -2
-"""Answer to a STORE of a replica that is not sure: the record is held, and yet that is no vote."""
-FORBIDDEN = -3
-"""Answer to a STORE of what its owner may not write: by its role, or because no certificate of it holds."""
-NO_ROOM = -4
-"""Answer to a STORE of several records for one whose owner has all that one owner may have; one that comes alone is
-refused with the figures."""
 
 OnRecord = Callable[[Record], None]
 
@@ -121,8 +114,8 @@ class Replica:
         """Whether this very record is held as a replica."""
         return self._store.slot(record.slot) == record and record.slot not in self.keepsakes
 
-    def keep(self, record: Record, left: float | None = None) -> int:
-        """Hold ``record`` if it beats what its slot holds; 0 if it does, else the sequence that holds.
+    def keep(self, record: Record, left: float | None = None) -> StoreReply:
+        """Hold ``record`` if it beats what its slot holds: STORED, or SUPERSEDED.
 
         It is held for ``left`` seconds, as long as whoever handed it on would have; by default a whole ttl.
         """
@@ -134,15 +127,14 @@ class Replica:
             self._sweep_in_time()
             self.on_record(record)
             self.pusher.push(record.key, [record], [])
-            return 0
-        if before is not None and before.sequence >= record.sequence and before.signature != record.signature:
-            return before.sequence
-        return 0
+        elif before is not None and before.sequence >= record.sequence and before.signature != record.signature:
+            return StoreReply(Outcome.SUPERSEDED, before.sequence)
+        return STORED
 
-    def store(self, record: Record, left: float | None = None) -> int:
-        """Keep ``record``, and say what that is worth: as ``keep``, or ``HELD`` where this replica is not sure."""
-        verdict = self.keep(record, left)
-        return HELD if not verdict and not self.is_sure() else verdict
+    def store(self, record: Record, left: float | None = None) -> StoreReply:
+        """Hold ``record`` as ``keep`` does; UNSYNCED instead of STORED if this replica is not sure."""
+        reply = self.keep(record, left)
+        return UNSYNCED if reply is STORED and not self.is_sure() else reply
 
     def left(self, record: Record) -> float:
         """Seconds for which ``record`` is still held here; its ttl where it is not."""
@@ -167,10 +159,10 @@ class Replica:
     def answer_store(
         self, peer: Contact, packed: list[object], left: list[object] | None = None
     ) -> list[int] | Deferred[list[int]]:
-        """STORE: keep records; answers for each what ``store`` says, or -1 for a forged one.
+        """STORE: keep records; answers the code of a ``StoreReply`` for each.
 
-        It is ``FORBIDDEN`` for one that its owner may not write.  ``left`` are the seconds that each is to be
-        kept, where it does not come from its owner.  The peer is asked for certificates that are not known here.
+        ``left`` are the seconds that each is to be kept, where it does not come from its owner.  The peer is asked for
+        certificates that are not known here.
         """
         self.on_peer(peer)
         records = [record for record in map(unpacked, packed) if record is not None]
@@ -258,10 +250,10 @@ class Replica:
         self._doubtful.discard(peer.node_id)
         self.on_goodbye(peer)
 
-    def _refusal(self, record: Record, peer: Contact) -> int:
+    def _refusal(self, record: Record, peer: Contact) -> StoreReply | None:
         if not self.may_store(record.slot):
-            return FORBIDDEN
-        return 0 if self.is_lawful(record, peer) else -1
+            return StoreReply(Outcome.FORBIDDEN)
+        return None if self.is_lawful(record, peer) else StoreReply(Outcome.FORGED)
 
     def is_lawful(self, record: Record, peer: Contact) -> bool:
         """Whether ``peer`` may store ``record``.
@@ -297,15 +289,15 @@ class Replica:
 
     def _stored(self, peer: Contact, records: list[Record], lives: Sequence[float | None]) -> list[int]:
         """Keep those of ``records`` that are lawful; one whose owner has too many does not keep the others out."""
-        verdicts = []
+        replies = []
         for record, life in zip(records, lives, strict=True):
             try:
-                verdicts.append(self._refusal(record, peer) or self.store(record, life))
+                replies.append(self._refusal(record, peer) or self.store(record, life))
             except Full as error:
                 if len(records) == 1 or error.code != OWNER_FULL:
                     raise
-                verdicts.append(NO_ROOM)
-        return verdicts
+                replies.append(StoreReply(Outcome.NO_ROOM))
+        return [reply.encode() for reply in replies]
 
     def _judge(self, owner: bytes, authority: Authority, before: Authority | None) -> None:
         """Let go of what ``owner`` may not write now, or show again what it may."""

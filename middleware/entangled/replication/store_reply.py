@@ -1,0 +1,58 @@
+"""The reply of a replica to the request to store a record.  Pure."""
+
+from __future__ import annotations
+
+from enum import Enum
+from typing import NamedTuple
+
+from middleware.entangled.record import Record
+
+MAX_SEQUENCE = 2**62
+"""A reply with a higher sequence is malformed: no owner could go on above it."""
+
+
+class Outcome(Enum):
+    """The value is the code on the wire; a later record that stands in the slot is told by its sequence instead."""
+
+    STORED = 0
+    SUPERSEDED = 1
+    """The slot holds a record with the same or a higher sequence."""
+    FORGED = -1
+    """The signature is wrong, or the sender may not store this record."""
+    UNSYNCED = -2
+    """Stored by a replica that has not caught up with the others, so it is no vote."""
+    FORBIDDEN = -3
+    """The certificate of the owner does not allow the record, or is missing."""
+    NO_ROOM = -4
+    """The owner has as many records as one owner may have; only in an answer about several records."""
+
+
+class StoreReply(NamedTuple):
+    """The ``outcome`` and, if it is SUPERSEDED, the ``sequence`` that stands in the slot."""
+
+    outcome: Outcome
+    sequence: int = 0
+
+    @property
+    def is_stored(self) -> bool:
+        """Whether the replica holds the record."""
+        return self.outcome in (Outcome.STORED, Outcome.UNSYNCED)
+
+    def encode(self) -> int:
+        """Return the integer that stands for the reply in a message."""
+        return self.sequence if self.outcome is Outcome.SUPERSEDED else self.outcome.value
+
+
+STORED = StoreReply(Outcome.STORED)
+UNSYNCED = StoreReply(Outcome.UNSYNCED)
+_BY_CODE = {each.value: StoreReply(each) for each in Outcome if each is not Outcome.SUPERSEDED}
+
+
+def decode_reply(code: object, record: Record) -> StoreReply | None:
+    """Return the reply that ``encode`` made about ``record``, or None if ``code`` cannot be one."""
+    if type(code) is not int:
+        return None
+    if code > 0:
+        is_valid = record.sequence <= code < MAX_SEQUENCE
+        return StoreReply(Outcome.SUPERSEDED, code) if is_valid else None
+    return _BY_CODE.get(code)
