@@ -114,6 +114,7 @@ class SwarmNode(Service):
         self.streams = Streams(self.entangled.endpoint, clock)
         self.joined: Deferred[None] = Deferred()
         self._known = list(known_nodes)
+        self._ends: list[Callable[[], None]] = []
         self._network = network
         self._born_at = clock.seconds()
         self._counted_at = self._reviewed_at = float("-inf")
@@ -150,13 +151,11 @@ class SwarmNode(Service):
     def _leave(self, leave: Callable[[], None]) -> None:
         self._chores.stop()
         self.streams.stop()
-        if "dissemination" in self.__dict__:
-            self.dissemination.stop()
+        while self._ends:
+            self._ends.pop()()
         if self.team is not None:
             self.team.stop()
         leave()
-        if "_strategies" in self.__dict__:
-            self._strategies.stop()
         self.stop_deployed()
         super().stopService()
 
@@ -408,7 +407,9 @@ class SwarmNode(Service):
         # Imported by the first who decides, or carries a bid: a node that does neither is spared the memory.
         from middleware.consensus.selection import Strategies
 
-        return Strategies()
+        strategies = Strategies()
+        self._ends.append(strategies.stop)
+        return strategies
 
     @cached_property
     def dissemination(self) -> Dissemination:
@@ -424,7 +425,9 @@ class SwarmNode(Service):
         around = Surroundings(
             lambda: entangled.contact, entangled.overlay.contacts, self.team_size, self.strategy, may_bid
         )
-        return Dissemination(entangled.identity, entangled.endpoint, around, self.clock, self.rng)
+        dissemination = Dissemination(entangled.identity, entangled.endpoint, around, self.clock, self.rng)
+        self._ends.append(dissemination.stop)
+        return dissemination
 
     # -- what peers ask ---------------------------------------------------------------------------------------------
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
@@ -21,13 +21,14 @@ from middleware.consensus.lease.lessee import Lease, Lessee
 from middleware.consensus.strategies import bidder, nearest
 from middleware.consensus.strategies.nearest import Nearest
 from middleware.consensus.strategy import Report
+from middleware.entangled.contact import Contact
 from middleware.entangled.data import schema
 from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.data.sqlite import SqliteStore
 from middleware.entangled.data.writer import Writer
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.kademlia import overlay
-from middleware.entangled.kademlia.overlay import Overlay
+from middleware.entangled.kademlia.overlay import Overlay, Voters
 from middleware.entangled.kademlia.roster import Roster
 from middleware.entangled.quorum import acceptor as acceptor_
 from middleware.entangled.quorum import round as round_
@@ -76,7 +77,11 @@ async def _read_here(self: Reader, key: bytes) -> dict[Slot, Record]:
     return {record.slot: record for record in self._replica.held(key)}
 
 
-def _any_answer(answers: dict[bytes, Any], voters: frozenset[bytes]) -> int:
+def _voters(targets: Sequence[Contact]) -> Voters:
+    return Voters(frozenset(contact.node_id for contact in targets), len(targets))
+
+
+def _any_answer(answers: dict[bytes, Any], voters: Voters) -> int:
     return len(answers) * 8
 
 
@@ -243,7 +248,7 @@ def _only_slot(self: Keeper, key: bytes) -> str:
 
 BUGS: dict[str, list[tuple[Any, str, Any]]] = {
     "tombstone dropped too early": [(owner, "TOMBSTONE_TTL", 3.0)],
-    "acknowledged by a minority": [(Overlay, "voters", lambda self, key, targets: [c.node_id for c in targets[:1]])],
+    "acknowledged by a minority": [(Overlay, "voters", lambda self, key, targets: _voters(targets[:1]))],
     "lower sequence accepted": [(Record, "beats", lambda self, other: True)],
     "contact entered unchecked": [(Overlay, "lookup", _lookup_that_believes)],
     "no hand-over": [
@@ -251,9 +256,7 @@ BUGS: dict[str, list[tuple[Any, str, Any]]] = {
         (Handover, "lost", _idle),
         (Handover, "is_sure", lambda self: True),
     ],
-    "absent members do not count": [
-        (Overlay, "voters", lambda self, key, targets: [contact.node_id for contact in targets])
-    ],
+    "absent members do not count": [(Overlay, "voters", lambda self, key, targets: _voters(targets))],
     "nothing instead of unavailable": [(Reader, "_nothing", lambda self, answers, voters: [])],
     "signature not checked": [(Replica, "is_lawful", lambda self, record, peer: True)],
     "sure before it has caught up": [(Handover, "is_sure", lambda self: True)],

@@ -48,12 +48,25 @@ MAX_HEARD = 4096
 PLACING, PLACING_STEP = 15, 0.1
 MEETING, MEETING_STEP = 75, 0.02
 """Steps for which what needs a majority waits until the members are known, and seconds of each."""
-NOBODY = b""
-"""Stands for members that must be there, though none is known yet."""
-
 LOOKUPS_KEPT = 16
 
 OnContact = Callable[[Contact], None]
+
+
+class Voters(NamedTuple):
+    """The nodes among which a majority is counted: the known ``ids``, and the number of all (``size``)."""
+
+    ids: frozenset[bytes]
+    size: int
+
+    @property
+    def majority(self) -> int:
+        """The least number of votes that is more than half."""
+        return self.size // 2 + 1
+
+    def count_known(self, ids: Iterable[bytes]) -> int:
+        """Return how many of ``ids`` are voters."""
+        return len(self.ids.intersection(ids))
 
 
 class Looked(NamedTuple):
@@ -180,16 +193,17 @@ class Overlay:
         if len(self._found) > MAX_FOUND:
             del self._found[next(iter(self._found))]
 
-    def voters(self, key: bytes, targets: list[Contact]) -> list[bytes]:
-        """The ids of the nodes among whom a majority for ``key`` is counted; ``targets`` are its holders.
+    def voters(self, key: bytes, targets: list[Contact]) -> Voters:
+        """Return the voters for ``key``, whose replicas are ``targets``.
 
-        In a team small enough for a roster the absent ones count too; in a larger network, who was found.
+        In a team small enough for a roster absent members are voters too; in a larger network, the nodes found.
         """
         if not (self.is_whole or self.is_large):
-            # It has not met its team yet: whoever knows a few of them shall not take those for all.
-            return [self.own_id, NOBODY]
+            # It has not met its team yet: the few nodes that it knows must not count as all.
+            return Voters(frozenset([self.own_id]), 2)
         absent = [] if self.roster.is_full or self.is_large else self.roster.absent()
-        return [contact.node_id for contact in (_closest([*targets, *absent], key) if absent else targets)]
+        ids = frozenset(contact.node_id for contact in (_closest([*targets, *absent], key) if absent else targets))
+        return Voters(ids, len(ids))
 
     async def lookup(self, target: bytes) -> list[Contact]:
         """The k live nodes closest to ``target``, this one not included (Kademlia, section 2.3)."""

@@ -193,16 +193,16 @@ class Owner:
         if concern != "one":
             await self._overlay.met()
         targets = await self._overlay.holders(record.key)
-        voters = frozenset(self._overlay.voters(record.key, targets))
-        needed = {"one": 1, "majority": len(voters) // 2 + 1, "all": len(voters)}[concern]
+        voters = self._overlay.voters(record.key, targets)
+        needed = {"one": 1, "majority": voters.majority, "all": voters.size}[concern]
 
         def is_vote(node_id: bytes, reply: StoreReply) -> bool:
-            return concern == "one" or (node_id in voters and reply.outcome is not Outcome.UNSYNCED)
+            return concern == "one" or (node_id in voters.ids and reply.outcome is not Outcome.UNSYNCED)
 
         left = self.left(record)
         replies: dict[bytes, StoreReply] = {}
         forbidden: list[Refused] = []
-        counted = [c for c in targets if concern == "one" or c.node_id in voters]
+        counted = [c for c in targets if concern == "one" or c.node_id in voters.ids]
         spare = self._spare(record, targets, counted, needed)
         released: Deferred[None] = Deferred()
 
@@ -220,15 +220,15 @@ class Owner:
                 if isinstance(error, Refused) and error.code in OWNERS_FAULT:
                     forbidden.append(error)
                 raise
-            for pause in UNSURE_FOR if concern != "one" and contact.node_id in voters else ():
+            for pause in UNSURE_FOR if concern != "one" and contact.node_id in voters.ids else ():
                 if reply.outcome is not Outcome.UNSYNCED:
                     break
                 release()
                 await self._chores.sleep(pause)
                 reply = await self._store_latest(contact, record, left)
             replies[contact.node_id] = reply
-            votes = sum(node_id in voters for node_id, reply in replies.items() if reply.outcome is Outcome.STORED)
-            if len(replies) == len(targets) and votes > len(voters) // 2:
+            votes = voters.count_known(each for each, reply in replies.items() if reply.outcome is Outcome.STORED)
+            if len(replies) == len(targets) and votes >= voters.majority:
                 self._settled(record)
 
         work = until(

@@ -15,7 +15,7 @@ from middleware.entangled.background import Background, until
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import EntangledError, Refused, Unavailable
 from middleware.entangled.kademlia.lookup import Lookup
-from middleware.entangled.kademlia.overlay import ALPHA, K, Overlay, contacts_of
+from middleware.entangled.kademlia.overlay import ALPHA, K, Overlay, Voters, contacts_of
 from middleware.entangled.record import Record, Slot, unpacked
 from middleware.entangled.replication.cache import MAX_AGE
 from middleware.entangled.replication.owner import OWNERS_FAULT, Owner
@@ -119,7 +119,7 @@ class Reader:
         if self._overlay.is_sparse:
             return await self._walk(key)
         targets = await self._overlay.holders(key)
-        voters = frozenset(self._overlay.voters(key, targets))
+        voters = self._overlay.voters(key, targets)
         answers = await self._asked(key, targets, voters, lambda given: _is_clear(given, voters), width=1)
         for answer in answers.values():
             if _is_something(answer.records):
@@ -129,15 +129,15 @@ class Reader:
     async def newest(self, key: bytes) -> dict[Slot, Record]:
         """What a majority knows of ``key``, tombstones included; raises ``Unavailable``."""
         targets = await self._overlay.holders(key)
-        voters = frozenset(self._overlay.voters(key, targets))
-        needed = _majority(voters)
+        voters = self._overlay.voters(key, targets)
+        needed = voters.majority
         answers = await self._asked(key, targets, voters, lambda given: _votes(given, voters) >= needed, width=needed)
         _check_votes(_votes(answers, voters), voters)
         newest = newest_of(answer.records for answer in answers.values())
         await self._repair(newest, targets, voters, answers)
         return newest
 
-    def _nothing(self, answers: dict[bytes, Answer], voters: frozenset[bytes]) -> list[Record]:
+    def _nothing(self, answers: dict[bytes, Answer], voters: Voters) -> list[Record]:
         """No records, where a majority says so; raises ``Unavailable`` where they cannot be asked."""
         _check_votes(_votes(answers, voters), voters)
         return []
@@ -146,7 +146,7 @@ class Reader:
         self,
         newest: dict[Slot, Record],
         targets: list[Contact],
-        voters: frozenset[bytes],
+        voters: Voters,
         answers: dict[bytes, Answer],
     ) -> None:
         """Bring what only some hold to a majority, before anybody is told of it: who reads next shall see no less."""
@@ -156,7 +156,7 @@ class Reader:
                 if newest[record.slot] == record:
                     has[record.slot].add(node_id)
         for slot, record in newest.items():
-            if record.lifetime == "leased" or len(has[slot] & voters) >= _majority(voters):
+            if record.lifetime == "leased" or voters.count_known(has[slot]) >= voters.majority:
                 continue  # nobody stores a lease but its owner, whose beat mends it
             holding = has[slot]
 
@@ -171,14 +171,14 @@ class Reader:
                 holding.add(contact.node_id)  # it took it, has a newer one, or lets this owner have no more
 
             lacking = [mend(c) for c in targets if c.node_id not in holding]
-            await until(lambda _, holding=holding: len(holding & voters) >= _majority(voters), lacking)  # type: ignore
-            _check_votes(len(holding & voters), voters)
+            await until(lambda _, holding=holding: voters.count_known(holding) >= voters.majority, lacking)  # type: ignore
+            _check_votes(voters.count_known(holding), voters)
 
     async def _asked(
         self,
         key: bytes,
         targets: list[Contact],
-        voters: frozenset[bytes],
+        voters: Voters,
         is_enough: Callable[[dict[bytes, Answer]], bool],
         width: int,
     ) -> dict[bytes, Answer]:
@@ -217,7 +217,7 @@ class Reader:
             more = 1
             try:
                 answer = answers[contact.node_id] = await self.pages(contact, key, same=here)
-                if answer.worth == SURE and contact.node_id in voters:
+                if answer.worth == SURE and contact.node_id in voters.ids:
                     more = 2 if at_first == 1 else 0
             except EntangledError:
                 pass
@@ -258,7 +258,7 @@ class Reader:
         await self._overlay.walk(lookup, visit, lambda: bool(found))
         nearest = lookup.closest()
         if not found:
-            voters = frozenset(self._overlay.voters(key, nearest))
+            voters = self._overlay.voters(key, nearest)
             self._overlay.note_found(key, nearest)
             some = list(newest_of(answer.records for answer in answers.values()).values())
             return some if _is_something(some) else self._nothing(answers, voters)
@@ -281,23 +281,19 @@ def newest_of(opinions: Iterable[list[Record]]) -> dict[Slot, Record]:
     return newest
 
 
-def _votes(answers: dict[bytes, Answer], voters: frozenset[bytes]) -> int:
-    return sum(1 for node_id, answer in answers.items() if answer.worth == SURE and node_id in voters)
+def _votes(answers: dict[bytes, Answer], voters: Voters) -> int:
+    return voters.count_known(node_id for node_id, answer in answers.items() if answer.worth == SURE)
 
 
-def _majority(voters: frozenset[bytes]) -> int:
-    return len(voters) // 2 + 1
-
-
-def _check_votes(votes: int, voters: frozenset[bytes]) -> None:
+def _check_votes(votes: int, voters: Voters) -> None:
     """Raise ``Unavailable`` where ``votes`` are fewer than a majority of ``voters``."""
-    if votes < _majority(voters):
-        raise Unavailable(votes, _majority(voters))
+    if votes < voters.majority:
+        raise Unavailable(votes, voters.majority)
 
 
-def _is_clear(answers: dict[bytes, Answer], voters: frozenset[bytes]) -> bool:
+def _is_clear(answers: dict[bytes, Answer], voters: Voters) -> bool:
     is_found = any(_is_something(answer.records) for answer in answers.values())
-    return is_found or _votes(answers, voters) >= _majority(voters)
+    return is_found or _votes(answers, voters) >= voters.majority
 
 
 def _is_something(records: list[Record]) -> bool:

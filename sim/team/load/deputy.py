@@ -38,6 +38,7 @@ class Rooms:
         self._clock = clock
         self._rng = rng
         self._born_at = clock.seconds()
+        self._ends: list[Callable[[], None]] = []
         for verb in LEASE_VERBS:
             answer = partial(self._answer_lease, f"lease.{verb}")
             node.endpoint.expose(f"lease.{verb}", answer, changes=True, idempotent=True)
@@ -57,12 +58,14 @@ class Rooms:
             return team_size(node.identity.node_id, node.overlay.contacts(), node.overlay.is_large)
 
         around = Surroundings(lambda: node.contact, node.overlay.contacts, size, strategy_for)
-        return Dissemination(node.identity, self._tally, around, self._clock, self._rng)
+        dissemination = Dissemination(node.identity, self._tally, around, self._clock, self._rng)
+        self._ends.append(dissemination.stop)
+        return dissemination
 
     def stop(self) -> None:
         """The node is gone."""
-        if "dissemination" in self.__dict__:
-            self.dissemination.stop()
+        for end in self._ends:
+            end()
 
     def _answer_lease(self, method: str, peer: Contact, *arguments: Any) -> object:
         return self.councils.desk.answer(method, peer, arguments)
