@@ -11,7 +11,7 @@ from middleware.entangled.errors import EntangledError
 from middleware.lease.lessee import Lease, Lessee
 
 STANDBYS = 2
-"""So many of those that wait are ready to take over at once: each asks the council now and then."""
+"""Agents that wait and are ready to take over at once: each asks the council now and then."""
 INSISTING_S = 1.0
 """An agent that is to act, and has no lease, reports again after this time: the holder may think that it gave up."""
 

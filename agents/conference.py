@@ -68,8 +68,8 @@ class Conference:
     def decide(self, task: Task, me: Member, now: float, is_successor: bool = False) -> Decision:
         """Who should act, of all that have reported (``me`` included).
 
-        An agent that stood by and was given the lease ``is_successor``: who was to act has given up, and the news of
-        that is on its way, so what it said counts for nothing until it says something new.
+        An agent that stood by and was given the lease ``is_successor``: the assigned agent has given up, and the news
+        of that is on its way, so its reports count for nothing until it sends a new one.
         """
         decision = self._decide(task, me, now)
         for _ in range(len(self) if is_successor else 0):
@@ -80,7 +80,7 @@ class Conference:
         return decision
 
     def new_fault(self, decision: Decision) -> str:
-        """How the strategy failed, where it did not fail so the last time."""
+        """The fault of the strategy, unless the decision before had the same; empty without a fault."""
         before, self._fault = self._fault, decision.fault
         return "" if before == decision.fault else decision.fault
 

@@ -61,13 +61,13 @@ class Ports(Protocol):
         """Write a line for people."""
 
     def halt(self) -> float:
-        """Stop the body now; for how many seconds it may still move because it does not hear that."""
+        """Stop the body now; the seconds for which it may still move because it does not hear that."""
 
     def justify(self, verdict: Verdict) -> None:
         """Publish why the agent decided so."""
 
     def reached(self, uuids: Sequence[str]) -> Sequence[Contact]:
-        """How the agents of some uuids are reached."""
+        """The contacts of the agents with these uuids, as far as they are known."""
 
 
 class Engagement:
@@ -105,7 +105,7 @@ class Engagement:
 
     @property
     def lessee(self) -> Lessee | None:
-        """The client of the task's lease, where the body is this task's."""
+        """The client of the task's lease; None while the body is not this task's."""
         return self.claim.lessee
 
     @property
@@ -172,7 +172,7 @@ class Engagement:
         self.claim.successors = tuple(members)
 
     def set_load(self, load: int) -> None:
-        """Take in how many tasks the agent has."""
+        """Take in the number of tasks that the agent has."""
         self._reporter.load = load
 
     def look(self, seen: Observation, now: float) -> None:
@@ -278,7 +278,7 @@ class Engagement:
     # -- events and effects ----------------------------------------------------------------------------------------
 
     def on(self, event: Event, now: float, decision: Decision = NOBODY, lease: Lease | None = None) -> Deed | None:
-        """Take the step of ``event`` and do what follows from it, in its order; what the body is to do, if anything."""
+        """Take the step of ``event`` and do its effects in their order; the deed for the body, if there is one."""
         order, deed = decision.order, None
         rank = order.index(self.me.uuid) if self.me.uuid in order else 0
         for effect in self.course.go(event, rank if order else None):
@@ -287,7 +287,7 @@ class Engagement:
 
     def _do(self, effect: Effect, now: float, decision: Decision, lease: Lease | None) -> Deed | None:
         claim, ports = self.claim, self._ports
-        match effect:  # what is done each turn comes first
+        match effect:  # the effects of each turn come first
             case Effect.WANT:
                 claim.want()
             case Effect.EXECUTE:
