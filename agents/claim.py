@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 from twisted.internet.defer import Deferred, succeed
 
+from middleware.consensus.lease.lessee import Lease, Lessee
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import EntangledError
-from middleware.lease.lessee import Lease, Lessee
 
 STANDBYS = 2
 """Agents that wait and are ready to take over at once: each asks the council now and then."""

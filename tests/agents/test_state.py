@@ -12,7 +12,7 @@ from twisted.trial.unittest import SynchronousTestCase
 from agents.engagement import Deed, Engagement
 from agents.state import ROWS, TABLE, Course, Effect, Event, State, build_table
 from drivers.reading import Observation
-from middleware.bidding.panel import Panel
+from middleware.consensus.bidding.panel import Panel
 from middleware.consensus.strategies.nearest import Nearest
 from middleware.directory.presence import EXECUTING, STATUSES, WAITING
 from middleware.entangled.clock import HeapClock
