@@ -38,7 +38,7 @@ class Caretaker:
     def look(self) -> None:
         """Look after the council, if it falls to this agent."""
         engagement, now = self._engagement, self._clock.seconds()
-        if now < self._visit_at or not engagement.keeps_council:
+        if now < self._visit_at or not engagement.keeps_council(now):
             return
         self._visit_at = now + VISIT
         lessee = engagement.lessee if engagement.is_acting else None

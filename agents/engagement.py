@@ -2,20 +2,19 @@
 
 Selection and commitment are two things here: ``decide`` says who should act, the lease who may.  Nothing is executed
 without a lease that is valid now; when the decision or the lease goes elsewhere, the body stops first and the lease is
-given back after.
+given back after.  Each turn finds one event, ``agents.state`` has what follows from it, and the effects are done here.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol
 
-from twisted.internet.defer import Deferred, succeed
-from twisted.internet.interfaces import IReactorTime
+from twisted.internet.defer import Deferred
 
-from agents.account import Account
 from agents.behaviour import Behaviour
+from agents.claim import STANDBYS, Claim
 from agents.conference import Conference
 from agents.decision import Decision
 from agents.division import Division
@@ -23,7 +22,7 @@ from agents.execution import Execution
 from agents.formation import Formation
 from agents.means import STAND
 from agents.report import Reporter
-from agents.state import Course, State
+from agents.state import Course, Effect, Event, State
 from drivers.driver import Permit
 from drivers.reading import Action, Observation
 from middleware.consensus.bidding.panel import Panel
@@ -32,16 +31,13 @@ from middleware.consensus.strategy import ConsensusAlgorithm, reads_of
 from middleware.consensus.verdict import Verdict
 from middleware.directory.presence import EXECUTING
 from middleware.entangled.contact import Contact
-from middleware.entangled.errors import EntangledError
 from middleware.tasks.order import PAUSE, Order
 from middleware.tasks.task import COMPLETED, FAILED, Member, Result, Task
 
-HEIRS = 2
-"""So many of those that wait are ready to take over at once: each asks the council now and then."""
-INSISTING = 1.0
-"""Seconds after which who is to act, and is not let, says so again: whoever acts may think that it has given up."""
 SEARCH_TTL = 0.5
 """Seconds for which a motion that needs no lease (to look around) is allowed at a time."""
+SETTLED = State.RELEASING, State.DONE
+NOBODY = Decision(None, "", "")
 
 
 @dataclass(frozen=True)
@@ -52,15 +48,33 @@ class Deed:
     permit: Permit
 
 
+class Ports(Protocol):
+    """The ways out of an engagement."""
+
+    def tell(self, member: Member) -> None:
+        """Publish this agent's report."""
+
+    def conclude(self, result: Result) -> None:
+        """Record the outcome."""
+
+    def say(self, text: str) -> None:
+        """Write a line for people."""
+
+    def halt(self) -> float:
+        """Stop the body now; the seconds for which it may still move because it does not hear that."""
+
+    def justify(self, verdict: Verdict) -> None:
+        """Publish why the agent decided so."""
+
+    def reached(self, uuids: Sequence[str]) -> Sequence[Contact]:
+        """The contacts of the agents with these uuids, as far as they are known."""
+
+
 class Engagement:
     """One agent at one task.
 
-    ``tell`` publishes this agent's report; ``conclude`` records the outcome; ``say`` writes a line for people; ``halt``
-    stops the body now, and says for how many seconds it may still move because it does not hear that; ``token`` is the
-    highest token that the body has obeyed so far; ``age`` is how old the task was when the agent took it up.  With a
-    ``lessee`` the agent has its body for this task, without one it only listens; and where ``is_lent`` says that
-    another task of its group has the body, it reports and decides all the same.
-    ``justify`` is told why, at each decision; ``reached`` knows how the agents of some uuids are reached.
+    ``age`` is how old the task was ``now``, when the agent took it up; ``token`` is the highest that its body has
+    obeyed so far.  The agent only listens until its body is given to this task, or to another of the task's group.
     """
 
     def __init__(
@@ -69,72 +83,35 @@ class Engagement:
         me: Member,
         behaviour: Behaviour,
         strategy: ConsensusAlgorithm,
-        clock: IReactorTime,
+        ports: Ports,
+        panel: Panel,
         token: int,
-        tell: Callable[[Member], None],
-        conclude: Callable[[Result], None],
-        say: Callable[[str], None],
-        halt: Callable[[], float],
+        now: float,
         age: float = 0.0,
     ) -> None:
         self.task = task
         self.course = Course()
-        self.me = replace(me, status=State.IDLE.status)
+        self.me = replace(me, status=self.course.state.status)
         self.result: Result | None = None
-        self.order: Order | None = None
-        self.token = token
-        self.lessee: Lessee | None = None
-        self.is_lent = False
-        self.justify: Callable[[Verdict], None] = lambda verdict: None
-        self.reached: Callable[[Sequence[str]], Sequence[Contact]] = lambda uuids: ()
-        self._heirs: tuple[str, ...] = ()
-        self._successors: tuple[Contact, ...] = ()
-        self._rests_until = 0.0
-        self._insists_at = 0.0
-        self._stands_at = 0.0
-        self._reporter = Reporter(behaviour, clock, reads_of(strategy))
-        self._behaviour = behaviour
+        self.is_paused = False
+        self.claim = Claim(token)
+        self._ports = ports
+        self._reporter = Reporter(behaviour, reads_of(strategy))
         self._execution = Execution(behaviour, task.stall_limit)
-        self._clock = clock
-        self._tell = tell
-        self._conclude = conclude
-        self._say = say
-        self._halt = halt
-        self._conference = Conference(me.uuid, strategy)
-        self._account = Account(task, strategy)
+        self._conference = Conference(task, me.uuid, strategy, panel)
         self._formation = Formation(me.uuid, behaviour)
-        self._began = clock.seconds()
+        self._began = now
         self._age = age
-        self.load = 1
-        self._fault = ""
-        self._concluding = False
+
+    @property
+    def lessee(self) -> Lessee | None:
+        """The client of the task's lease; None while the body is not this task's."""
+        return self.claim.lessee
 
     @property
     def is_over(self) -> bool:
         """Whether the task has an outcome."""
-        return self.result is not None
-
-    @property
-    def is_paused(self) -> bool:
-        """Whether an operator wants the task to rest."""
-        return self.order is not None and self.order.word == PAUSE
-
-    @property
-    def division(self) -> Division | None:
-        """What divides the task together with others, where it is of a group."""
-        return self._conference.division
-
-    def join(self, division: Division) -> None:
-        """Have the task divided together with others."""
-        self._conference.division = division
-        division.join(self.task, self._members, self._clock.seconds())
-
-    def seat(self, panel: Panel) -> None:
-        """Have ``panel`` say whose records stand for the group."""
-        self._conference.panel = panel
-
-    def _members(self, now: float) -> list[Member]:
-        return [self.me, *self._conference.others(now)]
+        return self.course.state is State.DONE
 
     @property
     def is_acting(self) -> bool:
@@ -142,40 +119,47 @@ class Engagement:
         return self.course.state in (State.CLAIMING, State.EXECUTING)
 
     @property
-    def keeps_council(self) -> bool:
-        """Whether it falls to this agent to look after the council: it acts, or is the first while nobody does."""
-        is_acting = self.course.state is State.EXECUTING
-        return not (self.is_over or self._concluding) and (
-            is_acting or self._conference.is_first(self._clock.seconds())
-        )
-
-    @property
     def may_be_put_aside(self) -> bool:
         """Whether the body may go to another task of a higher priority now."""
-        if self._concluding:
+        if self.course.state is State.RELEASING:
             return False
         return not self.is_acting or (self.task.preemptible and self._execution.is_safe)
 
+    @property
+    def division(self) -> Division | None:
+        """What divides the task together with others, where it is of a group."""
+        return self._conference.division
+
+    def keeps_council(self, now: float) -> bool:
+        """Whether it falls to this agent to look after the council: it acts, or is the first while nobody does."""
+        return self.course.state not in SETTLED and self._may_fail(now)
+
     # -- what comes in ----------------------------------------------------------------------------------------------
 
-    def heard(self, members: list[Member], outcome: Result | None) -> None:
+    def join(self, division: Division, now: float) -> None:
+        """Have the task divided together with others."""
+        self._conference.division = division
+        division.join(self.task, lambda now: [self.me, *self._conference.others(now)], now)
+
+    def heard(self, members: list[Member], outcome: Result | None, now: float) -> None:
         """Take in who is present and what they report, and how the task ended.  An outcome absorbs all that follows."""
-        now = self._clock.seconds()
         if outcome is not None and (self.result is None or outcome.rank > self.result.rank):
-            self._end(outcome)
+            self.result = outcome
+            self.on(Event.OUTCOME, now)
         self.me = self._conference.hear(members, self.me, now)
-        assigned = self.me.assigned
-        if self.lessee is not None and assigned not in ("", self.me.uuid, *(member.uuid for member in members)):
+        if self.is_over:
+            return
+        if self.lessee is not None and self.me.assigned not in ("", self.me.uuid, *(member.uuid for member in members)):
             self.lessee.suspect()
         left = self._formation.hear(self._conference.others(now))
-        if left and self._conference.counts(now) and not self.is_over:
-            self._say(f"one left, {len(self._conference) + 1} here: spreads out")
+        if left and self._conference.counts(now):
+            self._ports.say(f"one left, {len(self._conference) + 1} here: spreads out")
 
     def ordered(self, order: Order | None) -> None:
         """Take in what an operator wants of the task."""
-        was_paused, self.order = self.is_paused, order
+        was_paused, self.is_paused = self.is_paused, order is not None and order.word == PAUSE
         if order is not None and was_paused != self.is_paused and not self.is_over:
-            self._say(f"{'paused' if self.is_paused else 'resumed'} by {order.by}")
+            self._ports.say(f"{'paused' if self.is_paused else 'resumed'} by {order.by}")
 
     def renewed(self, task: Task) -> None:
         """Take in what the records of the task say now; of its councils the newest stays."""
@@ -185,271 +169,104 @@ class Engagement:
 
     def hand_council(self, members: Sequence[Contact]) -> None:
         """Have ``members`` be the council of the task that it acts for, when the body comes to a safe point."""
-        self._successors = tuple(members)
+        self.claim.successors = tuple(members)
 
-    def look(self, seen: Observation) -> None:
+    def set_load(self, load: int) -> None:
+        """Take in the number of tasks that the agent has."""
+        self._reporter.load = load
+
+    def look(self, seen: Observation, now: float) -> None:
         """Take in what the body senses, and report when it is new to the others."""
-        now = self._clock.seconds()
-        self._behaviour.look(seen, now)
-        is_free = self.lessee is not None or self.is_lent
-        if not is_free or self.is_paused or self.is_over or self._execution.has_stalled(now):
+        self._execution.look(seen, now)
+        if not self._is_free or self.is_over or self._execution.has_stalled(now):
             return
         # In a group somebody is free now and then: what is nearly done must not look as far away as at its beginning.
         is_acting = self.course.state is State.EXECUTING and self.division is None
-        news = self._reporter.news(self.me, is_acting, seen, self.load)
+        news = self._reporter.news(self.me, is_acting, seen, now)
         if news is not None:
             if "cost" in news:
                 cost = news["cost"]
-                self._say("lost sight of it" if cost is None else f"reports {cost:.2f} m")
+                self._ports.say("lost sight of it" if cost is None else f"reports {cost:.2f} m")
             self._publish(again=True, **news)
+
+    # -- the body ---------------------------------------------------------------------------------------------------
+
+    def take_body(self, lessee: Lessee, token: int) -> None:
+        """Have the body for this task, which has obeyed ``token``; ``lessee`` claims the task's lease."""
+        self.claim.lessee, self.claim.token = lessee, token
+
+    def lend_body(self, is_lent: bool, now: float) -> None:
+        """Take in whether another task of the group has the body; where this task has it, it does not act."""
+        if is_lent and self.lessee is not None:
+            if self.course.state in SETTLED:
+                return  # the lease is kept until the outcome is known
+            self.on(Event.LENT, now)
+            self.claim.lessee = None
+        self.claim.is_lent = is_lent
+
+    def put_aside(self, why: str, now: float) -> None:
+        """Leave the body to another task: stop it where it acts, give the lease back, and say that it is not free."""
+        if self.course.state not in SETTLED:
+            self.on(Event.NO_BODY, now, replace(NOBODY, why=why))
+            self.claim.lessee = None
 
     def lose_body(self) -> None:
         """Take the report back: the body does not answer, so nobody waits for it.  The next look reports again."""
         if self.me.available and not self.is_over:
-            self._say("has lost its robot")
+            self._ports.say("has lost its robot")
             self._publish(cost=None, available=False)
 
-    # -- what goes out ----------------------------------------------------------------------------------------------
-
-    def step(self) -> Deed | None:
-        """Decide again and say what to do now; None where there is nothing to do for this task."""
-        if self.is_over or self._concluding:
-            return None
-        now = self._clock.seconds()
-        if self._is_late(now) and self.lessee is not None and self._may_fail(now):
-            if self.lessee.lease is not None:
-                self._finish(FAILED, f"past its deadline of {self.task.deadline:g} s")
-            else:
-                self._stop(State.FENCED)
-                self.lessee.want()  # an agent ends only what it holds
-            return None
-        if self.is_paused or (self.lessee is None and not self.is_lent):
-            self._rest_aside("paused" if self.is_paused else self.me.why)
-            return None
-        if self.course.state is State.IDLE:
-            self.course.go(State.OBSERVING)
-            self.me = replace(self.me, available=True)
-        if self._execution.has_stalled(now) and self.me.cost is not None:
-            self._say("makes no progress")
-            self._publish(cost=None, available=False)
-        if self.lessee is None:  # another task of its group has the body
-            decision = self._decision(now)
-            self._place(decision)
-            self._publish_decision(decision, 0)
-            return None
-        is_executing = self.course.state is State.EXECUTING
-        if is_executing and self._successors and self._execution.is_safe:
-            self._move_council(now)
-        if is_executing and self.lessee.lease is None and now < self._rests_until:
-            return None
-        decision = self._decision(now)
-        if decision.assigned == self.me.uuid or self._must_go_on(decision):
-            return self._act(decision, now)
-        self._yield()
-        self._place(decision)
-        self._line_up(decision)
-        return self._stand_by(decision, now)
-
-    def fence(self) -> None:
-        """The body has obeyed a newer token than the one it acts under: another holds the task, or held it.
-
-        To an agent that only stands by it says nothing: the body remembers what a former life of its agent did.
-        """
-        if self._stop(State.FENCED) and self.lessee is not None:
-            self.lessee.release()
-
-    def put_aside(self, why: str) -> None:
-        """Leave the body to another task: stop it where it acts, give the lease back, and say that it is not free."""
-        if self._concluding:
-            return  # the lease is kept until the outcome is known
-        self._rest_aside(why)
-        self.lessee = None
-
-    def lend(self) -> None:
-        """Leave the body, which does not act, to another task of the group."""
-        self._yield()
-        if self.lessee is not None:
-            self.lessee.release()
-        self.lessee, self.is_lent = None, True
-
-    def abandon(self) -> Deferred[object]:
+    def abandon(self, now: float) -> Deferred[object]:
         """Leave the task: stop the body where it acts, and give the lease back, for good where the task is done.
 
         Fires when the council knows.
         """
-        if self.lessee is None:
-            return succeed(None)
-        self._stop(State.RELEASING)
-        return self.lessee.release(self.reached(self._heirs), self._rest)
+        self.on(Event.LEAVE, now)
+        return self.claim.released
 
-    # -- inside -----------------------------------------------------------------------------------------------------
+    # -- one turn ---------------------------------------------------------------------------------------------------
 
-    def _decision(self, now: float) -> Decision:
-        decision = self._conference.decide(self.task, self.me, now)
-        for _ in range(len(self._conference)):
-            if self.lessee is None or self.lessee.lease is None or self.course.state is not State.WAITING:
-                break
-            # It stood by and the lease is its own: who was to act has given up, and the news of that is on its way.
-            if decision.assigned in (None, self.me.uuid):
-                break
-            self._conference.dismiss(str(decision.assigned))
-            decision = self._conference.decide(self.task, self.me, now)
-        if decision.fault and decision.fault != self._fault:
-            self._say(decision.fault)
-        self._fault = decision.fault
-        return decision
+    def step(self, now: float) -> Deed | None:
+        """Decide again and say what to do now; None where there is nothing to do for this task."""
+        if self.course.state in SETTLED:
+            return None
+        lease = self.claim.lease
+        if self._is_late(now) and self.lessee is not None and self._may_fail(now):
+            return self.on(Event.EXPIRED if lease else Event.LATE, now, lease=lease)
+        if not self._is_free:
+            return self.on(Event.NO_BODY, now, replace(NOBODY, why="paused" if self.is_paused else self.me.why))
+        if self.course.state is State.IDLE:
+            self.on(Event.FREE, now)
+        if self._execution.has_stalled(now) and self.me.cost is not None:
+            self._ports.say("makes no progress")
+            self._publish(cost=None, available=False)
+        if self.course.state is State.EXECUTING:
+            if self.claim.successors and self._execution.is_safe:
+                self.on(Event.MOVE, now)
+                lease = self.claim.lease
+            if self.claim.is_moving(now):
+                return None
+        is_successor = self.course.state is State.WAITING and lease is not None
+        decision = self._conference.decide(self.task, self.me, now, is_successor)
+        fault = self._conference.new_fault(decision)
+        if fault:
+            self._ports.say(fault)
+        return self.on(self._event_of(decision, lease), now, decision, lease)
 
-    def _act(self, decision: Decision, now: float) -> Deed:
-        assert self.lessee is not None
-        self.lessee.want()
-        lease = self.lessee.lease
-        if lease is None:
-            if not self._stop(State.FENCED):
-                self._claim(decision, now)
-            return self._stand_by(decision, now)
-        if self.course.state is not State.EXECUTING:
-            self._place(decision)
-            self.course.go(State.EXECUTING)
-            self._say(f"goes: {decision.why}")
-        self.token = max(self.token, lease.token)
-        turn = self._execution.go_on(now, lease.token, lease.deadline, decision.consensus)
-        self._publish_decision(decision, lease.token, turn.progress)
-        if turn.action is None:
-            self._finish(COMPLETED)
-            return Deed(STAND, self._permit(lease))
-        return Deed(turn.action, self._permit(lease))
-
-    def _claim(self, decision: Decision, now: float) -> None:
-        was = self.course.state
-        self._place(decision)
-        if self.course.state is not State.CLAIMING:
-            return
-        if was is not State.CLAIMING:
-            self._insists_at = now + INSISTING
-        elif now >= self._insists_at:
-            self._insists_at = now + INSISTING
-            self._publish(again=True)
-
-    def _stand_by(self, decision: Decision, now: float) -> Deed:
-        post = None
-        if self._conference.counts(now):  # of a large team those close up who know of each other
-            post = self._formation.close_up(self.me, self._conference.others(now), decision.assigned)
-        self._publish_decision(decision, 0, post=post)
-        searching = self.me.cost is None
-        action = self._behaviour.search(now) if searching else self._behaviour.hold(now)
-        return Deed(action, Permit(self.token, now + SEARCH_TTL))
-
-    def _permit(self, lease: Lease) -> Permit:
-        return Permit(lease.token, lease.deadline)
-
-    def _move_council(self, now: float) -> None:
-        """Stop the body, and only then have the council changed; it goes on when it has its lease again."""
-        assert self.lessee is not None
-        members, self._successors = self._successors, ()
-        self._halt()
-        self._rests_until = now + self.task.lease_ttl
-        self._say(f"a member of the council is gone: {len(members)} from now on")
-        self.lessee.move(members).addErrback(lambda failure: failure.trap(EntangledError))
-
-    def _place(self, decision: Decision) -> None:
-        """Go to the state that the decision means for who does not execute."""
+    def _event_of(self, decision: Decision, lease: Lease | None) -> Event:
+        must_go_on = self.course.state is State.EXECUTING and self.me.cost is not None and not self._execution.is_safe
+        if decision.assigned == self.me.uuid or (must_go_on and decision.assigned is not None):
+            return Event.GRANTED if lease else Event.NAMED
         if self.me.cost is None:
-            self.course.reach(State.OBSERVING)
-        elif decision.assigned is None:
-            self.course.reach(State.REPORTED)
-        elif decision.assigned == self.me.uuid:
-            self.course.reach(State.CLAIMING)
-        else:
-            order = decision.order
-            self.course.reach(State.WAITING, order.index(self.me.uuid) if self.me.uuid in order else 0)
-
-    def _must_go_on(self, decision: Decision) -> bool:
-        """Whether another should act, and this agent is at no point where the task may change hands."""
-        is_executing = self.course.state is State.EXECUTING and self.me.cost is not None
-        return is_executing and decision.assigned is not None and not self._execution.is_safe
-
-    def _publish_decision(
-        self, decision: Decision, token: int, progress: float | None = None, post: float | None = None
-    ) -> None:
-        assigned = decision.assigned or ""
-        if assigned and assigned != self.me.assigned and assigned != self.me.uuid:
-            self._say(f"stands by: {decision.why}")
-        told: dict[str, Any] = {"assigned": assigned, "digest": decision.digest, "why": decision.why}
-        self._publish(token=token, progress=progress, post=post, **told)
-        self._heirs = tuple(uuid for uuid in decision.order if uuid != self.me.uuid)[:HEIRS]
-        now = self._clock.seconds()
-        verdict = self._account.of(decision, self.me, self._conference.others(now), token, now)
-        if verdict is not None:
-            self.justify(verdict)
-
-    def _publish(self, again: bool = False, **changes: object) -> None:
-        changes |= {"status": self.course.state.status, "state": str(self.course)}
-        # A round alone is told with the next report.
-        if again or any(getattr(self.me, name) != value for name, value in changes.items()):
-            epoch = self._conference.epoch
-            serial = self.me.serial + 1 if epoch == self.me.epoch else 0
-            changes |= {"epoch": epoch, "serial": serial, "load": self.load}
-            self.me = replace(self.me, **changes)  # type: ignore[arg-type]
-            self._tell(self.me)
-
-    def _yield(self) -> None:
-        """Let another act.  Who only stands by, and holds nothing, keeps its place in the line."""
-        if self.is_acting or (self.lessee is not None and self.lessee.lease is not None):
-            self._give_back()
-
-    def _line_up(self, decision: Decision) -> None:
-        """Be ready to take over at once, where few are before this agent; who acts now is not one of these."""
-        assert self.lessee is not None
-        if self.course.state is State.WAITING and 0 < self.course.rank <= HEIRS:
-            others = self._conference.others(self._clock.seconds())
-            is_acting = any(member.uuid == decision.assigned and member.status == EXECUTING for member in others)
-            self.lessee.stand_by(self.course.rank + (not is_acting))
-        else:
-            self.lessee.release()
-
-    def _give_back(self) -> None:
-        """Stop the body where it acts, and only then give the lease back."""
-        if self._stop(State.RELEASING):
-            self._say("gives the task back")
-        if self.lessee is not None:
-            self.lessee.release(rest=self._rest)
-
-    def _stop(self, state: State) -> bool:
-        """Stop the body where it acts, which leads to ``state``; whether it did."""
-        if self.course.state is not State.EXECUTING:
-            return False
-        self._stands_at = self._clock.seconds() + self._halt()
-        self.course.go(state)
-        return True
+            return Event.BLIND
+        if decision.assigned is None:
+            return Event.UNDECIDED
+        return Event.LEASED_IN_VAIN if lease else Event.PASSED_OVER
 
     @property
-    def _rest(self) -> float:
-        """Seconds for which the body may still move though it was stopped."""
-        return max(0.0, self._stands_at - self._clock.seconds())
-
-    def _rest_aside(self, why: str) -> None:
-        """Have no body for this task; who is to be asked for a report is another."""
-        self._give_back()
-        self.course.go(State.IDLE)
-        nothing: dict[str, Any] = {"cost": None, "assigned": "", "digest": "", "token": 0, "progress": None}
-        self._publish(available=False, why=why, post=None, **nothing)
-
-    def _finish(self, outcome: str, why: str = "") -> None:
-        """Record the outcome; the lease is kept until the outcome is known, so that nobody starts over in between."""
-        self._concluding = True
-        now = self._clock.seconds()
-        lease = None if self.lessee is None else self.lessee.lease
-        self._stop(State.RELEASING)
-        members = [self.me, *self._conference.others(now)]
-        bids = sorted((m.name, m.cost) for m in members if m.cost is not None)
-        token = 0 if lease is None else lease.token
-        self._conclude(Result(outcome, self.me.name, round(now - self._began, 2), token, tuple(bids), why))
-
-    def reopen(self) -> None:
-        """The task is another's by now: a higher token was granted before the end under this one was recorded."""
-        self._concluding = False
-        if self.lessee is not None:
-            self.lessee.release()
+    def _is_free(self) -> bool:
+        """Whether the body is free for the task, or for another of its group."""
+        return not self.is_paused and (self.lessee is not None or self.claim.is_lent)
 
     def _may_fail(self, now: float) -> bool:
         """Whether it falls to this agent to end the task without success: it acts, or is the first of those present."""
@@ -458,13 +275,116 @@ class Engagement:
     def _is_late(self, now: float) -> bool:
         return 0.0 < self.task.deadline < self._age + now - self._began
 
-    def _end(self, outcome: Result) -> None:
-        is_first, self.result = self.result is None, outcome
-        if not is_first:
-            return
-        by_me = outcome.outcome == COMPLETED and outcome.by == self.me.name
-        why = f": {outcome.why}" if outcome.why else ""
-        self._say("done" if by_me else f"{outcome.outcome.lower()} by {outcome.by}{why}")
-        self._stop(State.RELEASING)
-        self.course.go(State.DONE)
-        self._publish()
+    # -- events and effects ----------------------------------------------------------------------------------------
+
+    def on(self, event: Event, now: float, decision: Decision = NOBODY, lease: Lease | None = None) -> Deed | None:
+        """Take the step of ``event`` and do its effects in their order; the deed for the body, if there is one."""
+        order, deed = decision.order, None
+        rank = order.index(self.me.uuid) if self.me.uuid in order else 0
+        for effect in self.course.go(event, rank if order else None):
+            deed = self._do(effect, now, decision, lease)
+        return deed
+
+    def _do(self, effect: Effect, now: float, decision: Decision, lease: Lease | None) -> Deed | None:
+        claim, ports = self.claim, self._ports
+        match effect:  # the effects of each turn come first
+            case Effect.WANT:
+                claim.want()
+            case Effect.EXECUTE:
+                assert lease is not None
+                return self._execute(decision, lease, now)
+            case Effect.HOLD:
+                return self._stand_by(decision, now)
+            case Effect.STAND_BY:
+                claim.stand_by(self._place(decision, now))
+            case Effect.STOP:
+                claim.stop(ports.halt(), now)
+            case Effect.RELEASE:
+                claim.release(now)
+            case Effect.GIVE_BACK:
+                ports.say("gives the task back")
+                claim.release(now)
+            case Effect.HAND_OVER:
+                claim.released = claim.release(now, ports.reached(claim.standbys))
+            case Effect.CLAIM:
+                claim.begin(now)
+            case Effect.INSIST:
+                if claim.insist(now):
+                    self._publish(again=True)
+            case Effect.CHANGE_COUNCIL:
+                ports.say(f"a member of the council is gone: {len(claim.successors)} from now on")
+                claim.move(now, self.task.lease_ttl)
+            case Effect.OFFER:
+                self.me = replace(self.me, available=True)
+            case Effect.WITHDRAW:
+                nothing: dict[str, Any] = {"cost": None, "assigned": "", "digest": "", "token": 0, "progress": None}
+                self._publish(available=False, why=decision.why, post=None, **nothing)
+            case Effect.START:
+                ports.say(f"goes: {decision.why}")
+            case Effect.COMPLETE:
+                self._conclude(COMPLETED, lease, now)
+            case Effect.FAIL:
+                self._conclude(FAILED, lease, now, f"past its deadline of {self.task.deadline:g} s")
+            case Effect.END:
+                assert self.result is not None
+                by_me = self.result.outcome == COMPLETED and self.result.by == self.me.name
+                why = f": {self.result.why}" if self.result.why else ""
+                ports.say("done" if by_me else f"{self.result.outcome.lower()} by {self.result.by}{why}")
+                self._publish()
+        return None
+
+    def _execute(self, decision: Decision, lease: Lease, now: float) -> Deed:
+        self.claim.token = max(self.claim.token, lease.token)
+        turn = self._execution.go_on(now, lease.token, lease.deadline, decision.consensus)
+        self._publish_decision(decision, lease.token, now, turn.progress)
+        if turn.action is None:
+            self.on(Event.FINISHED, now, lease=lease)
+        return Deed(STAND if turn.action is None else turn.action, Permit(lease.token, lease.deadline))
+
+    def _stand_by(self, decision: Decision, now: float) -> Deed | None:
+        if self.lessee is None:  # another task of its group has the body
+            self._publish_decision(decision, 0, now)
+            return None
+        post = None
+        if self._conference.counts(now):  # of a large team those close up who know of each other
+            post = self._formation.close_up(self.me, self._conference.others(now), decision.assigned)
+        self._publish_decision(decision, 0, now, post=post)
+        action = self._execution.stand_by(self.me.cost is None, now)
+        return Deed(action, Permit(self.claim.token, now + SEARCH_TTL))
+
+    def _place(self, decision: Decision, now: float) -> int:
+        """The place in the line, from 1, of one of the few that take over at once; who acts now is not one of these."""
+        if not 0 < self.course.rank <= STANDBYS:
+            return 0
+        others = self._conference.others(now)
+        is_acting = any(member.uuid == decision.assigned and member.status == EXECUTING for member in others)
+        return self.course.rank + (not is_acting)
+
+    def _conclude(self, outcome: str, lease: Lease | None, now: float, why: str = "") -> None:
+        members = [self.me, *self._conference.others(now)]
+        bids = sorted((m.name, m.cost) for m in members if m.cost is not None)
+        token = 0 if lease is None else lease.token
+        self._ports.conclude(Result(outcome, self.me.name, round(now - self._began, 2), token, tuple(bids), why))
+
+    def _publish_decision(
+        self, decision: Decision, token: int, now: float, progress: float | None = None, post: float | None = None
+    ) -> None:
+        assigned = decision.assigned or ""
+        if assigned and assigned != self.me.assigned and assigned != self.me.uuid:
+            self._ports.say(f"stands by: {decision.why}")
+        told: dict[str, Any] = {"assigned": assigned, "digest": decision.digest, "why": decision.why}
+        self._publish(token=token, progress=progress, post=post, **told)
+        self.claim.standbys = tuple(uuid for uuid in decision.order if uuid != self.me.uuid)[:STANDBYS]
+        verdict = self._conference.account(decision, self.me, token, now)
+        if verdict is not None:
+            self._ports.justify(verdict)
+
+    def _publish(self, again: bool = False, **changes: object) -> None:
+        changes |= {"status": self.course.state.status, "state": str(self.course)}
+        # A round alone is told with the next report.
+        if again or any(getattr(self.me, name) != value for name, value in changes.items()):
+            epoch = self._conference.epoch
+            serial = self.me.serial + 1 if epoch == self.me.epoch else 0
+            changes |= {"epoch": epoch, "serial": serial, "load": self._reporter.load}
+            self.me = replace(self.me, **changes)  # type: ignore[arg-type]
+            self._ports.tell(self.me)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from agents.behaviour import Behaviour
 from agents.context import Context
-from drivers.reading import Action
+from drivers.reading import Action, Observation
 from middleware.consensus.strategy import Consensus
 
 SHARE = 0.01
@@ -43,6 +43,14 @@ class Execution:
         self._stalled_at = -math.inf
         self._agreed: tuple[tuple[float, ...], str] = (), ""
         self._asked_at = 0.0
+
+    def look(self, seen: Observation, now: float) -> None:
+        """Take in what the body senses."""
+        self._behaviour.look(seen, now)
+
+    def stand_by(self, is_searching: bool, now: float) -> Action:
+        """What to do without a lease: search for what the cost depends on, or hold."""
+        return self._behaviour.search(now) if is_searching else self._behaviour.hold(now)
 
     def go_on(self, now: float, token: int, deadline: float, consensus: Consensus | None = None) -> Turn:
         """Do the next bit under the lease of ``token``; ``consensus`` is what all agree on."""

@@ -15,6 +15,7 @@ from agents.division import Division, Key, group_of
 from agents.docket import Docket, next_task, precedence
 from agents.engagement import Engagement
 from agents.part import Part
+from agents.state import Event
 from drivers.driver import Driver
 from drivers.reading import Observation
 from middleware.directory.presence import DONE, IDLE
@@ -83,7 +84,7 @@ class Agent(Service):
             return  # what it offered now it could not do at once, and others would count on it
         for engagement in self._having_body():
             if not engagement.is_over:
-                engagement.look(seen)
+                engagement.look(seen, self._clock.seconds())
 
     def _no_body(self, reason: str) -> None:
         self._say(f"has no robot: {reason}")
@@ -152,14 +153,14 @@ class Agent(Service):
         if part is not self._holder:
             self._give_body(part)
         for each in active:
-            each.engagement.is_lent = each in parts and each is not part
+            each.engagement.lend_body(each in parts and each is not part, self._clock.seconds())
 
     def _heads(self, active: list[Part]) -> dict[Part, list[Part]]:
         """The most urgent part of each group with all that are in it, and each that is in none by itself."""
         for task_id, part in self._parts.items():
             division = part.engagement.division
             if division is not None and part in active:
-                part.engagement.join(division)
+                part.engagement.join(division, self._clock.seconds())
             elif division is not None:
                 division.leave(task_id)
         groups: dict[object, list[Part]] = {}
@@ -170,7 +171,7 @@ class Agent(Service):
 
     def _having_body(self) -> list[Engagement]:
         """The engagements that the body is free for: the one that has it, and those of its group."""
-        return [p.engagement for p in list(self._parts.values()) if p is self._holder or p.engagement.is_lent]
+        return [p.engagement for p in list(self._parts.values()) if p is self._holder or p.engagement.claim.is_lent]
 
     def _engage(self, task: Task) -> None:
         try:
@@ -185,9 +186,9 @@ class Agent(Service):
         self._say(f"assigned: {task.title}")
         group = group_of(task)
         if group is not None:
-            part.engagement.join(self._divisions.setdefault(group, Division(strategy)))
+            part.engagement.join(self._divisions.setdefault(group, Division(strategy)), self._clock.seconds())
         if self._holder is not None and (group is None or group != group_of(self._holder.engagement.task)):
-            part.engagement.put_aside(f"busy with {self._holder.engagement.task.title}")
+            part.engagement.put_aside(f"busy with {self._holder.engagement.task.title}", self._clock.seconds())
         part.report()
 
     def _give_body(self, part: Part | None) -> None:
@@ -195,16 +196,15 @@ class Agent(Service):
         before, self._holder = self._holder, part
         group = None if part is None else part.engagement.division
         if before is not None and group is not None and before.engagement.division is group:
-            before.engagement.lend()
+            before.engagement.lend_body(True, self._clock.seconds())
         elif before is not None and not before.engagement.is_over:
             self._body.driver.stop()
             why = f"busy with {part.engagement.task.title}" if part is not None else "paused"
-            before.engagement.put_aside(why)
+            before.engagement.put_aside(why, self._clock.seconds())
         if part is None:
             return self._node.presence.change(task="", status=IDLE)
         engagement = part.engagement
-        engagement.token = self._token
-        engagement.lessee = self._node.lessee(engagement.task, self._turn_now, self._token)
+        engagement.take_body(self._node.lessee(engagement.task, self._turn_now, self._token), self._token)
         self._node.presence.change(task=engagement.task.task_id, status=engagement.me.status)
 
     def _leave(self, task_id: str) -> Deferred[object]:
@@ -232,10 +232,10 @@ class Agent(Service):
                 self._finished(part)
         self._arrange()
         for part in list(self._parts.values()):
-            part.engagement.load = len(self._parts)
+            part.engagement.set_load(len(self._parts))
             part.caretaker.look()
             if part is not self._holder:
-                part.engagement.step()
+                part.engagement.step(self._clock.seconds())
         if self._node.halt.is_on:
             self._node.halt.refresh()
             return
@@ -247,13 +247,11 @@ class Agent(Service):
             for each in self._having_body():
                 each.lose_body()
         # A robot may have obeyed an agent before this one: nothing older than that does it obey now.
-        engagement.token = max(engagement.token, self._body.driver.token)
-        if engagement.lessee is not None:
-            engagement.lessee.outrank(engagement.token)
-        deed = engagement.step()
-        self._token = max(self._token, engagement.token)
+        engagement.claim.raise_token(self._body.driver.token)
+        deed = engagement.step(self._clock.seconds())
+        self._token = max(self._token, engagement.claim.token)
         if deed is not None and has_body and not self._body.do(deed):
-            engagement.fence()
+            engagement.on(Event.OUTRANKED, self._clock.seconds())
 
     def _obey(self) -> str:
         """Stand while the team is stopped, and say what the body does; what is held is kept, so nobody takes over."""

@@ -12,6 +12,7 @@ from twisted.internet.interfaces import IReactorTime
 from agents.behaviour import Behaviour
 from agents.caretaker import Caretaker
 from agents.engagement import Engagement
+from agents.state import Event
 from middleware.consensus.bidding.panel import panel_of
 from middleware.consensus.lease.council import Superseded
 from middleware.consensus.strategy import ConsensusAlgorithm
@@ -42,21 +43,19 @@ class Part:
         halt: Callable[[], float],
     ) -> None:
         self.is_left = False
+        self.halt = halt
+        self.reached = node.reached
         self._node = node
         self._clock = clock
         self._told = told
         self._close: Callable[[], None] = getattr(behaviour, "close", lambda: None)
         me = Member(node.uuid, node.presence.device.name, IDLE)
         age = max(0.0, node.wall() - task.created)
-        self.engagement = Engagement(
-            task, me, behaviour, strategy, clock, token, self._tell, self._conclude, self._say, halt, age
-        )
         self._panel = panel_of(node.uuid, group_key(task.task_id))
-        self.engagement.seat(self._panel)
-        self.engagement.justify = self._justify
-        self.engagement.reached = node.reached
+        now = clock.seconds()
+        self.engagement = Engagement(task, me, behaviour, strategy, self, self._panel, token, now, age)
         self.caretaker = Caretaker(self.engagement, node, clock)
-        self._group = node.group(task, self.engagement.heard, self._ordered, self._panel)
+        self._group = node.group(task, self._heard, self._ordered, self._panel)
 
     def report(self) -> None:
         """Tell the others how things stand."""
@@ -68,12 +67,15 @@ class Part:
         Fires when those who lend it know.
         """
         self.is_left = True
-        told = self.engagement.abandon()
+        told = self.engagement.abandon(self._clock.seconds())
         self._close()
         self._group.leave()
         if is_running:
             self._group.withdraw()
         return told
+
+    def _heard(self, members: list[Member], outcome: Result | None) -> None:
+        self.engagement.heard(members, outcome, self._clock.seconds())
 
     def _ordered(self, records: list[Record]) -> None:
         self.engagement.ordered(order_of(records))
@@ -81,15 +83,18 @@ class Part:
         if task is not self.engagement.task:
             self.engagement.renewed(task)
 
-    def _tell(self, member: Member) -> None:
+    def tell(self, member: Member) -> None:
+        """Publish this agent's report."""
         self._group.report(member)
         self._told(self, member)
 
-    def _justify(self, verdict: Verdict) -> None:
+    def justify(self, verdict: Verdict) -> None:
+        """Publish why the agent decided so, where the others know of it."""
         if self._panel.counts(self._clock.seconds()):
             self._node.justify(verdict)
 
-    def _conclude(self, result: Result) -> None:
+    def conclude(self, result: Result) -> None:
+        """Record the outcome, as long as it is this agent's to record."""
         lessee = self.engagement.lessee
         if self.is_left or lessee is None:
             return
@@ -102,9 +107,10 @@ class Part:
         """No majority could be told: try again for as long as the task is this agent's to conclude."""
         failure.trap(EntangledError)
         if failure.check(Superseded) is not None:
-            return self.engagement.reopen()
-        if not self.is_left and not self.engagement.is_over:
-            self._clock.callLater(AGAIN, self._conclude, result)
+            self.engagement.on(Event.REOPENED, self._clock.seconds())
+        elif not self.is_left and not self.engagement.is_over:
+            self._clock.callLater(AGAIN, self.conclude, result)
 
-    def _say(self, text: str) -> None:
+    def say(self, text: str) -> None:
+        """Write a line for people."""
         self._node.presence.say(self._node.wall(), text)

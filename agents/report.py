@@ -1,12 +1,10 @@
-"""Report: what one body has to tell the others of itself, and when it is worth telling; pure but for the clock."""
+"""Report: what one body has to tell the others of itself, and when it is worth telling; pure."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Collection
 from typing import Any
-
-from twisted.internet.interfaces import IReactorTime
 
 from agents.behaviour import Behaviour
 from drivers.reading import Observation
@@ -24,22 +22,20 @@ PAUSE = 1.0
 
 
 class Reporter:
-    """Looks at a ``behaviour`` and says what is new; ``reads`` is what the task's strategy goes by beside the cost."""
+    """Looks at a ``behaviour`` and says what is new; ``reads`` is what the task's strategy goes by beside the cost.
 
-    def __init__(self, behaviour: Behaviour, clock: IReactorTime, reads: Collection[str] = ()) -> None:
+    ``load`` is how many tasks the agent has.
+    """
+
+    def __init__(self, behaviour: Behaviour, reads: Collection[str] = ()) -> None:
+        self.load = 1
         self._behaviour = behaviour
-        self._clock = clock
         self._reads = reads
         self._told_at = -math.inf
         self._moved_at = -math.inf
 
-    def news(
-        self, known: Member, is_acting: bool, seen: Observation | None = None, load: int = 0
-    ) -> dict[str, Any] | None:
-        """What the others do not know yet beside ``known``; None where that is nothing.
-
-        ``seen`` is what the body senses, ``load`` how many tasks the agent has.
-        """
+    def news(self, known: Member, is_acting: bool, seen: Observation, now: float) -> dict[str, Any] | None:
+        """What the others do not know yet beside ``known``, as the body senses ``seen``; None where that is nothing."""
         cost = self._behaviour.cost
         if not is_bid(cost):
             cost = None  # what is no cost is no bid, whatever a behaviour says
@@ -54,21 +50,20 @@ class Reporter:
         angle = _number(getattr(self._behaviour, "angle", None))
         if angle is not None and cost is not None and (known.angle is None or _apart(angle, known.angle) > TURNED):
             news["angle"] = round(angle, 3)
-        now = self._clock.seconds()
         if cost is not None:
-            news |= self._offer(known, seen, load, now)
+            news |= self._offer(known, seen, now)
         if not news and cost is not None and 0.0 < valid_for < 2.0 * (now - self._told_at):
             news["valid_for"] = valid_for  # said again before it is void
         if news:
             self._told_at = now
         return news or None
 
-    def _offer(self, known: Member, seen: Observation | None, load: int, now: float) -> dict[str, Any]:
+    def _offer(self, known: Member, seen: Observation, now: float) -> dict[str, Any]:
         """What is new of that by which only some strategies go; what is nothing lawful is not told."""
         news: dict[str, Any] = {}
-        if "load" in self._reads and load != known.load:
-            news["load"] = load
-        charge = None if seen is None else _number(seen.values.get("power.level"))
+        if "load" in self._reads and self.load != known.load:
+            news["load"] = self.load
+        charge = _number(seen.values.get("power.level"))
         if "battery" in self._reads and charge is not None:
             battery = round(min(1.0, max(0.0, charge)), 2)
             if known.cost is None or abs(battery - known.battery) >= DRAINED:

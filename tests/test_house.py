@@ -31,6 +31,7 @@ PURE = (
     "agents.formation",
     "agents.means",
     "agents.pushed",
+    "agents.report",
     "agents.state",
     "drivers.aibo.cursor",
     "drivers.aibo.menu",

@@ -11,13 +11,14 @@ from twisted.trial.unittest import SynchronousTestCase
 from agents.behaviour import STAND
 from agents.context import Context
 from agents.engagement import SEARCH_TTL, Deed, Engagement
-from agents.state import State
+from agents.state import Event, State
 from drivers.driver import Permit
 from drivers.reading import Action, Observation
+from middleware.consensus.bidding.panel import Panel
 from middleware.consensus.guard import Guard
 from middleware.consensus.lease.lessee import Lease
 from middleware.consensus.strategies.nearest import Nearest
-from middleware.consensus.strategy import Consensus, Report
+from middleware.consensus.strategy import Consensus, ConsensusAlgorithm, Report
 from middleware.consensus.verdict import Verdict
 from middleware.directory.presence import ASSIGNED, DONE, EXECUTING, SEARCHING, WAITING
 from middleware.entangled.clock import HeapClock
@@ -120,35 +121,61 @@ class Council:
         self.token, self.deadline = token, self._clock.seconds() + ttl
 
 
+class Recorder:
+    """The ways out of an engagement, which write down what goes out."""
+
+    def __init__(self, events: list[str]) -> None:
+        self.told: list[Member] = []
+        self.results: list[Result] = []
+        self.said: list[str] = []
+        self.accounts: list[Verdict] = []
+        self.known: dict[str, Contact] = {}
+        self.moves_for = 0.0
+        self._events = events
+
+    def tell(self, member: Member) -> None:
+        """Keep a report."""
+        self.told.append(member)
+
+    def conclude(self, result: Result) -> None:
+        """Keep an outcome."""
+        self.results.append(result)
+
+    def say(self, text: str) -> None:
+        """Keep a line."""
+        self.said.append(text)
+
+    def justify(self, verdict: Verdict) -> None:
+        """Keep an account."""
+        self.accounts.append(verdict)
+
+    def halt(self) -> float:
+        """Stop the body, which may not hear it."""
+        self._events.append("halted")
+        return self.moves_for
+
+    def reached(self, uuids: Sequence[str]) -> Sequence[Contact]:
+        """How agents are reached."""
+        return [self.known[uuid] for uuid in uuids if uuid in self.known]
+
+
 class EngagementTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.clock = HeapClock()
         self.events: list[str] = []
-        self.told: list[Member] = []
-        self.results: list[Result] = []
-        self.said: list[str] = []
+        self.ports = Recorder(self.events)
+        self.told, self.results, self.said = self.ports.told, self.ports.results, self.ports.said
         self.dog = Dog()
-        self.moves_for = 0.0
         self.council = Council(self.clock, self.events)
         self.others = {n: Identity(bytes([n]) * 32) for n in (2, 3)}
-        self.engagement = Engagement(
-            TASK,
-            Member(ME.node_id.hex(), "dog1", ""),
-            self.dog,
-            Nearest(),
-            self.clock,
-            4,
-            self.told.append,
-            self.results.append,
-            self.said.append,
-            self.halt,
-        )
-        self.engagement.lessee = self.council  # type: ignore[assignment]
+        self.begin(TASK)
 
-    def halt(self) -> float:
-        """Stop the body, which may not hear it."""
-        self.events.append("halted")
-        return self.moves_for
+    def begin(self, task: Task, strategy: ConsensusAlgorithm | None = None) -> None:
+        """Take part in ``task``, with the body."""
+        uuid = ME.node_id.hex()
+        me, panel, now = Member(uuid, "dog1", ""), Panel(uuid), self.clock.seconds()
+        self.engagement = Engagement(task, me, self.dog, strategy or Nearest(), self.ports, panel, 4, now)
+        self.engagement.take_body(self.council, 4)  # type: ignore[arg-type]
 
     def report(self, number: int, cost: float | None, status: str = WAITING) -> Member:
         """What another dog reports."""
@@ -156,19 +183,20 @@ class EngagementTests(SynchronousTestCase):
 
     def hear(self, *members: Member) -> None:
         """Let the group tell who is present, while the task is open."""
-        self.engagement.heard(list(members), None)
+        self.engagement.heard(list(members), None, self.clock.seconds())
 
     def end(self, outcome: str, by: str) -> None:
         """Let the group tell how the task ended."""
-        self.engagement.heard([], Result(outcome, by, 1.0, 5))
+        self.engagement.heard([], Result(outcome, by, 1.0, 5), self.clock.seconds())
 
     def see(self, cost: float | None) -> None:
         """Let the body measure."""
-        self.engagement.look(Observation(0.0, 0.0, {"cost": "none" if cost is None else cost}))
+        seen = Observation(0.0, 0.0, {"cost": "none" if cost is None else cost})
+        self.engagement.look(seen, self.clock.seconds())
 
     def step(self) -> Deed:
         """One step that has to give a deed."""
-        deed = self.engagement.step()
+        deed = self.engagement.step(self.clock.seconds())
         assert deed is not None
         return deed
 
@@ -328,10 +356,10 @@ class EngagementTests(SynchronousTestCase):
         self.engagement.hand_council([CONTACT] * 3)
         self.assertEqual((self.step().action, self.events), (GO, []))
         self.dog.is_safe = True
-        self.assertIsNone(self.engagement.step())
+        self.assertIsNone(self.engagement.step(self.clock.seconds()))
         self.assertEqual(self.events, ["halted", "moved to 3"])
         self.clock.advance(0.2)
-        self.assertIsNone(self.engagement.step())
+        self.assertIsNone(self.engagement.step(self.clock.seconds()))
         self.assertEqual(self.told[-1].status, EXECUTING)
         self.council.grant(9)
         self.assertEqual(self.step(), Deed(GO, Permit(9, self.council.deadline)))
@@ -341,7 +369,7 @@ class EngagementTests(SynchronousTestCase):
         """Without its lease after one ttl it is fenced like anybody whose lease ran out."""
         self.acting()
         self.engagement.hand_council([CONTACT] * 3)
-        self.assertIsNone(self.engagement.step())
+        self.assertIsNone(self.engagement.step(self.clock.seconds()))
         self.clock.advance(TASK.lease_ttl)
         self.step()
         self.assertEqual(self.events, ["halted", "moved to 3", "halted"])
@@ -382,13 +410,13 @@ class EngagementTests(SynchronousTestCase):
 
     def test_lost_body_may_still_move(self) -> None:
         """With the lease of a robot that does not hear that it is to stop goes back for how long it still moves."""
-        for leave in (Engagement.lose_body, Engagement.abandon):
+        for leave in (lambda: self.engagement.lose_body(), lambda: self.engagement.abandon(self.clock.seconds())):
             self.setUp()
             self.acting()
-            self.moves_for = 0.8
-            leave(self.engagement)
-            self.engagement.step()
-            self.assertEqual(self.council.rest, 0.8, str(leave))
+            self.ports.moves_for = 0.8
+            leave()
+            self.engagement.step(self.clock.seconds())
+            self.assertEqual(self.council.rest, 0.8)
 
     def test_lost_body_is_not_waited_for(self) -> None:
         """Whose robot does not answer is not free, whether it had reported or not; at the next look it is again."""
@@ -422,12 +450,12 @@ class EngagementTests(SynchronousTestCase):
         self.acting()
         deed = self.step()
         self.assertEqual((deed.action, deed.permit.token), (STAND, 5))
-        self.assertIsNone(self.engagement.step())
+        self.assertIsNone(self.engagement.step(self.clock.seconds()))
         self.assertEqual([(r.outcome, r.by, r.token) for r in self.results], [(COMPLETED, "dog1", 5)])
         self.assertEqual(self.results[0].bids, (("dog1", 1.0), ("dog2", 2.0)))
         self.assertEqual(self.events, ["halted"])
         self.end(COMPLETED, "dog1")
-        self.engagement.abandon()
+        self.engagement.abandon(self.clock.seconds())
         self.assertEqual(self.events[-1], "released")
 
     def test_outcome_of_another_ends_it_at_once(self) -> None:
@@ -436,7 +464,7 @@ class EngagementTests(SynchronousTestCase):
         self.end(CANCELLED, "vaio")
         self.assertTrue(self.engagement.is_over)
         self.assertEqual(self.events, ["halted"])
-        self.assertIsNone(self.engagement.step())
+        self.assertIsNone(self.engagement.step(self.clock.seconds()))
         self.assertEqual(self.said[-1], "cancelled by vaio")
         self.see(0.5)
 
@@ -493,7 +521,7 @@ class EngagementTests(SynchronousTestCase):
         """A paused task stops the body, gives the lease back and reports no body; resumed it goes on where it was."""
         self.acting()
         self.engagement.ordered(Order(PAUSE, "vaio", 1.0))
-        self.assertIsNone(self.engagement.step())
+        self.assertIsNone(self.engagement.step(self.clock.seconds()))
         self.assertEqual(self.events, ["halted", "released"])
         self.assertEqual((self.engagement.me.cost, self.engagement.me.available), (None, False))
         self.see(0.9)
@@ -509,9 +537,9 @@ class EngagementTests(SynchronousTestCase):
     def test_put_aside_for_another_task(self) -> None:
         """Without its body the agent claims nothing, says so, and keeps nobody waiting."""
         self.acting()
-        self.engagement.put_aside("busy with T")
+        self.engagement.put_aside("busy with T", self.clock.seconds())
         self.assertEqual(self.events, ["halted", "released"])
-        self.assertIsNone(self.engagement.step())
+        self.assertIsNone(self.engagement.step(self.clock.seconds()))
         me = self.engagement.me
         self.assertEqual((me.status, me.state, me.why, me.available), (ASSIGNED, "IDLE", "busy with T", False))
 
@@ -521,45 +549,45 @@ class EngagementTests(SynchronousTestCase):
         self.acting()
         self.step()
         self.assertFalse(self.engagement.may_be_put_aside)
-        self.engagement.put_aside("busy with T")
+        self.engagement.put_aside("busy with T", self.clock.seconds())
         self.assertEqual(self.events, ["halted"])
         self.end(COMPLETED, "dog1")
-        self.engagement.abandon()
+        self.engagement.abandon(self.clock.seconds())
         self.assertEqual(self.events, ["halted", "released"])
 
     def test_deadline_fails_the_task_once(self) -> None:
         """Past its deadline the task fails by whoever acts, or by the first of those present, and by nobody else."""
-        self.engagement.task = replace(TASK, deadline=5.0)
+        self.begin(replace(TASK, deadline=5.0))
         self.acting()
         self.clock.advance(5.1)
         self.council.grant(5)
-        self.assertIsNone(self.engagement.step())
-        self.assertIsNone(self.engagement.step())
+        self.assertIsNone(self.engagement.step(self.clock.seconds()))
+        self.assertIsNone(self.engagement.step(self.clock.seconds()))
         self.assertEqual([(r.outcome, r.why) for r in self.results], [(FAILED, "past its deadline of 5 s")])
 
     def test_deadline_falls_to_one(self) -> None:
         """Who does not act leaves it to whoever does, or to the participant with the lowest uuid."""
-        self.engagement.task = replace(TASK, deadline=5.0)
+        self.begin(replace(TASK, deadline=5.0))
         self.clock.advance(5.1)
         lowest = min([ME, *self.others.values()], key=lambda one: one.node_id.hex())
         self.hear(self.report(2, 1.0, EXECUTING))
         self.step()
         self.assertEqual(self.results, [])
         self.hear(self.report(2, 1.0), self.report(3, 1.0))
-        self.engagement.step()
+        self.engagement.step(self.clock.seconds())
         self.assertEqual(len(self.results), int(lowest is ME))
 
     def test_deadline_is_told_by_who_holds_the_task(self) -> None:
         """Who is to end a task that nobody acts on claims it first: its council lets no other end it."""
-        self.engagement.task = replace(TASK, deadline=5.0)
+        self.begin(replace(TASK, deadline=5.0))
         self.patch(self.engagement._conference, "is_first", lambda now: True)
         self.acting()
         self.clock.advance(5.1)
         for _ in range(2):
-            self.assertIsNone(self.engagement.step())
+            self.assertIsNone(self.engagement.step(self.clock.seconds()))
             self.assertEqual((self.results, self.council.is_wanted), ([], True))
         self.council.grant(6)
-        self.assertIsNone(self.engagement.step())
+        self.assertIsNone(self.engagement.step(self.clock.seconds()))
         self.assertEqual([result.token for result in self.results], [6])
 
     def test_higher_token_reopens_the_task(self) -> None:
@@ -567,14 +595,14 @@ class EngagementTests(SynchronousTestCase):
         self.dog.steps = 1
         self.acting()
         self.step()
-        self.assertIsNone(self.engagement.step())
-        self.engagement.reopen()
+        self.assertIsNone(self.engagement.step(self.clock.seconds()))
+        self.engagement.on(Event.REOPENED, self.clock.seconds())
         self.assertEqual(self.events[-1], "released")
-        self.assertIsNotNone(self.engagement.step())
+        self.assertIsNotNone(self.engagement.step(self.clock.seconds()))
 
     def test_no_progress_gives_the_task_to_another(self) -> None:
         """Who comes no further within the stall limit gives the lease back and does not bid for as long."""
-        self.engagement._execution._stall_limit = 1.0
+        self.begin(replace(TASK, stall_limit=1.0))
         self.dog.progress = 0.5
         self.acting()
         for _ in range(22):
@@ -613,7 +641,7 @@ class EngagementTests(SynchronousTestCase):
                 """Fail."""
                 raise ZeroDivisionError("no luck")
 
-        self.engagement._conference.strategy = Guard(Broken())
+        self.begin(TASK, Guard(Broken()))
         self.hear(self.report(2, 0.5))
         self.see(1.0)
         self.step()
@@ -628,11 +656,11 @@ class EngagementTests(SynchronousTestCase):
         self.end(CANCELLED, "vaio")
         self.hear(self.report(2, 2.0))
         self.see(1.0)
-        self.assertIsNone(self.engagement.step())
+        self.assertIsNone(self.engagement.step(self.clock.seconds()))
         self.assertTrue(self.engagement.is_over)
-        self.engagement.heard([], Result(COMPLETED, "dog2", 1.0, 9))
+        self.engagement.heard([], Result(COMPLETED, "dog2", 1.0, 9), self.clock.seconds())
         self.assertEqual(self.engagement.result, Result(COMPLETED, "dog2", 1.0, 9))
-        self.engagement.heard([], Result(CANCELLED, "vaio"))
+        self.engagement.heard([], Result(CANCELLED, "vaio"), self.clock.seconds())
         self.assertEqual(self.engagement.result, Result(COMPLETED, "dog2", 1.0, 9))
 
     def test_older_life_is_counted_on(self) -> None:
@@ -654,20 +682,18 @@ class EngagementTests(SynchronousTestCase):
     def test_heirs_hear_of_a_leave_from_the_one_that_leaves(self) -> None:
         """Who leaves the task names those that stand by, the next one first, and never itself."""
         contacts = {n: Contact(each.public, Address("10.0.0.1", n)) for n, each in self.others.items()}
-        known = {contact.node_id.hex(): contact for contact in contacts.values()}
-        self.engagement.reached = lambda uuids: [known[uuid] for uuid in uuids]
+        self.ports.known = {contact.node_id.hex(): contact for contact in contacts.values()}
         self.hear(self.report(2, 3.0), self.report(3, 2.0))
         self.see(1.0)
         self.step()
         self.council.grant(1)
         self.step()
-        self.engagement.abandon()
+        self.engagement.abandon(self.clock.seconds())
         self.assertEqual(self.council.heirs, [contacts[3], contacts[2]])
 
     def test_each_decision_is_accounted_for_once(self) -> None:
         """A new decision is told why at once, moved reports at most once a second, and an unchanged one never again."""
-        accounts: list[Verdict] = []
-        self.engagement.justify = accounts.append
+        accounts = self.ports.accounts
         self.step()
         self.assertEqual(accounts, [])
         self.hear(self.report(2, 2.0))
@@ -689,8 +715,7 @@ class EngagementTests(SynchronousTestCase):
 
     def test_epoch_follows_the_token(self) -> None:
         """The epoch is the token under which somebody acts; when that agent is gone, the next one."""
-        accounts: list[Verdict] = []
-        self.engagement.justify = accounts.append
+        accounts = self.ports.accounts
         self.see(2.0)
         self.hear(replace(self.report(2, 1.0, EXECUTING), token=3))
         self.step()

@@ -30,7 +30,7 @@ class ReporterTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.clock = HeapClock()
         self.minded = self.made()
-        self.reporter = Reporter(self.minded, self.clock, READABLE)
+        self.reporter = Reporter(self.minded, READABLE)
         self.me = ME
 
     def made(self) -> Any:
@@ -40,7 +40,8 @@ class ReporterTests(SynchronousTestCase):
     def news(self, charge: float = 0.8, load: int = 2) -> dict[str, Any]:
         """What is told, and known from then on."""
         seen = Observation(0.0, 0.0, {"power.level": charge})
-        told = self.reporter.news(self.me, False, seen, load) or {}
+        self.reporter.load = load
+        told = self.reporter.news(self.me, False, seen, self.clock.seconds()) or {}
         self.me = replace(self.me, **told)
         return told
 
@@ -53,7 +54,7 @@ class ReporterTests(SynchronousTestCase):
 
     def test_what_nobody_reads_is_not_told(self) -> None:
         """For a strategy that goes by the cost alone nothing else is told."""
-        self.reporter = Reporter(self.minded, self.clock)
+        self.reporter = Reporter(self.minded)
         self.assertEqual(self.news(), {"cost": 2.0, "available": True})
 
     def test_without_cost_nothing_is_offered(self) -> None:

@@ -1,67 +1,236 @@
-"""Tests of ``agents.state``: the table of an agent's states."""
+"""Tests of ``agents.state``: the table, and what holds in each state that an agent can reach."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from copy import deepcopy
+from itertools import product
+from typing import Any
+
 from twisted.trial.unittest import SynchronousTestCase
 
-from agents.state import NEXT, Course, IllegalStep, State
-from middleware.directory.presence import STATUSES
+from agents.engagement import Deed, Engagement
+from agents.state import ROWS, TABLE, Course, Effect, Event, State, build_table
+from drivers.reading import Observation
+from middleware.consensus.bidding.panel import Panel
+from middleware.consensus.strategies.nearest import Nearest
+from middleware.directory.presence import EXECUTING, STATUSES, WAITING
+from middleware.entangled.clock import HeapClock
+from middleware.tasks.order import PAUSE, RESUME, Order
+from middleware.tasks.task import COMPLETED, Member, Result, Task
+from tests.agents.state_table import PAGE, write_states
+from tests.agents.test_engagement import CONTACT, GO, Council, Dog, Recorder
 
 S = State
+ME, OTHER = "1" * 40, "2" * 40
+DEADLINE = 100.0
 
 
-def at(state: State) -> Course:
-    """A course that stands there."""
-    course = Course()
-    course.state = state
-    return course
+class TableTests(SynchronousTestCase):
+    def test_each_pair_has_one_row(self) -> None:
+        """Each event is answered in each state, once; without any one row it is not."""
+        named = [(state, row.event) for row in ROWS for state in row.states]
+        self.assertEqual((len(named), set(TABLE)), (len(set(named)), set(product(State, Event))))
+        for row in ROWS:
+            self.assertNotEqual(set(build_table(each for each in ROWS if each is not row)), set(TABLE))
 
-
-class CourseTests(SynchronousTestCase):
-    def test_only_a_claim_leads_to_execution(self) -> None:
-        """EXECUTING is entered from CLAIMING alone."""
-        self.assertEqual([state for state in S if S.EXECUTING in NEXT[state]], [S.CLAIMING])
+    def test_only_a_grant_leads_to_execution(self) -> None:
+        """EXECUTING is entered by GRANTED alone, and the task is done in no other state."""
+        entered = {event for (state, event), (target, _) in TABLE.items() if S.EXECUTING is target is not state}
+        executed = {target for target, effects in TABLE.values() if Effect.EXECUTE in effects}
+        self.assertEqual((entered, executed), ({Event.GRANTED}, {S.EXECUTING}))
 
     def test_execution_ends_with_a_stopped_body(self) -> None:
-        """EXECUTING is left to RELEASING and FENCED alone, where the body stands."""
-        self.assertEqual(NEXT[S.EXECUTING], {S.RELEASING, S.FENCED})
+        """EXECUTING is left with a stop of the body as the first effect, and no other state has a body to stop."""
+        for (state, event), (target, effects) in TABLE.items():
+            is_acting = state is S.EXECUTING
+            self.assertEqual(Effect.STOP in effects[:1], is_acting and bool(effects) and Effect.EXECUTE not in effects)
+            self.assertNotIn(Effect.STOP, effects[1:])
+            if is_acting and target is not state:
+                self.assertIn(Effect.STOP, effects, event.name)
 
     def test_the_end_is_the_end(self) -> None:
-        """Nothing follows DONE, and everything that does not act can end there."""
-        self.assertEqual(NEXT[S.DONE], frozenset())
-        self.assertEqual({state for state in S if S.DONE not in NEXT[state]}, {S.EXECUTING, S.DONE})
-
-    def test_illegal_steps_raise(self) -> None:
-        """Each step that is not in the table raises and leaves the state as it was."""
-        for state in S:
-            for goal in S:
-                course = at(state)
-                if goal is state or goal in NEXT[state]:
-                    course.go(goal)
-                    self.assertIs(course.state, goal)
-                else:
-                    self.assertRaises(IllegalStep, course.go, goal)
-                    self.assertIs(course.state, state)
-
-    def test_reach_never_acts_on_the_way(self) -> None:
-        """A way through several states takes legal steps only, and never one through EXECUTING."""
-        for state in set(S) - {S.EXECUTING, S.DONE, S.IDLE}:
-            for goal in (S.OBSERVING, S.WAITING, S.REPORTED, S.CLAIMING):
-                course = at(state)
-                course.reach(goal, rank=2)
-                self.assertEqual((course.state, course.rank), (goal, 2))
-        for goal in (S.WAITING, S.OBSERVING, S.CLAIMING):
-            self.assertRaises(IllegalStep, at(S.EXECUTING).reach, goal)
-            self.assertRaises(IllegalStep, at(S.DONE).reach, goal)
+        """Nothing follows DONE but that the lease is handed over, and each state can end there."""
+        follow = {(target, effects) for (state, _), (target, effects) in TABLE.items() if state is S.DONE}
+        self.assertEqual(follow, {(S.DONE, ()), (S.DONE, (Effect.HAND_OVER,))})
+        self.assertEqual({TABLE[state, Event.OUTCOME][0] for state in State}, {S.DONE})
 
     def test_statuses_are_those_of_the_page(self) -> None:
         """Each state shows as one of the coarse statuses, and only EXECUTING as that."""
         self.assertTrue({state.status for state in S} <= set(STATUSES))
-        self.assertEqual([state for state in S if state.status == "EXECUTING"], [S.EXECUTING])
+        self.assertEqual([state for state in S if state.status == EXECUTING], [S.EXECUTING])
 
     def test_rank_is_shown(self) -> None:
-        """Who waits says its place among those that stand by."""
-        course = at(S.CONFERRING)
-        course.go(S.WAITING, rank=2)
-        self.assertEqual(str(course), "WAITING(2)")
-        self.assertEqual(str(at(S.CLAIMING)), "CLAIMING")
+        """An agent that waits shows its place in the line, and keeps it where nothing gives it another."""
+        course = Course()
+        course.state = S.OBSERVING
+        for event, rank, shown in (
+            (Event.PASSED_OVER, 2, "WAITING(2)"),
+            (Event.LENT, None, "WAITING(2)"),
+            (Event.NAMED, 0, "CLAIMING"),
+        ):
+            course.go(event, rank)
+            self.assertEqual(str(course), shown)
+
+    def test_page_has_the_table(self) -> None:
+        """The states on the page are made from the table."""
+        self.assertIn(write_states(), PAGE.read_text(encoding="utf-8"))
+
+
+class Rig:
+    """An agent in a task with a body, a council, another agent, and time; the invariants are checked at each input."""
+
+    def __init__(self) -> None:
+        self.clock = HeapClock()
+        self.events: list[str] = []
+        self.dog = Dog()
+        self.ports = Recorder(self.events)
+        self.council = Council(self.clock, self.events)
+        self.lessee: Any = self.council
+        self.others: list[Member] = []
+        self.is_moving = self.is_late = self.has_left = False
+        task = Task("t1", "find-target", "Find it", waiting_period=DEADLINE, deadline=DEADLINE, preemptible=True)
+        me = Member(ME, "dog1", "")
+        self.engagement = Engagement(task, me, self.dog, Nearest(), self.ports, Panel(ME), 0, 0.0)
+
+    @property
+    def key(self) -> tuple[object, ...]:
+        """What decides which event an input leads to."""
+        one, council = self.engagement, self.council
+        held = one.course.state, one.lessee is not None, council.lease is not None, self.has_left, self.is_moving
+        if one.is_over or self.has_left:
+            return held
+        asked = council.is_wanted, council.places[-1:] > [0], one.claim.is_lent, one.is_paused, self.is_late
+        moves = one.course.state is S.EXECUTING and (self.dog.is_safe, bool(one.claim.successors))
+        return (*held, *asked, moves, one.me.cost, *(other.cost for other in self.others))
+
+    def feed(self, name: str) -> list[str]:
+        """Have one thing happen, and then a turn; what is wrong with it."""
+        for past in (self.events, self.ports.told, self.ports.said, self.ports.accounts, self.dog.contexts):
+            past.clear()
+        was_over = self.engagement.is_over
+        now = self.clock.seconds()
+        INPUTS[name](self, self.engagement, now)
+        deed = None if self.has_left else self.engagement.step(now)
+        faults = self.faults(deed)
+        if was_over and (deed or self.events not in ([], ["released"]) or self.ports.told):
+            faults.append("something follows the outcome")
+        if was_over and self.engagement.course.state is not S.DONE:
+            faults.append("the outcome does not stay")
+        return faults
+
+    def faults(self, deed: Deed | None) -> list[str]:
+        """Which invariants the events and ``deed`` of a turn break."""
+        faults = []
+        for event in self.events:
+            if event == "halted":
+                self.is_moving = False
+            elif self.is_moving and (event == "released" or event.startswith("moved")):
+                faults.append("the lease is given back while the body moves")
+        lease = self.council.lease
+        if deed is not None and deed.action == GO:
+            self.is_moving = True
+            if lease is None or (deed.permit.token, deed.permit.deadline) != (lease.token, lease.deadline):
+                faults.append("the body acts without a lease")
+        elif self.is_moving and deed is not None:
+            faults.append("the body is not stopped before it does something else")
+        if self.is_moving and (lease is None or self.engagement.lessee is None):
+            faults.append("the body moves on without a lease")
+        return faults
+
+
+def hear(rig: Rig, one: Engagement, now: float, *others: Member) -> None:
+    """The other reports, or is gone."""
+    rig.others = list(others)
+    one.heard(rig.others, None, now)
+
+
+def take(rig: Rig, one: Engagement, now: float) -> None:
+    """The agent gives its body to the task."""
+    if one.lessee is None and not rig.has_left:
+        one.take_body(rig.lessee, one.claim.token)
+
+
+def lend(rig: Rig, one: Engagement, now: float) -> None:
+    """Another task of the group gets the body, as long as this one does not act."""
+    if not one.is_acting and one.may_be_put_aside:
+        one.lend_body(True, now)
+
+
+def finish(rig: Rig, one: Engagement, now: float) -> None:
+    """The behaviour has nothing left to do, if it acts now."""
+    if one.course.state is S.EXECUTING:
+        rig.dog.steps = 0
+
+
+def grant(rig: Rig, one: Engagement, now: float) -> None:
+    """The council grants the lease to an agent that asks for it."""
+    if one.lessee is not None and (rig.council.is_wanted or rig.council.places[-1:] > [0]):
+        rig.council.grant(one.claim.token + 1)
+
+
+def lose(rig: Rig, one: Engagement, now: float) -> None:
+    """The lease runs out, and the robot stops by itself."""
+    rig.council.token, rig.is_moving = 0, False
+
+
+def leave(rig: Rig, one: Engagement, now: float) -> None:
+    """The agent leaves the task."""
+    rig.has_left = True
+    one.abandon(now)
+
+
+def expire(rig: Rig, one: Engagement, now: float) -> None:
+    """The task is past its deadline; a lease that is held is renewed."""
+    rig.is_late = True
+    rig.council.deadline += DEADLINE
+    rig.clock.advance(DEADLINE + 1.0)
+
+
+INPUTS: dict[str, Callable[[Rig, Engagement, float], object]] = {
+    "turn": lambda rig, one, now: None,
+    "near": lambda rig, one, now: one.look(Observation(0.0, 0.0, {"cost": 1.0}), now),
+    "blind": lambda rig, one, now: one.look(Observation(0.0, 0.0, {"cost": "none"}), now),
+    "better": lambda rig, one, now: hear(rig, one, now, Member(OTHER, "dog2", WAITING, 0.2)),
+    "mute": lambda rig, one, now: hear(rig, one, now, Member(OTHER, "dog2", WAITING)),
+    "gone": hear,
+    "take": take,
+    "grant": grant,
+    "lose": lose,
+    "outrank": lambda rig, one, now: one.on(Event.OUTRANKED, now),
+    "lend": lend,
+    "return": lambda rig, one, now: one.lend_body(False, now),
+    "aside": lambda rig, one, now: one.put_aside("busy", now),
+    "pause": lambda rig, one, now: one.ordered(Order(PAUSE, "vaio", 1.0)),
+    "resume": lambda rig, one, now: one.ordered(Order(RESUME, "vaio", 2.0)),
+    "silent": lambda rig, one, now: one.lose_body(),
+    "unsafe": lambda rig, one, now: setattr(rig.dog, "is_safe", False),
+    "safe": lambda rig, one, now: setattr(rig.dog, "is_safe", True),
+    "finish": finish,
+    "council": lambda rig, one, now: one.hand_council([CONTACT] * 3),
+    "reopen": lambda rig, one, now: one.on(Event.REOPENED, now),
+    "outcome": lambda rig, one, now: one.heard([], Result(COMPLETED, "dog2", 1.0, 9), now),
+    "leave": leave,
+    "expire": expire,
+}
+
+
+class ReachableTests(SynchronousTestCase):
+    def test_invariants_hold_in_each_state_that_is_reached(self) -> None:
+        """From the beginning everything happens in each state: no act without a lease, a stop before its return."""
+        first = Rig()
+        shared = {id(each): each for each in (first.engagement.task, CONTACT)}
+        known: dict[tuple[object, ...], tuple[str, ...]] = {first.key: ()}
+        open_ = [first]
+        while open_:
+            rig = open_.pop(0)
+            way = known[rig.key]
+            for name in INPUTS:
+                after = deepcopy(rig, dict(shared))
+                self.assertEqual(after.feed(name), [], (*way, name))
+                if after.key not in known:
+                    known[after.key] = (*way, name)
+                    open_.append(after)
+        self.assertEqual({key[0] for key in known}, set(State))
+        self.assertEqual({key[0] for key in known if key[4]}, {S.EXECUTING})  # where the body moves
+        self.assertGreater(len(known), 400)
