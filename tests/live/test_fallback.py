@@ -28,7 +28,7 @@ class FallbackTests(BrowserCase):
         self.webs = [Team() for _ in NAMES]
         urls = [f"{name}={web.url[:-1]}" for name, web in zip(NAMES, self.webs, strict=True)]
         for name, web, pages in zip(NAMES, self.webs, (urls, urls[::-1]), strict=True):
-            self.addCleanup(web.stop)
+            self.addCleanup(web.end)
             web.order(f"name {name}")
             web.order(f"pages {' '.join(pages)}")
         self.page = self.tab(DESK)
@@ -91,7 +91,7 @@ class FallbackTests(BrowserCase):
     def test_go_past_an_impostor(self) -> None:
         """A page that is listed and has no token, as its node is no gateway, is asked nothing; no URL has a token."""
         eve = Team()
-        self.addCleanup(eve.stop)
+        self.addCleanup(eve.end)
         eve.order("name eve")
         urls = [f"{name}={web.url[:-1]}" for name, web in (("vaio", self.webs[0]), ("eve", eve), ("pi", self.webs[1]))]
         self.webs[0].order(f"pages {' '.join(urls)}")
@@ -110,7 +110,6 @@ class FallbackTests(BrowserCase):
             self.assertEqual([asked for asked, _ in shown if token in asked], [])
             strays = [asked for asked, header in shown if token in header and not asked.startswith(f"{url}/")]
             self.assertEqual(strays, [])
-        os.kill(self.pid(0), signal.SIGCONT)
 
     def test_new_task_is_asked_for_again(self) -> None:
         """A task that is asked of a node which is frozen is asked of the other, by the same name for the wish."""

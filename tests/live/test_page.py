@@ -343,9 +343,10 @@ class PageTests(PageCase):
         """A frozen node is noticed within about two seconds, a killed one at once; the page goes on when it is back."""
         page = self.opened(DESK)
         started = time.monotonic()
-        self.team.order("freeze 4")
+        self.team.freeze()
         page.locator("#link[data-link=lost]").wait_for()
         self.assertLess(time.monotonic() - started, 3.5)
+        self.team.thaw()
         page.locator("#link[data-link=live]").wait_for()
         self.team.stop()
         page.locator("#link[data-link=lost]").wait_for()

@@ -103,7 +103,9 @@ class SigningInTests(PageCase):
             "fetch('/api/v1/session', {method: 'DELETE', headers: {'X-Swarm': '1', Authorization: 'Bearer ' + "
             "JSON.parse(localStorage['swarm.sessions'])[location.origin].token}})"
         )
-        self.team.order("freeze 3")
+        self.team.freeze()
+        page.locator("#link[data-link=lost]").wait_for(state="attached")
+        self.team.thaw()
         page.locator("#signin-code").fill(self.team.code, timeout=15_000)
         page.keyboard.press("Enter")
         self.live(page)
