@@ -49,11 +49,19 @@ class DemonstrationPageTests(DemonstrationPageCase):
         )
         self.assertEqual(cut, [], page.url)
 
-    def test_be_driven_by_taps(self) -> None:
-        """On a phone, by taps alone: Run Demo, open a device, write to it, take it off the network, move the target."""
-        page = self.opened(PHONE)
+    def test_be_driven_and_looked_at(self) -> None:
+        """A phone drives the team by taps alone; a desk shows its devices, cameras and map while the dogs search."""
+        phone = self.opened(PHONE)
+        self.drive(phone)
+        phone.context.close()
+        self.look(self.opened(DESK))
+
+    def drive(self, page: Any) -> None:
+        """Run the demo, stop it and let it go on, open a device, write to it, disconnect it, move the target."""
         self.fits(page)
         page.get_by_role("button", name="Run Demo").tap()
+        self.stop(page)
+        self.view(page, "devices")
         page.locator(".device[data-state=EXECUTING]").first.wait_for(timeout=45_000)
         self.view(page, "groups")
         page.locator(".point[data-agree=true]").wait_for()
@@ -96,9 +104,18 @@ class DemonstrationPageTests(DemonstrationPageCase):
         else:
             self.fail(page.locator("#line").inner_text())
 
-    def test_be_looked_at_from_a_desk(self) -> None:
-        """On a desk: devices in the order of joining, three cameras whose views move as the dogs search, the map."""
-        page = self.opened(DESK)
+    def stop(self, page: Any) -> None:
+        """Stop, pressed while dogs search, has all three stand at once and for 3 s; then they go on."""
+        seen = page.evaluate(STOPPED)
+        self.assertLess(seen["took"], STANDING, seen)
+        self.assertEqual(seen["moved"], 0)
+        page.locator(".halted").wait_for()
+        self.fits(page)
+        page.get_by_role("button", name="Let it go on").tap()
+        page.locator(".halted").wait_for(state="hidden")
+
+    def look(self, page: Any) -> None:
+        """See devices in the order of joining, three cameras whose views move as the dogs search, and the map."""
         devices = self.demo.api("devices")
         self.assertEqual(page.locator(".device b").all_inner_texts(), [device["name"] for device in devices])
         joined = [device["joined"] for device in devices]
@@ -121,17 +138,3 @@ class DemonstrationPageTests(DemonstrationPageCase):
         page.locator("#tasks li button:visible").first.click()
         page.locator("#tasks li", has_text="cancelled").first.wait_for()
         self.fits(page)
-
-    def test_stop(self) -> None:
-        """Stop, pressed while dogs search, has all three stand at once and for 3 s; let go on, they finish the task."""
-        page = self.opened(PHONE)
-        page.get_by_role("button", name="Run Demo").tap()
-        seen = page.evaluate(STOPPED)
-        self.assertLess(seen["took"], STANDING, seen)
-        self.assertEqual(seen["moved"], 0)
-        page.locator(".halted").wait_for()
-        self.fits(page)
-        page.get_by_role("button", name="Let it go on").tap()
-        page.locator(".halted").wait_for(state="hidden")
-        self.view(page, "tasks")
-        page.locator("#tasks li", has_text="completed").first.wait_for(timeout=60_000)

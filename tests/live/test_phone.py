@@ -204,7 +204,7 @@ class DemonstrationPhoneTests(BrowserCase, DemonstrationCase):
         self.assertIsNone(after["gone"])
 
     def test_wins_at_another_web_node_and_is_taken_over(self) -> None:
-        """A phone joins by one tap, goes on when its web node dies, wins a task, and leaves it to a dog as it closes."""
+        """A phone joins by one tap, goes on when its web node dies, wins a task, and leaves it to a dog."""
         page = self.joined()
         anna = self.devices()["anna"]
         self.assertEqual((anna["kind"], "camera" in anna["capabilities"]), ("phone", True))
