@@ -18,6 +18,7 @@ from typing import Any
 from benchmarks.demo import family
 from tests.live.demonstration import DemonstrationCase, stretch
 from tests.live.page import DESK, PHONE, TABLET, BrowserCase, TeamCase, pin
+from tests.live.until import until
 
 TAKEOVER_S = 2.0
 PLACES = ((0.3, 2.1), (2.7, 2.1), (0.3, 0.3), (2.7, 0.3))
@@ -148,16 +149,14 @@ class DemonstrationPhoneTests(BrowserCase, DemonstrationCase):
 
     def until(self, is_so: Callable[[], Any], within: float, page: Any = None) -> float:
         """Wait until it is so; the seconds that it took."""
+
+        def told() -> str:
+            devices = {name: (each["status"], each["messages"]) for name, each in self.devices().items()}
+            seen = "" if page is None else page.locator(".phone").text_content()
+            return f"{devices} {[(task['status'], task['note']) for task in self.demo.api('tasks')]} {seen}"
+
         began = time.monotonic()
-        while not is_so():
-            if time.monotonic() - began > within:
-                told = {name: (each["status"], each["messages"]) for name, each in self.devices().items()}
-                seen = "" if page is None else page.locator(".phone").text_content()
-                self.fail(f"{told} {[(task['status'], task['note']) for task in self.demo.api('tasks')]} {seen}")
-            if page is None:
-                time.sleep(0.03)
-            else:
-                page.wait_for_timeout(100)
+        until(is_so, within, told)
         return time.monotonic() - began
 
     def statuses(self) -> dict[str, str]:
