@@ -226,6 +226,11 @@ class BrowserCase(SynchronousTestCase):
         page.evaluate(f"location.hash = {name!r}")
         page.locator(f"body[data-view={name}]").wait_for()
 
+    def pass_by(self, page: Any, seconds: float) -> None:
+        """Turn the page's clock on; what it asks for thereupon has been asked for."""
+        page.clock.fast_forward(1000 * seconds)
+        page.evaluate("fetch('/api/v1/node').then((told) => told.text())")
+
     def told(self, page: Any, words: str) -> None:
         """Wait until the page says so."""
         page.locator("#line", has_text=words).wait_for()
@@ -272,9 +277,11 @@ class PageCase(BrowserCase, TeamCase):
         if words.type == "error":
             self.faults.append(f"{words.text} {words.location['url']}")
 
-    def opened(self, screen: dict[str, Any], scheme: Any = "light") -> Any:
-        """The page, signed in, when it shows the team."""
+    def opened(self, screen: dict[str, Any], scheme: Any = "light", has_clock: bool = False) -> Any:
+        """The page, signed in, when it shows the team; with ``has_clock`` its time can ``pass_by``."""
         page = self.tab(screen, scheme)
         page.on("console", self.note)
+        if has_clock:
+            page.clock.install()
         page.goto(f"{self.team.url}#code={self.team.code}")
         return self.live(page)

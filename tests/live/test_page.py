@@ -64,8 +64,7 @@ class PageTests(PageCase):
             beside = ["place-groups"] if name == "tasks" else []
             self.assertEqual(sorted(page.evaluate(shown)), sorted([f"place-{name}", *beside]))
             self.assertEqual(page.locator("#views [aria-current=page]").count(), len(ways) == 1)
-            page.wait_for_timeout(100)
-            self.assertEqual(page.evaluate("scrollY"), 0, name)
+            page.wait_for_function("() => scrollY === 0")
         page.go_back()
         page.locator("body[data-view=events]").wait_for()
         page.locator("#views a").nth(2).focus()
@@ -107,9 +106,14 @@ class PageTests(PageCase):
 
     def test_ask_devices(self) -> None:
         """What is known of the network is asked only while it is looked at; what a device stores, when it is opened."""
-        page = self.opened(PHONE)
-        page.wait_for_timeout(300)
-        self.assertFalse([url for url in self.asked if url.endswith("/network")])
+        page = self.opened(PHONE, has_clock=True)
+
+        def asks() -> bool:
+            self.asked.clear()
+            self.pass_by(page, 10.0)
+            return any(url.endswith("/network") for url in self.asked)
+
+        self.assertFalse(asks())
         self.view(page, "network")
         page.locator("#network-line", has_text="dog3 did not answer").wait_for()
         rows = [row.split("\t") for row in page.locator("#ties tr").all_inner_texts()]
@@ -122,9 +126,7 @@ class PageTests(PageCase):
         self.assertIn("4 of devices", page.locator("dialog").inner_text())
         page.evaluate("location.hash = 'device/' + '03'.repeat(16)")
         page.locator("dialog", has_text="it did not answer").wait_for()
-        self.asked.clear()
-        page.wait_for_timeout(2500)
-        self.assertFalse([url for url in self.asked if url.endswith("/network")])
+        self.assertFalse(asks())
 
     def test_tell_why(self) -> None:
         """A task says who agrees and who differs; opened, it tells each decision's rule and reports, and stays open."""
@@ -165,8 +167,8 @@ class PageTests(PageCase):
                 page.wait_for_timeout(300)
         self.assertFalse([url for url in self.asked if "/shot/0202" in url])
         page.context.close()
-        phone = self.opened(PHONE)
-        phone.wait_for_timeout(500)
+        phone = self.opened(PHONE, has_clock=True)
+        self.pass_by(phone, 10.0)
         self.assertFalse([url for url in self.asked if "/shot/" in url])
         phone.get_by_role("link", name="Cameras").tap()
         phone.locator("figure[data-camera=live]").first.wait_for()
