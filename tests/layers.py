@@ -122,7 +122,7 @@ LAYERS: dict[str, Layer] = {
     ),
     "sim.demo": Layer("the demonstration", ("drivers", "sim.robots")),
     "sim.team": Layer(
-        "the simulator of teams in virtual time: nodes, links, stores, faults, schedules, invariants ([sim.md](sim.md))",
+        "the simulator of teams in virtual time: nodes, faults, schedules, invariants ([sim.md](sim.md))",
         ("formats", "middleware", *(f"drivers.{name}" for name in ("driver", "errors", "gate", "link"))),
     ),
     "sim.namespaces": Layer(
