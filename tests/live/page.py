@@ -145,6 +145,7 @@ class Team:
         root = Path(__file__).parents[2]
         command = [sys.executable, "-m", "tests.live.team"]
         process = subprocess.Popen(command, cwd=root, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        atexit.register(process.wait)
         atexit.register(process.kill)
         return process
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import time
 from collections.abc import Callable
 from typing import TypeVar
@@ -24,8 +25,6 @@ def until(is_so: Callable[[], T], within: float = PATIENCE_S, told: Callable[[],
 
 def takes(port: int) -> bool:
     """Whether something listens at that TCP port of this machine."""
-    import socket
-
     try:
         socket.create_connection(("127.0.0.1", port), 1.0).close()
     except OSError:
