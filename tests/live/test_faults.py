@@ -8,9 +8,9 @@ from tests.live.page import DESK, PHONE, TABLET, PageCase
 
 
 class FaultPageTests(PageCase):
-    def opened(self, screen: dict[str, Any], scheme: Any = "light") -> Any:
+    def opened(self, screen: dict[str, Any], scheme: Any = "light", has_clock: bool = False) -> Any:
         """The page with dog2 open, and its faults there."""
-        page = super().opened(screen, scheme)
+        page = super().opened(screen, scheme, has_clock)
         page.evaluate("location.hash = 'device/' + '02'.repeat(16)")
         page.locator(".fault-buttons button").first.wait_for()
         return page
