@@ -16,7 +16,7 @@ from middleware.entangled.errors import EntangledError
 from middleware.node import SwarmNode
 
 if TYPE_CHECKING:
-    from middleware.lease.council import Council
+    from middleware.consensus.lease.council import Council
 
 VISIT = 5.0
 """Seconds between two looks; a council that nobody asks for a lease is asked then whether it is there."""

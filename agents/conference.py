@@ -9,7 +9,7 @@ from agents.circle import Circle
 from agents.decision import Decision, decide
 from agents.division import Division
 from agents.epoch import Epoch
-from middleware.bidding.panel import Panel
+from middleware.consensus.bidding.panel import Panel
 from middleware.consensus.strategy import ConsensusAlgorithm
 from middleware.directory.presence import EXECUTING
 from middleware.tasks.task import Member, Task

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from middleware.bidding.panel import PATIENCE
+from middleware.consensus.bidding.panel import PATIENCE
 from middleware.consensus.strategy import Consensus, ConsensusAlgorithm, Report, agreement
 from middleware.consensus.view import view_of
 from middleware.directory.presence import EXECUTING

@@ -26,13 +26,13 @@ from agents.report import Reporter
 from agents.state import Course, State
 from drivers.driver import Permit
 from drivers.reading import Action, Observation
-from middleware.bidding.panel import Panel
+from middleware.consensus.bidding.panel import Panel
+from middleware.consensus.lease.lessee import Lease, Lessee
 from middleware.consensus.strategy import ConsensusAlgorithm, reads_of
 from middleware.consensus.verdict import Verdict
 from middleware.directory.presence import EXECUTING
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import EntangledError
-from middleware.lease.lessee import Lease, Lessee
 from middleware.tasks.order import PAUSE, Order
 from middleware.tasks.task import COMPLETED, FAILED, Member, Result, Task
 

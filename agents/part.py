@@ -12,13 +12,13 @@ from twisted.internet.interfaces import IReactorTime
 from agents.behaviour import Behaviour
 from agents.caretaker import Caretaker
 from agents.engagement import Engagement
-from middleware.bidding.panel import panel_of
+from middleware.consensus.bidding.panel import panel_of
+from middleware.consensus.lease.council import Superseded
 from middleware.consensus.strategy import ConsensusAlgorithm
 from middleware.consensus.verdict import Verdict
 from middleware.directory.presence import IDLE
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.record import Record
-from middleware.lease.council import Superseded
 from middleware.node import SwarmNode
 from middleware.tasks.order import order_of
 from middleware.tasks.task import Member, Result, Task, council_of, group_key

@@ -20,13 +20,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from middleware.bidding.announcement import Announcement
-from middleware.bidding.auction import Auction
-from middleware.bidding.bid import Bid
-from middleware.bidding.errand import Cry, Errand, Notice, Offer
-from middleware.bidding.party import Party
-from middleware.bidding.rule import Rule
-from middleware.bidding.scale import Scale
+from middleware.consensus.bidding.announcement import Announcement
+from middleware.consensus.bidding.auction import Auction
+from middleware.consensus.bidding.bid import Bid
+from middleware.consensus.bidding.errand import Cry, Errand, Notice, Offer
+from middleware.consensus.bidding.party import Party
+from middleware.consensus.bidding.rule import Rule
+from middleware.consensus.bidding.scale import Scale
 from middleware.consensus.strategy import Report, strategy_for
 from middleware.entangled.contact import Contact
 from middleware.entangled.kademlia.distance import closest

@@ -18,7 +18,7 @@ from twisted.internet.defer import Deferred, maybeDeferred
 from twisted.internet.interfaces import IReactorTime
 from twisted.logger import Logger
 
-from middleware.bidding.group import Group, Heard
+from middleware.consensus.bidding.group import Group, Heard
 from middleware.consensus.deployed import Deployed, is_deployed
 from middleware.consensus.strategy import place_of
 from middleware.directory.directory import Directory, Matches, Page
@@ -46,16 +46,16 @@ from middleware.tasks.task import COUNCIL, MEMBER, ORDER, RESULT, TASKS, Result,
 
 if TYPE_CHECKING:
     from middleware.admission.team import Team
-    from middleware.bidding.auctions import Dissemination
-    from middleware.bidding.bidding import Bidding
-    from middleware.bidding.panel import Panel
-    from middleware.bidding.party import OnSummary
+    from middleware.consensus.bidding.auctions import Dissemination
+    from middleware.consensus.bidding.bidding import Bidding
+    from middleware.consensus.bidding.panel import Panel
+    from middleware.consensus.bidding.party import OnSummary
     from middleware.consensus.guard import Guard
+    from middleware.consensus.lease.lessee import Lessee
     from middleware.consensus.selection import Strategies
     from middleware.consensus.verdict import Verdict
     from middleware.consensus.view import View
     from middleware.entangled.control.gauge import Gauge
-    from middleware.lease.lessee import Lessee
     from middleware.tasks.councils import Councils
 
 CAMERA = "camera"
@@ -258,7 +258,7 @@ class SwarmNode(Service):
 
     def team_size(self) -> int:
         """About how many nodes the team has, this one included."""
-        from middleware.bidding.scale import team_size
+        from middleware.consensus.bidding.scale import team_size
 
         overlay = self.entangled.overlay
         return team_size(overlay.own_id, overlay.contacts(), overlay.is_large)
@@ -303,7 +303,7 @@ class SwarmNode(Service):
 
         Then, in a large team, a ``panel`` writes records for all; tasks that are divided together need all of them.
         """
-        from middleware.bidding.panel import panel_of
+        from middleware.consensus.bidding.panel import panel_of
 
         panel = panel or panel_of(self.uuid, group_key(task.task_id))
         enter = partial(self.bidding, task, task.generation) if task.council else None
@@ -314,7 +314,7 @@ class SwarmNode(Service):
 
     def bidding(self, task: Task, epoch: int, on_summary: OnSummary) -> Bidding:
         """Bid for ``task`` in ``epoch``: ``on_summary`` is told which bids the task's council announces."""
-        from middleware.bidding.auction import MAX_WAITING, Auction
+        from middleware.consensus.bidding.auction import MAX_WAITING, Auction
 
         waiting = min(float(task.waiting_period), MAX_WAITING)
         auction = Auction(task.task_id, epoch, task.council, task.strategy, waiting, task.exclusive)
@@ -368,7 +368,7 @@ class SwarmNode(Service):
 
     async def _record(self, task: Task) -> None:
         """Record the present council of ``task``, unless that or a newer one is recorded already."""
-        from middleware.lease.charter import charter_of
+        from middleware.consensus.lease.charter import charter_of
 
         charter = charter_of(task.charter)
         if charter is not None:
@@ -414,7 +414,7 @@ class SwarmNode(Service):
     def dissemination(self) -> Dissemination:
         """How the bids for tasks travel through this node."""
         # Imported by the first bid: a node that never carries one is spared the memory.
-        from middleware.bidding.auctions import Dissemination, Surroundings
+        from middleware.consensus.bidding.auctions import Dissemination, Surroundings
 
         entangled = self.entangled
 
@@ -450,7 +450,7 @@ class SwarmNode(Service):
 
     def _learn_bidders(self, peer: Contact, bids: list[object]) -> Deferred[None] | None:
         """Ask ``peer`` for the certificates of those bidders that are unknown here; None where all are known."""
-        from middleware.bidding.errand import MAX_BIDS
+        from middleware.consensus.bidding.errand import MAX_BIDS
 
         certificates = self.entangled.replica.certificates
         owners = [each[0] for each in bids[:MAX_BIDS] if isinstance(each, list) and each and type(each[0]) is bytes]

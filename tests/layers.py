@@ -67,16 +67,16 @@ LAYERS: dict[str, Layer] = {
         _entangled("data", "kademlia", "network", "reach", "replication", "space", "wire"),
     ),
     "middleware.directory": Layer("presence of devices, and the list of all, split by prefix", LIBRARY),
-    "middleware.lease": Layer("task leases with fencing tokens, granted by a council's majority", LIBRARY),
+    "middleware.consensus.lease": Layer("task leases with fencing tokens, granted by a council's majority", LIBRARY),
     "middleware.stop": Layer("stops of the whole team and their releases", LIBRARY),
     "middleware.tasks": Layer(
-        "tasks, orders about them, and their councils", (*LIBRARY, *_middleware("directory", "lease"))
+        "tasks, orders about them, and their councils", (*LIBRARY, *_middleware("directory", "consensus.lease"))
     ),
     "middleware.consensus": Layer(
         "who should act: strategies, their conformance kit, the guard around them, verdicts",
         (*LIBRARY, *_middleware("directory", "tasks")),
     ),
-    "middleware.bidding": Layer(
+    "middleware.consensus.bidding": Layer(
         "bids on their way to the council and its announcement back: direct, tree, flood",
         (*LIBRARY, *_middleware("consensus", "directory", "tasks")),
     ),
@@ -87,7 +87,7 @@ LAYERS: dict[str, Layer] = {
         "`node.py` wires the packages above; `errors.py` has their exceptions",
         (
             *LIBRARY,
-            *_middleware("admission.team", "bidding", "consensus", "directory", "lease", "stop", "tasks"),
+            *_middleware("admission.team", "consensus", "directory", "stop", "tasks"),
         ),
     ),
     "middleware.config": Layer(
@@ -112,7 +112,7 @@ LAYERS: dict[str, Layer] = {
         (
             *LIBRARY,
             *("formats", "drivers.driver", "drivers.errors", "drivers.reading"),
-            *_middleware("bidding", "consensus", "directory", "lease", "node", "stop", "tasks"),
+            *_middleware("consensus", "directory", "node", "stop", "tasks"),
         ),
     ),
     "webnode": Layer("the page over the node's store", ("formats", "middleware")),

@@ -22,9 +22,10 @@ from drivers.errors import UsageError
 from drivers.phone import driver, option
 from drivers.registry import KINDS, describe
 from formats.head import MAX_HEAD
-from middleware.bidding import check, party, scale, teller, tree
 from middleware.config.settings import Settings
 from middleware.consensus import guard, strategy, worker
+from middleware.consensus.bidding import check, party, scale, teller, tree
+from middleware.consensus.lease import lease_codec, lessee
 from middleware.deployment import confinement, deployment, frame, manifest, module, runner
 from middleware.diagnostics import survey
 from middleware.entangled.control import gauge, port
@@ -34,7 +35,6 @@ from middleware.entangled.replication import handover, pusher, replica, subscrib
 from middleware.entangled.space import shelf, template
 from middleware.entangled.wire import rebuff
 from middleware.faults import kinds, takeover
-from middleware.lease import lease_codec, lessee
 from middleware.stop import halt, stop_set
 from sim.demo.cast import CASTS
 from sim.demo.configuration import DOGS

@@ -10,16 +10,16 @@ from typing import Any
 from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorTime
 
+from middleware.consensus.lease.charter import Judge, charter_of, pin
+from middleware.consensus.lease.council import Council
+from middleware.consensus.lease.desk import Desk
+from middleware.consensus.lease.lessee import Lessee
+from middleware.consensus.lease.vacancy import filled, odd
 from middleware.entangled.contact import Contact
 from middleware.entangled.data.store import Store
 from middleware.entangled.kademlia.distance import closest
 from middleware.entangled.node import EntangledNode
 from middleware.entangled.record import Slot
-from middleware.lease.charter import Judge, charter_of, pin
-from middleware.lease.council import Council
-from middleware.lease.desk import Desk
-from middleware.lease.lessee import Lessee
-from middleware.lease.vacancy import filled, odd
 from middleware.tasks.task import TASKS, Task, group_key
 
 LARGE = 50

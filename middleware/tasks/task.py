@@ -15,6 +15,8 @@ from typing import Any
 
 import msgpack
 
+from middleware.consensus.lease.charter import Charter, charter_of, ending_of
+from middleware.consensus.lease.lease_codec import MAX_PROOF_BYTES
 from middleware.directory.presence import Capabilities
 from middleware.entangled.contact import Contact, unpacked
 from middleware.entangled.identity import node_id
@@ -28,8 +30,6 @@ from middleware.entangled.value import (
     is_whole,
     mapping_of,
 )
-from middleware.lease.charter import Charter, charter_of, ending_of
-from middleware.lease.lease_codec import MAX_PROOF_BYTES
 
 TASKS = hashed_key("tasks")
 COMPLETED, FAILED, CANCELLED = "COMPLETED", "FAILED", "CANCELLED"
@@ -62,7 +62,7 @@ class Task:
     act outlives a silent holder; ``hysteresis`` by which share a late report must be better to take the task over;
     ``council`` are the nodes whose majority grants that right, pinned when the task is made: so many that ``tolerates``
     of them may be lost at once, where the team has as many; ``configuration`` counts
-    its changes.  ``charter`` is the proof of both (``middleware.lease.charter``).
+    its changes.  ``charter`` is the proof of both (``middleware.consensus.lease.charter``).
 
     Of several tasks the one with the highest ``priority`` has an agent's body, then the oldest; ``preemptible`` ones
     are put aside for it and resumed.  ``deadline`` is in seconds after its creation, and ``stall_limit`` in seconds

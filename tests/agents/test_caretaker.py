@@ -10,8 +10,8 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from agents.caretaker import AGAIN, VISIT
 from agents.catalogue import task_named
+from middleware.consensus.lease.charter import pin
 from middleware.entangled.record import Record
-from middleware.lease.charter import pin
 from middleware.tasks.councils import SILENT
 from middleware.tasks.order import PAUSE, RESUME, Order
 from middleware.tasks.task import COMPLETED, TASKS, Task, council_of, outcome_of, tasks_of

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from twisted.trial.unittest import SynchronousTestCase
 
 from agents.decision import Decision, decide
-from middleware.bidding.panel import PATIENCE
+from middleware.consensus.bidding.panel import PATIENCE
 from middleware.consensus.guard import Guard
 from middleware.consensus.strategies.nearest import Nearest
 from middleware.consensus.strategy import strategy_for

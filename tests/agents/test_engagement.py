@@ -15,6 +15,7 @@ from agents.state import State
 from drivers.driver import Permit
 from drivers.reading import Action, Observation
 from middleware.consensus.guard import Guard
+from middleware.consensus.lease.lessee import Lease
 from middleware.consensus.strategies.nearest import Nearest
 from middleware.consensus.strategy import Consensus, Report
 from middleware.consensus.verdict import Verdict
@@ -23,7 +24,6 @@ from middleware.entangled.clock import HeapClock
 from middleware.entangled.contact import Contact
 from middleware.entangled.identity import Identity
 from middleware.entangled.network.network import Address
-from middleware.lease.lessee import Lease
 from middleware.tasks.order import PAUSE, RESUME, Order
 from middleware.tasks.task import CANCELLED, COMPLETED, FAILED, Member, Result, Task
 

@@ -13,8 +13,8 @@ from agents.loop import Agent
 from drivers.driver import Permit
 from drivers.errors import NotEnabled
 from drivers.reading import Action, Frame, Observation
+from middleware.consensus.lease.lessee import Lease
 from middleware.errors import UnknownStrategy
-from middleware.lease.lessee import Lease
 from middleware.tasks.task import TASKS, Task
 from swarmnode.rehearsal import VirtualTeam
 

@@ -9,15 +9,15 @@ from twisted.internet.defer import Deferred
 
 from middleware.admission import roles
 from middleware.admission.team import Team
-from middleware.bidding.group import Group
+from middleware.consensus.bidding.group import Group
+from middleware.consensus.lease.lease_codec import pack_members
+from middleware.consensus.lease.lessee import Lessee
 from middleware.directory.presence import DEVICES, Device, devices_of
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import Refused
 from middleware.entangled.identity import Identity
 from middleware.entangled.quorum.register import Kind, Reply
 from middleware.entangled.record import Record
-from middleware.lease.lease_codec import pack_members
-from middleware.lease.lessee import Lessee
 from middleware.node import SwarmNode
 from middleware.tasks.task import COMPLETED, RESULT, TASKS, Result, Task, group_key, tasks_of
 from tests.attacks.siege import SOURCE, ClosedTeam, SiegeCase

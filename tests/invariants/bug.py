@@ -13,6 +13,11 @@ from agents import circle
 from agents.docket import Docket
 from drivers.errors import StaleCommand
 from drivers.gate import Gate
+from middleware.consensus.lease import charter, lessee
+from middleware.consensus.lease.charter import pin
+from middleware.consensus.lease.council import Council
+from middleware.consensus.lease.lease_codec import pack_members
+from middleware.consensus.lease.lessee import Lease, Lessee
 from middleware.consensus.strategies import bidder, nearest
 from middleware.consensus.strategies.nearest import Nearest
 from middleware.consensus.strategy import Report
@@ -44,11 +49,6 @@ from middleware.entangled.wire import greeting
 from middleware.entangled.wire.greeting import Cookies, Greeter
 from middleware.entangled.wire.method import Ledger
 from middleware.entangled.wire.session import Session
-from middleware.lease import charter, lessee
-from middleware.lease.charter import pin
-from middleware.lease.council import Council
-from middleware.lease.lease_codec import pack_members
-from middleware.lease.lessee import Lease, Lessee
 from sim.team.machine import Machine
 from tests.invariants.leases import Leases
 

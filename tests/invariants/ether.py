@@ -16,11 +16,11 @@ from twisted.internet.defer import Deferred, fail, succeed
 
 from middleware.consensus.deployed import Deployed
 from middleware.consensus.guard import Guard
+from middleware.consensus.lease.lessee import Lease
 from middleware.consensus.selection import Strategies
 from middleware.entangled.clock import HeapClock
 from middleware.entangled.errors import Unavailable
 from middleware.entangled.record import Record
-from middleware.lease.lessee import Lease
 from middleware.tasks.order import Order
 from middleware.tasks.task import ORDER, RESULT, TASKS, Member, Result, Task, group_key
 

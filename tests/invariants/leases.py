@@ -13,9 +13,9 @@ from typing import Any
 from twisted.internet.defer import Deferred
 from twisted.python.failure import Failure
 
+from middleware.consensus.lease.lessee import STAGGER
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import EntangledError
-from middleware.lease.lessee import STAGGER
 from sim.team.event import Awaited
 from sim.team.faults.timeline import TimedFault, Timeline
 from sim.team.leases.radio import CALM, Air

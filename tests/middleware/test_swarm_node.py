@@ -7,11 +7,11 @@ from typing import Any
 
 from twisted.internet.defer import Deferred
 
+from middleware.consensus.lease.lessee import Lessee
 from middleware.directory.presence import DEVICES, Device, devices_of
 from middleware.entangled.errors import NoAnswer, Refused
 from middleware.entangled.network.switchboard import Weather
 from middleware.entangled.record import Record
-from middleware.lease.lessee import Lessee
 from middleware.node import SwarmNode
 from middleware.tasks.task import COMPLETED, TASKS, Member, Result, Task, group_key, member_of, outcome_of, task_of
 from tests.fleet import FleetCase, SwarmFleet

@@ -8,13 +8,13 @@ from typing import Any
 from twisted.internet.defer import Deferred, succeed
 from twisted.trial.unittest import SynchronousTestCase
 
+from middleware.consensus.lease.acceptor import LeaseAcceptor
 from middleware.entangled.clock import HeapClock
 from middleware.entangled.kademlia.distance import distance
 from middleware.entangled.node import EntangledNode
 from middleware.entangled.quorum.ballot import Ballot
 from middleware.entangled.quorum.register import Kind, Reply
 from middleware.entangled.record import Record
-from middleware.lease.acceptor import LeaseAcceptor
 from sim.team.figure import Figure
 from sim.team.load.catalogue import LOADS
 from sim.team.load.census import Census

@@ -14,7 +14,7 @@ from agents.context import Context
 from agents.engagement import Engagement
 from agents.state import State
 from drivers.reading import Action, Observation
-from middleware.bidding.panel import SEATS
+from middleware.consensus.bidding.panel import SEATS
 from middleware.entangled.record import Record
 from middleware.tasks.task import Task, member_of
 from sim.robots.crowd.ground import Ground

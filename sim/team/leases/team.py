@@ -14,6 +14,10 @@ from twisted.internet.defer import Deferred, maybeDeferred
 from drivers.driver import Permit
 from drivers.errors import StaleCommand
 from drivers.gate import Gate
+from middleware.consensus.lease.charter import Charter, Judge, pin
+from middleware.consensus.lease.council import Council
+from middleware.consensus.lease.desk import Desk
+from middleware.consensus.lease.lessee import Lessee
 from middleware.entangled.clock import HeapClock
 from middleware.entangled.contact import Contact
 from middleware.entangled.data.memory import MemoryStore
@@ -22,10 +26,6 @@ from middleware.entangled.errors import Refused
 from middleware.entangled.identity import Identity
 from middleware.entangled.network.network import Address
 from middleware.entangled.quorum.ballot import majority
-from middleware.lease.charter import Charter, Judge, pin
-from middleware.lease.council import Council
-from middleware.lease.desk import Desk
-from middleware.lease.lessee import Lessee
 from sim.team.checker import check
 from sim.team.event import Born, Commanded, Died, Halted, Held, Issued, Reached, Terms, Won
 from sim.team.history import History

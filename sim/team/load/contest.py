@@ -13,12 +13,12 @@ from dataclasses import dataclass
 
 from twisted.internet.interfaces import IReactorTime
 
-from middleware.bidding.auction import Auction
-from middleware.bidding.bidding import Bidding
+from middleware.consensus.bidding.auction import Auction
+from middleware.consensus.bidding.bidding import Bidding
+from middleware.consensus.lease.lessee import Lessee
 from middleware.consensus.strategies.nearest import Nearest
 from middleware.consensus.strategy import Report
 from middleware.entangled.errors import EntangledError
-from middleware.lease.lessee import Lessee
 from middleware.tasks.task import Task
 from sim.team.load.deputies import Deputies
 from sim.team.load.deputy import Deputy

@@ -13,15 +13,15 @@ from typing import Any
 
 from twisted.internet.interfaces import IReactorTime
 
-from middleware.bidding.auction import Auction
-from middleware.bidding.auctions import Dissemination, Surroundings
-from middleware.bidding.bidding import Bidding
-from middleware.bidding.party import OnSummary
-from middleware.bidding.scale import team_size
+from middleware.consensus.bidding.auction import Auction
+from middleware.consensus.bidding.auctions import Dissemination, Surroundings
+from middleware.consensus.bidding.bidding import Bidding
+from middleware.consensus.bidding.party import OnSummary
+from middleware.consensus.bidding.scale import team_size
+from middleware.consensus.lease.lessee import Lessee
 from middleware.consensus.strategy import strategy_for
 from middleware.entangled.contact import Contact
 from middleware.entangled.node import EntangledNode
-from middleware.lease.lessee import Lessee
 from middleware.node import LEASE_VERBS, SwarmNode
 from middleware.tasks.councils import Councils
 from middleware.tasks.task import Task

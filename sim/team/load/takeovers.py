@@ -15,8 +15,8 @@ from msgspec import Meta
 from twisted.internet.defer import Deferred
 
 from formats.convert import Unit
+from middleware.consensus.lease.lessee import Lessee
 from middleware.entangled.errors import EntangledError
-from middleware.lease.lessee import Lessee
 from middleware.tasks.task import Task
 from sim.team.figure import Figure, at_most, share, spread
 from sim.team.load.deputies import deputies_of

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from middleware.consensus.lease import lease_codec
+from middleware.consensus.lease.lease_codec import AHEAD
 from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.quorum.acceptor import Acceptor, Terms
 from middleware.entangled.quorum.ballot import FIRST, Ballot
@@ -12,9 +14,7 @@ from middleware.entangled.quorum.log import Codec, Log
 from middleware.entangled.quorum.register import Reply
 from middleware.entangled.space import seat, take_codec
 from middleware.entangled.space.posting import Place
-from middleware.lease import lease_codec
-from middleware.lease.lease_codec import AHEAD
-from tests.middleware.lease.test_lease_codec import MEMBERS
+from tests.middleware.consensus.lease.test_lease_codec import MEMBERS
 
 TTL = 10.0
 

@@ -8,14 +8,14 @@ import msgpack
 from hypothesis import given, settings
 from twisted.trial.unittest import SynchronousTestCase
 
+from middleware.consensus.lease.acceptor import may_forget
+from middleware.consensus.lease.lease_codec import CODEC, unpack_row
 from middleware.entangled.data.memory import MemoryStore
 from middleware.entangled.quorum import log as module
 from middleware.entangled.quorum.ballot import FIRST, NONE, Ballot
 from middleware.entangled.quorum.log import Log
 from middleware.entangled.quorum.register import Register
-from middleware.lease.acceptor import may_forget
-from middleware.lease.lease_codec import CODEC, unpack_row
-from tests.middleware.lease.test_lease_codec import ANYTHING, MEMBERS
+from tests.middleware.consensus.lease.test_lease_codec import ANYTHING, MEMBERS
 
 
 def entered(log: Log[str], task_id: str, now: float) -> Register | None:

@@ -8,11 +8,11 @@ from typing import Any
 from twisted.internet.defer import Deferred, fail, succeed
 from twisted.trial.unittest import SynchronousTestCase
 
+from middleware.consensus.lease.lease_codec import pack_reply, unpack_reply
 from middleware.entangled.clock import HeapClock
 from middleware.entangled.errors import NoAnswer
 from middleware.entangled.quorum.register import Kind, Reply
 from middleware.entangled.quorum.round import NEWS, PAUSE, TRIES, Round, Tally
-from middleware.lease.lease_codec import pack_reply, unpack_reply
 
 YES, NO = Reply(Kind.GRANTED), Reply(Kind.HELD, remaining=1.0)
 

@@ -1,0 +1,93 @@
+"""Announcement: what one member of the council says has come in, signed by it; pure.
+
+It need not be right: it says who should act, and who may is decided elsewhere.  Of two the one with the higher number
+holds, of equal numbers the one of the member that stands earlier in the council.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import msgpack
+
+from middleware.consensus.bidding.auction import Auction
+from middleware.consensus.bidding.bid import packed_report, report_of
+from middleware.consensus.bidding.rule import MAX_REPORTS
+from middleware.consensus.strategy import Report
+from middleware.entangled.identity import verified
+from middleware.entangled.value import is_whole
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One report that stands, and which of its agent's bids it is."""
+
+    report: Report
+    revision: int = 0
+
+
+@dataclass(frozen=True)
+class Announcement:
+    """What the member at place ``rank`` of the council announces as its ``number``-th word, from 1 on."""
+
+    number: int
+    rank: int
+    entries: tuple[Entry, ...]
+    signature: bytes = field(default=b"", compare=False)
+
+    @property
+    def precedence(self) -> tuple[int, int]:
+        """Of two announcements the one with more precedence holds."""
+        return self.number, -self.rank
+
+    @property
+    def reports(self) -> tuple[Report, ...]:
+        """The reports that stand."""
+        return tuple(entry.report for entry in self.entries)
+
+    def signed(self, sign: Callable[[bytes], bytes], auction: Auction) -> Announcement:
+        """This announcement with the signature that ``sign`` makes, for ``auction``."""
+        return replace(self, signature=sign(self._signed_bytes(auction)))
+
+    def is_genuine(self, auction: Auction) -> bool:
+        """Whether a member of the council pinned in ``auction`` signed exactly this, for this auction."""
+        if self.rank >= len(auction.council):
+            return False
+        return verified(auction.council[self.rank].public, self._signed_bytes(auction), self.signature)
+
+    def packed(self) -> list[object]:
+        """The announcement as it stands in a message."""
+        return [self.number, self.rank, self._packed_entries(), self.signature]
+
+    def _packed_entries(self) -> list[object]:
+        return [[e.report.agent, packed_report(e.report), e.revision] for e in self.entries]
+
+    def _signed_bytes(self, auction: Auction) -> bytes:
+        content = [auction.digest, self.number, self.rank, self._packed_entries()]
+        return b"announcement" + bytes(msgpack.packb(content))
+
+
+def announcement_of(content: object) -> Announcement | None:
+    """The announcement that ``packed`` made, or None where it cannot be one; never raises."""
+    if not isinstance(content, list) or len(content) != 4:
+        return None
+    number, rank, packed, signature = content
+    if not (is_whole(number) and is_whole(rank) and isinstance(signature, bytes) and len(signature) == 64):
+        return None
+    if not isinstance(packed, list) or len(packed) > MAX_REPORTS:
+        return None
+    entries = [entry for each in packed if (entry := _entry_of(each)) is not None]
+    if number == 0 or len({entry.report.agent for entry in entries}) != len(packed):
+        return None
+    return Announcement(number, rank, tuple(entries), signature)
+
+
+def _entry_of(content: object) -> Entry | None:
+    if not isinstance(content, list) or len(content) != 3:
+        return None
+    agent, packed, revision = content
+    if not (isinstance(agent, str) and len(agent) == 40 and agent.isascii() and is_whole(revision)):
+        return None
+    report = report_of(packed, agent)
+    return Entry(report, revision) if report is not None else None

@@ -1,0 +1,231 @@
+"""Party: all that one node has to do with one auction: bid in it, relay it, or count it; pure.
+
+What comes in is told to it, ``errands`` says what goes out, ``due`` when to ask for that again.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Callable, Iterable
+
+from middleware.consensus.bidding.announcement import Announcement
+from middleware.consensus.bidding.auction import Auction
+from middleware.consensus.bidding.audience import Audience
+from middleware.consensus.bidding.bid import Bid
+from middleware.consensus.bidding.check import Check
+from middleware.consensus.bidding.direct import Direct
+from middleware.consensus.bidding.errand import Errand, Notice, Offer
+from middleware.consensus.bidding.flood import Flood
+from middleware.consensus.bidding.rule import Rule
+from middleware.consensus.bidding.scale import DIRECT
+from middleware.consensus.bidding.summary import Summary
+from middleware.consensus.bidding.teller import Teller
+from middleware.consensus.bidding.tree import MAX_CHILDREN, Branch
+from middleware.consensus.strategy import Report
+from middleware.entangled.contact import Contact
+
+RELAY_SILENCE = 0.4
+"""Seconds of silence after which a node asks for all that are behind it, before they do so themselves."""
+
+MOST_REVISION = 2**32
+"""What is announced beyond it was made up, and is not outbid."""
+
+OnSummary = Callable[[tuple[Report, ...]], None]
+"""Told of the reports that stand, each time that these are others."""
+
+
+class Party:
+    """The part of the node ``me`` in ``auction``; ``sign`` makes its signature, ``contacts`` gives whom it knows."""
+
+    def __init__(
+        self,
+        auction: Auction,
+        me: Contact,
+        rule: Rule,
+        contacts: Callable[[], Iterable[Contact]],
+        rng: random.Random,
+        sign: Callable[[bytes], bytes],
+    ) -> None:
+        self.auction = auction
+        self.announcement: Announcement | None = None
+        self.on_summary: OnSummary = lambda reports: None
+        self.audience = Audience()
+        self._me = me
+        self._rule = rule
+        self._rank = auction.rank(me.node_id)
+        self._teller = Teller(auction, self._rank, rule, sign) if self._rank is not None else None
+        self._branch = Branch(auction, me.node_id, rule, contacts)
+        self._check = Check(auction, me.node_id, rule, rng)
+        self._direct = Direct(auction, me.node_id)
+        self._flood = Flood(me.node_id, rule, contacts, rng)
+        self._flooded_at = math.inf
+        self.told: tuple[Report, ...] = ()
+        self.next_revision = 0
+        self._first_at = math.inf
+        self._is_relay = False
+        if self._teller is not None:
+            for member in auction.council:
+                if member.node_id != me.node_id:
+                    self.audience.add(member, is_shared=True)
+
+    @property
+    def summary(self) -> Summary:
+        """The bids that this node has gathered."""
+        return self._teller.summary if self._teller is not None else self._branch.summary
+
+    @property
+    def due(self) -> float:
+        """When there is something to do, if nothing happens before."""
+        always = min(self._direct.due, self._flooded_at, self.audience.due(self.announcement, self._is_mine))
+        if self._teller is not None:
+            return min(always, self._teller.due)
+        return min(always, self._branch.due, self._check.due)
+
+    @property
+    def own(self) -> Bid | None:
+        """The last bid of this node's own agent."""
+        return self._check.own
+
+    @property
+    def is_outlived(self) -> bool:
+        """Whether a bid of this agent's former life is announced in place of the own one, which has to be made anew."""
+        return self.own is not None and self.own.revision < self.next_revision - 1
+
+    def expect(self, bidders: float) -> None:
+        """Close the bidding as soon as that many agents have bid or abstained."""
+        if self._teller is not None:
+            self._teller.expected = bidders
+
+    def bid(self, bid: Bid, way: str, now: float) -> None:
+        """Make the own bid, or take it back."""
+        self._first_at = min(self._first_at, now)
+        self.next_revision = max(self.next_revision, bid.revision + 1)
+        is_direct = way == DIRECT
+        if is_direct:
+            self._direct.bid(bid, now)
+        if self._teller is not None:
+            self._teller.join([bid], self._me.node_id, is_direct, now - self._first_at, now)
+        elif not is_direct:
+            self._branch.join([bid], now)
+        self._check.bid(bid, self.announcement, is_direct, now)
+        if self._flooded_at != math.inf or self._flood.summary.standing:
+            self._cry(now)
+
+    def has_room(self, sender: Contact) -> bool:
+        """Whether the bids of ``sender`` may come this way: the council hears everybody, others so many."""
+        return self._teller is not None or len(self.audience) < MAX_CHILDREN or self.audience.has(sender)
+
+    def offered(
+        self, bids: Iterable[Bid], sender: Contact, age: float, is_shared: bool, now: float
+    ) -> Announcement | None:
+        """Take what ``sender`` offers; what it is to be told in return."""
+        self._first_at = min(self._first_at, now - age)
+        self.audience.add(sender, is_shared and self._teller is not None)
+        if self._teller is not None:
+            self._teller.join(bids, sender.node_id, is_shared, age, now)
+        else:
+            self._branch.join(bids, now)
+            if not self._is_relay and self.announcement is None:
+                self._is_relay = True
+                self._check.expect(self._first_at, RELAY_SILENCE)
+        if self.announcement is not None:
+            self.audience.knows(sender, self.announcement)
+        return self.announcement
+
+    def announced(self, announcement: Announcement, now: float) -> bool:
+        """Take a genuine announcement; whether it is newer than the one known."""
+        if self.announcement is not None and announcement.precedence <= self.announcement.precedence:
+            return False
+        self.announcement = announcement
+        if self._teller is not None:
+            self._teller.heard(announcement)
+        self._check.heard(announcement, now)
+        for entry in announcement.entries:
+            if entry.report.agent == self._me.node_id.hex() and entry.revision < MOST_REVISION:
+                own = self.own
+                is_mine = own is not None and (own.revision, own.report) == (entry.revision, entry.report)
+                self.next_revision = max(self.next_revision, entry.revision + (1 if is_mine else 2))
+        self._tell()
+        return True
+
+    def cried(self, bids: Iterable[Bid], sender: Contact, now: float) -> None:
+        """Take what a neighbour cries; an exclusive task is not decided so."""
+        if self.auction.exclusive:
+            return
+        self._first_at = min(self._first_at, now)
+        if self._flood.join(bids, sender):
+            if self._check.own is not None:
+                self._flood.join([self._check.own])
+            self._flooded_at = min(self._flooded_at, max(now, self._first_at + self.auction.waiting))
+
+    def errands(self, now: float) -> list[Errand]:
+        """What goes out now."""
+        age = max(0.0, now - self._first_at) if self._first_at != math.inf else 0.0
+        out: list[Errand] = []
+        if self._teller is not None:
+            made = self._teller.announcement(self.announcement, self.audience.is_shared, now)
+            if made is not None:
+                self.announced(made, now)
+            out += self._teller.offers(age, now)
+        else:
+            out += self._branch.offers(age, now)
+            out += self._check.offers(self.announcement, age, now)
+        out += self._direct.offers(age, now)
+        out += self.audience.notices(self.announcement, self._is_mine, now)
+        out += self._flood.cries()
+        if now >= self._flooded_at:
+            self._flooded_at = math.inf
+            self._tell()
+        return out
+
+    def answered(self, errand: Errand, now: float) -> None:
+        """Take note that an errand was confirmed; what came in return was told before."""
+        if isinstance(errand, Notice):
+            self.audience.answered(errand)
+        elif isinstance(errand, Offer):
+            if errand.is_straight:
+                self._check.answered(self.announcement, now)
+            elif errand.is_shared:
+                self._direct.answered(errand)
+            elif self._teller is not None:
+                self._teller.answered(errand, now)
+            else:
+                self._branch.answered(errand, now)
+
+    def failed(self, errand: Errand, now: float) -> None:
+        """Take note that nobody answered an errand."""
+        if isinstance(errand, Notice):
+            self.audience.failed(errand, now)
+        elif isinstance(errand, Offer):
+            if errand.is_straight:
+                self._check.failed(errand.to, now)
+            elif errand.is_shared:
+                self._direct.failed(errand, now)
+            elif self._teller is not None:
+                self._teller.failed(errand, now)
+            else:
+                self._branch.failed(errand, now)
+            is_alone = self._check.is_alone or self._direct.is_alone or self._branch.is_alone
+            if is_alone and self._teller is None:
+                self._cry(now)
+
+    @property
+    def _is_mine(self) -> bool:
+        """Whether what is announced is this node's own word."""
+        return self.announcement is not None and self.announcement.rank == self._rank
+
+    def _cry(self, now: float) -> None:
+        """No council is in reach: let the neighbours know."""
+        own = self._check.own
+        if own is not None and not self.auction.exclusive and self._flood.join([own]):
+            self._flooded_at = min(self._flooded_at, max(now, self._first_at + self.auction.waiting))
+
+    def _tell(self) -> None:
+        """Tell what stands, of the announcement and of what was cried."""
+        announced = self.announcement.reports if self.announcement is not None else ()
+        cried = self._flood.summary.standing
+        reports = self._rule.merged(announced, cried) if cried else announced
+        if reports != self.told:
+            self.told = reports
+            self.on_summary(reports)

@@ -1,0 +1,68 @@
+"""Summary: what one node knows of the bids of one auction; a join, the same in any order and however often; pure.
+
+Of each agent only the bid of the highest revision counts.  Of those the auction's rule says which stand, and only they
+travel on.  A bid that took the place of another is kept and travels even where it does not stand: else a late copy of
+the earlier one would stand again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from middleware.consensus.bidding.bid import Bid
+from middleware.consensus.bidding.rule import Rule
+from middleware.consensus.strategy import Report
+
+MAX_SUPERSEDING = 256
+
+
+class Summary:
+    """The bids that stand under ``rule``, and those that superseded others."""
+
+    def __init__(self, rule: Rule) -> None:
+        self._rule = rule
+        self._bids: dict[str, Bid] = {}
+        self._standing: tuple[Report, ...] = ()
+
+    @property
+    def standing(self) -> tuple[Report, ...]:
+        """The reports that stand."""
+        return self._standing
+
+    def bids(self) -> tuple[Bid, ...]:
+        """What has to travel on, in the order of the agents' ids."""
+        return tuple(self._bids[agent] for agent in sorted(self._bids))
+
+    def of(self, agent: str) -> Bid | None:
+        """The bid of an agent, as far as it is kept."""
+        return self._bids.get(agent)
+
+    def join(self, bids: Iterable[Bid]) -> bool:
+        """Take ``bids`` in; whether anything is another than before."""
+        before = dict(self._bids)
+        newer: dict[str, Bid] = {}
+        for bid in bids:
+            known = newer.get(bid.agent) or self._bids.get(bid.agent)
+            if known is None or bid.rank > known.rank:
+                newer[bid.agent] = bid
+        if not newer:
+            return False
+        replaced = any(report.agent in newer for report in self._standing)
+        self._bids.update(newer)
+        if replaced:
+            known_reports = [bid.report for bid in self._bids.values() if bid.report is not None]
+            self._standing = self._rule.merged(known_reports, ())
+        else:
+            fresh = [bid.report for bid in newer.values() if bid.report is not None]
+            self._standing = self._rule.merged(self._standing, fresh)
+        self._shed()
+        return self._bids != before
+
+    def _shed(self) -> None:
+        """Let go of every bid that neither stands nor superseded another, and of superseding ones beyond the limit."""
+        standing = {report.agent for report in self._standing}
+        kept = {agent: bid for agent, bid in self._bids.items() if agent in standing or bid.revision}
+        spare = [agent for agent in kept if agent not in standing]
+        for agent in spare[: max(0, len(spare) - MAX_SUPERSEDING)]:
+            del kept[agent]
+        self._bids = kept

@@ -1,0 +1,206 @@
+"""Desk: where peers reach this node's acceptor; it checks what they send; answers wait until they are kept.
+
+Which role may call which method is decided before (``middleware.admission.roles``): only nodes that may order tasks
+reach ``lease.cancel``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+from weakref import WeakValueDictionary
+
+from twisted.internet.defer import Deferred, maybeDeferred
+from twisted.internet.interfaces import IReactorTime
+
+from middleware.consensus.lease.acceptor import LeaseAcceptor
+from middleware.consensus.lease.charter import LEAST, Judge, sign_change, sign_end
+from middleware.consensus.lease.lease_codec import MAX_COUNCIL, members_of, pack_reply
+from middleware.consensus.lease.patience import in_time
+from middleware.entangled.contact import Contact
+from middleware.entangled.data.store import Store
+from middleware.entangled.errors import Refused
+from middleware.entangled.identity import Identity
+from middleware.entangled.quorum.ballot import MAX_NUMBER, NONE, Ballot
+from middleware.entangled.quorum.register import Kind, Reply
+from middleware.entangled.record import MAX_NAME
+from middleware.entangled.wire.endpoint import Endpoint
+from middleware.entangled.wire.method import Method
+
+if TYPE_CHECKING:
+    from middleware.consensus.lease.lessee import Lessee
+
+MAX_TTL = 60.0
+
+Answer = list[object] | Deferred[list[object]]
+
+
+class Desk:
+    """The acceptor of one node, and the lessees that wait for news from others' acceptors.
+
+    It may be made when the first peer asks: ``born_at`` is when the node began, for silence counts from then.
+    ``judge`` reads the charters of councils; ``may_sit`` says whether the holder of a key may be a member of one.
+    """
+
+    def __init__(
+        self,
+        endpoint: Endpoint,
+        identity: Identity,
+        store: Store,
+        clock: IReactorTime,
+        born_at: float,
+        judge: Judge,
+        may_sit: Callable[[bytes], bool],
+    ) -> None:
+        self._endpoint = endpoint
+        self._identity = identity
+        self._judge = judge
+        self._may_sit = may_sit
+        self._store = store
+        self._clock = clock
+        self._acceptor = LeaseAcceptor(store, born_at)
+        self._lessees: WeakValueDictionary[str, Lessee] = WeakValueDictionary()
+        self._contacts: dict[str, Contact] = {}
+        self._methods = {
+            name: Method(name, answer)
+            for name, answer in (
+                ("lease.prepare", self._prepare),
+                ("lease.propose", self._propose),
+                ("lease.release", self._release),
+                ("lease.close", self._close),
+                ("lease.cancel", self._cancel),
+                ("lease.change", self._change),
+                ("lease.install", self._install),
+                ("lease.freed", self._freed),
+            )
+        }
+
+    def answer(self, method: str, peer: Contact, arguments: tuple[Any, ...]) -> object:
+        """What a peer is told; raises ``Refused`` where its arguments do not fit."""
+        return self._methods[method].run(peer, arguments)
+
+    def enter(self, lessee: Lessee) -> None:
+        """Let ``lessee`` hear when the lease of its task is given back."""
+        self._lessees[lessee.task_id] = lessee
+
+    def ask(
+        self, own: Contact, member: Contact, method: str, arguments: tuple[Any, ...], patience: float
+    ) -> Deferred[Any]:
+        """Ask a member, which may be this node itself."""
+        if member.node_id == own.node_id:
+            return maybeDeferred(self.answer, method, own, arguments)
+        return self._endpoint.ask(member, method, *arguments, changes=True, timeout=patience)
+
+    # -- what peers ask ---------------------------------------------------------------------------------------------
+
+    def _prepare(self, peer: Contact, task_id: str, configuration: int, counter: int, ttl: float) -> Answer:
+        _check(task_id, configuration, counter + 1, ttl=ttl)
+        agent = self._known(peer)
+        ballot = Ballot(counter, agent)
+        return self._kept(self._acceptor.prepare(task_id, configuration, ballot, float(ttl), self._clock.seconds()))
+
+    def _propose(self, peer: Contact, task_id: str, configuration: int, counter: int, token: int, ttl: float) -> Answer:
+        _check(task_id, configuration, counter, token, ttl=ttl)
+        ballot, ttl = Ballot(counter, peer.node_id.hex()), float(ttl)
+
+        def proposed() -> Reply:
+            return self._acceptor.lease(task_id, configuration, ballot, token, ttl, self._clock.seconds())
+
+        return in_time(proposed, self._clock).addCallback(self._kept)
+
+    def _release(self, peer: Contact, task_id: str, counter: int, rest: float) -> None:
+        _check(task_id, counter, rest=rest)
+        ballot = Ballot(counter, peer.node_id.hex())
+        self._tell(self._acceptor.free(task_id, ballot, self._clock.seconds(), float(rest)), task_id, rest)
+
+    def _close(self, peer: Contact, task_id: str, configuration: int, token: int) -> Answer:
+        _check(task_id, configuration, token)
+        agent, now = peer.node_id.hex(), self._clock.seconds()
+        reply = self._acceptor.close(task_id, agent, configuration, token, now)
+        if reply.kind in (Kind.OVER, Kind.SEALED):
+            reply = reply._replace(proof=sign_end(self._identity, task_id, configuration, agent, token))
+        return self._kept(reply)
+
+    def _cancel(self, peer: Contact, task_id: str, configuration: int) -> Answer:
+        _check(task_id, configuration)
+        return self._kept(self._acceptor.close(task_id, "", configuration, 0, self._clock.seconds()))
+
+    def _change(
+        self,
+        peer: Contact,
+        task_id: str,
+        configuration: int,
+        counter: int,
+        packed: list[object],
+        token: int,
+        keep: bool,
+    ) -> Answer:
+        _check(task_id, configuration, counter, token + 1)
+        members = members_of(packed)
+        if members is None or len(members) < LEAST or not all(self._may_sit(member.public) for member in members):
+            raise Refused(f"the next council has {LEAST} to {MAX_COUNCIL} members of the team that are no viewers")
+        ballot, now = Ballot(counter, peer.node_id.hex()), self._clock.seconds()
+        reply = self._acceptor.accept(task_id, configuration, ballot, members, now, token, keep)
+        if reply.kind is Kind.GRANTED:
+            signature = sign_change(self._identity, task_id, configuration, ballot, members, reply.token)
+            reply = reply._replace(proof=signature)
+        return self._kept(reply)
+
+    def _install(self, peer: Contact, task_id: str, packed: bytes, keep: bool, ttl: float) -> Answer:
+        _check(task_id, ttl=ttl)
+        charter = self._judge.read(task_id, packed)
+        if charter is None or not charter.links:
+            raise Refused("a council is installed with the signatures of a majority of the one before it")
+        mine = keep and charter.ballot.proposer == peer.node_id.hex()
+        reply = self._acceptor.install(
+            task_id,
+            charter.configuration,
+            charter.members,
+            charter.token,
+            self._clock.seconds(),
+            charter.ballot if mine else NONE,
+            float(ttl),
+            packed,
+        )
+        return self._kept(reply)
+
+    def _freed(self, peer: Contact, task_id: str, token: int, rest: float) -> None:
+        _check(task_id, token + 1, rest=rest)
+        agent, now = peer.node_id.hex(), self._clock.seconds()
+        self._tell(self._acceptor.freed(task_id, agent, token, now, float(rest)), task_id, rest)
+        lessee = self._lessees.get(task_id)
+        if lessee is not None:
+            lessee.freed(token, float(rest))
+
+    # -- inside -----------------------------------------------------------------------------------------------------
+
+    def _tell(self, agents: list[str], task_id: str, rest: float) -> None:
+        """Tell those that asked for it that a lease was given back."""
+        for agent in agents:
+            contact = self._contacts.get(agent)
+            if contact is not None:
+                self._endpoint.tell(contact, "lease.freed", task_id, 0, rest)
+
+    def _known(self, peer: Contact) -> str:
+        """The id of an agent, to which its address is remembered for a push."""
+        agent = peer.node_id.hex()
+        self._contacts.pop(agent, None)
+        if len(self._contacts) >= 256:
+            del self._contacts[next(iter(self._contacts))]
+        self._contacts[agent] = peer
+        return agent
+
+    def _kept(self, reply: Reply) -> Answer:
+        """The answer, once everything that it promises survives the end of the process."""
+        packed = pack_reply(reply)
+        written = self._store.written()
+        return packed if written.called and written.result is None else written.addCallback(lambda _: packed)
+
+
+def _check(task_id: str, *numbers: int, ttl: float = 1.0, rest: float = 0.0) -> None:
+    if len(task_id) > MAX_NAME or not all(0 < number < MAX_NUMBER for number in numbers):
+        raise Refused("a lease is asked for with a task id and positive numbers below 2^62")
+    if not 0.0 < ttl <= MAX_TTL:
+        raise Refused(f"a lease lasts more than 0 and at most {MAX_TTL:g} seconds")
+    if not 0.0 <= rest <= MAX_TTL:
+        raise Refused(f"a robot comes to rest within 0 to {MAX_TTL:g} seconds")

@@ -1,0 +1,47 @@
+"""Auctions, agents and bids that the tests of this room share."""
+
+from __future__ import annotations
+
+import random
+
+from middleware.consensus.bidding.announcement import Announcement, Entry
+from middleware.consensus.bidding.auction import Auction
+from middleware.consensus.bidding.bid import Bid
+from middleware.consensus.bidding.party import Party
+from middleware.consensus.bidding.rule import Rule
+from middleware.consensus.strategies.nearest import Nearest
+from middleware.consensus.strategy import Report
+from middleware.entangled.contact import Contact
+from middleware.entangled.identity import Identity
+from middleware.entangled.network.network import Address
+
+AGENTS = [Identity(bytes([place]) * 32) for place in range(1, 13)]
+CONTACTS = [Contact(agent.public, Address("10.0.0.1", 7000 + place)) for place, agent in enumerate(AGENTS)]
+COUNCIL = tuple(CONTACTS[:3])
+AUCTION = Auction("job", 1, COUNCIL)
+BEST_EFFORT = Auction("job", 1, COUNCIL, exclusive=False)
+
+
+def bid(place: int, cost: float | None, revision: int = 0, auction: Auction = AUCTION) -> Bid:
+    """The signed bid of the agent at ``place``."""
+    agent = AGENTS[place]
+    report = None if cost is None else Report(agent.node_id.hex(), cost)
+    return Bid(agent.public, report, revision).signed(agent, auction)
+
+
+def announced(number: int, rank: int, *bids: Bid, auction: Auction = AUCTION) -> Announcement:
+    """What the council member at ``rank`` announces."""
+    entries = tuple(Entry(b.report, b.revision) for b in bids if b.report is not None)
+    return Announcement(number, rank, entries).signed(AGENTS[rank].sign, auction)
+
+
+def rule() -> Rule:
+    """The rule of the nearest."""
+    return Rule(Nearest())
+
+
+def party(place: int, auction: Auction = AUCTION, seed: int = 1) -> Party:
+    """The part of the node at ``place``, which knows all others."""
+    others = [contact for contact in CONTACTS if contact is not CONTACTS[place]]
+    dice = random.Random(f"{seed}/{place}")
+    return Party(auction, CONTACTS[place], rule(), lambda: others, dice, AGENTS[place].sign)

@@ -1,0 +1,330 @@
+"""Tests of bids between real nodes: sent, confirmed, believed and refused on their endpoints."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+from middleware.consensus.bidding import party
+from middleware.consensus.bidding.announcement import Announcement, Entry
+from middleware.consensus.bidding.auction import Auction
+from middleware.consensus.bidding.bid import Bid
+from middleware.consensus.bidding.bidding import Bidding
+from middleware.consensus.bidding.errand import MAX_BIDS
+from middleware.consensus.bidding.parties import MAX_PARTIES
+from middleware.consensus.bidding.scale import TREE
+from middleware.consensus.strategy import Report
+from middleware.entangled.errors import Refused
+from middleware.entangled.kademlia.distance import closest
+from middleware.entangled.network.switchboard import Weather
+from middleware.entangled.wire.door import ROLE
+from middleware.entangled.wire.message import Failure
+from middleware.entangled.wire.method import ErrorCodes
+from middleware.node import SwarmNode
+from middleware.tasks.task import MEMBER, Task, group_key
+from tests.fleet import FleetCase, SwarmFleet
+
+WAITING = 0.5
+
+
+class AuctionCase(FleetCase):
+    """A fleet and one auction."""
+
+    def prepared(self, n: int, seed: int = 1, weather: Weather | None = None, strategy: str = "nearest") -> SwarmFleet:
+        """A fleet whose first three nodes by distance are the council of one task."""
+        fleet = self.swarm(n, seed) if weather is None else self.swarm(n, seed, weather)
+        key = group_key("job")
+        council = closest([node.entangled.contact for node in fleet.nodes], key, 3)
+        self.task = Task("job", "find", "Find it", waiting_period=WAITING, council=tuple(council), strategy=strategy)
+        self.views: dict[int, list[tuple[Report, ...]]] = {place: [] for place in range(n)}
+        return fleet
+
+    def auction(self, **others: Any) -> Auction:
+        """The auction of the task."""
+        return Auction("job", 1, self.task.council, self.task.strategy, WAITING, **others)
+
+    def enter(self, fleet: SwarmFleet, *costs: float) -> list[Bidding]:
+        """Let the nodes bid."""
+        biddings = []
+        for place, cost in enumerate(costs):
+            node = fleet.nodes[place]
+            bidding = node.bidding(self.task, 1, self.views[place].append)
+            bidding.report(Report(node.uuid, cost))
+            biddings.append(bidding)
+        return biddings
+
+    def outsider(self, fleet: SwarmFleet) -> SwarmNode:
+        """A node that is not of the council."""
+        council = {member.node_id for member in self.task.council}
+        return next(node for node in fleet.nodes if node.entangled.identity.node_id not in council)
+
+    def ask(self, fleet: SwarmFleet, sender: SwarmNode, to: SwarmNode, method: str, *arguments: object) -> object:
+        """What a peer gets for a question: the value, or the exception."""
+        asked = sender.entangled.endpoint.ask(to.entangled.contact, method, *arguments, changes=True)
+        asked.addErrback(lambda failure: failure.value)
+        return self.done(fleet, asked)
+
+
+class DisseminationTests(AuctionCase):
+    """Behaviour of ``SwarmNode.bidding``."""
+
+    def test_all_agree(self) -> None:
+        """After the waiting period every bidder has the same reports, the cheapest first."""
+        fleet = self.prepared(4)
+        self.enter(fleet, 3.0, 1.0, 2.0)
+        fleet.run(WAITING - 0.1)
+        self.assertEqual([self.views[place] for place in range(3)], [[], [], []])
+        fleet.run(0.6)
+        for place in range(3):
+            self.assertEqual([r.cost for r in self.views[place][-1]], [1.0, 2.0, 3.0])
+            self.assertEqual(self.views[place][-1][0].agent, fleet.nodes[1].uuid)
+
+    def test_all_agree_at_bad_links(self) -> None:
+        """They agree where a fifth of the datagrams is lost."""
+        fleet = self.prepared(5, weather=Weather(delay_s=0.02, jitter_s=0.01, loss=0.2))
+        self.enter(fleet, 3.0, 1.0, 2.0, 5.0, 4.0)
+        fleet.run(6.0)
+        winners = {self.views[place][-1][0].agent for place in range(5)}
+        self.assertEqual(winners, {fleet.nodes[1].uuid})
+
+    def tree(self) -> SwarmFleet:
+        """A fleet of twelve whose bids go along the tree."""
+        fleet = self.prepared(12)
+        for node in fleet.nodes:
+            node.dissemination._scale.way = TREE
+            node.dissemination._scale.counted = lambda bidders: TREE  # type: ignore[method-assign]
+        return fleet
+
+    def assert_agreed(self, fleet: SwarmFleet) -> None:
+        """Let all twelve bid; they agree on the last one, which is the nearest."""
+        self.enter(fleet, *(float(12 - place) for place in range(12)))
+        fleet.run(3.0)
+        winners = {self.views[place][-1][0].agent for place in range(12)}
+        self.assertEqual(winners, {fleet.nodes[11].uuid})
+
+    def test_tree_of_real_nodes(self) -> None:
+        """Bids that go along the tree come to the same end."""
+        self.assert_agreed(self.tree())
+
+    def test_more_than_one_carries(self) -> None:
+        """Of many that know one contact only, those for whom it has no room go on to the council, and all agree."""
+        fleet = self.tree()
+        council = {member.node_id for member in self.task.council}
+        outside = [node for node in fleet.nodes if node.entangled.identity.node_id not in council]
+        [known] = closest([node.entangled.contact for node in outside], group_key("job"), 1)
+        refused: list[str] = []
+        answered = ErrorCodes.error
+
+        def noted(codes: ErrorCodes, failure: Failure) -> Exception:
+            refused.append(failure.text)
+            return answered(codes, failure)
+
+        self.patch(party, "MAX_CHILDREN", 2)
+        self.patch(ErrorCodes, "error", noted)
+        for node in outside:
+            around = replace(node.dissemination._around, contacts=lambda: [known])
+            node.dissemination._around = around
+        self.assert_agreed(fleet)
+        self.assertEqual(sum("send their bids here" in text for text in refused), len(outside) - 1 - 2)
+
+    def test_closes_early(self) -> None:
+        """Where the council knows how many bid, nobody waits longer than it takes."""
+        fleet = self.prepared(4)
+        for bidding in self.enter(fleet, 3.0, 1.0, 2.0):
+            bidding.expect(3)
+        fleet.run(0.2)
+        self.assertTrue(all(self.views[place] for place in range(3)))
+
+    def test_withdrawn_and_bid_anew(self) -> None:
+        """A bid taken back counts no more, a new one counts again, and an equal one sends nothing."""
+        fleet = self.prepared(4)
+        biddings = self.enter(fleet, 3.0, 1.0, 2.0)
+        fleet.run(1.0)
+        biddings[1].withdraw()
+        fleet.run(2.0)
+        self.assertEqual([r.cost for r in self.views[0][-1]], [2.0, 3.0])
+        biddings[1].report(Report(fleet.nodes[1].uuid, 0.5))
+        fleet.run(2.0)
+        self.assertEqual([r.cost for r in self.views[0][-1]], [0.5, 2.0, 3.0])
+        before = len(self.views[0])
+        biddings[1].report(Report(fleet.nodes[1].uuid, 0.5))
+        fleet.run(2.0)
+        self.assertEqual(len(self.views[0]), before)
+
+    def test_restarted_bidder(self) -> None:
+        """A node that comes back bids anew, though its former life had bid more often."""
+        fleet = self.prepared(4)
+        biddings = self.enter(fleet, 3.0, 4.0, 5.0, 6.0)
+        place = fleet.nodes.index(self.outsider(fleet))
+        for cost in (2.5, 2.4, 2.3):
+            biddings[place].report(Report(fleet.nodes[place].uuid, cost))
+        fleet.run(2.0)
+        fleet.nodes[place].vanish()
+        fleet.nodes[place] = fleet.made(place)
+        fleet.nodes[place].startService()
+        fleet.run(2.0)
+        node = fleet.nodes[place]
+        node.bidding(self.task, 1, self.views[place].append).report(Report(node.uuid, 9.0))
+        fleet.run(4.0)
+        for other in range(4):
+            costs = {r.agent: r.cost for r in self.views[other][-1]}
+            self.assertEqual(costs[node.uuid], 9.0)
+
+    def test_bad_bids_are_errors(self) -> None:
+        """A bid that is no cost, or for somebody else, flies at the caller."""
+        fleet = self.prepared(3)
+        [bidding] = self.enter(fleet, 3.0)
+        for cost in (math.nan, math.inf, -1.0):
+            with self.assertRaises(ValueError):
+                bidding.report(Report(fleet.nodes[0].uuid, cost))
+        with self.assertRaises(ValueError):
+            bidding.report(Report(fleet.nodes[1].uuid, 1.0))
+
+    def test_leaving(self) -> None:
+        """Who left hears no more."""
+        fleet = self.prepared(4)
+        biddings = self.enter(fleet, 3.0, 1.0, 2.0)
+        biddings[0].leave()
+        fleet.run(2.0)
+        self.assertEqual(self.views[0], [])
+        self.assertNotEqual(self.views[1], [])
+
+    def test_listener_that_raises(self) -> None:
+        """What somebody does with an announcement harms nobody else."""
+        fleet = self.prepared(4)
+        self.enter(fleet, 3.0, 1.0, 2.0)
+        fleet.nodes[0].bidding(self.task, 1, lambda reports: 1 // 0)  # type: ignore[arg-type]
+        fleet.run(2.0)
+        self.assertEqual(len(self.flushLoggedErrors(ZeroDivisionError)), 1)
+        self.assertNotEqual(self.views[0], [])
+
+
+class HostileTests(AuctionCase):
+    """What a member of the team that lies can and cannot do."""
+
+    def test_announcement_of_a_stranger(self) -> None:
+        """What a node outside of the council announces is refused by name, and nobody's view changes."""
+        fleet = self.prepared(5)
+        self.enter(fleet, 3.0, 1.0, 2.0, 4.0, 5.0)
+        liar = self.outsider(fleet)
+        victim = next(node for node in fleet.nodes if node is not liar)
+        auction = self.auction()
+        lie = (Entry(Report(liar.uuid, 0.0)),)
+        for rank in range(3):
+            forged = Announcement(99, rank, lie).signed(liar.entangled.identity.sign, auction)
+            answer = self.ask(fleet, liar, victim, "bid.announce", auction.packed(), forged.packed())
+            self.assertIsInstance(answer, Refused)
+            self.assertIn("no member of the task's council signed", str(answer))
+        fleet.run(2.0)
+        for place in range(5):
+            self.assertEqual(self.views[place][-1][0].agent, fleet.nodes[1].uuid)
+
+    def test_announcement_in_return_for_a_bid(self) -> None:
+        """An announcement that comes in an answer is checked as any other."""
+        fleet = self.prepared(4)
+        self.enter(fleet, 3.0, 1.0)
+        node, liar = fleet.nodes[0], self.outsider(fleet)
+        auction = self.auction()
+        forged = Announcement(99, 0, (Entry(Report(liar.uuid, 0.0)),)).signed(liar.entangled.identity.sign, auction)
+        party = next(iter(node.dissemination._parties))
+        with self.assertRaises(Refused):
+            node.dissemination._heard(party, forged.packed())
+
+    def test_bids_for_others(self) -> None:
+        """A bid that its agent did not sign, for this very auction, is refused whole."""
+        fleet = self.prepared(4)
+        liar, victim = fleet.nodes[3], fleet.nodes[0]
+        auction, other = self.auction(), Auction("job", 2, self.task.council, "nearest", WAITING)
+        own = liar.entangled.identity
+        bids = [
+            Bid(fleet.nodes[1].entangled.identity.public, Report(fleet.nodes[1].uuid, 0.0), 0, b"x" * 64),
+            Bid(own.public, Report(liar.uuid, 0.0)).signed(own, other),
+        ]
+        for bid in bids:
+            answer = self.ask(fleet, liar, victim, "bid.offer", auction.packed(), [bid.packed()], 0, False)
+            self.assertIsInstance(answer, Refused)
+
+    def test_bids_of_those_who_may_not(self) -> None:
+        """A bid of a member whose role lets it take no part does not count; where that was all, its carrier is told."""
+        fleet = self.prepared(4)
+        viewer, victim, good = fleet.nodes[3], fleet.nodes[0], fleet.nodes[1]
+        public, auction = viewer.entangled.identity.public, self.auction()
+        victim.entangled.replica.may_store = lambda slot: slot.owner != public or slot.name != MEMBER
+        bids = [
+            Bid(node.entangled.identity.public, Report(node.uuid, 1.0))
+            .signed(node.entangled.identity, auction)
+            .packed()
+            for node in (viewer, good)
+        ]
+        answer = self.ask(fleet, viewer, victim, "bid.offer", auction.packed(), bids[:1], 0, False)
+        self.assertEqual(getattr(answer, "code", ""), ROLE)
+        self.assertEqual(len(list(victim.dissemination._parties)), 0)
+        answer = self.ask(fleet, viewer, victim, "bid.offer", auction.packed(), bids, 0, False)
+        self.assertNotIsInstance(answer, Refused)
+        party = next(iter(victim.dissemination._parties))
+        self.assertIsNone(party.summary.of(viewer.uuid))
+        self.assertIsNotNone(party.summary.of(good.uuid))
+
+    def test_nonsense(self) -> None:
+        """Nonsense is refused in one line that says what is wanted; nobody stumbles."""
+        fleet = self.prepared(3)
+        liar, victim = fleet.nodes[0], fleet.nodes[1]
+        own, auction = liar.entangled.identity, self.auction()
+        good = Bid(own.public, Report(liar.uuid, 1.0)).signed(own, auction).packed()
+        questions: list[tuple[object, ...]] = [
+            ("bid.offer", [], [good], 0, False),
+            ("bid.offer", auction.packed(), [good] * (MAX_BIDS + 1), 0, False),
+            ("bid.offer", auction.packed(), [[1, 2, 3]], 0, False),
+            ("bid.offer", auction.packed(), [good], -1, False),
+            ("bid.offer", auction.packed(), [good], 10**12, False),
+            ("bid.offer", auction.packed(), "bids", 0, False),
+            ("bid.announce", auction.packed(), 7),
+            ("bid.announce", 7, []),
+        ]
+        for method, *arguments in questions:
+            answer = self.ask(fleet, liar, victim, str(method), *arguments)
+            self.assertIsInstance(answer, Refused, (method, answer))
+        liar.entangled.endpoint.tell(victim.entangled.contact, "bid.cry", auction.packed(), [good])
+        fleet.run(1.0)
+        self.assertEqual(len(list(victim.dissemination._parties)), 0)
+
+    def test_invented_auctions(self) -> None:
+        """A peer that invents auctions fills a table that has an end, and leaves no timer behind."""
+        fleet = self.prepared(3)
+        liar, victim = fleet.nodes[0], fleet.nodes[1]
+        [bidding] = self.enter(fleet, 3.0)
+        bidding_of_victim = victim.bidding(self.task, 1, self.views[1].append)
+        own = liar.entangled.identity
+        for epoch in range(MAX_PARTIES + 20):
+            auction = Auction("job", 1_000 + epoch, self.task.council, "nearest", WAITING)
+            bid = Bid(own.public, Report(liar.uuid, 1.0)).signed(own, auction)
+            peer = liar.entangled.contact
+            victim.dissemination.answer_offer(peer, auction.packed(), [bid.packed()], 0, True)
+        self.assertEqual(len(victim.dissemination._parties), MAX_PARTIES)
+        self.assertLessEqual(len(victim.dissemination._timers), MAX_PARTIES)
+        bidding_of_victim.report(Report(victim.uuid, 1.0))
+        fleet.run(2.0)
+        self.assertEqual(self.views[1][-1][0].agent, victim.uuid)
+
+    def test_unknown_strategy(self) -> None:
+        """A node that has not the task's strategy carries its bids all the same."""
+        fleet = self.prepared(4, strategy="nobody-has-this")
+        self.enter(fleet, 3.0, 1.0, 2.0)
+        fleet.run(2.0)
+        self.assertEqual(self.views[0][-1][0].agent, fleet.nodes[1].uuid)
+
+    def test_vanished_council(self) -> None:
+        """A best-effort task is decided among those that are left; a stopped node leaves nothing on the clock."""
+        fleet = self.prepared(8)
+        members = {member.node_id for member in self.task.council}
+        for node in fleet.nodes:
+            if node.entangled.identity.node_id in members:
+                node.vanish()
+        left = [place for place, node in enumerate(fleet.nodes) if node.running]
+        auction = self.auction(exclusive=False)
+        for place in left:
+            node = fleet.nodes[place]
+            node.dissemination.enter(auction, self.views[place].append).report(Report(node.uuid, 1.0 + place))
+        fleet.run(8.0)
+        self.assertEqual({self.views[place][-1][0].agent for place in left}, {fleet.nodes[left[0]].uuid})

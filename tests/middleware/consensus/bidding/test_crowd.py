@@ -1,0 +1,141 @@
+"""Tests of whole crowds on light links: messages, agreement, and what happens when links and nodes fail."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from benchmarks.dissemination import BUSIEST, Crowd, Outcome, Weather, main, measured, percentile
+from middleware.consensus.bidding.scale import DIRECT, TREE
+
+AFTER = 4.0
+
+
+def outcome(crowd: Crowd, until: float = AFTER) -> Outcome:
+    """What a crowd has come to."""
+    crowd.run(until)
+    return crowd.outcome()
+
+
+class SmallTests(SynchronousTestCase):
+    def test_three_agents(self) -> None:
+        """Three agents agree with at most ten messages each, a tenth of the datagrams lost."""
+        runs = [outcome(Crowd(3, seed, Weather(0.1))) for seed in range(40)]
+        self.assertEqual(min(run.right for run in runs), 1.0)
+        self.assertLessEqual(sum(run.messages for run in runs) / len(runs), 10.0)
+
+    def test_thirty_agents(self) -> None:
+        """Thirty agents still go the direct way, with at most ten messages each."""
+        runs = [outcome(Crowd(30, seed, Weather(0.1))) for seed in range(4)]
+        self.assertEqual(min(run.right for run in runs), 1.0)
+        self.assertLessEqual(sum(run.messages for run in runs) / len(runs), 10.0)
+
+    def test_every_second_datagram_comes_twice(self) -> None:
+        """Copies change nothing: one announcement, and everybody has it."""
+        crowd = Crowd(30, 2, Weather(twice=0.5))
+        self.assertEqual(outcome(crowd).right, 1.0)
+        self.assertEqual({p.announcement and p.announcement.number for p in crowd.parties}, {1})
+
+    def test_first_member_is_dead(self) -> None:
+        """The next member of the council stands in."""
+        for seed in range(3):
+            crowd = Crowd(12, seed, Weather(0.1), way=DIRECT)
+            crowd.dead.add(crowd._places[crowd.auction.council[0].node_id])
+            crowd.best = crowd.right_one()
+            self.assertEqual(outcome(crowd, 8.0).right, 1.0)
+
+    def test_withdrawal(self) -> None:
+        """When the winner takes its bid back, all agree on the next best."""
+        crowd = Crowd(12, 1, Weather(0.1), way=TREE)
+        winner = crowd.costs.index(min(crowd.costs))
+        crowd.at(2.0, crowd.bid, winner, None, 1)
+        outcome(crowd, 6.0)
+        crowd.costs[winner] = 1e6
+        crowd.best = crowd.right_one()
+        self.assertEqual(crowd.outcome().right, 1.0)
+
+
+class LargeTests(SynchronousTestCase):
+    def test_hundred_agents(self) -> None:
+        """A hundred agents agree along the tree within 0.6 s, with at most six messages each, a tenth lost."""
+        runs = [outcome(Crowd(100, seed, Weather(0.1))) for seed in range(5)]
+        took = [t for run in runs for t in run.took]
+        self.assertEqual(min(run.right for run in runs), 1.0)
+        self.assertLessEqual(sum(run.messages for run in runs) / len(runs), 6.0)
+        self.assertLessEqual(percentile(took, 0.95), 0.6)
+
+    def test_thousand_agents(self) -> None:
+        """A thousand agree within 0.8 s, with at most six messages each, none handles more than the limit."""
+        run = outcome(Crowd(1_000, 3, Weather(0.1)))
+        self.assertEqual(run.right, 1.0)
+        self.assertLessEqual(run.messages, 6.0)
+        self.assertLessEqual(run.busiest, BUSIEST)
+        self.assertLessEqual(percentile(run.took, 0.95), 0.8)
+
+    def test_dead_nodes_on_the_way(self) -> None:
+        """With one in twenty silently dead, those that live still agree on the best of them."""
+        runs = [outcome(Crowd(100, seed, Weather(0.1, dead=0.05)), 8.0) for seed in range(4)]
+        self.assertEqual(min(run.right for run in runs), 1.0)
+
+    def test_branch_dies_with_what_it_holds(self) -> None:
+        """A node that dies with its branch's bids in hand loses none for good: each bidder looks after its own."""
+        for seed in range(3):
+            crowd = Crowd(100, seed, Weather(), spread=0.02)
+            winner = crowd.costs.index(min(crowd.costs))
+            carry = crowd._carry
+
+            def killing(place: int, errand, crowd=crowd, winner=winner, carry=carry) -> None:  # type: ignore[no-untyped-def]
+                carry(place, errand)
+                if place == winner and not crowd.dead:
+                    # Whoever has the winning bid first confirms it and then dies with it.
+                    to = crowd._places[errand.to.node_id]
+                    if crowd.auction.rank(errand.to.node_id) is None:
+                        crowd.at(crowd.now + 0.1, crowd.dead.add, to)
+
+            crowd._carry = killing  # type: ignore[method-assign]
+            crowd.run(8.0)
+            crowd.best = crowd.right_one()
+            self.assertEqual(crowd.outcome().right, 1.0)
+
+    def test_announcement_is_lost_for_a_branch(self) -> None:
+        """Bidders that are told nothing ask the council themselves."""
+        crowd = Crowd(100, 4, Weather())
+        crowd.run(0.45)
+        relays = [i for i, p in enumerate(crowd.parties) if len(p.audience) and p._rank is None]
+        crowd.dead.update(relays)
+        crowd.best = crowd.right_one()
+        self.assertEqual(outcome(crowd, 8.0).right, 1.0)
+
+    def test_replayed(self) -> None:
+        """A seed gives the same run, another seed another."""
+        first, same, other = (outcome(Crowd(60, seed, Weather(0.1, 0.02))).digest for seed in (5, 5, 6))
+        self.assertEqual(first, same)
+        self.assertNotEqual(first, other)
+
+
+class CutOffTests(SynchronousTestCase):
+    def test_best_effort_without_a_council(self) -> None:
+        """Where no member of the council is in reach, the bids for a best-effort task are flooded and all agree."""
+        crowd = Crowd(60, 1, Weather(0.1), way=DIRECT, council_is_dead=True, exclusive=False)
+        self.assertEqual(outcome(crowd, 6.0).right, 1.0)
+
+    def test_exclusive_without_a_council(self) -> None:
+        """An exclusive task is not decided without its council."""
+        crowd = Crowd(20, 1, Weather(), council_is_dead=True)
+        self.assertEqual(outcome(crowd, 6.0).right, 0.0)
+
+
+class CommandTests(SynchronousTestCase):
+    def test_figures(self) -> None:
+        """A row says what it measured and which targets it missed."""
+        row = measured(3, 0.0, 0.0, 2, 1)
+        self.assertEqual((row["n"], row["way"], row["right"], row["missed"]), (3, DIRECT, 1.0, []))
+
+    def test_command(self) -> None:
+        """The command prints a table and ends well where the targets are reached."""
+        with contextlib.redirect_stdout(io.StringIO()) as printed:
+            self.assertEqual(main(["--n", "3", "--loss", "0", "--dead", "0", "--runs", "1"]), 0)
+        self.assertEqual(len(printed.getvalue().splitlines()), 2)
+        self.assertTrue(printed.getvalue().rstrip().endswith("yes"))

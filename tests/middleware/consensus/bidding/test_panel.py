@@ -1,0 +1,113 @@
+"""Tests of ``middleware.consensus.bidding.panel``: who of a large group writes a record, and when."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.consensus.bidding.panel import (
+    BELIEVED,
+    LISTENING,
+    MOST_OPEN,
+    PAUSE,
+    SEATS,
+    SETTLING,
+    SPACING,
+    Panel,
+    place_of,
+)
+from middleware.directory.presence import EXECUTING, SEARCHING, WAITING
+from middleware.tasks.task import Member
+
+MANY = 100
+ME = Member("me", "dog", SEARCHING)
+OTHERS = {f"other{n}" for n in range(SEATS)}
+
+
+class PanelTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.panel = Panel("me", 0.5)
+        self.panel.heard((), MANY, 0.0)
+        self.turn = LISTENING + 0.5 * MANY * SPACING
+
+    def full(self) -> None:
+        """There are records enough."""
+        self.panel.heard(OTHERS, MANY, 0.1)
+
+    def test_all_write_in_a_small_team(self) -> None:
+        """Up to the border each report is written at once, and each participant counts."""
+        self.panel.heard(OTHERS, MOST_OPEN, 0.0)
+        self.assertEqual((self.panel.is_partial(0.0), self.panel.counts(0.0)), (False, True))
+        self.assertEqual(self.panel.due(ME, 0.0), 0.0)
+        self.panel.wrote(ME, 0.0)
+        self.assertEqual(self.panel.due(replace(ME, why="waits"), 0.1), 0.1)
+
+    def test_turn_comes_while_there_are_few(self) -> None:
+        """One device more, and who has nothing to decide writes when its turn comes, unless enough have written."""
+        self.panel.heard(OTHERS, MOST_OPEN + 1, 0.0)
+        self.assertEqual((self.panel.is_partial(0.0), self.panel.due(ME, 0.0)), (True, math.inf))
+        panel = Panel("me", 0.5)
+        panel.heard((), MANY, 0.0)
+        self.assertAlmostEqual(panel.due(ME, 0.0), self.turn)
+        panel.heard(OTHERS, MANY, 0.2)
+        self.assertEqual(panel.due(ME, 50.0), math.inf)
+        self.assertFalse(panel.counts(50.0))
+
+    def test_gone_ones_are_replaced(self) -> None:
+        """When records vanish the turns begin anew."""
+        self.full()
+        self.panel.heard(sorted(OTHERS)[1:], MANY, 10.0)
+        self.assertAlmostEqual(self.panel.due(ME, 10.0), 10.0 + self.turn)
+
+    def test_small_group_of_a_large_team(self) -> None:
+        """Where all turns are over and there are few, they are all: then each writes at once."""
+        over = LISTENING + MANY * SPACING + SETTLING
+        self.assertEqual([self.panel.is_partial(over - 0.01), self.panel.is_partial(over)], [True, False])
+        self.assertEqual(self.panel.due(ME, over), over)
+
+    def test_who_is_announced_writes(self) -> None:
+        """Whom the council announces writes at once, though there are records enough."""
+        self.full()
+        self.panel.announced(["a", "me"], 5.0)
+        self.assertEqual((self.panel.due(ME, 5.0), self.panel.counts(5.0), self.panel.has_word), (5.0, True, True))
+
+    def test_who_acts_writes(self) -> None:
+        """Who acts, holds a token, or thinks that it is to act writes at once."""
+        self.full()
+        for told in (replace(ME, status=EXECUTING), replace(ME, token=3), replace(ME, assigned="me")):
+            self.assertEqual(self.panel.due(told, 5.0), 5.0)
+
+    def test_record_of_a_former_life_is_replaced(self) -> None:
+        """Where a record of this participant stands that it did not write, it says what holds now."""
+        self.panel.heard({*OTHERS, "me"}, MANY, 1.0)
+        self.assertEqual((self.panel.due(ME, 1.0), self.panel.is_written), (1.0, True))
+
+    def test_few_changes_are_written(self) -> None:
+        """What it does is told at once, whom it names after a pause, and anything else by who is needed only."""
+        self.full()
+        self.panel.wrote(ME, 1.0)
+        self.assertEqual(self.panel.due(ME, 9.0), math.inf)
+        self.assertEqual(self.panel.due(replace(ME, status=WAITING), 1.1), 1.1)
+        self.assertEqual(self.panel.due(replace(ME, cost=2.0), 1.1), 1.1)
+        self.assertEqual(self.panel.due(replace(ME, available=False), 1.1), 1.1)
+        self.assertEqual(self.panel.due(replace(ME, assigned="a"), 1.1), 1.0 + PAUSE)
+        self.assertEqual(self.panel.due(replace(ME, why="waits"), 1.1), math.inf)
+        self.panel.announced(["me"], 1.1)
+        self.assertEqual(self.panel.due(replace(ME, why="waits"), 1.2), 1.0 + PAUSE)
+
+    def test_announced_ones_are_believed_for_a_while(self) -> None:
+        """Who was announced counts as present until its record should have come, however often it is announced."""
+        self.panel.announced(["a"], 1.0)
+        self.panel.announced(["a", "b"], 1.9)
+        late = 1.0 + BELIEVED
+        self.assertEqual([self.panel.believes("a", late - 0.01), self.panel.believes("a", late)], [True, False])
+        self.assertEqual([self.panel.believes("b", late), self.panel.believes("c", late)], [True, False])
+
+    def test_places_are_spread(self) -> None:
+        """The farthest from the key comes first, the nearest last."""
+        key = bytes(20)
+        self.assertEqual(place_of("00" * 20, key), 1.0)
+        self.assertAlmostEqual(place_of("ff" * 20, key), 0.0)
+        self.assertAlmostEqual(place_of("80" + "00" * 19, key), 0.5)

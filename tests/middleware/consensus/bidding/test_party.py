@@ -1,0 +1,459 @@
+"""Tests of the parts of a party: bidder, branch, member of the council, and the flood without one."""
+
+from __future__ import annotations
+
+import math
+import random
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.consensus.bidding.auction import Auction
+from middleware.consensus.bidding.audience import MAX_LISTENERS, PAUSES, Audience
+from middleware.consensus.bidding.check import MAX_RELAYED
+from middleware.consensus.bidding.errand import MAX_BIDS, Cry, Errand, Notice, Offer
+from middleware.consensus.bidding.parties import LIFE_S, MAX_PARTIES, OWN, Parties
+from middleware.consensus.bidding.party import Party
+from middleware.consensus.bidding.route import hops, shared_bits
+from middleware.consensus.bidding.scale import DIRECT, LEAST_TREE, MOST_DIRECT, NEAR, TREE, Scale, team_size
+from middleware.consensus.bidding.tree import MAX_CHILDREN
+from middleware.entangled.contact import Contact
+from middleware.entangled.kademlia.distance import distance
+from middleware.entangled.network.network import Address
+from tests.middleware.consensus.bidding.ground import (
+    AGENTS,
+    AUCTION,
+    BEST_EFFORT,
+    CONTACTS,
+    COUNCIL,
+    announced,
+    bid,
+    party,
+)
+
+
+def offers(errands: list[Errand]) -> list[Offer]:
+    """The offers among errands."""
+    return [errand for errand in errands if isinstance(errand, Offer)]
+
+
+def notices(errands: list[Errand]) -> list[Notice]:
+    """The notices among errands."""
+    return [errand for errand in errands if isinstance(errand, Notice)]
+
+
+class RouteTests(SynchronousTestCase):
+    def test_each_hop_is_nearer(self) -> None:
+        """Whom a node sends to is nearer to the key than itself, the nearest first, and then comes the council."""
+        own = CONTACTS[5].node_id
+        found = hops(AUCTION, own, CONTACTS)
+        ahead = [c for c in found if c not in COUNCIL]
+        apart = [distance(c.node_id, AUCTION.key) for c in ahead]
+        self.assertEqual(apart, sorted(apart))
+        self.assertTrue(all(each < distance(own, AUCTION.key) for each in apart))
+        self.assertEqual([c for c in found if c in COUNCIL][-1], found[-1])
+
+    def test_nobody_nearer(self) -> None:
+        """A node that knows nobody nearer sends to the council itself, and never to itself."""
+        self.assertEqual(hops(AUCTION, CONTACTS[5].node_id, []), list(COUNCIL))
+        self.assertEqual(hops(AUCTION, COUNCIL[0].node_id, []), list(COUNCIL[1:]))
+
+    def test_council_is_the_goal(self) -> None:
+        """Where the nearest contact is of the council it is the next hop, and the other members follow."""
+        key = AUCTION.key
+        member = min(CONTACTS, key=lambda c: distance(c.node_id, key))
+        auction = Auction(AUCTION.task_id, 1, (CONTACTS[11], member))
+        far = max(CONTACTS, key=lambda c: distance(c.node_id, key))
+        self.assertEqual(hops(auction, far.node_id, CONTACTS), [member, CONTACTS[11]])
+
+    def test_shared_bits(self) -> None:
+        """The first bits that two ids have in common are counted."""
+        self.assertEqual(shared_bits(b"\x00", b"\x80"), 0)
+        self.assertEqual(shared_bits(b"\x0f\x00", b"\x0f\x01"), 15)
+        self.assertEqual(shared_bits(b"ab", b"ab"), 16)
+
+
+class ScaleTests(SynchronousTestCase):
+    def test_goes_over_once(self) -> None:
+        """A team at the border does not go back and forth between the ways."""
+        scale = Scale()
+        ways = [scale.counted(n) for n in (1, MOST_DIRECT, MOST_DIRECT + 1, MOST_DIRECT, LEAST_TREE, LEAST_TREE - 1)]
+        self.assertEqual(ways, [DIRECT, DIRECT, TREE, TREE, TREE, DIRECT])
+        self.assertEqual(scale.counted(MOST_DIRECT), DIRECT)
+
+    def test_team_size(self) -> None:
+        """A small team is counted, a large one estimated by how dense the nearest nodes lie."""
+        own = CONTACTS[0].node_id
+        self.assertEqual(team_size(own, [], False), 1)
+        self.assertEqual(team_size(own, CONTACTS[1:], False), len(CONTACTS))
+        rng = random.Random(1)
+        many = [Contact(rng.randbytes(32), Address("10.0.0.1", 1)) for _ in range(4_000)]
+        near = sorted(many, key=lambda c: distance(c.node_id, own))
+        known = near[:40] + rng.sample(near[40:], 40)
+        self.assertTrue(1_500 < team_size(own, known, False) < 12_000)
+        newcomer = near[:NEAR] + rng.sample(near[NEAR:], NEAR)  # knows few yet, but that there are many
+        self.assertTrue(1_500 < team_size(own, newcomer, True) < 12_000)
+        self.assertEqual(team_size(own, newcomer[: NEAR - 1], True), NEAR)
+
+
+class AudienceTests(SynchronousTestCase):
+    def test_told_once(self) -> None:
+        """A listener is told each announcement once, again after losses with longer and longer pauses, not for ever."""
+        audience = Audience()
+        audience.add(CONTACTS[5])
+        one = announced(1, 0)
+        [notice] = audience.notices(one, True, 0.0)
+        self.assertEqual(audience.notices(one, True, 0.0), [])
+        now = 0.0
+        for pause in PAUSES:
+            audience.failed(notice, now)
+            self.assertEqual(audience.due(one, True), now + pause)
+            now += pause
+            [notice] = audience.notices(one, True, now)
+        audience.failed(notice, now)
+        self.assertEqual(audience.due(one, True), math.inf)
+        self.assertEqual(audience.notices(one, True, 1e9), [])
+        audience.add(CONTACTS[5])
+        [notice] = audience.notices(one, True, now)
+        audience.answered(notice)
+        self.assertEqual(audience.notices(one, True, now), [])
+        self.assertEqual(len(audience.notices(announced(2, 0), True, now)), 1)
+
+    def test_shared_listeners(self) -> None:
+        """Who told the whole council hears an announcement from the member who made it only."""
+        audience = Audience()
+        audience.add(CONTACTS[5], is_shared=True)
+        self.assertEqual(audience.notices(announced(1, 1), False, 0.0), [])
+        self.assertEqual(len(audience.notices(announced(1, 1), True, 0.0)), 1)
+
+    def test_room(self) -> None:
+        """The one that came first goes when there is no more room."""
+        audience = Audience()
+        for number in range(MAX_LISTENERS + 1):
+            audience.add(Contact(number.to_bytes(32), Address("10.0.0.1", 1)))
+        self.assertEqual(len(audience), MAX_LISTENERS)
+
+
+class BidderTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.party = party(5)
+        self.told: list[list[float]] = []
+        self.party.on_summary = lambda reports: self.told.append([r.cost for r in reports])
+
+    def test_direct(self) -> None:
+        """In a small team a bid goes to each member of the council, again where it was not confirmed."""
+        self.party.bid(bid(5, 2.0), DIRECT, 0.0)
+        sent = offers(self.party.errands(0.0))
+        self.assertEqual([offer.to for offer in sent], list(COUNCIL))
+        self.assertTrue(all(offer.is_shared for offer in sent))
+        self.party.answered(sent[0], 0.1)
+        self.party.answered(sent[1], 0.1)
+        self.party.failed(sent[2], 0.4)
+        again = offers(self.party.errands(self.party.due))
+        self.assertEqual([offer.to for offer in again], [COUNCIL[2]])
+
+    def test_new_bid_while_the_old_one_is_under_way(self) -> None:
+        """What is confirmed is the bid that was sent, not the one made meanwhile."""
+        self.party.bid(bid(5, 2.0), DIRECT, 0.0)
+        sent = offers(self.party.errands(0.0))
+        self.party.bid(bid(5, 1.0, 1), DIRECT, 0.01)
+        for offer in sent:
+            self.party.answered(offer, 0.1)
+        newer = offers(self.party.errands(0.1))
+        self.assertEqual([offer.bids[0].revision for offer in newer], [1, 1, 1])
+
+    def test_own_bid_beats_what_is_announced(self) -> None:
+        """A bidder whose bid should have won sends it straight to the council within half the waiting period."""
+        self.party.bid(bid(5, 2.0), TREE, 0.0)
+        self.party.announced(announced(1, 0, bid(6, 3.0)), 0.6)
+        due = self.party.due
+        self.party._branch._send_at = math.inf
+        self.assertTrue(0.6 <= self.party.due <= 0.6 + AUCTION.waiting / 2, due)
+        [straight] = [o for o in offers(self.party.errands(self.party.due)) if o.is_straight]
+        self.assertEqual((straight.to, straight.bids), (COUNCIL[0], (bid(5, 2.0),)))
+
+    def test_own_bid_that_does_not_matter(self) -> None:
+        """A bidder that would not have won leaves the council alone."""
+        self.party.bid(bid(5, 4.0), TREE, 0.0)
+        self.party.announced(announced(1, 0, bid(6, 3.0)), 0.6)
+        self.assertEqual([o for t in range(10) for o in offers(self.party.errands(float(t))) if o.is_straight], [])
+
+    def test_silence(self) -> None:
+        """A bidder that is announced nothing asks the council, one member after the other."""
+        self.party.bid(bid(5, 2.0), TREE, 0.0)
+        asked: list[Contact] = []
+        now = 0.0
+        for _ in range(20):
+            now = max(now, min(self.party.due, 5.0))
+            for offer in offers(self.party.errands(now)):
+                if offer.is_straight:
+                    asked.append(offer.to)
+                    self.party.failed(offer, now)
+                else:
+                    self.party.answered(offer, now)
+            if len(asked) == 4:
+                break
+        self.assertEqual(asked, [*COUNCIL, COUNCIL[0]])
+        self.assertTrue(now < 5.0)
+
+    def test_taken_back_but_still_announced(self) -> None:
+        """A bidder that took its bid back insists while the council still names it."""
+        self.party.bid(bid(5, 2.0), DIRECT, 0.0)
+        for offer in offers(self.party.errands(0.0)):
+            self.party.answered(offer, 0.0)
+        self.party.bid(bid(5, None, 1), DIRECT, 0.1)
+        for offer in offers(self.party.errands(0.1)):
+            self.party.failed(offer, 0.1)
+        self.party.announced(announced(1, 0, bid(5, 2.0)), 0.6)
+        sent = [offer for offer in offers(self.party.errands(2.0)) if offer.is_straight]
+        self.assertEqual([offer.bids for offer in sent], [(bid(5, None, 1),)])
+
+    def test_bid_of_a_former_life(self) -> None:
+        """A node that forgot how often it had bid learns it from the announcement."""
+        self.party.bid(bid(5, 9.0), DIRECT, 0.0)
+        self.party.announced(announced(1, 0, bid(5, 1.0, 7)), 0.6)
+        self.assertTrue(self.party.is_outlived)
+        self.party.bid(bid(5, 9.0, self.party.next_revision), DIRECT, 0.6)
+        self.assertFalse(self.party.is_outlived)
+        self.assertGreater(self.party.next_revision, 8)
+
+    def test_later_announcements(self) -> None:
+        """Only what has precedence is told, whatever the order, and nothing is told twice."""
+        for announcement in (announced(2, 0, bid(6, 1.0)), announced(1, 0, bid(7, 0.5)), announced(2, 1, bid(8, 0.2))):
+            self.party.announced(announcement, 1.0)
+        self.party.announced(announced(3, 1, bid(6, 1.0)), 1.0)
+        self.assertEqual(self.told, [[1.0]])
+
+
+class BranchTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.party = party(5)
+
+    def test_one_message_for_many(self) -> None:
+        """What comes from several children within the wait goes on in one offer, to one contact nearer to the key."""
+        for place in (6, 7, 8):
+            self.party.offered([bid(place, float(place))], CONTACTS[place], 0.0, False, 0.0)
+        [up] = offers(self.party.errands(self.party.due))
+        self.assertEqual([b.agent for b in up.bids], sorted(AGENTS[place].node_id.hex() for place in (6, 7, 8)))
+        self.assertEqual(up.to, hops(AUCTION, CONTACTS[5].node_id, CONTACTS)[0])
+
+    def test_nearer_ones_wait_longer(self) -> None:
+        """The nearer a node is to the key the longer it waits for what is behind it, up to half the waiting period."""
+        waits = []
+        for contact in sorted(CONTACTS[3:], key=lambda c: shared_bits(c.node_id, AUCTION.key)):
+            one = party(CONTACTS.index(contact))
+            one.offered([bid(6, 1.0)], CONTACTS[6], 0.0, False, 0.0)
+            waits.append(one.due)
+        self.assertEqual(waits, sorted(waits))
+        self.assertEqual(waits[0], 0.0)
+        self.assertTrue(0.02 < waits[-1] <= AUCTION.waiting / 2)
+
+    def test_next_nearest(self) -> None:
+        """Where the parent does not answer, everything goes to the next nearest contact, and at last to the council."""
+        self.party.offered([bid(6, 1.0)], CONTACTS[6], 0.0, False, 0.0)
+        expected = hops(AUCTION, CONTACTS[5].node_id, [c for c in CONTACTS if c is not CONTACTS[5]])
+        self.assertEqual(len(expected), 4 + len(COUNCIL))
+        asked = []
+        for _ in expected:
+            [up] = [o for o in offers(self.party.errands(self.party.due)) if not o.is_straight]
+            asked.append(up.to)
+            self.party.failed(up, 0.3)
+        self.assertEqual(asked, expected)
+
+    def test_confirmed_is_not_sent_again(self) -> None:
+        """Only what the parent does not have goes out; a copy from a child sends nothing."""
+        self.party.offered([bid(6, 1.0)], CONTACTS[6], 0.0, False, 0.0)
+        [up] = offers(self.party.errands(self.party.due))
+        self.party.answered(up, 0.2)
+        self.party.offered([bid(6, 1.0)], CONTACTS[6], 0.0, False, 0.3)
+        self.party.offered([bid(7, 0.5)], CONTACTS[7], 0.0, False, 0.3)
+        [more] = offers(self.party.errands(self.party.due))
+        self.assertEqual([b.report and b.report.cost for b in more.bids], [0.5])
+
+    def test_announcement_goes_down(self) -> None:
+        """Each child is told what is announced, and one that comes late gets it in return for its offer."""
+        for place in (6, 7):
+            self.party.offered([bid(place, 1.0)], CONTACTS[place], 0.0, False, 0.0)
+        word = announced(1, 0, bid(6, 1.0))
+        self.party.announced(word, 0.6)
+        self.assertEqual([n.to for n in notices(self.party.errands(0.6))], [CONTACTS[6], CONTACTS[7]])
+        self.assertIs(self.party.offered([bid(8, 9.0)], CONTACTS[8], 0.0, False, 0.7), word)
+        self.assertEqual(notices(self.party.errands(0.7)), [])
+
+    def test_relay_asks_for_those_behind(self) -> None:
+        """A node that only carries others' bids asks the council where nothing comes down, and gives up in the end."""
+        self.party.offered([bid(6, 1.0)], CONTACTS[6], 0.0, False, 0.0)
+        straight = 0
+        for step in range(600):
+            for offer in offers(self.party.errands(step * 0.1)):
+                straight += offer.is_straight
+                self.party.answered(offer, step * 0.1)
+        self.assertEqual(straight, MAX_RELAYED)
+
+    def test_so_many_children(self) -> None:
+        """A branch that carries the bids of as many as it may has no room for another one, but for those it has."""
+        children = [Contact(number.to_bytes(32), Address("10.0.0.1", 1)) for number in range(MAX_CHILDREN)]
+        for child in children:
+            self.assertTrue(self.party.has_room(child))
+            self.party.offered([], child, 0.0, False, 0.0)
+        self.assertFalse(self.party.has_room(CONTACTS[6]))
+        self.assertTrue(self.party.has_room(children[0]))
+
+    def test_the_council_hears_everybody(self) -> None:
+        """A member of the council has room for whoever comes: there is nobody else to go to."""
+        member = party(0)
+        for number in range(MAX_CHILDREN + 1):
+            member.offered([], Contact(number.to_bytes(32), Address("10.0.0.1", 1)), 0.0, False, 0.0)
+        self.assertTrue(member.has_room(CONTACTS[6]))
+
+
+class TellerTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.first, self.second = party(0), party(1)
+
+    def take(
+        self, member: Party, place: int, cost: float | None, now: float, revision: int = 0, shared: bool = True
+    ) -> None:
+        """Let a member of the council take a bid."""
+        member.offered([bid(place, cost, revision)], CONTACTS[place], 0.0, shared, now)
+
+    def test_closes_after_the_waiting_period(self) -> None:
+        """The first member announces when the waiting period is over, counted from the first bid anywhere."""
+        self.first.offered([bid(5, 2.0)], CONTACTS[5], 0.2, True, 1.0)
+        self.first.errands(1.29)
+        self.assertIsNone(self.first.announcement)
+        self.assertAlmostEqual(self.first.due, 1.3)
+        told = notices(self.first.errands(1.3))
+        self.assertEqual({n.to for n in told}, {CONTACTS[5], *COUNCIL[1:]})
+        assert self.first.announcement is not None
+        self.assertTrue(self.first.announcement.is_genuine(AUCTION))
+
+    def test_closes_when_all_have_bid(self) -> None:
+        """Nobody waits where every expected agent has bid or abstained."""
+        self.first.expect(2)
+        self.take(self.first, 5, 2.0, 0.0)
+        self.take(self.first, 6, None, 0.1)
+        self.assertEqual(len(notices(self.first.errands(0.1))), 4)
+
+    def test_next_member_stands_in(self) -> None:
+        """Where the first member is silent the second announces, and it does not where the first was heard."""
+        self.take(self.second, 5, 2.0, 0.0)
+        self.second.errands(0.6)
+        self.assertIsNone(self.second.announcement)
+        self.assertTrue(0.6 < self.second.due < 1.0)
+        self.second.errands(self.second.due)
+        assert self.second.announcement is not None
+        self.assertEqual(self.second.announcement.precedence, (1, -1))
+        third = party(2)
+        self.take(third, 5, 2.0, 0.0)
+        third.announced(announced(1, 0, bid(5, 2.0)), 0.5)
+        third.errands(5.0)
+        self.assertEqual(third.announcement, announced(1, 0, bid(5, 2.0)))
+
+    def test_late_bid_that_matters(self) -> None:
+        """A late bid that changes who should act is announced anew; in a large team another one is not."""
+        for place in (5, 6, 7):
+            self.take(self.first, place, float(place), 0.0, shared=False)
+        self.first.errands(0.5)
+        self.take(self.first, 8, 8.0, 0.9, shared=False)
+        self.first.errands(2.0)
+        assert self.first.announcement is not None
+        self.assertEqual(self.first.announcement.number, 1)
+        self.take(self.first, 9, 1.0, 2.1, shared=False)
+        self.first.errands(self.first.due)
+        self.assertEqual(self.first.announcement.number, 2)
+        self.assertEqual(self.first.announcement.reports[0].cost, 1.0)
+
+    def test_withdrawal_is_announced(self) -> None:
+        """When the winner takes its bid back, the others learn it."""
+        self.take(self.first, 5, 1.0, 0.0)
+        self.take(self.first, 6, 2.0, 0.0)
+        self.first.errands(0.5)
+        self.take(self.first, 5, None, 1.0, revision=1)
+        self.first.errands(2.0)
+        assert self.first.announcement is not None
+        self.assertEqual([r.cost for r in self.first.announcement.reports], [2.0])
+
+    def test_fellows_share(self) -> None:
+        """What a member alone was given goes to its fellows; what all were given does not."""
+        self.take(self.second, 5, 2.0, 0.0, shared=True)
+        self.assertEqual(offers(self.second.errands(0.3)), [])
+        self.take(self.second, 6, 1.0, 0.3, shared=False)
+        sent = offers(self.second.errands(0.41))
+        self.assertEqual({o.to for o in sent}, {COUNCIL[0], COUNCIL[2]})
+        self.assertTrue(all(b.report and b.report.cost == 1.0 for o in sent for b in o.bids))
+
+    def test_large_summary_in_several_messages(self) -> None:
+        """No message has more bids than its receiver checks in one go."""
+        one = party(1)
+        many = [bid(5, None, revision) for revision in range(1, 3)]
+        self.assertLessEqual(len(many), MAX_BIDS)
+        one.offered(many, CONTACTS[5], 0.0, False, 0.0)
+        self.assertTrue(all(len(o.bids) <= MAX_BIDS for o in offers(one.errands(1.0))))
+
+
+class FloodTests(SynchronousTestCase):
+    def cut_off(self, auction: Auction) -> list[Errand]:
+        """What a bidder sends that reaches nobody of the council."""
+        one = party(5, auction)
+        one.bid(bid(5, 2.0, auction=auction), DIRECT, 0.0)
+        sent: list[Errand] = []
+        for step in range(40):
+            for errand in one.errands(step * 0.1):
+                sent.append(errand)
+                if isinstance(errand, Offer):
+                    one.failed(errand, step * 0.1)
+        return sent
+
+    def test_only_best_effort(self) -> None:
+        """Bids are cried to eight neighbours where no council answers, those for an exclusive task never."""
+        cries = [e for e in self.cut_off(BEST_EFFORT) if isinstance(e, Cry)]
+        self.assertEqual(len({cry.to.node_id for cry in cries}), 8)
+        self.assertEqual([e for e in self.cut_off(AUCTION) if isinstance(e, Cry)], [])
+
+    def test_each_change_once(self) -> None:
+        """A neighbour passes on what is news to it, and tells it when the waiting period is over."""
+        one = party(5, BEST_EFFORT)
+        told: list[list[float]] = []
+        one.on_summary = lambda reports: told.append([r.cost for r in reports])
+        one.cried([bid(6, 1.0, auction=BEST_EFFORT)], CONTACTS[6], 0.0)
+        self.assertEqual(len(one.errands(0.0)), 8)
+        one.cried([bid(6, 1.0, auction=BEST_EFFORT)], CONTACTS[7], 0.1)
+        self.assertEqual(one.errands(0.1), [])
+        self.assertEqual(told, [])
+        one.errands(one.due)
+        self.assertEqual(told, [[1.0]])
+
+    def test_cries_for_exclusive_tasks(self) -> None:
+        """What is cried for an exclusive task is not heard."""
+        one = party(5)
+        one.cried([bid(6, 1.0)], CONTACTS[6], 0.0)
+        self.assertEqual(one.errands(9.0), [])
+
+
+class PartiesTests(SynchronousTestCase):
+    def made(self, number: int) -> Party:
+        """A party in one of many auctions."""
+        return party(5, Auction(f"job {number}", 1, COUNCIL))
+
+    def test_whoever_opens_most_makes_room(self) -> None:
+        """A peer that invents auctions drives out its own; those of this node stay."""
+        parties = Parties()
+        own, honest = self.made(0), self.made(1)
+        parties.add(own, OWN, 0.0)
+        parties.add(honest, b"honest", 0.0)
+        for number in range(2, MAX_PARTIES + 50):
+            parties.add(self.made(number), b"liar", 1.0)
+        self.assertEqual(len(parties), MAX_PARTIES)
+        self.assertIs(parties.get(own.auction.digest), own)
+        self.assertIs(parties.get(honest.auction.digest), honest)
+
+    def test_idle_ones_are_forgotten(self) -> None:
+        """A party in which nothing happens any more goes when another comes; those of this node stay."""
+        parties = Parties()
+        own, old, busy = self.made(0), self.made(1), self.made(2)
+        parties.add(own, OWN, 0.0)
+        parties.add(old, b"peer", 0.0)
+        parties.add(busy, b"peer", 0.0)
+        parties.touch(busy.auction.digest, LIFE_S)
+        self.assertEqual(parties.add(self.made(3), b"peer", LIFE_S + 1.0), [old])
+        self.assertEqual(len(parties), 3)

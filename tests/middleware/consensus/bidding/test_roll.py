@@ -1,0 +1,145 @@
+"""Tests of the group of a task where its bids go to the council as well."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from twisted.internet.defer import Deferred
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.consensus.bidding.group import Group, Heard
+from middleware.consensus.bidding.roll import Roll
+from middleware.consensus.strategy import Report
+from middleware.consensus.view import View
+from middleware.tasks.task import Member, Result, Task
+from tests.fleet import FleetCase, SwarmFleet
+
+
+def member(uuid: str, cost: float | None) -> Member:
+    """What a participant's record says."""
+    return Member(uuid, uuid, "WAITING", cost)
+
+
+def costs(members: list[Member]) -> dict[str, float | None]:
+    """Who bids what."""
+    return {m.uuid: m.cost for m in members}
+
+
+class RollTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.roll = Roll()
+        self.roll.present([member("a", 3.0), member("b", None)])
+
+    def test_announced_bids_count(self) -> None:
+        """A bid that was announced after the record counts; who is not present bids nothing."""
+        self.roll.announced([Report("b", 1.0), Report("c", 0.5)])
+        self.assertEqual(costs(self.roll.members()), {"a": 3.0, "b": 1.0})
+
+    def test_later_record_counts(self) -> None:
+        """A record that changed after the announcement counts, also where it takes the bid back."""
+        self.roll.announced([Report("a", 2.0), Report("b", 1.0)])
+        self.roll.present([member("a", None), member("b", None)])
+        self.assertEqual(costs(self.roll.members()), {"a": None, "b": 1.0})
+
+    def test_announced_bids_tell_all_that_is_read(self) -> None:
+        """Of an announced bid all counts that the strategy reads; a record with another vote is the later word."""
+        roll = Roll(View(("choice", "weight")))
+        roll.present([member("a", 3.0), member("b", 2.0)])
+        roll.announced([Report("a", 3.0, choice="red", weight=2.0, battery=0.1), Report("b", 2.0, weight=-1.0)])
+        told = {m.uuid: (m.choice, m.weight, m.battery) for m in roll.members()}
+        self.assertEqual(told, {"a": ("red", 2.0, 1.0), "b": ("", 1.0, 1.0)})
+        roll.present([replace(member("a", 3.0), choice="blue"), member("b", 2.0)])
+        self.assertEqual(roll.members()[0].choice, "blue")
+
+    def test_who_left_bids_nothing(self) -> None:
+        """What was announced of a member goes with it, and does not count when it comes back."""
+        self.roll.announced([Report("b", 1.0)])
+        self.roll.present([member("a", 3.0)])
+        self.roll.present([member("a", 3.0), member("b", None)])
+        self.assertEqual(costs(self.roll.members()), {"a": 3.0, "b": None})
+        self.roll.present([member("a", 3.0)])
+        self.roll.announced([Report("b", 1.0)])
+        self.assertEqual(self.roll.awaited(), [])
+
+    def test_announced_before_the_record(self) -> None:
+        """What was announced of somebody whose record is on its way counts when that comes, until it says otherwise."""
+        self.roll.announced([Report("c", 0.5)])
+        self.assertEqual(self.roll.awaited(), [Report("c", 0.5)])
+        here = [member("a", 3.0), member("b", None)]
+        self.roll.present([*here, member("c", None)])
+        self.assertEqual((costs(self.roll.members())["c"], self.roll.awaited()), (0.5, []))
+        self.roll.present([*here, member("c", 0.7)])
+        self.assertEqual(costs(self.roll.members())["c"], 0.7)
+
+    def test_newest_announcement_alone_awaits(self) -> None:
+        """Who is not announced any more is not awaited, and its record, which came later, holds."""
+        self.roll.announced([Report("c", 0.5), Report("d", 0.6)])
+        self.roll.present([member("a", 3.0), member("d", None)])
+        self.roll.announced([Report("a", 2.0)])
+        self.assertEqual(self.roll.awaited(), [])
+        self.assertEqual(costs(self.roll.members()), {"a": 2.0, "d": None})
+
+
+class GroupTests(FleetCase):
+    """Behaviour of a ``Group`` that bids."""
+
+    def setUp(self) -> None:
+        super().setUp()
+        self.heard: dict[int, list[dict[str, float | None]]] = {place: [] for place in range(3)}
+
+    def groups(self, fleet: SwarmFleet) -> list[Group]:
+        """The places of the first three nodes in the group of a new task."""
+        task = Task("job", "find", "Find it", waiting_period=0.5)
+        task = self.done(fleet, Deferred.fromCoroutine(fleet.nodes[0].submit(task)))
+        self.assertEqual(len(task.council), 3)
+        groups = [fleet.nodes[place].group(task, self.hearing(place)) for place in range(3)]
+        for place, group in enumerate(groups):
+            group.report(member(fleet.nodes[place].uuid, None))
+        fleet.run(1.0)
+        return groups
+
+    def hearing(self, place: int) -> Heard:
+        """What takes down what the node of this place hears."""
+
+        def heard(members: list[Member], outcome: Result | None) -> None:
+            self.heard[place].append(costs(members))
+
+        return heard
+
+    def test_bids_come_by_the_council(self) -> None:
+        """A bid counts though no record tells it: the council announced it."""
+        fleet = self.swarm(4)
+        groups = self.groups(fleet)
+        uuid = fleet.nodes[1].uuid
+        bidding = groups[1]._bidding
+        assert bidding is not None
+        bidding.report(Report(uuid, 2.5))
+        fleet.run(1.0)
+        self.assertEqual([self.heard[place][-1][uuid] for place in range(3)], [2.5, 2.5, 2.5])
+
+    def test_records_and_bids_agree(self) -> None:
+        """A report is a record and a bid; taken back, it is neither."""
+        fleet = self.swarm(4)
+        groups = self.groups(fleet)
+        uuids = [fleet.nodes[place].uuid for place in range(3)]
+        for place, group in enumerate(groups):
+            group.report(member(uuids[place], 1.0 + place))
+        fleet.run(2.0)
+        groups[0].report(member(uuids[0], None))
+        fleet.run(2.0)
+        for place in range(3):
+            self.assertEqual(self.heard[place][-1], {uuids[0]: None, uuids[1]: 2.0, uuids[2]: 3.0})
+
+    def test_who_leaves_is_not_heard_of(self) -> None:
+        """A member that left is gone for the others, and hears nothing more itself."""
+        fleet = self.swarm(4)
+        groups = self.groups(fleet)
+        for place, group in enumerate(groups):
+            group.report(member(fleet.nodes[place].uuid, 1.0 + place))
+        fleet.run(2.0)
+        groups[0].leave()
+        groups[0].withdraw()
+        before = len(self.heard[0])
+        fleet.run(2.0)
+        self.assertEqual(len(self.heard[0]), before)
+        self.assertNotIn(fleet.nodes[0].uuid, self.heard[1][-1])

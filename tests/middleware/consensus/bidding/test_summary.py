@@ -1,0 +1,158 @@
+"""Tests of what is gathered: the join of bids, and strategies that do not behave."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Sequence
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.consensus.bidding.bid import Bid
+from middleware.consensus.bidding.rule import LEADING, MAX_REPORTS, Rule, leading
+from middleware.consensus.bidding.summary import MAX_SUPERSEDING, Summary
+from middleware.consensus.strategies.nearest import Nearest
+from middleware.consensus.strategy import Consensus, Report
+from tests.middleware.consensus.bidding.ground import AGENTS, bid, rule
+
+Spoken = tuple[int, float | None, int]
+places = st.integers(0, 7)
+costs = st.sampled_from([0.0, 1.0, 2.0, 3.0, None])
+batches = st.lists(st.lists(st.tuples(places, costs, st.integers(0, 2)), max_size=4), max_size=6)
+
+
+def unsigned(place: int, cost: float | None, revision: int) -> Bid:
+    """A bid as a party sees it; what each agent says in one revision is the same wherever it is heard."""
+    agent = AGENTS[place]
+    return Bid(agent.public, None if cost is None else Report(agent.node_id.hex(), cost), revision)
+
+
+class Finding:
+    """A strategy that has no summary of its own."""
+
+    find = Nearest().find
+
+
+class SummaryTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.summary = Summary(rule())
+
+    def test_best_stand(self) -> None:
+        """Where the strategy does not say how many, the cheapest stand, whatever the order in which they come."""
+        self.summary = Summary(Rule(Finding()))
+        for place, cost in ((3, 4.0), (4, 1.0), (5, 9.0), (6, 2.0), (7, 3.0), (8, 8.0)):
+            self.summary.join([bid(place, cost)])
+        self.assertEqual([report.cost for report in self.summary.standing], [1.0, 2.0, 3.0, 4.0])
+        self.assertEqual(len(self.summary.bids()), LEADING)
+
+    def test_change_is_told(self) -> None:
+        """A join says whether anything is another than before; a second copy changes nothing."""
+        self.assertTrue(self.summary.join([bid(3, 1.0)]))
+        self.assertFalse(self.summary.join([bid(3, 1.0)]))
+        self.assertFalse(self.summary.join([]))
+
+    @given(batches, st.randoms(use_true_random=False))
+    @settings(max_examples=80, deadline=None)
+    def test_join_is_idempotent_and_takes_any_order(self, batches: list[list[Spoken]], dice: random.Random) -> None:
+        """However often and in whatever order bids come, what stands is the same."""
+        batch = [[unsigned(*each) for each in one] for one in batches]
+        straight, mixed = Summary(rule()), Summary(rule())
+        for one in batch:
+            straight.join(one)
+        again = [*batch, *batch]
+        dice.shuffle(again)
+        for one in again:
+            mixed.join(one)
+        # Bids that were once crowded out come back when those before them are taken back: only of those that never
+        # were out of sight the same is promised.
+        for one in batch:
+            straight.join(one)
+            mixed.join(one)
+        self.assertEqual(straight.standing, mixed.standing)
+
+    def test_late_copy_of_an_earlier_bid(self) -> None:
+        """A bid that was taken back, or outbid by its own agent, does not stand again by a late copy."""
+        self.summary.join([bid(3, 1.0)])
+        self.summary.join([bid(3, None, 1)])
+        self.summary.join([bid(3, 1.0)])
+        self.assertEqual(self.summary.standing, ())
+        self.summary.join([bid(place, 2.0) for place in range(4, 9)])
+        self.summary.join([bid(3, 9.0, 2)])
+        self.summary.join([bid(3, 1.0)])
+        self.assertNotIn(1.0, [report.cost for report in self.summary.standing])
+
+    def test_two_things_at_once(self) -> None:
+        """An agent that says two things under one revision is heard as the same everywhere."""
+        other = Summary(rule())
+        self.summary.join([bid(3, 1.0)])
+        self.summary.join([bid(3, 5.0)])
+        other.join([bid(3, 5.0)])
+        other.join([bid(3, 1.0)])
+        self.assertEqual(self.summary.standing, other.standing)
+
+    def test_room(self) -> None:
+        """What was taken back is kept up to a limit, so nobody fills a node's memory."""
+        for number in range(MAX_SUPERSEDING + 50):
+            self.summary.join([Bid(number.to_bytes(32), None, 1)])
+        self.assertEqual(len(self.summary.bids()), MAX_SUPERSEDING)
+
+
+class Raising(Nearest):
+    def find(self, contacts: Sequence[Report]) -> Consensus:
+        """No opinion."""
+        raise ZeroDivisionError
+
+    def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
+        """No opinion."""
+        raise ZeroDivisionError
+
+
+class Lying(Nearest):
+    def find(self, contacts: Sequence[Report]) -> Consensus:
+        """Somebody who never bid."""
+        return Consensus("nobody")
+
+    def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
+        """Bids that nobody made, and all that were."""
+        return (Report("nobody", 0.0), *a, *b)
+
+
+class Hoarding(Nearest):
+    def merge(self, a: Sequence[Report], b: Sequence[Report]) -> tuple[Report, ...]:
+        """Everything, twice."""
+        return (*a, *b, *b)
+
+
+class RuleTests(SynchronousTestCase):
+    def test_strategy_that_raises(self) -> None:
+        """A strategy that raises is blamed by name, and the nearest stand."""
+        blamed: list[str] = []
+        raising = Rule(Raising(), lambda method, error: blamed.append(method))
+        both = (Report("a", 2.0), Report("b", 1.0))
+        self.assertEqual(raising.merged(both, ()), (both[1], both[0]))
+        self.assertEqual(raising.assigned(both), "b")
+        self.assertEqual(blamed, ["merge", "find"])
+
+    def test_strategy_that_lies(self) -> None:
+        """What a strategy makes up is dropped: nobody wins who did not bid."""
+        lying = Rule(Lying())
+        both = (Report("a", 2.0), Report("b", 1.0))
+        self.assertEqual(lying.merged(both, ()), (both[1], both[0]))
+        self.assertEqual(lying.assigned(both), "b")
+        self.assertIsNone(lying.assigned(()))
+
+    def test_strategy_that_hoards(self) -> None:
+        """A summary never has more reports than there is room for, and one of each agent."""
+        reports = [Report(f"{n:040}", float(n)) for n in range(MAX_REPORTS + 100)]
+        self.assertEqual(len(Rule(Hoarding()).merged(reports, reports)), MAX_REPORTS)
+        twice = Rule(Hoarding()).merged([Report("a", 1.0)], [Report("a", 2.0)])
+        self.assertEqual(twice, (Report("a", 1.0),))
+
+    @given(*(st.lists(st.builds(Report, st.sampled_from("abcdefgh"), st.floats(0, 9))) for _ in range(3)))
+    @settings(max_examples=60, deadline=None)
+    def test_leading_is_a_join(self, a: list[Report], b: list[Report], c: list[Report]) -> None:
+        """The built-in summary is commutative, associative and idempotent."""
+        self.assertEqual(leading(a, b), leading(b, a))
+        self.assertEqual(leading(leading(a, b), c), leading(a, leading(b, c)))
+        self.assertEqual(leading(leading(a, b), b), leading(a, b))

@@ -1,0 +1,151 @@
+"""Tests of what travels: auctions, bids and announcements, signed, and refused where they cannot be believed."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import msgpack
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.consensus.bidding.announcement import announcement_of
+from middleware.consensus.bidding.auction import Auction, auction_of
+from middleware.consensus.bidding.bid import Bid, bid_of, report_of
+from middleware.consensus.strategy import Report
+from tests.middleware.consensus.bidding.ground import AGENTS, AUCTION, CONTACTS, COUNCIL, announced, bid
+
+leaves = st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats() | st.text() | st.binary()
+anything = st.recursive(leaves, lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner), max_leaves=12)
+
+
+def sent(content: Any) -> Any:
+    """What arrives of ``content``."""
+    return msgpack.unpackb(msgpack.packb(content))
+
+
+class AuctionTests(SynchronousTestCase):
+    def test_comes_as_it_went(self) -> None:
+        """An auction is the same on the other side, with the same digest."""
+        there = auction_of(sent(AUCTION.packed()))
+        self.assertEqual(there, AUCTION)
+        assert there is not None
+        self.assertEqual(there.digest, AUCTION.digest)
+
+    def test_council_is_part_of_it(self) -> None:
+        """Another council, epoch, strategy or waiting period makes another auction, so nobody can slip one in."""
+        others = [
+            replace(AUCTION, council=COUNCIL[:2]),
+            replace(AUCTION, epoch=2),
+            replace(AUCTION, strategy="cbba"),
+            replace(AUCTION, waiting=9.0),
+            replace(AUCTION, exclusive=False),
+        ]
+        self.assertEqual(len({each.digest for each in [AUCTION, *others]}), 6)
+
+    def test_unlawful_ones(self) -> None:
+        """A council that is empty, doubled or too large, an epoch or waiting period that is none: no auction."""
+        lawful = AUCTION.packed()
+        for place, wrong in ((0, ""), (0, 7), (1, -1), (2, []), (2, [CONTACTS[0].packed()] * 2), (3, "x" * 65)):
+            self.assertIsNone(auction_of([*lawful[:place], wrong, *lawful[place + 1 :]]), wrong)
+        for waiting in (math.nan, math.inf, -1.0, 1e9):
+            self.assertIsNone(auction_of([*lawful[:4], waiting, True]), waiting)
+
+    @given(anything)
+    @settings(max_examples=60, deadline=None)
+    def test_decoders_are_total(self, content: Any) -> None:
+        """Whatever comes, a decoder gives what it promises or None, and never raises."""
+        auction, one, announcement = auction_of(content), bid_of(content), announcement_of(content)
+        for shaped in ([AUCTION.packed()[:2] + [content] * 4], [AGENTS[0].public, content, 0, b"s" * 64]):
+            auction_of(shaped)
+            bid_of(shaped)
+        announcement_of([1, 0, content, b"s" * 64])
+        announcement_of([1, 0, [["a" * 40, content, 0]], b"s" * 64])
+        self.assertTrue(auction is None or isinstance(auction, Auction))
+        self.assertEqual((one, announcement), (None, None))
+
+
+class BidTests(SynchronousTestCase):
+    def test_comes_as_it_went(self) -> None:
+        """A bid and its withdrawal are the same on the other side, and genuine."""
+        for one in (bid(3, 2.5), bid(3, 0), bid(3, None, 4)):
+            there = bid_of(sent(one.packed()))
+            self.assertEqual(there, one)
+            assert there is not None
+            self.assertTrue(there.is_genuine(AUCTION))
+
+    def test_forged_ones(self) -> None:
+        """Another cost, revision, key or auction than the one signed is not genuine."""
+        one = bid(3, 2.5)
+        assert one.report is not None
+        forged = [
+            replace(one, report=replace(one.report, cost=0.1)),
+            replace(one, report=None),
+            replace(one, revision=1),
+            replace(one, public=AGENTS[4].public),
+        ]
+        for each in forged:
+            self.assertFalse(each.is_genuine(AUCTION))
+        self.assertFalse(one.is_genuine(replace(AUCTION, epoch=2)))
+
+    def test_costs_that_are_none(self) -> None:
+        """NaN, infinite, negative and enormous costs are no bids, and neither are fields that a report has not."""
+        for cost in (math.nan, math.inf, -math.inf, -1.0, 1e300, True, "1", None):
+            self.assertIsNone(report_of({"cost": cost}, "a"), cost)
+        self.assertIsNone(report_of({"cost": 1.0, "friend": "b"}, "a"))
+        self.assertIsNone(report_of({"cost": 1.0, "agent": "b"}, "a"))
+
+    def test_agent_follows_from_the_key(self) -> None:
+        """Nobody bids for another: the agent is not in the message."""
+        there = bid_of(sent(bid(3, 2.5).packed()))
+        assert there is not None and there.report is not None
+        self.assertEqual(there.report.agent, AGENTS[3].node_id.hex())
+
+
+class AnnouncementTests(SynchronousTestCase):
+    def test_comes_as_it_went(self) -> None:
+        """An announcement is the same on the other side, and genuine."""
+        one = announced(3, 1, bid(4, 1.5), bid(5, 2.5, 2))
+        there = announcement_of(sent(one.packed()))
+        self.assertEqual(there, one)
+        assert there is not None
+        self.assertTrue(there.is_genuine(AUCTION))
+
+    def test_only_of_the_council(self) -> None:
+        """What a node outside of the pinned council signs, under whatever place it claims, is not genuine."""
+        stranger = AGENTS[7]
+        one = announced(1, 0, bid(4, 1.5))
+        for rank in (0, 1, 2, 3, 99):
+            forged = replace(one, rank=rank).signed(stranger.sign, AUCTION)
+            self.assertFalse(forged.is_genuine(AUCTION), rank)
+
+    def test_forged_ones(self) -> None:
+        """Another number, place, winner or auction than the one signed is not genuine."""
+        one = announced(1, 0, bid(4, 1.5))
+        other = announced(1, 0, bid(5, 1.5))
+        for forged in (replace(one, number=2), replace(one, rank=1), replace(one, entries=other.entries)):
+            self.assertFalse(forged.is_genuine(AUCTION))
+        self.assertFalse(one.is_genuine(replace(AUCTION, epoch=2)))
+
+    def test_doubled_agents(self) -> None:
+        """An announcement with two reports of one agent is none."""
+        one = announced(1, 0, bid(4, 1.5), bid(4, 2.5))
+        self.assertIsNone(announcement_of(sent(one.packed())))
+
+    def test_precedence(self) -> None:
+        """The higher number holds; of equal ones that of the earlier member."""
+        first, second, third = announced(1, 0), announced(1, 2), announced(2, 2)
+        self.assertEqual(sorted([first, third, second], key=lambda a: a.precedence), [second, first, third])
+
+
+class ReportTests(SynchronousTestCase):
+    def test_every_field_comes_through(self) -> None:
+        """A bid with all that a report may say is genuine on the other side."""
+        agent = AGENTS[3]
+        one = Bid(agent.public, Report(agent.node_id.hex(), 7)).signed(agent, AUCTION)
+        there = bid_of(sent(one.packed()))
+        assert there is not None
+        self.assertEqual(there.report, one.report)
+        self.assertTrue(there.is_genuine(AUCTION))

@@ -1,0 +1,302 @@
+"""Tests of ``middleware.consensus.lease.acceptor``."""
+
+from __future__ import annotations
+
+import math
+
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.consensus.lease.acceptor import IDLE_AGE, MAX_LISTENERS, LeaseAcceptor
+from middleware.consensus.lease.lease_codec import CODEC, LIFE
+from middleware.entangled.data.memory import MemoryStore
+from middleware.entangled.quorum import log
+from middleware.entangled.quorum.ballot import ROOM, Ballot
+from middleware.entangled.quorum.register import Kind, Reply
+from tests.middleware.consensus.lease.test_lease_codec import MEMBERS
+
+TTL = 2.0
+
+
+def ballot(number: int, agent: str) -> Ballot:
+    """A ballot of the agent's only life."""
+    return Ballot(number * LIFE, agent)
+
+
+class AcceptorTests(SynchronousTestCase):
+    def setUp(self) -> None:
+        self.acceptor = LeaseAcceptor(MemoryStore(), -math.inf)
+
+    def prepare(self, number: int, agent: str, now: float, configuration: int = 1) -> Reply:
+        """Ask for a promise."""
+        return self.acceptor.prepare("t", configuration, ballot(number, agent), TTL, now)
+
+    def propose(self, number: int, agent: str, token: int, now: float, configuration: int = 1) -> Reply:
+        """Ask for a lease."""
+        return self.acceptor.lease("t", configuration, ballot(number, agent), token, TTL, now)
+
+    def test_promise_and_grant(self) -> None:
+        """A ballot is promised, the lease granted for a ttl, and the next one told its token and how long it runs."""
+        self.assertEqual(self.prepare(1, "a", 0.0).kind, Kind.GRANTED)
+        self.assertEqual(self.propose(1, "a", 1, 0.5)[0:4], (Kind.GRANTED, ballot(1, "a"), 1, TTL))
+        refused = self.prepare(2, "b", 1.0)
+        self.assertEqual((refused.kind, refused.token, refused.remaining), (Kind.HELD, 1, 1.5))
+        self.assertEqual(self.prepare(2, "b", 2.5).kind, Kind.GRANTED)
+
+    def test_promise_for_the_time_after_a_lease(self) -> None:
+        """Shortly before a lease ends another is promised what follows; nothing is granted sooner for that."""
+        self.prepare(1, "a", 0.0)
+        self.propose(1, "a", 1, 0.0)
+        self.assertEqual(self.prepare(2, "b", 1.5).kind, Kind.HELD)
+        self.assertEqual(self.prepare(0, "b", 1.75).kind, Kind.HELD)
+        promised = self.prepare(2, "b", 1.75)
+        self.assertEqual((promised.kind, promised.remaining, promised.token), (Kind.GRANTED, 0.25, 1))
+        self.assertEqual(self.propose(2, "b", 2, 1.99).kind, Kind.HELD)
+        self.assertEqual(self.propose(2, "b", 2, 2.0).kind, Kind.GRANTED)
+
+    def test_promise_ends_no_lease(self) -> None:
+        """Who holds the lease renews it in spite of the promise, also when that is given back, but claims no other."""
+        self.prepare(1, "a", 0.0)
+        self.propose(1, "a", 1, 0.0)
+        self.prepare(2, "b", 1.75)
+        self.assertEqual(self.propose(1, "a", 2, 1.8).kind, Kind.OUTBID)
+        self.assertEqual(self.propose(1, "a", 1, 1.8).kind, Kind.GRANTED)
+        self.assertEqual(self.propose(2, "b", 2, 2.0).kind, Kind.HELD)
+        self.acceptor.free("t", ballot(2, "b"), 2.1)
+        self.assertEqual(self.propose(1, "a", 1, 2.2).kind, Kind.GRANTED)
+        self.assertEqual(self.propose(2, "b", 2, 4.3).kind, Kind.OUTBID)
+        self.assertEqual(self.prepare(3, "b", 4.3).kind, Kind.GRANTED)
+
+    def test_token_never_falls_and_belongs_to_one(self) -> None:
+        """A token at most as high as one granted to another is refused, under whatever ballot."""
+        self.prepare(1, "a", 0.0)
+        self.propose(1, "a", 5, 0.0)
+        self.prepare(2, "b", 3.0)
+        for token in (1, 4, 5):
+            self.assertEqual(self.propose(2, "b", token, 3.0)[:5:2], (Kind.OUTBID, 5, 1))
+        self.assertEqual(self.propose(2, "b", 6, 3.0).kind, Kind.GRANTED)
+
+    def test_former_life_is_another(self) -> None:
+        """A restarted agent waits like everybody until what its former life held has run out: its robot may move."""
+        self.prepare(1, "a", 0.0)
+        self.propose(1, "a", 1, 0.0)
+        self.assertEqual(self.acceptor.prepare("t", 1, Ballot(9 * LIFE + 5, "a"), TTL, 1.0).kind, Kind.HELD)
+
+    def test_release(self) -> None:
+        """What is given back is free at once, is told to those that asked, and no late proposal brings it back."""
+        self.prepare(1, "a", 0.0)
+        self.propose(1, "a", 1, 0.0)
+        self.prepare(2, "b", 0.5)
+        self.prepare(2, "c", 0.5)
+        self.assertEqual(self.acceptor.free("t", ballot(1, "a"), 1.0), ["b", "c"])
+        self.assertEqual(self.acceptor.free("t", ballot(1, "a"), 1.0), [])
+        self.assertEqual(self.propose(1, "a", 1, 1.0).kind, Kind.OUTBID)
+        self.assertEqual(self.prepare(2, "b", 1.0).kind, Kind.GRANTED)
+
+    def test_release_before_the_robot_rests(self) -> None:
+        """What is given back while the robot still moves is promised to others at once, and granted when it rests."""
+        self.prepare(1, "a", 0.0)
+        self.propose(1, "a", 1, 0.0)
+        self.prepare(2, "b", 0.5)
+        self.assertEqual(self.acceptor.free("t", ballot(1, "a"), 1.0, 0.2), ["b"])
+        promised = self.prepare(2, "b", 1.05)
+        self.assertEqual((promised.kind, round(promised.remaining, 3)), (Kind.GRANTED, 0.15))
+        early = self.propose(2, "b", 2, 1.15)
+        self.assertEqual((early.kind, round(early.remaining, 3)), (Kind.HELD, 0.05))
+        self.assertEqual(self.propose(1, "a", 1, 1.16).kind, Kind.OUTBID)
+        self.assertEqual(self.propose(2, "b", 2, 1.2).kind, Kind.GRANTED)
+
+    def test_change_by_the_holder(self) -> None:
+        """Who gives its own lease back by a change keeps others away; the member of the next council does, too."""
+        self.prepare(1, "a", 0.0)
+        self.propose(1, "a", 1, 0.0)
+        self.prepare(2, "a", 0.1)
+        self.assertEqual(self.acceptor.accept("t", 1, ballot(2, "a"), MEMBERS[:3], 0.1, 1, True).kind, Kind.GRANTED)
+        self.assertEqual(self.prepare(3, "b", 0.2).kind, Kind.HELD)
+        self.assertEqual(self.propose(2, "a", 1, 0.2).kind, Kind.SEALED)
+        self.acceptor.install("t", 2, MEMBERS[:3], 1, 0.3, ballot(2, "a"), TTL)
+        self.assertEqual(self.acceptor.prepare("t", 2, ballot(3, "b"), TTL, 1.0).kind, Kind.HELD)
+        self.assertEqual(self.acceptor.prepare("t", 2, ballot(3, "b"), TTL, 0.2 + TTL).kind, Kind.GRANTED)
+        self.assertEqual(self.acceptor.lease("t", 2, ballot(3, "b"), 2, TTL, 0.2 + TTL).kind, Kind.HELD)
+        self.assertEqual(self.acceptor.prepare("t", 2, ballot(4, "a"), TTL, 0.4).kind, Kind.GRANTED)
+        self.assertEqual(self.acceptor.prepare("t", 2, ballot(5, "b"), TTL, 0.3 + TTL).kind, Kind.GRANTED)
+
+    def test_release_that_overtakes_its_proposal(self) -> None:
+        """A proposal that arrives after its own release grants nothing."""
+        self.prepare(1, "a", 0.0)
+        self.acceptor.free("t", ballot(1, "a"), 0.1)
+        self.assertEqual(self.propose(1, "a", 1, 0.2).kind, Kind.OUTBID)
+        self.assertEqual(self.prepare(2, "a", 0.3).kind, Kind.GRANTED)
+
+    def test_release_of_an_older_ballot_too(self) -> None:
+        """Who gives back the latest that it asked for gives back all, whatever of it has arrived, and in what order."""
+        for proposes_first in (True, False):
+            self.setUp()
+            self.prepare(1, "a", 0.0)
+            self.propose(1, "a", 1, 0.0)
+            self.prepare(2, "a", 0.1)
+            if proposes_first:
+                self.propose(2, "a", 1, 0.2)
+            self.acceptor.free("t", ballot(2, "a"), 0.3)
+            self.assertEqual(self.propose(2, "a", 1, 0.4).kind, Kind.OUTBID)
+            self.acceptor.free("t", ballot(1, "a"), 0.5)
+            self.assertEqual(self.prepare(3, "b", 0.6)[:4:3], (Kind.GRANTED, 0.0))
+
+    def test_freed(self) -> None:
+        """A member that hears of a release as a stand-by takes it for one: from who holds that token, from no other."""
+        self.prepare(1, "a", 0.0)
+        self.propose(1, "a", 1, 0.0)
+        for agent, token in (("b", 1), ("a", 0), ("a", 2)):
+            self.assertEqual(self.acceptor.freed("t", agent, token, 0.5), [])
+            self.assertEqual(self.prepare(2, "b", 0.5).kind, Kind.HELD)
+        self.assertEqual(self.acceptor.freed("t", "a", 1, 0.5, 0.1), ["b"])
+        self.assertEqual(self.propose(1, "a", 1, 0.55).kind, Kind.OUTBID)
+        self.assertEqual(self.prepare(2, "b", 0.6).kind, Kind.GRANTED)
+        self.assertEqual(self.acceptor.freed("u", "a", 1, 0.5), [])
+
+    def test_listeners_are_bounded(self) -> None:
+        """However many ask, those that asked last are told."""
+        self.prepare(1, "a", 0.0)
+        self.propose(1, "a", 1, 0.0)
+        for number in range(3 * MAX_LISTENERS):
+            self.prepare(2, f"b{number:03d}", 0.5)
+        told = self.acceptor.free("t", ballot(1, "a"), 1.0)
+        self.assertEqual((len(told), told[-1]), (MAX_LISTENERS, f"b{3 * MAX_LISTENERS - 1:03d}"))
+
+    def test_numbers_are_bounded(self) -> None:
+        """The highest ballot that there is gets no promise, so that others can still ask."""
+        self.assertEqual(self.prepare(ROOM + 1, "a", 0.0).kind, Kind.OUTBID)
+        self.assertEqual(self.prepare(1, "b", 0.0).kind, Kind.GRANTED)
+
+    def test_no_room(self) -> None:
+        """A member that can remember no more tasks says so, and grants nothing that it would forget."""
+        self.patch(log, "MAX_REGISTERS", 1)
+        self.prepare(1, "a", 0.0)
+        for reply in (
+            self.acceptor.prepare("u", 1, ballot(1, "a"), TTL, 0.0),
+            self.acceptor.lease("u", 1, ballot(1, "a"), 1, TTL, 0.0),
+            self.acceptor.close("u", "a", 1, 0, 0.0),
+            self.acceptor.install("u", 2, MEMBERS[:3], 0, 0.0),
+        ):
+            self.assertEqual(reply.kind, Kind.QUIET)
+            self.assertGreater(reply.remaining, 0.0)
+
+    def test_close_after_release(self) -> None:
+        """An agent that gave its lease back may end the task under its token, also after a restart; nobody else."""
+        store = MemoryStore()
+        self.acceptor = LeaseAcceptor(store, -math.inf)
+        self.propose(1, "a", 3, 0.0)
+        self.acceptor.free("t", ballot(1, "a"), 0.5)
+        self.propose(2, "b", 4, 0.5)
+        self.acceptor.free("t", ballot(2, "b"), 1.0)
+        self.acceptor = LeaseAcceptor(store, -math.inf)
+        kinds = [self.acceptor.close("t", "a", 1, token, 1.0).kind for token in (3, 4)]
+        self.assertEqual(kinds, [Kind.OUTBID, Kind.BEHIND])
+        self.assertEqual(self.acceptor.close("t", "b", 1, 4, 1.0).kind, Kind.OVER)
+
+    def test_close_under_a_token_of_others(self) -> None:
+        """A member that only heard of a token signs no end under it."""
+        self.propose(1, "a", 3, 0.0)
+        self.acceptor.accept("t", 1, ballot(2, "b"), MEMBERS, 3.0, 5)
+        self.assertEqual([self.acceptor.close("t", agent, 1, 5, 3.0).kind for agent in ("a", "b")], [Kind.BEHIND] * 2)
+
+    def test_lower_token_that_is_heard(self) -> None:
+        """A proposer of a change that knows only a lower token lowers none."""
+        self.propose(1, "a", 3, 0.0)
+        self.assertEqual(self.acceptor.accept("t", 1, ballot(2, "b"), MEMBERS, TTL, 1).token, 3)
+
+    def test_close(self) -> None:
+        """After the end nothing is granted or renewed; who ends it learns how long another may still act."""
+        self.prepare(1, "a", 0.0)
+        self.propose(1, "a", 3, 0.0)
+        self.assertEqual(self.acceptor.close("t", "b", 1, 2, 0.5).kind, Kind.OUTBID)
+        closed = self.acceptor.close("t", "b", 1, 0, 0.5)
+        self.assertEqual((closed.kind, closed.remaining), (Kind.OVER, 1.5))
+        self.assertEqual(self.acceptor.close("t", "a", 1, 3, 0.5).remaining, 0.0)
+        self.assertEqual(self.propose(1, "a", 3, 0.6).kind, Kind.OVER)
+        self.assertEqual(self.prepare(9, "b", 99.0).kind, Kind.OVER)
+
+    def test_change(self) -> None:
+        """An accepted change seals the council; whoever asks is told of it, and once it is chosen where to go."""
+        self.prepare(1, "a", 0.0)
+        changed = self.acceptor.accept("t", 1, ballot(1, "a"), MEMBERS[:3], 0.0, 4)
+        self.assertEqual(changed.kind, Kind.GRANTED)
+        self.assertEqual(self.propose(1, "a", 5, 0.1).kind, Kind.SEALED)
+        asked = self.prepare(2, "b", 0.1)
+        self.assertEqual(
+            (asked.kind, asked.accepted, asked.value, asked.token), (Kind.SEALED, ballot(1, "a"), MEMBERS[:3], 4)
+        )
+        self.assertEqual(self.acceptor.accept("t", 1, ballot(1, "a"), MEMBERS[:2], 0.2, 4).kind, Kind.OUTBID)
+        installed = self.acceptor.install("t", 2, MEMBERS[:3], 4, 0.3, proof=b"proof")
+        self.assertEqual(installed.kind, Kind.GRANTED)
+        told = self.prepare(3, "b", 0.4)
+        self.assertEqual((told.kind, told.configuration, told.proof), (Kind.MOVED, 2, b"proof"))
+        self.assertEqual(self.prepare(3, "b", 0.4, configuration=2).kind, Kind.GRANTED)
+        self.assertEqual(self.propose(3, "b", 4, 0.4, configuration=2).kind, Kind.OUTBID)
+        self.assertEqual(self.propose(3, "b", 5, 0.4, configuration=2).kind, Kind.GRANTED)
+
+    def test_late_installs(self) -> None:
+        """What is installed twice, or after something newer, changes nothing."""
+        self.acceptor.install("t", 3, MEMBERS[:3], 9, 0.0)
+        self.prepare(1, "a", 0.0, configuration=3)
+        self.propose(1, "a", 10, 0.0, configuration=3)
+        self.assertEqual(self.acceptor.install("t", 3, MEMBERS[:3], 9, 0.1).kind, Kind.GRANTED)
+        self.assertEqual(self.acceptor.install("t", 2, MEMBERS[1:4], 5, 0.1).kind, Kind.MOVED)
+        self.assertEqual(self.prepare(2, "b", 0.2, configuration=3).kind, Kind.HELD)
+
+    def test_restart(self) -> None:
+        """Another process leases what was leased for as long again, and keeps promises and tokens."""
+        store = MemoryStore()
+        self.acceptor = LeaseAcceptor(store, -math.inf)
+        self.prepare(2, "a", 0.0)
+        self.propose(2, "a", 5, 0.0)
+        self.acceptor = LeaseAcceptor(store, 50.0)
+        self.assertEqual(self.prepare(3, "b", 51.0).kind, Kind.HELD)
+        self.assertEqual(self.prepare(1, "b", 50.0 + TTL)[:3], (Kind.OUTBID, ballot(2, "a"), 5))
+        self.assertEqual(self.prepare(3, "b", 50.0 + TTL).kind, Kind.GRANTED)
+
+    def test_promise_survives_a_restart(self) -> None:
+        """What was only promised is promised by another process, too; where a note is rotten it grants nothing."""
+        store = MemoryStore()
+        LeaseAcceptor(store, -math.inf).prepare("t", 1, ballot(2, "a"), TTL, 0.0)
+        self.acceptor = LeaseAcceptor(store, 50.0)
+        self.assertEqual(self.prepare(1, "b", 51.0).kind, Kind.OUTBID)
+        self.acceptor.accept("t", 1, ballot(2, "a"), MEMBERS[:3], 51.0)
+        self.acceptor = LeaseAcceptor(store, 60.0)
+        self.assertEqual(self.prepare(3, "b", 61.0).kind, Kind.SEALED)
+        store.note(CODEC.bucket_of("t"), b"rotten")
+        self.acceptor = LeaseAcceptor(store, 50.0)
+        self.assertEqual(self.prepare(1, "b", 51.0).kind, Kind.QUIET)
+
+    def test_look(self) -> None:
+        """To look is promised nothing, and lowers no promise."""
+        self.prepare(2, "a", 0.0)
+        self.assertEqual(self.prepare(0, "b", 0.0).kind, Kind.GRANTED)
+        self.assertEqual(self.prepare(1, "c", 0.0).kind, Kind.OUTBID)
+
+    def test_release_of_others(self) -> None:
+        """A ballot that was promised nothing here ends nothing, and bars nobody."""
+        self.propose(1, "a", 1, 0.0)
+        self.assertEqual(self.acceptor.free("t", ballot(9, "b"), 0.5), [])
+        self.assertEqual(self.prepare(2, "b", 0.5).kind, Kind.HELD)
+        self.assertEqual(self.prepare(2, "b", TTL).kind, Kind.GRANTED)
+
+    def test_forgotten(self) -> None:
+        """What a member forgot for want of room leaves a floor under its ballots and tokens, also after a restart."""
+        self.patch(log, "MAX_REGISTERS", 1)
+        store = MemoryStore()
+        self.acceptor = LeaseAcceptor(store, -math.inf)
+        self.prepare(2, "b", 0.0)
+        self.propose(2, "b", 5, 0.0)
+        self.assertEqual(self.acceptor.prepare("u", 1, ballot(9, "a"), TTL, 0.9 * IDLE_AGE).kind, Kind.QUIET)
+        self.assertEqual(self.acceptor.prepare("u", 1, ballot(9, "a"), TTL, 1.1 * IDLE_AGE).kind, Kind.GRANTED)
+        self.patch(log, "MAX_REGISTERS", 2)
+        for acceptor in (self.acceptor, LeaseAcceptor(store, 1.2 * IDLE_AGE)):
+            asked = acceptor.prepare("t", 1, ballot(2, "a"), TTL, 1.3 * IDLE_AGE)
+            self.assertEqual((asked.kind, asked.token), (Kind.OUTBID, 5))
+
+    def test_silence_after_a_restart(self) -> None:
+        """Who may have forgotten grants nothing for the longest ttl, and says how long that is."""
+        acceptor = LeaseAcceptor(MemoryStore(), 10.0)
+        self.assertEqual(acceptor.prepare("t", 1, ballot(1, "a"), TTL, 11.0), Reply(Kind.QUIET, remaining=1.0))
+        self.assertEqual(acceptor.lease("t", 1, ballot(1, "a"), 1, TTL, 11.0).kind, Kind.QUIET)
+        self.assertEqual(acceptor.prepare("t", 1, ballot(1, "a"), TTL, 12.0).kind, Kind.GRANTED)

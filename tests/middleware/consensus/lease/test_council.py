@@ -1,0 +1,232 @@
+"""Tests of ``middleware.consensus.lease.council``."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from middleware.consensus.lease.council import NoMajority, OpenClaim, Superseded
+from middleware.consensus.lease.lease_codec import LIFE
+from middleware.entangled.errors import Refused
+from middleware.entangled.quorum.ballot import Ballot
+from tests.middleware.consensus.lease.room import TTL, RoomCase, T
+
+
+class CouncilTests(RoomCase):
+    def change(self, place: int, *members: int) -> object:
+        """What comes of a change that an agent asks for: None, or the error."""
+        council = self.lessee(place).council
+        return self.outcome(council.change([self.room.contacts[n] for n in members]))
+
+    def places(self, place: int) -> list[int]:
+        """The council as an agent knows it."""
+        return [self.room.place_of(member) for member in self.lessee(place).council.members]
+
+    def test_ballots_rise(self) -> None:
+        """Each ballot is higher than the last, and than all that were seen."""
+        council = self.lessee(0).council
+        first, second = council.next_ballot(), council.next_ballot()
+        self.assertLess(first, second)
+        self.wanting(1)
+        council.hear(self.outcome(council.round("lease.prepare", 1, TTL).outcome))
+        self.assertTrue(first.is_kin(second, LIFE))
+        self.assertGreaterEqual(council.next_ballot().counter, 3 * LIFE)
+
+    def test_change(self) -> None:
+        """The council becomes another one, configuration + 1, and the next lease is that one's, with a higher token."""
+        self.wanting(0)
+        self.lessee(0).release()
+        self.run_for(0.1)
+        self.assertIsNone(self.change(1, 3, 4, 6))
+        self.assertEqual((self.places(1), self.lessee(1).council.configuration), ([3, 4, 6], 2))
+        for gone in (3, 5):
+            self.room.kill(gone)
+        self.wanting(1, 1.0)
+        self.assertEqual(self.token(1), 2)
+
+    def test_who_knows_the_old_council_is_told(self) -> None:
+        """A claimant with the old record is sent on by any member, of those that left too."""
+        self.assertIsNone(self.change(1, 0, 1, 2))
+        self.assertEqual(self.places(2), [0, 1, 2])
+        self.room.councils[T] = replace(self.room.councils[T], links=())
+        self.lessee(0)
+        self.assertEqual(self.places(0), [3, 4, 5])
+        self.wanting(0, 0.3)
+        self.assertEqual((self.places(0), self.holders()), ([0, 1, 2], [0]))
+
+    def test_member_that_was_away_is_told(self) -> None:
+        """A new member that was down when it was chosen learns of it from whoever claims."""
+        self.cut(6, *range(6))
+        self.assertIsNone(self.change(1, 3, 4, 6))
+        self.room.radio.cut.clear()
+        self.wanting(1)
+        self.room.kill(3)
+        self.run_for(3 * TTL)
+        self.assertEqual(self.holders(), [1])
+
+    def test_not_while_a_claim_is_open(self) -> None:
+        """As long as somebody holds the lease the council stays, also for the holder itself; the error says so."""
+        self.wanting(0)
+        for place in (0, 1):
+            error = self.change(place, 3, 4, 6)
+            self.assertIsInstance(error, OpenClaim)
+            self.assertIn("a claim is open", str(error))
+        self.run_for(TTL)
+        self.assertEqual(self.holders(), [0])
+
+    def test_moved_by_the_holder(self) -> None:
+        """Who holds the lease has it again in the new council, under a higher token, and nobody else in between."""
+        for stop_time in (0.0, 0.3):
+            self.room = self.made(stop_time)
+            self.wanting(0)
+            self.lessee(1).stand_by(1)
+            self.run_for(TTL)
+            self.room.referee.stop(0, T)
+            moved = self.lessee(0).move([self.room.contacts[n] for n in (3, 4, 6)])
+            self.assertIsNone(self.lessee(0).lease)
+            self.assertIsNone(self.outcome(moved, stop_time + 0.2))
+            self.assertEqual((self.holders(), self.token(0)), ([0], 2))
+            self.assertEqual((self.places(0), self.room.referee.wins), ([3, 4, 6], 2))
+            self.room.kill(5)
+            self.run_for(TTL)
+            self.room.kill(0)
+            self.run_for(2 * TTL)
+            self.assertEqual((self.holders(), self.places(1), self.room.referee.found), ([1], [3, 4, 6], []))
+
+    def test_move_that_fails(self) -> None:
+        """A holder whose council does not change claims the lease again where it was."""
+        self.wanting(0)
+        self.run_for(TTL)
+        moved = self.lessee(0).move([self.room.contacts[n] for n in (1, 2, 6)])
+        self.cut(0, 1, 2, 6)
+        self.assertIsInstance(self.outcome(moved), NoMajority)
+        self.run_for(TTL)
+        self.room.radio.cut.clear()
+        self.run_for(3 * TTL)
+        self.assertEqual(self.holders(), [0])
+
+    def test_silent_members_are_known(self) -> None:
+        """The holder knows who has not answered for how long; who comes back is silent no more."""
+        self.wanting(0)
+        self.cut(4, *range(4), 5, 6)
+        self.run_for(4.0)
+        council = self.lessee(0).council
+        self.assertEqual((council.silent(3.0), council.silent(4.5)), ((self.room.contacts[4],), ()))
+        self.room.radio.cut.clear()
+        self.run_for(TTL)
+        self.assertEqual(council.silent(0.0), ())
+        self.lessee(0).release()
+        self.cut(5, *range(5), 6)
+        self.run_for(5.0)
+        self.assertEqual(council.silent(3.0), ())
+        for _ in range(3):
+            council.visit()
+            self.run_for(2.0)
+        self.assertEqual(council.silent(3.0), (self.room.contacts[5],))
+
+    def test_learnt_from_the_record(self) -> None:
+        """A newer configuration of the task's record is taken over, an older one is not."""
+        council = self.lessee(0).council
+        council.learn(self.chartered([4, 5, 6], [0, 1, 2]).packed)
+        for packed in (self.chartered([4, 5, 6]).packed, b"", b"?"):
+            council.learn(packed)
+            self.assertEqual((council.configuration, self.places(0)), (3, [0, 1, 2]))
+
+    def test_minority_of_the_old_council_decides_nothing(self) -> None:
+        """Without a majority of the old council nothing changes, whoever the new ones would be."""
+        self.cut(1, 4, 5)
+        self.assertIsInstance(self.change(1, 3, 6, 0), NoMajority)
+        self.room.radio.cut.clear()
+        self.wanting(0)
+        self.assertEqual((self.places(0), self.holders()), ([3, 4, 5], [0]))
+
+    def test_two_changes_at_once(self) -> None:
+        """Of two that want different councils at one moment, both end up with the same one."""
+        for seed in range(12):
+            self.room = self.made(seed=f"two {seed}")
+            for place, members in ((0, (3, 4, 6)), (1, (5, 6, 2))):
+                council = self.lessee(place).council
+                council.change([self.room.contacts[n] for n in members]).addErrback(lambda f: f.trap(Refused))
+            self.run_for(3.0)
+            for place in (0, 1):
+                self.wanting(place, 1.0)
+                self.lessee(place).release()
+                self.run_for(0.1)
+            self.assertEqual(self.places(0), self.places(1))
+
+    def test_change_that_was_half_done_is_completed(self) -> None:
+        """Who meets a change that was accepted and not told completes it before anything is claimed."""
+        self.cut(1, 6, 0, 2)
+        council = self.lessee(1).council
+        error = self.outcome(council.change([self.room.contacts[n] for n in (0, 2, 6)]))
+        self.assertIsInstance(error, NoMajority)
+        self.wanting(0, 0.5)
+        self.assertEqual((self.places(0), self.holders()), ([0, 2, 6], [0]))
+
+    def test_change_of_the_highest_ballot_is_completed(self) -> None:
+        """Of two changes that were accepted by one member each the later one may be decided, so that one follows."""
+        for place, council in ((4, (0, 2, 6)), (3, (1, 2, 6))):
+            members = tuple(self.room.contacts[n] for n in council)
+            acceptor, now = self.room.bidders[place].acceptor, self.room.bidders[place].machine.seconds()
+            acceptor.accept(T, 1, Ballot(5 - place, "x"), members, now)
+        self.cut(0, 5)
+        self.assertIsInstance(self.change(0, 1, 3, 6), Superseded)
+        self.assertEqual(self.places(0), [1, 2, 6])
+
+    def test_another_change_came_first(self) -> None:
+        """Who asks for a change of a council that was changed meanwhile is told so."""
+        self.lessee(2)
+        self.assertIsNone(self.change(1, 3, 4, 6))
+        self.assertIsInstance(self.change(2, 3, 5, 6), Superseded)
+        self.assertEqual(self.places(2), [3, 4, 6])
+
+    def test_strange_councils(self) -> None:
+        """A council of nobody, or of too many, is the caller's mistake."""
+        for members in ([], [self.room.contacts[0]] * 8):
+            self.assertRaises(ValueError, self.lessee(0).council.change, members)
+
+    def test_close_waits_for_whoever_may_still_act(self) -> None:
+        """The end is acknowledged when a majority knows it and the lease that was in force has run out."""
+        self.wanting(0)
+        self.cut(0, 3, 4, 5)
+        closing = self.lessee(1).council.close()
+        self.run_for(TTL - 0.3)
+        self.assertNoResult(closing)
+        self.run_for(0.4)
+        self.assertIsNone(self.successResultOf(closing))
+        self.assertEqual(self.holders(), [])
+        for place in (1, 2):
+            self.wanting(place, 1.0)
+        self.assertEqual(self.holders(), [])
+
+    def test_holder_closes_at_once(self) -> None:
+        """Who has done the task and stands still need not wait for its own lease."""
+        lessee = self.wanting(0)
+        self.assertIsNone(self.outcome(lessee.council.close(self.token(0)), 0.05))
+        self.wanting(1, 1.0)
+        self.assertEqual((self.holders(), self.lessee(1).is_over), ([], True))
+
+    def test_close_by_who_missed_a_change(self) -> None:
+        """Whoever knows an older council is sent on to the newer one, and waits for the lease that this one granted."""
+        stale = self.lessee(0)
+        self.assertIsNone(self.change(1, 3, 6, 2))
+        self.wanting(1)
+        self.assertEqual(self.holders(), [1])
+        self.cut(0, 3)
+        closing = stale.council.close()
+        self.run_for(TTL - 0.3)
+        self.assertNoResult(closing)
+        self.run_for(0.5)
+        self.assertIsNone(self.successResultOf(closing))
+        self.assertEqual((self.holders(), self.lessee(1).is_over), ([], True))
+
+    def test_close_without_a_majority(self) -> None:
+        """An end that only a minority knows is not acknowledged."""
+        self.cut(0, 3, 4)
+        self.assertIsInstance(self.outcome(self.lessee(0).council.close()), NoMajority)
+
+    def test_change_after_the_end(self) -> None:
+        """The council of a task that has ended stays as it is."""
+        self.outcome(self.lessee(0).council.close())
+        error = self.change(1, 3, 4, 6)
+        self.assertIsInstance(error, Refused)
+        self.assertIn("the task has ended", str(error))

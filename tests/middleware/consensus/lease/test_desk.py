@@ -1,0 +1,128 @@
+"""Tests of ``middleware.consensus.lease.desk``, as the nodes of a team meet it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from twisted.internet.defer import Deferred
+
+from middleware.consensus.lease.lessee import Lessee
+from middleware.entangled.data.memory import MemoryStore
+from middleware.tasks.task import Task
+from tests.fleet import FleetCase, SwarmFleet
+
+TASK = Task("t1", "search", "Find it")
+
+
+class SlowStore(MemoryStore):
+    """A store whose disk writes only when it is told to."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.owed: list[Deferred[None]] = []
+        self.is_slow = False
+
+    def written(self) -> Deferred[None]:
+        """Fire at once, or with the next ``write``."""
+        if not self.is_slow:
+            return super().written()
+        self.owed.append(Deferred())
+        return self.owed[-1]
+
+    def write(self) -> None:
+        """Write everything that is owed."""
+        owed, self.owed = self.owed, []
+        for waiting in owed:
+            waiting.callback(None)
+
+
+class DeskTests(FleetCase):
+    def team(self, n: int = 4) -> tuple[SwarmFleet, Task, list[Lessee]]:
+        """Nodes that may grant, a task, and everybody's claim on it."""
+        fleet = self.swarm(n)
+        fleet.run(TASK.lease_ttl)
+        task = self.done(fleet, Deferred.fromCoroutine(fleet.nodes[0].submit(TASK)), 1.0)
+        return fleet, task, [node.lessee(task, lambda: None, 0) for node in fleet.nodes]
+
+    def holders(self, lessees: Sequence[Lessee]) -> list[int]:
+        """Who holds the lease."""
+        return [place for place, lessee in enumerate(lessees) if lessee.lease is not None]
+
+    def end(self, fleet: SwarmFleet, lessees: Sequence[Lessee]) -> None:
+        """Let everybody go, so that no timer is left."""
+        for lessee in lessees:
+            lessee.release()
+        fleet.run(2.0)
+
+    def test_polite_leave_is_heard_by_those_that_stand_by(self) -> None:
+        """The council tells the stand-by over the wire, and it acts long before it would have asked again."""
+        fleet, _, lessees = self.team()
+        lessees[1].want()
+        fleet.run(0.3)
+        lessees[2].stand_by()
+        fleet.run(2.02)
+        self.assertEqual(self.holders(lessees), [1])
+        lessees[1].release()
+        fleet.run(0.1)
+        self.assertEqual(self.holders(lessees), [2])
+        self.end(fleet, lessees)
+
+    def test_heirs_are_told_by_the_holder(self) -> None:
+        """Whoever the holder names hears of the release from it, also where it never asked the council."""
+        fleet, _, lessees = self.team()
+        lessees[1].want()
+        fleet.run(0.3)
+        lessees[3].stand_by(3)
+        lessees[1].release([fleet.nodes[3].entangled.contact])
+        fleet.run(0.7)
+        self.assertEqual(self.holders(lessees), [3])
+        self.end(fleet, lessees)
+
+    def test_answers_wait_for_the_disk(self) -> None:
+        """No member says that it has promised before its promise would survive its end."""
+        fleet = self.swarm(4)
+        stores = [SlowStore() for _ in range(4)]
+        for node, store in zip(fleet.nodes, stores, strict=True):
+            node.councils.desk._store = store
+        fleet.run(TASK.lease_ttl)
+        task = self.done(fleet, Deferred.fromCoroutine(fleet.nodes[0].submit(TASK)), 1.0)
+        for store in stores:
+            store.is_slow = True
+        lessee = fleet.nodes[1].lessee(task, lambda: None, 0)
+        lessee.want()
+        fleet.run(0.2)
+        self.assertIsNone(lessee.lease)
+        for _ in range(30):
+            fleet.run(0.02)
+            for store in stores:
+                store.write()
+        self.assertIsNotNone(lessee.lease)
+        for store in stores:
+            store.is_slow = False
+            store.write()
+        self.end(fleet, [lessee])
+
+    def test_council_changes_over_the_wire(self) -> None:
+        """A change, and the end of the task, are decided between real nodes, and a claimant is led on."""
+        fleet, task, lessees = self.team(5)
+        outsiders = [n.entangled.contact for n in fleet.nodes if n.entangled.contact not in task.council]
+        following = [task.council[0], *outsiders[:2]]
+        self.assertIsNone(self.done(fleet, lessees[0].council.change(following), 1.0))
+        lessees[1].want()
+        fleet.run(0.5)
+        self.assertEqual(self.holders(lessees), [1])
+        self.assertEqual((list(lessees[1].council.members), lessees[1].council.configuration), (following, 2))
+        self.assertIsNone(self.done(fleet, lessees[2].council.close(), 3.0))
+        self.assertEqual((self.holders(lessees), lessees[1].is_over), ([], True))
+        self.end(fleet, lessees)
+
+    def test_news_for_nobody(self) -> None:
+        """News of a release of which nobody here waits, or that a forgotten claim would have heard, is no accident."""
+        fleet, task, lessees = self.team()
+        to = fleet.nodes[2].entangled.contact
+        self.assertIsNone(
+            self.done(
+                fleet, fleet.nodes[1].entangled.endpoint.ask(to, "lease.freed", "other", 0, 0.0, changes=True), 0.5
+            )
+        )
+        self.end(fleet, lessees)

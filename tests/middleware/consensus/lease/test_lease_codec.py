@@ -1,0 +1,121 @@
+"""Tests of ``middleware.consensus.lease.lease_codec``."""
+
+from __future__ import annotations
+
+import zlib
+
+import msgpack
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from twisted.trial.unittest import SynchronousTestCase
+
+from middleware.consensus.lease.lease_codec import CODEC, LIFE, MAX_COUNCIL, members_of, pack_reply, unpack_reply
+from middleware.entangled.contact import Contact
+from middleware.entangled.network.network import Address
+from middleware.entangled.quorum.ballot import Ballot, majority
+from middleware.entangled.quorum.log import Floor
+from middleware.entangled.quorum.register import Kind, Reply
+
+MEMBERS = tuple(Contact(bytes([n]) * 32, Address("10.0.0.1", 7000 + n)) for n in range(MAX_COUNCIL + 1))
+ANYTHING = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8) | st.binary(max_size=40),
+    lambda inner: st.lists(inner, max_size=8) | st.dictionaries(st.text(max_size=3), inner, max_size=3),
+    max_leaves=12,
+)
+
+
+class BallotTests(SynchronousTestCase):
+    def test_order(self) -> None:
+        """Ballots are ordered by counter, and among equals by agent, so that no two are the same."""
+        ballots = [Ballot(1, "b"), Ballot(2, "a"), Ballot(1, "a")]
+        self.assertEqual(sorted(ballots), [Ballot(1, "a"), Ballot(1, "b"), Ballot(2, "a")])
+
+    def test_lives(self) -> None:
+        """Ballots of one life of an agent are kin; those of another agent or another life are not."""
+        one = Ballot(3 * LIFE + 7, "a")
+        self.assertTrue(one.is_kin(Ballot(9 * LIFE + 7, "a"), LIFE))
+        self.assertFalse(one.is_kin(Ballot(3 * LIFE + 7, "b"), LIFE))
+        self.assertFalse(one.is_kin(Ballot(3 * LIFE + 8, "a"), LIFE))
+
+    def test_quorum(self) -> None:
+        """Two quorums of one council always share a member."""
+        for size in range(1, MAX_COUNCIL + 1):
+            self.assertGreater(2 * majority(size), size)
+
+
+class ReplyTests(SynchronousTestCase):
+    def test_there_and_back(self) -> None:
+        """What is packed is read as it was, of every kind."""
+        for kind in Kind:
+            reply = Reply(kind, Ballot(5, "a"), 3, 1.25, 2)
+            if kind is Kind.SEALED:
+                reply = reply._replace(accepted=reply.promised, value=MEMBERS[:3])
+            self.assertEqual(unpack_reply(pack_reply(reply)), reply)
+
+    def test_strange_durations(self) -> None:
+        """What cannot be a duration counts as none."""
+        for strange in (-1.0, float("nan")):
+            read = unpack_reply(["granted", 1, "a", 1, strange, 1, []])
+            assert read is not None
+            self.assertEqual(read.remaining, 0.0)
+
+    def test_unlawful(self) -> None:
+        """Anything else is no reply."""
+        good = pack_reply(Reply(Kind.GRANTED, Ballot(5, "a"), 3, 1.25, 2))
+        for place, bad in (
+            (0, "yes"),
+            (0, 1),
+            (1, -1),
+            (1, True),
+            (1, 2**62),
+            (2, 5),
+            (3, 1.0),
+            (4, 1),
+            (5, "1"),
+            (6, 0),
+        ):
+            self.assertIsNone(unpack_reply([*good[:place], bad, *good[place + 1 :]]), (place, bad))
+        others: tuple[object, ...] = (None, 5, [], good[:-1], [*good, 0], {})
+        for other in others:
+            self.assertIsNone(unpack_reply(other))
+
+    def test_councils(self) -> None:
+        """A council has contacts, not too many, and none twice."""
+        packed = [member.packed() for member in MEMBERS]
+        self.assertEqual(members_of(packed[:MAX_COUNCIL]), MEMBERS[:MAX_COUNCIL])
+        for bad in (packed, [packed[0], packed[0]], [[b"k", "h", 1]], [1], None, b"x"):
+            self.assertIsNone(members_of(bad))
+
+    @settings(max_examples=300, deadline=None, derandomize=True, database=None)
+    @given(ANYTHING)
+    def test_total(self, answer: object) -> None:
+        """Whatever a peer answers is read as a reply or as none, and never an accident."""
+        read = unpack_reply(answer)
+        self.assertTrue(read is None or read.remaining >= 0.0)
+        members_of(answer)
+
+
+class NoteTests(SynchronousTestCase):
+    """Notes as the versions before wrote them."""
+
+    def test_old_notes(self) -> None:
+        """What was promised, leased, accepted and closed is read, whether the row has a proof and a grantee or not."""
+        codec, members = CODEC, [member.packed() for member in MEMBERS[:3]]
+        row = [2, [9, "b", 7, "a", 5, "c", 9, "b"], 4, 1.5, members, True, b"proof", "d"]
+        for length, proof, grantee in ((6, b"", "a"), (7, b"proof", "a"), (8, b"proof", "d")):
+            registers, is_whole = codec.unpack(msgpack.packb({"t": row[:length]}))
+            self.assertTrue(is_whole)
+            found = registers["t"]
+            ballots = found.promised, found.holder, found.spent, found.accepted
+            self.assertEqual(ballots, (Ballot(9, "b"), Ballot(7, "a"), Ballot(5, "c"), Ballot(9, "b")))
+            self.assertEqual((found.configuration, found.token, found.ttl, found.value), (2, 4, 1.5, MEMBERS[:3]))
+            self.assertEqual((found.is_over, found.proof, found.grantee), (True, proof, grantee))
+        self.assertEqual(codec.pack(registers), msgpack.packb({"t": row}))
+        self.assertEqual(codec.bucket_of("t"), f"lease/{zlib.crc32(b't') % 64}")
+
+    def test_old_floors(self) -> None:
+        """The floor of the version that had one for ballots and tokens, and that of the one before this."""
+        self.assertEqual(CODEC.unpack_floor(msgpack.packb([40, 2.0])), Floor(40, 40, 2.0))
+        self.assertEqual(CODEC.unpack_floor(msgpack.packb([40, 2.0, 7])), Floor(40, 7, 2.0))
+        self.assertEqual(CODEC.pack_floor(Floor(40, 7, 2.0)), msgpack.packb([40, 2.0, 7]))
+        self.assertEqual([CODEC.unpack_floor(rotten) for rotten in (None, b"?", msgpack.packb([1]))], [None] * 3)

@@ -1,0 +1,274 @@
+"""Tests of ``middleware.consensus.lease.lessee``."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from middleware.entangled.data.memory import MemoryStore
+from sim.team.leases.radio import Air
+from sim.team.leases.takeover import takeover, upkeep
+from tests.middleware.consensus.lease.room import TTL, RoomCase, T
+
+
+class LesseeTests(RoomCase):
+    def test_win_keep_and_release(self) -> None:
+        """A claimant alone wins, keeps the lease by renewing it with the same token, and gives it back."""
+        lessee = self.wanting(0)
+        lessee.want()
+        for _ in range(40):
+            self.run_for(0.25)
+            self.assertEqual(self.token(0), 1)
+        lessee.release()
+        self.assertIsNone(lessee.lease)
+        self.wanting(1)
+        self.assertEqual(self.token(1), 2)
+
+    def test_one_of_many(self) -> None:
+        """Of several that want it at one moment one gets it, and the others do not disturb it."""
+        for place in range(3):
+            self.lessee(place).want()
+        self.run_for(1.0)
+        (holder,) = self.holders()
+        token = self.token(holder)
+        self.run_for(10 * TTL)
+        self.assertEqual((self.holders(), self.token(holder)), ([holder], token))
+
+    def test_ranks(self) -> None:
+        """When the executor is gone, of those that stand by the first in rank acts."""
+        for seed in range(5):
+            self.room = self.made(seed=f"rank {seed}")
+            self.wanting(0)
+            self.lessee(1).stand_by(2)
+            self.lessee(2).stand_by(1)
+            self.run_for(TTL)
+            self.room.kill(0)
+            self.run_for(TTL + 0.3)
+            self.assertEqual(self.holders()[-1:], [2], seed)
+
+    def test_first_in_line_is_ready(self) -> None:
+        """It has the lease as soon as the one before it ends at a majority and an answer has come, and never sooner."""
+        for seed in range(5):
+            self.room = self.made(seed=f"ready {seed}")
+            self.wanting(0)
+            self.lessee(1).stand_by(1)
+            self.run_for(TTL)
+            self.room.kill(0)
+            members = [self.room.bidders[place] for place in (3, 4, 5)]
+            _, ends, _ = sorted(one.machine.at(one.acceptor.log.get(T).until) for one in members)  # type: ignore[union-attr]
+            self.run_for(ends - self.room.clock.seconds() - 0.001)
+            self.assertIsNone(self.lessee(1).lease, seed)
+            self.run_for(0.02)
+            self.assertIsNotNone(self.lessee(1).lease, seed)
+
+    def test_ready_for_a_lease_that_is_renewed(self) -> None:
+        """Who was promised the lease of a holder that was away is no takeover when that comes back in time."""
+        self.wanting(0)
+        self.lessee(1).stand_by(1)
+        self.run_for(TTL)
+        self.cut(0, 3, 4, 5)
+        until = [self.room.bidders[place].acceptor.log.get(T).until for place in (3, 4, 5)]  # type: ignore[union-attr]
+        self.run_for(min(until) - self.room.bidders[3].machine.seconds() - 0.2)
+        self.room.radio.cut.clear()
+        self.run_for(2 * TTL)
+        self.assertEqual((self.holders(), self.token(0)), ([0], 1))
+
+    def test_place_in_the_line_that_changes(self) -> None:
+        """Who is moved up or down shortly before the lease ends claims at the time of its new place."""
+        for seed in range(5):
+            self.room = self.made(seed=f"moved {seed}")
+            self.wanting(0)
+            self.lessee(1).stand_by(1)
+            self.lessee(2).stand_by(2)
+            self.run_for(TTL)
+            self.room.kill(0)
+            self.run_for(0.55 * TTL)
+            self.lessee(1).stand_by(3)
+            self.lessee(2).stand_by(1)
+            self.run_for(0.45 * TTL + 0.1)
+            self.assertEqual(self.holders()[-1:], [2], seed)
+
+    def test_place_in_the_line_that_changes_after_a_release(self) -> None:
+        """Who did not learn from a majority how long the lease lasts claims what is released, wherever it is moved."""
+        self.cut(1, 4, 5)
+        self.lessee(1).stand_by(3)
+        self.run_for(1.5 * TTL)
+        self.lessee(1).freed(0)
+        self.run_for(0.35)
+        self.lessee(1).stand_by(2)
+        self.room.radio.cut.clear()
+        self.run_for(0.2)
+        self.assertEqual(self.holders(), [1])
+
+    def test_council_that_moved(self) -> None:
+        """Who looks and hears that the council is another one by now asks that at once, and so is told of a release."""
+        self.wanting(0)
+        self.lessee(1).stand_by(1)
+        moved = self.lessee(0).move([self.room.contacts[place] for place in (3, 4, 6)])
+        self.outcome(moved, 0.1)
+        self.lessee(1).suspect()
+        self.run_for(0.1)
+        self.lessee(0).release()
+        self.run_for(0.1)
+        self.assertEqual(self.holders(), [1])
+
+    def test_second_in_line_lets_the_first_try(self) -> None:
+        """Of two that find at one moment that nobody holds the lease, the first in line has it."""
+        for seed in range(5):
+            self.room = self.made(seed=f"free {seed}")
+            for place, rank in ((2, 2), (1, 1)):
+                self.lessee(place).stand_by(rank)
+                self.lessee(place).suspect()
+            self.run_for(0.1)
+            self.assertEqual(self.holders(), [1], seed)
+
+    def test_heir_that_never_looked(self) -> None:
+        """Whoever hears of a release before its first look claims above what it has not heard of, at the first try."""
+        for seed in range(5):
+            self.room = self.made(seed=f"heir {seed}")
+            for _ in range(4):
+                self.lessee(0).release()
+                self.wanting(0)
+            self.lessee(1).stand_by(1)
+            self.room.bidders[0].leave(T, [1])
+            self.run_for(0.04)
+            self.assertEqual(self.holders(), [1], seed)
+
+    def test_member_that_keeps_silent(self) -> None:
+        """A holder goes on under its ballot while a member may grant nothing yet: another would serve no better."""
+        self.room.kill(3)
+        self.room._stores[3] = MemoryStore()
+        self.room.bidders[3] = self.room.born(3)
+        self.wanting(0)
+        first = self.room.bidders[4].acceptor.log.get(T).holder  # type: ignore[union-attr]
+        self.run_for(2 * TTL)
+        for place in (3, 4):
+            self.assertEqual(self.room.bidders[place].acceptor.log.get(T).holder, first)  # type: ignore[union-attr]
+
+    def test_stand_by_that_is_named(self) -> None:
+        """Who stands by and is wanted then keeps its place; who holds the lease is not put off by a rank."""
+        self.lessee(0).stand_by(3)
+        self.lessee(0).want()
+        self.run_for(2 * TTL)
+        self.assertEqual(self.holders(), [0])
+        self.lessee(0).stand_by(1)
+        self.run_for(2 * TTL)
+        self.assertEqual(self.holders(), [0])
+
+    def test_floor(self) -> None:
+        """A claimant whose robot has obeyed a token never comes with that one or an older one."""
+        self.lessee(0).outrank(41)
+        self.wanting(0)
+        self.assertEqual(self.token(0), 42)
+
+    def test_outranked_while_it_holds(self) -> None:
+        """When the device says that it has obeyed a higher token its lease is void, and a higher one claimed."""
+        lessee = self.wanting(0)
+        lessee.outrank(1)
+        self.assertEqual(self.token(0), 1)
+        lessee.outrank(7)
+        self.assertIsNone(lessee.lease)
+        self.run_for(0.1)
+        self.assertEqual(self.token(0), 8)
+
+    def test_want_again_while_a_claim_is_under_way(self) -> None:
+        """What was asked for before the release is not used after it; the next claim has a token of its own."""
+        lessee = self.lessee(0)
+        for _ in range(5):
+            lessee.want()
+            self.run_for(0.003)
+            lessee.release()
+        lessee.want()
+        self.run_for(TTL)
+        self.assertEqual(self.holders(), [0])
+
+    def test_claim_that_is_dropped_holds_nobody_up(self) -> None:
+        """A claim that its agent thinks better of is given back, whatever the members had granted by then."""
+        for steps in range(1, 12):
+            self.room = self.made(seed=f"dropped {steps}")
+            self.wanting(0, 0.001 * steps)
+            self.lessee(0).release()
+            self.wanting(1, 0.4)
+            self.assertEqual(self.holders(), [1], steps)
+
+    def test_loss_is_told(self) -> None:
+        """Whoever held the lease and cannot renew it stops at its end, and claims again when it can."""
+        lessee = self.wanting(0)
+        self.cut(0, 3, 4)
+        self.run_for(TTL)
+        self.assertIsNone(lessee.lease)
+        self.run_for(TTL / 3)
+        self.assertEqual(lessee.token, 0)
+        self.room.radio.cut.clear()
+        self.run_for(TTL)
+        self.assertEqual(self.token(0), 2)
+
+    def test_member_that_promised_to_another_is_won_back(self) -> None:
+        """A holder goes on, with its token, though a member has promised a higher ballot while it did not hear it."""
+        self.wanting(0)
+        self.cut(0, 3)
+        self.lessee(1).stand_by()
+        self.run_for(2 * TTL)
+        self.room.radio.cut.clear()
+        self.run_for(2 * TTL)
+        self.room.kill(4)
+        self.run_for(2 * TTL)
+        self.assertEqual((self.holders(), self.token(0)), ([0], 1))
+
+    def test_nobody_to_ask(self) -> None:
+        """A council of nobody grants nothing, and is asked in peace."""
+        self.room.councils[T] = replace(self.room.councils[T], first=())
+        self.wanting(0, 2.0)
+        self.assertEqual(self.holders(), [])
+        self.lessee(0).release()
+
+    def test_time_to_stop_longer_than_the_lease(self) -> None:
+        """A robot that needs longer to stop than a lease lasts never gets to act."""
+        self.room = self.made(stop_time=2.0)
+        self.wanting(0, 5.0)
+        self.assertEqual(self.holders(), [])
+
+    def test_claim_that_is_dropped_shortens_no_rest(self) -> None:
+        """Who gave a lease back and drops another claim tells, by a fast clock, no less of how long its robot moves."""
+        self.room = self.made(stop_time=0.3, rates=(1.01, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0))
+        self.wanting(0, 1.0)
+        self.lessee(0).release()
+        stopped = self.room.clock.seconds()
+        self.run_for(0.27)
+        self.wanting(0, 0.01)
+        self.lessee(0).release()
+        self.run_for(0.1)
+        for place in (3, 4, 5):
+            bidder = self.room.bidders[place]
+            until = bidder.machine.at(bidder.acceptor.log.get(T).until)  # type: ignore[union-attr]
+            self.assertGreaterEqual(until, stopped + 0.3)
+
+    def test_rough_weather(self) -> None:
+        """At half of everything lost, doubled and late there is still never more than one holder, and often one."""
+        self.room.radio.air = Air(0.02, 0.05, 0.5, 0.3, 5.0)
+        for place in range(3):
+            self.lessee(place).want()
+        held = 0
+        for _ in range(400):
+            self.run_for(0.1)
+            self.assertLessEqual(len(self.holders()), 1)
+            held += len(self.holders())
+        self.assertGreater(held, 100)
+        self.assertEqual(self.room.referee.found, [])
+
+
+class FigureTests(RoomCase):
+    def test_takeover(self) -> None:
+        """Two hundred executors die at 10 % loss: half of them are followed within 1.5 s, 99 of 100 within 2."""
+        seconds = sorted(takeover(seed) for seed in range(200))
+        self.assertLess(seconds[100], 1.5)
+        self.assertLess(seconds[198], 2.0)
+
+    def test_polite_leave(self) -> None:
+        """Who leaves in order is followed within a fifth of a second, on a link of 20 ms and more each way."""
+        seconds = sorted(takeover(seed, 0.0, is_polite=True) for seed in range(30))
+        self.assertLess(seconds[15], 0.16)
+        self.assertLess(seconds[-1], 0.25)
+
+    def test_upkeep(self) -> None:
+        """To keep a lease costs at most twelve datagrams a second."""
+        self.assertLessEqual(upkeep(), 12.0)

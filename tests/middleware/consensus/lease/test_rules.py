@@ -1,0 +1,239 @@
+"""The rules of leases and fencing, each a test that names it."""
+
+from __future__ import annotations
+
+from twisted.internet.defer import Deferred
+
+from drivers.driver import Permit
+from drivers.errors import StaleCommand
+from drivers.gate import Gate
+from middleware.consensus.lease.council import NoMajority, OpenClaim, Superseded
+from middleware.consensus.lease.lessee import CLOCK_MARGIN, RENEWALS
+from middleware.entangled.data.memory import MemoryStore
+from middleware.entangled.kademlia.distance import closest
+from middleware.entangled.record import Record
+from middleware.tasks.task import COMPLETED, RESULT, Result, Task, group_key, outcome_of
+from sim.team.machine import Machine
+from tests.fleet import FleetCase
+from tests.middleware.consensus.lease.room import TTL, RoomCase, T
+
+
+class PinnedTests(FleetCase):
+    def test_rule_1_council_is_pinned(self) -> None:
+        """The council is the three nodes closest to the task's key at its creation, also when closer ones come."""
+        fleet = self.swarm(4)
+        task = self.done(fleet, Deferred.fromCoroutine(fleet.nodes[0].submit(Task("t1", "search", "Find it"))), 1.0)
+        key = group_key("t1")
+        contacts = [node.entangled.contact for node in fleet.nodes]
+        self.assertEqual(list(task.council), closest(contacts, key, 3))
+        lessee = fleet.nodes[1].lessee(task, lambda: None, 0)
+        for place in range(4, 9):
+            fleet.nodes.append(fleet.made(place))
+            fleet.nodes[place].startService()
+            fleet.run(0.5)
+        now_closest = closest([node.entangled.contact for node in fleet.nodes], key, 3)
+        self.assertNotEqual(list(task.council), now_closest)
+        self.assertEqual(lessee.council.members, task.council)
+
+
+class RuleTests(RoomCase):
+    def test_rule_2_council_changes_by_a_majority_of_the_old_one(self) -> None:
+        """Configuration + 1, decided by the old council and never while a claim is open."""
+        council = self.lessee(1).council
+        following = [self.room.contacts[n] for n in (0, 1, 2)]
+        self.wanting(0)
+        self.assertIsInstance(self.outcome(council.change(following)), OpenClaim)
+        self.lessee(0).release()
+        self.run_for(0.1)
+        self.cut(1, 3, 4)
+        self.assertIsInstance(self.outcome(council.change(following)), NoMajority)
+        self.room.radio.cut.clear()
+        self.assertIsNone(self.outcome(council.change(following)))
+        self.assertEqual((council.configuration, list(council.members)), (2, following))
+
+    def test_rule_3_durations_travel_never_times(self) -> None:
+        """Clocks that show quite other times work together, and no moment of any clock is on the wire."""
+        sent: list[float] = []
+        for bidder in self.room.bidders:
+            answer = bidder.answer
+
+            def heard(source: int, method: str, arguments: tuple[object, ...], answer=answer) -> object:  # type: ignore[no-untyped-def]
+                reply = answer(source, method, arguments)
+                sent.extend(x for x in (*arguments, *(reply if isinstance(reply, list) else ())) if type(x) is float)
+                return reply
+
+            bidder.answer = heard  # type: ignore[method-assign]
+        clocks = [bidder.machine.seconds() for bidder in self.room.bidders]
+        self.assertGreater(max(clocks) - min(clocks), 100.0)
+        self.lessee(1).stand_by()
+        self.wanting(0, 3 * TTL)
+        self.assertEqual(self.holders(), [0])
+        self.assertLessEqual(max(sent), TTL)
+
+    def test_rule_4_token_outlives_restarts(self) -> None:
+        """Each lease has a higher token than all before it, though every member was restarted in between."""
+        tokens = []
+        for place in (0, 1, 2, 0):
+            self.wanting(place)
+            tokens.append(self.token(place))
+            self.lessee(place).release()
+            self.run_for(0.1)
+            for member in range(self.room.n):
+                self.room.kill(member)
+                self.room.bidders[member] = self.room.born(member)
+            self.run_for(0.1)
+        self.assertEqual(tokens, sorted(set(tokens)))
+
+    def test_rule_4_restarted_member_keeps_silent(self) -> None:
+        """A member that lost its store grants nothing for the longest ttl; one whose store was synced need not wait."""
+        for is_lost in (True, False):
+            self.room = self.made(seed=f"silent {is_lost}")
+            self.wanting(0)
+            self.run_for(1.0)
+            for member in (3, 4):
+                self.room.kill(member)
+                if is_lost:
+                    self.room._stores[member] = MemoryStore()
+                self.room.bidders[member] = self.room.born(member)
+            self.lessee(0).release()
+            self.wanting(1, 0.2)
+            self.assertEqual(self.holders(), [] if is_lost else [1])
+            self.run_for(TTL)
+            self.assertEqual(self.holders(), [1])
+
+    def test_rule_5_deadline_counts_from_the_sending(self) -> None:
+        """It is the moment of sending + ttl x (1 - 2 rho) - the time to stop, however late the answers come."""
+        self.room = self.made(stop_time=0.3)
+        lessee = self.lessee(0)
+        self.wanting(0)
+        lease = lessee.lease
+        assert lease is not None
+        asked_at: list[float] = []
+        member = self.room.bidders[3].machine
+        take = member.take
+        member.take = lambda *a: (asked_at.append(self.room.bidders[0].machine.seconds()), take(*a))[1]  # type: ignore[func-returns-value,method-assign]
+        self.run_for(TTL / RENEWALS)
+        renewed = lessee.lease
+        assert renewed is not None
+        sent = renewed.deadline - TTL * (1.0 - CLOCK_MARGIN) + 0.3
+        self.assertLess(sent, asked_at[0])
+        self.assertGreater(sent, asked_at[0] - 0.02)
+
+    def test_rule_5_next_one_starts_when_the_robot_stands(self) -> None:
+        """The next holder never begins before the last one's robot has come to rest, with clocks 1 % apart."""
+        for stop_time in (0.0, 0.4):
+            self.room = self.made(stop_time, [0.99, 1.01, 1.0, 1.01, 1.01, 1.01, 1.0])
+            lessee = self.wanting(0, 1.0)
+            self.lessee(1).stand_by()
+            self.run_for(TTL)
+            lease = lessee.lease
+            assert lease is not None
+            self.cut(0, 3, 4, 5)
+            ends = 0.0
+            while not self.lessee(1).lease:
+                now = lessee.lease
+                ends = self.room.bidders[0].machine.at(now.deadline) if now else ends
+                self.run_for(0.005)
+            self.assertGreaterEqual(self.room.clock.seconds() + 0.001, ends + stop_time)
+            self.assertEqual(self.room.referee.found, [])
+
+    def test_rule_6_stand_by_asks_when_pushes_are_lost(self) -> None:
+        """Whoever stands by takes over although it hears of no release, for it asks in every third of a ttl."""
+        self.wanting(0)
+        self.lessee(1).stand_by()
+        self.run_for(TTL)
+        self.room.tell = lambda *_: None  # type: ignore[method-assign]
+        self.lessee(0).release()
+        self.run_for(TTL / RENEWALS + 0.1)
+        self.assertEqual(self.holders(), [1])
+
+    def test_rule_6_renewed_three_times_a_ttl(self) -> None:
+        """Two rounds in which nothing gets through do not cost the lease."""
+        self.wanting(0)
+        for _ in range(20):
+            lease = self.lessee(0).lease
+            assert lease is not None
+            self.cut(0, 3, 4, 5)
+            self.run_for(TTL * 0.55)
+            self.room.radio.cut.clear()
+            self.run_for(TTL * 0.45)
+        self.assertEqual(self.token(0), 1)
+
+    def test_rule_7_suspended_holder_knows_that_time_has_passed(self) -> None:
+        """Who wakes from a suspension holds nothing and sends nothing, and takes its late timer for a pause."""
+        lessee = self.wanting(0, 1.0)
+        self.lessee(1).stand_by()
+        self.run_for(0.2)
+        self.room.bidders[0].machine.freeze(is_suspended=True)
+        self.run_for(4 * TTL)
+        accepted = len(self.room.referee.accepted[T])
+        self.room.bidders[0].machine.thaw()
+        self.assertIsNone(lessee.lease)
+        self.run_for(1.0)
+        self.assertEqual((self.holders(), lessee.pauses), ([1], 1))
+        self.assertEqual({place for _, _, place in self.room.referee.accepted[T][accepted:]}, {1})
+        self.assertEqual(self.room.referee.found, [])
+
+    def test_rule_7_clock_that_stands_still_is_not_enough(self) -> None:
+        """On a clock that does not count the suspension the same holder would believe in its old lease."""
+        self.patch(Machine, "COUNTS_SUSPENSION", False)
+        lessee = self.wanting(0, 1.0)
+        self.room.bidders[0].machine.freeze(is_suspended=True)
+        self.run_for(4 * TTL)
+        self.assertIsNotNone(lessee.lease)
+
+    def test_rule_8_device_refuses_lower_tokens_and_stops_by_itself(self) -> None:
+        """The device keeps the highest token, whoever sends, and says when its motion is over without being asked."""
+        gate = Gate()
+        gate.admit(Permit(2, 5.0), 4.0)
+        self.assertRaises(StaleCommand, gate.admit, Permit(1, 9.0), 4.1)
+        self.assertRaises(StaleCommand, gate.admit, Permit(3, 4.0), 4.1)
+        self.assertEqual((gate.is_over(4.9), gate.is_over(5.0)), (False, True))
+
+    def test_rule_9_the_end_carries_the_token(self) -> None:
+        """Who held the task before cannot conclude it under its old token; of two results the higher token holds."""
+        self.wanting(0)
+        self.lessee(0).release()
+        self.wanting(1)
+        stale = self.lessee(0).council.close(1)
+        self.assertIsInstance(self.outcome(stale), Superseded)
+        self.assertEqual(self.holders(), [1])
+        self.assertIsNone(self.outcome(self.lessee(1).council.close(2)))
+        self.assertEqual(self.holders(), [])
+        results = [Result(COMPLETED, "dog1", 1.0, 2), Result(COMPLETED, "dog0", 1.0, 1)]
+        records = [
+            Record(group_key(T), RESULT, bytes([n]) * 32, 1, "team", 0.0, result.packed(), bytes(64))
+            for n, result in enumerate(results)
+        ]
+        for told in (records, records[::-1]):
+            self.assertEqual(outcome_of(Task(T, "search", "Find it"), told), results[0])
+
+    def test_rule_10_graceful_leave(self) -> None:
+        """Stopped, given back, and in a fifth of a second the first that stands by acts, after the time to stop."""
+        for stop_time in (0.0, 0.4):
+            self.room = self.made(stop_time)
+            self.wanting(0)
+            self.lessee(2).stand_by(2)
+            self.lessee(1).stand_by(1)
+            self.run_for(TTL)
+            self.room.bidders[0].leave(T)
+            self.run_for(max(0.0, stop_time - 0.01))
+            self.assertEqual(self.holders(), [])
+            self.run_for(0.05)
+            self.assertEqual(self.holders(), [1])
+            self.assertEqual(self.room.referee.found, [])
+
+    def test_rule_11_suspicion_shortens_no_lease(self) -> None:
+        """However often a stand-by suspects, the holder's lease runs on; and when it ends the stand-by is ready."""
+        self.wanting(0)
+        self.lessee(1).stand_by()
+        for _ in range(40):
+            self.lessee(1).suspect()
+            self.run_for(0.1)
+        self.assertEqual((self.holders(), self.token(0)), ([0], 1))
+        self.room.kill(0)
+        self.lessee(1).suspect()
+        self.run_for(TTL - 0.6)
+        self.assertIsNone(self.lessee(1).lease)
+        self.run_for(0.7)
+        self.assertIsNotNone(self.lessee(1).lease)
