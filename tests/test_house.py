@@ -448,3 +448,15 @@ class TestCustomTests(SynchronousTestCase):
                 if isinstance(node, ast.ImportFrom) and node.module in ("unittest", "unittest.mock"):
                     wrong.append(f"{where} line {node.lineno}: use a fake that ships, not a patch")
         self.assertEqual(wrong, [])
+
+    def test_tests_wait_for_conditions(self) -> None:
+        """No test sleeps: what another process does is waited for by ``tests.live.until`` alone."""
+        texts = {path: path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("*.py")}
+        sleeping = {
+            path.relative_to(ROOT).as_posix()
+            for path, text in texts.items()
+            if "sleep" in text
+            for node in ast.walk(ast.parse(text))
+            if isinstance(node, ast.Call) and ast.unparse(node.func) in ("time.sleep", "sleep")
+        }
+        self.assertEqual(sleeping, {"tests/live/until.py"})

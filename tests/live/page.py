@@ -1,13 +1,24 @@
-"""Page: what the tests in a real browser share: the screens, the page's server as a child process, and opening it."""
+"""Page: what the tests in a real browser share: the screens, the page's server as a child process, and opening it.
+
+A browser, its driver and the program that serves teams start slowly, and ``trial -j`` hands out single tests, so that a
+fixture of a class would be made for each.  They are started once in a process and live as long as it; each test has a
+browser context and a team of its own.
+"""
 
 from __future__ import annotations
 
+import asyncio
+import atexit
 import base64
 import hashlib
+import os
 import shutil
+import signal
 import ssl
 import subprocess
 import sys
+import tempfile
+from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -19,6 +30,8 @@ FLAGS = [
     *("--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"),
     *("--disable-component-update", "--disable-sync", "--disable-dev-shm-usage"),
 ]
+DISC = 66
+"""Pixels across the red disc that the camera shows, of 104."""
 PHONE = {"viewport": {"width": 412, "height": 839}, "has_touch": True}
 TABLET = {"viewport": {"width": 820, "height": 1180}, "has_touch": True}
 DESK = {"viewport": {"width": 1280, "height": 800}}
@@ -38,6 +51,7 @@ MISSING = [
     ),
 ]
 SMALL = """[...document.querySelectorAll('button, input, select, nav a')].filter(e => e.offsetParent)
+    .map(e => e.type === 'checkbox' ? e.closest('label') ?? e : e)
     .filter(e => e.offsetHeight < 44 || e.offsetWidth < 44
         || (e.tagName !== 'INPUT' && e.scrollWidth > e.clientWidth + 1))
     .map(e => e.outerHTML)"""
@@ -54,34 +68,115 @@ def pin(port: int) -> str:
     return base64.b64encode(hashlib.sha256(key).digest()).decode()
 
 
+def film(path: Path) -> Path:
+    """A film for the fake camera, 320 x 240: a red disc that trembles a little."""
+    import cv2
+    import numpy as np
+
+    with path.open("wb") as file:
+        for n in range(30):
+            picture = np.full((240, 320, 3), (190, 200, 205), np.uint8)
+            picture[150:] = (90, 120, 130)
+            cv2.circle(picture, (160 + n % 3, 120), round(DISC / 104 * 320 / 2), (40, 40, 210), -1)
+            file.write(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes())
+    return path
+
+
+class Chromium:
+    """The driver of the browser and a browser whose camera shows a film; a context without leave has no camera.
+
+    Between two calls the driver has the thread marked as running an event loop; other tests run theirs, so the mark is
+    removed while no test uses it.
+    """
+
+    def __init__(self) -> None:
+        from playwright.sync_api import sync_playwright
+
+        self._driver = sync_playwright().start()
+        self._loop = asyncio.get_running_loop()
+        self._folder = tempfile.TemporaryDirectory()
+        atexit.register(self._end)
+        self._film = film(Path(self._folder.name) / "film.mjpeg")
+        self.browser = self.launched("--host-resolver-rules=MAP vaio.local 127.0.0.1")
+
+    def launched(self, *flags: str) -> Any:
+        """Another one, with more flags."""
+        camera = ("--use-fake-device-for-media-stream", f"--use-file-for-fake-video-capture={self._film}")
+        return self._driver.chromium.launch(executable_path=CHROMIUM, args=[*FLAGS, *camera, *flags])
+
+    def resume(self) -> None:
+        """A test begins to use it."""
+        asyncio._set_running_loop(self._loop)
+        if not self.browser.is_connected():
+            self.browser = self.launched("--host-resolver-rules=MAP vaio.local 127.0.0.1")
+
+    def pause(self) -> None:
+        """A test has used it."""
+        asyncio._set_running_loop(None)
+
+    def _end(self) -> None:
+        asyncio._set_running_loop(self._loop)
+        self.browser.close()
+        self._driver.stop()
+        self._folder.cleanup()
+
+
+@cache
+def chromium() -> Chromium:
+    """The one of this process."""
+    return Chromium()
+
+
 class Team:
-    """The page's server as a child process; ``order`` changes what it shows."""
+    """A team and its page, served by a child process; ``order`` changes what it shows."""
+
+    _idle: list[subprocess.Popen[str]] = []
+    """Processes that serve no team now."""
 
     def __init__(self, port: int = 0) -> None:
-        root = Path(__file__).parents[2]
-        command = [sys.executable, "-m", "tests.live.team", str(port)]
-        self._process = subprocess.Popen(command, cwd=root, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-        found, self.code, self.token, self.ticket = self._line().split()
+        self._process = Team._idle.pop() if Team._idle else self._started()
+        self.pid = self._process.pid
+        found, self.code, self.token, self.ticket = self.order(f"team {port}").split()
         self.port = int(found)
         self.url = f"http://127.0.0.1:{self.port}/"
-        self.pid = self._process.pid
 
-    def _line(self) -> str:
-        assert self._process.stdout is not None
-        return self._process.stdout.readline()
+    @staticmethod
+    def _started() -> subprocess.Popen[str]:
+        root = Path(__file__).parents[2]
+        command = [sys.executable, "-m", "tests.live.team"]
+        process = subprocess.Popen(command, cwd=root, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        atexit.register(process.wait)
+        atexit.register(process.kill)
+        return process
 
-    def order(self, words: str) -> None:
-        """Give an order; ``freeze`` is not waited for."""
-        assert self._process.stdin is not None
+    def order(self, words: str) -> str:
+        """Give an order, and wait until it is done; what the process says of it."""
+        assert self._process.stdin is not None and self._process.stdout is not None
         self._process.stdin.write(words + "\n")
         self._process.stdin.flush()
-        if not words.startswith("freeze"):
-            self._line()
+        return self._process.stdout.readline()
+
+    def freeze(self) -> None:
+        """Let the whole process stand, with its port open."""
+        os.kill(self.pid, signal.SIGSTOP)
+
+    def thaw(self) -> None:
+        """Let it go on."""
+        os.kill(self.pid, signal.SIGCONT)
 
     def stop(self) -> None:
-        """End it at once."""
+        """Kill the process."""
         self._process.kill()
         self._process.communicate()
+
+    def end(self) -> None:
+        """Close the page; the process serves another team later."""
+        if self._process.poll() is None:
+            self.thaw()
+            if self.order("end"):
+                Team._idle.append(self._process)
+            else:
+                self.stop()
 
 
 class BrowserCase(SynchronousTestCase):
@@ -91,19 +186,23 @@ class BrowserCase(SynchronousTestCase):
         skip = f"THE PAGE IS NOT TESTED IN A BROWSER: missing {'; '.join(MISSING)}"
 
     def setUp(self) -> None:
-        from playwright.sync_api import sync_playwright
-
         super().setUp()
-        play = sync_playwright().start()
-        self.addCleanup(play.stop)
-        self.browser = play.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        self.addCleanup(self.browser.close)
+        shared = chromium()
+        shared.resume()
+        self.addCleanup(shared.pause)
+        self.browser = shared.browser
         self.asked: list[str] = []
         self.faults: list[str] = []
 
-    def tab(self, screen: dict[str, Any], scheme: Any = "light") -> Any:
+    def launched(self, *flags: str) -> Any:
+        """A browser for this test alone, with more flags."""
+        browser = chromium().launched(*flags)
+        self.addCleanup(browser.close)
+        return browser
+
+    def tab(self, screen: dict[str, Any], scheme: Any = "light", **more: Any) -> Any:
         """An empty page on that screen, in a session of its own."""
-        context = self.browser.new_context(**screen, color_scheme=scheme, reduced_motion="reduce")
+        context = self.browser.new_context(**screen, color_scheme=scheme, reduced_motion="reduce", **more)
         self.addCleanup(context.close)
         page = context.new_page()
         page.set_default_timeout(PATIENCE_MS)
@@ -128,6 +227,11 @@ class BrowserCase(SynchronousTestCase):
         page.evaluate(f"location.hash = {name!r}")
         page.locator(f"body[data-view={name}]").wait_for()
 
+    def pass_by(self, page: Any, seconds: float) -> None:
+        """Turn the page's clock on; what it asks for thereupon has been asked for."""
+        page.clock.fast_forward(1000 * seconds)
+        page.evaluate("fetch('/api/v1/node').then((told) => told.text())")
+
     def told(self, page: Any, words: str) -> None:
         """Wait until the page says so."""
         page.locator("#line", has_text=words).wait_for()
@@ -150,6 +254,12 @@ class BrowserCase(SynchronousTestCase):
         self.assertLessEqual(page.evaluate("document.documentElement.scrollWidth - innerWidth"), 0, where)
         self.assertEqual((page.evaluate(SMALL), self.faults), ([], []), where)
 
+    def sound_by_day_and_night(self, page: Any) -> None:
+        """So it is in light colours and in dark ones."""
+        for scheme in ("light", "dark"):
+            page.emulate_media(color_scheme=scheme)
+            self.sound(page)
+
 
 class TeamCase(SynchronousTestCase):
     """The page of the team of ``tests.live.team``."""
@@ -157,7 +267,7 @@ class TeamCase(SynchronousTestCase):
     def setUp(self) -> None:
         super().setUp()
         self.team = Team()
-        self.addCleanup(lambda: self.team.stop())
+        self.addCleanup(lambda: self.team.end())
 
 
 class PageCase(BrowserCase, TeamCase):
@@ -168,9 +278,11 @@ class PageCase(BrowserCase, TeamCase):
         if words.type == "error":
             self.faults.append(f"{words.text} {words.location['url']}")
 
-    def opened(self, screen: dict[str, Any], scheme: Any = "light") -> Any:
-        """The page, signed in, when it shows the team."""
+    def opened(self, screen: dict[str, Any], scheme: Any = "light", has_clock: bool = False) -> Any:
+        """The page, signed in, when it shows the team; with ``has_clock`` its time can ``pass_by``."""
         page = self.tab(screen, scheme)
         page.on("console", self.note)
+        if has_clock:
+            page.clock.install()
         page.goto(f"{self.team.url}#code={self.team.code}")
         return self.live(page)

@@ -1,8 +1,9 @@
 """A web node with three dogs that stand still: the server of the page's tests, run as a child process.
 
-``python -m tests.live.team`` prints the port, the code to sign in with, and an operator's token and ticket in its first
-line; vaio and pi vouch for each other's sessions.  Lines on its input change the team: ``gone NAME``, ``back
-NAME``, ``status NAME STATUS``, ``freeze SECONDS`` (the whole process stands), ``name NAME`` (of the node that serves),
+``python -m tests.live.team`` does what the lines on its input say, and answers each with a line.  ``team PORT`` begins
+a new team, and is answered with the port, the code to sign in with, and an operator's token and ticket; vaio and pi
+vouch for each other's sessions.  ``end`` closes its page.  Others change the team: ``gone NAME``, ``back NAME``,
+``status NAME STATUS``, ``name NAME`` (of the node that serves),
 ``pages NODE=URL ...`` (the web nodes, itself first), ``strange FILE`` (devices and tasks whose words are those of that
 JSON list), ``session SECONDS`` (that one is signed in for at a time), ``place NAME KEY=NUMBER ...`` (where it says that
 it is), ``outdoors`` (without a yard), ``crowd COUNT`` (so many devices, three of them with cameras); it ends when its
@@ -13,9 +14,9 @@ from __future__ import annotations
 
 import json
 import random
-import sys
 import time
 from collections.abc import Iterable
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ from typing import Any
 import cv2
 import numpy as np
 from twisted.internet import reactor as _reactor
-from twisted.internet.defer import Deferred
+from twisted.internet.defer import Deferred, maybeDeferred
 from twisted.internet.stdio import StandardIO
 from twisted.internet.threads import deferToThread
 from twisted.protocols.basic import LineReceiver
@@ -130,6 +131,7 @@ class Team:
         self.devices = [dog(1, "WAITING", "t1", now), dog(2, "EXECUTING", "t1", now), dog(3, "SEARCHING", "t1", now)]
         self.away: set[str] = set()
         self.node = "vaio"
+        self.yard = deepcopy(YARD)
         self.halts = MemoryHalts(*(f"{n:02x}" * 16 for n in (1, 2, 3)))
         self.batch = 0
         self.version = 0
@@ -212,7 +214,7 @@ class Team:
                 "status": said,
             }
             self.tasks.append({**task, "note": said, "strategy": said, "why": told, "requirements": {said: {}}})
-        YARD["dogs"] = [{**YARD["dogs"][0], "name": said} for said in words[:20]]
+        self.yard["dogs"] = [{**YARD["dogs"][0], "name": said} for said in words[:20]]
         self._departed = Departed()
 
     def be_many(self, count: int) -> None:
@@ -273,21 +275,40 @@ class Orders(LineReceiver):
 
     delimiter = b"\n"
 
-    def __init__(self, team: Team, web: WebService, board: Board, pages: list[Page]) -> None:
-        self._team = team
-        self._web = web
-        assert isinstance(board.sessions, SignedSessions) and isinstance(board.desk, MemoryDesk)
-        self._sessions, self._desk = board.sessions, board.desk
-        self._pages = pages
+    _team: Team
+    _web: WebService
+    _sessions: SignedSessions
+    _desk: MemoryDesk
+    _pages: list[Page]
 
-    def connectionMade(self) -> None:
-        """Say where the team is, and how to come in."""
+    def lineReceived(self, line: bytes) -> None:
+        """Do one order and answer, so that the test knows that it was done."""
+        verb, *rest = line.decode().split()
+        if verb == "team":
+            self._begin(int(rest[0]))
+        elif verb == "end":
+            maybeDeferred(self._web.stopService).addCallback(lambda _: self.sendLine(line))
+        else:
+            self._change(verb, rest)
+            self._team.version += 1
+            self.sendLine(line)
+
+    def _begin(self, port: int) -> None:
+        """Serve a new team, and say where it is and how to come in."""
+        self._team = team = Team()
+        pages = MemoryFallbacks()
+        self._pages = pages.pages
+        served = replace(board(team), fallbacks=pages)
+        assert isinstance(served.sessions, SignedSessions) and isinstance(served.desk, MemoryDesk)
+        self._sessions, self._desk = served.sessions, served.desk
+        self._web = web_service(reactor, "127.0.0.1", port, team.read, served, team, time.time, ("vaio.local",))
+        pages_here = ["http://192.168.0.7:8080", "https://192.168.0.7:8443", f"http://127.0.0.1:{port}"]
+        served.invites = TeamInvites(lambda: pages_here, b"PEM", "AB:CD:" * 10, reactor, reactor.getThreadPool())
+        self._web.startService()
         token = self._sessions.token(NOBODY, "operator", "operator", time.time(), 3600.0)
         self.sendLine(f"{self._web.port} {self._sessions.code} {token.text} {token.ticket}".encode())
 
-    def lineReceived(self, line: bytes) -> None:
-        """Do one order and repeat it, so that the test knows that it was done."""
-        verb, *rest = line.decode().split()
+    def _change(self, verb: str, rest: list[str]) -> None:
         if verb == "gone":
             self._team.away.add(rest[0])
         elif verb == "back":
@@ -301,8 +322,6 @@ class Orders(LineReceiver):
             named = [each.split("=") for each in rest]
             uuids = [key_of(node).node_id.hex() for node, _ in named]
             self._pages[:] = [Page(uuids[place], url, is_self=place == 0) for place, (_, url) in enumerate(named)]
-        elif verb == "freeze":
-            time.sleep(float(rest[0]))
         elif verb == "place":
             numbers = {key: float(number) for key, _, number in (each.partition("=") for each in rest[1:])}
             next(each for each in self._team.devices if each["name"] == rest[0])["position"] = numbers
@@ -314,8 +333,6 @@ class Orders(LineReceiver):
             self._sessions.signed_s = float(rest[0])
         elif verb == "strange":
             self._team.be_strange(json.loads(Path(rest[0]).read_text(encoding="utf-8")))
-        self._team.version += 1
-        self.sendLine(line)
 
     def connectionLost(self, reason: Any = None) -> None:
         """End with the test."""
@@ -325,7 +342,7 @@ class Orders(LineReceiver):
 
 def board(team: Team) -> Board:
     """What the page can ask for: twins in memory, so that every order is taken and none does harm."""
-    desk = MemoryDesk(CATALOGUE, YARD)
+    desk = MemoryDesk(CATALOGUE, team.yard)
     able = [{"uuid": f"{n:02x}" * 16, "name": f"dog{n}", "busy": "Patrol the yard" * (n == 2)} for n in (1, 2)]
     desk.previews["search"] = {"able": able, "refused": {"dog3": ["no gripper", "no lift"]}, "likely": None}
     desk.together["yard"] = [{"id": "t1", "title": "Find and touch the red target"}]
@@ -436,16 +453,7 @@ def inventory() -> Any:
 
 def main() -> None:
     """Serve until the input ends."""
-    team = Team()
-    port = int(sys.argv[1]) if len(sys.argv) > 1 else 0
-    pages = MemoryFallbacks()
-    served = replace(board(team), fallbacks=pages)
-    web = web_service(reactor, "127.0.0.1", port, team.read, served, team, time.time, ("vaio.local",))
-    pages_here = ["http://192.168.0.7:8080", "https://192.168.0.7:8443", f"http://127.0.0.1:{port}"]
-    served.invites = TeamInvites(lambda: pages_here, b"PEM", "AB:CD:" * 10, reactor, reactor.getThreadPool())
-    web.startService()
-    reactor.addSystemEventTrigger("before", "shutdown", web.stopService)
-    reactor.callWhenRunning(lambda: StandardIO(Orders(team, web, served, pages.pages)))
+    reactor.callWhenRunning(lambda: StandardIO(Orders()))
     reactor.run()
 
 

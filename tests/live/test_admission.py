@@ -9,13 +9,13 @@ import subprocess
 import sys
 import tempfile
 import threading
-import time
 from pathlib import Path
 from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
 from sim.demo.port import free
+from tests.live.until import until
 
 ROOT = Path(__file__).resolve().parents[2]
 PATIENCE_S = 30.0
@@ -57,13 +57,6 @@ class ClosedTeamTests(SynchronousTestCase):
         """Whether a node's log has these words."""
         return any(words in line for line in list(self.lines[name]))
 
-    def until(self, condition: Any, what: str) -> None:
-        """Wait for a condition."""
-        end = time.monotonic() + PATIENCE_S
-        while not condition():
-            self.assertLess(time.monotonic(), end, f"{what}: {self.lines}")
-            time.sleep(0.05)
-
     def swarm(self, *words: str, code: int = 0) -> Any:
         """What ``swarm WORDS --json`` answers; where it is refused, what it complains of."""
         program = "import sys; from swarmnode.command import main; sys.exit(main(sys.argv[1:]))"
@@ -83,20 +76,20 @@ class ClosedTeamTests(SynchronousTestCase):
         [port] = free("udp", "127.0.0.1", 1)
         team = self.swarm("init", "yard", "--first", "vaio", "--at", f"127.0.0.1:{port}")
         self.start(team["settings"], "vaio")
-        self.until(lambda: self.said("vaio", "vaio joined"), "the first node joins")
+        until(lambda: self.said("vaio", "vaio joined"), told=lambda: self.lines)
         invited = self.swarm("invite", "dog9")
         found = self.swarm("join", invited["text"], "--folder", "dog9")
         self.assertEqual((found["team"], found["name"]), ("yard", "dog9"))
         self.assertIn("was used as often", self.swarm("join", invited["text"], "--folder", "thief", code=1))
         self.start(found["settings"], "dog9")
-        self.until(lambda: self.said("dog9", "dog9 joined"), "the newcomer joins")
+        until(lambda: self.said("dog9", "dog9 joined"), told=lambda: self.lines)
         members = self.swarm("members", "--node", "vaio")["members"]
         self.assertEqual([(each["name"], bool(each["at"])) for each in members], [("dog9", True), ("vaio", True)])
         self.swarm("rotate", "--node", "vaio")
         self.swarm("revoke", "dog9", "--node", "vaio")
-        self.until(lambda: self.said("dog9", "revoked"), "the revoked one is told")
+        until(lambda: self.said("dog9", "revoked"), told=lambda: self.lines)
         self.assertEqual([each["name"] for each in self.swarm("members", "--node", "vaio")["members"]], ["vaio"])
         (self.folder / "dog9" / "swarm.membership").chmod(0o644)
         again = self.start(found["settings"], "again")
         again.wait(PATIENCE_S)
-        self.until(lambda: self.said("again", "chmod 600"), "a membership that others can read is refused")
+        until(lambda: self.said("again", "chmod 600"), told=lambda: self.lines)

@@ -24,6 +24,7 @@ class LiveTests(SynchronousTestCase):
     """Nodes in processes of their own."""
 
     def setUp(self) -> None:
+        super().setUp()
         self.folder = Path(self.mktemp()).resolve()
         self.folder.mkdir()
 

@@ -8,10 +8,11 @@ import shutil
 import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
 
 from twisted.trial.unittest import SynchronousTestCase
+
+from tests.live.until import until
 
 ROOT = Path(__file__).resolve().parents[2]
 PATIENCE_S = 30.0
@@ -81,9 +82,7 @@ class ControlTests(SynchronousTestCase):
         child.wait()
         self.assertIn("does not answer (Connection refused); start it", self.swarm("dht", "get", "colour").stderr)
         self.start()
-        deadline = time.monotonic() + PATIENCE_S
-        while self.swarm("dht", "get", "colour").returncode and time.monotonic() < deadline:
-            time.sleep(0.2)
+        until(lambda: not self.swarm("dht", "get", "colour").returncode)
         self.assertIn("red", self.said("dht", "get", "colour"))
 
     def test_operator_pushes_to_a_running_node(self) -> None:
@@ -102,18 +101,15 @@ class ControlTests(SynchronousTestCase):
                 f"from middleware.consensus.strategies.nearest import Nearest as Strategy\nVERSION = {number}\n"
             )
             self.said("deploy", "push", str(module), "--name", "mine", "--kind", "strategy")
-            self.until(f"  a  {number} ")
+            self.shows(f"  a  {number} ")
         self.assertIn("went back", self.said("deploy", "rollback", "mine"))
-        self.until("  a  1 ")
+        self.shows("  a  1 ")
         child.kill()
         child.wait()
         self.start("--config", str(settings))
-        self.until("  a  1 ")
+        self.shows("  a  1 ")
         self.assertIn("the team has no task", self.swarm("why", "last").stderr)
 
-    def until(self, words: str) -> None:
+    def shows(self, words: str) -> None:
         """Wait until ``swarm deploy status`` says so."""
-        deadline = time.monotonic() + PATIENCE_S
-        while words not in (told := self.swarm("deploy", "status").stdout):
-            self.assertLess(time.monotonic(), deadline, told)
-            time.sleep(0.2)
+        until(lambda: words in self.swarm("deploy", "status").stdout)

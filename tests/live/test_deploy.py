@@ -7,14 +7,14 @@ import shutil
 import subprocess
 import sys
 import tempfile
-import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from sim.namespaces.internet import PUB, Internet, Site
 from sim.namespaces.kind import Kind
 from sim.namespaces.room import environment
 from tests.live.namespaces import NamespaceCase
+from tests.live.until import until
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "deploy.md"
@@ -122,14 +122,7 @@ class DeployTests(NamespaceCase):
         with open(log, "wb") as file:
             options = {"cwd": self.home(name), "env": self.surroundings(name), "stdout": file, "stderr": file}
             self.nodes[name] = net.start(host, line.split(), **options)
-        self.until(lambda: " joined as number " in log.read_text(), f"{name} joins")
-
-    def until(self, condition: Callable[[], bool], what: str) -> None:
-        """Wait for a condition."""
-        end = time.monotonic() + PATIENCE_S
-        while not condition():
-            self.assertLess(time.monotonic(), end, f"{what}\n{self.logs()}")
-            time.sleep(0.05)
+        until(lambda: " joined as number " in log.read_text(), told=self.logs)
 
     def logs(self) -> str:
         """What all nodes have said."""
@@ -159,7 +152,7 @@ class DeployTests(NamespaceCase):
                 shutil.move(self.home("boss") / f"host1.{ending}", self.home("host1"))
             said = self.follow(net, places, rest)
             gone = self.home("cam2") / "log"
-            self.until(lambda: "revoked the certificate" in gone.read_text(), "the one that was put out is told")
+            until(lambda: "revoked the certificate" in gone.read_text(), told=self.logs)
             members = said["boss: swarm members"]
             self.assertRegex(members, r"cam2 +revoked")
             self.assertRegex(members, r"cam1 .*bootstrap")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from typing import Any
 from sim.namespaces.internet import PUBS, Internet, Site
 from sim.namespaces.kind import Kind
 from tests.live.namespaces import NamespaceCase
+from tests.live.until import until
 
 LIMIT_S = 30.0
 TEAM = "of the test"
@@ -73,11 +73,8 @@ class DoctorCase(NamespaceCase):
         home = self.home(settings)
         words = ["env", f"XDG_RUNTIME_DIR={home}", *NODE, "--config", str(settings)]
         process = self.net.start(at, words, stdout=log, stderr=log)
-        until = time.monotonic() + LIMIT_S
-        while not list(home.glob("swarm-node/*.control")):
-            self.assertLess(time.monotonic(), until, settings.with_suffix(".log").read_text(encoding="utf-8"))
-            self.assertIsNone(process.poll(), settings.with_suffix(".log").read_text(encoding="utf-8"))
-            time.sleep(0.02)
+        said = settings.with_suffix(".log")
+        until(lambda: list(home.glob("swarm-node/*.control")), told=lambda: said.read_text(encoding="utf-8"))
         return process
 
     def home(self, settings: Path) -> Path:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import select
 import socket
 import ssl
 import subprocess
@@ -10,10 +11,12 @@ import time
 import urllib.error
 import urllib.request
 from importlib.util import find_spec
+from itertools import chain, repeat
 from typing import Any
 
 from sim.demo import port
-from tests.live.test_bad_input import PATIENCE_S, LiveTests
+from tests.live.test_bad_input import LiveTests
+from tests.live.until import takes, until
 
 MISSING = [name for name in ("flask", "OpenSSL", "cryptography") if find_spec(name) is None]
 DRIBBLED_S = 20.0
@@ -40,15 +43,8 @@ class SecureNode:
         self.process: subprocess.Popen[str] = test.start("--config", str(path))
         test.addCleanup(self.process.communicate)
         test.addCleanup(self.process.kill)
-        end = time.monotonic() + PATIENCE_S
-        while True:
-            try:
-                self.authority = asked(f"{self.plain}/api/v1/ca.crt").decode()
-                break
-            except OSError:
-                test.assertIsNone(self.process.poll(), "the node has ended")
-                test.assertLess(time.monotonic(), end, "the node does not answer")
-                time.sleep(0.1)
+        until(lambda: takes(http))
+        self.authority = asked(f"{self.plain}/api/v1/ca.crt").decode()
 
 
 def asked(url: str, trust: ssl.SSLContext | None = None, body: object = None, token: str = "") -> bytes:
@@ -139,20 +135,23 @@ class HttpsTests(LiveTests):
             client.setblocking(False)
         slow[0].send(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
         left = set(slow)
-        for n in range(int(DRIBBLED_S)):
+        octets = chain(b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03", repeat(ord("x")))
+
+        def all_closed() -> bool:
+            octet = bytes([next(octets)])
+            select.select(list(left), [], [], 1.0)
             for client in list(left):
                 try:
                     if client is not slow[1]:
-                        client.send(b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03"[n : n + 1] or b"x")
+                        client.send(octet)
                     if client.recv(100) == b"":
                         left.discard(client)
                 except BlockingIOError:
                     continue
                 except OSError:
                     left.discard(client)
-            if not left:
-                break
             self.assertIn(b"Swarm", asked(node.secure, self.trusting(node)))
-            time.sleep(1.0)
-        self.assertEqual(left, set())
+            return not left
+
+        until(all_closed)
         self.assertLess(time.monotonic() - began, DRIBBLED_S)

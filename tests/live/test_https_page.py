@@ -6,42 +6,30 @@ import json
 import signal
 import ssl
 from importlib.util import find_spec
-from typing import Any
 
-from tests.live.page import CHROMIUM, DESK, FLAGS, PHONE, pin
+from tests.live.page import DESK, PHONE, BrowserCase, pin
 from tests.live.page import MISSING as NO_BROWSER
 from tests.live.test_bad_input import LiveTests
 from tests.live.test_https import CODE, SecureNode, asked
-from tests.live.test_phone import FAKE, film
 
 MISSING = [*NO_BROWSER, *(name for name in ("OpenSSL", "cryptography") if find_spec(name) is None)]
-FOUND_S = 30.0
-"""For two nodes to know each other's pages, on a busy machine."""
 MOVED_S = 15.0
 """Within 2 s where the machine has nothing else to do."""
 
 
-class HttpsPageTests(LiveTests):
+class HttpsPageTests(BrowserCase, LiveTests):
     if MISSING:
         skip = f"THE PAGE OVER TLS IS NOT TESTED IN A BROWSER: missing {'; '.join(MISSING)}"
 
     def test_take_part_by_an_invitation(self) -> None:
         """A phone that scanned an invitation gives its camera over TLS by one tap, and is a device of the team."""
-        from playwright.sync_api import sync_playwright
-
         node = SecureNode(self, "vaio")
         trust = ssl.create_default_context(cadata=node.authority)
         session = json.loads(asked(f"{node.secure}/api/v1/session", trust, {"code": CODE}))["token"]
         invited = json.loads(asked(f"{node.secure}/api/v1/invitations", trust, {"role": "phone"}, session))
         self.assertTrue(invited["link"].startswith(f"{node.secure}/#code="), invited["link"])
-        play: Any = sync_playwright().start()
-        self.addCleanup(play.stop)
-        shown = f"--use-file-for-fake-video-capture={film(self.folder / 'film.mjpeg')}"
-        trusted = f"--ignore-certificate-errors-spki-list={pin(node.port)}"
-        browser = play.chromium.launch(executable_path=CHROMIUM, args=[*FLAGS, *FAKE, shown, trusted])
-        self.addCleanup(browser.close)
-        page = browser.new_context(**PHONE).new_page()
-        page.set_default_timeout(1000 * FOUND_S)
+        self.browser = self.launched(f"--ignore-certificate-errors-spki-list={pin(node.port)}")
+        page = self.tab(PHONE, permissions=["camera"])
         page.goto(invited["link"])
         page.get_by_role("button", name="Take part", exact=True).tap()
         page.get_by_role("button", name="Stop taking part").wait_for()
@@ -51,19 +39,11 @@ class HttpsPageTests(LiveTests):
 
     def test_stay_secure_when_the_node_is_lost(self) -> None:
         """The page has camera and service worker within reach, and goes on at another node's https, never at http."""
-        from playwright.sync_api import sync_playwright
-
         first = SecureNode(self, "vaio")
         second = SecureNode(self, "pi", first.address)
-        play: Any = sync_playwright().start()
-        self.addCleanup(play.stop)
         pins = ",".join(pin(node.port) for node in (first, second))
-        browser = play.chromium.launch(
-            executable_path=CHROMIUM, args=[*FLAGS, f"--ignore-certificate-errors-spki-list={pins}"]
-        )
-        self.addCleanup(browser.close)
-        page = browser.new_context(**DESK).new_page()
-        page.set_default_timeout(1000 * FOUND_S)
+        self.browser = self.launched(f"--ignore-certificate-errors-spki-list={pins}")
+        page = self.tab(DESK)
         wanted: list[str] = []
         page.on("request", lambda request: wanted.append(request.url))
         page.goto(f"{first.secure}/#code={CODE}")

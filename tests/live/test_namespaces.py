@@ -126,13 +126,13 @@ class InternetTests(NamespaceCase):
     def test_nothing_is_left(self) -> None:
         """After an exception, and after a kill of whoever made it, no process of an internet is left."""
         program = (
-            "import os, sys, time\n"
+            "import os, signal, sys\n"
             "from sim.namespaces.internet import Internet, Site\nfrom sim.namespaces.kind import Kind\n"
             "with Internet([Site('a', Kind.PORT)]) as net:\n"
             "    started = net.start('a1', ['sleep', '600'])\n"
             "    print(started.pid, *[net.room(name).pid for name in ('', 'a1', 'a-gw')], flush=True)\n"
             "    if sys.argv[1] == 'raise': raise SystemExit(3)\n"
-            "    time.sleep(600)\n"
+            "    signal.pause()\n"
         )
         for end in ("raise", "kill"):
             child = subprocess.Popen([sys.executable, "-c", program, end], cwd=ROOT, stdout=subprocess.PIPE, text=True)

@@ -13,16 +13,13 @@ import urllib.error
 import urllib.request
 from collections.abc import Callable
 from importlib.util import find_spec
-from pathlib import Path
 from typing import Any
-
-from twisted.trial.unittest import SynchronousTestCase
 
 from benchmarks.demo import family
 from tests.live.demonstration import DemonstrationCase, stretch
-from tests.live.page import CHROMIUM, DESK, FLAGS, MISSING, PATIENCE_MS, PHONE, TABLET, Team, pin
+from tests.live.page import DESK, PHONE, TABLET, BrowserCase, TeamCase, pin
+from tests.live.until import until
 
-FAKE = ("--use-fake-device-for-media-stream", "--use-fake-ui-for-media-stream")
 TAKEOVER_S = 2.0
 PLACES = ((0.3, 2.1), (2.7, 2.1), (0.3, 0.3), (2.7, 0.3))
 SIGHTS = """async (pictures) => {
@@ -44,64 +41,13 @@ HIDE = """(hidden) => {
 }"""
 
 
-def film(path: Path, disc: int = 66) -> Path:
-    """A film for the fake camera, 320 x 240: a red disc, so many of 104 pixels across, that trembles a little."""
-    import cv2
-    import numpy as np
-
-    with path.open("wb") as file:
-        for n in range(30):
-            picture = np.full((240, 320, 3), (190, 200, 205), np.uint8)
-            picture[150:] = (90, 120, 130)
-            if disc:
-                cv2.circle(picture, (160 + n % 3, 120), round(disc / 104 * 320 / 2), (40, 40, 210), -1)
-            file.write(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes())
-    return path
-
-
-class Browser(SynchronousTestCase):
-    if MISSING:
-        skip = f"THE PHONE IS NOT TESTED IN A BROWSER: missing {'; '.join(MISSING)}"
-
-    def browser(self, disc: int = 66, *flags: str) -> Any:
-        """Chromium whose camera shows the film."""
-        from playwright.sync_api import sync_playwright
-
-        shown = f"--use-file-for-fake-video-capture={film(Path(self.mktemp()).with_suffix('.mjpeg').absolute(), disc)}"
-        play = sync_playwright().start()
-        self.addCleanup(play.stop)
-        browser = play.chromium.launch(executable_path=CHROMIUM, args=[*FLAGS, shown, *(flags or FAKE)])
-        self.addCleanup(browser.close)
-        self.faults: list[str] = []
-        return browser
-
-    def page(self, browser: Any, address: str, screen: Any = PHONE, **more: Any) -> Any:
-        page = browser.new_context(**screen, **more).new_page()
-        page.set_default_timeout(PATIENCE_MS)
-        page.on("pageerror", lambda error: self.faults.append(str(error)))
-        page.goto(address)
-        page.locator("#link[data-link=live]").wait_for()
-        return page
-
-    def assert_sound(self, page: Any, when: str) -> None:
-        """Axe finds nothing, and nothing is wider than the screen."""
-        from axe_playwright_python.sync_playwright import Axe
-
-        found = Axe().run(page).response["violations"]
-        self.assertEqual([(each["id"], each["nodes"][0]["html"]) for each in found], [], when)
-        self.assertLessEqual(page.evaluate("document.documentElement.scrollWidth - innerWidth"), 0, when)
-        self.assertEqual(self.faults, [], when)
-
-
-class PhoneViewTests(Browser):
+class PhoneViewTests(BrowserCase, TeamCase):
     """The view of a phone, over the twin of a gateway."""
 
-    def setUp(self) -> None:
-        self.team = Team()
-        self.addCleanup(self.team.stop)
-
-    def opened(self, browser: Any, screen: Any = PHONE, base: str = "", **more: Any) -> Any:
-        page = self.page(browser, f"{base or self.team.url}#code={self.team.code}", screen, **more)
+    def opened(self, screen: Any = PHONE, base: str = "", may_film: bool = True) -> Any:
+        page = self.tab(screen, permissions=["camera"] if may_film else [])
+        page.goto(f"{base or self.team.url}#code={self.team.code}")
+        page.locator("#link[data-link=live]").wait_for()
         if screen is PHONE:
             page.locator("#views a", has_text="More").tap()
         page.get_by_role("button", name="Take part with this device").press("Enter")
@@ -110,28 +56,26 @@ class PhoneViewTests(Browser):
 
     def test_take_part_and_stop(self) -> None:
         """By touch and by keyboard alone, on three screens: it shows what it sees and what it is asked, and stops."""
-        browser = self.browser()
         for screen in (PHONE, TABLET, DESK):
-            for colours in ("light", "dark"):
-                page = self.opened(browser, screen, color_scheme=colours)
-                self.assert_sound(page, f"before, {colours}")
-                button = page.get_by_role("button", name="Take part", exact=True)
-                if screen.get("has_touch"):
-                    button.tap()
-                else:
-                    page.locator("#phone-name").focus()
-                    page.keyboard.press("Enter")
-                page.locator(".phone .said", has_text="Look for the red target").wait_for()
-                page.locator(".phone", has_text="Target at about 0.2").wait_for()
-                self.assert_sound(page, f"taking part, {colours}")
-                page.get_by_role("button", name="Stop taking part").click()
-                page.locator(".phone .trouble", has_text="takes no part any more").wait_for()
-                self.assert_sound(page, f"after, {colours}")
-                page.context.close()
+            page = self.opened(screen)
+            self.sound_by_day_and_night(page)
+            button = page.get_by_role("button", name="Take part", exact=True)
+            if screen.get("has_touch"):
+                button.tap()
+            else:
+                page.locator("#phone-name").focus()
+                page.keyboard.press("Enter")
+            page.locator(".phone .said", has_text="Look for the red target").wait_for()
+            page.locator(".phone", has_text="Target at about 0.2").wait_for()
+            self.sound_by_day_and_night(page)
+            page.get_by_role("button", name="Stop taking part").click()
+            page.locator(".phone .trouble", has_text="takes no part any more").wait_for()
+            self.sound_by_day_and_night(page)
+            page.context.close()
 
     def test_leave_while_hidden(self) -> None:
         """Out of sight it leaves and lets the camera go; in sight again it comes back by itself, as the same phone."""
-        page = self.opened(self.browser())
+        page = self.opened()
         page.get_by_role("button", name="Take part", exact=True).tap()
         page.locator(".phone .said", has_text="Look for the red target").wait_for()
         secret = page.evaluate("localStorage.getItem('swarm.phone')")
@@ -146,19 +90,15 @@ class PhoneViewTests(Browser):
 
     def test_say_why_not(self) -> None:
         """A refused camera, a page that is not secure and a visitor who only looks: each is told what to do."""
-        refusing = self.browser(
-            66, "--use-fake-device-for-media-stream", "--host-resolver-rules=MAP vaio.local 127.0.0.1"
-        )
-        page = self.opened(refusing)
+        page = self.opened(may_film=False)
         page.get_by_role("button", name="Take part", exact=True).tap()
         page.locator(".phone .trouble", has_text="The camera was refused. Allow it").wait_for()
-        self.assert_sound(page, "refused")
-        page = self.opened(refusing, base=f"http://vaio.local:{self.team.port}/")
+        self.sound(page)
+        page = self.opened(base=f"http://vaio.local:{self.team.port}/", may_film=False)
         page.locator(".phone .trouble", has_text="https pages alone").wait_for()
         self.assertTrue(page.get_by_role("button", name="Take part", exact=True).is_disabled())
-        viewer = self.invited("viewer")
-        page = self.page(refusing, f"{self.team.url}#code={viewer}")
-        page.evaluate("location.hash = 'phone'")
+        page = self.tab(PHONE)
+        page.goto(f"{self.team.url}#code={self.invited('viewer')}/phone")
         page.locator(".phone .trouble", has_text="Ask an operator for an invitation").wait_for()
 
     def invited(self, role: str) -> str:
@@ -181,7 +121,7 @@ class PhoneViewTests(Browser):
             walk.world.place_target(x, y)
             pictures.append(walk.camera.jpeg(walk.dog))
         pictures.append(Walk().camera.jpeg(Walk().dog))
-        page = self.opened(self.browser())
+        page = self.opened()
         found = page.evaluate(SIGHTS, [base64.b64encode(picture).decode() for picture in pictures])
         count = 0
         for picture, here in zip(pictures, found, strict=True):
@@ -194,7 +134,7 @@ class PhoneViewTests(Browser):
         self.assertGreater(count, 5)
 
 
-class DemonstrationPhoneTests(Browser, DemonstrationCase):
+class DemonstrationPhoneTests(BrowserCase, DemonstrationCase):
     """The team of the demonstration, six processes, and a visitor's phone."""
 
     is_secure = all(find_spec(name) for name in ("OpenSSL", "cryptography"))
@@ -209,16 +149,14 @@ class DemonstrationPhoneTests(Browser, DemonstrationCase):
 
     def until(self, is_so: Callable[[], Any], within: float, page: Any = None) -> float:
         """Wait until it is so; the seconds that it took."""
+
+        def told() -> str:
+            devices = {name: (each["status"], each["messages"]) for name, each in self.devices().items()}
+            seen = "" if page is None else page.locator(".phone").text_content()
+            return f"{devices} {[(task['status'], task['note']) for task in self.demo.api('tasks')]} {seen}"
+
         began = time.monotonic()
-        while not is_so():
-            if time.monotonic() - began > within:
-                told = {name: (each["status"], each["messages"]) for name, each in self.devices().items()}
-                seen = "" if page is None else page.locator(".phone").text_content()
-                self.fail(f"{told} {[(task['status'], task['note']) for task in self.demo.api('tasks')]} {seen}")
-            if page is None:
-                time.sleep(0.03)
-            else:
-                page.wait_for_timeout(100)
+        until(is_so, within, told)
         return time.monotonic() - began
 
     def statuses(self) -> dict[str, str]:
@@ -243,25 +181,39 @@ class DemonstrationPhoneTests(Browser, DemonstrationCase):
         invitation = self.demo.api("invitations", {"role": "phone", "name": "visitor"})["token"]
         self.until(lambda: {"dog1", "dog2", "dog3"} <= set(self.devices()), 30.0 * stretch())
         self.until(lambda: len(self.demo.api("node")["pages"]) == (4 if self.is_secure else 2), 30.0 * stretch())
-        browser = self.browser(66, *FAKE, f"--ignore-certificate-errors-spki-list={self.pins()}")
-        page = self.page(browser, f"{self.demo.url}#code={invitation}/phone")
+        self.browser = self.launched(f"--ignore-certificate-errors-spki-list={self.pins()}")
+        page = self.tab(PHONE, permissions=["camera"])
+        page.goto(f"{self.demo.url}#code={invitation}/phone")
         page.locator("#phone-name").fill("anna")
         page.get_by_role("button", name="Take part", exact=True).tap()
         page.locator(".phone", has_text="Target at about 0.2").wait_for()
         self.until(lambda: "anna" in self.devices(), 10.0, page)
         return page
 
-    def test_wins_and_is_taken_over(self) -> None:
-        """One tap joins; the phone sees the target, bids, wins and shows it all; its tab closes, and a dog goes on."""
+    def lose_web_node(self, page: Any) -> None:
+        """Kill the node that the phone takes part at; it goes on at the other as the same device."""
+        before = self.devices()["anna"]
+        os.kill(next(pid for pid, name in family(self.demo.pid).items() if name == "vaio"), signal.SIGKILL)
+        page.locator("#node", has_text="pi").wait_for()
+        self.demo.sign_in(page.evaluate("import('/static/link.js').then(({ base }) => base())") + "/")
+        self.until(lambda: self.devices().get("anna", before)["address"] != before["address"], 15.0 * stretch(), page)
+        page.locator(".phone .said", has_text="Nothing to do").wait_for()
+        after = self.devices()["anna"]
+        self.assertEqual((after["uuid"], after["joined"]), (before["uuid"], before["joined"]))
+        self.assertIsNone(after["gone"])
+
+    def test_wins_at_another_web_node_and_is_taken_over(self) -> None:
+        """A phone joins by one tap, goes on when its web node dies, wins a task, and leaves it to a dog."""
         page = self.joined()
         anna = self.devices()["anna"]
         self.assertEqual((anna["kind"], "camera" in anna["capabilities"]), ("phone", True))
         self.assertNotIn("base2d", anna["capabilities"])
+        self.lose_web_node(page)
 
         self.place_target()
         self.demo.api("tasks", {"name": "watch-target"})
         self.until(lambda: self.has_task(page), 60.0 * stretch(), page)
-        self.assert_sound(page, "executing")
+        self.sound(page)
         page.evaluate("location.hash = 'cameras'")
         page.locator("figure[data-camera=live]", has_text="anna").wait_for()
         reds = page.evaluate(
@@ -286,22 +238,4 @@ class DemonstrationPhoneTests(Browser, DemonstrationCase):
         )
         self.assertLess(took, TAKEOVER_S * stretch())
         self.assertNotIn("EXECUTING", [self.statuses().get("anna", "GONE")])
-        self.assertEqual(self.faults, [])
-
-    def test_go_on_at_another_web_node(self) -> None:
-        """The web node dies with its phones in it: the phone goes on through the other as the same device, and wins."""
-        page = self.joined()
-        page.locator("#reserve", has_text="pi").wait_for()
-        before = self.devices()["anna"]
-        os.kill(next(pid for pid, name in family(self.demo.pid).items() if name == "vaio"), signal.SIGKILL)
-        page.locator("#node", has_text="pi").wait_for()
-        self.demo.sign_in(page.evaluate("import('/static/link.js').then(({ base }) => base())") + "/")
-        self.until(lambda: self.devices().get("anna", before)["address"] != before["address"], 15.0 * stretch(), page)
-        page.locator(".phone .said", has_text="Nothing to do").wait_for()
-        after = self.devices()["anna"]
-        self.assertEqual((after["uuid"], after["joined"]), (before["uuid"], before["joined"]))
-        self.assertIsNone(after["gone"])
-        self.place_target()
-        self.demo.api("tasks", {"name": "watch-target"})
-        self.until(lambda: self.has_task(page), 60.0 * stretch(), page)
         self.assertEqual(self.faults, [])

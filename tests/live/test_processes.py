@@ -6,13 +6,14 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 from twisted.trial.unittest import SynchronousTestCase
 
+from tests.live.until import until
+
 ROOT = Path(__file__).resolve().parents[2]
-CHILD = "import os, sys, time; print(os.getpid(), *sys.argv[1:], flush=True); time.sleep(60)"
+CHILD = "import os, signal, sys; print(os.getpid(), *sys.argv[1:], flush=True); signal.pause()"
 PARENT = """
 import signal
 import sys
@@ -64,10 +65,7 @@ class OrphanTests(SynchronousTestCase):
 
     def assert_ended(self) -> None:
         """Wait until no child runs, and fail where one still does."""
-        end = time.monotonic() + PATIENCE_S
-        while any(map(is_alive, self.pids)) and time.monotonic() < end:
-            time.sleep(0.05)
-        self.assertEqual([pid for pid in self.pids if is_alive(pid)], [])
+        until(lambda: not any(map(is_alive, self.pids)), told=lambda: list(filter(is_alive, self.pids)))
 
     def test_killed_parent_leaves_no_orphan(self) -> None:
         """When the parent is killed by SIGKILL, its children end by themselves."""

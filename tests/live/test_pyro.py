@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import time
 from functools import partial
 from pathlib import Path
 from random import Random
@@ -20,6 +19,7 @@ from drivers.pyro.robot import PyroRobot
 from drivers.registry import driver_for
 from sim.robots.emulator.aibo import AiboEmulator
 from sim.robots.emulator.body import MemoryBody
+from tests.live.until import until
 
 ROOT = Path(__file__).parents[2]
 reactor: Any = running
@@ -36,13 +36,14 @@ class ThreadTests(TestCase):
         driver = driver_for("aibo", {"host": "dog", "camera": False}, "dog", reactor, dog.connector())
         robot = PyroRobot(driver, reactor, partial(blockingCallFromThread, reactor))
 
+        def moves() -> bool:
+            robot.update()
+            return body.motion[0] != 0.0
+
         def script() -> tuple[Any, Any, Any]:
             robot.connect()
             robot.move(0.5, 0.0)
-            until = time.monotonic() + 5.0
-            while body.motion[0] == 0.0 and time.monotonic() < until:
-                robot.update()
-                time.sleep(0.02)
+            until(moves)
             moving = body.motion
             level = robot.battery[0].level
             robot.stop()

@@ -25,13 +25,14 @@ from sim.robots.emulator.rosbridge import RosbridgeRobot
 reactor: Any = running
 MISSING = "NOTHING IS HELD AGAINST THE ROSBRIDGE OF OTHERS: install the extra ros"
 OTHERS = """
-import json, sys, time
+import json, sys, threading, time
 import roslibpy
 ros = roslibpy.Ros("127.0.0.1", int(sys.argv[1]))
 ros.run(timeout=10)
 seen = []
 odom = roslibpy.Topic(ros, "/odom", "nav_msgs/Odometry", throttle_rate=50)
-odom.subscribe(seen.append)
+heard = threading.Event()
+odom.subscribe(lambda told: (seen.append(told), heard.set()))
 wheels = roslibpy.Topic(ros, "/cmd_vel", "geometry_msgs/Twist")
 wheels.advertise()
 found = roslibpy.Service(ros, "/rosapi/topic_type", "rosapi/TopicType")
@@ -39,7 +40,8 @@ kind = found.call(roslibpy.ServiceRequest({"topic": "/cmd_vel"}), timeout=5)["ty
 end = time.monotonic() + 5
 while time.monotonic() < end and not (seen and seen[-1]["twist"]["twist"]["linear"]["x"] == 0.125):
     wheels.publish(roslibpy.Message({"linear": {"x": 0.125, "y": 0, "z": 0}, "angular": {"x": 0, "y": 0, "z": 0}}))
-    time.sleep(0.05)
+    heard.wait(0.5)
+    heard.clear()
 missing = ""
 try:
     roslibpy.Service(ros, "/none", "x/Y").call(roslibpy.ServiceRequest({}), timeout=5)

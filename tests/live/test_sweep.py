@@ -6,7 +6,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 from twisted.trial.unittest import SkipTest, TestCase
@@ -30,7 +29,6 @@ class InterruptTests(TestCase):
         with self.command(100_000, book) as child:
             assert child.stdout is not None
             self.assertIn("from seed 1", child.stdout.readline())
-            time.sleep(0.5)
             child.send_signal(signal.SIGINT)
             told, _ = child.communicate(timeout=60)
             self.assertEqual(child.returncode, 130, told)

@@ -25,6 +25,7 @@ from middleware.entangled.network.url import Url
 from middleware.entangled.wire.endpoint import Endpoint
 from sim.demo import port
 from tests.live.test_bad_input import PATIENCE_S, LiveTests
+from tests.live.until import takes, until
 
 REACTOR: Any = reactor
 HOST = "127.0.0.1"
@@ -324,14 +325,7 @@ class NodeTests(LiveTests):
             silent.bind((HOST, 0))
             known = f'known_nodes = ["{HOST}:{silent.getsockname()[1]}"]\n'
             self.node("b", f'roles = ["bootstrap"]\ntunnel_port = {number}\n')
-            end = time.monotonic() + PATIENCE_S
-            while True:
-                try:
-                    socket.create_connection((HOST, number), 1.0).close()
-                    break
-                except OSError:
-                    self.assertLess(time.monotonic(), end, "the bootstrap does not listen")
-                    time.sleep(0.1)
+            until(lambda: takes(number))
             child = self.node("a", f'{known}tunnels = ["wss://{HOST}:{number}"]\n')
             silent.settimeout(PATIENCE_S)
             silent.recv(2000)

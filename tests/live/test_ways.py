@@ -8,9 +8,9 @@ from tests.live.page import DESK, PHONE, PageCase
 
 
 class WaysTests(PageCase):
-    def looked(self, screen: dict[str, Any], scheme: str = "light") -> Any:
+    def looked(self, screen: dict[str, Any]) -> Any:
         """The network's view, when both panels have come."""
-        page = self.opened(screen, scheme)
+        page = self.opened(screen)
         self.view(page, "network")
         page.locator("#ways li").nth(2).wait_for()
         page.locator("#team-kind").scroll_into_view_if_needed()
@@ -60,8 +60,12 @@ class WaysTests(PageCase):
         )
 
     def test_tell_the_team(self) -> None:
-        """A closed team has its name, fingerprint and members; whose certificate ends soon is first, and stands out."""
-        page = self.looked(PHONE)
+        """A closed team has its name, fingerprint and members; whose certificate ends soon is first, and stands out.
+
+        An operator reads by which command a member is put out; a viewer sees the members without, and no button.
+        However much a member may do, its name stands in one line.
+        """
+        page = self.looked(DESK)
         self.assertEqual(page.locator("#team-kind").inner_text(), "Closed team yard")
         self.assertIn("Fingerprint 1a2b 3c4d 5e6f 7081", page.locator("#team-about").inner_text())
         first, second, third = (item.inner_text() for item in page.locator("#members li").all())
@@ -69,10 +73,8 @@ class WaysTests(PageCase):
         self.assertIn("device, bootstrap", second)
         self.assertIn("not here", third)
         self.assertNotIn("!", second + third)
-
-    def test_keep_a_name_whole(self) -> None:
-        """However much a member may do, its name stands in one line."""
-        page = self.looked(DESK)
+        self.assertEqual(page.locator("#members code").all_inner_texts(), [f"swarm revoke dog{n}" for n in (2, 1, 7)])
+        self.assertEqual(page.locator("#place-network button").count(), 0)
         lines = """item => {
           item.querySelector(".roles").textContent = "device, operator, gateway, bootstrap";
           const name = document.createRange();
@@ -80,33 +82,30 @@ class WaysTests(PageCase):
           return name.getClientRects().length;
         }"""
         self.assertEqual(page.locator("#members li").first.evaluate(lines), 1)
-
-    def test_show_commands_to_operators_alone(self) -> None:
-        """An operator reads by which command a member is put out; a viewer sees the members without, and no button."""
-        page = self.looked(DESK)
-        self.assertEqual(page.locator("#members code").all_inner_texts(), [f"swarm revoke dog{n}" for n in (2, 1, 7)])
-        self.assertEqual(page.locator("#place-network button").count(), 0)
         page.evaluate("import('/static/model.js').then(({ model }) => { model.me = { name: '', role: 'viewer' }; })")
         page.wait_for_function("() => !document.querySelector('#members code:not(:empty)')")
         self.assertEqual(page.locator("#members li").count(), 3)
 
     def test_ask_while_somebody_looks(self) -> None:
         """What is measured for the page is asked for while it is in sight, and no longer."""
-        page = self.opened(PHONE)
-        page.wait_for_timeout(300)
-        self.assertFalse([url for url in self.asked if url.endswith(("/links", "/team"))])
+        page = self.opened(PHONE, has_clock=True)
+
+        def asks() -> bool:
+            self.asked.clear()
+            self.pass_by(page, 10.0)
+            return any(url.endswith(("/links", "/team")) for url in self.asked)
+
+        self.assertFalse(asks())
         self.view(page, "network")
         page.locator("#ways li").first.wait_for()
+        self.assertTrue(asks())
         self.view(page, "devices")
-        page.wait_for_timeout(300)
-        self.asked.clear()
-        page.wait_for_timeout(3000)
-        self.assertFalse([url for url in self.asked if url.endswith(("/links", "/team"))])
+        self.assertFalse(asks())
 
     def test_sound(self) -> None:
         """On phone and desk, light and dark, axe finds nothing, and nothing is wider than the screen."""
-        for screen, scheme in ((PHONE, "light"), (PHONE, "dark"), (DESK, "light"), (DESK, "dark")):
-            page = self.looked(screen, scheme)
+        for screen in (PHONE, DESK):
+            page = self.looked(screen)
             page.locator("#ways-others summary").click()
-            self.sound(page)
+            self.sound_by_day_and_night(page)
             page.context.close()

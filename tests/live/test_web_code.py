@@ -13,6 +13,7 @@ from importlib.util import find_spec
 from typing import Any
 
 from tests.live.test_bad_input import PATIENCE_S, ROOT, LiveTests
+from tests.live.until import until
 
 MISSING = [name for name in ("flask",) if find_spec(name) is None]
 
@@ -47,11 +48,7 @@ class WebCodeTests(LiveTests):
         )
         self.addCleanup(child.communicate)
         self.addCleanup(child.terminate)
-        end = time.monotonic() + PATIENCE_S
-        while not (told := self.swarm_web(runtime.name, "--json")).stdout and time.monotonic() < end:
-            self.assertIsNone(child.poll())
-            time.sleep(0.2)
-        page = json.loads(told.stdout)
+        page = json.loads(until(lambda: self.swarm_web(runtime.name, "--json").stdout))
         self.assertEqual(page["link"], f"{page['url']}#code={page['code']}")
         self.assertIn(page["link"], self.swarm_web(runtime.name).stdout)
         token = self.asked(f"{page['url']}api/v1/session", {"code": page["code"]})["token"]
