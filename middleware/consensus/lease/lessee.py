@@ -105,6 +105,7 @@ class Lessee:
         self.council = council
         self.pauses = 0
         self.state = State.IDLE
+        self._steps = 0
         self._clock = clock
         self._rng = rng
         self._changed = changed
@@ -237,8 +238,10 @@ class Lessee:
         :param delay: seconds, for an event that sets the timer
         """
         self.state, actions = next_step(self.state, event)
+        self._steps = step = self._steps + 1
         for action in actions:
-            self._perform(action, asked, delay)
+            if self._steps == step:  # else the listener has called, and its transition has replaced this one
+                self._perform(action, asked, delay)
 
     def _perform(self, action: Action, asked: Round | None, delay: float) -> None:
         match action:

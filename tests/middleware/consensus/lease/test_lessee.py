@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from middleware.consensus.lease.client_states import State
 from middleware.entangled.data.memory import MemoryStore
 from sim.team.leases.radio import Air
 from sim.team.leases.takeover import takeover, upkeep
@@ -22,6 +23,21 @@ class LesseeTests(RoomCase):
         self.assertIsNone(lessee.lease)
         self.wanting(1)
         self.assertEqual(self.token(1), 2)
+
+    def test_release_by_the_listener(self) -> None:
+        """A listener that gives up when the lease is lost ends the claim: nothing is asked after it."""
+        for lose in ("outrank", "cut"):
+            self.room = self.made(seed=f"listener {lose}")
+            lessee = self.wanting(0)
+            lessee._changed = lambda lessee=lessee: lessee.release() if not lessee.token else None  # type: ignore[misc]
+            if lose == "outrank":
+                lessee.outrank(9)
+            else:
+                self.cut(0, 3, 4, 5)
+                self.run_for(2 * TTL)
+            self.assertEqual((lessee.state, lessee._round, lessee._timer), (State.IDLE, None, None), lose)
+            self.run_for(2 * TTL)
+            self.assertIs(lessee.state, State.IDLE, lose)
 
     def test_one_of_many(self) -> None:
         """Of several that want it at one moment one gets it, and the others do not disturb it."""
