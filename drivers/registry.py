@@ -9,10 +9,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from importlib import import_module
+from importlib.util import find_spec
+from pkgutil import iter_modules
 from typing import TYPE_CHECKING, cast
 
 from twisted.internet.interfaces import IReactorTime
 
+import drivers
 from drivers.driver import Driver
 from drivers.errors import UsageError
 from drivers.reading import Description
@@ -25,24 +28,21 @@ Describe = Callable[[Mapping[str, object], str], Description]
 Parts = Sequence[tuple[str, Mapping[str, object]]]
 """Kind and options of each part that rides on a robot and only senses."""
 
-KINDS = {
-    "aibo": "drivers.aibo.maker",
-    "bittle": "drivers.bittle.maker",
-    "camera": "drivers.camera.maker",
-    "compass": "drivers.compass.maker",
-    "create2": "drivers.create2.maker",
-    "phone": "drivers.phone.maker",
-    "rosbridge": "drivers.rosbridge.maker",
-    "sim": "drivers.sim.maker",
-}
-"""Kind to the module that has ``made(options, name, clock, connector)`` and ``description(options, name)``."""
+
+def built_in_kinds() -> list[str]:
+    """Return the kinds in the tree: the packages of ``drivers`` that have a ``driver`` module; none is imported.
+
+    It has ``make_driver(options, name, clock, connector)`` and ``describe(options, name)``.
+    """
+    packages = [module.name for module in iter_modules(drivers.__path__) if module.ispkg]
+    return [name for name in packages if find_spec(f"drivers.{name}.driver") is not None]
 
 
 def kinds() -> list[str]:
     """The kinds of robot that there are drivers for, those of other distributions as well; none is imported."""
     from drivers.foreign import places
 
-    return sorted({*KINDS, *places()})
+    return sorted({*built_in_kinds(), *places()})
 
 
 def driver_for(
@@ -59,7 +59,7 @@ def driver_for(
     links, real TCP on the running reactor where it is None.  Raises ``UsageError`` with one line for an unknown
     kind or a wrong option.
     """
-    main = cast(Factory, _found(kind, "made"))(options, name, clock, connector)
+    main = cast(Factory, _found(kind, "make_driver"))(options, name, clock, connector)
     if not parts:
         return main
     from drivers.joined import joined  # a robot without parts is spared it
@@ -67,13 +67,13 @@ def driver_for(
     made = []
     for number, (part, table) in enumerate(parts, 1):
         with _naming(number):
-            made.append(cast(Factory, _found(part, "made"))(table, f"{name}'s {part}", clock, connector))
+            made.append(cast(Factory, _found(part, "make_driver"))(table, f"{name}'s {part}", clock, connector))
     return joined(main, made, name)
 
 
 def describe(kind: str, options: Mapping[str, object], name: str = "robot", parts: Parts = ()) -> Description:
     """What a robot of ``kind`` with ``parts`` is, without making a driver; raises as ``driver_for`` does."""
-    main = cast(Describe, _found(kind, "description"))(options, name)
+    main = cast(Describe, _found(kind, "describe"))(options, name)
     if not parts:
         return main
     from drivers.joined import described
@@ -81,7 +81,7 @@ def describe(kind: str, options: Mapping[str, object], name: str = "robot", part
     made = []
     for number, (part, table) in enumerate(parts, 1):
         with _naming(number):
-            made.append(cast(Describe, _found(part, "description"))(table, name))
+            made.append(cast(Describe, _found(part, "describe"))(table, name))
     return described(main, made)
 
 
@@ -95,8 +95,8 @@ def _naming(number: int) -> Iterator[None]:
 
 
 def _found(kind: str, attribute: str) -> object:
-    if kind in KINDS:
-        return getattr(import_module(KINDS[kind]), attribute)
+    if kind in built_in_kinds():
+        return getattr(import_module(f"drivers.{kind}.driver"), attribute)
     from drivers.foreign import description_of, maker, places  # most nodes never come here
 
     place = kind if ":" in kind else places().get(kind)
@@ -104,4 +104,4 @@ def _found(kind: str, attribute: str) -> object:
         remedy = "of your own: module:Class"
         raise UsageError(f"no driver for robots of kind {kind!r}; known are {', '.join(kinds())}; {remedy}")
     make = maker(kind, place)
-    return make if attribute == "made" else partial(description_of, make)
+    return make if attribute == "make_driver" else partial(description_of, make)

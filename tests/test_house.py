@@ -258,7 +258,7 @@ def _crosses(module: str, name: str) -> bool:
     """Say whether ``module`` may not import ``name``."""
     if module.startswith("drivers.") and name.startswith("drivers.") and module != "drivers.registry":
         # A kind of robot never knows another kind; only the registry knows them all.
-        kinds = {file.split(".")[1] for file in FILES if re.fullmatch(r"drivers\.\w+\.maker", file)}
+        kinds = {file.split(".")[1] for file in FILES if re.fullmatch(r"drivers\.\w+\.driver", file)}
         return name.split(".")[1] in kinds - {module.split(".")[1]}
     return not may_import(module, name)
 

@@ -13,17 +13,18 @@ from twisted.internet.interfaces import IReactorTime
 from drivers.aibo import recipe, sense
 from drivers.aibo.camera import Camera
 from drivers.aibo.codec import LineReader, StateReader, WorldState, command
-from drivers.aibo.link import Datagrams, Port
+from drivers.aibo.link import WAITS, Datagrams, Port, UdpDatagrams
 from drivers.aibo.menu import Hello, Load, MenuReader, select
 from drivers.aibo.odometry import Odometry
 from drivers.aibo.option import SOUNDS, Options, checked, described
 from drivers.aibo.picture import Picture
 from drivers.base import ENGAGED, BaseDriver, heard_at
+from drivers.deadman.keeper import kept
 from drivers.deadman.switch import DeadMan, LastWord
 from drivers.driver import Permit
 from drivers.errors import BadFrame, LinkLost, NotEnabled, Unsupported
-from drivers.link import Connector
-from drivers.reading import Action, Frame, Value
+from drivers.link import Connector, TcpConnector
+from drivers.reading import Action, Description, Frame, Value
 
 AGAIN_S = 0.5
 """A live walk is said again so often; the dog stops by itself 3 s after it heard the last one."""
@@ -392,3 +393,22 @@ def _walking(f: float, s: float, r: float) -> bytes:
 
 _HEAD = {"pan": ("p", sense.PAN), "tilt": ("t", sense.TILT), "nod": ("r", sense.NOD)}
 """The letter of each axis, and how far it goes."""
+
+
+def make_driver(
+    options: Mapping[str, object], name: str, clock: IReactorTime, connector: Connector | None
+) -> AiboDriver:
+    """A driver of the dog at the host that ``options`` name."""
+    return AiboDriver(
+        checked(options),
+        name,
+        TcpConnector(waits=WAITS) if connector is None else connector,
+        clock,
+        UdpDatagrams(clock),
+        kept(name) if connector is None else None,
+    )
+
+
+def describe(options: Mapping[str, object], name: str) -> Description:
+    """What that dog is."""
+    return described(checked(options))

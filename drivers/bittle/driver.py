@@ -18,13 +18,15 @@ from drivers.base import ENGAGED, BaseDriver
 from drivers.bittle import codec
 from drivers.bittle.dialogue import Dialogue
 from drivers.bittle.gait import REST, STAND, Velocity, chosen
-from drivers.bittle.link import HttpLine
-from drivers.bittle.option import JOINT_LIMITS, JOINT_NAMES, Options, described
+from drivers.bittle.link import HttpConnector, HttpLine
+from drivers.bittle.option import JOINT_LIMITS, JOINT_NAMES, Options, checked, described
+from drivers.deadman.keeper import kept
 from drivers.deadman.switch import DeadMan, LastWord
 from drivers.driver import Permit
 from drivers.errors import BadFrame, DriverError, LinkLost, NotEnabled, Unsupported
-from drivers.link import Connector, Line, Link
-from drivers.reading import Action, Value
+from drivers.link import Connector, Line, Link, TcpConnector
+from drivers.reading import Action, Description, Value
+from drivers.serial import SerialConnector
 
 GREET_S = 1.0
 """A robot that has not told its version after so long is asked again: it may be booting."""
@@ -400,3 +402,20 @@ def _range(lines: list[str]) -> dict[str, Value]:
 def _power(lines: list[str]) -> dict[str, Value]:
     volts = codec.volts(lines)
     return {"power.volts": volts, "power.level": min(max((volts - EMPTY_V) / (FULL_V - EMPTY_V), 0.0), 1.0)}
+
+
+def make_driver(
+    options: Mapping[str, object], name: str, clock: IReactorTime, connector: Connector | None
+) -> BittleDriver:
+    """A driver of the dog at the serial device or the address that ``options`` name."""
+    checked_options = checked(options)
+    dead_man = kept(name) if connector is None else None
+    if checked_options.host:
+        over = TcpConnector() if connector is None else connector
+        return BittleDriver(checked_options, name, HttpConnector(over, clock, checked_options.board), clock, dead_man)
+    return BittleDriver(checked_options, name, SerialConnector() if connector is None else connector, clock, dead_man)
+
+
+def describe(options: Mapping[str, object], name: str) -> Description:
+    """What that dog is."""
+    return described(checked(options))

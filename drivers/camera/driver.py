@@ -5,19 +5,23 @@ It senses, and moves as whoever holds it does.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
+from importlib import import_module
 from typing import Any
 
 from twisted.internet.defer import Deferred, fail
 from twisted.internet.interfaces import IReactorTime
 
 from drivers.base import BaseDriver
-from drivers.camera.option import Options, checked, described
-from drivers.camera.shots import Shot
-from drivers.camera.thread import Film
+from drivers.camera.option import Options, checked, described, place_of
+from drivers.camera.shots import CaptureShots, FolderShots, Shot
+from drivers.camera.stream import StreamFilm
+from drivers.camera.thread import ClockFilm, Film, ThreadFilm
 from drivers.driver import Permit
 from drivers.errors import LinkLost
-from drivers.reading import Action, Frame
+from drivers.link import Connector, TcpConnector
+from drivers.reading import Action, Description, Frame
 
 
 class CameraDriver(BaseDriver):
@@ -119,3 +123,25 @@ class CameraDriver(BaseDriver):
         if self._beat is not None and self._beat.active():
             self._beat.cancel()
         self._beat = None
+
+
+def make_driver(options: Mapping[str, object], name: str, clock: IReactorTime, connector: Any) -> CameraDriver:
+    """A driver of a camera, or of pictures in its place; only one on the network needs a link."""
+    wanted = checked(options)
+    return CameraDriver(wanted, film_of(wanted, clock, connector), clock, name)
+
+
+def describe(options: Mapping[str, object], name: str) -> Description:
+    """What that camera is."""
+    return described(checked(options))
+
+
+def film_of(options: Options, clock: Any, connector: Connector | None = None) -> Film:
+    """Where the pictures come from; a camera brings them to the thread of ``clock``, which then is a reactor."""
+    if options.url:
+        size = options.width, options.height
+        return StreamFilm(place_of(options.url), size, TcpConnector() if connector is None else connector, clock)
+    if isinstance(options.source, str) and not options.is_device and os.path.isdir(options.source):
+        return ClockFilm(FolderShots(options.source), clock)
+    shots = CaptureShots(options, lambda: import_module("cv2"))
+    return ThreadFilm(shots, clock.callFromThread) if options.is_device else ClockFilm(shots, clock)

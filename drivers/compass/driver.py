@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 from twisted.internet.defer import Deferred, fail, succeed
@@ -13,11 +14,11 @@ from twisted.internet.interfaces import IReactorTime
 
 from drivers.base import BaseDriver
 from drivers.compass.codec import Heading, SentenceReader
-from drivers.compass.option import Options, described
+from drivers.compass.option import Options, checked, described
 from drivers.driver import Permit
 from drivers.errors import LinkLost
-from drivers.link import Connector, Line, Link
-from drivers.reading import Action
+from drivers.link import Connector, Line, Link, TcpConnector
+from drivers.reading import Action, Description
 
 HEADING = "compass.heading"
 SILENCE_S, LAST_SILENCE_S = 3.0, 24.0
@@ -152,3 +153,20 @@ class CompassDriver(BaseDriver):
         if problem != self._problem:
             self.log.warn("{robot}: {problem}", robot=self._name, problem=problem)
         self._problem = problem
+
+
+def make_driver(
+    options: Mapping[str, object], name: str, clock: IReactorTime, connector: Connector | None
+) -> CompassDriver:
+    """A driver of the compass that ``options`` name."""
+    wanted = checked(options)
+    if connector is None and wanted.device:
+        from drivers.serial import SerialConnector  # a compass on the network is spared it
+
+        connector = SerialConnector()
+    return CompassDriver(wanted, name, TcpConnector(says=True) if connector is None else connector, clock)
+
+
+def describe(options: Mapping[str, object], name: str) -> Description:
+    """What that compass is."""
+    return described(checked(options))

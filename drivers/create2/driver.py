@@ -17,13 +17,15 @@ from twisted.internet.interfaces import IReactorTime
 from drivers.base import BaseDriver, heard_at
 from drivers.create2 import codec
 from drivers.create2.odometry import WHEEL_BASE, Odometry
-from drivers.create2.option import SKILLS, Options, described
+from drivers.create2.option import SKILLS, Options, checked, described
 from drivers.create2.sense import ARMED, IDS, event_of, mode_of, seen
+from drivers.deadman.keeper import kept
 from drivers.deadman.switch import DeadMan, LastWord
 from drivers.driver import Permit
 from drivers.errors import LinkLost, NoReply, NotEnabled, Unsupported, UsageError
 from drivers.link import Connector, Line, Link
-from drivers.reading import Action, Value
+from drivers.reading import Action, Description, Value
+from drivers.serial import SerialConnector
 
 SETTLE_S = 0.05
 """The robot is given so long after ``START`` before the next command."""
@@ -286,3 +288,17 @@ class Create2Driver(BaseDriver):
 
 def _is_between(value: float | str, low: float, high: float) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool) and low <= value <= high
+
+
+def make_driver(
+    options: Mapping[str, object], name: str, clock: IReactorTime, connector: Connector | None
+) -> Create2Driver:
+    """A driver of the robot at the end of the serial cable that ``options`` name."""
+    if connector is not None:
+        return Create2Driver(checked(options), name, connector, clock)
+    return Create2Driver(checked(options), name, SerialConnector(), clock, kept(name))
+
+
+def describe(options: Mapping[str, object], name: str) -> Description:
+    """What that robot is."""
+    return described(checked(options))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import Any
 
 from twisted.internet.defer import Deferred, fail, succeed
 from twisted.internet.interfaces import IReactorTime
@@ -12,7 +13,7 @@ from drivers.base import BaseDriver
 from drivers.driver import Permit
 from drivers.errors import LinkLost
 from drivers.phone.option import Options, checked, described
-from drivers.reading import Action, Frame, Value
+from drivers.reading import Action, Description, Frame, Value
 
 SIGHT = ("target.bearing", "target.distance")
 """Where the phone's own page sees the red target: radians, left positive, and metres; NaN while it sees none."""
@@ -56,3 +57,13 @@ class PhoneDriver(BaseDriver):
         if self.state == "stale":
             return fail(LinkLost("the phone is stale; wait for its next look"))
         return super()._switch(on)
+
+
+def make_driver(options: Mapping[str, object], name: str, clock: IReactorTime, connector: Any) -> PhoneDriver:
+    """A driver of a phone; it opens no link, as looks are handed to it."""
+    return PhoneDriver(options, clock)
+
+
+def describe(options: Mapping[str, object], name: str) -> Description:
+    """What that phone is."""
+    return described(checked(options))

@@ -12,11 +12,12 @@ from twisted.internet.interfaces import IReactorTime
 from twisted.python.failure import Failure
 
 from drivers.base import ENGAGED, BaseDriver
+from drivers.deadman.keeper import kept
 from drivers.deadman.switch import DeadMan, LastWord
 from drivers.driver import Permit
 from drivers.errors import BadFrame, LinkLost, NoReply, RobotError
-from drivers.link import Connector
-from drivers.reading import Action, Frame, Value
+from drivers.link import Connector, TcpConnector
+from drivers.reading import Action, Description, Frame, Value
 from drivers.rosbridge import codec
 from drivers.rosbridge.codec import Answered, Published, Status, decoded, encoded
 from drivers.rosbridge.link import Bridge
@@ -336,3 +337,17 @@ class RosbridgeDriver(BaseDriver):
         if text not in self._warned and len(self._warned) < 100:
             self._warned.add(text)
             self.log.warn("{robot}: {text}", robot=self._name, text=text)
+
+
+def make_driver(
+    options: Mapping[str, object], name: str, clock: IReactorTime, connector: Connector | None
+) -> RosbridgeDriver:
+    """A driver of the robot behind the rosbridge that ``options`` names."""
+    if connector is not None:
+        return RosbridgeDriver(checked(options), connector, clock, name)
+    return RosbridgeDriver(checked(options), TcpConnector(says=True), clock, name, dead_man=kept(name))
+
+
+def describe(options: Mapping[str, object], name: str) -> Description:
+    """What that robot is."""
+    return described(checked(options))

@@ -12,8 +12,8 @@ from twisted.internet.interfaces import IReactorTime
 from drivers.base import BaseDriver
 from drivers.driver import Permit
 from drivers.errors import Unsupported
-from drivers.link import Connector, Line, Link
-from drivers.reading import Action, Frame
+from drivers.link import Connector, Line, Link, TcpConnector
+from drivers.reading import Action, Description, Frame
 from drivers.sim.codec import (
     VERSION,
     Alive,
@@ -147,3 +147,19 @@ class SimDriver(BaseDriver):
         if self._alive is not None and self._alive.active():
             self._alive.cancel()
         self._alive = None
+
+
+def make_driver(
+    options: Mapping[str, object], name: str, clock: IReactorTime, connector: Connector | None
+) -> SimDriver:
+    """A driver of the dog that ``options`` or else the device's ``name`` names."""
+    return SimDriver(_named(options, name), TcpConnector(says=True) if connector is None else connector, clock)
+
+
+def describe(options: Mapping[str, object], name: str) -> Description:
+    """What that dog is."""
+    return described(_named(options, name))
+
+
+def _named(options: Mapping[str, object], name: str) -> Options:
+    return checked({"robot": name, **options})

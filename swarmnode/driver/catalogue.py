@@ -9,7 +9,7 @@ from importlib.util import find_spec
 
 from drivers.errors import UsageError
 from drivers.foreign import maker, places
-from drivers.registry import KINDS, kinds
+from drivers.registry import built_in_kinds, kinds
 
 NEEDS: Mapping[str, tuple[str, str, str]] = {
     "bittle": ("serial", "serial", "on a cable"),
@@ -33,11 +33,11 @@ class Entry:
 
 def catalogue(is_there: Callable[[str], bool] = lambda library: find_spec(library) is not None) -> list[Entry]:
     """Every kind there is; a broken one of another distribution is told as such, and the others are as they are."""
-    foreign = places()
+    built_in, foreign = built_in_kinds(), places()
     return [
-        _built_in(kind, is_there) if kind in KINDS else _foreign(kind, foreign[kind])
+        _built_in(kind, is_there) if kind in built_in else _foreign(kind, foreign[kind])
         for kind in kinds()
-        if kind in KINDS or kind in foreign
+        if kind in built_in or kind in foreign
     ]
 
 
@@ -53,7 +53,7 @@ def lines(entries: list[Entry]) -> list[str]:
 
 
 def _built_in(kind: str, is_there: Callable[[str], bool]) -> Entry:
-    package = import_module(KINDS[kind].rpartition(".")[0])
+    package = import_module(f"drivers.{kind}")
     about = (package.__doc__ or "").strip().split("\n")[0].partition(": ")[0].rstrip(".")
     if kind not in NEEDS:
         return Entry(kind, about)

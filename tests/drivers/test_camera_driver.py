@@ -9,8 +9,7 @@ from typing import Any
 from twisted.internet.task import Clock
 from twisted.trial.unittest import SynchronousTestCase
 
-from drivers.camera.driver import CameraDriver
-from drivers.camera.maker import film_of
+from drivers.camera.driver import CameraDriver, film_of
 from drivers.camera.option import Options, checked
 from drivers.camera.shots import CaptureShots, FolderShots, Shot, Shots
 from drivers.camera.thread import ClockFilm, Reel, ThreadFilm

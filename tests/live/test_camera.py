@@ -12,8 +12,7 @@ from twisted.internet.defer import Deferred, inlineCallbacks
 from twisted.internet.task import Clock, deferLater
 from twisted.trial.unittest import TestCase
 
-from drivers.camera.driver import CameraDriver
-from drivers.camera.maker import film_of
+from drivers.camera.driver import CameraDriver, film_of
 from drivers.camera.option import checked
 from drivers.camera.shots import Shot
 from drivers.camera.thread import ThreadFilm
