@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 from twisted.internet.task import Clock
@@ -11,7 +12,7 @@ from twisted.trial.unittest import SynchronousTestCase
 
 import drivers
 from drivers.errors import UsageError
-from drivers.registry import describe, driver_for, kinds
+from drivers.registry import built_in_kinds, describe, driver_for, kinds
 
 
 class RegistryTests(SynchronousTestCase):
@@ -23,6 +24,16 @@ class RegistryTests(SynchronousTestCase):
         self.assertEqual(driver.state, "idle")
         self.assertEqual(driver.description, describe("sim", {"port": 7400}))
         self.assertEqual(driver.description.kind, "aibo-ers7")
+
+    def test_every_kind_is_complete(self) -> None:
+        """Each package of a driver is found, is described in one line, and has both functions of the registry."""
+        folder = Path(drivers.__file__).parent
+        self.assertEqual(sorted(built_in_kinds()), sorted(file.parent.name for file in folder.glob("*/driver.py")))
+        for kind in built_in_kinds():
+            module = import_module(f"drivers.{kind}.driver")
+            missing = [name for name in ("make_driver", "describe") if not callable(getattr(module, name, None))]
+            self.assertEqual((kind, missing), (kind, []))
+            self.assertTrue(import_module(f"drivers.{kind}").__doc__, kind)
 
     def test_names_the_known_kinds(self) -> None:
         """An unknown kind is a usage error that lists the kinds there are."""
