@@ -53,8 +53,8 @@ def _play(ports: list[dict[str, int]]) -> int:
     from twisted.internet import reactor as running
 
     from sim.robots.dog import LIMITS
-    from sim.robots.emulator.aibo import AiboEmulator
-    from sim.robots.emulator.aibo_server import AiboServer
+    from sim.robots.emulator.aibo import AiboServer
+    from sim.robots.emulator.aibo_dog import AiboEmulator
     from sim.robots.scene import loaded
     from sim.robots.yard import Yard
 

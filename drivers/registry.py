@@ -18,6 +18,7 @@ from twisted.internet.interfaces import IReactorTime
 import drivers
 from drivers.driver import Driver
 from drivers.errors import UsageError
+from drivers.manifest import Manifest
 from drivers.reading import Description
 
 if TYPE_CHECKING:
@@ -32,10 +33,15 @@ Parts = Sequence[tuple[str, Mapping[str, object]]]
 def built_in_kinds() -> list[str]:
     """Return the kinds in the tree: the packages of ``drivers`` that have a ``driver`` module; none is imported.
 
-    It has ``make_driver(options, name, clock, connector)`` and ``describe(options, name)``.
+    It has ``MANIFEST``, ``make_driver(options, name, clock, connector)`` and ``describe(options, name)``.
     """
     packages = [module.name for module in iter_modules(drivers.__path__) if module.ispkg]
     return [name for name in packages if find_spec(f"drivers.{name}.driver") is not None]
+
+
+def manifest_of(kind: str) -> Manifest:
+    """Return the manifest of a built-in kind; an empty one for any other."""
+    return cast(Manifest, _found(kind, "MANIFEST")) if kind in built_in_kinds() else Manifest()
 
 
 def kinds() -> list[str]:

@@ -40,8 +40,8 @@ from sim.demo.cast import CASTS
 from sim.demo.configuration import DOGS
 from sim.robots import dog, scene, sensor, world
 from sim.robots.crowd import crowd, ray
-from sim.robots.emulator import aibo, rosbridge
-from sim.robots.table import Robots
+from sim.robots.emulator import aibo_dog, rosbridge
+from sim.robots.table import Robots, emulated_kinds
 from sim.robots.yard import Yard
 from swarmnode import gateway
 from swarmnode.driver import pilot
@@ -81,7 +81,7 @@ FIGURES: Sequence[tuple[str, str]] = (
     ("consensus", f"after {teller.STAND_IN:g} s each the next one stands in"),
     ("consensus", f"told nothing {check.SILENCE:g} s after the waiting period asks"),
     ("consensus", f"for all behind it after {party.RELAY_SILENCE:g} s"),
-    ("demo", f"an AIBO walks on until {aibo.DEAD_MAN_S:g} s after its last command"),
+    ("demo", f"an AIBO walks on until {aibo_dog.DEAD_MAN_S:g} s after its last command"),
     ("deployment", f"the source has at most {manifest.MAX_SOURCE // 1024} KiB"),
     ("deployment", f"takes at most {module.STEPS:,} instructions"),
     ("deployment", f"seccomp: {len(confinement.CALLS)} system calls"),
@@ -118,7 +118,7 @@ FIGURES: Sequence[tuple[str, str]] = (
     ("robots/stopping", f"it wakes {1 / process.TICK_S:g} times a second"),
     ("robots/stopping", f"tried again, every {keeper.LAST_WAIT_S:g} s at last"),
     ("safety", f"halts the robot: {process.GRACE_S:g} s after the deadline, or at once"),
-    ("safety", f"AIBO {aibo.DEAD_MAN_S:g} s, most ROS bases {rosbridge.BASE_STOPS_S:g} s"),
+    ("safety", f"AIBO {aibo_dog.DEAD_MAN_S:g} s, most ROS bases {rosbridge.BASE_STOPS_S:g} s"),
     ("safety", f"the head of a request | {channel.HEAD_S:g} s after its first byte"),
     ("safety", f"less than {channel.PACE / 1000:g} kB/s on the average after {channel.GRACE_S:g} s"),
     ("safety", f"that has had an answer | {channel.KEEP_S:g} s"),
@@ -133,16 +133,28 @@ FIGURES: Sequence[tuple[str, str]] = (
     ("simulator", f"Physics in steps of {1000 * world.SUBSTEP:g} ms"),
     ("simulator", f"a battery of {sensor.BATTERY_S / 60:g} minutes"),
     ("simulator", f"a circle of {200 * scene.FOOTPRINT:g} cm that weighs {dog.MASS:g} kg"),
-    ("simulator", f"TCP {PORTS['main']} (main control), {PORTS['estop']} (e-stop)"),
-    ("simulator", f"{PORTS['state']} (world state), {PORTS['walk']} (walk), {PORTS['head']} (head), {PORTS['camera']}"),
-    ("simulator", f"a world state each {1000 * aibo.FRAME_S:g} ms, pictures up to {1 / aibo.CAMERA_S:g} a second"),
-    ("simulator", f"Walks on for {aibo.DEAD_MAN_S:g} s after the last command"),
-    ("simulator", f"the stream each {1000 * STREAM_S:g} ms"),
-    ("simulator", f"stands after {rosbridge.BASE_STOPS_S:g} s without"),
-    ("simulator", f"`/imu` {rosbridge.TOPICS['/imu'][1]:g} times a second, `/scan` {rosbridge.TOPICS['/scan'][1]:g}"),
-    ("simulator", f"`/camera/image_raw/compressed` {rosbridge.TOPICS['/camera/image_raw/compressed'][1]:g} times"),
+    ("robots/aibo", f"TCP {PORTS['main']} (main control), {PORTS['estop']} (e-stop)"),
+    (
+        "robots/aibo",
+        f"{PORTS['state']} (world state), {PORTS['walk']} (walk), {PORTS['head']} (head), {PORTS['camera']}",
+    ),
+    (
+        "robots/aibo",
+        f"a world state each {1000 * aibo_dog.FRAME_S:g} ms, pictures up to {1 / aibo_dog.CAMERA_S:g} a second",
+    ),
+    ("robots/aibo", f"Walks on for {aibo_dog.DEAD_MAN_S:g} s after the last command"),
+    ("robots/create2", f"the stream each {1000 * STREAM_S:g} ms"),
+    ("robots/rosbridge", f"stands after {rosbridge.BASE_STOPS_S:g} s without"),
+    (
+        "robots/rosbridge",
+        f"`/imu` {rosbridge.TOPICS['/imu'][1]:g} times a second, `/scan` {rosbridge.TOPICS['/scan'][1]:g}",
+    ),
+    (
+        "robots/rosbridge",
+        f"`/camera/image_raw/compressed` {rosbridge.TOPICS['/camera/image_raw/compressed'][1]:g} times",
+    ),
     ("simulator", f"Of the scanner's {rosbridge.BEAMS} beams"),
-    ("simulator", f"TCP {COMPASS_PORT} or `port`"),
+    ("robots/compass", f"TCP {COMPASS_PORT} or `port`"),
     ("tuplespace", f"1 to {template.MAX_FIELDS} fields"),
     ("tuplespace", f"asked every {shelf.POLL:g} s whether"),
     ("tunnel", f"no known node has answered by UDP for {detour.AFTER_S:g} s"),
@@ -242,20 +254,23 @@ class DocumentTests(SynchronousTestCase):
         (default,) = re.findall(r"^ROBOT +\?= (\w+)$", makefile, re.MULTILINE)
         self.assertIn(f"| `{default}` (default) |", part_of(ROOT / "docs" / "demo.md", "Which robots"))
 
-    def test_yard_plays_what_its_page_says(self) -> None:
-        """Each table of robots on the yard's page is one that the yard takes, and together they have all its kinds."""
-        text = (ROOT / "docs" / "simulator.md").read_text(encoding="utf-8")
-        clock, played = Clock(), set()
-        for block in re.findall(r"^```toml\n(.*?)^```$", text, re.MULTILINE | re.DOTALL):
-            table = tomllib.loads(block)
-            self.assertLessEqual(set(table), set(DOGS))
-            Robots(clock, Random(1), Yard(clock, Random(1), scene.loaded("three-dogs")), table)
-            for robot in table.values():
-                played |= {robot["kind"], *(part["kind"] for part in robot.get("parts", []))}
-        self.assertEqual(set(re.findall(r"^\| `(\w+)` \|", text, re.MULTILINE)), played)
+    def test_emulators_serve_the_tables_of_their_pages(self) -> None:
+        """The page of each kind that has an emulator shows a table that the yard takes; so does the yard's own page."""
+        clock = Clock()
+        for page in ("simulator", *(f"robots/{kind}" for kind in emulated_kinds())):
+            played: set[str] = set()
+            text = (ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8")
+            for block in re.findall(r"^```toml\n(.*?)^```$", text, re.MULTILINE | re.DOTALL):
+                table = tomllib.loads(block)
+                if not set(table) <= set(DOGS):
+                    continue
+                Robots(clock, Random(1), Yard(clock, Random(1), scene.loaded("three-dogs")), table)
+                for robot in table.values():
+                    played |= {robot["kind"], *(part["kind"] for part in robot.get("parts", []))}
+            self.assertIn("create2" if page == "simulator" else page.removeprefix("robots/"), played)
         with self.assertRaises(UsageError) as refused:
             Robots(clock, Random(1), Yard(clock, Random(1), scene.loaded("three-dogs")), {"dog1": {"kind": "phone"}})
-        self.assertTrue(str(refused.exception).endswith(f"it has {', '.join(sorted(played))}"), refused.exception)
+        self.assertTrue(str(refused.exception).endswith(f"it has {', '.join(emulated_kinds())}"), refused.exception)
 
     def test_thesis_is_complete(self) -> None:
         """The page on the thesis has a row for each requirement, assumption and algorithm, and Figures 5.3 to 5.7."""

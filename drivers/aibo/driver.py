@@ -24,7 +24,10 @@ from drivers.deadman.switch import DeadMan, LastWord
 from drivers.driver import Permit
 from drivers.errors import BadFrame, LinkLost, NotEnabled, Unsupported
 from drivers.link import Connector, TcpConnector
+from drivers.manifest import Manifest
 from drivers.reading import Action, Description, Frame, Value
+
+MANIFEST = Manifest(example={"host": "192.168.0.51"})
 
 AGAIN_S = 0.5
 """A live walk is said again so often; the dog stops by itself 3 s after it heard the last one."""

@@ -25,8 +25,11 @@ from drivers.deadman.switch import DeadMan, LastWord
 from drivers.driver import Permit
 from drivers.errors import BadFrame, DriverError, LinkLost, NotEnabled, Unsupported
 from drivers.link import Connector, Line, Link, TcpConnector
+from drivers.manifest import Manifest
 from drivers.reading import Action, Description, Value
 from drivers.serial import SerialConnector
+
+MANIFEST = Manifest("serial", "serial", "on a cable", {"port": "/dev/ttyUSB0"}, is_on_cable=True)
 
 GREET_S = 1.0
 """A robot that has not told its version after so long is asked again: it may be booting."""

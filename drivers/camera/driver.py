@@ -21,7 +21,10 @@ from drivers.camera.thread import ClockFilm, Film, ThreadFilm
 from drivers.driver import Permit
 from drivers.errors import LinkLost
 from drivers.link import Connector, TcpConnector
+from drivers.manifest import Manifest
 from drivers.reading import Action, Description, Frame
+
+MANIFEST = Manifest("cv2", "vision", "but for a folder of JPEGs or an address")
 
 
 class CameraDriver(BaseDriver):

@@ -18,7 +18,10 @@ from drivers.compass.option import Options, checked, described
 from drivers.driver import Permit
 from drivers.errors import LinkLost
 from drivers.link import Connector, Line, Link, TcpConnector
+from drivers.manifest import Manifest
 from drivers.reading import Action, Description
+
+MANIFEST = Manifest("serial", "serial", "on a cable", {"device": "/dev/ttyUSB1"})
 
 HEADING = "compass.heading"
 SILENCE_S, LAST_SILENCE_S = 3.0, 24.0

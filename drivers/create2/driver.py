@@ -24,8 +24,11 @@ from drivers.deadman.switch import DeadMan, LastWord
 from drivers.driver import Permit
 from drivers.errors import LinkLost, NoReply, NotEnabled, Unsupported, UsageError
 from drivers.link import Connector, Line, Link
+from drivers.manifest import Manifest
 from drivers.reading import Action, Description, Value
 from drivers.serial import SerialConnector
+
+MANIFEST = Manifest("serial", "serial", example={"port": "/dev/ttyUSB0"}, is_on_cable=True)
 
 SETTLE_S = 0.05
 """The robot is given so long after ``START`` before the next command."""

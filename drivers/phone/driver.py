@@ -12,8 +12,11 @@ from twisted.internet.interfaces import IReactorTime
 from drivers.base import BaseDriver
 from drivers.driver import Permit
 from drivers.errors import LinkLost
+from drivers.manifest import Manifest
 from drivers.phone.option import Options, checked, described
 from drivers.reading import Action, Description, Frame, Value
+
+MANIFEST = Manifest()
 
 SIGHT = ("target.bearing", "target.distance")
 """Where the phone's own page sees the red target: radians, left positive, and metres; NaN while it sees none."""

@@ -17,11 +17,14 @@ from drivers.deadman.switch import DeadMan, LastWord
 from drivers.driver import Permit
 from drivers.errors import BadFrame, LinkLost, NoReply, RobotError
 from drivers.link import Connector, TcpConnector
+from drivers.manifest import Manifest
 from drivers.reading import Action, Description, Frame, Value
 from drivers.rosbridge import codec
 from drivers.rosbridge.codec import Answered, Published, Status, decoded, encoded
 from drivers.rosbridge.link import Bridge
 from drivers.rosbridge.option import RATES, TYPES, Options, checked, described, sectors
+
+MANIFEST = Manifest()
 
 REPEAT_S = 0.1
 """A velocity is said so often while it is in force: most bases stop by themselves when they hear none."""

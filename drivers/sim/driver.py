@@ -13,6 +13,7 @@ from drivers.base import BaseDriver
 from drivers.driver import Permit
 from drivers.errors import Unsupported
 from drivers.link import Connector, Line, Link, TcpConnector
+from drivers.manifest import Manifest
 from drivers.reading import Action, Description, Frame
 from drivers.sim.codec import (
     VERSION,
@@ -29,6 +30,8 @@ from drivers.sim.codec import (
     encoded,
 )
 from drivers.sim.option import Options, checked, described
+
+MANIFEST = Manifest()
 
 ALIVE_S = 0.5
 

@@ -18,7 +18,7 @@ from drivers.pyro.robot import PyroRobot
 from drivers.reading import Value
 from drivers.registry import driver_for, kinds
 from sim.robots.camera import Camera
-from sim.robots.emulator.aibo import AiboEmulator
+from sim.robots.emulator.aibo_dog import AiboEmulator
 from sim.robots.scene import loaded
 from sim.robots.sensor import Sensors
 from sim.robots.world import SUBSTEP, World

@@ -7,9 +7,9 @@ import os
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
+from drivers.registry import built_in_kinds, manifest_of
+
 PATTERNS = ("/dev/ttyUSB*", "/dev/ttyACM*", "/dev/cu.usb*")
-KINDS = ("create2", "bittle")
-"""The kinds that hang on a cable; nothing tells from outside which of them it is."""
 
 
 @dataclass(frozen=True)
@@ -51,8 +51,13 @@ def lines(found: list[Candidate]) -> list[str]:
         told.append(f"{each.device}  {each.about}".rstrip())
         if not each.is_allowed:
             told.append("  no permission; add this user to the device's group (often dialout), and sign in anew")
-        told += [f"  swarm driver probe --kind {kind} --option port={each.device}" for kind in KINDS]
+        told += [f"  swarm driver probe --kind {kind} --option port={each.device}" for kind in cable_kinds()]
     return told
+
+
+def cable_kinds() -> list[str]:
+    """Return the kinds that hang on a cable; nothing tells from outside which of them a device is."""
+    return [kind for kind in built_in_kinds() if manifest_of(kind).is_on_cable]
 
 
 def _about(port: object) -> str:

@@ -2,22 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.util import find_spec
 
 from drivers.errors import UsageError
 from drivers.foreign import maker, places
-from drivers.registry import built_in_kinds, kinds
-
-NEEDS: Mapping[str, tuple[str, str, str]] = {
-    "bittle": ("serial", "serial", "on a cable"),
-    "camera": ("cv2", "vision", "but for a folder of JPEGs or an address"),
-    "compass": ("serial", "serial", "on a cable"),
-    "create2": ("serial", "serial", ""),
-}
-"""Kind to the library that it needs, the extra that brings it, and when."""
+from drivers.registry import built_in_kinds, kinds, manifest_of
 
 
 @dataclass(frozen=True)
@@ -55,12 +47,12 @@ def lines(entries: list[Entry]) -> list[str]:
 def _built_in(kind: str, is_there: Callable[[str], bool]) -> Entry:
     package = import_module(f"drivers.{kind}")
     about = (package.__doc__ or "").strip().split("\n")[0].partition(": ")[0].rstrip(".")
-    if kind not in NEEDS:
+    manifest = manifest_of(kind)
+    if not manifest.library or is_there(manifest.library):
         return Entry(kind, about)
-    library, extra, when = NEEDS[kind]
-    if is_there(library):
-        return Entry(kind, about)
-    return Entry(kind, about, f"pip install 'swarm-node[{extra}]'{when and ', ' + when}", False)
+    return Entry(
+        kind, about, f"pip install 'swarm-node[{manifest.extra}]'{manifest.when and ', ' + manifest.when}", False
+    )
 
 
 def _foreign(kind: str, place: str) -> Entry:

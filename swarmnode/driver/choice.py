@@ -12,15 +12,7 @@ from typing import Any
 
 from drivers.errors import UsageError
 from drivers.reading import Description
-from drivers.registry import describe, driver_for
-
-EXAMPLES: Mapping[str, Mapping[str, object]] = {
-    "aibo": {"host": "192.168.0.51"},
-    "bittle": {"port": "/dev/ttyUSB0"},
-    "compass": {"device": "/dev/ttyUSB1"},
-    "create2": {"port": "/dev/ttyUSB0"},
-}
-"""What the kinds must be given; where nothing is given, as for a look at what such a robot can do, these stand in."""
+from drivers.registry import describe, driver_for, manifest_of
 
 
 @dataclass(frozen=True)
@@ -41,8 +33,8 @@ class Choice:
         try:
             return describe(self.kind, self.options, self.name, **self._more())
         except UsageError:
-            example = EXAMPLES.get(self.kind)
-            if self.options or example is None:
+            example = manifest_of(self.kind).example
+            if self.options or not example:
                 raise
             return describe(self.kind, example, self.name, **self._more())
 

@@ -19,7 +19,7 @@ from drivers.link import MemoryConnector
 from drivers.reading import Frame, Observation, Value
 from drivers.registry import driver_for
 from sim.robots.camera import Camera
-from sim.robots.emulator.aibo import AiboEmulator
+from sim.robots.emulator.aibo_dog import AiboEmulator
 from sim.robots.emulator.bittle import Bittle
 from sim.robots.emulator.create2 import Create2
 from sim.robots.emulator.rosbridge import RosbridgeRobot

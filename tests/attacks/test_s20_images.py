@@ -35,7 +35,7 @@ from drivers.rosbridge import codec
 from formats.jpeg import MAX_DECODED, MAX_SIDE, size_of
 from middleware.tasks.task import Task
 from sim.robots.emulator.body import MemoryBody
-from sim.robots.emulator.mjpeg import MjpegCamera
+from sim.robots.emulator.camera import MjpegCamera
 from swarmnode.gateway import sides
 from webnode.camera import Camera as WebCamera
 from webnode.camera import MemoryFrames

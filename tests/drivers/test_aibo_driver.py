@@ -13,7 +13,7 @@ from drivers.aibo.driver import AiboDriver
 from drivers.driver import Driver
 from drivers.errors import LinkLost, NotEnabled, Unsupported
 from drivers.reading import Observation
-from sim.robots.emulator.aibo import AiboEmulator
+from sim.robots.emulator.aibo_dog import AiboEmulator
 from sim.robots.emulator.body import MemoryBody
 from swarmnode.driver.witness import Ear
 from tests.drivers.contract import BodyContract

@@ -1,4 +1,4 @@
-"""Tests of ``drivers.camera.stream`` against ``sim.robots.emulator.mjpeg``, joined through memory."""
+"""Tests of ``drivers.camera.stream`` against ``sim.robots.emulator.camera``, joined through memory."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from drivers.link import MemoryConnector
 from drivers.registry import describe, driver_for
 from middleware.faults.stream import StreamFaults
 from sim.robots.emulator.body import MemoryBody
-from sim.robots.emulator.mjpeg import MjpegCamera
+from sim.robots.emulator.camera import MjpegCamera
 from tests.drivers.contract import SensingContract
 from tests.drivers.test_camera_driver import jpeg
 

@@ -1,4 +1,4 @@
-"""Tests of ``drivers.compass`` against ``sim.robots.emulator.nmea``, joined through memory."""
+"""Tests of ``drivers.compass`` against ``sim.robots.emulator.compass``, joined through memory."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from drivers.link import MemoryConnector
 from drivers.registry import describe, driver_for
 from sim.robots.dog import Dog
 from sim.robots.emulator.body import MemoryBody
-from sim.robots.emulator.nmea import NmeaCompass
+from sim.robots.emulator.compass import NmeaCompass
 from sim.robots.scene import Kennel
 from tests.drivers.contract import SensingContract
 

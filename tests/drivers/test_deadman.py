@@ -38,7 +38,7 @@ from drivers.link import MemoryConnector, MemoryLink
 from drivers.reading import Action, Description
 from drivers.registry import driver_for
 from drivers.rosbridge.driver import ASK_S, RosbridgeDriver
-from sim.robots.emulator.aibo import AiboEmulator
+from sim.robots.emulator.aibo_dog import AiboEmulator
 from sim.robots.emulator.bittle import Bittle
 from sim.robots.emulator.body import MemoryBody
 from sim.robots.emulator.create2 import Create2

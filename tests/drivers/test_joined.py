@@ -22,9 +22,9 @@ from drivers.link import Caller, Line, MemoryConnector
 from drivers.reading import Action, Description, Frame, Observation, Value
 from drivers.registry import describe, driver_for
 from sim.robots.emulator.body import MemoryBody
+from sim.robots.emulator.camera import MjpegCamera
+from sim.robots.emulator.compass import NmeaCompass
 from sim.robots.emulator.create2 import Create2
-from sim.robots.emulator.mjpeg import MjpegCamera
-from sim.robots.emulator.nmea import NmeaCompass
 from tests.drivers.contract import BodyContract
 from tests.drivers.test_camera_driver import jpeg
 

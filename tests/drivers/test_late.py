@@ -16,7 +16,7 @@ from twisted.trial.unittest import SynchronousTestCase
 from drivers.driver import Driver, Permit
 from drivers.link import MemoryConnector
 from drivers.registry import driver_for
-from sim.robots.emulator.aibo import AiboEmulator
+from sim.robots.emulator.aibo_dog import AiboEmulator
 from sim.robots.emulator.bittle import Bittle
 from sim.robots.emulator.body import MemoryBody
 from sim.robots.emulator.create2 import Create2

@@ -25,7 +25,7 @@ from drivers.pyro.robot import TTL_S, PyroRobot
 from drivers.pyro.sensorvalue import Geometry, SensorValue
 from drivers.reading import Frame, Value
 from drivers.registry import describe
-from sim.robots.emulator.aibo import AiboEmulator
+from sim.robots.emulator.aibo_dog import AiboEmulator
 from sim.robots.emulator.body import MemoryBody
 from sim.robots.emulator.create2 import Create2
 

@@ -14,8 +14,8 @@ from drivers.aibo.driver import AiboDriver
 from drivers.driver import Permit
 from drivers.registry import driver_for
 from sim.demo.port import free
-from sim.robots.emulator.aibo import EMULATED, AiboEmulator
-from sim.robots.emulator.aibo_server import AiboServer
+from sim.robots.emulator.aibo import AiboServer
+from sim.robots.emulator.aibo_dog import EMULATED, AiboEmulator
 from sim.robots.emulator.body import MemoryBody
 from tests.webnode.picture import jpeg
 

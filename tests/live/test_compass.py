@@ -15,7 +15,7 @@ from twisted.trial.unittest import TestCase
 from drivers.link import TcpLinkFactory
 from drivers.registry import driver_for
 from sim.robots.emulator.body import MemoryBody
-from sim.robots.emulator.nmea import NmeaCompass
+from sim.robots.emulator.compass import NmeaCompass
 from sim.robots.emulator.pty import PtyPort
 
 reactor: Any = running

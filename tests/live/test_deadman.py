@@ -28,8 +28,8 @@ from drivers.deadman.keeper import Keeper
 from drivers.deadman.process import now
 from drivers.deadman.switch import LastWord
 from drivers.link import TcpLinkFactory
-from sim.robots.emulator.aibo import AiboEmulator
-from sim.robots.emulator.aibo_server import AiboServer
+from sim.robots.emulator.aibo import AiboServer
+from sim.robots.emulator.aibo_dog import AiboEmulator
 from sim.robots.emulator.bittle import Bittle
 from sim.robots.emulator.body import MemoryBody
 from sim.robots.emulator.create2 import Create2

@@ -21,8 +21,8 @@ from twisted.internet.interfaces import IReactorTime
 from twisted.internet.task import deferLater
 from twisted.trial.unittest import TestCase
 
-from sim.robots.emulator.aibo import AiboEmulator
-from sim.robots.emulator.aibo_server import AiboServer
+from sim.robots.emulator.aibo import AiboServer
+from sim.robots.emulator.aibo_dog import AiboEmulator
 from sim.robots.emulator.body import MemoryBody
 from tests.live.test_aibo_socket import free_ports
 from tests.webnode.picture import jpeg

@@ -18,7 +18,7 @@ from drivers.driver import Driver
 from drivers.link import TcpLinkFactory
 from drivers.registry import driver_for
 from sim.robots.emulator.body import MemoryBody
-from sim.robots.emulator.mjpeg import MjpegCamera
+from sim.robots.emulator.camera import MjpegCamera
 from tests.drivers.test_camera_driver import jpeg
 
 reactor: Any = running

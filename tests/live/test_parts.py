@@ -18,9 +18,9 @@ from drivers.reading import Observation
 from drivers.registry import driver_for
 from middleware.config.settings import Settings
 from sim.robots.emulator.body import MemoryBody
+from sim.robots.emulator.camera import MjpegCamera
+from sim.robots.emulator.compass import NmeaCompass
 from sim.robots.emulator.create2 import Create2
-from sim.robots.emulator.mjpeg import MjpegCamera
-from sim.robots.emulator.nmea import NmeaCompass
 from sim.robots.emulator.pty import PtyPort
 from tests.drivers.test_camera_driver import jpeg
 

@@ -1,4 +1,4 @@
-"""Tests of ``sim.robots.emulator.aibo``: the dog's side of the wire, as a client that knows bytes alone sees it."""
+"""Tests of ``sim.robots.emulator.aibo_dog``: the dog's side of the wire, as a client that knows bytes alone sees it."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from drivers.aibo.codec import T2, GainReader, command
 from drivers.link import Link
-from sim.robots.emulator.aibo import AiboEmulator
+from sim.robots.emulator.aibo_dog import AiboEmulator
 from sim.robots.emulator.body import MemoryBody
 
 MAIN, STATE, WALK, HEAD, ESTOP, CAMERA, GAINS = 10020, 10031, 10050, 10052, 10053, 10011, 10032

@@ -18,7 +18,7 @@ from drivers.errors import UsageError
 from drivers.registry import describe
 from formats.jpeg import size_of
 from sim.robots.dog import LIMITS
-from sim.robots.emulator.aibo import AiboEmulator
+from sim.robots.emulator.aibo_dog import AiboEmulator
 from sim.robots.emulator.bittle import Bittle
 from sim.robots.emulator.body import MemoryBody
 from sim.robots.emulator.dog import DogBody

@@ -16,7 +16,7 @@ from agents.catalogue import DEMO, TASKS
 from drivers.registry import describe
 from middleware.config.settings import Settings
 from middleware.directory.presence import Device
-from sim.robots.emulator.aibo import AiboEmulator
+from sim.robots.emulator.aibo_dog import AiboEmulator
 from sim.robots.emulator.body import MemoryBody
 from swarmnode.service import NodeService
 from tests.swarmnode.team import World

@@ -1,356 +1,76 @@
-"""AiboEmulator: the dog's side of Tekkotsu's wire, over a body that it is given.
-
-It serves main control and the e-stop from the start and the rest once they are selected, takes one client a port,
-starts with its motors stopped, and stands still 3 s after the last walk command.
-"""
+"""AiboServer: an emulated dog on real sockets; its ports open and close as those of the dog do."""
 
 from __future__ import annotations
 
-import math
 import random
-from collections.abc import Callable
+from functools import partial
 from typing import Any
 
-from twisted.internet.interfaces import IReactorTime
+from twisted.internet.defer import Deferred, gatherResults, maybeDeferred
+from twisted.internet.protocol import DatagramProtocol
 
-from drivers.aibo import picture, sense
-from drivers.aibo.codec import T2, T4, CommandReader, Gains, LineReader, encoded, encoded_gains
-from drivers.aibo.option import ASIDE, BACKWARD, FORWARD, PORTS, TURN
-from drivers.link import Link, MemoryConnector, Receiver
-from middleware.faults.stream import StreamFaults
-from sim.robots.emulator.aibo_menu import AiboMenu
+from drivers.aibo.option import checked
+from drivers.link import TcpLinkFactory
+from sim.robots.emulator.aibo_dog import AiboEmulator
 from sim.robots.emulator.body import Body
-
-FRAME_S = 0.032
-CAMERA_S = 1.0 / 30.0
-DEAD_MAN_S = 3.0
-NATIVE = (208, 160)
-"""The camera's own size; it sends half of it each way unless it is asked for more."""
-DARK = b"\xff\xd8\xff\xc0\x00\x0b\x08\x00\x50\x00\x68\x01\x01\x11\x00" + bytes(64) + b"\xff\xd9"
-"""What a body without a picture shows: a JPEG of 104 x 80 pixels, as far as its header goes."""
-EMULATED = {**PORTS, "gains": 10032}
+from sim.robots.emulator.wire import Table, Wire
 
 
-class AiboEmulator:
-    """One emulated dog; ``accept`` takes its TCP links, ``datagram`` what comes by UDP.
+class AiboServer:
+    """Serves ``dog`` on ``interface`` of ``reactor``, under the port numbers that the dog has."""
 
-    ``on_ports`` is told whenever the ports that listen may have changed, for who serves real sockets.
-    """
-
-    def __init__(
-        self,
-        clock: IReactorTime,
-        body: Body,
-        rng: random.Random,
-        dialect: str = T4,
-        ports: dict[str, int] | None = None,
-        is_raw: bool = False,
-    ) -> None:
-        self.faults = StreamFaults()
-        self.ports = {**EMULATED, **(ports or {})}
-        self.on_ports: Callable[[], None] = lambda: None
-        self.is_engaged = True
-        self.clients: dict[str, _Client] = {}
-        self.menu = AiboMenu(self.ports, dialect == T2, self._on_server, self._on_setting)
-        self.head = {"p": 0.0, "t": 0.0, "r": 0.0}
-        self.heard: list[tuple[str, float]] = []
-        """The newest walk commands, for tests."""
-        self.start_ms = 0
-        self._clock = clock
-        self._body = body
-        self._rng = rng
-        self._dialect = dialect
-        self._is_raw = is_raw
-        self._walk = {"f": 0.0, "s": 0.0, "r": 0.0}
-        self._booted_at = clock.seconds()
-        self._frame = self._picture = 0
-        self._peer: Callable[[bytes], None] | None = None
-        self._timers: dict[str, Any] = {}
-        self._dead_man: Any = None
+    def __init__(self, reactor: Any, dog: AiboEmulator, interface: str = "127.0.0.1") -> None:
+        self.faults = dog.faults
+        self._reactor = reactor
+        self._dog = dog
+        self._interface = interface
+        self._open: dict[int, Any] = {}
+        self._closing: list[Deferred[Any]] = []
+        self._udp: Any = None
 
     def start(self) -> None:
-        """Switch the dog on."""
-        self._every(FRAME_S, self._send_state, "state")
-        self._every(CAMERA_S, self._send_picture, "camera")
+        """Switch the dog on and open what it serves from the start; raises ``CannotListenError`` for a taken port."""
+        self._udp = self._reactor.listenUDP(self._dog.ports["camera"], _Camera(self._dog), self._interface, 65536)
+        self._dog.on_ports = self._sync
+        self._sync()
+        self._dog.start()
 
-    def stop(self) -> None:
-        """Switch the dog off: every link breaks."""
-        for timer in (*self._timers.values(), self._dead_man):
-            if timer is not None and timer.active():
-                timer.cancel()
-        self._timers.clear()
-        self._rest()
-        self._peer = None
-        for client in list(self.clients.values()):
-            client.link.close()
+    def stop(self) -> Deferred[None]:
+        """Switch it off; fires when every port is free."""
+        self._dog.on_ports = lambda: None
+        self._dog.stop()
+        closing = [maybeDeferred(port.stopListening) for port in (*self._open.values(), self._udp)]
+        self._open.clear()
+        return gatherResults([*closing, *self._closing]).addCallback(lambda _: None)
 
-    def reboot(self) -> None:
-        """Off and on again: the motors are stopped, the servers have to be selected again, the time begins anew."""
-        self.stop()
-        self.menu.reset()
-        self.is_engaged = True
-        self._booted_at = self._clock.seconds()
-        self._frame = self._picture = self.start_ms = 0
-        self.on_ports()
-        self.start()
-
-    def press(self) -> None:
-        """Press its back twice: the e-stop turns over."""
-        self._set_engaged(not self.is_engaged)
-
-    def listens(self, port: int) -> bool:
-        """Whether a link to this port would be taken now."""
-        return self._service(port) is not None
-
-    def connector(self, delay: float = 0.0005) -> MemoryPorts:
-        """What opens links to this dog through memory."""
-        return MemoryPorts(self._clock, self, delay)
-
-    def accept(self, port: int, link: Link) -> Receiver:
-        """Take a link to ``port``; one that does not listen closes it at once."""
-        service = self._service(port)
-        client = _Client(self, service or "", link)
-        if service is None:
-            link.close()
-            return client
-        self.clients[service] = client
-        if service == "main":
-            self.menu.client()
-        self.on_ports()
-        return client
-
-    def datagram(self, data: bytes, answer: Callable[[bytes], None]) -> None:
-        """Take a datagram to the camera's port; ``answer`` sends one back."""
-        if data == picture.REQUEST and self._is_udp and "camera" in self.menu.running and not self.faults.half_open:
-            self._peer = answer
-
-    # -- what the clients say ---------------------------------------------------------------------------------------
-
-    def on_bytes(self, client: _Client, data: bytes) -> None:
-        """A client wrote."""
-        if self.faults.half_open:
-            return
-        match client.service:
-            case "main":
-                self._say(client, self.menu.answers(data))
-            case "estop":
-                for line in client.lines.read(data):
-                    self._on_estop(client, line)
-            case "walk":
-                for letter, value in client.commands.read(data):
-                    self._on_walk(letter, value)
-            case "head":
-                for letter, value in client.commands.read(data):
-                    if letter in self.head:
-                        self.head[letter] = max(-1.0, min(value, 1.0))
-
-    def on_gone(self, client: _Client) -> None:
-        """A client left: its port listens again; its walk goes on until the dead man's time."""
-        if self.clients.get(client.service) is client:
-            del self.clients[client.service]
-            self.on_ports()
-
-    def _on_estop(self, client: _Client, line: str) -> None:
-        if line in ("start", "stop"):
-            self._set_engaged(line == "stop")
-        elif line == "refresh":
-            self._say(client, b"on\n" if self.is_engaged else b"off\n")
-
-    def _set_engaged(self, is_engaged: bool) -> None:
-        if is_engaged == self.is_engaged:
-            return
-        self.is_engaged = is_engaged
-        if is_engaged:
-            self._rest()
-        client = self.clients.get("estop")
-        if client is not None:
-            self._say(client, b"on\n" if is_engaged else b"off\n")
-
-    def _on_walk(self, letter: str, value: float) -> None:
-        self.heard = [*self.heard[-99:], (letter, value)]
-        if self.is_engaged or letter not in "fsr0":
-            return
-        if letter != "0":
-            # What is no number cannot be walked; nor is it a reason to fall.
-            self._walk[letter] = value if math.isfinite(value) else 0.0
-        f, s, r = self._walk.values()
-        self._body.drive(f * (FORWARD if f > 0 else BACKWARD), s * ASIDE, r * TURN)
-        self._stop_dead_man()
-        if any(self._walk.values()):
-            self._dead_man = self._clock.callLater(DEAD_MAN_S, self._rest)
-
-    def _rest(self) -> None:
-        self._stop_dead_man()
-        self._walk = dict.fromkeys(self._walk, 0.0)
-        self._body.halt()
-
-    def _stop_dead_man(self) -> None:
-        if self._dead_man is not None and self._dead_man.active():
-            self._dead_man.cancel()
-        self._dead_man = None
-
-    # -- what the dog says ------------------------------------------------------------------------------------------
-
-    def _send_state(self) -> None:
-        self._frame += 4
-        client, gains = self.clients.get("state"), self.clients.get("gains")
-        if client is not None and not client.link.is_busy:
-            self._say(
-                client, encoded(sense.state(self._body.sense(), self._joints(), self._dialect, self._ms, self._frame))
-            )
-        if gains is not None and not gains.link.is_busy:
-            self._say(gains, encoded_gains(Gains(self._ms, ((10.0, 4.0, 2.0),) * 18)))
-
-    def _send_picture(self) -> None:
-        client = self.clients.get("camera")
-        if client is None and self._peer is None:
-            return
-        self._picture += 1
-        data = self._pictured()
-        if self._is_udp:
-            if self._peer is not None:
-                for piece in StreamFaults(self.faults.drop, self.faults.garbage, half_open=self.faults.half_open).wire(
-                    data, self._rng
-                ):
-                    self._peer(piece)
-        elif client is not None and not client.link.is_busy:
-            self._say(client, data)
-
-    def _pictured(self) -> bytes:
-        is_halved = self.menu.settings.get("vision.rawcam.y_skip", "2") != "1"
-        width, height = (side // 2 if is_halved else side for side in NATIVE)
-        head = picture.header(picture.COLOUR, 0 if self._is_raw else 1, width, height, self._ms, self._picture)
-        if not self._is_raw:
-            jpeg = self._body.picture(is_halved) or DARK
-            return head + picture.block(picture.Block(width, height, "JPEGColor", jpeg))
-        sizes = ((width, height), (width // 2, height // 2), (width // 2, height // 2))
-        return head + b"".join(
-            picture.block(picture.Block(w, h, "RawImage", bytes([picture.BLANK]) * (w * h), channel))
-            for channel, (w, h) in enumerate(sizes)
-        )
-
-    def _joints(self) -> list[float]:
-        joints = [0.0] * len(sense.JOINTS)
-        for at, letter, (low, high) in ((12, "t", sense.TILT), (13, "p", sense.PAN), (14, "r", sense.NOD)):
-            value = self.head[letter]
-            joints[at] = value * high if value > 0 else -value * low
-        return joints
-
-    def _say(self, client: _Client, data: bytes) -> None:
-        for piece in self.faults.wire(data, self._rng) if data else ():
-            if self.faults.delay:
-                self._clock.callLater(self.faults.delay, client.link.send, piece)
-            else:
-                client.link.send(piece)
-
-    # -- inside -----------------------------------------------------------------------------------------------------
-
-    @property
-    def _ms(self) -> int:
-        return (self.start_ms + round((self._clock.seconds() - self._booted_at) * 1000.0)) % 2**32
-
-    @property
-    def _is_udp(self) -> bool:
-        return self.menu.settings.get("vision.rawcam.transport", "UDP").upper() == "UDP"
-
-    def _service(self, port: int) -> str | None:
-        for service, number in self.ports.items():
-            runs = service == "main" or ("state" if service == "gains" else service) in self.menu.running
-            if number == port and runs and service not in self.clients and not (service == "camera" and self._is_udp):
-                return service
-        return None
-
-    def _on_server(self, service: str, runs: bool) -> None:
-        client = self.clients.get(service)
-        if not runs and service == "camera":
-            if self._peer is not None:
-                self._peer(picture.CLOSING)
-            elif client is not None:
-                self._say(client, picture.CLOSING)
-            self._peer = None
-        if not runs and client is not None:
-            client.link.close()
-        if not runs and service == "walk":
-            self._rest()
-        self.on_ports()
-
-    def _on_setting(self, key: str, value: str) -> None:
-        if key == "vision.rawcam.interval":
-            wait_s = float(value) / 1000.0 if value.isdecimal() else 0.0
-            # The dog looks at its camera's own frames only: the first one after the wait is sent.
-            self._every(CAMERA_S * (int(wait_s / CAMERA_S) + 1), self._send_picture, "camera")
-        elif key == "vision.rawcam.transport":
-            self.on_ports()
-
-    def _every(self, seconds: float, act: Callable[[], None], name: str) -> None:
-        timer = self._timers.get(name)
-        if timer is not None and timer.active():
-            timer.cancel()
-        # Counted from the beginning, so that late turns of the clock do not add up.
-        due = self._clock.seconds() + seconds
-
-        def turn() -> None:
-            nonlocal due
-            now = self._clock.seconds()
-            due = max(due + seconds, now)
-            self._timers[name] = self._clock.callLater(due - now, turn)
-            act()
-
-        self._timers[name] = self._clock.callLater(seconds, turn)
+    def _sync(self) -> None:
+        """Listen where the dog listens now, and nowhere else: a port with a client takes no second one."""
+        for number in self._dog.ports.values():
+            listens = self._dog.listens(number)
+            if listens and number not in self._open:
+                factory = TcpLinkFactory(partial(self._dog.accept, number))
+                self._open[number] = self._reactor.listenTCP(number, factory, interface=self._interface)
+            elif not listens and number in self._open:
+                closed = maybeDeferred(self._open.pop(number).stopListening)
+                self._closing = [*(one for one in self._closing if not one.called), closed]
 
 
-class _Client:
-    """Who holds a port."""
+class _Camera(DatagramProtocol):
+    noisy = False
 
-    def __init__(self, dog: AiboEmulator, service: str, link: Link) -> None:
-        self.service = service
-        self.link = link
-        self.lines = LineReader()
-        self.commands = CommandReader()
+    def __init__(self, dog: AiboEmulator) -> None:
         self._dog = dog
 
-    def received(self, data: bytes) -> None:
-        self._dog.on_bytes(self, data)
+    def datagramReceived(self, datagram: bytes, addr: Any) -> None:
+        self._dog.datagram(datagram, partial(self._answer, addr))
 
-    def link_down(self) -> None:
-        self._dog.on_gone(self)
-
-
-class MemoryPorts:
-    """Opens links through memory to whichever port is called; ``is_open`` False turns all away, ``cut`` breaks all."""
-
-    def __init__(self, clock: IReactorTime, dog: AiboEmulator, delay: float) -> None:
-        self.is_open = True
-        self._clock = clock
-        self._dog = dog
-        self._delay = delay
-        self._ports: dict[int, _MemoryPort] = {}
-
-    def call(self, host: str, port: int, caller: Any) -> Any:
-        """Keep ``caller`` connected, with back-off, until the line hangs up."""
-        if port not in self._ports:
-            self._ports[port] = _MemoryPort(self._clock, self, port, self._delay)
-        return self._ports[port].call(host, port, caller)
-
-    def cut(self, port: int | None = None) -> None:
-        """Break the links to ``port``, or all, as a lost network does."""
-        for number, one in self._ports.items():
-            if port in (None, number):
-                one.cut()
-
-    def takes(self, port: int) -> bool:
-        """Whether a call would be answered."""
-        return self.is_open and self._dog.listens(port)
-
-    def accept(self, port: int, link: Link) -> Receiver:
-        """Hand a link to the dog."""
-        return self._dog.accept(port, link)
+    def _answer(self, addr: Any, data: bytes) -> None:
+        if self.transport is not None:
+            self.transport.write(data, addr)
 
 
-class _MemoryPort(MemoryConnector):
-    def __init__(self, clock: IReactorTime, ports: MemoryPorts, port: int, delay: float) -> None:
-        super().__init__(clock, lambda link: ports.accept(port, link), delay)
-        self._takes = lambda: ports.takes(port)
-
-    def opened(self, caller: Receiver) -> Any:
-        return super().opened(caller) if self._takes() else None
+def serve(reactor: Any, body: Body, rng: random.Random, options: Table, dialect: str) -> Wire:
+    """Return the wire of an AIBO; ``dialect`` is its Tekkotsu, "T4" or "T2"."""
+    chosen = checked(options)
+    dog = AiboEmulator(reactor, body, rng, dialect, dict(chosen.ports) | {"gains": 0})
+    return AiboServer(reactor, dog, chosen.host)

@@ -14,12 +14,13 @@ from twisted.internet.interfaces import IReactorTime
 
 from drivers.bittle.codec import END_BYTES, END_TEXT
 from drivers.bittle.gait import GAITS, Velocity
-from drivers.bittle.option import BEHAVIOURS, POSTURES
+from drivers.bittle.option import BEHAVIOURS, POSTURES, checked
 from drivers.link import Link
 from drivers.reading import Value
 from middleware.faults.stream import StreamFaults
 from sim.robots.emulator.body import Body
 from sim.robots.emulator.outlet import Outlet
+from sim.robots.emulator.wire import CableWire, Table, TcpWire, Wire
 
 VERSIONS = {"biboard": "B10_250712", "nyboard": "N_250224"}
 UNFINISHED_S = 0.01
@@ -320,3 +321,13 @@ class BittlePage:
         )
         for piece in self._robot.faults.wire((head + text).encode(), self._rng):
             self._link.send(piece)
+
+
+def serve(reactor: Any, body: Body, rng: random.Random, options: Table, dialect: str) -> Wire:
+    """Return the wire of a Bittle: a pseudo-terminal, or HTTP."""
+    chosen = checked(options)
+    board = "biboard" if chosen.board == "auto" else chosen.board
+    dog = Bittle(body, reactor, rng, board=board, gaits=dict(chosen.gaits))
+    if chosen.port:
+        return CableWire(reactor, dog, chosen.port)
+    return TcpWire(reactor, dog, dog.accept_http, chosen.host, chosen.http_port, False)

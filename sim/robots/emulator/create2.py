@@ -10,11 +10,13 @@ from typing import Any
 from twisted.internet.interfaces import IReactorTime
 
 from drivers.create2 import codec
+from drivers.create2.option import checked
 from drivers.link import Link
 from drivers.reading import Value
 from middleware.faults.stream import StreamFaults
 from sim.robots.emulator.body import Body
 from sim.robots.emulator.outlet import Outlet
+from sim.robots.emulator.wire import CableWire, Table, Wire
 
 MM_PER_COUNT = math.pi * 72.0 / 508.8
 WHEEL_BASE = 235.0
@@ -230,3 +232,8 @@ class Create2:
             strength = round(4095 * (1.0 - max(distance, 0.0) / LIGHT_REACH))
             packets |= {"light_center_left": strength, "light_center_right": strength, "light_bumper": 0b001100}
         return packets
+
+
+def serve(reactor: Any, body: Body, rng: random.Random, options: Table, dialect: str) -> Wire:
+    """Return the wire of a Create 2, a pseudo-terminal."""
+    return CableWire(reactor, Create2(body, reactor, rng), checked(options).port)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import math
+import random
 from collections.abc import Iterator, Mapping
 from random import Random
 from typing import Any
@@ -13,9 +14,11 @@ from twisted.internet.interfaces import IReactorTime
 
 from drivers.link import Link, Receiver
 from drivers.reading import Value
+from drivers.rosbridge.option import checked
 from drivers.rosbridge.websocket import WebSocket
 from middleware.faults.stream import StreamFaults
 from sim.robots.emulator.body import Body
+from sim.robots.emulator.wire import Table, TcpWire, Wire
 
 BASE_STOPS_S = 0.5
 """A base that hears no velocity for so long stands still, as those of most robots do."""
@@ -329,3 +332,10 @@ def _quaternion(yaw: float) -> dict[str, float]:
 
 def _real(value: object, default: float = 0.0) -> float:
     return float(value) if isinstance(value, (int, float)) and not isinstance(value, bool) else default
+
+
+def serve(reactor: Any, body: Body, rng: random.Random, options: Table, dialect: str) -> Wire:
+    """Return the wire of a rosbridge server."""
+    chosen = checked(options)
+    robot = RosbridgeRobot(reactor, body, rng)
+    return TcpWire(reactor, robot, robot.accept, chosen.host, chosen.port)

@@ -48,7 +48,7 @@ class CandidateTests(SynchronousTestCase):
         found = candidates(lambda: [("/dev/ttyUSB1", "FTDI"), ("/dev/ttyUSB0", "")], lambda device: "1" in device)
         self.assertEqual(found, [Candidate("/dev/ttyUSB0", "", False), Candidate("/dev/ttyUSB1", "FTDI", True)])
         told = "\n".join(candidate_lines(found))
-        self.assertIn("/dev/ttyUSB1  FTDI\n  swarm driver probe --kind create2 --option port=/dev/ttyUSB1", told)
+        self.assertIn("/dev/ttyUSB1  FTDI\n  swarm driver probe --kind bittle --option port=/dev/ttyUSB1", told)
         self.assertEqual(told.count("no permission"), 1)
 
     def test_nothing_is_said_as_well(self) -> None:

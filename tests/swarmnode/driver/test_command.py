@@ -14,7 +14,7 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from drivers.driver import Permit
 from drivers.registry import driver_for, kinds
-from sim.robots.emulator.aibo import AiboEmulator
+from sim.robots.emulator.aibo_dog import AiboEmulator
 from sim.robots.emulator.body import MemoryBody
 from swarmnode.driver.command import main
 from swarmnode.driver.pilot import Pilot

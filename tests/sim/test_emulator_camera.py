@@ -1,4 +1,4 @@
-"""Tests of ``sim.robots.emulator.mjpeg``: what a client of any kind finds there."""
+"""Tests of ``sim.robots.emulator.camera``: what a client of any kind finds there."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from drivers.camera.codec import StreamReader, request
 from sim.robots.emulator.body import MemoryBody
-from sim.robots.emulator.mjpeg import MjpegCamera
+from sim.robots.emulator.camera import MjpegCamera
 
 
 class Wire:

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import math
 import random
+from typing import Any
 
 from twisted.internet.interfaces import IReactorTime
 
 from drivers.compass.codec import eastward, sentence
+from drivers.compass.option import checked
 from drivers.link import Link
 from middleware.faults.stream import StreamFaults
 from sim.robots.emulator.body import Body
 from sim.robots.emulator.broadcast import Broadcast
 from sim.robots.emulator.outlet import Outlet
+from sim.robots.emulator.wire import CableWire, Table, TcpWire, Wire
 
 
 class NmeaCompass(Broadcast["_Client"]):
@@ -76,3 +79,12 @@ class _Client:
         """The client has gone."""
         self.outlet.link = None
         self._compass.leave(self)
+
+
+def serve(reactor: Any, body: Body, rng: random.Random, options: Table, dialect: str) -> Wire:
+    """Return the wire of a compass: a pseudo-terminal, or TCP."""
+    chosen = checked(options)
+    compass = NmeaCompass(reactor, body)
+    if chosen.device:
+        return CableWire(reactor, compass, chosen.device, True)
+    return TcpWire(reactor, compass, compass.accept, chosen.host, chosen.port)

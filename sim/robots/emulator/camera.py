@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import random
+from typing import Any
 
 from twisted.internet.interfaces import IReactorTime
 
 from drivers.camera import codec
+from drivers.camera.option import checked, place_of
+from drivers.errors import UsageError
 from drivers.link import Link
 from middleware.faults.stream import StreamFaults
 from sim.robots.emulator.body import Body
 from sim.robots.emulator.broadcast import Broadcast
 from sim.robots.emulator.outlet import Outlet
+from sim.robots.emulator.wire import Table, TcpWire, Wire
 
 MOST_REQUEST = 8192
 """Bytes of a request."""
@@ -101,3 +105,13 @@ class _Client:
         """The client has gone."""
         self._outlet.link = None
         self._camera.leave(self)
+
+
+def serve(reactor: Any, body: Body, rng: random.Random, options: Table, dialect: str) -> Wire:
+    """Return the wire of a camera; raises ``UsageError`` where ``options`` have no url."""
+    chosen = checked(options)
+    if not chosen.url:
+        raise UsageError('a camera of the yard needs the option url, as in url = "http://127.0.0.1:8081/"')
+    place = place_of(chosen.url)
+    camera = MjpegCamera(reactor, body, float(options.get("fps", 15.0)))
+    return TcpWire(reactor, camera, camera.accept, place.host, place.port)
