@@ -1,16 +1,13 @@
 """The desk: what an operator can ask the team for.
 
-The front door implements it over the node; ``MemoryDesk`` is the twin in memory, for a page without a team.  Every
-method is called on the reactor's thread and returns at once (or returns a Deferred that fires soon); what cannot be
-is a ``Refusal``.
+Every method is called on the reactor's thread and returns at once, or returns a Deferred that fires soon.  A wish that
+cannot be granted raises ``Refusal``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
-
-from webnode.errors import Refusal
 
 
 class Desk(Protocol):
@@ -72,86 +69,3 @@ class Desk(Protocol):
         ``{"walls": [w, h], "dogs": [{"name", "x", "y", "heading", "stripes"}], "target": {"x", "y", "radius"} |
         None}``; metres and radians, origin in the lower left corner.
         """
-
-
-class MemoryDesk:
-    """A desk that writes down what it is asked, in ``asked``, and keeps the target of its own small yard."""
-
-    def __init__(self, catalogue: Sequence[Mapping[str, Any]] = (), yard: Mapping[str, Any] | None = None) -> None:
-        self.asked: list[tuple[Any, ...]] = []
-        self.tasks = list(catalogue)
-        self.previews: dict[str, dict[str, Any]] = {}
-        self.together: dict[str, list[dict[str, Any]]] = {}
-        self.ground: dict[str, Any] | None = dict(yard) if yard is not None else None
-
-    def run_demo(self, task_id: str = "") -> str:
-        """Return ``demo-N``, or the id that it is to have."""
-        noted = self._noted("demo")
-        return task_id or noted
-
-    def assign(self, name: str, tolerates: int = 1, group: str = "", task_id: str = "") -> dict[str, Any]:
-        """Return ``assign-N``, or the id that it is to have; nobody is able, nobody is refused."""
-        if name not in [task["name"] for task in self.tasks]:
-            raise Refusal("name", f"there is no task {name!r}", "choose one of /api/v1/catalogue", 404)
-        noted = self._noted("assign", name)
-        return {"id": task_id or noted, "able": [], "refused": {}}
-
-    def preview(self, name: str, group: str = "") -> dict[str, Any]:
-        """Return what is in ``previews``, else that nobody is able and nobody refused."""
-        if name not in [task["name"] for task in self.tasks]:
-            raise Refusal("name", f"there is no task {name!r}", "choose one of /api/v1/catalogue", 404)
-        told = self.previews.get(name, {"able": [], "refused": {}, "likely": None})
-        return {**told, "together": self.together.get(group, [])}
-
-    def catalogue(self) -> list[Mapping[str, Any]]:
-        """Return what the desk was made with."""
-        return self.tasks
-
-    def cancel(self, task_id: str) -> None:
-        """Write it down."""
-        self._noted("cancel", task_id)
-
-    def pause(self, task_id: str) -> None:
-        """Write it down."""
-        self._noted("pause", task_id)
-
-    def resume(self, task_id: str) -> None:
-        """Write it down."""
-        self._noted("resume", task_id)
-
-    def message(self, uuid: str, text: str) -> dict[str, Any]:
-        """Write it down; nobody is here to have it."""
-        self._noted("message", uuid, text)
-        return {"delivered": [], "failed": {}}
-
-    def disconnect(self, uuid: str, seconds: float) -> None:
-        """Write it down."""
-        self._noted("disconnect", uuid, seconds)
-
-    def move_target(self, x: float, y: float) -> None:
-        """Move it."""
-        self._noted("target", x, y)
-        if self.ground is not None:
-            self.ground = {**self.ground, "target": {"x": x, "y": y, "radius": 0.08}}
-
-    def clear_target(self) -> None:
-        """Take it away."""
-        self._noted("clear")
-        if self.ground is not None:
-            self.ground = {**self.ground, "target": None}
-
-    def move_robot(self, name: str, x: float, y: float, heading: float) -> None:
-        """Move it."""
-        self._noted("robot", name, x, y, heading)
-        if self.ground is not None:
-            place = {"x": x, "y": y, "heading": heading}
-            dogs = [{**dog, **place} if dog["name"] == name else dog for dog in self.ground["dogs"]]
-            self.ground = {**self.ground, "dogs": dogs}
-
-    def yard(self) -> dict[str, Any] | None:
-        """Return the ground."""
-        return self.ground
-
-    def _noted(self, *wish: Any) -> str:
-        self.asked.append(wish)
-        return f"{wish[0]}-{len(self.asked)}"

@@ -20,9 +20,9 @@ from middleware.admission.membership import MemoryMembership
 from middleware.admission.operator import FIRST
 from swarmnode import invitation
 from swarmnode.rehearsal import VirtualTeam
+from tests.webnode.memory import MemoryDesk
 from webnode.app import create_app
 from webnode.board import Board, OpenSessions, Token, Visitor
-from webnode.desk import MemoryDesk
 from webnode.errors import Refusal
 from webnode.fallback import TeamFallbacks, fallbacks
 from webnode.ground import Ground

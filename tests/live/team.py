@@ -32,23 +32,10 @@ from twisted.protocols.basic import LineReceiver
 from middleware.faults.kinds import KINDS
 from swarmnode.gateway import sides
 from tests.live.keys import GATEWAYS, key_of
-from webnode.board import (
-    Board,
-    Knob,
-    MemoryAudit,
-    MemoryFallbacks,
-    MemoryFaults,
-    MemoryHalts,
-    MemoryPhones,
-    MemorySurvey,
-    MemoryTuning,
-    Page,
-    Token,
-    Visitor,
-)
+from tests.webnode.memory import MemoryDesk, MemoryFaults, MemoryHalts, MemoryPhones, MemorySurvey, MemoryTuning
+from webnode.board import Board, Knob, MemoryAudit, MemoryFallbacks, Page, Token, Visitor
 from webnode.camera import OnFrame
 from webnode.chronicle import TeamChronicle
-from webnode.desk import MemoryDesk
 from webnode.invite import TeamInvites
 from webnode.limits import AddressLimits
 from webnode.password import hashed, is_password

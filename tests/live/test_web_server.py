@@ -17,10 +17,10 @@ from twisted.web.client import Agent, HTTPConnectionPool, readBody
 from twisted.web.http_headers import Headers
 from twisted.web.static import Data
 
+from tests.webnode.memory import MemoryDesk
 from tests.webnode.picture import jpeg
 from webnode.board import Board, OpenSessions
 from webnode.camera import MemoryFrames
-from webnode.desk import MemoryDesk
 from webnode.errors import PortTaken
 from webnode.route import Route
 from webnode.routes.table import TABLE

@@ -10,9 +10,9 @@ from twisted.internet.defer import Deferred, fail
 from twisted.trial.unittest import SynchronousTestCase
 
 from tests.webnode.guests import Guests
+from tests.webnode.memory import MemoryDesk, MemoryHalts, MemoryTuning
 from webnode.app import create_app
-from webnode.board import Board, Knob, MemoryChronicle, MemoryHalts, MemoryTuning
-from webnode.desk import MemoryDesk
+from webnode.board import Board, Knob, MemoryChronicle
 from webnode.errors import Refusal
 from webnode.state import state_of
 

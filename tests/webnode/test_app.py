@@ -12,9 +12,9 @@ from flask.testing import FlaskClient
 from twisted.trial.unittest import SynchronousTestCase
 
 from tests.webnode.guests import Guests
+from tests.webnode.memory import MemoryDesk
 from webnode.app import create_app
 from webnode.board import Board, MemoryFallbacks, OpenSessions, Page, Sessions
-from webnode.desk import MemoryDesk
 from webnode.guard import HEADERS, MAX_BODY
 from webnode.route import Content, Route
 from webnode.routes.table import TABLE

@@ -12,10 +12,10 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.config.settings import IN_MEMORY, Settings
 from tests.webnode.guests import Guests
+from tests.webnode.memory import MemoryDesk
 from webnode.app import create_app
 from webnode.audit import QUIET_S, FileAudit, audit
 from webnode.board import AUDITED, Board, MemoryAudit, Visitor
-from webnode.desk import MemoryDesk
 from webnode.ground import Ground
 from webnode.state import state_of
 

@@ -4,24 +4,19 @@ from __future__ import annotations
 
 from twisted.trial.unittest import SynchronousTestCase
 
+from tests.webnode.memory import MemoryDesk
 from webnode.board import (
     AUDITED,
     Board,
     Entry,
-    Knob,
     MemoryAudit,
     MemoryChronicle,
     MemoryFallbacks,
-    MemoryHalts,
-    MemoryPhones,
-    MemoryTuning,
     NoLimits,
     OpenSessions,
     Page,
     Visitor,
 )
-from webnode.desk import MemoryDesk
-from webnode.errors import Refusal
 
 
 class TwinTests(SynchronousTestCase):
@@ -56,38 +51,6 @@ class TwinTests(SynchronousTestCase):
         self.assertEqual([page.node for page in fallbacks.here()], ["02"])
         self.assertTrue(fallbacks.lets_in("http://10.0.0.2:8080"))
         self.assertFalse(fallbacks.lets_in("http://10.0.0.2:8081"))
-
-    def test_phones_in_memory_are_counted(self) -> None:
-        """The twin of the gateway knows a phone by its secret, takes looks of those that are here, and so many."""
-        phones = MemoryPhones(most=1)
-        uuid = self.successResultOf(phones.join(b"1" * 32, "anna", {}))
-        self.assertEqual(self.successResultOf(phones.join(b"1" * 32, "anna", {})), uuid)
-        self.failureResultOf(phones.join(b"2" * 32, "ben", {}), Refusal)
-        self.assertGreater(phones.look(uuid, b"jpeg", {"target.distance": 1.0}).fps, 0.0)
-        self.assertEqual(phones.looks, [(uuid, b"jpeg", {"target.distance": 1.0})])
-        phones.leave(uuid)
-        phones.leave(uuid)
-        self.assertEqual(self.assertRaises(Refusal, phones.look, uuid, b"jpeg", {}).status, 404)
-        self.successResultOf(phones.join(b"2" * 32, "ben", {}))
-        self.successResultOf(phones.close())
-        self.assertEqual(phones.here, {})
-
-    def test_team_in_memory_obeys(self) -> None:
-        """The twin of the stop has all its devices stand and go on, and knows which was said last."""
-        halts = MemoryHalts("01", "02")
-        self.assertFalse(halts.is_halted())
-        self.assertEqual(self.successResultOf(halts.halt("ann")), {"01": "stands", "02": "stands"})
-        self.assertTrue(halts.is_halted())
-        self.assertEqual(self.successResultOf(halts.release("bob")), {"01": "goes on", "02": "goes on"})
-        self.assertFalse(halts.is_halted())
-
-    def test_settings_in_memory(self) -> None:
-        """The twin of the settings takes what a device has, and refuses the rest by its key."""
-        tuning = MemoryTuning({"01": [Knob("description", "a dog", "A line")]})
-        self.assertEqual(self.successResultOf(tuning.settings("02")), [])
-        (knob,) = self.successResultOf(tuning.change("01", {"description": "lame"}))
-        self.assertEqual(knob.value, "lame")
-        self.assertEqual(self.failureResultOf(tuning.change("01", {"colour": "red"}), Refusal).value.field, "colour")
 
     def test_board_says_what_it_has(self) -> None:
         """What a node lacks is not said to the page; a yard counts where there is one."""

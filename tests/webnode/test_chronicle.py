@@ -7,10 +7,10 @@ from typing import Any
 from twisted.trial.unittest import SynchronousTestCase
 
 from tests.webnode.guests import Guests
+from tests.webnode.memory import MemoryDesk
 from webnode.app import create_app
 from webnode.board import Board
 from webnode.chronicle import TeamChronicle
-from webnode.desk import MemoryDesk
 from webnode.state import Departed, State, state_of
 
 

@@ -7,8 +7,8 @@ from typing import Any
 from twisted.internet.defer import Deferred
 from twisted.trial.unittest import SynchronousTestCase
 
+from tests.webnode.memory import MemoryDesk
 from webnode.board import Board, OpenSessions, Role, Visitor
-from webnode.desk import MemoryDesk
 from webnode.dispatch import REMEMBERED, Dispatch
 from webnode.errors import Refusal
 from webnode.route import Ask, Route

@@ -9,9 +9,9 @@ from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.faults.kinds import KINDS
 from swarmnode.rehearsal import VirtualTeam
+from tests.webnode.memory import MemoryDesk, MemoryFaults
 from webnode.app import create_app
-from webnode.board import Board, MemoryChronicle, MemoryFaults, OpenSessions
-from webnode.desk import MemoryDesk
+from webnode.board import Board, MemoryChronicle, OpenSessions
 from webnode.errors import Refusal
 from webnode.faults import TOLD_S, FaultControl, faults
 from webnode.state import state_of

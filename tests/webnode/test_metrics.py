@@ -9,9 +9,9 @@ from typing import Any
 from twisted.trial.unittest import SynchronousTestCase
 
 from tests.webnode.guests import Guests
+from tests.webnode.memory import MemoryDesk
 from webnode.app import create_app
 from webnode.board import Board, Visitor
-from webnode.desk import MemoryDesk
 from webnode.limits import AddressLimits
 from webnode.state import state_of
 

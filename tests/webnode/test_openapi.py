@@ -9,9 +9,9 @@ from typing import Any
 from twisted.trial.unittest import SynchronousTestCase
 
 from tests.webnode.guests import Guests
+from tests.webnode.memory import MemoryDesk
 from webnode.app import create_app
 from webnode.board import Board
-from webnode.desk import MemoryDesk
 from webnode.openapi import document
 from webnode.route import Field, Route
 from webnode.routes.table import TABLE

@@ -15,10 +15,10 @@ from twisted.web.resource import Resource
 from middleware.entangled.identity import Identity
 from swarmnode.gateway import sides
 from tests.webnode.browser import Connection, site_of
+from tests.webnode.memory import MemoryDesk, MemoryPhones
 from tests.webnode.picture import jpeg
 from webnode.app import create_app
-from webnode.board import Board, MemoryAudit, MemoryFallbacks, MemoryPhones, OpenSessions, Page
-from webnode.desk import MemoryDesk
+from webnode.board import Board, MemoryAudit, MemoryFallbacks, OpenSessions, Page
 from webnode.guard import MAX_BODY
 from webnode.limits import AddressLimits
 from webnode.routes.phones import MEASURES, ROUTES

@@ -7,8 +7,8 @@ from typing import Any
 
 from twisted.trial.unittest import SynchronousTestCase
 
+from tests.webnode.memory import MemoryDesk
 from webnode.board import Board, OpenSessions, Visitor
-from webnode.desk import MemoryDesk
 from webnode.errors import Refusal
 from webnode.route import ALLOWED, Ask, Field, Route, checked, device, guarded
 from webnode.routes.table import TABLE

@@ -16,8 +16,8 @@ from twisted.web.static import Data
 
 from tests.webnode.browser import Connection, site_of
 from tests.webnode.guests import Guests
+from tests.webnode.memory import MemoryDesk
 from webnode.board import Board, MemoryFallbacks, OpenSessions, Page
-from webnode.desk import MemoryDesk
 from webnode.errors import Refusal
 from webnode.guard import MAX_BODY
 from webnode.resource import JsonResource

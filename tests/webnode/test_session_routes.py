@@ -9,9 +9,9 @@ from twisted.internet.defer import succeed
 from twisted.trial.unittest import SynchronousTestCase
 
 from middleware.entangled.identity import Identity
+from tests.webnode.memory import MemoryDesk, MemoryInvites
 from webnode.app import create_app
-from webnode.board import Board, MemoryAudit, MemoryFallbacks, MemoryInvites, Page
-from webnode.desk import MemoryDesk
+from webnode.board import Board, MemoryAudit, MemoryFallbacks, Page
 from webnode.password import hashed, is_password
 from webnode.session import SignedSessions
 from webnode.state import state_of

@@ -12,9 +12,9 @@ from middleware.entangled.wire.door import UNPROTECTED
 from middleware.node import SwarmNode
 from tests.fleet import FleetCase, SwarmFleet
 from tests.webnode.guests import Guests
+from tests.webnode.memory import MemoryDesk, MemorySurvey
 from webnode.app import create_app
-from webnode.board import Board, MemorySurvey
-from webnode.desk import MemoryDesk
+from webnode.board import Board
 from webnode.errors import Refusal
 from webnode.state import state_of
 from webnode.survey import PATIENCE_S, TeamSurvey

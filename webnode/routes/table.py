@@ -1,40 +1,12 @@
-"""Table: every route of the API, in the order in which it is documented."""
+"""Table: every route of the API, from the ``ROUTES`` of each module of this package."""
 
 from __future__ import annotations
 
-from webnode.route import Route
-from webnode.routes import (
-    audit,
-    devices,
-    events,
-    faults,
-    halt,
-    metrics,
-    network,
-    node,
-    openapi,
-    orders,
-    phones,
-    session,
-    settings,
-    tasks,
-    yard,
-)
+from importlib import import_module
+from pkgutil import iter_modules
 
-TABLE: tuple[Route, ...] = (
-    *node.ROUTES,
-    *openapi.ROUTES,
-    *session.ROUTES,
-    *devices.ROUTES,
-    *tasks.ROUTES,
-    *orders.ROUTES,
-    *halt.ROUTES,
-    *yard.ROUTES,
-    *settings.ROUTES,
-    *network.ROUTES,
-    *events.ROUTES,
-    *faults.ROUTES,
-    *phones.ROUTES,
-    *audit.ROUTES,
-    *metrics.ROUTES,
-)
+from webnode import routes
+from webnode.route import Route
+
+_MODULES = [module.name for module in iter_modules(routes.__path__) if module.name != "table"]
+TABLE: tuple[Route, ...] = tuple(route for name in _MODULES for route in import_module(f"webnode.routes.{name}").ROUTES)

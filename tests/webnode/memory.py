@@ -1,0 +1,255 @@
+"""Parts of a web node in memory, for tests of routes, pages and servers without a team."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from twisted.internet.defer import Deferred, fail, succeed
+
+from webnode.board import Knob, Wanted
+from webnode.errors import Refusal
+from webnode.field import Json
+
+
+class MemorySurvey:
+    """Answers that it was made with: of the network, of each device by uuid, of the links and of the team."""
+
+    def __init__(self, network: Json, inventories: Mapping[str, Json], links: Json = None, team: Json = None) -> None:
+        self._network = network
+        self._inventories = inventories
+        self._links = links
+        self._team = team
+
+    def network(self) -> Deferred[Json]:
+        """Return it."""
+        return succeed(self._network)
+
+    def links(self) -> Deferred[Json]:
+        """Return them."""
+        return succeed(self._links)
+
+    def team(self) -> Json:
+        """Return it."""
+        return self._team
+
+    def inventory(self, uuid: str) -> Deferred[Json]:
+        """Return it, or fail with 504: the device did not answer."""
+        if uuid not in self._inventories:
+            return fail(Refusal("device", "it did not answer", "wait a moment, then try again", 504))
+        return succeed(self._inventories[uuid])
+
+
+class MemoryTuning:
+    """Settings of devices that take whatever they are told; ``knobs`` are those of each uuid."""
+
+    def __init__(self, knobs: Mapping[str, Sequence[Knob]]) -> None:
+        self.knobs = {uuid: list(each) for uuid, each in knobs.items()}
+
+    def settings(self, uuid: str) -> Deferred[list[Knob]]:
+        """Return them."""
+        return succeed(self.knobs.get(uuid, []))
+
+    def change(self, uuid: str, changes: Mapping[str, Json]) -> Deferred[list[Knob]]:
+        """Change them; fails where the device has no such setting."""
+        for key in changes:
+            if key not in [knob.key for knob in self.knobs.get(uuid, [])]:
+                return fail(Refusal(key, "cannot be changed on this device", "leave it out"))
+        self.knobs[uuid] = [replace(knob, value=changes.get(knob.key, knob.value)) for knob in self.knobs[uuid]]
+        return succeed(self.knobs[uuid])
+
+
+class MemoryHalts:
+    """The button of a team that obeys; ``devices`` are the uuids of those that say so, ``said`` who pressed what."""
+
+    def __init__(self, *devices: str) -> None:
+        self.devices = devices
+        self.said: list[tuple[str, str]] = []
+
+    def halt(self, by: str) -> Deferred[dict[str, str]]:
+        """All stand."""
+        self.said.append(("halt", by))
+        return succeed(dict.fromkeys(self.devices, "stands"))
+
+    def release(self, by: str, stops: Sequence[str] | None = None) -> Deferred[dict[str, str]]:
+        """All go on."""
+        self.said.append(("release", by))
+        return succeed(dict.fromkeys(self.devices, "goes on"))
+
+    def is_halted(self) -> bool:
+        """Whether the last that was pressed was the halt."""
+        return bool(self.said) and self.said[-1][0] == "halt"
+
+
+class MemoryFaults:
+    """Faults that are only written down, in ``caused`` as (uuid, kind, seconds, amount); ``rows`` are those told of."""
+
+    def __init__(self, *kinds: str) -> None:
+        self.caused: list[tuple[str, str, float, float | None]] = []
+        self.rows: list[dict[str, Json]] = []
+        self._kinds = kinds
+
+    def kinds(self, uuid: str) -> Sequence[str]:
+        """Return what it was made with."""
+        return self._kinds
+
+    def cause(self, uuid: str, kind: str, seconds: float, amount: float | None) -> Deferred[None]:
+        """Write it down; nothing comes of it."""
+        self.caused.append((uuid, kind, seconds, amount))
+        row: dict[str, Json] = {
+            "n": len(self.caused),
+            "uuid": uuid,
+            "name": uuid[:4],
+            "kind": kind,
+            "amount": amount,
+            "left_s": seconds,
+        }
+        self.rows.insert(0, {**row, "task": "t1", "since_s": 0.0, "takeover_s": None, "to": "", "watched": True})
+        return succeed(None)
+
+    def active(self) -> list[dict[str, Json]]:
+        """Those that were caused, the newest first."""
+        return self.rows
+
+
+class MemoryPhones:
+    """Phones that are only counted: ``here`` maps each uuid to its name, ``looks`` are (uuid, bytes, values).
+
+    ``check`` raises ``Refusal`` for what is no picture.
+    """
+
+    def __init__(self, most: int = 8, check: Callable[[bytes], object] = lambda jpeg: None) -> None:
+        self.here: dict[str, str] = {}
+        self.looks: list[tuple[str, bytes, Mapping[str, float]]] = []
+        self.can: Mapping[str, Any] = {}
+        self._most = most
+        self._check = check
+
+    def join(self, secret: bytes, name: str, can: Mapping[str, Any]) -> Deferred[str]:
+        """Count it; its uuid is the end of its secret."""
+        uuid = secret[-20:].hex()
+        if uuid not in self.here and len(self.here) >= self._most:
+            return fail(Refusal("phone", "too many take part", "wait until one leaves", 409))
+        self.here[uuid], self.can = name, can
+        return succeed(uuid)
+
+    def look(self, uuid: str, jpeg: bytes, values: Mapping[str, float]) -> Wanted:
+        """Keep it."""
+        self._check(jpeg)
+        if uuid not in self.here:
+            raise Refusal("uuid", "this phone takes no part here", "join by POST /api/v1/phones", 404)
+        self.looks.append((uuid, jpeg, values))
+        return Wanted(10.0, "Look for the red target: turn slowly.")
+
+    def leave(self, uuid: str) -> None:
+        """Forget it."""
+        self.here.pop(uuid, None)
+
+    def close(self) -> Deferred[Any]:
+        """Forget all."""
+        self.here.clear()
+        return succeed(None)
+
+
+class MemoryInvites:
+    """Pages that it was made with, and drawings that only say of what they are."""
+
+    def __init__(self, *urls: str, authority: bytes = b"", fingerprint: str = "") -> None:
+        self.pages = list(urls)
+        self.authority = authority
+        self.fingerprint = fingerprint
+
+    def urls(self) -> list[str]:
+        """Return them."""
+        return self.pages
+
+    def drawn(self, text: str) -> Deferred[str]:
+        """Return an empty picture with ``text`` for its title, or nothing where there is none."""
+        if not text:
+            return succeed("")
+        title = text.replace("&", "&amp;").replace("<", "&lt;")
+        return succeed(f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 9 9"><title>{title}</title></svg>')
+
+
+class MemoryDesk:
+    """A desk that writes down what it is asked, in ``asked``, and keeps the target of its own small yard."""
+
+    def __init__(self, catalogue: Sequence[Mapping[str, Any]] = (), yard: Mapping[str, Any] | None = None) -> None:
+        self.asked: list[tuple[Any, ...]] = []
+        self.tasks = list(catalogue)
+        self.previews: dict[str, dict[str, Any]] = {}
+        self.together: dict[str, list[dict[str, Any]]] = {}
+        self.ground: dict[str, Any] | None = dict(yard) if yard is not None else None
+
+    def run_demo(self, task_id: str = "") -> str:
+        """Return ``demo-N``, or the id that it is to have."""
+        noted = self._noted("demo")
+        return task_id or noted
+
+    def assign(self, name: str, tolerates: int = 1, group: str = "", task_id: str = "") -> dict[str, Any]:
+        """Return ``assign-N``, or the id that it is to have; nobody is able, nobody is refused."""
+        if name not in [task["name"] for task in self.tasks]:
+            raise Refusal("name", f"there is no task {name!r}", "choose one of /api/v1/catalogue", 404)
+        noted = self._noted("assign", name)
+        return {"id": task_id or noted, "able": [], "refused": {}}
+
+    def preview(self, name: str, group: str = "") -> dict[str, Any]:
+        """Return what is in ``previews``, else that nobody is able and nobody refused."""
+        if name not in [task["name"] for task in self.tasks]:
+            raise Refusal("name", f"there is no task {name!r}", "choose one of /api/v1/catalogue", 404)
+        told = self.previews.get(name, {"able": [], "refused": {}, "likely": None})
+        return {**told, "together": self.together.get(group, [])}
+
+    def catalogue(self) -> list[Mapping[str, Any]]:
+        """Return what the desk was made with."""
+        return self.tasks
+
+    def cancel(self, task_id: str) -> None:
+        """Write it down."""
+        self._noted("cancel", task_id)
+
+    def pause(self, task_id: str) -> None:
+        """Write it down."""
+        self._noted("pause", task_id)
+
+    def resume(self, task_id: str) -> None:
+        """Write it down."""
+        self._noted("resume", task_id)
+
+    def message(self, uuid: str, text: str) -> dict[str, Any]:
+        """Write it down; nobody is here to have it."""
+        self._noted("message", uuid, text)
+        return {"delivered": [], "failed": {}}
+
+    def disconnect(self, uuid: str, seconds: float) -> None:
+        """Write it down."""
+        self._noted("disconnect", uuid, seconds)
+
+    def move_target(self, x: float, y: float) -> None:
+        """Move it."""
+        self._noted("target", x, y)
+        if self.ground is not None:
+            self.ground = {**self.ground, "target": {"x": x, "y": y, "radius": 0.08}}
+
+    def clear_target(self) -> None:
+        """Take it away."""
+        self._noted("clear")
+        if self.ground is not None:
+            self.ground = {**self.ground, "target": None}
+
+    def move_robot(self, name: str, x: float, y: float, heading: float) -> None:
+        """Move it."""
+        self._noted("robot", name, x, y, heading)
+        if self.ground is not None:
+            place = {"x": x, "y": y, "heading": heading}
+            dogs = [{**dog, **place} if dog["name"] == name else dog for dog in self.ground["dogs"]]
+            self.ground = {**self.ground, "dogs": dogs}
+
+    def yard(self) -> dict[str, Any] | None:
+        """Return the ground."""
+        return self.ground
+
+    def _noted(self, *wish: Any) -> str:
+        self.asked.append(wish)
+        return f"{wish[0]}-{len(self.asked)}"
