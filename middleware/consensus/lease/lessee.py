@@ -354,7 +354,8 @@ class Lessee:
         if deadline <= self._clock.seconds():
             return self._failed(asked)
         self._held = _Held(token, deadline, ballot)
-        self._rests_at = deadline + self._stop_time
+        # The device counts the deadline on its own clock, which may be slower than the one of this client.
+        self._rests_at = deadline + self._stop_time + self.council.ttl * CLOCK_MARGIN
         # A member that may not grant anything yet needs no other ballot later.
         others = [reply for reply in asked.tally.replies.values() if reply.kind not in (Kind.GRANTED, Kind.QUIET)]
         self._handle(Event.PARTIAL_GRANTS if others else Event.GRANTS)

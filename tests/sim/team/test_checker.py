@@ -106,6 +106,7 @@ BROKEN: dict[str, list[list[Event]]] = {
     ],
     "E5": [
         [Asked(1.0, 1, 1, "close", "t0"), Answered(1.1, 1), command(1.2, 7)],
+        [Terms(0.0, 1.5, 0.05, 0.3, 0.1), Asked(1.0, 1, 1, "close", "t0"), Answered(1.1, 1), command(1.3, 7)],
         [Asked(1.0, 1, 1, "close", "t0"), Unanswered(1.1, 1, "no majority")],
         [Asked(1.0, 1, 1, "close", "t0")],
         [Calm(0.0, 4.0), Concluded(1.0, "t0", "COMPLETED"), Engaged(5.1, 1, ("t0",))],

@@ -258,6 +258,23 @@ class LesseeTests(RoomCase):
             until = bidder.machine.at(bidder.acceptor.log.get(T).until)  # type: ignore[union-attr]
             self.assertGreaterEqual(until, stopped + 0.3)
 
+    def test_rest_after_the_deadline_counts_on_the_clock_of_the_device(self) -> None:
+        """A holder with a fast clock that wakes after its deadline releases nothing before its robot stands still."""
+        self.room = self.made(stop_time=0.3, rates=(1.01, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0))
+        self.wanting(0, 1.0)
+        machine, lease = self.room.bidders[0].machine, self.lessee(0).lease
+        assert lease is not None
+        obeyed_until = self.room.clock.seconds() + lease.deadline - machine.seconds()
+        machine.freeze(False)
+        self.room.clock.advance(machine.at(lease.deadline) + 0.1 - self.room.clock.seconds())
+        machine.thaw()
+        self.lessee(0).release()
+        self.run_for(0.1)
+        for place in (3, 4, 5):
+            bidder = self.room.bidders[place]
+            until = bidder.machine.at(bidder.acceptor.log.get(T).until)  # type: ignore[union-attr]
+            self.assertGreaterEqual(until, obeyed_until + 0.3)
+
     def test_rough_weather(self) -> None:
         """At half of everything lost, doubled and late there is still never more than one holder, and often one."""
         self.room.radio.air = Air(0.02, 0.05, 0.5, 0.3, 5.0)
