@@ -141,7 +141,7 @@ class DiscoveryTests(FleetCase):
         lan.run(60.0)
         self.assertEqual(a.overlay.contacts(), [])
         lan.segment.is_blocked = False
-        lan.groups[0].on_change()
+        lan.groups[0].moved()
         lan.run(0.3)
         self.assertEqual(a.overlay.contacts(), [b.contact])
 
