@@ -277,9 +277,15 @@ class Crowd:
             return known
 
         dice = random.Random(f"{self.auction.task_id}/{place}")
-        party = Party(self.auction, self.ring.contacts[place], self._rule, contacts, dice, lambda message: b"")
-        party.on_summary = lambda reports: self._told(place, reports)
-        return party
+        return Party(
+            self.auction,
+            self.ring.contacts[place],
+            self._rule,
+            contacts,
+            dice,
+            lambda message: b"",
+            lambda reports: self._told(place, reports),
+        )
 
     def _told(self, place: int, reports: tuple[Report, ...]) -> None:
         before = self._rule.assigned(self.views[place])

@@ -59,10 +59,10 @@ class Member:
         """The peers that are called as soon as they are known, and for how many seconds at most."""
         self._network = network
         endpoint = self.node.endpoint
-        self._ask, self._proved = endpoint.ask, endpoint.on_contact
+        self._ask = endpoint.ask
         # From outside nobody can tell when a node first hears of another: so its own questions are looked at.
         endpoint.ask = self._asked  # type: ignore[method-assign]
-        endpoint.on_contact = self._met
+        endpoint.on_contact.add(self._met)
         self.node.rpc(CALL)(lambda peer: True)
 
     def sight(self, public: bytes) -> Sight:
@@ -132,7 +132,6 @@ class Member:
         sight = self.sight(contact.public)
         sight.proved = contact
         self._note(contact, sight)
-        self._proved(contact)
 
     def _note(self, contact: Contact, sight: Sight) -> None:
         sight.contact = contact

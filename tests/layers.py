@@ -31,7 +31,7 @@ def _middleware(*names: str) -> tuple[str, ...]:
     return tuple(f"middleware.{name}" for name in names)
 
 
-BASE = _entangled("background", "contact", "errors", "identity", "record", "token_bucket")
+BASE = _entangled("background", "contact", "errors", "identity", "listeners", "record", "token_bucket")
 """Small modules of the library on which all of its packages stand."""
 LIBRARY = _middleware("entangled", "errors")
 
@@ -115,7 +115,7 @@ LAYERS: dict[str, Layer] = {
     "webnode": Layer("the page over the node's store", ("formats", "middleware")),
     "sim.robots": Layer(
         "the simulator of robots: world, cameras, sensors, emulators, and the server that drivers connect to",
-        ("formats", "drivers", "middleware.faults.stream"),
+        ("formats", "drivers", "middleware.entangled.listeners", "middleware.faults.stream"),
     ),
     "sim.demo": Layer("the demonstration", ("drivers", "sim.robots")),
     "sim.team": Layer(

@@ -359,6 +359,18 @@ class PurityTests(SynchronousTestCase):
                     wrong.append(f"{module} line {getattr(node, 'lineno', 0)}: random.{named}")
         self.assertEqual(wrong, [])
 
+    def test_nobody_replaces_a_listener(self) -> None:
+        """An ``on_`` attribute is set by its own object only: others add themselves to its ``Listeners``."""
+        wrong = []
+        for module in FILES:
+            for node in ast.walk(TREES[module]):
+                targets = node.targets if isinstance(node, ast.Assign) else []
+                for target in targets:
+                    is_slot = isinstance(target, ast.Attribute) and target.attr.startswith("on_")
+                    if is_slot and not (isinstance(target.value, ast.Name) and target.value.id == "self"):
+                        wrong.append(f"{module} line {target.lineno}: {target.attr}")
+        self.assertEqual(wrong, [])
+
     def test_package_files_hold_only_a_docstring(self) -> None:
         """An ``__init__`` runs no code, so that importing one module never imports its neighbours."""
         wrong = [

@@ -40,7 +40,8 @@ class Reception:
 
     ``identity`` signs for the node, ``take`` uses an invitation once, ``admit`` tells the team of an admission,
     ``given`` is what a newcomer with that pass is given, and ``send`` carries the answer.  ``now`` is the clock that
-    rates are measured by, ``wall`` that of statements.
+    rates are measured by, ``wall`` that of statements.  ``refused`` is called when a newcomer is not let in, with its
+    key (empty: nobody knows its code) and the code of ``WHY``.
     """
 
     _log = Logger()
@@ -56,6 +57,7 @@ class Reception:
         now: Callable[[], float],
         wall: Callable[[], float],
         rng: random.Random,
+        refused: Callable[[bytes, Address, str], None],
     ) -> None:
         self._roll = roll
         self._identity = identity
@@ -68,8 +70,7 @@ class Reception:
         self._rng = rng
         self._answers: OrderedDict[bytes, bytes] = OrderedDict()
         self._under_way: dict[bytes, str] = {}
-        self.on_refused: Callable[[bytes, Address, str], None] = lambda who, source, code: None
-        """Called when a newcomer is not let in, with its key (empty: nobody knows its code) and the code of ``WHY``."""
+        self._refused = refused
         self._said = Noted()
         self._opening = TokenBucket(RATE)
         self._hinting = TokenBucket(HINTS)
@@ -188,7 +189,7 @@ class Reception:
 
     def _say(self, who: bytes, code: str, source: Address, name: str = "") -> None:
         """Once for each newcomer and reason, and not for each datagram; who makes up ids cannot fill the log."""
-        self.on_refused(b"" if code == "unknown" else who, source, code)
+        self._refused(b"" if code == "unknown" else who, source, code)
         if not self._said.is_new(self._now(), who, code):
             return
         whose = f" by the invitation of {name}" if name else ""

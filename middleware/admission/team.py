@@ -93,19 +93,11 @@ class Team:
             clock.seconds,
             self._wall,
             self._rng,
-        )
-        reception.on_refused = lambda who, source, code: endpoint.rebuffs.met(
-            who, str(source), "code", code, WHY[code], clock.seconds()
+            lambda who, source, code: endpoint.rebuffs.met(who, str(source), "code", code, WHY[code], clock.seconds()),
         )
         endpoint.route(knock.KNOCK, reception.on_knock)
         endpoint.expose("roll.secret", self._answer_secret)
-        welcome = node.overlay.on_newcomer
-
-        def met(contact: Contact) -> None:
-            welcome(contact)
-            self._gossip.met(contact)
-
-        node.overlay.on_newcomer = met
+        node.overlay.on_newcomer.add(self._gossip.met)
         if len(self._accepted) > 1:
             endpoint.rekey(*self._accepted)
 

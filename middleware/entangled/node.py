@@ -87,12 +87,11 @@ class EntangledNode:
         self.endpoint = Endpoint(identity, team_key, paths, clock, rng, door)
         self.overlay = Overlay(lambda: self.contact, self.endpoint, clock, chores)
         self.reach = Reach(identity.node_id, self.endpoint, paths, self.overlay.contacts, clock, chores)
-        self.overlay.on_named = self.reach.acquaintances.named
-        self.replica = Replica(store, self.endpoint, clock, chores)
+        self.overlay.on_named.add(self.reach.acquaintances.named)
+        self.replica = Replica(store, self.endpoint, self.overlay, clock, chores)
         self._owner = Owner(identity, lease, store, self.replica, self.overlay, self.endpoint, clock, chores)
         self._membership = membership = Membership(self.overlay, self.endpoint, clock, rng, chores)
         membership.sounding.needs_use = self.reach.ways.needs_use
-        self.endpoint.on_let_go = self.reach.let_go
         self._detour = membership.detour
         self.discovery = (
             None if lan is None else Discovery(lan, self.endpoint, self.overlay, membership, clock, rng, chores)
@@ -103,22 +102,16 @@ class EntangledNode:
             identity.node_id, self.replica, self.overlay, self._reader, self.endpoint, clock, chores
         )
         self.replica.is_sure = self._handover.is_sure
-        self.replica.nearest = self.overlay.nearest
-        self.replica.belongs = lambda key: self.overlay.belongs(key, self.overlay.me())
         self._made_of = (clock, rng)
         self.endpoint.expose("decree.enrol", self._answer_enrol)
-        self.overlay.on_newcomer = self._welcome
-        self.overlay.on_lost = self._lost
-        self.replica.on_record = self._held_here
-        self.replica.on_gone = self._gone_here
-        self.replica.on_silent = self._subscriber.silent
-        self.replica.on_peer = self.overlay.heard
-        self.replica.on_goodbye = self.overlay.left
-        self.replica.certificates.door = door
+        self.overlay.on_newcomer.add(self._welcome)
+        self.overlay.on_lost.add(self._lost)
+        self.replica.on_record.add(self._held_here)
+        self.replica.on_gone.add(self._gone_here)
         if wall is not None:
             self.endpoint.echoer.wall = wall
-        self.endpoint.on_refused = self._refused
-        self.endpoint.on_refusing = self._refusing
+        self.endpoint.on_refused.add(self._refused)
+        self.endpoint.on_refusing.add(self._refusing)
         self._running = False
 
     @cached_property

@@ -125,8 +125,11 @@ def _knock(whole: bytes) -> None:
     def given(shown: bytes) -> Welcome:
         return Welcome(shown, ((1, bytes(32), 0),))
 
+    def refused(who: bytes, source: Address, code: str) -> None:
+        pass
+
     bootstrap = Reception(
-        roll, identity("vaio"), take, admissions.append, given, send, lambda: 1.0, lambda: float(NOW), DICE
+        roll, identity("vaio"), take, admissions.append, given, send, lambda: 1.0, lambda: float(NOW), DICE, refused
     )
     bootstrap.on_knock(whole, STRANGER)
     if sum(len(datagram) for datagram, _ in sent) > len(whole):

@@ -108,13 +108,7 @@ class Tuples:
 
     def _born(self, place: int, node: EntangledNode) -> None:
         self._lives += 1
-        inner = node.replica.on_record
-
-        def on_record(record: Record) -> None:
-            self._witness.stored(record)
-            inner(record)
-
-        node.replica.on_record = on_record
+        node.replica.on_record.add(self._witness.stored)
         rng = random.Random(f"tuples/{self._schedule.seed}/{place}/{self._lives}")
         space = self._spaces[place] = TupleSpace(node, self._clock, rng)
         self._witness.attend(node.seat, node.endpoint.expose, node.identity.public)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from twisted.internet import reactor as _reactor
@@ -21,12 +22,12 @@ class LoopbackTests(TestCase):
     """Two places in the group on the loopback."""
 
     def group(
-        self, host: str = "127.0.0.1", look: Any = interfaces
+        self, host: str = "127.0.0.1", look: Any = interfaces, moved: Callable[[], None] = lambda: None
     ) -> tuple[LanMulticast, list[tuple[bytes, Address]]]:
         """A place in the group, and what it hears."""
         heard: list[tuple[bytes, Address]] = []
         group = LanMulticast(reactor, host, look)
-        group.listen(lambda datagram, source: heard.append((datagram, source)))
+        group.listen(lambda datagram, source: heard.append((datagram, source)), moved)
         self.addCleanup(group.close)
         return group, heard
 
@@ -63,8 +64,9 @@ class LoopbackTests(TestCase):
         loopback = Interface(1, "lo", ("127.0.0.1",), is_loopback=True)
         found = [[loopback], [loopback], [Interface(1, "lo", ("127.0.0.1", "::1"), is_loopback=True)]]
         changes: list[int] = []
-        group, _ = self.group("", lambda: found.pop(0) if len(found) > 1 else found[0])
-        group.on_change = lambda: changes.append(len(found))
+        group, _ = self.group(
+            "", lambda: found.pop(0) if len(found) > 1 else found[0], lambda: changes.append(len(found))
+        )
         group._look_again()
         self.assertEqual(changes, [])
         group._look_again()

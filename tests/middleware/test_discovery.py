@@ -141,7 +141,7 @@ class DiscoveryTests(FleetCase):
         lan.run(60.0)
         self.assertEqual(a.overlay.contacts(), [])
         lan.segment.is_blocked = False
-        lan.groups[0].on_change()
+        lan.groups[0].moved()
         lan.run(0.3)
         self.assertEqual(a.overlay.contacts(), [b.contact])
 
@@ -171,7 +171,7 @@ class DiscoveryTests(FleetCase):
         call = a.endpoint.call()
         thief = lan.segment.group()
         got: list[bytes] = []
-        thief.listen(lambda datagram, source: got.append(datagram))
+        thief.listen(lambda datagram, source: got.append(datagram), lambda: None)
         for _ in range(50):
             thief.send(call)
             lan.run(0.2)
@@ -185,7 +185,7 @@ class DiscoveryTests(FleetCase):
         lan.run(1.0)
         noise = random.Random(5)
         thief = lan.segment.group()
-        thief.listen(lambda datagram, source: None)
+        thief.listen(lambda datagram, source: None, lambda: None)
         for kind in (0, 0x11, 0x14, 0x15, 0x19):
             for size in (0, 1, 88, 89, 400):
                 thief.send((bytes([kind]) + noise.randbytes(size))[:size])

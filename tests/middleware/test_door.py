@@ -120,7 +120,7 @@ class PassTests(ClosedCase):
     def test_both_are_told_where_they_are_seen(self) -> None:
         """Who opens a session learns from which address its INIT came."""
         seen: list[tuple[Contact, Address]] = []
-        self.a.on_seen = lambda contact, address: seen.append((contact, address))
+        self.a.on_seen.add(lambda contact, address: seen.append((contact, address)))
         self.got(self.a.ask(self.to_b, "echo", 1))
         self.assertEqual(seen, [(self.to_b, self.to_a.address)])
 
@@ -137,8 +137,9 @@ class PassTests(ClosedCase):
         self.at_a.refused[self.to_b.public] = REVOKED
         met: list[Contact] = []
         refusals: list[tuple[Contact, str]] = []
-        self.a.on_contact = self.b.on_contact = met.append
-        self.b.on_refused = lambda contact, code: refusals.append((contact, code))
+        self.a.on_contact.add(met.append)
+        self.b.on_contact.add(met.append)
+        self.b.on_refused.add(lambda contact, code: refusals.append((contact, code)))
         self.refused(self.a.ask(self.to_b, "echo", 1), REVOKED)
         self.assertEqual((met, refusals), ([], [(self.to_a, REVOKED)]))
         self.assertEqual((self.a._sessions, self.b._sessions), ({}, {}))
@@ -593,7 +594,7 @@ class MemberTests(FleetCase, LogCase):
         stranger.listen(lambda datagram, source: None)
         stranger.send(init, fleet.address(0))
         lost: list[Contact] = []
-        fleet.nodes[0].overlay.on_lost = lost.append
+        fleet.nodes[0].overlay.on_lost.add(lost.append)
         fleet.run(1.0)
         self.assertEqual((fleet.nodes[0].endpoint.counters["refused"], lost), (1, []))
         self.assertEqual([r.value for r in self.done(fleet, fleet.nodes[1].get(KEY))], [b"2"])

@@ -245,8 +245,8 @@ class AskTests(EndpointCase):
     def test_contacts_are_reported_when_proved(self) -> None:
         """The asker reports the answerer when it answers, the answerer the asker when its session is confirmed."""
         seen: list[tuple[float, str, Contact]] = []
-        self.a.on_contact = lambda contact: seen.append((self.clock.seconds(), "a", contact))
-        self.b.on_contact = lambda contact: seen.append((self.clock.seconds(), "b", contact))
+        self.a.on_contact.add(lambda contact: seen.append((self.clock.seconds(), "a", contact)))
+        self.b.on_contact.add(lambda contact: seen.append((self.clock.seconds(), "b", contact)))
         self.got(self.a.ask(self.to_b, "echo", 1))
         self.assertIn((2 * DELAY, "a", self.to_b), seen)
         self.assertEqual([item for item in seen if item[1] == "b"], [(3 * DELAY, "b", self.to_a)])
@@ -364,7 +364,7 @@ class WeatherTests(EndpointCase):
         self.assertEqual(self.got(self.a.ask(self.to_b, "echo", 2)), 2)
         recorded = self.kept(self.to_b, DATA)[-1][0]
         self.taps[self.to_b.address].receiver(recorded, Address("127.0.0.1", 666))
-        self.b.on_contact = seen.append
+        self.b.on_contact.add(seen.append)
         self.assertEqual(self.got(self.b.ask(self.to_a, "echo", 3)), 3)
         self.assertEqual(seen, [Contact(self.to_a.public, Address("127.0.0.1", 40000))])
 
@@ -500,7 +500,7 @@ class AttackTests(EndpointCase):
         self.got(self.a.ask(self.to_b, "echo", 0))
         self.got(self.a.ask(self.to_b, "add", 1, changes=True))
         seen: list[Contact] = []
-        self.b.on_contact = seen.append
+        self.b.on_contact.add(seen.append)
         for datagram, _ in list(self.taps[self.to_b.address].kept):
             sent = self.send_raw(datagram)
             self.assertEqual(sent, 1 if datagram[0] == INIT else 0)
@@ -515,7 +515,7 @@ class AttackTests(EndpointCase):
         self.b, self.to_b = self.endpoint(3, port=self.to_b.address.port, identity=2)
         self.equip(self.b)
         seen: list[Contact] = []
-        self.b.on_contact = seen.append
+        self.b.on_contact.add(seen.append)
         for datagram, source in recording:
             self.send_raw(datagram, source)
         self.assertEqual((self.runs, seen), ([1], []))

@@ -38,6 +38,24 @@ def record(
     return Record(KEY, name, owner.public, sequence, lifetime, 1.0, value).signed(owner)
 
 
+class Alone:
+    """The neighbours of a node that knows nobody."""
+
+    def is_responsible(self, key: bytes) -> bool:
+        """Say that it is."""
+        return True
+
+    def nearest(self, target: bytes) -> list[Contact]:
+        """Return nobody."""
+        return []
+
+    def heard(self, contact: Contact) -> None:
+        """Ignore it."""
+
+    def left(self, contact: Contact) -> None:
+        """Ignore it."""
+
+
 class ReplicaTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.clock = HeapClock()
@@ -45,12 +63,12 @@ class ReplicaTests(SynchronousTestCase):
         self.store = MemoryStore(50)
         self.chores = Background(self.clock)
         self.endpoint = self.opened(ME, 1)
-        self.replica = Replica(self.store, self.endpoint, self.clock, self.chores)
+        self.replica = Replica(self.store, self.endpoint, Alone(), self.clock, self.chores)
         self.replica.start()
         self.told: list[tuple[object, ...]] = []
-        self.replica.on_record = lambda r: self.told.append(("record", r.name))
-        self.replica.on_gone = lambda r: self.told.append(("gone", r.name))
-        self.replica.on_silent = lambda owner: self.told.append(("silent", owner))
+        self.replica.on_record.add(lambda r: self.told.append(("record", r.name)))
+        self.replica.on_gone.add(lambda r: self.told.append(("gone", r.name)))
+        self.replica.on_silent.add(lambda owner: self.told.append(("silent", owner)))
         self.dog = Contact(DOG.public, Address("10.0.0.1", 2))
         self.cat = Contact(CAT.public, Address("10.0.0.1", 3))
         self.heard: list[tuple[object, ...]] = []

@@ -151,8 +151,15 @@ class Dissemination:
         except UnknownStrategy:
             strategy = self._around.strategy_for(FALLBACK)
         rule = Rule(strategy, self._blame)
-        party = Party(auction, self._around.me(), rule, self._around.contacts, self._rng, self._identity.sign)
-        party.on_summary = lambda reports: self._tell(auction.digest, reports)
+        party = Party(
+            auction,
+            self._around.me(),
+            rule,
+            self._around.contacts,
+            self._rng,
+            self._identity.sign,
+            lambda reports: self._tell(auction.digest, reports),
+        )
         for gone in self._parties.add(party, opener, self._clock.seconds()):
             self._disarm(gone.auction.digest)
         return party

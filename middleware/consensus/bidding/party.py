@@ -46,11 +46,12 @@ class Party:
         contacts: Callable[[], Iterable[Contact]],
         rng: random.Random,
         sign: Callable[[bytes], bytes],
+        on_summary: OnSummary,
     ) -> None:
         self.auction = auction
         self.announcement: Announcement | None = None
-        self.on_summary: OnSummary = lambda reports: None
         self.audience = Audience()
+        self._on_summary = on_summary
         self._me = me
         self._rule = rule
         self._rank = auction.rank(me.node_id)
@@ -228,4 +229,4 @@ class Party:
         reports = self._rule.merged(announced, cried) if cried else announced
         if reports != self.told:
             self.told = reports
-            self.on_summary(reports)
+            self._on_summary(reports)

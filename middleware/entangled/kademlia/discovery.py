@@ -84,14 +84,12 @@ class Discovery:
 
     def start(self) -> None:
         """Join the group and call."""
-        self._group.on_change = self._moved
-        self._group.listen(self._received)
+        self._group.listen(self._received, self._moved)
         # A team that gets its power from one switch does not call at one moment.
         self._not_again = self._chores.later(self._rng.random() * MOMENT / 5, self._turn)
 
     def stop(self) -> None:
         """Leave the group."""
-        self._group.on_change = lambda: None
         self._group.close()
 
     def first(self) -> Deferred[None]:

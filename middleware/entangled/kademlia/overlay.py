@@ -23,6 +23,7 @@ from middleware.entangled.kademlia.distance import closest
 from middleware.entangled.kademlia.lookup import Lookup
 from middleware.entangled.kademlia.roster import MAX_MEMBERS, Roster
 from middleware.entangled.kademlia.routing import STALE_AFTER, RoutingTable
+from middleware.entangled.listeners import Listeners
 from middleware.entangled.wire.congestion import RoundTrip
 from middleware.entangled.wire.endpoint import Endpoint
 
@@ -49,8 +50,6 @@ PLACING, PLACING_STEP = 15, 0.1
 MEETING, MEETING_STEP = 75, 0.02
 """Steps for which what needs a majority waits until the members are known, and seconds of each."""
 LOOKUPS_KEPT = 16
-
-OnContact = Callable[[Contact], None]
 
 
 class Voters(NamedTuple):
@@ -102,9 +101,9 @@ class Overlay:
         self.is_whole = False
         self.is_large = False
         self.is_placed = False
-        self.on_newcomer: OnContact = lambda contact: None
-        self.on_lost: OnContact = lambda contact: None
-        self.on_named: Callable[[Contact, Contact], None] = lambda contact, by: None
+        self.on_newcomer = Listeners[[Contact]]()
+        self.on_lost = Listeners[[Contact]]()
+        self.on_named = Listeners[[Contact, Contact]]()
         self._heard_at: dict[bytes, float] = {}
         self._round_trip = RoundTrip(FIRST_HEDGE)
         self._slow: set[bytes] = set()
@@ -115,7 +114,7 @@ class Overlay:
         self.patience = 0.0
         self._checked_at: dict[bytes, float] = {}
         self.lookups: deque[Looked] = deque(maxlen=LOOKUPS_KEPT)
-        endpoint.on_contact = self.proved
+        endpoint.on_contact.add(self.proved)
         endpoint.expose("find_node", self._answer_find_node, early=True)
 
     @cached_property
@@ -163,6 +162,10 @@ class Overlay:
             return [c for c in self.responsible(key) if c.node_id != self.own_id]
         both = {c.node_id: c for c in [*self._found.get(key, ()), *self.responsible(key)]}
         return [contact for node_id, contact in both.items() if node_id != self.own_id]
+
+    def is_responsible(self, key: bytes) -> bool:
+        """Say whether this node is one of the k closest to ``key``, as far as is known here."""
+        return self.belongs(key, self.me())
 
     def belongs(self, key: bytes, contact: Contact) -> bool:
         """Whether ``contact`` is among the k closest to ``key``, as far as is known here."""

@@ -35,7 +35,7 @@ class LanMulticast:
     _log = Logger()
 
     def __init__(self, reactor: Any, host: str, look: Callable[[], list[Interface]] = interfaces) -> None:
-        self.on_change: Callable[[], None] = lambda: None
+        self._moved: Callable[[], None] = lambda: None
         self.counters: Counter[str] = Counter()
         self._reactor = reactor
         self._host = host
@@ -44,8 +44,9 @@ class LanMulticast:
         self._families: list[_Family] = []
         self._timer: IDelayedCall | None = None
 
-    def listen(self, receiver: Receiver) -> None:
+    def listen(self, receiver: Receiver, moved: Callable[[], None]) -> None:
         """Join on every interface, and hand each datagram to ``receiver``; a family that cannot be had is left out."""
+        self._moved = moved
         for kind in (_Four, _Six):
             try:
                 self._families.append(kind(self._reactor, receiver, self.counters))
@@ -81,7 +82,7 @@ class LanMulticast:
         shown = ", ".join(f"{each.name} {' '.join(each.addresses)}" for each in found) or "no interface"
         self._log.info("looking for the team on the LAN by {interfaces}", interfaces=shown)
         if not is_first:
-            self.on_change()
+            self._moved()
 
 
 class _Family:

@@ -17,15 +17,13 @@ GROUP6 = Address("ff02::8357", 8483)
 
 
 class Multicast(Protocol):
-    """One node's place in the group: what it sends all others on the LAN hear, and answer to where it came from.
+    """One node's place in the group: what it sends all others on the LAN hear, and answer to where it came from."""
 
-    ``on_change`` is called when the node has come to another LAN, so that those who are there are worth a call.
-    """
+    def listen(self, receiver: Receiver, moved: Callable[[], None]) -> None:
+        """Hand each datagram that comes by the group, or as an answer, to ``receiver``; never raises.
 
-    on_change: Callable[[], None]
-
-    def listen(self, receiver: Receiver) -> None:
-        """Hand each datagram that comes by the group, or as an answer, to ``receiver``; never raises."""
+        ``moved`` is called, until ``close``, when the node has come to another LAN, so that a call there is worth it.
+        """
 
     def send(self, datagram: bytes) -> None:
         """Send to the group on every interface; what cannot be sent is lost, as datagrams may be."""
@@ -53,11 +51,12 @@ class Segment:
 class SegmentMulticast:
     """One node's place on a ``Segment``; a ``Multicast``.
 
-    As with real sockets it hears at one port and speaks from another; ``addresses`` are both.
+    As with real sockets it hears at one port and speaks from another; ``addresses`` are both.  Whoever moves the node
+    to another LAN calls ``moved``.
     """
 
     def __init__(self, segment: Segment, ear: SwitchboardNetwork, mouth: SwitchboardNetwork) -> None:
-        self.on_change: Callable[[], None] = lambda: None
+        self.moved: Callable[[], None] = lambda: None
         self._segment = segment
         self._ear = ear
         self._mouth = mouth
@@ -67,8 +66,9 @@ class SegmentMulticast:
         """Where it hears the group, and where it speaks and is answered."""
         return self._ear.address, self._mouth.address
 
-    def listen(self, receiver: Receiver) -> None:
+    def listen(self, receiver: Receiver, moved: Callable[[], None]) -> None:
         """Hand each datagram that comes by the group, or as an answer, to ``receiver``."""
+        self.moved = moved
         self._ear.listen(receiver)
         self._mouth.listen(receiver)
         self._segment.groups.append(self)

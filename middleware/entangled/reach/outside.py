@@ -31,7 +31,7 @@ datagram that shows it, it learns where to."""
 class Outside:
     """The addresses at which peers see this node.
 
-    ``contacts`` gives the peers that are known.  ``on_change`` is called with the peer that told it when this
+    ``contacts`` gives the peers that are known.  ``moved`` is called with the peer that told it when this
     node is seen elsewhere than before.  A node ``is_translated`` as soon as one peer saw it at an address that it has
     not.
     """
@@ -41,11 +41,12 @@ class Outside:
         endpoint: Endpoint,
         paths: PathNetwork,
         contacts: Callable[[], Iterable[Contact]],
+        moved: Callable[[Contact], None],
         clock: IReactorTime,
         chores: Background,
     ) -> None:
         self.is_translated = False
-        self.on_change: Callable[[Contact], None] = lambda teller: None
+        self._moved = moved
         self._endpoint = endpoint
         self._peers = endpoint.peers
         self._paths = paths
@@ -100,7 +101,7 @@ class Outside:
         # By another port of this node itself it is seen elsewhere anyway.
         is_usual = self._paths.local(peer.address).port == self._paths.address.port
         if is_usual and address != before and (is_told or before is not None):
-            self.on_change(peer)
+            self._moved(peer)
 
     # -- what others are told ---------------------------------------------------------------------------------------
 

@@ -96,7 +96,7 @@ class Reach:
         self._known = Known(endpoint.peers)
         self._is_ticking = False
         self._opened_at = float("-inf")
-        self.outside = Outside(endpoint, paths, contacts, clock, chores)
+        self.outside = Outside(endpoint, paths, contacts, self._open_again, clock, chores)
         self._carriers = Carriers(own_id, endpoint, paths, clock)
         self.acquaintances = Acquaintances(
             own_id, endpoint.peers, contacts, self.outside, self._carriers, clock, lambda: self._rng
@@ -117,11 +117,11 @@ class Reach:
         endpoint.expose("reach.meet", self._answer_meet, changes=True)
         endpoint.expose("reach.seen", self.outside.answer_seen, changes=True)
         self._peers.is_far = self.outside.is_far
-        self._peers.on_silence = lambda opening: chores.fork(self._find(opening))
-        self._peers.on_established = self._established
-        self._peers.on_moved = self.outside.tell
-        endpoint.on_seen = self.outside.saw
-        self.outside.on_change = self._open_again
+        self._peers.on_silence.add(lambda opening: chores.fork(self._find(opening)))
+        self._peers.on_established.add(self._established)
+        self._peers.on_moved.add(self.outside.tell)
+        endpoint.on_seen.add(self.outside.saw)
+        endpoint.on_let_go.add(self._let_go)
         paths.carry = self._carriers.carry
 
     @cached_property
@@ -129,7 +129,7 @@ class Reach:
         # Dice of its own: they only spread the load, and the endpoint's shall fall as they would without it.
         return random.Random(int.from_bytes(self._own_id))
 
-    def let_go(self, public: bytes) -> None:
+    def _let_go(self, public: bytes) -> None:
         """Forget a peer that was silent for long, and with which there is no session."""
         self._known.forget(public)
         self.outside.forget(public)

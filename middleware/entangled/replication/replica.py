@@ -10,6 +10,7 @@ import math
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Sequence
 from functools import wraps
+from typing import Protocol
 
 from twisted.internet.defer import Deferred
 from twisted.internet.interfaces import IReactorTime
@@ -18,6 +19,7 @@ from middleware.entangled.background import Background
 from middleware.entangled.contact import Contact
 from middleware.entangled.data.store import Store
 from middleware.entangled.errors import OWNER_FULL, Full, Refused
+from middleware.entangled.listeners import Listeners
 from middleware.entangled.record import KEY_BYTES, Record, Signed, Slot, unpacked
 from middleware.entangled.replication.cache import PathCache
 from middleware.entangled.replication.certificates import Certificates
@@ -40,7 +42,21 @@ MAX_DOUBTFUL = 4096
 UNSURE, SURE, CACHED = 0, 1, 2
 """What an answer is worth: of a replica that has yet to catch up, of one that has, a copy from the path."""
 
-OnRecord = Callable[[Record], None]
+
+class Neighbours(Protocol):
+    """The nodes that a replica knows, and notifies of those that it hears from."""
+
+    def is_responsible(self, key: bytes) -> bool:
+        """Say whether this node is one of the closest to ``key``."""
+
+    def nearest(self, target: bytes) -> list[Contact]:
+        """Return the known nodes closest to ``target``, this one not included."""
+
+    def heard(self, contact: Contact) -> None:
+        """Take note of a peer that stores, watches or is alive."""
+
+    def left(self, contact: Contact) -> None:
+        """Take note of a peer that leaves in order."""
 
 
 class Replica:
@@ -48,18 +64,19 @@ class Replica:
 
     ``may_store`` says whether the owner of a slot may write there, by its certificate as it is at present, ``may_stay``
     whether what is held there may be held on and shown; that is the same but for few slots.  ``is_sure`` says whether
-    this node has caught up with the others, ``nearest`` whom it knows close to a key, ``belongs`` whether it is one of
-    the closest itself.
+    this node has caught up with the others.
 
     ``on_record`` is told of every record that was accepted, ``on_gone`` of every one that is let go of, ``on_silent``
-    of every owner (its public key) whose lease ran out or that said goodbye, ``on_peer`` of every peer that stores,
-    watches or is alive, ``on_goodbye`` of every peer that leaves in order.
+    of every owner (its public key) whose lease ran out or that said goodbye.
     """
 
-    def __init__(self, store: Store, endpoint: Endpoint, clock: IReactorTime, chores: Background) -> None:
+    def __init__(
+        self, store: Store, endpoint: Endpoint, neighbours: Neighbours, clock: IReactorTime, chores: Background
+    ) -> None:
         self.keepsakes = Keepsakes(store)
         self._store = store
         self._endpoint = endpoint
+        self._neighbours = neighbours
         self._clock = clock
         self.pusher = Pusher(endpoint, clock, chores)
         self.cache = PathCache()
@@ -69,16 +86,12 @@ class Replica:
         self.may_stay: Callable[[Slot], bool] = self.certificates.may_stay
         self._authorities: dict[bytes, Authority] = {}
         self.is_sure: Callable[[], bool] = lambda: True
-        self.nearest: Callable[[bytes], list[Contact]] = lambda key: []
-        self.belongs: Callable[[bytes], bool] = lambda key: True
         self._doubtful: set[bytes] = set()
         self._swept_at = self._sweep_at = -1.0
         self._no_sweep: Callable[[], None] = lambda: None
-        self.on_record: OnRecord = lambda record: None
-        self.on_gone: OnRecord = lambda record: None
-        self.on_silent: Callable[[bytes], None] = lambda owner: None
-        self.on_peer: Callable[[Contact], None] = lambda contact: None
-        self.on_goodbye: Callable[[Contact], None] = lambda contact: None
+        self.on_record = Listeners[[Record]]()
+        self.on_gone = Listeners[[Record]]()
+        self.on_silent = Listeners[[bytes]]()
         self._chores = chores
         endpoint.expose("store", self._once_written(self.answer_store), changes=True, idempotent=True)
         endpoint.expose("find_value", self.answer_find_value, early=True)
@@ -164,7 +177,7 @@ class Replica:
         ``left`` are the seconds that each is to be kept, where it does not come from its owner.  The peer is asked for
         certificates that are not known here.
         """
-        self.on_peer(peer)
+        self._neighbours.heard(peer)
         records = [record for record in map(unpacked, packed) if record is not None]
         lives = [None] * len(packed) if left is None else [_checked_life(life) for life in left]
         if len(records) < len(packed) or len(lives) != len(packed):
@@ -197,10 +210,10 @@ class Replica:
         cached = self.cache.get(key, self._clock.seconds()) if is_nothing and not wants_sure else None
         if cached:
             return [[record.packed() for record in cached if self.may_store(record.slot)], None, CACHED]
-        is_aside = not is_nothing and not wants_sure and not self.belongs(key)
+        is_aside = not is_nothing and not wants_sure and not self._neighbours.is_responsible(key)
         if not (is_nothing or is_aside):
             return [page, following, self._worth()]
-        near = [contact.packed() for contact in self.nearest(key) if contact.node_id != peer.node_id]
+        near = [contact.packed() for contact in self._neighbours.nearest(key) if contact.node_id != peer.node_id]
         return [page, following, UNSURE if is_aside else self._worth(), near]
 
     def answer_cache(self, peer: Contact, key: bytes, packed: list[object], ttl: float) -> None:
@@ -216,7 +229,7 @@ class Replica:
 
         Answers the number of the last push, and the first page (None where ``digest`` is that of what is held).
         """
-        self.on_peer(peer)
+        self._neighbours.heard(peer)
         number = self.pusher.watched(_checked_key(key), peer, ttl)
         return [number, None if digest == digest_of(self.held(key)) else self.first_page(key)]
 
@@ -225,7 +238,7 @@ class Replica:
 
         Where nothing is held, they have run out here though the peer lives: it is told at once.
         """
-        self.on_peer(peer)
+        self._neighbours.heard(peer)
         held = self._leased(peer.public)
         self._store.extend(peer.public, self._clock.seconds() + min(float(lease), MAX_LEASE))
         if digest == digest_of(held):
@@ -248,7 +261,7 @@ class Replica:
         self.on_silent(peer.public)
         self.pusher.forget(peer)
         self._doubtful.discard(peer.node_id)
-        self.on_goodbye(peer)
+        self._neighbours.left(peer)
 
     def _refusal(self, record: Record, peer: Contact) -> StoreReply | None:
         if not self.may_store(record.slot):

@@ -50,6 +50,7 @@ class Subscriber:
         self._clock = clock
         self._chores = chores
         self._watches: list[Watch] = []
+        replica.on_silent.add(self._silent)
         endpoint.expose("push", self._answer_push, changes=True, idempotent=True)
 
     def start(self) -> None:
@@ -100,7 +101,7 @@ class Subscriber:
             watch.forget(replica)
             self._settle(watch)
 
-    def silent(self, owner: bytes) -> None:
+    def _silent(self, owner: bytes) -> None:
         """Whoever let its lease run out no longer speaks for others either."""
         if node_id(owner) != self._own_id:
             self.forget(node_id(owner))

@@ -48,7 +48,7 @@ class Waits(Protocol):
 class Taker:
     """The takes of one node in one space; ``held`` are the tuples it holds, ``gone`` those it knows to be taken.
 
-    ``on_free`` is called when this node gives up a tuple that it held or failed to claim, ``put_back`` with a tuple
+    ``freed`` is called when this node gives up a tuple that it held or failed to claim, ``put_back`` with a tuple
     that was confirmed to a call for which nobody waits any more.
     """
 
@@ -60,9 +60,11 @@ class Taker:
         chores: Background,
         keeper: Keeper,
         council: int,
+        freed: Callable[[Place], None],
+        put_back: Callable[[Tuple], object],
     ) -> None:
-        self.on_free: Callable[[Place], None] = lambda place: None
-        self.put_back: Callable[[Tuple], None] = lambda fields: None
+        self._freed = freed
+        self._put_back = put_back
         self.held: set[Place] = set()
         self.gone: dict[Place, bytes] = {}
         self._node = node
@@ -202,7 +204,7 @@ class Taker:
         with suppress(EntangledError):  # the node goes on to spread the note, and the council knows without it
             await self._keeper.note(place, winner)
         if wait is not None and wait.is_over:
-            self.put_back(claim.fields)
+            self._put_back(claim.fields)
         return True
 
     async def _complete(self, posted: Posted, value: bytes | None) -> None:
@@ -217,7 +219,7 @@ class Taker:
             self._keeper.doubt(place, winner)
             self._node.seat.settle(place)
         else:
-            self.on_free(place)
+            self._freed(place)
 
     def _missed(self, place: Place, outcome: Outcome) -> None:
         now = self._clock.seconds()
@@ -269,7 +271,7 @@ class Taker:
 
     def _free(self, place: Place) -> None:
         self.held.discard(place)
-        self.on_free(place)
+        self._freed(place)
 
     def _confirm(self, claim: Claim) -> Deferred[Tuple]:
         class Cancelled:

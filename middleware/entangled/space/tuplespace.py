@@ -16,6 +16,7 @@ from twisted.logger import Logger
 
 from middleware.entangled.background import Background
 from middleware.entangled.errors import EntangledError, NoAnswer, NotRunning, WeatherError
+from middleware.entangled.listeners import Listeners
 from middleware.entangled.space.claim import Claim
 from middleware.entangled.space.keeper import Keeper
 from middleware.entangled.space.peer import Peer
@@ -42,14 +43,13 @@ class Wait:
     def __init__(self) -> None:
         self.is_over = False
         self.deferred: Deferred[Any] = Deferred(lambda _: self.end())
-        self.on_end: list[Callable[[], object]] = []
+        self.on_end = Listeners[[]]()
 
     def end(self) -> None:
         """Let whoever works for this call know that nobody waits any more."""
         if not self.is_over:
             self.is_over = True
-            for tell in self.on_end:
-                tell()
+            self.on_end()
 
 
 class TupleSpace:
@@ -75,9 +75,16 @@ class TupleSpace:
         self._rng = rng
         self._chores = Background(clock)
         self._keeper = Keeper(node, rng, self._chores)
-        self._taker = Taker(node, clock, rng, self._chores, self._keeper, council)
-        self._taker.on_free = self._freed
-        self._taker.put_back = lambda fields: self._chores.fork(self._put(fields, None))
+        self._taker = Taker(
+            node,
+            clock,
+            rng,
+            self._chores,
+            self._keeper,
+            council,
+            self._freed,
+            lambda fields: self._chores.fork(self._put(fields, None)),
+        )
         self._shelves: dict[bytes, Shelf] = {}
         self._waits: dict[Wait, None] = {}
 
@@ -157,7 +164,7 @@ class TupleSpace:
         """A claim on a matching tuple, or None when nobody waits for it any more."""
         shelf = self._shelf(space_key(self.name, template.arity))
         shelf.enter()
-        wait.on_end.append(shelf.wake)
+        wait.on_end.add(shelf.wake)
         try:
             while not wait.is_over:
                 ready, pause = self._taker.candidates(shelf.posted, template)
@@ -219,7 +226,7 @@ class TupleSpace:
     async def _read(self, template: Template, wait: Wait) -> Tuple | None:
         shelf = self._shelf(space_key(self.name, template.arity))
         shelf.enter()
-        wait.on_end.append(shelf.wake)
+        wait.on_end.add(shelf.wake)
         try:
             while not wait.is_over:
                 for one in shelf.posted:
@@ -262,7 +269,7 @@ class TupleSpace:
     ) -> Deferred[Any]:
         wait = Wait()
         self._waits[wait] = None
-        wait.on_end.append(lambda: self._waits.pop(wait, None))
+        wait.on_end.add(lambda: self._waits.pop(wait, None))
 
         def answered(value: object) -> None:
             if not wait.is_over:
@@ -282,6 +289,6 @@ class TupleSpace:
                 wait.deferred.errback(NoTuple(f"no matching tuple came within {timeout} s"))
 
         if timeout is not None:
-            wait.on_end.append(self._chores.later(timeout, expired))
+            wait.on_end.add(self._chores.later(timeout, expired))
         self._work(work(template, wait)).addCallbacks(answered, failed)
         return wait.deferred

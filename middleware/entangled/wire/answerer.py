@@ -51,7 +51,7 @@ _GONE = "the call ran, and its answer was too large to keep; ask what it changed
 class Answerer:
     """What peers may ask of this node; ``send`` is called with a session and the bytes of a message.
 
-    ``may`` says whether a peer of that public key may call a method, ``on_refused`` is told of each that may not.
+    ``may`` says whether a peer of that public key may call a method, ``refused`` is told of each that may not.
     """
 
     _log = Logger()
@@ -63,10 +63,12 @@ class Answerer:
         courier: Courier,
         codes: ErrorCodes,
         counters: Counter[str],
+        may: Callable[[bytes, str], bool],
+        refused: Callable[[Contact, str], None],
     ) -> None:
         self.methods: dict[str, Method] = {}
-        self.may: Callable[[bytes, str], bool] = lambda public, method: True
-        self.on_refused: Callable[[Contact, str], None] = lambda peer, method: None
+        self._may = may
+        self._refused = refused
         self._clock = clock
         self._send = send
         self._courier = courier
@@ -138,7 +140,7 @@ class Answerer:
         method = self.methods.get(question.method)
         if method is None or not method.is_early or not question.left_ms:
             return b""
-        if not self.may(peer.public, question.method) or self._ledger.entry(peer.public, question.id) is not None:
+        if not self._may(peer.public, question.method) or self._ledger.entry(peer.public, question.id) is not None:
             return b""
         result = self._called(method, peer, question.arguments, math.inf)
         if isinstance(result, Deferred):
@@ -157,7 +159,7 @@ class Answerer:
         if method is None:
             self._counters["unknown method"] += 1
             return
-        if not self.may(peer.public, told.method):
+        if not self._may(peer.public, told.method):
             self._refuse(peer, told.method)
             return
         result = self._called(method, peer, told.arguments, math.inf)
@@ -184,7 +186,7 @@ class Answerer:
         method = self.methods.get(question.method)
         if method is None:
             return encoded(Failure(question.id, UNKNOWN_METHOD, f"{question.method}: no such method here"))
-        if not self.may(peer.public, question.method):
+        if not self._may(peer.public, question.method):
             self._refuse(peer, question.method)
             return encoded(Failure(question.id, ROLE, f"{question.method}: {meaning(ROLE)}"))
         public, entry, now = peer.public, None, self._clock.seconds()
@@ -251,7 +253,7 @@ class Answerer:
 
     def _refuse(self, peer: Contact, method: str) -> None:
         self._counters["refused"] += 1
-        self.on_refused(peer, method)
+        self._refused(peer, method)
 
     def _busy(self, number: int, text: str = _BUSY) -> bytes:
         self._counters["busy"] += 1

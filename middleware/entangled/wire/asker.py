@@ -104,7 +104,7 @@ class Asker:
         self._queued = 0
         # Starting anywhere in 62 bits keeps the numbers of a restarted node apart from those it used before.
         self._next_number = rng.getrandbits(62)
-        peers.on_unheard = self._unheard
+        peers.on_unheard.add(self._unheard)
 
     def ask(
         self,

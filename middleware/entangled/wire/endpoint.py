@@ -19,6 +19,7 @@ from twisted.logger import Logger
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import Forged, Malformed, NotAdmitted, NotRunning
 from middleware.entangled.identity import Identity
+from middleware.entangled.listeners import Listeners
 from middleware.entangled.network.network import MAX_CARRIED, MAX_DATAGRAM, Address, Network
 from middleware.entangled.wire.answerer import Answerer
 from middleware.entangled.wire.asker import PATIENCE, Asker
@@ -107,11 +108,11 @@ class Endpoint:
         door: Door = OPEN,
     ) -> None:
         self.door = door
-        self.on_contact: Callable[[Contact], None] = lambda contact: None
-        self.on_seen: Callable[[Contact, Address], None] = lambda contact, address: None
-        self.on_refused: Callable[[Contact, str], None] = lambda contact, code: None
-        self.on_refusing: Callable[[Contact, str], None] = lambda contact, code: None
-        self.on_let_go: Callable[[bytes], None] = lambda public: None
+        self.on_contact = Listeners[[Contact]]()
+        self.on_seen = Listeners[[Contact, Address]]()
+        self.on_refused = Listeners[[Contact, str]]()
+        self.on_refusing = Listeners[[Contact, str]]()
+        self.on_let_go = Listeners[[bytes]]()
         self.refusals: dict[bytes, tuple[Contact, str]] = {}
         """By key, the peers that said that they do not let this node in, and the name of the refusal; the last few."""
         self.rebuffs = Rebuffs()
@@ -137,10 +138,8 @@ class Endpoint:
             lambda number, public: self._asker.progressed(number, public),
             self.counters,
         )
-        self._answerer = Answerer(clock, self._send, self._courier, self._codes, self.counters)
+        self._answerer = Answerer(clock, self._send, self._courier, self._codes, self.counters, door.may, self._may_not)
         self._asker = Asker(clock, rng, self._peers, self._courier, self._send, self._codes, self.counters)
-        self._answerer.may = door.may
-        self._answerer.on_refused = self._may_not
         self._greeter = Greeter(identity.public, self._peers, network, clock, rng, self.counters)
         self._cookies = Cookies(self._own.cookie_key, rng)
         self.echoer = Echoer(self.post, clock, lambda: door.fingerprint)

@@ -101,13 +101,9 @@ class _Hailing:
 
 
 class Hailer:
-    """Hails addresses until one answers or the time is up; ``send`` sends a datagram.
-
-    ``on_other`` is told of echoes from elsewhere than where the HAIL went, as after one to a group.
-    """
+    """Hails addresses until one answers or the time is up; ``send`` sends a datagram."""
 
     def __init__(self, send: Callable[[bytes, Address], None], clock: IReactorTime, rng: random.Random) -> None:
-        self.on_other: Callable[[Echo, Address], None] = lambda echo, source: None
         self._send = send
         self._clock = clock
         self._rng = rng
@@ -131,7 +127,6 @@ class Hailer:
         if hailing is None:
             return "unasked"
         if hailing.address != source:
-            self.on_other(answer, source)
             return ""
         self._forget(answer.token)
         hailing.deferred.callback(answer)

@@ -16,6 +16,7 @@ from twisted.internet.interfaces import IDelayedCall, IReactorTime
 
 from middleware.entangled.contact import Contact
 from middleware.entangled.identity import exchange_key
+from middleware.entangled.listeners import Listeners
 from middleware.entangled.network.network import Address, Network, is_relayed
 from middleware.entangled.wire.congestion import BACK_OFF, FIRST_GUESS, LONGEST, RoundTrip
 from middleware.entangled.wire.door import OPEN, Door
@@ -178,11 +179,11 @@ class Peers:
         self.ring = ring
         self.door = door
         self.sessions: dict[int, Session] = {}
-        self.on_unheard: Callable[[Opening], None] = lambda opening: None
+        self.on_unheard = Listeners[[Opening]]()
         self.is_far: Callable[[Address], bool] = lambda address: False
-        self.on_silence: Callable[[Opening], None] = lambda opening: None
-        self.on_established: Callable[[Session], None] = lambda session: None
-        self.on_moved: Callable[[Session], None] = lambda session: None
+        self.on_silence = Listeners[[Opening]]()
+        self.on_established = Listeners[[Session]]()
+        self.on_moved = Listeners[[Session]]()
         self._clock = clock
         self._rng = rng
         self._network = network

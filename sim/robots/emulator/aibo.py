@@ -27,24 +27,26 @@ class AiboServer:
         self._open: dict[int, Any] = {}
         self._closing: list[Deferred[Any]] = []
         self._udp: Any = None
+        dog.on_ports.add(self._sync)
 
     def start(self) -> None:
         """Switch the dog on and open what it serves from the start; raises ``CannotListenError`` for a taken port."""
         self._udp = self._reactor.listenUDP(self._dog.ports["camera"], _Camera(self._dog), self._interface, 65536)
-        self._dog.on_ports = self._sync
         self._sync()
         self._dog.start()
 
     def stop(self) -> Deferred[None]:
         """Switch it off; fires when every port is free."""
-        self._dog.on_ports = lambda: None
+        ports, self._udp = [*self._open.values(), self._udp], None
         self._dog.stop()
-        closing = [maybeDeferred(port.stopListening) for port in (*self._open.values(), self._udp)]
+        closing = [maybeDeferred(port.stopListening) for port in ports]
         self._open.clear()
         return gatherResults([*closing, *self._closing]).addCallback(lambda _: None)
 
     def _sync(self) -> None:
         """Listen where the dog listens now, and nowhere else: a port with a client takes no second one."""
+        if self._udp is None:
+            return
         for number in self._dog.ports.values():
             listens = self._dog.listens(number)
             if listens and number not in self._open:

@@ -17,6 +17,7 @@ from drivers.aibo import picture, sense
 from drivers.aibo.codec import T2, T4, CommandReader, Gains, LineReader, encoded, encoded_gains
 from drivers.aibo.option import ASIDE, BACKWARD, FORWARD, PORTS, TURN
 from drivers.link import Link, MemoryConnector, Receiver
+from middleware.entangled.listeners import Listeners
 from middleware.faults.stream import StreamFaults
 from sim.robots.emulator.aibo_menu import AiboMenu
 from sim.robots.emulator.body import Body
@@ -34,7 +35,7 @@ EMULATED = {**PORTS, "gains": 10032}
 class AiboEmulator:
     """One emulated dog; ``accept`` takes its TCP links, ``datagram`` what comes by UDP.
 
-    ``on_ports`` is told whenever the ports that listen may have changed, for who serves real sockets.
+    ``on_ports`` is notified when the ports that listen may have changed, for a server on real sockets.
     """
 
     def __init__(
@@ -48,7 +49,7 @@ class AiboEmulator:
     ) -> None:
         self.faults = StreamFaults()
         self.ports = {**EMULATED, **(ports or {})}
-        self.on_ports: Callable[[], None] = lambda: None
+        self.on_ports = Listeners[[]]()
         self.is_engaged = True
         self.clients: dict[str, _Client] = {}
         self.menu = AiboMenu(self.ports, dialect == T2, self._on_server, self._on_setting)

@@ -10,7 +10,6 @@ from middleware.entangled.errors import EntangledError
 from middleware.entangled.identity import Identity
 from middleware.entangled.network.switchboard import Weather
 from middleware.entangled.node import EntangledNode
-from middleware.entangled.record import Record
 from middleware.entangled.space.claim import Claim
 from middleware.entangled.space.posting import Posted, posting
 from middleware.entangled.space.template import ANY, Tuple
@@ -76,13 +75,7 @@ class Trial(World):
         """A whole node."""
         network = self.network(place)
         node = EntangledNode(identity, TEAM, network, self.store(place), self.clock, rng)
-        inner = node.replica.on_record
-
-        def on_record(record: Record) -> None:
-            self.witness.stored(record)
-            inner(record)
-
-        node.replica.on_record = on_record
+        node.replica.on_record.add(self.witness.stored)
         return node
 
     def furnish(self, node: EntangledNode, space: TupleSpace, rng: random.Random) -> None:

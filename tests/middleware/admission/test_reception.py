@@ -34,6 +34,7 @@ class ReceptionTests(SynchronousTestCase):
         terms = OPERATOR.invite("dog", ("device",), 1, NOW, LATER, random.Random(1)).terms
         self.roll: Roll = roll(OPERATOR, granted(OPERATOR, "vaio", "bootstrap"), PACKED, terms)
         self.taken: Deferred[bool] = succeed(True)
+        self.refused: list[tuple[bytes, Address, str]] = []
         self.admit: Any = lambda packed: self.roll.add(packed, NOW)
         self.reception = Reception(
             self.roll,
@@ -45,6 +46,7 @@ class ReceptionTests(SynchronousTestCase):
             lambda: self.now,
             lambda: NOW,
             random.Random(1),
+            lambda who, source, code: self.refused.append((who, source, code)),
         )
 
     def knocked(self, dice: int = 1, name: str = "dog", secret: bytes = SECRET) -> bytes:

@@ -7,7 +7,7 @@ import random
 from middleware.consensus.bidding.announcement import Announcement, Entry
 from middleware.consensus.bidding.auction import Auction
 from middleware.consensus.bidding.bid import Bid
-from middleware.consensus.bidding.party import Party
+from middleware.consensus.bidding.party import OnSummary, Party
 from middleware.consensus.bidding.rule import Rule
 from middleware.consensus.strategies.nearest import Nearest
 from middleware.consensus.strategy import Report
@@ -40,8 +40,8 @@ def rule() -> Rule:
     return Rule(Nearest())
 
 
-def party(place: int, auction: Auction = AUCTION, seed: int = 1) -> Party:
+def party(place: int, auction: Auction = AUCTION, seed: int = 1, on_summary: OnSummary = lambda reports: None) -> Party:
     """The part of the node at ``place``, which knows all others."""
     others = [contact for contact in CONTACTS if contact is not CONTACTS[place]]
     dice = random.Random(f"{seed}/{place}")
-    return Party(auction, CONTACTS[place], rule(), lambda: others, dice, AGENTS[place].sign)
+    return Party(auction, CONTACTS[place], rule(), lambda: others, dice, AGENTS[place].sign, on_summary)

@@ -135,9 +135,8 @@ class AudienceTests(SynchronousTestCase):
 
 class BidderTests(SynchronousTestCase):
     def setUp(self) -> None:
-        self.party = party(5)
         self.told: list[list[float]] = []
-        self.party.on_summary = lambda reports: self.told.append([r.cost for r in reports])
+        self.party = party(5, on_summary=lambda reports: self.told.append([r.cost for r in reports]))
 
     def test_direct(self) -> None:
         """In a small team a bid goes to each member of the council, again where it was not confirmed."""
@@ -412,9 +411,8 @@ class FloodTests(SynchronousTestCase):
 
     def test_each_change_once(self) -> None:
         """A neighbour passes on what is news to it, and tells it when the waiting period is over."""
-        one = party(5, BEST_EFFORT)
         told: list[list[float]] = []
-        one.on_summary = lambda reports: told.append([r.cost for r in reports])
+        one = party(5, BEST_EFFORT, on_summary=lambda reports: told.append([r.cost for r in reports]))
         one.cried([bid(6, 1.0, auction=BEST_EFFORT)], CONTACTS[6], 0.0)
         self.assertEqual(len(one.errands(0.0)), 8)
         one.cried([bid(6, 1.0, auction=BEST_EFFORT)], CONTACTS[7], 0.1)
