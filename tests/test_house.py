@@ -366,8 +366,9 @@ class PurityTests(SynchronousTestCase):
             for node in ast.walk(TREES[module]):
                 targets = node.targets if isinstance(node, ast.Assign) else []
                 for target in targets:
-                    is_slot = isinstance(target, ast.Attribute) and target.attr.startswith("on_")
-                    if is_slot and not (isinstance(target.value, ast.Name) and target.value.id == "self"):
+                    if not isinstance(target, ast.Attribute) or not target.attr.startswith("on_"):
+                        continue
+                    if not isinstance(target.value, ast.Name) or target.value.id != "self":
                         wrong.append(f"{module} line {target.lineno}: {target.attr}")
         self.assertEqual(wrong, [])
 
