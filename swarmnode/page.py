@@ -41,7 +41,6 @@ from webnode.session import sessions
 from webnode.state import Departed, State
 from webnode.survey import survey
 from webnode.team import TeamDesk
-from webnode.tuner import tuning
 
 if TYPE_CHECKING:
     from webnode.tls import TlsDoor
@@ -135,7 +134,6 @@ def _board(ground: Ground, phones: Phones, invites: TeamInvites) -> Board:
         team,
         limits(ground),
         survey(ground),
-        tuning(ground),
         halts(ground),
         faults(ground),
         phones,

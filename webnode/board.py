@@ -291,29 +291,6 @@ class Survey(Protocol):
         """What a device stores."""
 
 
-@dataclass(frozen=True)
-class Knob:
-    """A setting of a device that can be changed while it runs."""
-
-    key: str
-    value: Json
-    about: str
-    unit: str = ""
-    least: float | None = None
-    most: float | None = None
-    choices: tuple[str, ...] = ()
-
-
-class Tuning(Protocol):
-    """The settings of devices; Deferreds fail with ``Refusal``: 400 names the key, 409 and 504 the device."""
-
-    def settings(self, uuid: str) -> Deferred[list[Knob]]:
-        """What can be changed."""
-
-    def change(self, uuid: str, changes: Mapping[str, Json]) -> Deferred[list[Knob]]:
-        """Change some, all or none; the device checks them."""
-
-
 class Halts(Protocol):
     """Stopping the whole team; answers map each uuid to ``stands``, or to why it does not."""
 
@@ -403,7 +380,6 @@ class Board:
     fallbacks: Fallbacks = field(default_factory=MemoryFallbacks)
     limits: Limits = field(default_factory=NoLimits)
     survey: Survey | None = None
-    tuning: Tuning | None = None
     halts: Halts | None = None
     faults: Faults | None = None
     phones: Phones | None = None
@@ -412,6 +388,6 @@ class Board:
     @property
     def has(self) -> list[str]:
         """What this node has beyond what every web node has, for the page."""
-        parts = ("survey", "tuning", "halts", "faults", "phones", "invites")
+        parts = ("survey", "halts", "faults", "phones", "invites")
         yard = ["yard"] if self.desk.yard() is not None else []
         return yard + [name for name in parts if getattr(self, name) is not None]

@@ -6,12 +6,30 @@ cannot be granted raises ``Refusal``.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
+
+from twisted.internet.defer import Deferred
+
+from middleware.entangled.errors import Refused
+from webnode.errors import Refusal
 
 
 class Desk(Protocol):
     """An operator's wishes; the outcome is seen in the state, not in the answer."""
+
+    def call(
+        self,
+        uuid: str,
+        method: str,
+        *arguments: object,
+        refused: Callable[[Refused], Refusal | None] = lambda refused: None,
+    ) -> Deferred[Any]:
+        """Call ``method`` of a device; fires with its answer, fails with ``Refusal``.
+
+        409: it is not here, leaves while it is asked, or refuses; 504: it does not answer.  ``refused`` may translate
+        its refusal.
+        """
 
     def run_demo(self, task_id: str = "") -> Any:
         """Assign the demonstration's task; returns its id."""

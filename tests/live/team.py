@@ -32,8 +32,8 @@ from twisted.protocols.basic import LineReceiver
 from middleware.faults.kinds import KINDS
 from swarmnode.gateway import sides
 from tests.live.keys import GATEWAYS, key_of
-from tests.webnode.memory import MemoryDesk, MemoryFaults, MemoryHalts, MemoryPhones, MemorySurvey, MemoryTuning
-from webnode.board import Board, Knob, MemoryAudit, MemoryFallbacks, Page, Token, Visitor
+from tests.webnode.memory import MemoryDesk, MemoryFaults, MemoryHalts, MemoryPhones, MemorySurvey
+from webnode.board import Board, MemoryAudit, MemoryFallbacks, Page, Token, Visitor
 from webnode.camera import OnFrame
 from webnode.chronicle import TeamChronicle
 from webnode.invite import TeamInvites
@@ -246,10 +246,10 @@ YARD: dict[str, Any] = {
     ],
     "target": {"x": 1.8, "y": 1.7, "radius": 0.08},
 }
-KNOBS = [
-    Knob("description", "The dog with 1 yellow stripe on its head.", "A line about the device", most=200),
-    Knob("presence_lease", 1.0, "How long the others believe in the device", "s", 0.1, 60.0),
-    Knob("capabilities", {"gripper": {"width": 0.1}}, "What the device can do beyond what its driver says"),
+KNOBS: list[list[Any]] = [
+    ["description", "The dog with 1 yellow stripe on its head.", "A line about the device", "", None, 200],
+    ["presence_lease", 1.0, "How long the others believe in the device", "s", 0.1, 60.0],
+    ["capabilities", {"gripper": {"width": 0.1}}, "What the device can do beyond what its driver says", "", None, None],
 ]
 CATALOGUE = [
     {"name": "search", "title": "Find and touch the red target", "requirements": {}},
@@ -335,9 +335,9 @@ def board(team: Team) -> Board:
     desk.together["yard"] = [{"id": "t1", "title": "Find and touch the red target"}]
     gateways = {key_of(name).public for name in GATEWAYS}
     sessions = TeamSessions(key_of(team.node), gateways.__contains__, "quiet-otter", PASSWORD, random.Random(), checked)
-    tuning = MemoryTuning({able[0]["uuid"]: KNOBS})
+    desk.settings[able[0]["uuid"]] = KNOBS
     survey = MemorySurvey(network(), {f"0{n}" * 16: inventory() for n in (1, 2)}, links(), membership())
-    parts: dict[str, Any] = {"halts": team.halts, "tuning": tuning, "survey": survey, "chronicle": TeamChronicle()}
+    parts: dict[str, Any] = {"halts": team.halts, "survey": survey, "chronicle": TeamChronicle()}
     parts["faults"], parts["phones"] = MemoryFaults(*KINDS), MemoryPhones(check=sides)
     return Board(desk, sessions, MemoryAudit(time.time), limits=AddressLimits(), **parts)
 

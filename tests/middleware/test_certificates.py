@@ -41,6 +41,7 @@ class Endpoint:
     """Answers as the test says."""
 
     def __init__(self) -> None:
+        self.door = KnownDoor()
         self.asked: list[list[bytes]] = []
         self.answer: Any = lambda owners: succeed(owners)
         self.exposed: Any = None
@@ -79,7 +80,7 @@ class CertificateTests(SynchronousTestCase):
         self.clock = HeapClock()
         self.endpoint = made()
         self.certificates = Certificates(self.endpoint, self.clock)
-        self.door = self.certificates.door = KnownDoor()
+        self.door = self.endpoint.door
 
     def learn(self, which: list[bytes], peer: int = 1) -> None:
         """Ask a peer."""

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 from twisted.internet.defer import Deferred, fail, succeed
 
-from webnode.board import Knob, Wanted
+from middleware.config.tuning import WRONG
+from middleware.entangled.errors import Refused
+from webnode.board import Wanted
 from webnode.errors import Refusal
 from webnode.field import Json
 
@@ -39,25 +40,6 @@ class MemorySurvey:
         if uuid not in self._inventories:
             return fail(Refusal("device", "it did not answer", "wait a moment, then try again", 504))
         return succeed(self._inventories[uuid])
-
-
-class MemoryTuning:
-    """Settings of devices that take whatever they are told; ``knobs`` are those of each uuid."""
-
-    def __init__(self, knobs: Mapping[str, Sequence[Knob]]) -> None:
-        self.knobs = {uuid: list(each) for uuid, each in knobs.items()}
-
-    def settings(self, uuid: str) -> Deferred[list[Knob]]:
-        """Return them."""
-        return succeed(self.knobs.get(uuid, []))
-
-    def change(self, uuid: str, changes: Mapping[str, Json]) -> Deferred[list[Knob]]:
-        """Change them; fails where the device has no such setting."""
-        for key in changes:
-            if key not in [knob.key for knob in self.knobs.get(uuid, [])]:
-                return fail(Refusal(key, "cannot be changed on this device", "leave it out"))
-        self.knobs[uuid] = [replace(knob, value=changes.get(knob.key, knob.value)) for knob in self.knobs[uuid]]
-        return succeed(self.knobs[uuid])
 
 
 class MemoryHalts:
@@ -181,6 +163,25 @@ class MemoryDesk:
         self.previews: dict[str, dict[str, Any]] = {}
         self.together: dict[str, list[dict[str, Any]]] = {}
         self.ground: dict[str, Any] | None = dict(yard) if yard is not None else None
+        self.settings: dict[str, list[list[Any]]] = {}
+
+    def call(
+        self,
+        uuid: str,
+        method: str,
+        *arguments: Any,
+        refused: Callable[[Refused], Refusal | None] = lambda refused: None,
+    ) -> Deferred[Any]:
+        """Answer with the rows of ``settings``, changed as asked; fails where the device has no such setting."""
+        rows = self.settings.get(uuid, [])
+        for changes in arguments:
+            for key, value in changes.items():
+                row = next((row for row in rows if row[0] == key), None)
+                if row is None:
+                    error = Refused(f"{key}: cannot be changed on this device; leave it out", WRONG)
+                    return fail(refused(error) or error)
+                row[1] = value
+        return succeed(rows)
 
     def run_demo(self, task_id: str = "") -> str:
         """Return ``demo-N``, or the id that it is to have."""

@@ -10,9 +10,9 @@ from twisted.internet.defer import Deferred, fail
 from twisted.trial.unittest import SynchronousTestCase
 
 from tests.webnode.guests import Guests
-from tests.webnode.memory import MemoryDesk, MemoryHalts, MemoryTuning
+from tests.webnode.memory import MemoryDesk, MemoryHalts
 from webnode.app import create_app
-from webnode.board import Board, Knob, MemoryChronicle
+from webnode.board import Board, MemoryChronicle
 from webnode.errors import Refusal
 from webnode.state import state_of
 
@@ -25,8 +25,8 @@ class ActionTests(SynchronousTestCase):
         self.desk = MemoryDesk([{"name": "search"}], {"walls": [3.0, 2.4], "dogs": [DOG], "target": None})
         self.halts = MemoryHalts("01", "02")
         self.chronicle = MemoryChronicle()
-        tuning = MemoryTuning({"01": [Knob("description", "a dog", "A line", most=200.0)]})
-        self.board = Board(self.desk, Guests(), chronicle=self.chronicle, halts=self.halts, tuning=tuning)
+        self.desk.settings["01"] = [["description", "a dog", "A line", "", None, 200.0]]
+        self.board = Board(self.desk, Guests(), chronicle=self.chronicle, halts=self.halts)
         state = state_of([{"uuid": "01", "name": "dog1", "joined": 1}], [], {}, node="vaio")
         app = create_app(lambda: {**state, "halted": self.halts.is_halted()}, self.board, wall=lambda: 1e9)
         app.logger.setLevel(logging.CRITICAL + 1)
@@ -109,8 +109,6 @@ class ActionTests(SynchronousTestCase):
         for uuid, body, expected, field in wrong:
             status, answer = self.ask("PUT", f"devices/{uuid}/settings", body)
             self.assertEqual((status, answer["error"]["field"]), (expected, field), body)
-        self.board.tuning = None
-        self.assertEqual(self.ask("GET", "devices/01/settings")[0], 409)
 
     def test_orders_answer_what_became_of_them(self) -> None:
         """A message is answered with who has it; a device that was lost meanwhile is an error that says so."""

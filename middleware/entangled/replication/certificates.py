@@ -14,7 +14,7 @@ from twisted.internet.interfaces import IReactorTime
 from middleware.entangled.contact import Contact
 from middleware.entangled.errors import EntangledError
 from middleware.entangled.record import Slot
-from middleware.entangled.wire.door import FOREIGN
+from middleware.entangled.wire.door import FOREIGN, Door
 from middleware.entangled.wire.endpoint import Endpoint
 
 MAX_OWNERS = 12
@@ -29,7 +29,7 @@ class Certificates:
     """The certificates of the owners of records, as the ``door`` of one node judges them."""
 
     def __init__(self, endpoint: Endpoint, clock: IReactorTime) -> None:
-        self.door = endpoint.door
+        self.door: Door = endpoint.door
         self._endpoint = endpoint
         self._clock = clock
         self._unasked: dict[bytes, float] = {}

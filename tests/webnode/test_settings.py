@@ -1,4 +1,4 @@
-"""Tests of ``webnode.tuner`` and ``config.tuning``: settings of running devices, in a small team in memory."""
+"""Tests of ``webnode.routes.settings`` and ``config.tuning``: settings of running devices."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from twisted.trial.unittest import SynchronousTestCase
 from swarmnode.assembly import assembled
 from swarmnode.rehearsal import VirtualTeam
 from webnode.errors import Refusal
-from webnode.tuner import TeamTuning
+from webnode.routes.settings import change_settings, read_settings
 
 KEYS = ["description", "presence_lease", "capabilities", "camera_fps"]
 
@@ -20,24 +20,23 @@ class TunerTests(SynchronousTestCase):
     def setUp(self) -> None:
         self.team = VirtualTeam(4, dogs=("dog1", "dog2"))
         self.addCleanup(self.team.stop)
-        self.tuning = TeamTuning(self.team.desk)
         self.node = self.team.services["dog1"].assembly.node
 
     def told(self, name: str = "dog1") -> dict[str, Any]:
         """The settings of a device, as it tells."""
-        asked = self.tuning.settings(self.team.services[name].assembly.node.uuid)
+        asked = read_settings(self.team.desk, self.team.services[name].assembly.node.uuid)
         self.team.clock.advance(0.1)
         return {knob.key: knob.value for knob in self.successResultOf(asked)}
 
     def change(self, **changes: Any) -> dict[str, Any]:
         """Change settings of dog1; what it tells then."""
-        asked = self.tuning.change(self.node.uuid, changes)
+        asked = change_settings(self.team.desk, self.node.uuid, changes)
         self.team.clock.advance(0.1)
         return {knob.key: knob.value for knob in self.successResultOf(asked)}
 
     def refusal(self, **changes: Any) -> Refusal:
         """Why dog1 does not change them."""
-        asked = self.tuning.change(self.node.uuid, changes)
+        asked = change_settings(self.team.desk, self.node.uuid, changes)
         self.team.clock.advance(0.1)
         refusal = self.failureResultOf(asked, Refusal).value
         assert isinstance(refusal, Refusal)
@@ -51,7 +50,7 @@ class TunerTests(SynchronousTestCase):
         """A robot with a camera has four settings, a laptop three; each with its bounds and its unit."""
         self.assertEqual(list(self.told()), KEYS)
         self.assertEqual(list(self.told("vaio")), KEYS[:3])
-        asked = self.tuning.settings(self.node.uuid)
+        asked = read_settings(self.team.desk, self.node.uuid)
         self.team.clock.advance(0.1)
         lease = self.successResultOf(asked)[1]
         self.assertEqual((lease.value, lease.unit, lease.least, lease.most), (1.0, "s", 0.1, 60.0))
@@ -118,7 +117,7 @@ class TunerTests(SynchronousTestCase):
     def test_device_that_is_gone_is_told(self) -> None:
         """The settings of a device that has just died are refused as those of one that left."""
         self.team.kill("dog1")
-        asked = self.tuning.settings(self.node.uuid)
+        asked = read_settings(self.team.desk, self.node.uuid)
         self.team.clock.advance(2.0)
         self.assertEqual(self.failureResultOf(asked, Refusal).value.status, 409)
 
